@@ -1,0 +1,1 @@
+"""Annotation files, data sets, transforms and converters."""

@@ -1,0 +1,1 @@
+"""The detector that joins backbone, BEV encoder and head."""

@@ -1,0 +1,1 @@
+"""AP_chamfer and AP_raster."""

@@ -1,0 +1,98 @@
+"""The extent of the map in metres and its raster: every metres <-> [0, 1] <-> pixel conversion."""
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Array = TypeVar("Array", np.ndarray, Tensor)
+
+
+@dataclass(frozen=True)
+class BEVGrid:
+    """A bird's-eye-view rectangle in metres, divided into ``height`` x ``width`` pixels.
+
+    Row 0 lies at the smallest y, column 0 at the smallest x; a pixel's value is taken at its centre, so pixel
+    (row, col) has the continuous pixel coordinates (col + 0.5, row + 0.5).
+
+    Args:
+        x_range: Smallest and largest x in metres.
+        y_range: Smallest and largest y in metres.
+        height: Number of rows H (along y).
+        width: Number of columns W (along x).
+
+    Raises:
+        ValueError: If a range is empty or a size is not positive.
+    """
+
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+    height: int
+    width: int
+
+    def __post_init__(self) -> None:
+        for name in ("x_range", "y_range"):
+            low, high = (float(v) for v in getattr(self, name))
+            if not low < high:
+                raise ValueError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
+            object.__setattr__(self, name, (low, high))  # lists from a config become a hashable value
+        if self.height < 1 or self.width < 1:
+            raise ValueError(f"height and width must be >= 1, got {self.height} x {self.width}.")
+
+    @classmethod
+    def from_pc_range(cls, pc_range: list[float] | tuple[float, ...], height: int, width: int) -> "BEVGrid":
+        """Build a grid from a point-cloud range (x_min, y_min, z_min, x_max, y_max, z_max) in metres."""
+        if len(pc_range) != 6:
+            raise ValueError(f"pc_range must hold 6 values, got {len(pc_range)}.")
+        return cls((pc_range[0], pc_range[3]), (pc_range[1], pc_range[4]), height, width)
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Size along x and y in metres."""
+        return self.x_range[1] - self.x_range[0], self.y_range[1] - self.y_range[0]
+
+    @property
+    def pixel_size_m(self) -> tuple[float, float]:
+        """Size of one pixel along x and y in metres."""
+        return self.extent_m[0] / self.width, self.extent_m[1] / self.height
+
+    def resized(self, height: int, width: int) -> "BEVGrid":
+        """Return the same extent with another raster size."""
+        return BEVGrid(self.x_range, self.y_range, height, width)
+
+    def _affine(self, points: Array, scale: tuple[float, float], shift: tuple[float, float]) -> Array:
+        """Return ``points * scale + shift`` on the last axis (x, y); further entries (z) are kept. (..., >= 2)"""
+        if points.shape[-1] < 2:
+            raise ValueError(f"points must end in (x, y), got shape {tuple(points.shape)}.")
+        if isinstance(points, Tensor):
+            x, y = points[..., 0] * scale[0] + shift[0], points[..., 1] * scale[1] + shift[1]
+            return torch.cat([torch.stack([x, y], -1), points[..., 2:]], -1)
+        xy = points[..., :2] * np.asarray(scale) + np.asarray(shift)
+        return np.concatenate([xy, points[..., 2:]], -1).astype(points.dtype, copy=False)
+
+    def norm_from_metres(self, points: Array) -> Array:
+        """Map metres to [0, 1] over the extent. (..., 2)"""
+        (w, h), x0, y0 = self.extent_m, self.x_range[0], self.y_range[0]
+        return self._affine(points, (1 / w, 1 / h), (-x0 / w, -y0 / h))
+
+    def metres_from_norm(self, points: Array) -> Array:
+        """Map [0, 1] over the extent to metres. (..., 2)"""
+        return self._affine(points, self.extent_m, (self.x_range[0], self.y_range[0]))
+
+    def px_from_metres(self, points: Array) -> Array:
+        """Map metres to continuous pixel coordinates (u along x, v along y); a pixel's centre is at + 0.5. (..., 2)"""
+        (dx, dy), x0, y0 = self.pixel_size_m, self.x_range[0], self.y_range[0]
+        return self._affine(points, (1 / dx, 1 / dy), (-x0 / dx, -y0 / dy))
+
+    def metres_from_px(self, points: Array) -> Array:
+        """Map continuous pixel coordinates to metres. (..., 2)"""
+        return self._affine(points, self.pixel_size_m, (self.x_range[0], self.y_range[0]))
+
+    def pixel_centres(self, device: torch.device | str | None = None, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Return the centre (x, y) of every pixel in metres. (H, W, 2)"""
+        (dx, dy), x0, y0 = self.pixel_size_m, self.x_range[0], self.y_range[0]
+        x = x0 + dx * (torch.arange(self.width, device=device, dtype=dtype) + 0.5)
+        y = y0 + dy * (torch.arange(self.height, device=device, dtype=dtype) + 0.5)
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)

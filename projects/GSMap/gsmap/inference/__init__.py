@@ -1,0 +1,1 @@
+"""Prediction on samples outside a data set."""

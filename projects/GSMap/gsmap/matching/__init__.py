@@ -1,0 +1,1 @@
+"""Matching of predicted to ground-truth map elements."""

@@ -1,0 +1,1 @@
+"""Rasterizers and other tensor operations, each beside a plain torch reference."""

@@ -1,0 +1,1 @@
+"""Importing this module registers everything that GSMap adds to mmdet3d's registries."""

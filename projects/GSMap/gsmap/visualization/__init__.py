@@ -1,0 +1,1 @@
+"""Pictures of maps over cameras and in bird's-eye view."""
