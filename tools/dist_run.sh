@@ -1,0 +1,12 @@
+#!/usr/bin/env bash
+# Run a script under torchrun: tools/dist_run.sh PROCESSES SCRIPT [arguments]. NCCL on GPUs, gloo without.
+# Several machines: set NNODES, NODE_RANK, MASTER_ADDR and PORT on each.
+set -euo pipefail
+processes=$1
+shift
+python=python
+[ -x "$(dirname "$0")/../.venv/bin/python" ] && python="$(dirname "$0")/../.venv/bin/python"
+exec "${PYTHON:-$python}" -m torch.distributed.run \
+    --nnodes="${NNODES:-1}" --node_rank="${NODE_RANK:-0}" \
+    --master_addr="${MASTER_ADDR:-127.0.0.1}" --master_port="${PORT:-29500}" \
+    --nproc_per_node="$processes" "$@"
