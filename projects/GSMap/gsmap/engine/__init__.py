@@ -1,0 +1,1 @@
+"""How a run starts, saves and resumes: launch arguments, config checks, checkpoint safety."""

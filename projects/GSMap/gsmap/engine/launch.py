@@ -1,0 +1,83 @@
+"""What `tools/train.py` and `tools/test.py` share: reading a config, checking it, naming the work folder."""
+
+import argparse
+import difflib
+import os
+from pathlib import Path
+
+from mmengine.config import Config, DictAction
+
+# mmengine accepts a misspelt top-level key in silence: only these mean something.
+KNOWN_KEYS = frozenset(
+    """
+    auto_scale_lr backend_args cfg custom_hooks custom_imports data_preprocessor data_root default_hooks default_scope
+    env_cfg launcher load_from log_level log_processor model optim_wrapper param_scheduler randomness resume runner_type
+    test_cfg test_dataloader test_evaluator train_cfg train_dataloader val_cfg val_dataloader val_evaluator vis_backends
+    visualizer work_dir experiment_name
+    """.split()
+)
+
+
+def add_common_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that every OpenMMLab tool has."""
+    parser.add_argument("--work-dir", help="folder for logs, checkpoints and pictures")
+    parser.add_argument(
+        "--cfg-options",
+        nargs="+",
+        action=DictAction,
+        metavar="KEY=VALUE",
+        help="override settings, e.g. train_dataloader.batch_size=2",
+    )
+    parser.add_argument("--launcher", choices=["none", "pytorch", "slurm", "mpi"], default="none")
+    parser.add_argument("--local_rank", "--local-rank", type=int, default=0)
+
+
+def load_config(args: argparse.Namespace) -> Config:
+    """Read ``args.config``, apply ``--cfg-options``, ``--launcher`` and ``--work-dir``, and check the result.
+
+    Raises:
+        SystemExit: If the file does not exist.
+        ValueError: If the config cannot mean what was intended (see `check_config`).
+    """
+    if not Path(args.config).is_file():
+        raise SystemExit(f"There is no config file {args.config}.")
+    os.environ.setdefault("LOCAL_RANK", str(args.local_rank))
+    cfg = Config.fromfile(args.config)
+    if args.cfg_options:
+        cfg.merge_from_dict(args.cfg_options)
+    cfg.launcher = args.launcher
+    if args.work_dir:
+        cfg.work_dir = args.work_dir
+    elif cfg.get("work_dir") is None:
+        cfg.work_dir = str(Path("work_dirs") / Path(args.config).stem)
+    check_config(cfg)
+    return cfg
+
+
+def check_config(cfg: Config) -> None:
+    """Refuse the mistakes that the config system lets through.
+
+    Raises:
+        ValueError: If a top-level key is unknown (lower-case names that a config uses for its own values must start with
+            an underscore), or a learning-rate schedule ends at another epoch than the training.
+    """
+    # Values that a config computes with are inlined where they are used; mmengine keeps their names as keys.
+    for key in cfg:
+        if key in KNOWN_KEYS or key.startswith("_"):
+            continue
+        close = difflib.get_close_matches(key, KNOWN_KEYS, n=1)
+        hint = f" Did you mean {close[0]!r}?" if close else " Names of a config's own values start with '_'."
+        raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}.{hint}")
+    _check_schedule(cfg)
+
+
+def _check_schedule(cfg: Config) -> None:
+    train_cfg = cfg.get("train_cfg") or {}
+    end = train_cfg.get("max_epochs")
+    for scheduler in cfg.get("param_scheduler") or []:
+        last = scheduler.get("T_max")
+        if end is not None and last is not None and scheduler.get("by_epoch", True) and last != end:
+            raise ValueError(
+                f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {last}: set both "
+                "train_cfg.max_epochs and param_scheduler's T_max (a schedule is one base file)."
+            )
