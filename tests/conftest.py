@@ -10,7 +10,7 @@ REPO = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
-    """Folder with reference data that is not part of the project (``GSMAP_SHARED``); skips without it."""
+    """Folder with reference data outside the project (``GSMAP_SHARED``); skips without it."""
     path = Path(os.environ.get("GSMAP_SHARED", REPO.parent / "shared"))
     if not path.is_dir():
         pytest.skip(f"no reference data at {path}: set GSMAP_SHARED")

@@ -8,23 +8,27 @@ import numpy as np
 import torch
 from mmengine.fileio import LocalBackend, register_backend
 from mmengine.logging.history_buffer import HistoryBuffer
+from numpy.core import multiarray
 
 
 def allow_mmengine_checkpoints() -> None:
-    """Let ``torch.load(weights_only=True)`` read the plain data that mmengine keeps beside the weights.
+    """Let ``torch.load(weights_only=True)`` read what mmengine keeps beside the weights.
 
-    A checkpoint to resume from holds the message hub: ``HistoryBuffer`` objects around numpy arrays and numbers. Each
-    of these types only holds data; naming them keeps torch's protection on for everything else.
+    A checkpoint to resume from holds the message hub: ``HistoryBuffer`` objects around numpy arrays
+    and numbers. Each of these types only holds data; naming them keeps torch's protection on for
+    everything else.
     """
-    dtypes = [type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int64, np.int32, np.uint8, np.bool_)]
-    reconstruct = [np.core.multiarray._reconstruct, np.core.multiarray.scalar]
-    torch.serialization.add_safe_globals([HistoryBuffer, np.ndarray, np.dtype, *reconstruct, *dtypes])
+    kinds = (np.float32, np.float64, np.int64, np.int32, np.uint8, np.bool_)
+    dtypes = [type(np.dtype(kind)) for kind in kinds]
+    rebuild = [multiarray._reconstruct, multiarray.scalar]  # type: ignore[attr-defined]
+    torch.serialization.add_safe_globals([HistoryBuffer, np.ndarray, np.dtype, *rebuild, *dtypes])
 
 
 class AtomicLocalBackend(LocalBackend):
     """mmengine's local files, each written beside its place and then moved there in one step.
 
-    A run that is killed while it saves leaves the previous checkpoint as it was, so ``--resume`` always finds a whole one.
+    A run that is killed while it saves leaves the previous checkpoint as it was, so ``--resume``
+    always finds a whole one.
     """
 
     def put(self, obj: bytes, filepath: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""What `tools/train.py` and `tools/test.py` share: reading a config, checking it, naming the work folder."""
+"""What the training and test tools share: reading a config, checking it, the work folder."""
 
 import argparse
 import difflib
@@ -9,12 +9,13 @@ from mmengine.config import Config, DictAction
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 KNOWN_KEYS = frozenset(
-    """
-    auto_scale_lr backend_args cfg custom_hooks custom_imports data_preprocessor data_root default_hooks default_scope
-    env_cfg launcher load_from log_level log_processor model optim_wrapper param_scheduler randomness resume runner_type
-    test_cfg test_dataloader test_evaluator train_cfg train_dataloader val_cfg val_dataloader val_evaluator vis_backends
-    visualizer work_dir experiment_name
-    """.split()
+    (
+        "auto_scale_lr backend_args custom_hooks custom_imports data_preprocessor data_root "
+        "default_hooks default_scope env_cfg experiment_name launcher load_from log_level "
+        "log_processor model optim_wrapper param_scheduler randomness resume runner_type test_cfg "
+        "test_dataloader test_evaluator train_cfg train_dataloader val_cfg val_dataloader "
+        "val_evaluator vis_backends visualizer work_dir"
+    ).split()
 )
 
 
@@ -33,7 +34,7 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def load_config(args: argparse.Namespace) -> Config:
-    """Read ``args.config``, apply ``--cfg-options``, ``--launcher`` and ``--work-dir``, and check the result.
+    """Read ``args.config``, apply the command-line options to it, and check the result.
 
     Raises:
         SystemExit: If the file does not exist.
@@ -58,15 +59,18 @@ def check_config(cfg: Config) -> None:
     """Refuse the mistakes that the config system lets through.
 
     Raises:
-        ValueError: If a top-level key is unknown (lower-case names that a config uses for its own values must start with
-            an underscore), or a learning-rate schedule ends at another epoch than the training.
+        ValueError: If a top-level key is unknown (names of a config's own values must start with an
+            underscore), or a learning-rate schedule ends at another epoch than the training.
     """
-    # Values that a config computes with are inlined where they are used; mmengine keeps their names as keys.
     for key in cfg:
         if key in KNOWN_KEYS or key.startswith("_"):
             continue
         close = difflib.get_close_matches(key, KNOWN_KEYS, n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else " Names of a config's own values start with '_'."
+        hint = (
+            f" Did you mean {close[0]!r}?"
+            if close
+            else " Names of a config's own values start with '_'."
+        )
         raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}.{hint}")
     _check_schedule(cfg)
 
@@ -78,6 +82,7 @@ def _check_schedule(cfg: Config) -> None:
         last = scheduler.get("T_max")
         if end is not None and last is not None and scheduler.get("by_epoch", True) and last != end:
             raise ValueError(
-                f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {last}: set both "
-                "train_cfg.max_epochs and param_scheduler's T_max (a schedule is one base file)."
+                f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {last}: set "
+                "both train_cfg.max_epochs and param_scheduler's T_max (a schedule is one base "
+                "file)."
             )

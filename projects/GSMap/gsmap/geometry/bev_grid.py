@@ -4,18 +4,19 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-Array = TypeVar("Array", np.ndarray, Tensor)
+Array = TypeVar("Array", npt.NDArray[np.floating], Tensor)
 
 
 @dataclass(frozen=True)
 class BEVGrid:
     """A bird's-eye-view rectangle in metres, divided into ``height`` x ``width`` pixels.
 
-    Row 0 lies at the smallest y, column 0 at the smallest x; a pixel's value is taken at its centre, so pixel
-    (row, col) has the continuous pixel coordinates (col + 0.5, row + 0.5).
+    Row 0 lies at the smallest y, column 0 at the smallest x; a pixel's value is taken at its
+    centre, so pixel (row, col) has the continuous pixel coordinates (col + 0.5, row + 0.5).
 
     Args:
         x_range: Smallest and largest x in metres.
@@ -37,13 +38,17 @@ class BEVGrid:
             low, high = (float(v) for v in getattr(self, name))
             if not low < high:
                 raise ValueError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
-            object.__setattr__(self, name, (low, high))  # lists from a config become a hashable value
+            object.__setattr__(
+                self, name, (low, high)
+            )  # lists from a config become a hashable value
         if self.height < 1 or self.width < 1:
             raise ValueError(f"height and width must be >= 1, got {self.height} x {self.width}.")
 
     @classmethod
-    def from_pc_range(cls, pc_range: list[float] | tuple[float, ...], height: int, width: int) -> "BEVGrid":
-        """Build a grid from a point-cloud range (x_min, y_min, z_min, x_max, y_max, z_max) in metres."""
+    def from_pc_range(
+        cls, pc_range: list[float] | tuple[float, ...], height: int, width: int
+    ) -> "BEVGrid":
+        """Build a grid from a range (x_min, y_min, z_min, x_max, y_max, z_max) in metres."""
         if len(pc_range) != 6:
             raise ValueError(f"pc_range must hold 6 values, got {len(pc_range)}.")
         return cls((pc_range[0], pc_range[3]), (pc_range[1], pc_range[4]), height, width)
@@ -62,8 +67,10 @@ class BEVGrid:
         """Return the same extent with another raster size."""
         return BEVGrid(self.x_range, self.y_range, height, width)
 
-    def _affine(self, points: Array, scale: tuple[float, float], shift: tuple[float, float]) -> Array:
-        """Return ``points * scale + shift`` on the last axis (x, y); further entries (z) are kept. (..., >= 2)"""
+    def _affine(
+        self, points: Array, scale: tuple[float, float], shift: tuple[float, float]
+    ) -> Array:
+        """Return ``points * scale + shift`` on (x, y); further entries (z) are kept. (..., >= 2)"""
         if points.shape[-1] < 2:
             raise ValueError(f"points must end in (x, y), got shape {tuple(points.shape)}.")
         if isinstance(points, Tensor):
@@ -82,7 +89,7 @@ class BEVGrid:
         return self._affine(points, self.extent_m, (self.x_range[0], self.y_range[0]))
 
     def px_from_metres(self, points: Array) -> Array:
-        """Map metres to continuous pixel coordinates (u along x, v along y); a pixel's centre is at + 0.5. (..., 2)"""
+        """Map metres to continuous pixels (u along x, v along y), centres at + 0.5. (..., 2)"""
         (dx, dy), x0, y0 = self.pixel_size_m, self.x_range[0], self.y_range[0]
         return self._affine(points, (1 / dx, 1 / dy), (-x0 / dx, -y0 / dy))
 
@@ -90,7 +97,9 @@ class BEVGrid:
         """Map continuous pixel coordinates to metres. (..., 2)"""
         return self._affine(points, self.pixel_size_m, (self.x_range[0], self.y_range[0]))
 
-    def pixel_centres(self, device: torch.device | str | None = None, dtype: torch.dtype = torch.float32) -> Tensor:
+    def pixel_centres(
+        self, device: torch.device | str | None = None, dtype: torch.dtype = torch.float32
+    ) -> Tensor:
         """Return the centre (x, y) of every pixel in metres. (H, W, 2)"""
         (dx, dy), x0, y0 = self.pixel_size_m, self.x_range[0], self.y_range[0]
         x = x0 + dx * (torch.arange(self.width, device=device, dtype=dtype) + 0.5)

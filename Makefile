@@ -1,0 +1,33 @@
+.PHONY: help setup test lint format demo clean
+
+VENV ?= .venv
+PY := $(VENV)/bin/python
+
+help:
+	@echo "make setup   build the environment in $(VENV) (again: a second)"
+	@echo "make test    set up if needed, then run every test"
+	@echo "make demo    set up if needed, then generate, train, test and draw on MiniCity"
+	@echo "make lint    ruff, ruff format, codespell, mypy"
+	@echo "make format  let ruff mend what it can"
+
+setup:
+	@tools/setup_env.sh $(VENV)
+
+test: setup
+	$(PY) -m pytest $(ARGS)
+
+lint: setup
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m codespell_lib
+	$(PY) -m mypy
+
+format: setup
+	$(PY) -m ruff check --fix .
+	$(PY) -m ruff format .
+
+demo: setup
+	$(PY) tools/demo.py $(ARGS)
+
+clean:
+	rm -rf demo work_dirs .pytest_cache .mypy_cache .ruff_cache
