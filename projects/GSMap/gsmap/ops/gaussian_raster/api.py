@@ -1,0 +1,62 @@
+"""The public rendering function: argument checks and the choice of a backend."""
+
+import torch
+from torch import Tensor
+
+from ...geometry.bev_grid import BEVGrid
+from .reference import render_gaussians_reference
+
+BACKENDS = ("auto", "reference", "cpu", "triton")
+
+
+def render_gaussians(
+    means: Tensor, scales: Tensor, rotations: Tensor, grid: BEVGrid, backend: str = "auto"
+) -> Tensor:
+    r"""Render each map element's 2D Gaussians to a soft occupancy raster.
+
+    A pixel :math:`p` takes :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6), with :math:`G_i` from
+    Eq. 2. Half-precision inputs are computed in float32, also under autocast.
+
+    Args:
+        means: Centres (x, y) in metres, in the frame of ``grid``. (..., P, 2)
+        scales: Standard deviations along each Gaussian's own axes, in metres, > 0. (..., P, 2)
+        rotations: Angle of the first axis from +x, in radians, anticlockwise. (..., P)
+        grid: The raster: its extent in metres and its size in pixels.
+        backend: ``"reference"`` (plain torch), ``"cpu"`` or ``"triton"`` (fused kernels), or
+            ``"auto"``: the fastest one that serves the inputs' device and type.
+
+    Returns:
+        Occupancy in [0, 1], differentiable in the first three inputs. (..., H, W)
+
+    Raises:
+        TypeError: If an input is not floating point.
+        ValueError: If the shapes, types or devices disagree, or ``backend`` is unknown.
+    """
+    _check(means, scales, rotations, backend)
+    dtype = torch.promote_types(means.dtype, torch.float32)
+    means, scales, rotations = means.to(dtype), scales.to(dtype), rotations.to(dtype)
+    with torch.autocast(means.device.type, enabled=False):
+        return render_gaussians_reference(means, scales, rotations, grid)
+
+
+def _check(means: Tensor, scales: Tensor, rotations: Tensor, backend: str) -> None:
+    """Raise for inputs that do not belong together."""
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {BACKENDS}, got {backend!r}.")
+    if means.ndim < 2 or means.shape[-1] != 2:
+        raise ValueError(f"means must have shape (..., P, 2), got {tuple(means.shape)}.")
+    for name, tensor, shape in (
+        ("scales", scales, means.shape),
+        ("rotations", rotations, means.shape[:-1]),
+    ):
+        if tensor.shape != shape:
+            raise ValueError(
+                f"{name} must have shape {tuple(shape)} to match means, got {tuple(tensor.shape)}."
+            )
+        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise ValueError(
+                f"{name} must be {means.dtype} on {means.device} like means, "
+                f"got {tensor.dtype} on {tensor.device}."
+            )
+    if not means.dtype.is_floating_point:
+        raise TypeError(f"means must be floating point, got {means.dtype}.")
