@@ -1,7 +1,10 @@
 """Checkpoints that run no code when read, and are whole or absent when written."""
 
+import codecs
 import os
+import pickle
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +17,27 @@ from numpy.core import multiarray
 def allow_mmengine_checkpoints() -> None:
     """Let ``torch.load(weights_only=True)`` read what mmengine keeps beside the weights.
 
-    A checkpoint to resume from holds the message hub: ``HistoryBuffer`` objects around numpy arrays
-    and numbers. Each of these types only holds data; naming them keeps torch's protection on for
-    everything else.
+    A checkpoint to resume from holds the message hub: ``HistoryBuffer`` objects around numpy arrays,
+    numbers, and references to the class's own statistics (``getattr(HistoryBuffer, "mean")``).
+    Naming just these keeps torch's protection on for everything else.
     """
     kinds = (np.float32, np.float64, np.int64, np.int32, np.uint8, np.bool_)
     dtypes = [type(np.dtype(kind)) for kind in kinds]
     rebuild = [multiarray._reconstruct, multiarray.scalar]  # type: ignore[attr-defined]
-    torch.serialization.add_safe_globals([HistoryBuffer, np.ndarray, np.dtype, *rebuild, *dtypes])
+    types = [HistoryBuffer, np.ndarray, np.dtype, codecs.encode]
+    statistics = (_history_statistic, "builtins.getattr")
+    torch.serialization.add_safe_globals([*types, *rebuild, *dtypes, statistics])
+
+
+def _history_statistic(owner: type, name: str) -> Callable[..., float]:
+    """Stand in for ``getattr`` while unpickling: a statistic of ``HistoryBuffer`` and nothing else.
+
+    Raises:
+        pickle.UnpicklingError: If anything else is asked for.
+    """
+    if owner is not HistoryBuffer or name not in {"min", "max", "current", "mean"}:
+        raise pickle.UnpicklingError(f"A checkpoint must not look up {name!r} of {owner!r}.")
+    return getattr(HistoryBuffer, name)
 
 
 class AtomicLocalBackend(LocalBackend):

@@ -9,13 +9,39 @@ from mmengine.config import Config, DictAction
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 KNOWN_KEYS = frozenset(
-    (
-        "auto_scale_lr backend_args custom_hooks custom_imports data_preprocessor data_root "
-        "default_hooks default_scope env_cfg experiment_name launcher load_from log_level "
-        "log_processor model optim_wrapper param_scheduler randomness resume runner_type test_cfg "
-        "test_dataloader test_evaluator train_cfg train_dataloader val_cfg val_dataloader "
-        "val_evaluator vis_backends visualizer work_dir"
-    ).split()
+    [
+        "auto_scale_lr",
+        "backend_args",
+        "custom_hooks",
+        "custom_imports",
+        "data_preprocessor",
+        "data_root",
+        "default_hooks",
+        "default_scope",
+        "env_cfg",
+        "experiment_name",
+        "launcher",
+        "load_from",
+        "log_level",
+        "log_processor",
+        "model",
+        "optim_wrapper",
+        "param_scheduler",
+        "randomness",
+        "resume",
+        "runner_type",
+        "test_cfg",
+        "test_dataloader",
+        "test_evaluator",
+        "train_cfg",
+        "train_dataloader",
+        "val_cfg",
+        "val_dataloader",
+        "val_evaluator",
+        "vis_backends",
+        "visualizer",
+        "work_dir",
+    ]
 )
 
 

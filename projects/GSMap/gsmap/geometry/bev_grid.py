@@ -1,14 +1,14 @@
 """The extent of the map in metres and its raster: every metres <-> [0, 1] <-> pixel conversion."""
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-Array = TypeVar("Array", npt.NDArray[np.floating], Tensor)
+Array = TypeVar("Array", npt.NDArray[Any], Tensor)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,90 @@
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pytest
+import torch
+from mmengine.fileio import get_file_backend
+from mmengine.logging import MessageHub
+from mmengine.runner.checkpoint import save_checkpoint
+
+from gsmap.engine.checkpoint_io import AtomicLocalBackend
+
+
+def test_a_message_hub_comes_back_with_weights_only(tmp_path):
+    hub = MessageHub.get_instance("checkpoint-io-test")
+    for value in (3.0, 2.0, np.float64(1.0)):
+        hub.update_scalar("train/loss", value)
+    path = str(tmp_path / "epoch_1.pth")
+    save_checkpoint({"message_hub": hub.state_dict(), "state_dict": {"w": torch.ones(2)}}, path)
+
+    loaded = torch.load(path, weights_only=True)
+
+    history = loaded["message_hub"]["log_scalars"]["train/loss"]
+    np.testing.assert_array_equal(history.data[0], [3.0, 2.0, 1.0])
+
+
+class Malicious:
+    def __reduce__(self):
+        return os.system, ("touch pwned",)
+
+
+def test_code_in_a_checkpoint_does_not_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"state_dict": Malicious()}, "bad.pth")
+    with pytest.raises(pickle.UnpicklingError, match="Weights only load failed"):
+        torch.load("bad.pth")
+    assert not (tmp_path / "pwned").exists()
+
+
+class LooksUp:
+    def __reduce__(self):
+        return getattr, (np.dtype, "__init__")
+
+
+def test_a_checkpoint_may_not_look_up_anything_else(tmp_path):
+    torch.save({"state_dict": LooksUp()}, tmp_path / "bad.pth")
+    with pytest.raises(pickle.UnpicklingError, match="must not look up '__init__'"):
+        torch.load(tmp_path / "bad.pth")
+
+
+def test_mmengine_writes_through_the_atomic_backend(tmp_path):
+    assert isinstance(get_file_backend(str(tmp_path / "a.pth")), AtomicLocalBackend)
+    path = tmp_path / "new" / "log.txt"
+    get_file_backend(str(path)).put_text("h\u00e9", path)
+    assert path.read_text(encoding="utf-8") == "h\u00e9"
+    assert os.listdir(path.parent) == ["log.txt"]
+
+
+def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(tmp_path):
+    path = tmp_path / "epoch_1.pth"
+    path.write_bytes(b"old")
+    with pytest.raises(TypeError):
+        AtomicLocalBackend().put("not bytes", path)
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["epoch_1.pth"]
+
+
+def test_a_killed_writer_leaves_the_old_file_whole(tmp_path):
+    path = tmp_path / "last.pth"
+    path.write_bytes(b"whole")
+    code = textwrap.dedent(
+        f"""
+        from gsmap.engine.checkpoint_io import AtomicLocalBackend
+        backend = AtomicLocalBackend()
+        print("ready", flush=True)
+        while True:
+            backend.put(b"whole" * 20_000_000, {str(path)!r})
+        """
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b"ready\n"
+        time.sleep(0.3)  # long enough to be in the middle of one of the writes
+        writer.send_signal(signal.SIGKILL)
+    content = path.read_bytes()
+    assert content in (b"whole", b"whole" * 20_000_000)

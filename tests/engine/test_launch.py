@@ -1,0 +1,46 @@
+import argparse
+
+import pytest
+from mmengine.config import Config
+
+from gsmap.engine.launch import add_common_arguments, check_config, load_config
+
+
+def parse(*arguments):
+    parser = argparse.ArgumentParser()
+    parser.add_argument("config")
+    add_common_arguments(parser)
+    return parser.parse_args(arguments)
+
+
+def test_options_override_and_the_work_folder_takes_the_config_name(tmp_path):
+    path = tmp_path / "tiny.py"
+    path.write_text("train_dataloader = dict(batch_size=4)\n")
+    cfg = load_config(parse(str(path), "--cfg-options", "train_dataloader.batch_size=1"))
+    assert cfg.train_dataloader.batch_size == 1
+    assert cfg.work_dir == "work_dirs/tiny"
+    assert load_config(parse(str(path), "--work-dir", "elsewhere")).work_dir == "elsewhere"
+
+
+def test_a_missing_config_is_named():
+    with pytest.raises(SystemExit, match=r"no config file nowhere\.py"):
+        load_config(parse("nowhere.py"))
+
+
+def test_a_misspelt_key_is_refused_with_the_right_one():
+    with pytest.raises(ValueError, match=r"'optim_wraper'.*Did you mean 'optim_wrapper'"):
+        check_config(Config({"optim_wraper": {}}))
+
+
+def test_own_values_start_with_an_underscore():
+    check_config(Config({"_num_points": 20}))
+    with pytest.raises(ValueError, match="start with '_'"):
+        check_config(Config({"zzz": 20}))
+
+
+def test_a_cosine_schedule_of_another_length_is_refused():
+    cfg = {"train_cfg": {"max_epochs": 110}, "param_scheduler": [{"by_epoch": True, "T_max": 24}]}
+    with pytest.raises(ValueError, match="lasts 110 epochs but the cosine schedule 24"):
+        check_config(Config(cfg))
+    cfg["param_scheduler"][0]["T_max"] = 110
+    check_config(Config(cfg))
