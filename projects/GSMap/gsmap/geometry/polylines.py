@@ -1,0 +1,212 @@
+"""Polylines as numpy arrays: resampling, equivalent point orders, boxes and clipping."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.floating[Any]]
+
+PADDING = -10000.0
+"""Fills the rows of ``equivalent_orders`` that are not used."""
+
+
+def _check_polyline(points: Points) -> Points:
+    points = np.asarray(points)
+    if points.ndim != 2 or len(points) < 2 or points.shape[1] < 2:
+        raise ValueError(f"points must have shape (n >= 2, 2 or 3), got {points.shape}.")
+    return points.astype(np.float64, copy=False)
+
+
+def is_closed(points: Points) -> bool:
+    """Whether a polyline is a ring: its last point equals its first exactly. (n, D)."""
+    return len(points) > 2 and bool(np.array_equal(points[0], points[-1]))
+
+
+def arc_lengths(points: Points) -> NDArray[np.float64]:
+    """Return the distance from the first point to each point along a polyline.
+
+    Args:
+        points: Vertices in metres. (n, D)
+
+    Returns:
+        Distances in metres, from 0 to the length. (n,)
+    """
+    steps = np.linalg.norm(np.diff(np.asarray(points, np.float64), axis=0), axis=-1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def points_at(points: Points, distances: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Return the points at given distances along a polyline.
+
+    Args:
+        points: Vertices in metres. (n, D)
+        distances: Distances from the first point in metres; beyond the ends, the ends are returned.
+            (...)
+
+    Returns:
+        Points in metres. (..., D)
+    """
+    along = arc_lengths(points)
+    return np.stack([np.interp(distances, along, column) for column in np.asarray(points).T], -1)
+
+
+def resample(points: Points, num_points: int) -> NDArray[np.float64]:
+    """Resample a polyline at equal arc length, both end points included.
+
+    Args:
+        points: Vertices in metres. (n, D)
+        num_points: Number P of points to return, >= 2.
+
+    Returns:
+        Resampled points in metres. (P, D)
+
+    Raises:
+        ValueError: If ``points`` is no polyline or ``num_points`` is below 2.
+    """
+    points = _check_polyline(points)
+    if num_points < 2:
+        raise ValueError(f"num_points must be >= 2, got {num_points}.")
+    length = arc_lengths(points)[-1]
+    return points_at(points, np.linspace(0.0, length, num_points))
+
+
+def rotations(
+    points: Points, num_points: int, starts: NDArray[np.integer[Any]]
+) -> NDArray[np.float64]:
+    """Resample a ring at equal arc length from several of its vertices.
+
+    Args:
+        points: Vertices of the ring in metres, the last equal to the first. (n, D)
+        num_points: Number P of points per order, both ends included.
+        starts: Index of the vertex that each order starts at. (S,)
+
+    Returns:
+        One resampled ring per start. (S, P, D)
+    """
+    along = arc_lengths(points)
+    length = along[-1]
+    distances = along[starts][:, None] + np.linspace(0.0, length, num_points)  # (S, P)
+    twice = np.concatenate([points, points[1:]])  # a second lap, so that no distance wraps around
+    return points_at(twice, distances)
+
+
+def equivalent_orders(
+    points: Points, num_points: int, rng: np.random.Generator | None = None
+) -> NDArray[np.float64]:
+    """Return the point orders that describe the same map element ("v2" of MapTR).
+
+    An open polyline has two: as it is, and reversed. A ring has one for each of its K vertices,
+    which starts there and runs in the ring's own direction; order k starts at vertex -k. Of more
+    than P - 1 vertices, P - 1 are taken: at random if ``rng`` is given, else evenly spread.
+
+    Args:
+        points: Vertices at full resolution in metres; a ring's last equals its first. (n, D)
+        num_points: Number P of points per order, >= 2.
+        rng: Source of the random choice.
+
+    Returns:
+        Orders, resampled at equal arc length; unused rows hold ``PADDING``. (max(P - 1, 2), P, D)
+
+    Raises:
+        ValueError: If ``points`` is no polyline or ``num_points`` is below 2.
+    """
+    points = _check_polyline(points)
+    if num_points < 2:
+        raise ValueError(f"num_points must be >= 2, got {num_points}.")
+    slots = max(num_points - 1, 2)
+    orders = np.full((slots, num_points, points.shape[1]), PADDING)
+    if not is_closed(points):
+        orders[0] = resample(points, num_points)
+        orders[1] = orders[0, ::-1]
+        return orders
+    count = len(points) - 1
+    rolls = np.arange(count)
+    if count > slots:
+        rolls = (
+            np.linspace(0, count, slots, endpoint=False).astype(np.int64)
+            if rng is None
+            else rng.choice(count, slots, replace=False)
+        )
+    orders[: len(rolls)] = rotations(points, num_points, -rolls % count)
+    return orders
+
+
+def bounding_boxes(points: Points) -> Points:
+    """Return axis-aligned boxes (xmin, ymin, xmax, ymax) in metres. (..., P, D) -> (..., 4)."""
+    xy = np.asarray(points)[..., :2]
+    return np.concatenate([xy.min(-2), xy.max(-2)], -1)
+
+
+def clamp(points: Points, x_range: tuple[float, float], y_range: tuple[float, float]) -> Points:
+    """Move points outside a rectangle to its nearest edge; entries after (x, y) are kept.
+
+    Args:
+        points: Points in metres. (..., D)
+        x_range: Smallest and largest x in metres.
+        y_range: Smallest and largest y in metres.
+
+    Returns:
+        A copy. (..., D)
+    """
+    clamped = np.array(points)
+    clamped[..., 0] = np.clip(clamped[..., 0], *x_range)
+    clamped[..., 1] = np.clip(clamped[..., 1], *y_range)
+    return clamped
+
+
+def _segment_parameters(
+    start: Points, step: Points, x_range: tuple[float, float], y_range: tuple[float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where segments enter and leave a rectangle, in [0, 1]; enter > leave: missed. (n,)."""
+    enter, leave = np.zeros(len(start)), np.ones(len(start))
+    for axis, (low, high) in enumerate((x_range, y_range)):
+        parallel = step[:, axis] == 0
+        divisor = np.where(parallel, 1.0, step[:, axis])
+        a, b = (low - start[:, axis]) / divisor, (high - start[:, axis]) / divisor
+        inside = (start[:, axis] >= low) & (start[:, axis] <= high)
+        first = np.where(parallel, np.where(inside, 0.0, 2.0), np.minimum(a, b))
+        last = np.where(parallel, 1.0, np.maximum(a, b))
+        enter, leave = np.maximum(enter, first), np.minimum(leave, last)
+    return enter, leave
+
+
+def clip_to_box(
+    points: Points, x_range: tuple[float, float], y_range: tuple[float, float]
+) -> list[NDArray[np.float64]]:
+    """Cut a polyline with an axis-aligned rectangle (Liang and Barsky, 1984).
+
+    Direction is kept, further coordinates are interpolated, and a ring that is cut comes back as
+    open pieces, none of which ends at the ring's arbitrary start. Pieces that only touch the
+    rectangle are left out.
+
+    Args:
+        points: Vertices in metres. (n, D)
+        x_range: Smallest and largest x in metres.
+        y_range: Smallest and largest y in metres.
+
+    Returns:
+        The pieces inside, in order. each (m >= 2, D)
+
+    Raises:
+        ValueError: If ``points`` is no polyline.
+    """
+    points = _check_polyline(points)
+    start, step = points[:-1], np.diff(points, axis=0)
+    moving = step.any(axis=-1)
+    start, step = start[moving], step[moving]
+    enter, leave = _segment_parameters(start, step, x_range, y_range)
+    hits = np.flatnonzero(enter < leave)
+    if not len(hits):
+        return []
+    first = start[hits] + enter[hits, None] * step[hits]
+    last = start[hits] + leave[hits, None] * step[hits]
+    joined = (np.diff(hits) == 1) & (leave[hits[:-1]] == 1.0) & (enter[hits[1:]] == 0.0)
+    breaks = np.flatnonzero(~joined) + 1
+    ends = [0, *breaks.tolist(), len(hits)]
+    pieces = [np.concatenate([first[a : a + 1], last[a:b]]) for a, b in pairwise(ends)]
+    runs_through = hits[0] == 0 and hits[-1] == len(start) - 1 and enter[0] == 0 and leave[-1] == 1
+    if len(pieces) > 1 and runs_through and is_closed(points):
+        pieces[0] = np.concatenate([pieces.pop(), pieces[0][1:]])
+    return pieces
