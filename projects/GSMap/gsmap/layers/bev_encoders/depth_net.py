@@ -1,0 +1,169 @@
+"""Camera-aware depth net of MapTRv2, after BEVDepth (arXiv 2206.10092)."""
+
+from collections import OrderedDict
+
+import torch
+import torch.nn.functional as F
+from mmdet.models.backbones.resnet import BasicBlock
+from torch import Tensor, nn
+
+CAMERA_VECTOR_SIZE = 22
+
+
+def _conv_bn_relu(
+    in_channels: int, out_channels: int, kernel_size: int, dilation: int = 1
+) -> nn.Sequential:
+    """Build a size-keeping convolution with BatchNorm and ReLU, under MapTRv2's parameter names."""
+    padding = dilation * (kernel_size // 2)
+    conv = nn.Conv2d(
+        in_channels, out_channels, kernel_size, padding=padding, dilation=dilation, bias=False
+    )
+    parts = [("atrous_conv", conv), ("bn", nn.BatchNorm2d(out_channels)), ("relu", nn.ReLU())]
+    return nn.Sequential(OrderedDict(parts))
+
+
+class CameraMLP(nn.Module):
+    """Two linear layers that embed a camera's parameter vector.
+
+    Args:
+        in_channels: Length of the vector.
+        channels: Width of the embedding.
+    """
+
+    def __init__(self, in_channels: int, channels: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(in_channels, channels)
+        self.fc2 = nn.Linear(channels, channels)
+
+    def forward(self, vector: Tensor) -> Tensor:
+        """Embed vectors. (n, in_channels) -> (n, channels)"""
+        return self.fc2(F.relu(self.fc1(vector)))
+
+
+class SEGate(nn.Module):
+    """Squeeze-and-excitation gate: features scaled per channel by a sigmoid of an embedding.
+
+    Args:
+        channels: Number of channels of features and embedding.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv_reduce = nn.Conv2d(channels, channels, 1)
+        self.conv_expand = nn.Conv2d(channels, channels, 1)
+
+    def forward(self, feats: Tensor, embedding: Tensor) -> Tensor:
+        """Gate ``feats`` (n, C, h, w) by ``embedding`` (n, C)."""
+        # linear layers stored as 1x1 convolutions, which are slow on a single pixel
+        hidden = F.relu(self._linear(self.conv_reduce, embedding))
+        return feats * self._linear(self.conv_expand, hidden).sigmoid()[..., None, None]
+
+    @staticmethod
+    def _linear(conv: nn.Conv2d, vectors: Tensor) -> Tensor:
+        """Apply a 1x1 convolution to vectors. (n, C) -> (n, C)"""
+        return F.linear(vectors, conv.weight.flatten(1), conv.bias)
+
+
+class ASPP(nn.Module):
+    """Atrous spatial pyramid pooling: five branches side by side, then a 1x1 convolution.
+
+    The branches are a 1x1, three dilated 3x3 convolutions and a global average.
+
+    Args:
+        channels: Input and output channels.
+        mid_channels: Channels of each branch.
+        dropout: Dropout probability of the output.
+    """
+
+    def __init__(self, channels: int, mid_channels: int, dropout: float = 0.5) -> None:
+        super().__init__()
+        self.aspp1 = _conv_bn_relu(channels, mid_channels, 1)
+        self.aspp2 = _conv_bn_relu(channels, mid_channels, 3, dilation=6)
+        self.aspp3 = _conv_bn_relu(channels, mid_channels, 3, dilation=12)
+        self.aspp4 = _conv_bn_relu(channels, mid_channels, 3, dilation=18)
+        self.global_avg_pool = nn.Sequential(
+            nn.AdaptiveAvgPool2d(1),
+            nn.Conv2d(channels, mid_channels, 1, bias=False),
+            nn.BatchNorm2d(mid_channels),
+            nn.ReLU(),
+        )
+        self.conv1 = nn.Conv2d(5 * mid_channels, channels, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, feats: Tensor) -> Tensor:
+        """Apply to ``feats``. (n, C, h, w) -> (n, C, h, w)"""
+        branches = [branch(feats) for branch in (self.aspp1, self.aspp2, self.aspp3, self.aspp4)]
+        branches.append(self.global_avg_pool(feats).expand_as(branches[0]))
+        return self.dropout(F.relu(self.bn1(self.conv1(torch.cat(branches, 1)))))
+
+
+class CameraAwareDepthNet(nn.Module):
+    """Predict depth logits and context features, both gated by the camera's parameters.
+
+    Args:
+        in_channels: Channels of the image features.
+        context_channels: Channels C of the context.
+        depth_channels: Number of depth bins D.
+        aspp_channels: Channels of each branch of the depth head's pyramid.
+    """
+
+    def __init__(
+        self, in_channels: int, context_channels: int, depth_channels: int, aspp_channels: int = 96
+    ) -> None:
+        super().__init__()
+        self.reduce_conv = nn.Sequential(
+            nn.Conv2d(in_channels, in_channels, 3, padding=1),
+            nn.BatchNorm2d(in_channels),
+            nn.ReLU(inplace=True),
+        )
+        self.bn = nn.BatchNorm1d(CAMERA_VECTOR_SIZE)
+        self.context_mlp = CameraMLP(CAMERA_VECTOR_SIZE, in_channels)
+        self.context_se = SEGate(in_channels)
+        self.context_conv = nn.Conv2d(in_channels, context_channels, 1)
+        self.depth_mlp = CameraMLP(CAMERA_VECTOR_SIZE, in_channels)
+        self.depth_se = SEGate(in_channels)
+        self.depth_conv = nn.Sequential(
+            *(BasicBlock(in_channels, in_channels) for _ in range(3)),
+            ASPP(in_channels, aspp_channels),
+            nn.Conv2d(in_channels, depth_channels, 1),
+        )
+
+    def forward(self, feats: Tensor, camera_vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Predict depth and context.
+
+        Args:
+            feats: Image features of n cameras. (n, C_in, h, w)
+            camera_vectors: Parameters of each camera, from `geometry.frustum.camera_vector`. (n,
+                22)
+
+        Returns:
+            Depth logits (n, D, h, w) and context features (n, C, h, w).
+        """
+        vectors = self.bn(camera_vectors)
+        feats = self.reduce_conv(feats)
+        context = self.context_conv(self.context_se(feats, self.context_mlp(vectors)))
+        depth = self.depth_conv(self.depth_se(feats, self.depth_mlp(vectors)))
+        return depth, context
+
+
+class PlainDepthNet(nn.Module):
+    """A single 1x1 convolution to depth logits and context (MapTR's BEVPool encoder).
+
+    Args:
+        in_channels: Channels of the image features.
+        context_channels: Channels C of the context.
+        depth_channels: Number of depth bins D.
+    """
+
+    def __init__(self, in_channels: int, context_channels: int, depth_channels: int) -> None:
+        super().__init__()
+        self.depth_channels = depth_channels
+        self.conv = nn.Conv2d(in_channels, depth_channels + context_channels, 1)
+
+    def forward(self, feats: Tensor, camera_vectors: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Predict depth logits (n, D, h, w) and context (n, C, h, w) from the features alone."""
+        depth, context = self.conv(feats).split(
+            [self.depth_channels, self.conv.out_channels - self.depth_channels], 1
+        )
+        return depth, context

@@ -1,0 +1,94 @@
+"""Auxiliary supervision of MapTRv2 (arXiv 2308.05736): depth, BEV and perspective masks."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, float]) -> Tensor:
+    """Turn sparse depth images into the class targets of a depth net.
+
+    A block of ``stride`` x ``stride`` pixels takes its nearest return. Bin 0 starts at ``low``; a
+    block whose nearest return lies in front of ``low`` or beyond the last bin has no target, even
+    if a further one would.
+
+    Args:
+        depth_m: Depth along the optical axis in metres, 0 where there is no return. (..., H, W)
+        stride: Pixels per feature pixel.
+        depth_range: ``(low, high, step)`` in metres.
+
+    Returns:
+        Bin of each block, -1 for none, int64. (..., H / stride, W / stride)
+
+    Raises:
+        ValueError: If the image size is no multiple of ``stride``.
+    """
+    height, width = depth_m.shape[-2:]
+    if height % stride or width % stride:
+        raise ValueError(
+            f"depth_m must have a size divisible by stride {stride}, got {height} x {width}."
+        )
+    low, _, step = depth_range
+    blocks = depth_m.unflatten(-1, (-1, stride)).unflatten(-3, (-1, stride))  # (..., h, s, w, s)
+    nearest = torch.where(blocks == 0, torch.inf, blocks).amin((-3, -1))  # (..., h, w)
+    position = (nearest - (low - step)) / step
+    num_bins = num_depth_bins(depth_range)
+    valid = (position >= 1) & (position < num_bins + 1)
+    return torch.where(valid, position, 0).long() - 1
+
+
+def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
+    """Return the number of bins of ``(low, high, step)``.
+
+    Raises:
+        ValueError: If the range holds no bin.
+    """
+    low, high, step = depth_range
+    if step <= 0 or high - low < step:
+        raise ValueError(
+            f"depth_range must be (low, high, step) with one bin or more, got {depth_range}."
+        )
+    return int((high - low) / step)
+
+
+def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
+    """Return the mean of -log p at the target bin, over the pixels that have one (0 if none has).
+
+    Only the target bin enters; the other bins are held down by the softmax.
+
+    Args:
+        probs: Probability of each depth bin. (..., D, h, w)
+        bins: Target bin, -1 for none. (..., h, w)
+
+    Raises:
+        ValueError: If the shapes disagree.
+    """
+    if probs.shape[:-3] + probs.shape[-2:] != bins.shape:
+        raise ValueError(
+            f"bins must have the shape of probs without its bin axis, got {tuple(bins.shape)} "
+            f"for {tuple(probs.shape)}."
+        )
+    valid = bins >= 0
+    chosen = probs.float().gather(-3, bins.clamp(min=0).unsqueeze(-3)).squeeze(-3)  # (..., h, w)
+    chosen = torch.where(valid, chosen, 1).clamp(min=torch.finfo(chosen.dtype).tiny)
+    return -chosen.log().sum() / valid.sum().clamp(min=1)
+
+
+def mask_loss(logits: Tensor, target: Tensor, pos_weight: float = 1.0) -> Tensor:
+    """Return the mean binary cross-entropy of a mask.
+
+    Args:
+        logits: Predicted mask. (...)
+        target: 0 or 1, any dtype. (...)
+        pos_weight: Weight of the pixels where ``target`` is 1.
+
+    Raises:
+        ValueError: If the shapes disagree.
+    """
+    if logits.shape != target.shape:
+        raise ValueError(
+            f"target must have shape {tuple(logits.shape)} to match logits, "
+            f"got {tuple(target.shape)}."
+        )
+    weight = torch.tensor(pos_weight, device=logits.device)
+    return F.binary_cross_entropy_with_logits(logits.float(), target.float(), pos_weight=weight)
