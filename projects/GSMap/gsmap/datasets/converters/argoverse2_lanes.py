@@ -1,0 +1,188 @@
+"""The lane graph of an Argoverse 2 log: which lane boundaries join to one line (MapTRv2)."""
+
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+ROUND_DECIMALS = 3  # points closer than a millimetre are one node of the graph
+SIMPLIFY_TOLERANCE_M = 0.2
+MAX_PATHS = 20_000
+
+# An edge leads to a node by way of the private points of one lane: (interior point ids, end point
+# id).
+Edge = tuple[tuple[int, ...], int]
+
+
+@dataclass(frozen=True)
+class LaneLinks:
+    """How the lanes of a log follow one another; a lane is named by its position in the log.
+
+    Args:
+        predecessors: For each lane, the lanes that lead into it.
+        successors: For each lane, the lanes that it leads into.
+    """
+
+    predecessors: Sequence[Sequence[int]]
+    successors: Sequence[Sequence[int]]
+
+    @classmethod
+    def from_ids(
+        cls,
+        ids: Sequence[Hashable],
+        predecessors: Sequence[Iterable[Hashable]],
+        successors: Sequence[Iterable[Hashable]],
+    ) -> "LaneLinks":
+        """Translate lane ids to positions; ids of lanes outside the log's map are left out."""
+        position = {lane_id: i for i, lane_id in enumerate(ids)}
+
+        def translate(neighbours: Iterable[Hashable]) -> list[int]:
+            return [position[i] for i in neighbours if i in position]
+
+        return cls([translate(p) for p in predecessors], [translate(s) for s in successors])
+
+
+class LanePaths:
+    """One polyline per lane of a log, and the simple paths through any subset of them.
+
+    The graph has a node for every polyline point (rounded to 1 mm, so that lanes may share nodes),
+    an edge between consecutive points, and an edge from the end of each lane to the start of each
+    of its successors. A path runs from a node that nothing leads to, to a node that leads nowhere,
+    without visiting a node twice.
+
+    Points that only one lane of the log has can neither start, end nor branch a path; they are
+    folded into the edges once per log, so that the search for paths in a frame takes about one step
+    per lane instead of one per point.
+
+    Args:
+        polylines: Points of each lane's line, in metres, city frame. list of (n >= 2, 3)
+        links: Which lanes follow which.
+
+    Raises:
+        ValueError: If a polyline has fewer than two points or is not (n, 3).
+    """
+
+    def __init__(self, polylines: Sequence[np.ndarray], links: LaneLinks) -> None:
+        for i, line in enumerate(polylines):
+            if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2:
+                raise ValueError(f"polylines[{i}] must have shape (n >= 2, 3), got {line.shape}.")
+        self._links = links
+        node_of_point: dict[tuple[float, ...], int] = {}
+        uses: list[int] = []
+        lanes: list[list[int]] = []
+        for line in polylines:
+            nodes = []
+            for point in map(tuple, np.round(line, ROUND_DECIMALS).tolist()):
+                node = node_of_point.setdefault(point, len(node_of_point))
+                if node == len(uses):
+                    uses.append(0)
+                uses[node] += 1
+                nodes.append(node)
+            lanes.append(nodes)
+        self._points = np.array(list(node_of_point), dtype=np.float64).reshape(-1, 3)  # (nodes, 3)
+        self._first = [nodes[0] for nodes in lanes]
+        self._last = [nodes[-1] for nodes in lanes]
+        self._edges = [_fold(nodes, uses) for nodes in lanes]
+        self._memo: tuple[tuple[int, ...], np.ndarray] = ((), np.empty(0, dtype=object))
+
+    def simplified(self, lanes: Sequence[int]) -> np.ndarray:
+        """Return every simple path through the given lanes, simplified (Douglas-Peucker, 0.2 m).
+
+        The answer for the latest set of lanes is kept: neighbouring frames usually see the same
+        lanes.
+
+        Args:
+            lanes: Positions of the lanes that take part, in the order of the log.
+
+        Returns:
+            3-D line strings in the city frame. (paths,)
+
+        Raises:
+            ValueError: If the lanes allow more than ``MAX_PATHS`` paths.
+        """
+        key = tuple(lanes)
+        if key != self._memo[0]:
+            paths = self._simple_paths(key)
+            if paths:
+                points = self._points[np.concatenate(paths)]
+                indices = np.repeat(np.arange(len(paths)), [len(p) for p in paths])
+                lines = shapely.linestrings(points, indices=indices)
+            else:
+                lines = np.empty(0, dtype=object)
+            self._memo = (key, shapely.simplify(lines, SIMPLIFY_TOLERANCE_M))
+        return self._memo[1]
+
+    def _simple_paths(self, lanes: Sequence[int]) -> list[list[int]]:
+        """Return the nodes of each simple path from source to sink in the subgraph of ``lanes``."""
+        graph = self._subgraph(lanes)
+        entered = {end for edges in graph.values() for _, end in edges}
+        sources = [node for node, edges in graph.items() if edges and node not in entered]
+        paths: list[list[int]] = []
+        for source in sources:
+            paths.extend(_paths_from(source, graph, MAX_PATHS - len(paths)))
+        return paths
+
+    def _subgraph(self, lanes: Sequence[int]) -> dict[int, list[Edge]]:
+        """Return the edges that leave each node when only ``lanes`` take part, in their order."""
+        members = set(lanes)
+        graph: dict[int, dict[Edge, None]] = {}
+
+        def add(start: int, edge: Edge) -> None:
+            graph.setdefault(start, {})[edge] = None  # a dict: an ordered set
+            graph.setdefault(edge[1], {})
+
+        for lane in lanes:
+            for start, edge in self._edges[lane]:
+                add(start, edge)
+            for other in self._links.predecessors[lane]:
+                if other in members:
+                    add(self._last[other], ((), self._first[lane]))
+            for other in self._links.successors[lane]:
+                if other in members:
+                    add(self._last[lane], ((), self._first[other]))
+        return {node: list(edges) for node, edges in graph.items()}
+
+
+def _fold(nodes: Sequence[int], uses: Sequence[int]) -> list[tuple[int, Edge]]:
+    """Return a lane's edges between its ends and shared nodes, private points folded in."""
+    edges: list[tuple[int, Edge]] = []
+    start, interior = nodes[0], []
+    for i, node in enumerate(nodes[1:], 1):
+        if uses[node] == 1 and i < len(nodes) - 1:
+            interior.append(node)
+        else:
+            edges.append((start, (tuple(interior), node)))
+            start, interior = node, []
+    return edges
+
+
+def _paths_from(source: int, graph: dict[int, list[Edge]], limit: int) -> list[list[int]]:
+    """Return the nodes of every simple path from ``source`` to a node that leads nowhere."""
+    paths: list[list[int]] = []
+    path, visited = [source], {source}
+    stack = [
+        (1, source, iter(graph[source]))
+    ]  # (length of the path up to the node, node, edges still to try)
+    while stack:
+        length, node, edges = stack[-1]
+        del path[length:]
+        edge = next((e for e in edges if e[1] not in visited), None)
+        if edge is None:
+            stack.pop()
+            visited.discard(node)
+            continue
+        interior, end = edge
+        path.extend(interior)
+        path.append(end)
+        if graph[end]:
+            visited.add(end)
+            stack.append((len(path), end, iter(graph[end])))
+            continue
+        if len(paths) >= limit:
+            raise ValueError(
+                f"the lanes of one frame allow more than {MAX_PATHS} paths: the lane graph is "
+                "damaged."
+            )
+        paths.append(path.copy())
+    return paths
