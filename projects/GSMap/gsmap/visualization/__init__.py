@@ -1,1 +1,27 @@
-"""Pictures of maps over cameras and in bird's-eye view."""
+"""Pictures of maps over cameras and in bird's-eye view.
+
+``MapVisualizer`` and ``MapVisualizationHook`` live in modules of their own that need OpenMMLab;
+what is imported here needs numpy, OpenCV and matplotlib alone.
+"""
+
+from .bev_view import BEVPanel
+from .camera_view import CameraView
+from .figure import compose_figure, figure_to_rgb, save_figure
+from .frame_view import FRAME_VIEWS, FrameView, resolve_frame_view
+from .map_elements import MapElements, ground_truth_elements, predicted_elements
+from .style import MapStyle
+
+__all__ = [
+    "FRAME_VIEWS",
+    "BEVPanel",
+    "CameraView",
+    "FrameView",
+    "MapElements",
+    "MapStyle",
+    "compose_figure",
+    "figure_to_rgb",
+    "ground_truth_elements",
+    "predicted_elements",
+    "resolve_frame_view",
+    "save_figure",
+]

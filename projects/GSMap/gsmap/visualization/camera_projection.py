@@ -1,0 +1,136 @@
+"""Projection of polylines into pinhole images, cut at the near plane and the image's edges.
+
+All cutting happens in homogeneous pixel coordinates (u w, v w, w), where every edge of the viewing
+frustum is a linear inequality and a straight line stays straight. So a line that runs behind the
+camera is cut instead of wrapping round, and no dense sampling is needed for a correct result.
+"""
+
+import numpy as np
+
+NEAR_M = 0.3
+
+
+def _frustum_values(points: np.ndarray, size_px: tuple[int, int], near_m: float) -> np.ndarray:
+    """Signed distances to the five planes of the frustum, >= 0 inside. (n, 3) -> (5, n)"""
+    width, height = size_px
+    u, v, w = points.T
+    return np.stack([w - near_m, u, width * w - u, v, height * w - v])
+
+
+def homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarray:
+    """Map points of the frame to homogeneous pixel coordinates.
+
+    Args:
+        points: Points (x, y, z) in metres. (n, 3)
+        img_from_frame: Projection matrix, intrinsics times extrinsics; its third row yields the
+            depth. (4, 4)
+
+    Returns:
+        (u w, v w, w), where w is the depth in metres. (n, 3)
+
+    Raises:
+        ValueError: If a shape is wrong.
+    """
+    points, matrix = np.asarray(points, dtype=np.float64), np.asarray(img_from_frame, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points must have shape (n, 3), got {points.shape}.")
+    if matrix.shape != (4, 4):
+        raise ValueError(f"img_from_frame must have shape (4, 4), got {matrix.shape}.")
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def project_segments(
+    starts: np.ndarray,
+    ends: np.ndarray,
+    img_from_frame: np.ndarray,
+    size_px: tuple[int, int],
+    near_m: float = NEAR_M,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project straight segments into an image and keep the visible parts (Liang-Barsky clipping).
+
+    Args:
+        starts: First end points in metres. (n, 3)
+        ends: Second end points in metres. (n, 3)
+        img_from_frame: Projection matrix. (4, 4)
+        size_px: Width and height of the image.
+        near_m: Smallest depth that is drawn, > 0.
+
+    Returns:
+        The visible segments as pixel coordinates (m, 2, 2), the depth of their middle in metres
+        (m,), and the index of the segment that each came from (m,).
+
+    Raises:
+        ValueError: If ``near_m`` is not positive.
+    """
+    if near_m <= 0:
+        raise ValueError(f"near_m must be > 0, got {near_m}.")
+    first, last = homogeneous_px(starts, img_from_frame), homogeneous_px(ends, img_from_frame)
+    f0, f1 = (_frustum_values(p, size_px, near_m) for p in (first, last))  # (5, n)
+    crossing = (f0 < 0) != (f1 < 0)
+    t = np.where(crossing, f0 / np.where(crossing, f0 - f1, 1.0), 0.0)
+    enter = np.where(crossing & (f0 < 0), t, 0.0).max(axis=0)  # (n,)
+    leave = np.where(crossing & (f1 < 0), t, 1.0).min(axis=0)
+    index = np.flatnonzero((enter < leave) & ~((f0 < 0) & (f1 < 0)).any(axis=0))
+    direction = (last - first)[index]
+    cut = np.stack(
+        [first[index] + s[index, None] * direction for s in (enter, leave)], axis=1
+    )  # (m, 2, 3)
+    return cut[..., :2] / cut[..., 2:], cut[..., 2].mean(axis=1), index
+
+
+def project_polygon(
+    ring: np.ndarray,
+    img_from_frame: np.ndarray,
+    size_px: tuple[int, int],
+    near_m: float = NEAR_M,
+) -> np.ndarray:
+    """Project a flat polygon into an image and cut it (Sutherland-Hodgman clipping).
+
+    Args:
+        ring: Vertices in metres; repeating the first one at the end is optional. (n, 3)
+        img_from_frame: Projection matrix. (4, 4)
+        size_px: Width and height of the image.
+        near_m: Smallest depth that is drawn.
+
+    Returns:
+        Pixel coordinates of the visible part, empty if there is none. (m, 2)
+    """
+    points = homogeneous_px(ring, img_from_frame)
+    for plane in range(5):
+        values = _frustum_values(points, size_px, near_m)[plane]
+        following, next_values = np.roll(points, -1, axis=0), np.roll(values, -1)
+        kept: list[np.ndarray] = []
+        for p, q, f0, f1 in zip(points, following, values, next_values, strict=True):
+            if f0 >= 0:
+                kept.append(p)
+            if (f0 < 0) != (f1 < 0):
+                kept.append(p + f0 / (f0 - f1) * (q - p))
+        if len(kept) < 3:
+            return np.empty((0, 2))
+        points = np.stack(kept)
+    return points[:, :2] / points[:, 2:]
+
+
+def subdivided(points: np.ndarray, step_m: float) -> np.ndarray:
+    """Insert vertices so that no segment is longer than ``step_m``; every original vertex is kept.
+
+    Args:
+        points: Polyline in metres, at least one point. (n, D)
+        step_m: Longest allowed segment, > 0.
+
+    Returns:
+        The denser polyline. (m, D)
+
+    Raises:
+        ValueError: If ``step_m`` is not positive.
+    """
+    if step_m <= 0:
+        raise ValueError(f"step_m must be > 0, got {step_m}.")
+    points = np.asarray(points, dtype=np.float64)
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    counts = np.maximum(np.ceil(lengths / step_m).astype(int), 1)
+    position = np.concatenate(
+        [i + np.arange(n) / n for i, n in enumerate(counts)] + [np.array([len(points) - 1.0])]
+    )
+    knots = np.arange(len(points))
+    return np.stack([np.interp(position, knots, column) for column in points.T], axis=1)

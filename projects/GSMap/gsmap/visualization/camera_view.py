@@ -1,0 +1,196 @@
+"""Camera panels: a mosaic that mirrors the rig, and the map drawn over each image."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from matplotlib import colors as mcolors
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+
+from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
+from gsmap.visualization.frame_view import FrameView
+from gsmap.visualization.map_elements import MapElements
+from gsmap.visualization.style import MapStyle
+
+_STEP_M = 1.0  # a line's width follows its depth in steps of this length
+_NOMINAL_WIDTH_IN = 3.2  # on a panel of this width lines have the widths of the style
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """One camera's image and projection.
+
+    Args:
+        name: Channel name, such as ``CAM_FRONT_LEFT``.
+        image: RGB, 0 to 255. (h, w, 3) uint8
+        img_from_frame: Projection from the annotation frame to this image's pixels. (4, 4)
+
+    Raises:
+        ValueError: If the image or the matrix has another shape or type.
+    """
+
+    name: str
+    image: np.ndarray
+    img_from_frame: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
+            raise ValueError(
+                f"image of camera {self.name} must be RGB uint8 (h, w, 3), "
+                f"got {self.image.dtype} {self.image.shape}."
+            )
+        if np.shape(self.img_from_frame) != (4, 4):
+            raise ValueError(
+                f"img_from_frame of camera {self.name} must be (4, 4), "
+                f"got {np.shape(self.img_from_frame)}."
+            )
+
+    @property
+    def title(self) -> str:
+        """The channel name as a reader would write it."""
+        words = self.name.lower().replace("_", " ").split()
+        return " ".join(word for word in words if word not in ("cam", "ring", "camera"))
+
+
+def viewing_azimuth(img_from_frame: np.ndarray, view: FrameView) -> float:
+    """Return the direction in which a camera looks.
+
+    The third row of a projection matrix is the optical axis, up to a positive factor.
+
+    Args:
+        img_from_frame: Projection matrix. (4, 4)
+        view: Orientation of the frame.
+
+    Returns:
+        Angle from straight ahead, anticlockwise (to the left) positive, in radians, in (-pi, pi].
+    """
+    right, ahead = view.display_from_frame(np.asarray(img_from_frame)[2, :2])
+    return float(np.arctan2(-right, ahead))
+
+
+def arrange_cameras(cameras: Sequence[CameraView], view: FrameView) -> list[list[CameraView]]:
+    """Arrange cameras as on the car: looking ahead above, looking back below, left to right.
+
+    Args:
+        cameras: Any number of cameras.
+        view: Orientation of the frame.
+
+    Returns:
+        One or two rows of cameras, without empty rows.
+    """
+    azimuth = [viewing_azimuth(camera.img_from_frame, view) for camera in cameras]
+    order = np.argsort(azimuth)
+    ahead = [cameras[i] for i in order[::-1] if abs(azimuth[i]) <= np.pi / 2 + 1e-3]
+    back = sorted(
+        (i for i in order if abs(azimuth[i]) > np.pi / 2 + 1e-3),
+        key=lambda i: azimuth[i] % (2 * np.pi),
+    )
+    return [row for row in (ahead, [cameras[i] for i in back]) if row]
+
+
+def _line_widths(depth_m: np.ndarray, style: MapStyle, scale: float) -> np.ndarray:
+    """Widths in points that fall with distance, within what stays legible. (m,)"""
+    return (
+        scale * style.camera_line_pt * np.clip((10.0 / np.maximum(depth_m, 0.1)) ** 0.6, 0.45, 2.6)
+    )
+
+
+def _draw_areas(
+    ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
+) -> None:
+    """Fill the closed elements faintly."""
+    height, width = camera.image.shape[:2]
+    shapes, faces = [], []
+    for line, label in zip(elements.polylines, elements.labels, strict=True):
+        if style.is_closed(label):
+            ring = project_polygon(view.lifted(line), camera.img_from_frame, (width, height))
+            if len(ring):
+                shapes.append(ring)
+                faces.append(mcolors.to_rgba(style.colour(label), 0.25))
+    ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=3))
+
+
+def _draw_polylines(
+    ax: Axes,
+    elements: MapElements,
+    camera: CameraView,
+    view: FrameView,
+    style: MapStyle,
+    scale: float,
+) -> None:
+    """Draw the polylines, thinner with distance, on a dark edge."""
+    height, width = camera.image.shape[:2]
+    dense = [
+        subdivided(view.lifted(np.asarray(line, dtype=float)), _STEP_M)
+        for line in elements.polylines
+    ]
+    starts, ends = (
+        np.concatenate([line[s] for line in dense]) for s in (slice(None, -1), slice(1, None))
+    )
+    owner = np.repeat(np.arange(len(dense)), [len(line) - 1 for line in dense])
+    segments, depth, index = project_segments(starts, ends, camera.img_from_frame, (width, height))
+    widths = _line_widths(depth, style, scale)
+    colours = [style.colour(elements.labels[i]) for i in owner[index]]
+    for colour, extra, level in (
+        (mcolors.to_rgba(style.halo, 0.55), 1.1 * scale, 4),
+        (colours, 0.0, 5),
+    ):
+        ax.add_collection(
+            LineCollection(
+                list(segments),
+                colors=colour,
+                linewidths=widths + extra,
+                capstyle="round",
+                zorder=level,
+            )
+        )
+
+
+def draw_camera(
+    ax: Axes,
+    camera: CameraView,
+    elements: MapElements | None,
+    view: FrameView,
+    style: MapStyle,
+    size_px: tuple[int, int],
+) -> None:
+    """Draw one image with the map over it.
+
+    Args:
+        ax: Axes to fill; it has the image's aspect ratio.
+        camera: Image and projection.
+        elements: Map elements, or None for the bare image.
+        view: Ground plane of the frame.
+        style: Colours and widths.
+        size_px: Width and height of the axes on the canvas; the image is resampled to it with an
+            area filter.
+    """
+    height, width = camera.image.shape[:2]
+    shrinks = size_px[0] < width
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+    ax.imshow(
+        cv2.resize(camera.image, size_px, interpolation=method),
+        extent=(0, width, height, 0),
+        interpolation="nearest",
+        zorder=1,
+    )
+    scale = ax.get_window_extent().width / ax.figure.dpi / _NOMINAL_WIDTH_IN
+    if elements is not None and len(elements):
+        _draw_areas(ax, elements, camera, view, style)
+        _draw_polylines(ax, elements, camera, view, style, scale)
+    ax.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+    ax.text(
+        0.014,
+        0.965,
+        camera.title,
+        transform=ax.transAxes,
+        fontsize=7,
+        color="white",
+        va="top",
+        bbox={"boxstyle": "round,pad=0.3", "facecolor": (0, 0, 0, 0.5), "edgecolor": "none"},
+        zorder=8,
+    )

@@ -1,0 +1,232 @@
+"""Composition of cameras and bird's-eye views into one picture, rendered or written."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from gsmap.geometry import BEVGrid
+from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
+from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
+from gsmap.visualization.frame_view import FrameView
+from gsmap.visualization.map_elements import MapElements
+from gsmap.visualization.style import MapStyle
+
+DPI = 150
+VECTOR_SUFFIXES = (".pdf", ".svg")
+RASTER_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+_MARGIN, _GAP, _HEADER, _TICKS, _TITLE = 26, 6, 52, 38, 34  # px at DPI
+_TALLEST = 0.5  # of a camera row or a BEV panel, as a share of the figure's width
+
+
+@dataclass(frozen=True)
+class _Box:
+    """A rectangle on the canvas, from the top left corner, in pixels."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+
+def _justified_rows(
+    rows: Sequence[Sequence[float]], width: float, top: float
+) -> tuple[list[list[_Box]], float]:
+    """Place rows of pictures so that each fills the width at one height.
+
+    Args:
+        rows: Aspect ratios (width / height) of the pictures in each row.
+        width: Width of the figure in pixels.
+        top: Upper edge of the first row.
+
+    Returns:
+        The boxes of each row, and the lower edge of the last row.
+    """
+    usable, boxes = width - 2 * _MARGIN, []
+    for row in rows:
+        gaps = _GAP * (len(row) - 1)
+        height = min((usable - gaps) / sum(row), _TALLEST * usable)
+        x = _MARGIN + (usable - gaps - height * sum(row)) / 2
+        placed = []
+        for aspect in row:
+            placed.append(_Box(x, top, height * aspect, height))
+            x += height * aspect + _GAP
+        boxes.append(placed)
+        top += height + _GAP
+    return boxes, top - _GAP if rows else top
+
+
+def _panel_boxes(count: int, aspect: float, width: float, top: float) -> tuple[list[_Box], float]:
+    """Place bird's-eye views in a centred row; return their boxes and the lower edge."""
+    usable = width - 2 * _MARGIN
+    slot = usable / count
+    height = min((slot - _TICKS) / aspect, _TALLEST * usable)
+    pitch = min(slot, height * aspect + 3 * _TICKS)
+    left = _MARGIN + (usable - pitch * count) / 2
+    boxes = [
+        _Box(
+            left + i * pitch + (pitch - height * aspect + _TICKS) / 2,
+            top + _TITLE,
+            height * aspect,
+            height,
+        )
+        for i in range(count)
+    ]
+    return boxes, top + _TITLE + height + _TICKS
+
+
+def _add_axes(figure: Figure, box: _Box) -> Axes:
+    """Add axes at a box given in pixels from the top left corner."""
+    width, height = figure.get_size_inches() * DPI
+    return figure.add_axes(
+        (box.x / width, 1 - (box.y + box.height) / height, box.width / width, box.height / height)
+    )
+
+
+def _draw_header(figure: Figure, title: str, style: MapStyle) -> None:
+    """Write the title on the left and the legend of classes on the right."""
+    width, height = figure.get_size_inches() * DPI
+    figure.text(
+        _MARGIN / width, 1 - _HEADER / 2 / height, title, fontsize=9, color=style.ink, va="center"
+    )
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=style.colour(i),
+            linewidth=2.6,
+            solid_capstyle="round",
+            label=style.title(i),
+        )
+        for i in range(len(style.classes))
+    ]
+    figure.legend(
+        handles=handles,
+        loc="center right",
+        bbox_to_anchor=(1 - _MARGIN / width, 1 - _HEADER / 2 / height),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=8,
+        labelcolor=style.ink,
+        borderaxespad=0,
+        handlelength=1.4,
+        columnspacing=1.6,
+    )
+
+
+def compose_figure(
+    cameras: Sequence[CameraView],
+    panels: Sequence[BEVPanel],
+    grid: BEVGrid,
+    view: FrameView,
+    style: MapStyle,
+    camera_elements: MapElements | None = None,
+    title: str = "",
+    width_px: int = 1500,
+) -> Figure:
+    """Compose one picture: cameras arranged as on the car, bird's-eye views in a row below.
+
+    Args:
+        cameras: Any number of cameras, also none.
+        panels: Bird's-eye views, at least one if there is no camera.
+        grid: Extent of the map in metres.
+        view: Orientation and ground plane of the frame.
+        style: Colours and widths.
+        camera_elements: Map elements drawn over the images.
+        title: Heading.
+        width_px: Width of the picture in pixels.
+
+    Returns:
+        The figure; ``figure_to_rgb`` and ``save_figure`` render it.
+
+    Raises:
+        ValueError: If there is nothing to draw.
+    """
+    if not cameras and not panels:
+        raise ValueError("compose_figure needs at least one camera or one panel.")
+    scale = 1500 / width_px  # boxes are laid out at 1500 px and the dots per inch follow
+    rows = arrange_cameras(cameras, view)
+    aspects = [[c.image.shape[1] / c.image.shape[0] for c in row] for row in rows]
+    camera_boxes, bottom = _justified_rows(aspects, 1500, _HEADER)
+    panel_boxes: list[_Box] = []
+    if panels:
+        left, right, low, high = display_extent(grid, view)
+        aspect = (right - left) / (high - low)
+        panel_boxes, bottom = _panel_boxes(
+            len(panels), aspect, 1500, bottom + (_GAP if rows else 0)
+        )
+    figure = Figure(
+        figsize=(1500 / DPI, (bottom + _MARGIN / 2) / DPI), dpi=DPI / scale, facecolor="white"
+    )
+    FigureCanvasAgg(figure)
+    with matplotlib.rc_context({"font.family": style.font_family}):
+        _draw_header(figure, title, style)
+        for row, boxes in zip(rows, camera_boxes, strict=True):
+            for camera, box in zip(row, boxes, strict=True):
+                size_px = (max(round(box.width / scale), 1), max(round(box.height / scale), 1))
+                draw_camera(_add_axes(figure, box), camera, camera_elements, view, style, size_px)
+        for panel, box in zip(panels, panel_boxes, strict=True):
+            draw_bev(_add_axes(figure, box), panel, grid, view, style)
+    return figure
+
+
+def figure_to_rgb(figure: Figure) -> np.ndarray:
+    """Render a figure. Returns RGB (h, w, 3) uint8."""
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def save_figure(figure: Figure, path: str | Path) -> Path:
+    """Write a figure; the file appears only when it is whole.
+
+    Args:
+        figure: What to write.
+        path: ``.png``, ``.jpg`` or ``.webp`` for pixels, ``.pdf`` or ``.svg`` for vectors.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: If the suffix is none of these.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in VECTOR_SUFFIXES + RASTER_SUFFIXES:
+        raise ValueError(
+            f"Cannot write a picture to {path}: "
+            f"the name must end in one of {VECTOR_SUFFIXES + RASTER_SUFFIXES}."
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.{os.getpid()}{suffix}")
+    try:
+        if suffix in VECTOR_SUFFIXES:
+            undated = {"CreationDate": None} if suffix == ".pdf" else {"Date": None}
+            figure.savefig(partial, metadata=undated)
+        else:
+            _write_pixels(figure_to_rgb(figure), partial, suffix)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def _write_pixels(picture: np.ndarray, path: Path, suffix: str) -> None:
+    """Encode an RGB picture."""
+    options = {
+        ".png": [cv2.IMWRITE_PNG_COMPRESSION, 4],
+        ".webp": [cv2.IMWRITE_WEBP_QUALITY, 90],
+    }.get(suffix, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    good, encoded = cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
+    if not good:
+        raise ValueError(f"OpenCV could not encode {path}.")
+    path.write_bytes(encoded.tobytes())

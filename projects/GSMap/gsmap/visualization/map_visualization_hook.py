@@ -1,0 +1,138 @@
+"""Draws samples while a model is validated or tested."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mmdet3d.registry import HOOKS
+from mmengine.hooks import Hook
+from mmengine.runner import Runner
+from mmengine.visualization import Visualizer
+
+from gsmap.visualization.figure import save_figure
+from gsmap.visualization.map_visualizer import MapVisualizer
+
+
+def picture_name(token: str, suffix: str) -> str:
+    """Return a file name made of a sample's token, without characters that a file system minds."""
+    return re.sub(r"[^\w.+=-]", "_", token) + suffix
+
+
+def _points(data_batch: Any, index: int) -> np.ndarray | None:
+    """Return the LiDAR points of one sample of a batch, if it has any. (n, >= 2)"""
+    clouds = data_batch.get("inputs", {}).get("points") if isinstance(data_batch, dict) else None
+    return None if clouds is None else np.asarray(clouds[index].detach().cpu())
+
+
+@HOOKS.register_module()
+class MapVisualizationHook(Hook):
+    """Draws predictions: to ``test_out_dir`` in testing, to the backends in validation.
+
+    Every rank draws its own samples in testing. In validation, rank 0 draws the same few samples
+    each time, so that TensorBoard's slider shows how each improves.
+
+    Args:
+        draw: Whether to draw at all.
+        interval: In testing, draw every ``interval``-th sample of a rank.
+        max_samples: In testing, largest number of pictures per rank; None draws all.
+        num_val_samples: In validation, how many samples to draw.
+        score_thr: Smallest drawn score; None leaves it to the visualizer.
+        test_out_dir: Folder for the pictures of a test (``tools/test.py --show-dir``).
+        suffix: Format of the pictures: ``.jpg``, ``.png``, ``.webp``, ``.pdf`` or ``.svg``.
+
+    Raises:
+        ValueError: If ``interval`` is smaller than 1.
+    """
+
+    priority = "NORMAL"
+
+    def __init__(
+        self,
+        draw: bool = False,
+        interval: int = 1,
+        max_samples: int | None = None,
+        num_val_samples: int = 4,
+        score_thr: float | None = None,
+        test_out_dir: str | None = None,
+        suffix: str = ".jpg",
+    ):
+        if interval < 1:
+            raise ValueError(f"interval must be >= 1, got {interval}.")
+        self.draw = draw
+        self.interval = interval
+        self.max_samples = max_samples
+        self.num_val_samples = num_val_samples
+        self.score_thr = score_thr
+        self.test_out_dir = test_out_dir
+        self.suffix = suffix
+        self._seen = 0
+        self._drawn = 0
+
+    @staticmethod
+    def _visualizer(runner: Runner) -> MapVisualizer:
+        """Return the runner's visualizer, which must be ours."""
+        visualizer: Visualizer = runner.visualizer
+        if not isinstance(visualizer, MapVisualizer):
+            raise TypeError(
+                "MapVisualizationHook needs visualizer=dict(type='MapVisualizer') in the config, "
+                f"got {type(visualizer).__name__}."
+            )
+        return visualizer
+
+    def after_val_iter(
+        self,
+        runner: Runner,
+        batch_idx: int,
+        data_batch: Any = None,
+        outputs: Sequence | None = None,
+    ) -> None:
+        """Draw the first sample of a few evenly spaced batches to the backends."""
+        if not self.draw or not outputs or runner.rank != 0:
+            return
+        stride = max(len(runner.val_dataloader) // max(self.num_val_samples, 1), 1)
+        if batch_idx % stride or batch_idx // stride >= self.num_val_samples:
+            return
+        sample = outputs[0]
+        self._visualizer(runner).add_datasample(
+            picture_name(f"val_{sample.metainfo['token']}", ""),
+            None,
+            sample,
+            step=runner.iter,
+            pred_score_thr=self.score_thr,
+            points=_points(data_batch, 0),
+        )
+
+    def before_test_epoch(self, runner: Runner) -> None:
+        """Start counting anew."""
+        self._seen = self._drawn = 0
+
+    def after_test_iter(
+        self,
+        runner: Runner,
+        batch_idx: int,
+        data_batch: Any = None,
+        outputs: Sequence | None = None,
+    ) -> None:
+        """Write the pictures of a batch to ``test_out_dir``."""
+        if not self.draw or self.test_out_dir is None:
+            return
+        for index, sample in enumerate(outputs or ()):
+            chosen = self._seen % self.interval == 0
+            self._seen += 1
+            if not chosen or (self.max_samples is not None and self._drawn >= self.max_samples):
+                continue
+            figure = self._visualizer(runner).draw_sample(
+                sample, score_thr=self.score_thr, points=_points(data_batch, index)
+            )
+            save_figure(
+                figure,
+                Path(self.test_out_dir) / picture_name(sample.metainfo["token"], self.suffix),
+            )
+            self._drawn += 1
+
+    def after_test_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
+        """Say where the pictures are."""
+        if self._drawn:
+            runner.logger.info(f"{self._drawn} pictures of predictions are in {self.test_out_dir}.")

@@ -1,0 +1,292 @@
+"""MMEngine's visualizer for vectorized maps."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from mmdet3d.registry import VISUALIZERS
+from mmengine.dist import master_only
+from mmengine.visualization import Visualizer
+
+from gsmap.geometry import BEVGrid
+from gsmap.visualization.bev_view import BEVPanel
+from gsmap.visualization.camera_view import CameraView
+from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure
+from gsmap.visualization.frame_view import FrameView, resolve_frame_view
+from gsmap.visualization.map_elements import MapElements, ground_truth_elements, predicted_elements
+from gsmap.visualization.style import MapStyle
+
+PANELS = ("ground_truth", "prediction", "gaussians", "rasters")
+
+
+def read_image(path: str | Path) -> np.ndarray:
+    """Read an image file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        RGB (h, w, 3) uint8.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is not a whole image.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(
+            f"No image at {path}: check the data root, or fetch the file again."
+        )
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError(
+            f"{path} is not a readable image (truncated?): fetch or generate it again."
+        )
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def render_masks(elements: MapElements, grid: BEVGrid) -> np.ndarray:
+    """Render every element's Gaussians to occupancy in [0, 1] (GSMap Eq. 6). (N, H, W)"""
+    from gsmap.ops.gaussian_raster import render_gaussians
+
+    means = torch.as_tensor(np.stack(elements.polylines), dtype=torch.float32)[..., :2]
+    scales = torch.as_tensor(np.asarray(elements.scales), dtype=torch.float32)
+    rotations = torch.as_tensor(np.asarray(elements.rotations), dtype=torch.float32)
+    with torch.no_grad():
+        return render_gaussians(means, scales, rotations, grid).numpy()
+
+
+@VISUALIZERS.register_module()
+class MapVisualizer(Visualizer):
+    """Draws samples: the map over the cameras, and bird's-eye views of truth and prediction.
+
+    Extent, classes and frame come from the data set's ``metainfo`` (``dataset_meta``, which the
+    runner sets); arguments given here win.
+
+    Args:
+        name: Name of the instance.
+        pc_range: Extent of the map (x_min, y_min, z_min, x_max, y_max, z_max) in metres.
+        raster_size: Rows and columns of the rendered masks.
+        ground_z_m: Level ground at this z of the frame. By default the ground follows the sensor's
+            mounting (``lidar2ego`` of the sample), or else the frame's usual height.
+        score_thr: Smallest score of a drawn prediction.
+        max_num: Largest number of drawn predictions; None draws all above the threshold.
+        panels: Which bird's-eye views to draw, of ``ground_truth``, ``prediction``, ``gaussians``,
+            ``rasters``; those that a sample has no data for are left out.
+        camera_source: What is drawn over the cameras, ``prediction`` or ``ground_truth``; the other
+            is drawn if a sample lacks it.
+        show_scores: Whether to write scores.
+        show_vertices: Whether to mark the predicted vertices.
+        show_order: Whether to mark the start and direction of elements.
+        width_px: Width of the picture.
+        style: Other options of ``MapStyle``, by name.
+        **kwargs: Options of mmengine's ``Visualizer``: ``vis_backends``, ``save_dir``.
+
+    Raises:
+        ValueError: If a panel or the camera source is not known.
+    """
+
+    def __init__(
+        self,
+        name: str = "visualizer",
+        pc_range: Sequence[float] | None = None,
+        raster_size: tuple[int, int] = (400, 200),
+        ground_z_m: float | None = None,
+        score_thr: float = 0.4,
+        max_num: int | None = None,
+        panels: Sequence[str] = PANELS,
+        camera_source: str = "prediction",
+        show_scores: bool = True,
+        show_vertices: bool = True,
+        show_order: bool = False,
+        width_px: int = 1500,
+        style: dict | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(name=name, **kwargs)
+        unknown = set(panels) - set(PANELS)
+        if unknown:
+            raise ValueError(f"panels must be among {PANELS}, got {sorted(unknown)}.")
+        if camera_source not in PANELS[:2]:
+            raise ValueError(f"camera_source must be one of {PANELS[:2]}, got {camera_source!r}.")
+        self.pc_range = pc_range
+        self.raster_size = tuple(raster_size)
+        self.ground_z_m = ground_z_m
+        self.score_thr = score_thr
+        self.max_num = max_num
+        self.panels = tuple(panels)
+        self.camera_source = camera_source
+        self.show_scores = show_scores
+        self.show_vertices = show_vertices
+        self.show_order = show_order
+        self.width_px = width_px
+        self._style_options = dict(style or {})
+
+    @property
+    def grid(self) -> BEVGrid:
+        """Extent of the map and size of its rendered masks."""
+        rows, columns = self.raster_size
+        if self.pc_range is not None:
+            return BEVGrid.from_pc_range(tuple(self.pc_range), rows, columns)
+        meta = self.dataset_meta or {}
+        if "x_range" not in meta or "y_range" not in meta:
+            return BEVGrid((-15.0, 15.0), (-30.0, 30.0), rows, columns)
+        return BEVGrid(tuple(meta["x_range"]), tuple(meta["y_range"]), rows, columns)
+
+    @property
+    def style(self) -> MapStyle:
+        """Colours and widths, with the data set's classes."""
+        classes = (self.dataset_meta or {}).get("classes")
+        options = {"classes": tuple(classes)} if classes else {}
+        return MapStyle(**{**options, **self._style_options})
+
+    def frame_view(self, metainfo: dict) -> FrameView:
+        """Return orientation and ground plane for a sample with this meta data."""
+        view = resolve_frame_view(self.dataset_meta)
+        if self.ground_z_m is not None:
+            return view.level(self.ground_z_m)
+        mounting = metainfo.get("lidar2ego")
+        return view if mounting is None else view.tilted(np.asarray(mounting))
+
+    def cameras(
+        self, metainfo: dict, images: Sequence[np.ndarray] | None = None
+    ) -> list[CameraView]:
+        """Pair a sample's images with their projections.
+
+        Args:
+            metainfo: Meta data of the sample; without ``img_path`` and ``images`` there are no
+                cameras.
+            images: RGB images in the geometry that the model sees (after augmentation); None reads
+                the original files and takes the augmentation out of the projections.
+
+        Returns:
+            One view per camera.
+
+        Raises:
+            ValueError: If the numbers of images and projections disagree.
+        """
+        paths = metainfo.get("img_path")
+        if images is None and paths is None:
+            return []
+        projections = np.asarray(metainfo["lidar2img"], dtype=np.float64)  # (V, 4, 4)
+        if images is None:
+            images = [read_image(path) for path in paths]  # type: ignore[union-attr]
+            if metainfo.get("img_aug_matrix") is not None:
+                projections = (
+                    np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64)) @ projections
+                )
+        if len(images) != len(projections):
+            raise ValueError(
+                f"A sample has {len(images)} images, but {len(projections)} projections."
+            )
+        names = metainfo.get("cam_names") or [f"camera {i}" for i in range(len(images))]
+        return [CameraView(*fields) for fields in zip(names, images, projections, strict=True)]
+
+    def _bev_panels(
+        self, truth: MapElements | None, found: MapElements | None, points: np.ndarray | None
+    ) -> list[BEVPanel]:
+        """Choose the bird's-eye views that the sample has data for."""
+        panels = []
+        if truth is not None and "ground_truth" in self.panels:
+            panels.append(BEVPanel("Ground truth", truth, order=self.show_order, points=points))
+        if found is not None and "prediction" in self.panels:
+            panels.append(
+                BEVPanel(
+                    "Prediction",
+                    found,
+                    vertices=self.show_vertices,
+                    order=self.show_order,
+                    scores=self.show_scores,
+                    points=points,
+                )
+            )
+        if found is not None and found.has_gaussians:
+            if "gaussians" in self.panels:
+                panels.append(BEVPanel("Gaussians (1$\\sigma$)", found, gaussians=True))
+            if "rasters" in self.panels:
+                masks = render_masks(found, self.grid) if len(found) else None
+                panels.append(BEVPanel("Rendered masks", found, lines=False, rasters=masks))
+        return panels
+
+    def draw_sample(
+        self,
+        data_sample: Any,
+        images: Sequence[np.ndarray] | None = None,
+        draw_gt: bool = True,
+        draw_pred: bool = True,
+        score_thr: float | None = None,
+        points: np.ndarray | None = None,
+        title: str | None = None,
+    ) -> Figure:
+        """Compose the picture of one sample.
+
+        Args:
+            data_sample: A ``Det3DDataSample`` as ``docs/architecture.md`` describes it.
+            images: RGB images after augmentation, V x (h, w, 3) uint8; None reads the original
+                files.
+            draw_gt: Whether to draw the ground truth.
+            draw_pred: Whether to draw the prediction.
+            score_thr: Smallest drawn score instead of the visualizer's own.
+            points: LiDAR points in metres of the frame, drawn as faint dots. (n, >= 2)
+            title: Heading instead of scene and token.
+
+        Returns:
+            The figure.
+
+        Raises:
+            ValueError: If the sample has neither images nor a map.
+        """
+        meta = data_sample.metainfo
+        truth = ground_truth_elements(data_sample) if draw_gt else None
+        threshold = self.score_thr if score_thr is None else score_thr
+        found = predicted_elements(data_sample, threshold, self.max_num) if draw_pred else None
+        first, second = (found, truth) if self.camera_source == "prediction" else (truth, found)
+        if title is None:
+            title = "  \N{MIDDLE DOT}  ".join(
+                str(meta[key]) for key in ("scene", "token") if meta.get(key)
+            )
+        return compose_figure(
+            self.cameras(meta, images),
+            self._bev_panels(truth, found, points),
+            self.grid,
+            self.frame_view(meta),
+            self.style,
+            camera_elements=second if first is None else first,
+            title=title,
+            width_px=self.width_px,
+        )
+
+    @master_only
+    def add_datasample(
+        self,
+        name: str,
+        image: Sequence[np.ndarray] | None,
+        data_sample: Any,
+        draw_gt: bool = True,
+        draw_pred: bool = True,
+        step: int = 0,
+        out_file: str | Path | None = None,
+        pred_score_thr: float | None = None,
+        points: np.ndarray | None = None,
+    ) -> None:
+        """Draw one sample to a file, or else to the backends (TensorBoard, ``vis_data``).
+
+        Args:
+            name: Tag in the backends.
+            image: RGB images after augmentation, or None to read the original files.
+            data_sample: The sample.
+            draw_gt: Whether to draw the ground truth.
+            draw_pred: Whether to draw the prediction.
+            step: Global step of the picture in the backends.
+            out_file: File to write instead; its suffix chooses the format.
+            pred_score_thr: Smallest drawn score instead of the visualizer's own.
+            points: LiDAR points in metres. (n, >= 2)
+        """
+        figure = self.draw_sample(data_sample, image, draw_gt, draw_pred, pred_score_thr, points)
+        if out_file is not None:
+            save_figure(figure, out_file)
+        else:
+            self.add_image(name, figure_to_rgb(figure), step)

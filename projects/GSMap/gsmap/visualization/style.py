@@ -1,0 +1,60 @@
+"""Colours, widths and fonts that all pictures share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+CLASS_COLOURS: dict[str, str] = {
+    "divider": "#FF9500",
+    "ped_crossing": "#2D8CFF",
+    "boundary": "#1DB954",
+    "centerline": "#8E8E93",
+}
+CLASS_TITLES: dict[str, str] = {
+    "divider": "divider",
+    "ped_crossing": "pedestrian crossing",
+    "boundary": "road boundary",
+    "centerline": "centre line",
+}
+# For classes that the table above does not name, in the order of their labels.
+SPARE_COLOURS = ("#AF52DE", "#FF3B30", "#5AC8FA", "#A2845E", "#FF2D92", "#34495E")
+
+
+@dataclass(frozen=True)
+class MapStyle:
+    """How map elements are drawn.
+
+    Args:
+        classes: Class names in label order.
+        closed_classes: Names of the classes that are areas, filled faintly.
+        font_family: Font of all text.
+        bev_line_pt: Line width in bird's-eye view, in points.
+        camera_line_pt: Line width over an image for an element 10 m away, in points; nearer is
+            thicker.
+        halo: Colour of the edge that keeps lines legible over an image.
+    """
+
+    classes: Sequence[str] = ("divider", "ped_crossing", "boundary")
+    closed_classes: Sequence[str] = ("ped_crossing",)
+    font_family: str = "DejaVu Sans"
+    bev_line_pt: float = 1.6
+    camera_line_pt: float = 1.7
+    halo: str = "#101418"
+    ink: str = "#1C1C1E"
+    muted: str = "#8A8F98"
+    ground: str = "#F4F5F7"
+    grid: str = "#DCDFE4"
+    spare: Sequence[str] = field(default=SPARE_COLOURS)
+
+    def colour(self, label: int) -> str:
+        """Return the colour of a class: the same for a class name in every data set."""
+        name = self.classes[label]
+        return CLASS_COLOURS.get(name, self.spare[label % len(self.spare)])
+
+    def title(self, label: int) -> str:
+        """Return the class name as a reader would write it."""
+        name = self.classes[label]
+        return CLASS_TITLES.get(name, name.replace("_", " "))
+
+    def is_closed(self, label: int) -> bool:
+        """Whether elements of the class enclose an area."""
+        return self.classes[label] in self.closed_classes
