@@ -1,0 +1,1 @@
+"""Checkpoints of the earlier systems: their names, conversion both ways, strict loading."""

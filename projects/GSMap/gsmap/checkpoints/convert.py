@@ -1,0 +1,99 @@
+"""Conversion of state dicts between the format of the earlier systems and ours."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .key_map import KeyMap, find_key_map, is_upstream
+
+
+def ours_from_upstream(
+    state: Mapping[str, Tensor], key_map: KeyMap | None = None
+) -> dict[str, Tensor]:
+    """Rename an upstream state to our keys.
+
+    Args:
+        state: Upstream state dict.
+        key_map: The table to use; None picks it by the keys.
+
+    Returns:
+        Our state dict; keys that the table calls unused are left out.
+
+    Raises:
+        ValueError: If a key is not in the table.
+    """
+    key_map = key_map or find_key_map(state)
+    renamed, unknown = {}, []
+    for key, value in state.items():
+        ours = key_map.to_ours(key)
+        if ours is not None:
+            renamed[ours] = value
+        elif key not in key_map.unused:
+            unknown.append(key)
+    if unknown:
+        raise ValueError(f"keys that no {key_map.name} model has: {', '.join(unknown)}.")
+    return renamed
+
+
+def upstream_from_ours(
+    state: Mapping[str, Tensor], key_map: KeyMap | None = None
+) -> dict[str, Tensor]:
+    """Rename our state to upstream's keys and add the ones that only upstream has.
+
+    Args:
+        state: Our state dict.
+        key_map: The table to use; None picks it by the keys.
+
+    Returns:
+        Upstream state dict.
+
+    Raises:
+        ValueError: If a key has no upstream name.
+    """
+    key_map = key_map or find_key_map(state)
+    names = {key: key_map.to_upstream(key) for key in state}
+    unknown = [key for key, name in names.items() if name is None]
+    if unknown:
+        raise ValueError(
+            f"keys that upstream's {key_map.name} does not have: {', '.join(unknown)}."
+        )
+    renamed = {name: state[key] for key, name in names.items() if name is not None}
+    return {**renamed, **{key: unused.value() for key, unused in key_map.unused.items()}}
+
+
+def read_state(path: str | Path) -> dict[str, Tensor]:
+    """Read the weights of a checkpoint file without running any code from it.
+
+    Args:
+        path: A checkpoint with or without ``state_dict`` around the weights.
+
+    Returns:
+        The state dict.
+
+    Raises:
+        ValueError: If the file holds no weights.
+    """
+    checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
+    state = checkpoint.get("state_dict", checkpoint) if isinstance(checkpoint, Mapping) else None
+    if not state or not all(isinstance(value, Tensor) for value in state.values()):
+        raise ValueError(f"{path} holds no state dict of tensors.")
+    return {key.removeprefix("module."): value for key, value in state.items()}
+
+
+def convert_state(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+    """Turn either format into the other.
+
+    Args:
+        state: State dict in either format.
+
+    Returns:
+        The converted state dict and what was done: ``"<architecture>: upstream to gsmap"`` or the
+        reverse.
+    """
+    key_map = find_key_map(state)
+    if is_upstream(state):
+        return ours_from_upstream(state, key_map), f"{key_map.name}: upstream to gsmap"
+    return upstream_from_ours(state, key_map), f"{key_map.name}: gsmap to upstream"

@@ -1,0 +1,155 @@
+"""The table between the state keys of the earlier systems and ours, read in both directions."""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+_NUMBER = "{i}"
+
+
+class UnusedKey(NamedTuple):
+    """An upstream key that our model does not hold.
+
+    Attributes:
+        reason: Why nothing is lost without it.
+        value: Makes the tensor that upstream expects there, for conversion back.
+    """
+
+    reason: str
+    value: Callable[[], Tensor]
+
+
+@dataclass(frozen=True)
+class KeyMap:
+    """How the keys of one upstream architecture correspond to ours.
+
+    Attributes:
+        name: Name of the architecture.
+        rules: Pairs of key prefixes (upstream's, ours); ``{i}`` stands for a number, the same on
+            both sides, in order. The first that fits wins.
+        unused: Upstream keys without a counterpart.
+        marker: A pair of key prefixes (upstream's, ours) that tells this architecture from those
+            after it in ``KEY_MAPS``.
+    """
+
+    name: str
+    rules: tuple[tuple[str, str], ...]
+    unused: Mapping[str, UnusedKey] = field(default_factory=dict)
+    marker: tuple[str, str] = ("", "")
+
+    def to_ours(self, key: str) -> str | None:
+        """Return our name of an upstream key, or None if there is none."""
+        return _rename(key, self.rules)
+
+    def to_upstream(self, key: str) -> str | None:
+        """Return upstream's name of one of our keys, or None if there is none."""
+        return _rename(key, tuple((ours, upstream) for upstream, ours in self.rules))
+
+
+def _pattern(template: str) -> re.Pattern[str]:
+    """Compile a key prefix in which ``{i}`` stands for a number."""
+    return re.compile(r"(\d+)".join(re.escape(part) for part in template.split(_NUMBER)))
+
+
+def _rename(key: str, rules: Iterable[tuple[str, str]]) -> str | None:
+    """Replace the prefix of ``key`` by the first rule that fits."""
+    for source, target in rules:
+        match = _pattern(source).match(key)
+        if match:
+            for number in match.groups():
+                target = target.replace(_NUMBER, number, 1)
+            return target + key[match.end() :]
+    return None
+
+
+_HEAD = "pts_bbox_head."
+_TRANSFORMER = "pts_bbox_head.transformer."
+_ENCODER_LAYER = "pts_bbox_head.transformer.encoder.layers.{i}."
+_DECODER_LAYER = "pts_bbox_head.transformer.decoder.layers.{i}."
+
+IMAGE_RULES = (("img_backbone.", "img_backbone."), ("img_neck.", "img_neck."))
+HEAD_RULES = (
+    (_HEAD + "instance_embedding.", "map_head.instance_embedding."),
+    (_HEAD + "pts_embedding.", "map_head.pts_embedding."),
+    (_HEAD + "cls_branches.", "map_head.cls_branches."),
+    (_HEAD + "reg_branches.", "map_head.reg_branches."),
+    (_TRANSFORMER + "reference_points.", "map_head.reference_points."),
+)
+DECODER_RULES = (
+    (_DECODER_LAYER + "attentions.0.attn.", "map_head.decoder.layers.{i}.self_attn."),
+    (_DECODER_LAYER + "attentions.1.", "map_head.decoder.layers.{i}.cross_attn."),
+    (_DECODER_LAYER + "ffns.0.", "map_head.decoder.layers.{i}.ffn."),
+    (_DECODER_LAYER + "norms.", "map_head.decoder.layers.{i}.norms."),
+)
+BEV_QUERY_RULES = (
+    (_HEAD + "bev_embedding.", "bev_encoder.bev_embedding."),
+    (_HEAD + "positional_encoding.", "bev_encoder.positional_encoding."),
+    (_TRANSFORMER + "level_embeds", "bev_encoder.level_embeds"),
+    (_TRANSFORMER + "cams_embeds", "bev_encoder.cams_embeds"),
+    (_TRANSFORMER + "can_bus_mlp.", "bev_encoder.can_bus_mlp."),
+    (_ENCODER_LAYER + "attentions.0.", "bev_encoder.layers.{i}.self_attn."),
+    (
+        _ENCODER_LAYER + "attentions.1.output_proj.",
+        "bev_encoder.layers.{i}.cross_attn.output_proj.",
+    ),
+    (_ENCODER_LAYER + "ffns.0.", "bev_encoder.layers.{i}.ffn."),
+    (_ENCODER_LAYER + "norms.", "bev_encoder.layers.{i}.norms."),
+)
+CODE_WEIGHTS = {
+    _HEAD + "code_weights": UnusedKey(
+        "weights of box coordinates, whose loss has weight 0", lambda: torch.ones(4)
+    )
+}
+
+MAPTR = KeyMap(
+    name="maptr",
+    rules=(
+        *IMAGE_RULES,
+        *HEAD_RULES,
+        *DECODER_RULES,
+        *BEV_QUERY_RULES,
+        (_ENCODER_LAYER + "attentions.1.attention.", "bev_encoder.layers.{i}.cross_attn."),
+    ),
+    unused=CODE_WEIGHTS,
+)
+MAPTR_BEVFORMER = KeyMap(
+    name="maptr-bevformer",
+    rules=(
+        *IMAGE_RULES,
+        *HEAD_RULES,
+        *DECODER_RULES,
+        *BEV_QUERY_RULES,
+        (
+            _ENCODER_LAYER + "attentions.1.deformable_attention.",
+            "bev_encoder.layers.{i}.cross_attn.",
+        ),
+    ),
+    unused=CODE_WEIGHTS,
+    marker=(
+        _ENCODER_LAYER + "attentions.1.deformable_attention.",
+        "bev_encoder.layers.{i}.cross_attn.sampling_offsets.",
+    ),
+)
+
+KEY_MAPS: list[KeyMap] = [MAPTR_BEVFORMER, MAPTR]
+"""Known architectures, the most special first; the last needs no marker."""
+
+
+def is_upstream(keys: Iterable[str]) -> bool:
+    """Return whether state keys are in the format of the earlier systems."""
+    return any(key.startswith(_HEAD) for key in keys)
+
+
+def find_key_map(keys: Iterable[str]) -> KeyMap:
+    """Return the map of the architecture that state keys, upstream's or ours, belong to."""
+    keys = list(keys)
+    side = 0 if is_upstream(keys) else 1
+    for key_map in KEY_MAPS:
+        pattern = _pattern(key_map.marker[side])
+        if any(pattern.match(key) for key in keys):
+            return key_map
+    raise ValueError("the checkpoint holds no weights.")

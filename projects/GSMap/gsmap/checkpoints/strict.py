@@ -1,0 +1,88 @@
+"""Strict loading: every key is used and every weight is loaded, or an error names it."""
+
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+
+from .convert import ours_from_upstream
+from .key_map import is_upstream
+
+_SHOWN = 20
+
+
+def neutral_keys(model: nn.Module, prefix: str = "") -> set[str]:
+    """Return the state keys that modules declare neutral at the start.
+
+    A module that extends another one, as GSMap's extend MapTR's, lists the keys that it adds in its
+    attribute ``neutral_keys`` (prefixes, relative to the module). The model can then start from a
+    checkpoint
+    without them.
+
+    Args:
+        model: The model.
+        prefix: Prefix of its keys.
+
+    Returns:
+        The full keys.
+    """
+    declared = []
+    for name, module in model.named_modules():
+        path = f"{prefix}{name}." if name else prefix
+        declared += [path + relative for relative in getattr(module, "neutral_keys", ())]
+    return {key for key in model.state_dict(prefix=prefix) if key.startswith(tuple(declared))}
+
+
+def adapt_state(
+    state: dict[str, Tensor], expected: Mapping[str, Tensor], prefix: str, neutral: set[str]
+) -> None:
+    """Rename upstream's keys in place, then compare the state with what the model expects.
+
+    Batch counters of BatchNorm may be missing, as in old checkpoints. Neutral keys may be missing
+    all together.
+
+    Args:
+        state: The checkpoint's state dict; changed in place.
+        expected: The model's state dict.
+        prefix: Prefix of both.
+        neutral: Keys from :func:`neutral_keys`.
+
+    Raises:
+        ValueError: If a key is missing, left over or of another shape.
+    """
+    own = {key.removeprefix(prefix): value for key, value in state.items()}
+    if is_upstream(own):
+        state.clear()
+        state.update({prefix + key: value for key, value in ours_from_upstream(own).items()})
+    missing = {
+        key for key in expected if key not in state and not key.endswith("num_batches_tracked")
+    }
+    if neutral <= missing:
+        missing -= neutral
+    left_over = [key for key in state if key not in expected]
+    reshaped = [
+        f"{key} {tuple(value.shape)} instead of {tuple(expected[key].shape)}"
+        for key, value in state.items()
+        if key in expected and value.shape != expected[key].shape
+    ]
+    problems = [
+        f"{what}: {_listed(keys)}"
+        for what, keys in (
+            ("missing", sorted(missing)),
+            ("left over", left_over),
+            ("of another shape", reshaped),
+        )
+        if keys
+    ]
+    if problems:
+        raise ValueError(
+            "the checkpoint does not fit the model; "
+            + "; ".join(problems)
+            + ". Load it with the config it was trained "
+            "with; docs/migration.md lists the architectures that load."
+        )
+
+
+def _listed(keys: list[str]) -> str:
+    """Join the first keys and count the rest."""
+    rest = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
+    return ", ".join(keys[:_SHOWN]) + rest

@@ -1,0 +1,124 @@
+"""The detector: cameras (and LiDAR) to BEV features to map elements."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from mmdet3d.models.detectors import Base3DDetector
+from mmdet3d.registry import MODELS
+from mmdet3d.structures import Det3DDataSample
+from torch import Tensor
+
+from gsmap.checkpoints.strict import adapt_state, neutral_keys
+
+
+@MODELS.register_module()
+class MapDetector(Base3DDetector):
+    """Image backbone and neck, BEV encoder, map head.
+
+    Args:
+        bev_encoder: Config of the BEV encoder.
+        map_head: Config of the head.
+        img_backbone: Config of the image backbone; None for a model without cameras.
+        img_neck: Config of the image neck, or None.
+        img_augment: Config of an augmentation of the normalised images in training (GridMask), or
+            None.
+        data_preprocessor: As in mmdet3d.
+        init_cfg: As in mmengine.
+    """
+
+    def __init__(
+        self,
+        bev_encoder: dict,
+        map_head: dict,
+        img_backbone: dict | None = None,
+        img_neck: dict | None = None,
+        img_augment: dict | None = None,
+        data_preprocessor: dict | None = None,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(data_preprocessor=data_preprocessor, init_cfg=init_cfg)
+        self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
+        self.img_neck = MODELS.build(img_neck) if img_neck else None
+        self.img_augment = MODELS.build(img_augment) if img_augment else None
+        self.bev_encoder = MODELS.build(bev_encoder)
+        self.map_head = MODELS.build(map_head)
+
+    def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
+        """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
+        batch = len(imgs)
+        images = imgs.flatten(0, 1)
+        if self.training and self.img_augment is not None:
+            images = self.img_augment(images)
+        feats = self.img_backbone(images)
+        if self.img_neck is not None:
+            feats = self.img_neck(feats)
+        return [feat.unflatten(0, (batch, -1)) for feat in feats]
+
+    def extract_feat(
+        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> dict[str, Tensor]:
+        """Return the BEV encoder's outputs: ``bev_feats`` (B, C, H, W) and what its losses need."""
+        imgs = batch_inputs["imgs"]
+        img_shape = tuple(imgs.shape[-2:])
+        img_metas = [
+            {**sample.metainfo, "batch_input_shape": img_shape} for sample in batch_data_samples
+        ]
+        return self.bev_encoder(self.extract_img_feats(imgs), img_metas)
+
+    def loss(
+        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> dict[str, Tensor]:
+        """Return all losses of a batch.
+
+        Raises:
+            FloatingPointError: If a cost or a loss is not finite; the message names the samples.
+        """
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        losses = self.map_head.loss(outputs, batch_data_samples)
+        if hasattr(self.bev_encoder, "loss"):
+            losses.update(self.bev_encoder.loss(outputs, batch_data_samples))
+        self._check_finite(losses, batch_data_samples)
+        return losses
+
+    def predict(
+        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> list[Det3DDataSample]:
+        """Add ``pred_instances_3d``, as the head's ``predict`` returns them, to the samples."""
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        results = self.map_head.predict(outputs, batch_data_samples)
+        return self.add_pred_to_datasample(batch_data_samples, results)
+
+    def _forward(
+        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> dict[str, Tensor]:
+        """Return the head's raw outputs."""
+        return self.map_head(self.extract_feat(batch_inputs, batch_data_samples))
+
+    @staticmethod
+    def _check_finite(
+        losses: dict[str, Tensor], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> None:
+        """Stop at a loss that is not finite (mmengine reads each loss anyway: no new sync)."""
+        finite = torch.isfinite(
+            torch.stack([loss.detach().float().mean() for loss in losses.values()])
+        ).tolist()
+        bad = [name for name, good in zip(losses, finite, strict=True) if not good]
+        if bad:
+            tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
+            raise FloatingPointError(
+                f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
+                "truth, then at the "
+                "learning rate and at the loss scale of mixed precision."
+            )
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        """Accept upstream's names, then require every key to match.
+
+        Raises:
+            ValueError: If a key is missing, left over or of another shape.
+        """
+        adapt_state(state_dict, self.state_dict(prefix=prefix), prefix, neutral_keys(self, prefix))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

@@ -1,0 +1,40 @@
+"""GridMask augmentation of normalised images."""
+
+import torch
+from mmdet3d.registry import MODELS
+from torch import Tensor, nn
+
+
+@MODELS.register_module()
+class GridMask(nn.Module):
+    """Black out a regular grid of squares in all images of a batch (Chen et al., 2020).
+
+    Args:
+        prob: Probability of a batch to be masked.
+        ratio: Side of a kept square over the period of the grid, in (0, 1).
+
+    Raises:
+        ValueError: If an argument is out of its range.
+    """
+
+    def __init__(self, prob: float = 0.7, ratio: float = 0.5) -> None:
+        super().__init__()
+        if not 0 <= prob <= 1 or not 0 < ratio < 1:
+            raise ValueError(f"prob must be in [0, 1] and ratio in (0, 1), got {prob} and {ratio}.")
+        self.prob = prob
+        self.ratio = ratio
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Mask the images, or return them as they are. (V, 3, H, W)"""
+        if torch.rand(()) >= self.prob:
+            return images
+        return images * self.draw_mask(*images.shape[-2:]).to(images)
+
+    def draw_mask(self, height: int, width: int) -> Tensor:
+        """Return one where the image is kept and zero in the squares of a random grid. (H, W)"""
+        period = int(torch.randint(2, height, ()))
+        side = min(max(round(period * self.ratio), 1), period - 1)
+        row, col = torch.randint(period, (2,)).tolist()
+        in_row = (torch.arange(height) + row) % period < side
+        in_col = (torch.arange(width) + col) % period < side
+        return (in_row[:, None] | in_col).float()

@@ -1,0 +1,81 @@
+"""Matching costs between predicted and annotated elements, read off ``InstanceData``."""
+
+from typing import Any
+
+import torch
+from mmdet3d.registry import TASK_UTILS
+from mmengine.structures import InstanceData
+from torch import Tensor
+
+
+def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
+    """Return the summed L1 distance of every prediction to every order of every ground truth.
+
+    Args:
+        pts: Predicted points. (N, P, 2)
+        pts_shifts: Equivalent orders of the annotated points, in the same units. (K, S, P, 2)
+
+    Returns:
+        Distances, summed over points and coordinates. (N, K, S)
+
+    Raises:
+        ValueError: If the numbers of points differ.
+    """
+    if pts.shape[-2:] != pts_shifts.shape[-2:]:
+        raise ValueError(
+            f"predictions of {tuple(pts.shape[-2:])} points and ground truth of "
+            f"{tuple(pts_shifts.shape[-2:])} "
+            "do not fit: set the same number of points in the head and in the pipeline."
+        )
+    num_gts, num_orders = pts_shifts.shape[:2]
+    distances = torch.cdist(pts.flatten(1), pts_shifts.flatten(0, 1).flatten(1), p=1)
+    return distances.view(len(pts), num_gts, num_orders)
+
+
+@TASK_UTILS.register_module()
+class OrderedPointsCost:
+    """L1 distance to the closest equivalent point order (MapTR Eq. 5).
+
+    Args:
+        weight: Factor of the cost.
+    """
+
+    def __init__(self, weight: float = 5.0) -> None:
+        self.weight = weight
+
+    def __call__(
+        self,
+        pred_instances: InstanceData,
+        gt_instances: InstanceData,
+        img_meta: dict[str, Any] | None = None,
+    ) -> Tensor:
+        """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
+        return order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1) * self.weight
+
+
+@TASK_UTILS.register_module()
+class IoUCost:
+    """One minus the soft IoU of rendered rasters, sum of minima over sum of maxima (GSMap Eq. 9).
+
+    Args:
+        weight: Factor of the cost.
+        eps: Added to the denominator, for a pair of empty rasters.
+    """
+
+    def __init__(self, weight: float = 1.0, eps: float = 1e-6) -> None:
+        self.weight = weight
+        self.eps = eps
+
+    def __call__(
+        self,
+        pred_instances: InstanceData,
+        gt_instances: InstanceData,
+        img_meta: dict[str, Any] | None = None,
+    ) -> Tensor:
+        """Compare ``rasters`` (N, h, w) with ``rasters`` (K, h, w), both in [0, 1]. (N, K)"""
+        pred, target = pred_instances.rasters.flatten(1), gt_instances.rasters.flatten(1)
+        # min = (a + b - |a - b|) / 2 and max = (a + b + |a - b|) / 2, so one matrix of L1 distances
+        # is enough
+        distance = torch.cdist(pred, target, p=1)
+        total = pred.sum(1)[:, None] + target.sum(1)
+        return self.weight * (1 - (total - distance) / (total + distance + self.eps))
