@@ -17,7 +17,7 @@ from numpy.core import multiarray
 def allow_mmengine_checkpoints() -> None:
     """Let ``torch.load(weights_only=True)`` read what mmengine keeps beside the weights.
 
-    A checkpoint to resume from holds the message hub: ``HistoryBuffer`` objects around numpy arrays,
+    A checkpoint to resume from holds the message hub: ``HistoryBuffer`` objects around arrays,
     numbers, and references to the class's own statistics (``getattr(HistoryBuffer, "mean")``).
     Naming just these keeps torch's protection on for everything else.
     """

@@ -1,5 +1,6 @@
 """The extent of the map in metres and its raster: every metres <-> [0, 1] <-> pixel conversion."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -45,9 +46,7 @@ class BEVGrid:
             raise ValueError(f"height and width must be >= 1, got {self.height} x {self.width}.")
 
     @classmethod
-    def from_pc_range(
-        cls, pc_range: list[float] | tuple[float, ...], height: int, width: int
-    ) -> "BEVGrid":
+    def from_pc_range(cls, pc_range: Sequence[float], height: int, width: int) -> "BEVGrid":
         """Build a grid from a range (x_min, y_min, z_min, x_max, y_max, z_max) in metres."""
         if len(pc_range) != 6:
             raise ValueError(f"pc_range must hold 6 values, got {len(pc_range)}.")
