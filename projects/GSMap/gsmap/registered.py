@@ -1,12 +1,22 @@
 """Importing this module registers everything that GSMap adds to mmdet3d's registries."""
 
-import gsmap.detectors.map_detector  # noqa: F401
-import gsmap.heads.map_head  # noqa: F401
-import gsmap.layers.bev_encoders.bev_query_encoder  # noqa: F401
-import gsmap.layers.bev_encoders.bevformer  # noqa: F401
-import gsmap.layers.bev_encoders.gkt  # noqa: F401
-import gsmap.layers.decoders.map_decoder  # noqa: F401
-import gsmap.layers.grid_mask  # noqa: F401
-import gsmap.matching.map_assigner  # noqa: F401
-import gsmap.matching.map_coder  # noqa: F401
-import gsmap.matching.match_costs  # noqa: F401
+from mmdet3d.registry import MODELS
+
+import gsmap.detectors.map_detector
+import gsmap.engine.checkpoint_io
+import gsmap.heads.gsmap_head
+import gsmap.heads.map_head
+import gsmap.layers.bev_encoders.bev_query_encoder
+import gsmap.layers.bev_encoders.bevformer
+import gsmap.layers.bev_encoders.gkt
+import gsmap.layers.decoders.gaussian_layer
+import gsmap.layers.decoders.map_decoder
+import gsmap.layers.grid_mask
+import gsmap.matching.map_assigner
+import gsmap.matching.map_coder
+import gsmap.matching.match_costs
+import gsmap.matching.raster_costs  # noqa: F401
+from gsmap.losses.raster import RasterLoss
+
+# The losses are plain torch modules, usable without OpenMMLab; they enter the registry here.
+MODELS.register_module(module=RasterLoss)

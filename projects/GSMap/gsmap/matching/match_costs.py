@@ -51,31 +51,3 @@ class OrderedPointsCost:
     ) -> Tensor:
         """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
         return order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1) * self.weight
-
-
-@TASK_UTILS.register_module()
-class IoUCost:
-    """One minus the soft IoU of rendered rasters, sum of minima over sum of maxima (GSMap Eq. 9).
-
-    Args:
-        weight: Factor of the cost.
-        eps: Added to the denominator, for a pair of empty rasters.
-    """
-
-    def __init__(self, weight: float = 1.0, eps: float = 1e-6) -> None:
-        self.weight = weight
-        self.eps = eps
-
-    def __call__(
-        self,
-        pred_instances: InstanceData,
-        gt_instances: InstanceData,
-        img_meta: dict[str, Any] | None = None,
-    ) -> Tensor:
-        """Compare ``rasters`` (N, h, w) with ``rasters`` (K, h, w), both in [0, 1]. (N, K)"""
-        pred, target = pred_instances.rasters.flatten(1), gt_instances.rasters.flatten(1)
-        # min = (a + b - |a - b|) / 2 and max = (a + b + |a - b|) / 2, so one matrix of L1 distances
-        # is enough
-        distance = torch.cdist(pred, target, p=1)
-        total = pred.sum(1)[:, None] + target.sum(1)
-        return self.weight * (1 - (total - distance) / (total + distance + self.eps))
