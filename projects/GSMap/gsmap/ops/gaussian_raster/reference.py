@@ -1,11 +1,15 @@
 """Plain torch renderer: the definition of right, in any floating-point type."""
 
+import math
+
 import torch
 from torch import Tensor
 
 from ...geometry.bev_grid import BEVGrid
 
 MAX_DENSITY = 1 - 1e-6  # keeps log1p finite at a Gaussian's own centre
+CUT = 1e-8  # fused kernels may leave out a Gaussian where its density is below
+SQUARED_REACH = -2 * math.log(CUT)  # the squared Mahalanobis distance at which it is
 
 
 def gaussian_densities(means: Tensor, scales: Tensor, rotations: Tensor, grid: BEVGrid) -> Tensor:

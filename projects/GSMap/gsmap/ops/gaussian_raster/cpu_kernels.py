@@ -1,0 +1,229 @@
+# mypy: disable-error-code="no-untyped-def"  # numba infers its types
+r"""Fused CPU kernels (numba): masks of 2D Gaussians without a tensor per Gaussian.
+
+How the work is laid out
+    One thread renders one instance at a time, straight into the instance's (H, W) mask, which
+    stays in the cache (80 kB at 200 x 100). Gaussian by Gaussian and row by row, only the pixels
+    inside the ellipse where the Gaussian exceeds a cut are visited.
+
+    Along a row the exponent is a parabola: with the inverse covariance [[a, b], [b, c]],
+    a (x - v)^2 + dy^2 det / a, whose vertex v = mu_x - dy b / a and constant are worked out once
+    per row in float64. Neither term can cancel, so the inner loop is safe in float32: a multiply-
+    add, an exponential (a polynomial on eight lanes at once) and a multiply-add into the mask,
+
+        R <- R + G (1 - R),        the same as 1 - prod (1 - G) and exact for small G.
+
+What is left out
+    The cut is 1e-8 (6.07 sigma): P Gaussians together change a pixel by less than P * 1e-8, and a
+    Gaussian's second moments change by 2e-7 of themselves.
+
+Backward
+    Nothing but the five parameters of each Gaussian is kept from the forward pass. Per instance:
+    (1) the transmittance T = prod (1 - G) is rebuilt in a scratch buffer of one mask per thread;
+    (2) per Gaussian, w = dL/dR * T * G / (1 - G) is summed per row as (sum w, sum w t, sum w t^2)
+    in float32, and the rows are gathered in float64 into the moments of w in the Gaussian's own
+    frame (u, v), from which the gradients follow:
+
+        dL/dsigma = (M_uu / s_u^3, M_vv / s_v^3),  dL/dmu = R(theta) (M_u / s_u^2, M_v / s_v^2),
+        dL/dtheta = -M_uv (1 / s_u^2 - 1 / s_v^2).
+
+    T and 1 - G are rounded alike in (1) and (2), so their quotient stays exact near a centre.
+
+The floor
+    Memory: the masks are written once forward; backward reads dL/dR inside the ellipses alone.
+    Arithmetic: one exponential per visited pixel forward and two backward. A Gaussian of
+    sigma_u x sigma_v pixels visits pi * 2 ln(1 / cut) * sigma_u * sigma_v of them: 510 for
+    1.0 x 0.4 m at 0.3 m per pixel, against 20,000 in the reference.
+
+Two runs give the same bits, whatever the number of threads.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .._numba import FASTMATH, exp2_coefficients
+from .reference import SQUARED_REACH
+
+C0, C1, C2, C3, C4, C5 = exp2_coefficients()
+HALF, ONE, LOWEST = np.float32(0.5), np.float32(1), np.float32(-126)
+BIAS, MANTISSA_BITS = np.int32(127), np.int32(23)
+MAX_DENSITY = np.float32(1 - 1e-6)
+HALF_LOG2E = 0.5 / math.log(2)
+
+Array = NDArray[np.float32]
+
+
+@njit(inline="always")
+def exp2_float32(x):
+    """Return 2^x for x <= 0, at least 2^-126."""
+    x = max(x, LOWEST)
+    whole = np.int32(x - HALF)  # to the nearest, as x <= 0
+    part = x - np.float32(whole)
+    power = ((((C5 * part + C4) * part + C3) * part + C2) * part + C1) * part + C0
+    return power * np.int32((whole + BIAS) << MANTISSA_BITS).view(np.float32)
+
+
+@njit(inline="always")
+def _conic(scale_u, scale_v, rotation):
+    """Return cos, sin, 1 / sigma_u^2, 1 / sigma_v^2 and the inverse covariance's a and b."""
+    cos, sin = math.cos(rotation), math.sin(rotation)
+    inv_u, inv_v = 1.0 / (scale_u * scale_u), 1.0 / (scale_v * scale_v)
+    return (
+        cos,
+        sin,
+        inv_u,
+        inv_v,
+        cos * cos * inv_u + sin * sin * inv_v,
+        cos * sin * (inv_u - inv_v),
+    )
+
+
+@njit(inline="always")
+def _span(centre, half, origin, step, size):
+    """Return the first and one past the last of the pixels whose centres lie within a range."""
+    low, high = (centre - half - origin) / step - 0.5, (centre + half - origin) / step - 0.5
+    return math.ceil(min(max(low, 0.0), size)), math.floor(max(min(high, size - 1.0), -1.0)) + 1
+
+
+@njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
+def _accumulate(gaussian, frame, steps, mask, through):
+    """Add one Gaussian to a mask (R), or multiply it into a transmittance (T) if ``through``."""
+    x_min, y_min, step_x, step_y = frame
+    mean_x, mean_y = gaussian[0], gaussian[1]
+    height, width = mask.shape
+    _, _, inv_u, inv_v, a, b = _conic(gaussian[2], gaussian[3], gaussian[4])
+    det_a = inv_u * inv_v / a
+    curve, step = np.float32(min(a * HALF_LOG2E, 1e30)), np.float32(step_x)
+    top, bottom = _span(mean_y, math.sqrt(SQUARED_REACH / det_a), y_min, step_y, height)
+    for row in range(top, bottom):
+        dy = y_min + (row + 0.5) * step_y - mean_y
+        q = dy * dy * det_a
+        vertex = mean_x - dy * b / a
+        left, right = _span(
+            vertex, math.sqrt(max(SQUARED_REACH - q, 0.0) / a), x_min, step_x, width
+        )
+        base = np.float32(q * HALF_LOG2E)
+        start = np.float32(x_min + (left + 0.5) * step_x - vertex)
+        line = mask[row, left : max(left, right)]
+        if through:
+            for k in range(len(line)):
+                t = start + steps[k] * step
+                density = min(exp2_float32(-(curve * t * t + base)), MAX_DENSITY)
+                line[k] *= ONE - density
+        else:
+            for k in range(len(line)):
+                t = start + steps[k] * step
+                density = min(exp2_float32(-(curve * t * t + base)), MAX_DENSITY)
+                line[k] += density * (ONE - line[k])
+
+
+@njit(inline="always")
+def _row_sums(grad, trans, curve, base, start, step, steps):
+    """Return the sums of w, w t and w t^2 over one row's pixels inside the ellipse."""
+    sum_0, sum_1, sum_2 = np.float32(0), np.float32(0), np.float32(0)
+    for k in range(len(grad)):
+        t = start + steps[k] * step
+        density = exp2_float32(-(curve * t * t + base))
+        weight = grad[k] * trans[k] * density / (ONE - min(density, MAX_DENSITY))
+        weight = np.float32(0) if density > MAX_DENSITY else weight  # clamped: no gradient
+        sum_0 += weight
+        sum_1 += weight * t
+        sum_2 += weight * t * t
+    return sum_0, sum_1, sum_2
+
+
+@njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
+def _gaussian_gradient(gaussian, frame, steps, grad, trans, out):
+    """Write the gradient in one Gaussian's (mean, scales, rotation)."""
+    x_min, y_min, step_x, step_y = frame
+    mean_x, mean_y = gaussian[0], gaussian[1]
+    height, width = grad.shape
+    cos, sin, inv_u, inv_v, a, b = _conic(gaussian[2], gaussian[3], gaussian[4])
+    det_a = inv_u * inv_v / a
+    curve, step = np.float32(min(a * HALF_LOG2E, 1e30)), np.float32(step_x)
+    m_u = m_v = m_uu = m_uv = m_vv = 0.0
+    top, bottom = _span(mean_y, math.sqrt(SQUARED_REACH / det_a), y_min, step_y, height)
+    for row in range(top, bottom):
+        dy = y_min + (row + 0.5) * step_y - mean_y
+        q = dy * dy * det_a
+        offset = -dy * b / a  # of the row's vertex from the mean
+        vertex = mean_x + offset
+        left, right = _span(
+            vertex, math.sqrt(max(SQUARED_REACH - q, 0.0) / a), x_min, step_x, width
+        )
+        if right <= left:
+            continue
+        start = np.float32(x_min + (left + 0.5) * step_x - vertex)
+        base = np.float32(q * HALF_LOG2E)
+        s_0, s_1, s_2 = _row_sums(
+            grad[row, left:right], trans[row, left:right], curve, base, start, step, steps
+        )
+        u, v = cos * offset + sin * dy, cos * dy - sin * offset  # the vertex in the own frame
+        m_u += cos * s_1 + u * s_0
+        m_v += v * s_0 - sin * s_1
+        m_uu += cos * cos * s_2 + 2 * cos * u * s_1 + u * u * s_0
+        m_vv += sin * sin * s_2 - 2 * sin * v * s_1 + v * v * s_0
+        m_uv += (cos * v - sin * u) * s_1 - cos * sin * s_2 + u * v * s_0
+    out[0] = cos * m_u * inv_u - sin * m_v * inv_v
+    out[1] = sin * m_u * inv_u + cos * m_v * inv_v
+    out[2] = m_uu * inv_u / gaussian[2]
+    out[3] = m_vv * inv_v / gaussian[3]
+    out[4] = m_uv * (inv_v - inv_u)
+
+
+@njit(nogil=True, cache=True)
+def _is_finite(gaussians):
+    """Tell whether an instance's Gaussians can be rendered."""
+    for gaussian in gaussians:
+        if not np.isfinite(gaussian).all() or gaussian[2] == 0 or gaussian[3] == 0:
+            return False
+    return True
+
+
+@njit(nogil=True, cache=True)
+def render_forward(gaussians, frame, masks, first, last):
+    """Render instances ``first`` to ``last - 1``; NaN where a parameter is not finite.
+
+    Args:
+        gaussians: Mean x, y, scale u, v and rotation, float64. (N, P, 5)
+        frame: Smallest x and y and the pixel's size along x and y, in metres.
+        masks: Written to, float32. (N, H, W)
+        first: First instance.
+        last: One past the last instance.
+    """
+    steps = np.arange(masks.shape[2]).astype(np.float32)
+    for n in range(first, last):
+        masks[n] = 0
+        if not _is_finite(gaussians[n]):
+            masks[n] = np.nan
+            continue
+        for gaussian in gaussians[n]:
+            _accumulate(gaussian, frame, steps, masks[n], False)
+
+
+@njit(nogil=True, cache=True)
+def render_backward(gaussians, frame, grads, out, first, last):
+    """Write the gradients of instances ``first`` to ``last - 1``.
+
+    Args:
+        gaussians: As in :func:`render_forward`. (N, P, 5)
+        frame: As in :func:`render_forward`.
+        grads: Gradient in the masks, float32. (N, H, W)
+        out: Gradient in ``gaussians``, written to, float64. (N, P, 5)
+        first: First instance.
+        last: One past the last instance.
+    """
+    steps = np.arange(grads.shape[2]).astype(np.float32)
+    trans = np.empty(grads.shape[1:], dtype=np.float32)
+    for n in range(first, last):
+        if not _is_finite(gaussians[n]):
+            out[n] = np.nan
+            continue
+        trans[:] = 1
+        for gaussian in gaussians[n]:
+            _accumulate(gaussian, frame, steps, trans, True)
+        for p in range(gaussians.shape[1]):
+            _gaussian_gradient(gaussians[n, p], frame, steps, grads[n], trans, out[n, p])
