@@ -298,17 +298,16 @@ class MapHead(BaseModule):
             first.
         """
         results = []
-        for scores, references in zip(
-            outputs["all_cls_scores"][-1], outputs["all_references"][-1], strict=True
-        ):
+        last = zip(outputs["all_cls_scores"][-1], outputs["all_references"][-1], strict=True)
+        for scores, references in last:
             fields = self.decode_reference(references)
             best = self.coder.decode(scores, fields["pts"])
-            chosen = {name: values[best.query_inds] for name, values in fields.items()}
+            chosen = {name: value[best.query_inds] for name, value in fields.items()}
             results.append(InstanceData(scores_3d=best.scores, labels_3d=best.labels, **chosen))
         return results
 
     def decode_reference(self, references: Tensor) -> dict[str, Tensor]:
-        """Return what a reference (N, P, D) says in metres: ``pts`` (N, P, 2); subclasses add."""
+        """Return what a reference (N, P, D) says in metres: ``pts`` (N, P, 2)."""
         return {"pts": self.grid.metres_from_norm(references[..., :2])}
 
 

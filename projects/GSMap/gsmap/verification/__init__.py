@@ -1,0 +1,1 @@
+"""Comparison of the models with reference outputs of the earlier systems."""

@@ -1,0 +1,134 @@
+"""A folder of reference data: its recipes, inputs and models with its weights."""
+
+import importlib.util
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from mmdet3d.registry import MODELS
+from mmengine.config import Config
+from mmengine.model import BaseModel
+from mmengine.registry import init_default_scope
+from torch import Tensor
+
+from gsmap import registered  # noqa: F401
+
+NUM_CAMS = 6
+
+
+@dataclass
+class Golden:
+    """Reference data of one variant.
+
+    Attributes:
+        folder: Folder of the reference files.
+        configs: The project's ``configs`` folder.
+        variant: Suffix of the variant's files, as in ``maptr_r50_forward_full_A.npz``.
+        seed: Seed string of the recipes of weights and inputs.
+        recipes: Folder of ``weights_recipe.py`` and ``inputs_recipe.py``; None means ``folder``.
+    """
+
+    folder: Path
+    configs: Path
+    variant: str = "A"
+    seed: str = "A"
+    recipes: Path | None = None
+    _models: dict[str, BaseModel] = field(default_factory=dict, repr=False)
+
+    def _module(self, name: str) -> ModuleType:
+        """Load a recipe.
+
+        Raises:
+            FileNotFoundError: If the folder has no such recipe.
+        """
+        path = (self.recipes or self.folder) / f"{name}.py"
+        if not path.is_file():
+            raise FileNotFoundError(f"no {path}: give the folder of the recipes with --recipes.")
+        spec = importlib.util.spec_from_file_location(f"golden_{name}", path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    @cached_property
+    def weights(self) -> ModuleType:
+        """The recipe of weights: ``tensor(key, shape, seed)``."""
+        return self._module("weights_recipe")
+
+    @cached_property
+    def inputs(self) -> ModuleType:
+        """The recipe of inputs: ``images(h, w, cameras, seed)`` and others."""
+        return self._module("inputs_recipe")
+
+    @cached_property
+    def cameras(self) -> dict[str, Any]:
+        """Cameras of the variant."""
+        return self.read_json(f"cameras_{self.variant}.json")
+
+    @cached_property
+    def gt_sets(self) -> dict[str, list[dict[str, Any]]]:
+        """Sets of annotated elements: ``label`` and ``pts`` (n, 2) in metres."""
+        return self.read_json(f"gt_{self.variant}.json")["sets"]
+
+    def read_json(self, name: str) -> Any:
+        """Read a JSON file of the folder."""
+        return json.loads((self.folder / name).read_text())
+
+    def read_arrays(self, name: str) -> dict[str, np.ndarray]:
+        """Read an ``.npz`` file of the folder."""
+        with np.load(self.folder / name, allow_pickle=False) as arrays:
+            return dict(arrays)
+
+    def state_shapes(self, name: str) -> dict[str, tuple[int, ...]]:
+        """Return key -> shape of an upstream state list."""
+        return {key: tuple(entry["shape"]) for key, entry in self.read_json(name)["state"].items()}
+
+    def upstream_state(self, name: str) -> dict[str, Tensor]:
+        """Return the upstream state that the recipe makes for a state list."""
+        arrays = self.weights.state(self.state_shapes(name), self.seed)
+        return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}
+
+    def model(self, config: str, state_list: str) -> BaseModel:
+        """Build a model, load the recipe's weights in upstream's format, and set it to eval.
+
+        Args:
+            config: Path of the config below ``configs``.
+            state_list: Name of the upstream state list.
+
+        Returns:
+            The model; one per config, built once.
+        """
+        if config not in self._models:
+            init_default_scope("mmdet3d")
+            cfg = Config.fromfile(self.configs / config, import_custom_modules=False)
+            model = MODELS.build(cfg.model)
+            model.load_state_dict(self.upstream_state(state_list))
+            self._models[config] = model.eval()
+        return self._models[config]
+
+    def images(self, size: str) -> Tensor:
+        """Return the normalised images of a size (``full`` or ``reduced``). (1, V, 3, H, W)"""
+        height, width = self.cameras[size]["padded_hw"]
+        return torch.from_numpy(self.inputs.images(height, width, NUM_CAMS, self.seed))[None]
+
+    def meta(self, size: str) -> dict[str, Any]:
+        """Return the meta dict of a size's sample."""
+        cameras = [self.cameras["cameras"][name] for name in self.cameras["camera_order"]]
+        camera2ego = np.array([camera["camera2ego"] for camera in cameras])
+        return {
+            "token": f"{size}_{self.variant}",
+            "batch_input_shape": tuple(self.cameras[size]["padded_hw"]),
+            "lidar2img": np.array(self.cameras[size]["lidar2img"]),
+            "cam2img": np.array([camera["intrinsics_1600x900"] for camera in cameras]),
+            "lidar2cam": np.linalg.inv(camera2ego) @ np.array(self.cameras["lidar2ego"]),
+            "lidar2ego": np.array(self.cameras["lidar2ego"]),
+            "cam2ego": camera2ego,
+            "img_aug_matrix": np.array([self.cameras[size]["img_aug_matrix"]] * NUM_CAMS),
+            "can_bus": np.zeros(18),
+        }
