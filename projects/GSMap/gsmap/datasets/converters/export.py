@@ -1,0 +1,94 @@
+"""Annotation files as JSON, for comparison by other tools."""
+
+import argparse
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.datasets.annotation_file import AnnotationFile
+from gsmap.datasets.annotation_record import MapSample
+
+_DECIMALS = 6
+
+
+def frame_record(sample: MapSample) -> dict[str, Any]:
+    """Return one sample as a JSON object.
+
+    Args:
+        sample: A sample with ground truth.
+
+    Returns:
+        Identity and pose (position and yaw in degrees of the annotation frame) with the
+        ``vectors``: label and points in metres, rounded to 1e-6 m.
+    """
+    pose = sample.global_from_frame
+    return {
+        "sample_token": sample.token,
+        "scene": sample.scene,
+        "location": sample.map_name,
+        "timestamp": sample.timestamp_ns // 1000,
+        "lidar2global_xy": pose[:2, 3].tolist(),
+        "patch_angle_deg": float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0]))),
+        "vectors": [
+            {"label": i.label, "pts": i.points.astype(np.float64).round(_DECIMALS).tolist()}
+            for i in sample.instances or []
+        ],
+    }
+
+
+def export_json(annotations: Path, target: Path) -> int:
+    """Write an annotation file's ground truth as JSON; the file appears when it is whole.
+
+    Args:
+        annotations: Annotation file.
+        target: JSON file to write.
+
+    Returns:
+        Number of samples written.
+
+    Raises:
+        ValueError: If a sample has no ground truth.
+    """
+    file = AnnotationFile(annotations)
+    meta = file.meta
+    head = {
+        "dataset": meta.dataset, "split": meta.split, "frame": meta.frame, "classes": meta.classes,
+        "x_range": meta.x_range, "y_range": meta.y_range, "versions": meta.versions,
+    }  # fmt: skip
+    partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with partial.open("w") as out:
+            out.write(f'{{"meta": {json.dumps(head)}, "frames": [')
+            for number, sample in enumerate(_known(file)):
+                out.write(",\n" if number else "\n")
+                json.dump(frame_record(sample), out)
+            out.write("\n]}\n")
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
+    return len(file)
+
+
+def _known(file: AnnotationFile) -> Iterator[MapSample]:
+    for sample in file:
+        if sample.instances is None:
+            raise ValueError(f"{file.path}: sample {sample.token!r} has no ground truth to export.")
+        yield sample
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``tools/create_data.py export``."""
+    parser.add_argument("annotations", type=Path, help="annotation file (.arrow)")
+    parser.add_argument("target", type=Path, help="JSON file to write")
+
+
+def run(arguments: argparse.Namespace, command: str) -> str:
+    """Export as the command line asks and say how much was written."""
+    del command
+    count = export_json(arguments.annotations, arguments.target)
+    return f"{count} samples written to {arguments.target}"

@@ -1,0 +1,89 @@
+"""Command line of the nuScenes converter: ``tools/create_data.py nuscenes``."""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tqdm import tqdm
+
+from gsmap.datasets.annotation_record import CLASSES
+from gsmap.datasets.converters.nuscenes import NuScenesOptions, convert_nuscenes
+from gsmap.datasets.converters.nuscenes_map import MAP_CLASSES
+from gsmap.datasets.converters.worker_pool import default_workers
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the converter's options to a parser."""
+    parser.add_argument(
+        "--root", type=Path, required=True, help="data root with maps, samples, v1.0-..."
+    )
+    parser.add_argument(
+        "--version", default="v1.0-trainval", help="version folder (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--out-dir",
+        type=Path,
+        help="where gsmap_<dataset>_<split>.arrow go (default: the data root)",
+    )
+    parser.add_argument("--dataset", default="nuscenes", help="name of the data set in the files")
+    parser.add_argument("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
+    parser.add_argument(
+        "--classes", nargs="+", default=list(CLASSES), choices=MAP_CLASSES, metavar="CLASS",
+        help=f"classes in label order, of {', '.join(MAP_CLASSES)} (default: the first three)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--x-range", type=float, nargs=2, default=(-15.0, 15.0), metavar=("MIN", "MAX")
+    )
+    parser.add_argument(
+        "--y-range", type=float, nargs=2, default=(-30.0, 30.0), metavar=("MIN", "MAX")
+    )
+    parser.add_argument(
+        "--max-sweeps", type=int, default=10, help="earlier LiDAR sweeps to list per sample"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=default_workers(), help="processes (default: all cores)"
+    )
+    parser.add_argument("--tag", default="", help="appended to the file names, such as _extended")
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[tqdm]:
+    """Show a progress bar whose total is set later."""
+    with tqdm(desc=title, unit="sample", smoothing=0.05) as bar:
+        yield bar
+
+
+def run(arguments: argparse.Namespace, command: str) -> str:
+    """Convert as the command line asks.
+
+    Args:
+        arguments: Parsed options.
+        command: The command line as typed.
+
+    Returns:
+        The summary as text.
+    """
+    options = NuScenesOptions(
+        root=arguments.root,
+        version=arguments.version,
+        out_dir=arguments.out_dir,
+        dataset=arguments.dataset,
+        split_file=arguments.split_file,
+        classes=tuple(arguments.classes),
+        x_range=tuple(arguments.x_range),
+        y_range=tuple(arguments.y_range),
+        max_sweeps=arguments.max_sweeps,
+        workers=arguments.workers,
+        tag=arguments.tag,
+        command=command,
+    )
+    with progress_bar(f"{options.dataset} {options.version}") as bar:
+
+        def advance(kind: str, count: int) -> None:
+            if kind:
+                bar.reset(total=count)
+            else:
+                bar.update(count)
+
+        return convert_nuscenes(options, advance).text()

@@ -1,0 +1,98 @@
+"""Which scenes belong to which split, and whether splits overlap on the ground."""
+
+import json
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+OVERLAP_DISTANCE_M = 5.0
+
+
+def read_split_file(path: Path) -> dict[str, list[str]]:
+    """Read a split file: JSON, an object with a list of scene names or tokens for each split.
+
+    It is the format of the nuScenes devkit's own ``splits.json``.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Scene names or tokens by split.
+
+    Raises:
+        FileNotFoundError: If it does not exist.
+        ValueError: If it has another form, or a scene stands in two splits.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no split file at {path}.")
+    try:
+        splits = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"split file {path} is not JSON: {error}.") from error
+    if not isinstance(splits, dict) or not all(
+        isinstance(scenes, list) and all(isinstance(s, str) for s in scenes)
+        for scenes in splits.values()
+    ):
+        raise ValueError(
+            f'split file {path} must look like {{"train": ["scene-0001", ...], "val": [...]}}.'
+        )
+    owner: dict[str, str] = {}
+    for split, scenes in splits.items():
+        for scene in scenes:
+            if owner.setdefault(scene, split) != split:
+                raise ValueError(f"{path}: scene {scene} is in both {owner[scene]} and {split}.")
+    return splits
+
+
+def resolve_scenes(
+    splits: Mapping[str, Collection[str]], names: Mapping[str, str]
+) -> tuple[dict[str, list[str]], list[str]]:
+    """Turn scene names or tokens into names of scenes that exist.
+
+    Args:
+        splits: Names or tokens by split.
+        names: Name of each scene of the data set, by token.
+
+    Returns:
+        Names by split, in the data set's order, and the entries that the data set does not have.
+
+    Raises:
+        ValueError: If a scene is in two splits, once by name and once by token.
+    """
+    known = {name: name for name in names.values()} | dict(names)
+    resolved: dict[str, list[str]] = {}
+    missing, seen = [], set()
+    for split, entries in splits.items():
+        chosen = {known[entry] for entry in entries if entry in known}
+        missing += [entry for entry in entries if entry not in known]
+        if chosen & seen:
+            raise ValueError(f"scenes {sorted(chosen & seen)} are in more than one split.")
+        seen |= chosen
+        resolved[split] = [name for name in names.values() if name in chosen]
+    return resolved, missing
+
+
+def overlap_share(
+    train: Mapping[str, np.ndarray],
+    val: Mapping[str, np.ndarray],
+    distance_m: float = OVERLAP_DISTANCE_M,
+) -> float:
+    """Return the share of validation positions that lie near a training position on the same map.
+
+    Args:
+        train: Positions (x, y) in metres by map name. each (n, 2)
+        val: Positions by map name. each (m, 2)
+        distance_m: What counts as near, in metres, inclusive.
+
+    Returns:
+        A share in [0, 1]; 0 without validation positions.
+    """
+    total = sum(len(positions) for positions in val.values())
+    near = 0
+    for name, positions in val.items():
+        if len(positions) and len(train.get(name, ())):
+            distances, _ = cKDTree(train[name]).query(positions)
+            near += int((distances <= distance_m).sum())
+    return near / total if total else 0.0
