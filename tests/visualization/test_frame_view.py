@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+
+from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView, resolve_frame_view
+
+
+def test_ahead_is_up_in_both_frames():
+    ahead_and_right = {"lidar": [2.0, 10.0], "ego": [10.0, -2.0]}
+    for frame, point in ahead_and_right.items():
+        np.testing.assert_allclose(
+            FRAME_VIEWS[frame].display_from_frame(np.array([point])), [[2, 10]]
+        )
+
+
+def test_display_turn_agrees_with_the_points():
+    for view in FRAME_VIEWS.values():
+        turn = view.display_turn_rad
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        points = np.array([[1.0, 2.0], [-3.0, 0.5]])
+        np.testing.assert_allclose(view.display_from_frame(points), points @ rotation.T, atol=1e-12)
+
+
+def test_lifted_uses_own_height_or_the_plane():
+    view = FrameView("y", (0.1, -0.2, -1.5), (-1, 1, 1))
+    np.testing.assert_allclose(view.lifted(np.array([[1.0, 2, 7]])), [[1, 2, 7]])
+    np.testing.assert_allclose(view.lifted(np.array([[1.0, 2]])), [[1, 2, 0.1 - 0.4 - 1.5]])
+
+
+def test_tilted_plane_is_the_vehicles_ground():
+    angle = np.radians(1.4)
+    ego_from_lidar = np.eye(4)
+    ego_from_lidar[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    ego_from_lidar[:3, 3] = [0.9, 0.0, 1.84]
+    view = FRAME_VIEWS["lidar"].tilted(ego_from_lidar)
+    ground = view.lifted(np.array([[0.0, 0], [5, 20], [-5, -20]]))
+    in_vehicle = ground @ ego_from_lidar[:3, :3].T + ego_from_lidar[:3, 3]
+    np.testing.assert_allclose(in_vehicle[:, 2], 0, atol=1e-12)
+
+
+def test_level_ground_and_identity_mounting():
+    assert FRAME_VIEWS["ego"].tilted(np.eye(4)).ground == (0, 0, -0.31)
+    assert FRAME_VIEWS["ego"].level(-2).ground == (0, 0, -2)
+
+
+def test_resolution_by_data_set():
+    assert resolve_frame_view(None) is FRAME_VIEWS["lidar"]
+    assert resolve_frame_view({"frame": "ego"}) is FRAME_VIEWS["ego"]
+    with pytest.raises(ValueError, match="No view is known for frame 'map'"):
+        resolve_frame_view({"frame": "map"})
+    with pytest.raises(ValueError, match="forward must be"):
+        FrameView("z", (0, 0, 0), (-1, 1, 1))

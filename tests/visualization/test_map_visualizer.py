@@ -1,0 +1,196 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+from mmdet3d.registry import HOOKS, VISUALIZERS
+from mmdet3d.structures import Det3DDataSample
+from mmengine.structures import InstanceData
+
+from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
+from gsmap.visualization.map_visualization_hook import picture_name
+from gsmap.visualization.map_visualizer import read_image
+
+CLASSES = ("divider", "ped_crossing", "boundary")
+
+
+def make_sample(folder, gaussians=True, truth=True, cameras=2, token="scene/1"):
+    paths = []
+    for i in range(cameras):
+        path = folder / f"camera{i}.jpg"
+        cv2.imwrite(str(path), np.full((90, 160, 3), 80, np.uint8))
+        paths.append(str(path))
+    projection = np.array([[80.0, 80, 0, 0], [0, 45, -80, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    half = np.diag([0.5, 0.5, 1, 1])
+    info = {"polylines": [np.array([[0.0, 1], [0, 20]])], "labels": np.array([0])}
+    sample = Det3DDataSample(
+        metainfo={
+            "token": token,
+            "scene": "scene",
+            "img_path": paths,
+            "cam_names": [f"CAM_{i}" for i in range(cameras)],
+            "lidar2img": np.stack([half @ projection] * cameras),
+            "img_aug_matrix": np.stack([half] * cameras),
+            "eval_ann_info": info if truth else None,
+        }
+    )
+    fields = {
+        "scores_3d": torch.tensor([0.9, 0.2, 0.6]),
+        "labels_3d": torch.tensor([0, 1, 2]),
+        "pts": torch.arange(3 * 4 * 2, dtype=torch.float32).reshape(3, 4, 2) / 2,
+    }
+    if gaussians:
+        fields |= {"scales": torch.full((3, 4, 2), 0.5), "rotations": torch.zeros(3, 4)}
+    sample.pred_instances_3d = InstanceData(**fields)
+    return sample
+
+
+def make_visualizer(name, **options):
+    visualizer = VISUALIZERS.build({"type": "MapVisualizer", "name": name, **options})
+    visualizer.dataset_meta = {"classes": CLASSES, "frame": "lidar"}
+    return visualizer
+
+
+def titles(figure):
+    return [ax.get_title() for ax in figure.axes if ax.get_title()]
+
+
+def test_panels_follow_what_the_sample_has(tmp_path):
+    visualizer = make_visualizer("panels", width_px=500)
+    full = ["Ground truth", "Prediction", "Gaussians (1$\\sigma$)", "Rendered masks"]
+    assert titles(visualizer.draw_sample(make_sample(tmp_path))) == full
+    assert titles(visualizer.draw_sample(make_sample(tmp_path, gaussians=False))) == full[:2]
+    sample = make_sample(tmp_path, truth=False)
+    assert titles(visualizer.draw_sample(sample)) == full[1:]
+    assert titles(visualizer.draw_sample(sample, score_thr=0.99)) == full[1:]
+    assert titles(visualizer.draw_sample(make_sample(tmp_path), draw_pred=False)) == full[:1]
+
+
+def test_predictions_are_chosen_by_score_and_drawn_in_its_order(tmp_path):
+    sample = make_sample(tmp_path)
+    found = predicted_elements(sample, score_thr=0.5)
+    assert found.labels.tolist() == [2, 0]
+    np.testing.assert_allclose(found.polylines[1], sample.pred_instances_3d.pts[0])
+    np.testing.assert_allclose(found.scales[0], sample.pred_instances_3d.scales[2])
+    assert predicted_elements(sample, max_num=1).labels.tolist() == [0]
+
+
+def test_ground_truth_falls_back_to_the_training_targets(tmp_path):
+    sample = make_sample(tmp_path, truth=False)
+    assert ground_truth_elements(sample) is None
+    sample.gt_instances_3d = InstanceData(pts=torch.ones(2, 20, 2), labels_3d=torch.tensor([2, 0]))
+    assert ground_truth_elements(sample).labels.tolist() == [2, 0]
+
+
+def test_projections_lose_the_augmentation_for_original_files_only(tmp_path):
+    visualizer = make_visualizer("projections")
+    meta = make_sample(tmp_path).metainfo
+    original = visualizer.cameras(meta)[0]
+    assert original.image.shape == (90, 160, 3)
+    np.testing.assert_allclose(original.img_from_frame[0], [80, 80, 0, 0])
+    seen = visualizer.cameras(meta, [np.zeros((45, 80, 3), np.uint8)] * 2)[0]
+    np.testing.assert_allclose(seen.img_from_frame[0], [40, 40, 0, 0])
+    with pytest.raises(ValueError, match="1 images, but 2 projections"):
+        visualizer.cameras(meta, [np.zeros((45, 80, 3), np.uint8)])
+
+
+def test_ground_follows_the_mounting_or_the_option():
+    mounting = np.eye(4)
+    mounting[2, 3] = 2.5
+    assert make_visualizer("mounted").frame_view({"lidar2ego": mounting}).ground == (0, 0, -2.5)
+    assert make_visualizer("usual").frame_view({}).ground == (0, 0, -1.84)
+    fixed = make_visualizer("fixed", ground_z_m=-1.0)
+    assert fixed.frame_view({"lidar2ego": mounting}).ground == (0, 0, -1.0)
+
+
+def test_extent_comes_from_the_data_set_or_the_option():
+    visualizer = make_visualizer("extent")
+    visualizer.dataset_meta = {"x_range": (-30, 30), "y_range": (-15, 15), "frame": "ego"}
+    assert visualizer.grid.x_range == (-30, 30)
+    chosen = make_visualizer("chosen", pc_range=[-1, -2, -3, 1, 2, 3])
+    assert (chosen.grid.x_range, chosen.grid.y_range) == ((-1, 1), (-2, 2))
+
+
+def test_pictures_reach_tensorboard(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    visualizer = make_visualizer(
+        "board",
+        width_px=300,
+        vis_backends=[{"type": "TensorboardVisBackend"}],
+        save_dir=str(tmp_path),
+    )
+    visualizer.add_datasample("val_1", None, make_sample(tmp_path), step=7)
+    visualizer.close()
+    events = EventAccumulator(str(tmp_path / "vis_data")).Reload()
+    image = events.Images("val_1")[0]
+    assert (image.step, image.width) == (7, 300)
+
+
+class FakeRunner:
+    """What the hook reads off a runner."""
+
+    def __init__(self, visualizer, batches=10, rank=0):
+        self.visualizer, self.rank, self.iter = visualizer, rank, 3
+        self.val_dataloader = range(batches)
+
+
+def test_test_pictures_go_to_the_folder_named_by_token(tmp_path):
+    out = tmp_path / "out"
+    hook = HOOKS.build(
+        {
+            "type": "MapVisualizationHook",
+            "draw": True,
+            "interval": 2,
+            "max_samples": 2,
+            "test_out_dir": str(out),
+        }
+    )
+    runner = FakeRunner(make_visualizer("test-hook", width_px=300))
+    samples = [make_sample(tmp_path, cameras=1, token=f"a/{i}") for i in range(7)]
+    hook.before_test_epoch(runner)
+    for start in (0, 4):
+        hook.after_test_iter(runner, 0, {}, samples[start : start + 4])
+    assert sorted(p.name for p in out.iterdir()) == ["a_0.jpg", "a_2.jpg"]
+
+
+def test_validation_draws_the_same_few_samples_on_rank_0(tmp_path, monkeypatch):
+    visualizer = make_visualizer("val-hook")
+    drawn = []
+    monkeypatch.setattr(
+        visualizer, "add_datasample", lambda name, *args, **kw: drawn.append((name, kw["step"]))
+    )
+    hook = HOOKS.build({"type": "MapVisualizationHook", "draw": True, "num_val_samples": 3})
+    sample = make_sample(tmp_path)
+    for index in range(10):
+        sample.set_metainfo({"token": str(index)})
+        hook.after_val_iter(FakeRunner(visualizer), index, {}, [sample])
+        hook.after_val_iter(FakeRunner(visualizer, rank=1), index, {}, [sample])
+    assert drawn == [("val_0", 3), ("val_3", 3), ("val_6", 3)]
+
+
+def test_hook_is_silent_unless_told_to_draw(tmp_path):
+    hook = HOOKS.build({"type": "MapVisualizationHook", "test_out_dir": str(tmp_path / "out")})
+    hook.after_test_iter(FakeRunner(None), 0, {}, [make_sample(tmp_path)])
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_arguments(tmp_path):
+    with pytest.raises(ValueError, match="panels must be among"):
+        make_visualizer("bad-1", panels=["lidar"])
+    with pytest.raises(ValueError, match="camera_source must be one of"):
+        make_visualizer("bad-2", camera_source="both")
+    with pytest.raises(ValueError, match="interval must be >= 1"):
+        HOOKS.build({"type": "MapVisualizationHook", "interval": 0})
+    hook = HOOKS.build({"type": "MapVisualizationHook", "draw": True, "test_out_dir": "x"})
+    with pytest.raises(TypeError, match="needs visualizer=dict"):
+        hook.after_test_iter(FakeRunner(None), 0, {}, [make_sample(tmp_path)])
+    assert picture_name("a/b:c..d", ".png") == "a_b_c..d.png"
+
+
+def test_missing_and_truncated_images_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"No image at .*gone.jpg"):
+        read_image(tmp_path / "gone.jpg")
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"\xff\xd8\xff\xe0 not an image")
+    with pytest.raises(ValueError, match=r"broken.jpg is not a readable image"):
+        read_image(broken)

@@ -1,0 +1,87 @@
+import json
+
+import numpy as np
+import pytest
+
+from gsmap.visualization.figure import figure_to_rgb
+from gsmap.visualization.run_curves import plot_runs, read_run, smoothed, summary_table
+
+
+def write_log(folder, start, records):
+    path = folder / start / "vis_data" / "scalars.json"
+    path.parent.mkdir(parents=True)
+    path.write_text("\n".join(json.dumps(r) for r in records))
+    return path
+
+
+@pytest.fixture
+def run(tmp_path):
+    folder = tmp_path / "demo"
+    train = [
+        {"loss": 8.0 / s, "loss_pts": 4.0 / s, "d0.loss_pts": 5.0 / s, "time": 0.5, "step": s}
+        for s in (1, 2, 4)
+    ]
+    write_log(folder, "20260101_000000", [*train, {"chamfer/mAP": 0.25, "time": 0.1, "step": 1}])
+    later = [{"loss": 1.0, "loss_pts": 0.5, "time": 0.7, "step": s} for s in (4, 8)]
+    write_log(
+        folder,
+        "20260102_000000",
+        [
+            *later,
+            {"chamfer/mAP": 0.75, "chamfer/divider/AP": 0.9, "step": 2},
+            {"chamfer/mAP": 0.5, "step": 3},
+        ],
+    )
+    return folder
+
+
+def test_resumed_run_is_joined_and_the_later_record_counts(run):
+    log = read_run(run)
+    steps, values = log.series("loss")
+    assert steps.tolist() == [1, 2, 4, 8]
+    assert values.tolist() == [8, 4, 1, 1]
+    assert log.series("chamfer/mAP", validation=True)[1].tolist() == [0.25, 0.75, 0.5]
+    assert log.metrics == ["chamfer/mAP"]
+
+
+def test_table_gives_last_and_best(run):
+    rows = [
+        [c.strip() for c in line.split("|")[1:-1]]
+        for line in summary_table([read_run(run)]).split("\n")
+    ]
+    assert rows[0][-1] == "chamfer/mAP (last / best)"
+    assert rows[2] == ["demo", "8", "8", "1", "0.6", "0.5 / 0.75"]
+
+
+def test_plot_shows_total_parts_and_metrics(run):
+    figure = plot_runs([read_run(run), read_run(run, "again")])
+    total, parts, metrics = figure.axes
+    assert [line.get_label() for line in parts.lines] == ["loss_pts"]
+    np.testing.assert_allclose(metrics.lines[0].get_ydata(), [0.25, 0.75, 0.5])
+    assert total.lines[1].get_label() == "demo"
+    assert figure_to_rgb(figure).std() > 10
+
+
+def test_values_that_are_not_finite_are_left_out(tmp_path):
+    path = write_log(tmp_path, "a", [{"loss": float("nan"), "step": 1}, {"loss": 2.0, "step": 2}])
+    assert read_run(path, "x").series("loss")[0].tolist() == [2]
+
+
+def test_smoothed_is_a_running_mean():
+    np.testing.assert_allclose(smoothed(np.array([2.0, 4, 6, 8]), 2), [2, 3, 5, 7])
+
+
+def test_unfinished_last_line_is_dropped_but_a_broken_one_is_named(tmp_path):
+    path = write_log(tmp_path, "a", [{"loss": 1.0, "step": 1}])
+    path.write_text(path.read_text() + '\n{"loss": 2.0, "st')
+    assert len(read_run(tmp_path).train) == 1
+    path.write_text('{"loss"\n{"loss": 1.0, "step": 1}')
+    with pytest.raises(ValueError, match=r"scalars.json, line 1 is not JSON"):
+        read_run(tmp_path)
+
+
+def test_missing_log_and_no_runs(tmp_path):
+    with pytest.raises(FileNotFoundError, match="No vis_data/scalars"):
+        read_run(tmp_path)
+    with pytest.raises(ValueError, match="at least one run"):
+        plot_runs([])

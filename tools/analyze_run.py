@@ -1,0 +1,44 @@
+#!/usr/bin/env python
+"""Draw the loss and metric curves of training runs and print a table of them.
+
+Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out curves.png``.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from gsmap.visualization.figure import save_figure
+from gsmap.visualization.run_curves import plot_runs, read_run, summary_table
+
+
+def parse_args() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "runs", nargs="+", type=Path, help="work folders of runs, or scalars.json files"
+    )
+    parser.add_argument("--names", nargs="+", help="a name for each run, for the legend")
+    parser.add_argument("--out", type=Path, help="picture to write: .png, .jpg, .pdf or .svg")
+    parser.add_argument("--table", type=Path, help="also write the Markdown table to this file")
+    return parser.parse_args()
+
+
+def main() -> None:
+    args = parse_args()
+    names = args.names or [None] * len(args.runs)
+    if len(names) != len(args.runs):
+        sys.exit(f"--names gives {len(names)} names for {len(args.runs)} runs.")
+    try:
+        runs = [read_run(path, name) for path, name in zip(args.runs, names, strict=True)]
+        table = summary_table(runs)
+        print(table)
+        if args.table:
+            args.table.write_text(table + "\n")
+        if args.out:
+            print(f"curves: {save_figure(plot_runs(runs), args.out)}")
+    except (FileNotFoundError, ValueError) as error:
+        sys.exit(str(error))
+
+
+if __name__ == "__main__":
+    main()
