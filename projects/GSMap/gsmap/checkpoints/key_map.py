@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -135,7 +136,72 @@ MAPTR_BEVFORMER = KeyMap(
     ),
 )
 
-KEY_MAPS: list[KeyMap] = [MAPTR_BEVFORMER, MAPTR]
+_V2_ENCODER = _TRANSFORMER + "encoder."
+_BY_QUERIES = "part of the encoder with learned BEV queries, which depth lifting does not run"
+
+
+def _unused_zeros(reason: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, UnusedKey]:
+    """Return parameters that have no effect on any output: zeros do as well as what was trained."""
+    return {key: UnusedKey(reason, partial(torch.zeros, shape)) for key, shape in shapes.items()}
+
+
+def _constants(reason: str, values: Mapping[str, tuple[float, ...]]) -> dict[str, UnusedKey]:
+    """Return numbers of the configuration that upstream keeps in its state."""
+    return {key: UnusedKey(reason, partial(torch.tensor, value)) for key, value in values.items()}
+
+
+MAPTRV2 = KeyMap(
+    name="maptrv2",
+    rules=(
+        *IMAGE_RULES,
+        *HEAD_RULES,
+        (_HEAD + "seg_head.", "map_head.seg_head."),
+        (_HEAD + "pv_seg_head.", "map_head.pv_seg_head."),
+        (_V2_ENCODER + "depth_net.", "bev_encoder.depth_net."),
+        (_V2_ENCODER + "downsample.", "bev_encoder.downsample."),
+        (_DECODER_LAYER + "attentions.0.attn.", "map_head.decoder.layers.{i}.self_attn."),
+        (_DECODER_LAYER + "attentions.1.attn.", "map_head.decoder.layers.{i}.point_attn."),
+        (_DECODER_LAYER + "attentions.2.", "map_head.decoder.layers.{i}.cross_attn."),
+        (_DECODER_LAYER + "ffns.0.", "map_head.decoder.layers.{i}.ffn."),
+        (_DECODER_LAYER + "norms.", "map_head.decoder.layers.{i}.norms."),
+    ),
+    unused={
+        **CODE_WEIGHTS,
+        **_unused_zeros(
+            _BY_QUERIES,
+            {
+                _HEAD + "positional_encoding.row_embed.weight": (200, 128),
+                _HEAD + "positional_encoding.col_embed.weight": (100, 128),
+                _TRANSFORMER + "level_embeds": (4, 256),
+                _TRANSFORMER + "cams_embeds": (6, 256),
+                _TRANSFORMER + "can_bus_mlp.0.weight": (128, 18),
+                _TRANSFORMER + "can_bus_mlp.0.bias": (128,),
+                _TRANSFORMER + "can_bus_mlp.2.weight": (256, 128),
+                _TRANSFORMER + "can_bus_mlp.2.bias": (256,),
+                _TRANSFORMER + "can_bus_mlp.norm.weight": (256,),
+                _TRANSFORMER + "can_bus_mlp.norm.bias": (256,),
+            },
+        ),
+        **_constants(
+            "the grid of voxels, which the config says: size, first centre and number (x, y, z)",
+            {
+                _V2_ENCODER + "dx": (0.15, 0.15, 20.0),
+                _V2_ENCODER + "bx": (-14.925, -29.925, 0.0),
+                _V2_ENCODER + "nx": (200.0, 400.0, 1.0),
+            },
+        ),
+        **_constants(
+            "weight of the foreground in a mask loss, which the config says",
+            {
+                _HEAD + "loss_seg.loss_fn.pos_weight": (4.0,),
+                _HEAD + "loss_pv_seg.loss_fn.pos_weight": (1.0,),
+            },
+        ),
+    },
+    marker=(_V2_ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv."),
+)
+
+KEY_MAPS: list[KeyMap] = [MAPTRV2, MAPTR_BEVFORMER, MAPTR]
 """Known architectures, the most special first; the last needs no marker."""
 
 

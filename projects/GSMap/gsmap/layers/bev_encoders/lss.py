@@ -105,8 +105,8 @@ class LSSEncoder(BaseModule):
                 4).
 
         Returns:
-            ``bev_feats`` (B, C, H, W), row 0 at the smallest y, and ``depth``, the probability of
-            each depth bin (B, V, D, h, w).
+            ``bev_feats`` (B, C, H, W), row 0 at the smallest y; ``depth``, the probability of each
+            depth bin (B, V, D, h, w); ``img_feats``, the image features used (B, V, C, h, w).
 
         Raises:
             ValueError: If a sample lacks a matrix.
@@ -121,7 +121,7 @@ class LSSEncoder(BaseModule):
         with torch.autocast(feats.device.type, enabled=False):
             kernel = cast(Tensor, self.downsample[0].weight)
             bev = bev_pool_conv3x3(depth, context, indices, self.cells, kernel.float())
-        return {"bev_feats": self.downsample[1:](bev), "depth": depth}
+        return {"bev_feats": self.downsample[1:](bev), "depth": depth, "img_feats": feats}
 
     def points(self, img_metas: Sequence[dict[str, Any]], feats: Tensor) -> Tensor:
         """Return every feature pixel at every depth, in metres. (B, V, D, h, w, 3)"""
