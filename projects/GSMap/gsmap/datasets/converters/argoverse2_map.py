@@ -147,16 +147,18 @@ class Argoverse2Map:
         self,
         city_from_ego: np.ndarray,
         classes: Collection[str] = MAP_CLASSES[:3],
-        extent_m: tuple[float, float] = (60.0, 30.0),
         compat: str = "maptrv2",
+        x_range: tuple[float, float] = (-30.0, 30.0),
+        y_range: tuple[float, float] = (-15.0, 15.0),
     ) -> dict[str, list[np.ndarray]]:
         """Return the map elements around the vehicle, in its frame (x forward, y left, z up).
 
         Args:
             city_from_ego: Pose of the vehicle. (4, 4)
             classes: Which of ``MAP_CLASSES`` to extract.
-            extent_m: Size of the patch along x and y in metres.
             compat: ``maptrv2`` or ``maptr``: whose rules.
+            x_range: Smallest and largest x (forward) in metres.
+            y_range: Smallest and largest y (left) in metres.
 
         Returns:
             For each class, the vertices of its elements in metres. list of (n, 3)
@@ -169,7 +171,7 @@ class Argoverse2Map:
         unknown = set(classes) - set(MAP_CLASSES)
         if unknown:
             raise ValueError(f"classes must be among {MAP_CLASSES}, got {sorted(unknown)}.")
-        patch = EgoPatch(np.asarray(city_from_ego, dtype=np.float64), extent_m)
+        patch = EgoPatch(np.asarray(city_from_ego, dtype=np.float64), x_range, y_range)
         lanes = self._lanes.touching(patch)
         maptr = compat == "maptr"
         rules = {

@@ -7,6 +7,8 @@ from functools import cached_property
 import numpy as np
 import shapely
 
+from gsmap.datasets.converters.local_map import LocalPatch
+
 EDGE_MARGIN_M = 0.2
 DUPLICATE_IOU = 0.9
 DUPLICATE_BUFFER_M = 1.0
@@ -15,45 +17,33 @@ PARALLEL_COSINE_GAP = 0.01  # about 8 degrees
 _LINE, _POLYGON, _COLLECTION = 1, 3, 7  # shapely type ids
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EgoPatch:
-    """The rectangle of the map that a sample sees, centred on the vehicle and turned with it.
+    """The rectangle of the map that a sample sees, turned with the vehicle.
 
     Args:
         city_from_ego: Pose of the vehicle. (4, 4)
-        extent_m: Size along the vehicle's x (forward) and y (left) in metres.
-
-    Raises:
-        ValueError: If the pose is not a finite 4 x 4 matrix or the extent is not positive.
+        x_range: Smallest and largest x (forward) in the vehicle's frame, in metres.
+        y_range: Smallest and largest y (left) in the vehicle's frame, in metres.
     """
 
     city_from_ego: np.ndarray
-    extent_m: tuple[float, float] = (60.0, 30.0)
-
-    def __post_init__(self) -> None:
-        pose = np.asarray(self.city_from_ego)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError(
-                f"city_from_ego must be a finite 4 x 4 matrix, got shape {pose.shape}."
-            )
-        if min(self.extent_m) <= 2 * EDGE_MARGIN_M:
-            raise ValueError(f"extent_m must exceed {2 * EDGE_MARGIN_M} m, got {self.extent_m}.")
+    x_range: tuple[float, float] = (-30.0, 30.0)
+    y_range: tuple[float, float] = (-15.0, 15.0)
 
     @cached_property
     def polygon(self) -> shapely.Polygon:
-        """The rectangle in the city's plane: the vehicle's yaw turns it, roll and pitch do not."""
-        pose = self.city_from_ego
-        forward = pose[:2, 0] / np.hypot(*pose[:2, 0])
-        left = np.array([-forward[1], forward[0]])
-        corners = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * np.asarray(self.extent_m) / 2
-        polygon = shapely.Polygon(pose[:2, 3] + corners @ np.stack([forward, left]))
-        shapely.prepare(polygon)
-        return polygon
+        """The rectangle in the city's plane: the vehicle's yaw turns it, roll and pitch do not.
+
+        Raises:
+            ValueError: If the pose is not a finite 4 x 4 matrix.
+        """
+        return LocalPatch.from_pose(self.city_from_ego, self.x_range, self.y_range).polygon
 
     def box(self, margin_m: float) -> shapely.Polygon:
         """Return the rectangle in the vehicle's frame, enlarged by ``margin_m`` on every side."""
-        x, y = (size / 2 + margin_m for size in self.extent_m)
-        return shapely.box(-x, -y, x, y)
+        (x0, x1), (y0, y1) = self.x_range, self.y_range
+        return shapely.box(x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
 
     def to_ego(self, geometries: np.ndarray) -> np.ndarray:
         """Move geometries from the city to the vehicle's frame, roll and pitch included."""

@@ -3,6 +3,8 @@
 import argparse
 import json
 import os
+import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -40,6 +42,26 @@ def frame_record(sample: MapSample) -> dict[str, Any]:
     }
 
 
+def log_frame_record(sample: MapSample, row: int) -> dict[str, Any]:
+    """Return one sample of an Argoverse 2 log as a JSON object.
+
+    Args:
+        sample: A sample with ground truth.
+        row: Row of the log's pose table, which is ordered by time.
+
+    Returns:
+        Log, row and pose with the ``vectors``: label and points in metres, rounded to 1e-6 m.
+    """
+    record = frame_record(sample)
+    return {
+        "log": sample.scene,
+        "row": row,
+        "timestamp_ns": sample.timestamp_ns,
+        "city_from_ego": sample.global_from_frame.tolist(),
+        "vectors": record["vectors"],
+    }
+
+
 def export_json(annotations: Path, target: Path) -> int:
     """Write an annotation file's ground truth as JSON; the file appears when it is whole.
 
@@ -64,14 +86,26 @@ def export_json(annotations: Path, target: Path) -> int:
     try:
         with partial.open("w") as out:
             out.write(f'{{"meta": {json.dumps(head)}, "frames": [')
-            for number, sample in enumerate(_known(file)):
+            for number, record in enumerate(_records(file)):
                 out.write(",\n" if number else "\n")
-                json.dump(frame_record(sample), out)
+                json.dump(record, out)
             out.write("\n]}\n")
         os.replace(partial, target)
     finally:
         partial.unlink(missing_ok=True)
     return len(file)
+
+
+def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
+    """Yield each sample as JSON: by log and row where the rows of the pose table are known."""
+    stride = re.fullmatch(r"poses:(\d+)", str(file.meta.options.get("at")))
+    position: Counter[str] = Counter()
+    for sample in _known(file):
+        if stride is None:
+            yield frame_record(sample)
+        else:  # every N-th row was taken and none left out
+            yield log_frame_record(sample, int(stride[1]) * position[sample.scene])
+            position[sample.scene] += 1
 
 
 def _known(file: AnnotationFile) -> Iterator[MapSample]:

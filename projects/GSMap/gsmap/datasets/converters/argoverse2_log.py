@@ -1,0 +1,192 @@
+"""The folder of one Argoverse 2 log: poses, calibration, and when each sensor fired."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from av2.datasets.sensor.constants import RingCameras
+from av2.geometry.camera.pinhole_camera import PinholeCamera
+from av2.geometry.geometry import quat_to_mat
+from av2.utils.io import read_feather
+from av2.utils.synchronization_database import SynchronizationDB
+
+# The order of MapTR and MapTRv2: camera embeddings of their checkpoints depend on it.
+RING_CAMERAS = (
+    RingCameras.RING_FRONT_CENTER.value,
+    RingCameras.RING_FRONT_RIGHT.value,
+    RingCameras.RING_FRONT_LEFT.value,
+    RingCameras.RING_REAR_RIGHT.value,
+    RingCameras.RING_REAR_LEFT.value,
+    RingCameras.RING_SIDE_RIGHT.value,
+    RingCameras.RING_SIDE_LEFT.value,
+)
+MAX_CAMERA_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_RING_CAM_TIMESTAMP_DIFF)  # 25 ms
+MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 51 ms
+
+BROKEN_LOGS = {
+    "01bb304d-7bd8-35f8-bbef-7086b688e35e": "its map or sensor data cannot be used (known to fail)",
+    "453e5558-6363-38e3-bf9b-42b5ba0a6f1d": "its map or sensor data cannot be used (known to fail)",
+}
+MAP_CHANGE_LOGS = {
+    log_id: "its map was changed on purpose and contradicts the images (Argoverse 2's own note)"
+    for log_id in (
+        "75e8adad-50a6-3245-8726-5e612db3d165",
+        "54bc6dbc-ebfb-3fba-b5b3-57f88b4b79ca",
+        "af170aac-8465-3d7b-82c5-64147e94af7d",
+        "6e106cf8-f6dd-38f6-89c8-9be7a71e7275",
+    )
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTable:
+    """The vehicle's poses, in the order of time.
+
+    Args:
+        timestamps_ns: Strictly ascending. (n,)
+        city_from_ego: Pose at each time. (n, 4, 4)
+    """
+
+    timestamps_ns: np.ndarray
+    city_from_ego: np.ndarray
+
+    @classmethod
+    def read(cls, log_dir: Path) -> "PoseTable":
+        """Read ``city_SE3_egovehicle.feather``.
+
+        Args:
+            log_dir: The log's folder.
+
+        Raises:
+            FileNotFoundError: If the table is missing.
+            ValueError: If it is damaged or holds no finite pose.
+        """
+        path = log_dir / "city_SE3_egovehicle.feather"
+        if not path.is_file():
+            raise FileNotFoundError(f"no poses at {path}: download the log again.")
+        try:
+            table = read_feather(path)
+            table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
+            quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
+            translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
+        except (OSError, KeyError) as error:  # pyarrow's ArrowInvalid is a ValueError already
+            raise ValueError(f"{path} is damaged ({error}): download the log again.") from error
+        finite = np.isfinite(quaternions).all(1) & np.isfinite(translations).all(1)
+        if not finite.all() or len(table) == 0:
+            raise ValueError(f"{path} holds {int((~finite).sum())} bad of {len(table)} poses.")
+        poses = np.tile(np.eye(4), (len(table), 1, 1))
+        poses[:, :3, :3] = quat_to_mat(quaternions)
+        poses[:, :3, 3] = translations
+        return cls(table["timestamp_ns"].to_numpy(np.int64), poses)
+
+    def at(self, timestamp_ns: int) -> np.ndarray | None:
+        """Return the pose at exactly this time, or None where the table has no such row. (4, 4)"""
+        row = int(np.searchsorted(self.timestamps_ns, timestamp_ns))
+        if row == len(self.timestamps_ns) or self.timestamps_ns[row] != timestamp_ns:
+            return None
+        return self.city_from_ego[row]
+
+
+class Argoverse2Log:
+    """One log's folder, read on demand.
+
+    Args:
+        log_dir: The folder, named by the log's id.
+
+    Raises:
+        FileNotFoundError: If there is no such folder.
+    """
+
+    def __init__(self, log_dir: Path) -> None:
+        if not log_dir.is_dir():
+            raise FileNotFoundError(f"no log folder {log_dir}.")
+        self.log_dir = log_dir
+        self.log_id = log_dir.name
+
+    @cached_property
+    def poses(self) -> PoseTable:
+        """The vehicle's poses."""
+        return PoseTable.read(self.log_dir)
+
+    @cached_property
+    def city(self) -> str:
+        """Short name of the city, such as ``PIT``; empty if the map's file name does not tell."""
+        names = [path.name for path in (self.log_dir / "map").glob("log_map_archive_*____*.json")]
+        return names[0].split("____")[1].split("_")[0] if names else ""
+
+    @cached_property
+    def calibration(self) -> dict[str, PinholeCamera]:
+        """The calibrated ring cameras by name; empty if the log has no calibration.
+
+        Raises:
+            ValueError: If calibration files are there but damaged.
+        """
+        folder = self.log_dir / "calibration"
+        names = ("intrinsics.feather", "egovehicle_SE3_sensor.feather")
+        if not all((folder / name).is_file() for name in names):
+            return {}
+        try:
+            known = set(read_feather(folder / names[0])["sensor_name"])
+            return {
+                name: PinholeCamera.from_feather(self.log_dir, name)
+                for name in RING_CAMERAS
+                if name in known
+            }
+        except (OSError, KeyError) as error:
+            raise ValueError(f"the calibration in {folder} is damaged ({error}).") from error
+
+    @cached_property
+    def lidar_timestamps_ns(self) -> np.ndarray:
+        """Times of the LiDAR sweeps, ascending. (n,)"""
+        return _timestamps(self.log_dir / "sensors" / "lidar", ".feather")
+
+    @cached_property
+    def image_timestamps_ns(self) -> dict[str, np.ndarray]:
+        """Times of each ring camera's images, ascending. each (n,)"""
+        folder = self.log_dir / "sensors" / "cameras"
+        return {name: _timestamps(folder / name, ".jpg") for name in RING_CAMERAS}
+
+
+def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> int | None:
+    """Return the time closest to the wanted one, or None if it is farther than the tolerance.
+
+    Args:
+        timestamps_ns: Ascending. (n,)
+        wanted_ns: Time to come close to.
+        tolerance_ns: Largest allowed difference.
+    """
+    if len(timestamps_ns) == 0:
+        return None
+    after = int(np.searchsorted(timestamps_ns, wanted_ns))
+    candidates = timestamps_ns[max(after - 1, 0) : after + 1]
+    best = int(candidates[np.abs(candidates - wanted_ns).argmin()])
+    return best if abs(best - wanted_ns) <= tolerance_ns else None
+
+
+def find_split(root: Path, split: str) -> Path:
+    """Return the folder that holds a split's logs.
+
+    Args:
+        root: Data root: the folder above the splits, or the one above ``sensor``.
+        split: ``train``, ``val`` or ``test``.
+
+    Raises:
+        FileNotFoundError: If there is no such split.
+    """
+    for folder in (root / split, root / "sensor" / split):
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(
+        f"no folder {root / split} (nor {root / 'sensor' / split}): --root must name the folder "
+        "that holds train, val and test of the Argoverse 2 sensor data set "
+        "(https://www.argoverse.org/av2.html#download-link)."
+    )
+
+
+def _timestamps(folder: Path, suffix: str) -> np.ndarray:
+    """Return the times in the names of a folder's files, ascending; none if there is no folder."""
+    if not folder.is_dir():
+        return np.empty(0, dtype=np.int64)
+    stems = (path.stem for path in folder.iterdir() if path.suffix == suffix)
+    return np.array(sorted(int(stem) for stem in stems if stem.isdigit()), dtype=np.int64)
