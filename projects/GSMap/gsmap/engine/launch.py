@@ -5,6 +5,7 @@ import difflib
 import os
 from pathlib import Path
 
+import torch
 from mmengine.config import Config, DictAction
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
@@ -62,6 +63,8 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
 def load_config(args: argparse.Namespace) -> Config:
     """Read ``args.config``, apply the command-line options to it, and check the result.
 
+    Without a GPU several processes talk through gloo, whatever the config says.
+
     Raises:
         SystemExit: If the file does not exist.
         ValueError: If the config cannot mean what was intended (see `check_config`).
@@ -77,6 +80,8 @@ def load_config(args: argparse.Namespace) -> Config:
         cfg.work_dir = args.work_dir
     elif cfg.get("work_dir") is None:
         cfg.work_dir = str(Path("work_dirs") / Path(args.config).stem)
+    if not torch.cuda.is_available():
+        cfg.merge_from_dict({"env_cfg.dist_cfg.backend": "gloo"})
     check_config(cfg)
     return cfg
 
