@@ -1,4 +1,5 @@
-# mypy: disable-error-code="no-untyped-def"  # numba infers its types
+# numba infers the types of its kernels:
+# mypy: disable-error-code="no-untyped-def"
 r"""Fused CPU kernels (numba): masks of 2D Gaussians without a tensor per Gaussian.
 
 How the work is laid out

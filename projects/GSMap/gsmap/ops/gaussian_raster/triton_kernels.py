@@ -1,4 +1,5 @@
-# mypy: disable-error-code="no-untyped-def"  # Triton infers its types
+# Triton infers the types of its kernels:
+# mypy: disable-error-code="no-untyped-def"
 r"""Triton kernels: masks of 2D Gaussians, one tile of one instance per program.
 
 How the work is laid out
