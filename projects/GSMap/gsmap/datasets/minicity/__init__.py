@@ -1,0 +1,1 @@
+"""MiniCity: a procedural town written in the nuScenes format."""

@@ -1,0 +1,89 @@
+"""What a MiniCity data set is made of: its size, its seed and its fixed choices."""
+
+import hashlib
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+VERSION = "v1.0-trainval"
+FORMAT = 1
+TRAIN_LOCATIONS = ("singapore-onenorth", "singapore-hollandvillage", "singapore-queenstown")
+VAL_LOCATIONS = ("boston-seaport",)
+MAX_TRAIN_SCENES = 700
+MAX_VAL_SCENES = 150
+
+
+@dataclass(frozen=True)
+class MiniCityConfig:
+    """Everything that decides the bytes of a MiniCity data set.
+
+    Attributes:
+        scenes: Number of scenes, training and validation together, >= 2.
+        seed: Seed of every random choice, >= 0.
+        image_width: Width of the camera images in pixels.
+        image_height: Height of the camera images in pixels.
+        samples_per_scene: Key frames per scene, half a second apart.
+        sweeps_per_sample: LiDAR sweeps between two key frames.
+        val_scenes: Validation scenes among ``scenes``; None takes a fifth, at least one.
+    """
+
+    scenes: int
+    seed: int = 0
+    image_width: int = 800
+    image_height: int = 450
+    samples_per_scene: int = 10
+    sweeps_per_sample: int = 2
+    val_scenes: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check every value, naming the one that is wrong."""
+        if self.scenes < 2:
+            raise ValueError(
+                f"scenes must be at least 2 (one to train, one to test), got {self.scenes}."
+            )
+        if self.seed < 0:
+            raise ValueError(f"seed must be >= 0, got {self.seed}.")
+        if not (64 <= self.image_width <= 3200 and 36 <= self.image_height <= 1800):
+            raise ValueError(
+                "image size must lie between 64x36 and 3200x1800, got "
+                f"{self.image_width}x{self.image_height}."
+            )
+        if not 1 <= self.samples_per_scene <= 40:
+            raise ValueError(f"samples_per_scene must be in 1..40, got {self.samples_per_scene}.")
+        if not 0 <= self.sweeps_per_sample <= 9:
+            raise ValueError(f"sweeps_per_sample must be in 0..9, got {self.sweeps_per_sample}.")
+        if self.val_scenes is not None and not 1 <= self.val_scenes < self.scenes:
+            raise ValueError(f"val_scenes must be in 1..{self.scenes - 1}, got {self.val_scenes}.")
+        if self.num_val > MAX_VAL_SCENES or self.num_train > MAX_TRAIN_SCENES:
+            raise ValueError(
+                f"the official nuScenes split names at most {MAX_TRAIN_SCENES} training and {MAX_VAL_SCENES} "
+                f"validation scenes, got {self.num_train} and {self.num_val}: ask for fewer scenes."
+            )
+
+    @property
+    def num_val(self) -> int:
+        """Number of validation scenes."""
+        return self.val_scenes if self.val_scenes is not None else max(1, self.scenes // 5)
+
+    @property
+    def num_train(self) -> int:
+        """Number of training scenes."""
+        return self.scenes - self.num_val
+
+    def as_dict(self) -> dict:
+        """All values as JSON-ready fields, with the version of the generator's output."""
+        return {"format": FORMAT, **asdict(self), "val_scenes": self.num_val}
+
+
+def _digest(parts: tuple) -> bytes:
+    return hashlib.blake2b("|".join(map(str, parts)).encode(), digest_size=16).digest()
+
+
+def make_rng(*parts: object) -> np.random.Generator:
+    """A random generator that depends on ``parts`` alone, not on the order of calls or on the process."""
+    return np.random.default_rng(np.frombuffer(_digest(parts), dtype=np.uint32).tolist())
+
+
+def make_token(*parts: object) -> str:
+    """A 32-digit token as in nuScenes, which depends on ``parts`` alone."""
+    return _digest(("token", *parts)).hex()
