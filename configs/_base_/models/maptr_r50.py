@@ -1,8 +1,6 @@
 # MapTR with ResNet-50 and geometry kernel attention, as published (tiny): 35.92 M trainable parameters.
 # torchvision://resnet50 is fetched from download.pytorch.org; without a network set
 # model.img_backbone.init_cfg.checkpoint to a local copy, or to None to train from scratch.
-custom_imports = dict(imports=['gsmap.registered'], allow_failed_imports=False)
-
 model = dict(
     type='MapDetector',
     data_preprocessor=dict(

@@ -13,6 +13,7 @@ from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
 from gsmap.geometry.bev_grid import BEVGrid
+from gsmap.layers.deformable_attention import init_matrices
 from gsmap.losses.direction import direction_loss
 from gsmap.losses.point import points_l1_loss
 from gsmap.matching.map_assigner import MapMatch
@@ -120,11 +121,7 @@ class MapHead(BaseModule):
     def init_weights(self) -> None:
         """Initialise the decoder's matrices (Xavier) and let every class start improbable."""
         super().init_weights()
-        for name, parameter in self.decoder.named_parameters():
-            if parameter.dim() > 1 and not name.endswith(
-                ("sampling_offsets.weight", "attention_weights.weight")
-            ):
-                nn.init.xavier_uniform_(parameter)
+        init_matrices(self.decoder)
         xavier_init(self.reference_points, distribution="uniform", bias=0.0)
         for branch in self.cls_branches:
             nn.init.constant_(branch[-1].bias, bias_init_with_prob(_PRIOR_PROBABILITY))

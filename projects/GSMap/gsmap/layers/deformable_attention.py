@@ -9,6 +9,8 @@ from mmcv.ops.multi_scale_deform_attn import MultiScaleDeformableAttnFunction
 from mmengine.model import BaseModule, constant_init, xavier_init
 from torch import Tensor, nn
 
+_SAMPLING_WEIGHTS = ("sampling_offsets.weight", "attention_weights.weight")
+
 
 def bilinear_rows(locations: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Turn sampling locations into the four surrounding cells of a map and their bilinear weights.
@@ -187,3 +189,10 @@ def directional_offsets(num_heads: int, num_points: int) -> Tensor:
     directions = directions / directions.abs().amax(-1, keepdim=True)
     steps = torch.arange(1, num_points + 1, dtype=torch.float32)
     return directions[:, None] * steps[:, None]
+
+
+def init_matrices(module: nn.Module) -> None:
+    """Initialise all matrices of a transformer (Xavier) but those that place and weigh samples."""
+    for name, parameter in module.named_parameters():
+        if parameter.dim() > 1 and not name.endswith(_SAMPLING_WEIGHTS):
+            nn.init.xavier_uniform_(parameter)

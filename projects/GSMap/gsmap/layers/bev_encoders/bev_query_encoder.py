@@ -12,7 +12,11 @@ from mmengine.model import BaseModule
 from torch import Tensor, nn
 
 from gsmap.geometry.bev_grid import BEVGrid
-from gsmap.layers.deformable_attention import DeformableAttention, directional_offsets
+from gsmap.layers.deformable_attention import (
+    DeformableAttention,
+    directional_offsets,
+    init_matrices,
+)
 
 from .projection import PillarProjection, pillar_points, project_pillars
 
@@ -180,6 +184,12 @@ class BEVQueryEncoder(BaseModule):
         self.layers = nn.ModuleList(BEVEncoderLayer(**layer) for _ in range(num_layers))
         nn.init.normal_(self.level_embeds)
         nn.init.normal_(self.cams_embeds)
+
+    def init_weights(self) -> None:
+        """Initialise the matrices of the layers (Xavier)."""
+        super().init_weights()
+        init_matrices(self.layers)
+        init_matrices(self.can_bus_mlp)
 
     def forward(
         self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]

@@ -39,8 +39,8 @@ class SpatialCrossAttention(DeformableAttention):
             raise ValueError(
                 f"num_points must be a multiple of num_heights, got {num_points} and {num_heights}."
             )
-        self.num_heights = num_heights
         super().__init__(embed_dims, num_heads, num_points, dropout=0.0, init_cfg=init_cfg)
+        self.num_heights = num_heights
 
     def forward(self, query: Tensor, img_feats: Tensor, projection: PillarProjection) -> Tensor:
         """Collect camera features for every BEV cell.
