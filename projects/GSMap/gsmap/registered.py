@@ -2,8 +2,15 @@
 
 from mmdet3d.registry import MODELS
 
+import gsmap.datasets.transforms.images
+import gsmap.datasets.transforms.map_targets
+import gsmap.datasets.transforms.masks
+import gsmap.datasets.transforms.packing
+import gsmap.datasets.transforms.points
+import gsmap.datasets.vectorized_map_dataset
 import gsmap.detectors.map_detector
 import gsmap.engine.checkpoint_io
+import gsmap.evaluation.map_metric
 import gsmap.heads.gsmap_head
 import gsmap.heads.map_head
 import gsmap.heads.maptrv2_head

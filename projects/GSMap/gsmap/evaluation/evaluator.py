@@ -1,0 +1,138 @@
+"""Both metrics over a stream of samples: match each sample once, keep only its matches."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
+from gsmap.evaluation.elements import MapElements
+from gsmap.evaluation.matches import FrameMatches
+from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
+from gsmap.evaluation.report import MetricReport
+
+METRIC_NAMES = ("chamfer", "raster")
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Which metrics to compute and their rules.
+
+    Args:
+        chamfer: Rules of AP_chamfer, or None to leave it out.
+        raster: Rules of AP_raster, or None to leave it out.
+
+    Raises:
+        ValueError: If both are left out, or their classes differ.
+    """
+
+    chamfer: ChamferConfig | None
+    raster: RasterConfig | None
+
+    def __post_init__(self) -> None:
+        if self.chamfer is None and self.raster is None:
+            raise ValueError(f"name at least one metric of {METRIC_NAMES}.")
+        if self.chamfer and self.raster and self.chamfer.classes != self.raster.classes:
+            raise ValueError(
+                "both metrics must have the same classes, got "
+                f"{self.chamfer.classes} and {self.raster.classes}."
+            )
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes."""
+        config = self.chamfer or self.raster
+        assert config is not None
+        return config.classes
+
+
+@dataclass(frozen=True)
+class SampleMatches:
+    """What is kept of one sample; small, and picklable between processes.
+
+    Args:
+        token: Name of the sample.
+        by_metric: Matches by the name of the metric.
+    """
+
+    token: str
+    by_metric: dict[str, FrameMatches]
+
+
+def match_sample(
+    token: str, predictions: MapElements, ground_truth: MapElements, config: EvaluationConfig
+) -> SampleMatches:
+    """Match one sample under every metric that is asked for.
+
+    Args:
+        token: Name of the sample.
+        predictions: Its predictions.
+        ground_truth: Its ground truth.
+        config: Metrics and their rules.
+    """
+    found: dict[str, FrameMatches] = {}
+    if config.chamfer:
+        found["chamfer"] = match_chamfer(predictions, ground_truth, config.chamfer, token)
+    if config.raster:
+        found["raster"] = match_raster(predictions, ground_truth, config.raster, token)
+    return SampleMatches(token, found)
+
+
+def reports(samples: Iterable[SampleMatches], config: EvaluationConfig) -> list[MetricReport]:
+    """Compute the metrics from the matches of all samples.
+
+    Args:
+        samples: Matches in any order; repeated tokens count once.
+        config: Metrics and their rules.
+    """
+    records = list(samples)
+    found = []
+    if config.chamfer:
+        found.append(chamfer_report((r.by_metric["chamfer"] for r in records), config.chamfer))
+    if config.raster:
+        found.append(raster_report((r.by_metric["raster"] for r in records), config.raster))
+    return found
+
+
+def flat_metrics(found: Sequence[MetricReport]) -> dict[str, float]:
+    """Join the figures of several metrics under their flat keys."""
+    return {key: value for report in found for key, value in report.metrics.items()}
+
+
+@dataclass
+class MapEvaluator:
+    """Streaming evaluation: update per sample while a network runs, compute at the end.
+
+    Memory grows by a few kilobytes per sample; masks and points are not kept.
+
+    Args:
+        config: Metrics and their rules.
+    """
+
+    config: EvaluationConfig
+    samples: list[SampleMatches] = field(default_factory=list)
+
+    def update(self, token: str, predictions: MapElements, ground_truth: MapElements) -> None:
+        """Match one sample and keep its matches.
+
+        Args:
+            token: Name of the sample; a repeated one counts once.
+            predictions: Its predictions.
+            ground_truth: Its ground truth.
+        """
+        self.samples.append(match_sample(token, predictions, ground_truth, self.config))
+
+    def merge(self, other: "MapEvaluator") -> None:
+        """Add the samples that another evaluator has seen.
+
+        Args:
+            other: An evaluator with the same rules.
+
+        Raises:
+            ValueError: If its rules differ.
+        """
+        if other.config != self.config:
+            raise ValueError(f"evaluators differ: {self.config} and {other.config}.")
+        self.samples.extend(other.samples)
+
+    def compute(self) -> list[MetricReport]:
+        """Return one report per metric."""
+        return reports(self.samples, self.config)

@@ -1,0 +1,190 @@
+"""The metric class that the MMEngine runner calls: a thin shell around the evaluator."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mmdet3d.registry import METRICS
+from mmengine.evaluator import BaseMetric
+from mmengine.logging import MMLogger, print_log
+
+from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.elements import MapElements, map_elements
+from gsmap.evaluation.evaluator import (
+    METRIC_NAMES,
+    EvaluationConfig,
+    SampleMatches,
+    flat_metrics,
+    match_sample,
+    reports,
+)
+from gsmap.evaluation.raster_ap import POLYGON_CLASSES, RasterConfig
+from gsmap.evaluation.report import format_table
+from gsmap.evaluation.results_json import gaussian_extras, vectors_of, write_results
+
+
+@METRICS.register_module()
+class MapMetric(BaseMetric):
+    """AP_chamfer and AP_raster of predicted map elements.
+
+    Samples are matched as they come, so evaluation overlaps inference; what is kept and collected
+    from the ranks are matches, never masks. Figures do not depend on the number of ranks, the
+    order of the samples or the padding of the last batch.
+
+    Args:
+        eval: Metrics to compute: ``chamfer``, ``raster``; may be empty if only ``out_file`` is
+            wanted.
+        classes: Names of the classes; the data set's if left out.
+        pc_range: (x_min, y_min, z_min, x_max, y_max, z_max) in metres, for the canvas of
+            AP_raster; the data set's if left out.
+        thresholds: Thresholds of AP_chamfer in metres.
+        polygon_classes: Classes that AP_raster fills.
+        out_file: Where to write the predictions in MapTR's JSON form, or None.
+        **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
+
+    Raises:
+        ValueError: If a metric is unknown, or there is nothing to do.
+    """
+
+    default_prefix = None
+
+    def __init__(
+        self,
+        eval: Sequence[str] = METRIC_NAMES,
+        classes: Sequence[str] | None = None,
+        pc_range: Sequence[float] | None = None,
+        thresholds: Sequence[float] = CHAMFER_THRESHOLDS,
+        polygon_classes: Sequence[str] = POLYGON_CLASSES,
+        out_file: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        unknown = set(eval) - set(METRIC_NAMES)
+        if unknown or (not eval and out_file is None):
+            raise ValueError(f"eval must name metrics of {METRIC_NAMES}, got {list(eval)}.")
+        self.eval = tuple(eval)
+        self.out_file = out_file
+        self._classes = tuple(classes) if classes else None
+        self._pc_range = tuple(pc_range) if pc_range else None
+        self._thresholds = tuple(thresholds)
+        self._polygon_classes = tuple(polygon_classes)
+
+    def _from_dataset(self, value: Any, key: str) -> Any:
+        """Return a setting, or the data set's metainfo under the same name."""
+        found = value or (self.dataset_meta or {}).get(key)
+        if found is None:
+            raise ValueError(f"MapMetric needs {key}: set it, or give the data set it as metainfo.")
+        return tuple(found)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes."""
+        return self._from_dataset(self._classes, "classes")
+
+    @property
+    def config(self) -> EvaluationConfig | None:
+        """Metrics and their rules; None if there is only a file to write."""
+        if not self.eval:
+            return None
+        chamfer = raster = None
+        if "chamfer" in self.eval:
+            chamfer = ChamferConfig(self.classes, self._thresholds)
+        if "raster" in self.eval:
+            x0, y0, _, x1, y1, _ = self._from_dataset(self._pc_range, "pc_range")
+            raster = RasterConfig(self.classes, self._polygon_classes, (x0, x1), (y0, y1))
+        return EvaluationConfig(chamfer, raster)
+
+    def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
+        """Match one batch and keep its matches.
+
+        Args:
+            data_batch: Not used.
+            data_samples: Samples with ``token``, ``pred_instances_3d`` (``pts``, ``scores_3d``,
+                ``labels_3d``) and, if a metric is asked for, ``eval_ann_info`` (``polylines``,
+                ``labels``).
+        """
+        config = self.config
+        for sample in data_samples:
+            token = str(sample["token"])
+            instances = sample["pred_instances_3d"]
+            predictions = _predictions(instances, token)
+            record: dict[str, Any] = {"token": token}
+            if config is not None:
+                record["matches"] = match_sample(token, predictions, _truth(sample), config)
+            if self.out_file is not None:
+                gaussians = [_array(instances.get(key)) for key in ("scales", "rotations")]
+                record["vectors"] = vectors_of(
+                    predictions, self.classes, gaussian_extras(*gaussians)
+                )
+            self.results.append(record)
+
+    def evaluate(self, size: int) -> dict[str, float]:
+        """Collect the records of all ranks and compute the metrics.
+
+        Args:
+            size: Number of samples in the data set.
+        """
+        self._size = size
+        # MMEngine would cut the list off at `size` by position; repeated samples go by their token
+        return super().evaluate(sys.maxsize)
+
+    def compute_metrics(self, results: list[dict[str, Any]]) -> dict[str, float]:
+        """Compute the figures, print the tables and write the file; on the first rank only.
+
+        Args:
+            results: Records of all ranks.
+        """
+        unique = {record["token"]: record for record in reversed(results)}
+        records = [unique[token] for token in sorted(unique)]
+        expected = getattr(self, "_size", len(records))
+        if len(records) != expected:
+            print_log(
+                f"MapMetric: {len(records)} different samples were scored, the data set has "
+                f"{expected}.",
+                "current",
+                level=30,
+            )
+        if self.out_file is not None:
+            samples = ((record["token"], record["vectors"]) for record in records)
+            write_results(self.out_file, samples, {"classes": list(self.classes)})
+            print_log(f"Results of {len(records)} samples written to {self.out_file}", "current")
+        config = self.config
+        if config is None:
+            return {}
+        matches: list[SampleMatches] = [record["matches"] for record in records]
+        found = reports(matches, config)
+        logger = MMLogger.get_current_instance()
+        for report in found:
+            logger.info("\n%s", format_table(report))
+        return flat_metrics(found)
+
+
+def _array(value: Any) -> npt.NDArray[Any] | None:
+    """Convert a tensor on any device to an array."""
+    if value is None:
+        return None
+    return value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)
+
+
+def _predictions(instances: Mapping[str, Any], token: str) -> MapElements:
+    """Read the predictions of one sample."""
+    points, labels, scores = (_array(instances[k]) for k in ("pts", "labels_3d", "scores_3d"))
+    assert points is not None
+    assert labels is not None
+    try:
+        return map_elements(list(points.astype(np.float64)), labels, scores)
+    except ValueError as error:
+        raise ValueError(f"predictions of sample {token}: {error}") from error
+
+
+def _truth(sample: Mapping[str, Any]) -> MapElements:
+    """Read the ground truth of one sample."""
+    info = sample.get("eval_ann_info")
+    if info is None:
+        raise ValueError(
+            f"sample {sample['token']} has no ground truth (eval_ann_info): it cannot be scored. "
+            "Use an annotation file with instances, or eval=[] with an out_file."
+        )
+    return map_elements(list(info["polylines"]), info["labels"])
