@@ -262,3 +262,12 @@ class AnnotationFile(Sequence[MapSample]):
             for i in range(len(self._starts) - 1)
             for v in self._reader.get_batch(i).column(name).to_pylist()
         ]
+
+    def instance_counts(self) -> np.ndarray:
+        """Return each sample's number of map elements, -1 if not known. (samples,)."""
+        counts = [np.empty(0, np.int64)]
+        for i in range(len(self._starts) - 1):
+            column = self._reader.get_batch(i).column("instances")
+            known = column.is_valid().to_numpy(zero_copy_only=False)
+            counts.append(np.where(known, np.diff(column.offsets.to_numpy()), -1))
+        return np.concatenate(counts)

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="where gsmap_<dataset>_<split>.arrow go (default: the data root)",
     )
-    parser.add_argument("--dataset", default="nuscenes", help="name of the data set in the files")
+    parser.add_argument("--dataset", help="name in the files (default: minicity or nuscenes)")
     parser.add_argument("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
     parser.add_argument(
         "--classes", nargs="+", default=list(CLASSES), choices=MAP_CLASSES, metavar="CLASS",
@@ -45,6 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=int, default=default_workers(), help="processes (default: all cores)"
     )
     parser.add_argument("--tag", default="", help="appended to the file names, such as _extended")
+
+
+def dataset_name(root: Path) -> str:
+    """Tell MiniCity, which says so in its root, from nuScenes."""
+    return "minicity" if (root / "minicity.json").is_file() else "nuscenes"
 
 
 @contextmanager
@@ -68,7 +73,7 @@ def run(arguments: argparse.Namespace, command: str) -> str:
         root=arguments.root,
         version=arguments.version,
         out_dir=arguments.out_dir,
-        dataset=arguments.dataset,
+        dataset=arguments.dataset or dataset_name(arguments.root),
         split_file=arguments.split_file,
         classes=tuple(arguments.classes),
         x_range=tuple(arguments.x_range),

@@ -1,0 +1,50 @@
+# nuScenes, six cameras at half size, ground truth of 60 x 30 m in the LIDAR_TOP frame.
+# `python tools/create_data.py nuscenes --root data/nuscenes` makes the annotation files.
+data_root = 'data/nuscenes/'
+
+_cameras = [
+    'CAM_FRONT', 'CAM_FRONT_RIGHT', 'CAM_FRONT_LEFT', 'CAM_BACK', 'CAM_BACK_LEFT', 'CAM_BACK_RIGHT'
+]
+_load = [dict(type='LoadCameraImages')]
+_train_pipeline = [
+    *_load,
+    dict(
+        type='MultiViewWrapper',
+        transforms=[dict(type='PhotoMetricDistortion3D')],
+        override_aug_config=False,  # each camera its own, as in MapTR
+        collected_keys=[]),
+    dict(type='ScaleImages', scale=0.5),
+    dict(type='FormatMapTargets', num_points=20),
+    dict(type='PackMapInputs'),
+]
+_test_pipeline = [*_load, dict(type='ScaleImages', scale=0.5), dict(type='PackMapInputs')]
+_dataset = dict(
+    type='VectorizedMapDataset',
+    data_root=data_root,
+    classes=['divider', 'ped_crossing', 'boundary'],
+    pc_range=[-15.0, -30.0, -2.0, 15.0, 30.0, 2.0],
+    frame='lidar',
+    cameras=_cameras)
+
+train_dataloader = dict(
+    batch_size=4,
+    num_workers=4,
+    persistent_workers=True,
+    sampler=dict(type='DefaultSampler', shuffle=True),
+    dataset=dict(
+        **_dataset,
+        ann_file='gsmap_nuscenes_train.arrow',
+        split='train',
+        pipeline=_train_pipeline))
+val_dataloader = dict(
+    batch_size=1,
+    num_workers=4,
+    persistent_workers=True,
+    sampler=dict(type='DefaultSampler', shuffle=False),
+    dataset=dict(
+        **_dataset,
+        ann_file='gsmap_nuscenes_val.arrow',
+        split='val',
+        test_mode=True,
+        pipeline=_test_pipeline))
+test_dataloader = val_dataloader

@@ -1,0 +1,43 @@
+# nuScenes with LiDAR: ten sweeps beside the cameras.
+_base_ = './nuscenes.py'
+
+_points = [
+    dict(type='LoadPointsFromFile', coord_type='LIDAR', load_dim=5, use_dim=5),
+    dict(
+        type='LoadPointsFromMultiSweeps',
+        sweeps_num=9,
+        use_dim=[0, 1, 2, 3, 4],
+        pad_empty_sweeps=True,
+        remove_close=True),
+]
+_test_points = [
+    _points[0],
+    dict(
+        type='LoadPointsFromMultiSweeps',
+        sweeps_num=9,
+        use_dim=[0, 1, 2, 3, 4],
+        pad_empty_sweeps=True,
+        remove_close=True,
+        test_mode=True),
+]
+train_dataloader = dict(
+    dataset=dict(pipeline=[
+        dict(type='LoadCameraImages'),
+        *_points,
+        dict(
+            type='MultiViewWrapper',
+            transforms=[dict(type='PhotoMetricDistortion3D')],
+            override_aug_config=False,  # each camera its own, as in MapTR
+            collected_keys=[]),
+        dict(type='ScaleImages', scale=0.5),
+        dict(type='FormatMapTargets', num_points=20),
+        dict(type='PackMapInputs'),
+    ]))
+val_dataloader = dict(
+    dataset=dict(pipeline=[
+        dict(type='LoadCameraImages'),
+        *_test_points,
+        dict(type='ScaleImages', scale=0.5),
+        dict(type='PackMapInputs'),
+    ]))
+test_dataloader = val_dataloader

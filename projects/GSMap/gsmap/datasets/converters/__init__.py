@@ -1,0 +1,1 @@
+"""Converters from data sets to annotation files."""

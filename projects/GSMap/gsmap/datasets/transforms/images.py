@@ -1,0 +1,129 @@
+"""Camera images: loading with checks, and scaling with the matrices kept right."""
+
+from pathlib import Path
+from typing import Any
+
+import mmcv
+import numpy as np
+from mmcv.transforms import BaseTransform
+from mmdet3d.datasets.transforms import LoadMultiViewImageFromFiles
+from mmdet3d.registry import TRANSFORMS
+
+from gsmap.datasets.errors import BrokenSampleError
+
+_JPEG_SUFFIXES = {".jpg", ".jpeg"}
+_JPEG_END = b"\xff\xd9"
+_TAIL_BYTES = 1024
+
+
+def check_image_file(path: str, where: str) -> None:
+    """Check that an image file exists and, if it is a JPEG, that it is not cut short.
+
+    OpenCV decodes a truncated JPEG to a picture whose rest is grey, without an error.
+
+    Args:
+        path: The file.
+        where: Sample and camera, for the message.
+
+    Raises:
+        BrokenSampleError: If it is missing, empty or truncated.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise BrokenSampleError(f"{where}: no image at {path}; is data_root right?")
+    size = file.stat().st_size
+    with file.open("rb") as stream:
+        stream.seek(max(size - _TAIL_BYTES, 0))
+        tail = stream.read()
+    if not size or (file.suffix.lower() in _JPEG_SUFFIXES and _JPEG_END not in tail):
+        raise BrokenSampleError(f"{where}: {path} is truncated ({size} bytes); copy it again.")
+
+
+@TRANSFORMS.register_module()
+class LoadCameraImages(LoadMultiViewImageFromFiles):
+    """Load the images of all cameras as mmdet3d does, naming sample and file when one is damaged.
+
+    Images of different size are padded at the bottom and right to the largest. Adds ``lidar2img``,
+    ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``.
+
+    Args:
+        to_float32: Whether to convert to float32 before anything else.
+        color_type: As in ``mmcv.imfrombytes``.
+        backend_args: As in mmdet3d.
+    """
+
+    def __init__(
+        self, to_float32: bool = True, color_type: str = "color", backend_args: dict | None = None
+    ) -> None:
+        super().__init__(to_float32, color_type, backend_args)
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Load ``results['images']``."""
+        for name, camera in results["images"].items():
+            where = f"sample {results['token']!r}, camera {name}"
+            check_image_file(camera["img_path"], where)
+        try:
+            results = super().transform(results)
+        except (AttributeError, ValueError, OSError) as error:
+            raise BrokenSampleError(self._undecodable(results)) from error
+        results["img_path"] = results["filename"]
+        results["img_aug_matrix"] = [np.eye(4) for _ in results["img"]]
+        results["lidar2img"] = [
+            cam2img @ lidar2cam
+            for cam2img, lidar2cam in zip(results["cam2img"], results["lidar2cam"], strict=True)
+        ]
+        return results
+
+    def _undecodable(self, results: dict[str, Any]) -> str:
+        """Say which image cannot be decoded."""
+        for name, camera in results["images"].items():
+            if mmcv.imread(camera["img_path"], flag=self.color_type) is None:
+                return (
+                    f"sample {results['token']!r}, camera {name}: {camera['img_path']} is not an "
+                    f"image that OpenCV can decode; copy it again."
+                )
+        return (
+            f"sample {results['token']!r}: its images do not fit together; do all of them have the "
+            f"same number of channels?"
+        )
+
+
+@TRANSFORMS.register_module()
+class ScaleImages(BaseTransform):
+    """Resize all images and update ``lidar2img`` and ``img_aug_matrix``.
+
+    Args:
+        scale: Factor, > 0; sizes are rounded down, and the matrices take the exact ratio of each
+            axis.
+        interpolation: As in ``mmcv.imresize``.
+
+    Raises:
+        ValueError: If ``scale`` is not positive.
+    """
+
+    def __init__(self, scale: float, interpolation: str = "bilinear") -> None:
+        if not scale > 0:
+            raise ValueError(f"scale must be > 0, got {scale}.")
+        self.scale = scale
+        self.interpolation = interpolation
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Scale ``results['img']``."""
+        height, width = results["img"][0].shape[:2]
+        # 1e-6: a factor such as 0.58 * 100 must not round down to 57
+        size = (int(width * self.scale + 1e-6), int(height * self.scale + 1e-6))
+        if min(size) < 1:
+            raise ValueError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
+        matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
+        if size != (width, height):
+            results["img"] = [
+                mmcv.imresize(img, size, interpolation=self.interpolation) for img in results["img"]
+            ]
+        results["lidar2img"] = [matrix @ m for m in results["lidar2img"]]
+        results["img_aug_matrix"] = [matrix @ m for m in results["img_aug_matrix"]]
+        results["img_shape"] = results["pad_shape"] = size[::-1]
+        results["scale_factor"] = self.scale
+        return results
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(scale={self.scale})"

@@ -1,0 +1,116 @@
+"""Training targets of map elements: resampled points and their equivalent orders."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from mmcv.transforms import BaseTransform
+from mmdet3d.registry import TRANSFORMS
+from mmengine.structures import InstanceData
+
+from gsmap.datasets.annotation_record import MapInstance
+from gsmap.geometry.polylines import (
+    PADDING,
+    bounding_boxes,
+    clamp,
+    equivalent_orders,
+    is_closed,
+    resample,
+)
+
+
+def map_targets(
+    instances: Sequence[MapInstance],
+    num_points: int,
+    x_range: tuple[float, float],
+    y_range: tuple[float, float],
+    dim: int = 2,
+    rng: np.random.Generator | None = None,
+) -> InstanceData:
+    """Make a sample's training targets, as MapTR does ("v2" orders).
+
+    Args:
+        instances: Map elements at full resolution.
+        num_points: Points P per element.
+        x_range: Smallest and largest x in metres; points beyond are moved onto the edge.
+        y_range: Smallest and largest y in metres.
+        dim: Coordinates per point, 2 or 3.
+        rng: Draws the orders of rings with more than P - 1 vertices; None spreads them evenly.
+
+    Returns:
+        ``labels_3d`` (K,) int64, ``pts`` (K, P, dim), ``pts_shifts`` (K, S, P, dim), ``boxes`` (K,
+        4) float32 in metres, ``closed`` (K,) bool; unused orders hold -10000.
+
+    Raises:
+        ValueError: If the elements have fewer coordinates than ``dim``.
+    """
+    slots = max(num_points - 1, 2)
+    points = np.empty((len(instances), num_points, dim))
+    orders = np.empty((len(instances), slots, num_points, dim))
+    boxes = np.empty((len(instances), 4))
+    for i, instance in enumerate(instances):
+        if instance.points.shape[1] < dim:
+            raise ValueError(
+                f"targets of dim {dim} need points of as many coordinates, got "
+                f"{instance.points.shape}."
+            )
+        line = instance.points[:, :dim].astype(np.float64)
+        orders[i] = equivalent_orders(line, num_points, rng)
+        points[i] = resample(line, num_points)
+        boxes[i] = bounding_boxes(line)
+    points = clamp(points, x_range, y_range)
+    unused = orders == PADDING
+    orders = clamp(orders, x_range, y_range)
+    orders[unused] = PADDING
+    corners = clamp(boxes.reshape(-1, 2, 2), x_range, y_range)
+    return InstanceData(
+        labels_3d=torch.tensor([instance.label for instance in instances], dtype=torch.int64),
+        pts=torch.from_numpy(points.astype(np.float32)),
+        pts_shifts=torch.from_numpy(orders.astype(np.float32)),
+        boxes=torch.from_numpy(corners.reshape(-1, 4).astype(np.float32)),
+        closed=torch.tensor(
+            [is_closed(instance.points) for instance in instances], dtype=torch.bool
+        ),
+    )
+
+
+@TRANSFORMS.register_module()
+class FormatMapTargets(BaseTransform):
+    """Add ``gt_instances_3d``, the training targets, from ``map_instances``.
+
+    Args:
+        num_points: Points P per element.
+        dim: Coordinates per point, 2 or 3.
+        random_orders: Whether the orders of rings with more than P - 1 vertices are drawn anew each
+            time, as in MapTR; else they are evenly spread over the ring.
+    """
+
+    def __init__(self, num_points: int = 20, dim: int = 2, random_orders: bool = True) -> None:
+        self.num_points = num_points
+        self.dim = dim
+        self.random_orders = random_orders
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Add the targets.
+
+        Raises:
+            ValueError: If the sample has no ground truth.
+        """
+        if results["map_instances"] is None:
+            raise ValueError(
+                f"sample {results['token']!r} has no ground truth: leave FormatMapTargets out of "
+                "this pipeline."
+            )
+        rng = None
+        if self.random_orders:  # seeded from the generator that mmengine seeds in each worker
+            rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
+        results["gt_instances_3d"] = map_targets(
+            results["map_instances"],
+            self.num_points,
+            results["x_range"],
+            results["y_range"],
+            self.dim,
+            rng,
+        )
+        return results

@@ -1,0 +1,98 @@
+"""Segmentation targets of MapTRv2: map elements drawn in BEV and in each camera's feature map."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from mmcv.transforms import BaseTransform
+from mmdet3d.registry import TRANSFORMS
+
+from gsmap.geometry.polylines import resample
+
+_PV_SAMPLES = 200
+_MIN_DEPTH = 1e-7
+
+
+@TRANSFORMS.register_module()
+class MakeBEVMask(BaseTransform):
+    """Add ``gt_seg``: all elements drawn in one channel. (1, H, W)
+
+    Pixel coordinates are truncated to integers, as in MapTRv2.
+
+    Args:
+        size: Rows H and columns W over the ground truth's range.
+        thickness_px: Width of the lines.
+    """
+
+    def __init__(self, size: tuple[int, int] = (200, 100), thickness_px: int = 3) -> None:
+        self.size = tuple(size)
+        self.thickness_px = thickness_px
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Draw the mask."""
+        mask = np.zeros(self.size, np.uint8)
+        origin = np.array([results["x_range"][0], results["y_range"][0]])
+        extent = np.array([results["x_range"][1], results["y_range"][1]]) - origin
+        scale = np.array(self.size[::-1]) / extent
+        for instance in results["map_instances"]:
+            pixels = ((instance.points[:, :2].astype(np.float64) - origin) * scale).astype(np.int32)
+            cv2.polylines(mask, [pixels], False, (1,), self.thickness_px)
+        results["gt_seg"] = torch.from_numpy(mask[None].astype(np.float32))
+        return results
+
+
+@TRANSFORMS.register_module()
+class MakePVMask(BaseTransform):
+    """Add ``gt_pv_seg``: all elements projected into each camera's feature map. (V, 1, h, w)
+
+    Comes after the images have their final scale. Two-dimensional elements lie at one height.
+
+    Args:
+        stride: Image pixels per feature pixel.
+        pad_size_divisor: To what the images are padded later.
+        ground_z_m: Height of the ground in the annotation frame, in metres.
+        thickness_px: Width of the lines in feature pixels.
+    """
+
+    def __init__(
+        self,
+        stride: int = 32,
+        pad_size_divisor: int = 32,
+        ground_z_m: float = -1.6,
+        thickness_px: int = 1,
+    ) -> None:
+        self.stride = stride
+        self.pad_size_divisor = pad_size_divisor
+        self.ground_z_m = ground_z_m
+        self.thickness_px = thickness_px
+
+    def _points(self, points: np.ndarray) -> np.ndarray:
+        """Return an element as homogeneous points along it. (200, 4)."""
+        line = resample(points, _PV_SAMPLES)
+        height = line[:, 2:3] if line.shape[1] == 3 else np.full((len(line), 1), self.ground_z_m)
+        return np.concatenate([line[:, :2], height, np.ones((len(line), 1))], -1)
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Draw the masks."""
+        height, width = padded_size(results["img_shape"], self.pad_size_divisor)
+        masks = np.zeros(
+            (len(results["lidar2img"]), height // self.stride, width // self.stride), np.uint8
+        )
+        lines = [self._points(instance.points) for instance in results["map_instances"]]
+        shrink = np.diag([1 / self.stride, 1 / self.stride, 1.0, 1.0])
+        for mask, lidar2img in zip(masks, results["lidar2img"], strict=True):
+            for line in lines:
+                u, v, depth = (line @ (shrink @ lidar2img).T)[:, :3].T
+                front = depth > 0
+                pixels = np.stack([u[front], v[front]], -1) / (depth[front, None] + _MIN_DEPTH)
+                if len(pixels):
+                    clipped = pixels.clip(-1e6, 1e6).astype(np.int32)
+                    cv2.polylines(mask, [clipped], False, (1,), self.thickness_px)
+        results["gt_pv_seg"] = torch.from_numpy(masks[:, None].astype(np.float32))
+        return results
+
+
+def padded_size(size: tuple[int, int], divisor: int) -> tuple[int, int]:
+    """Return height and width rounded up to multiples of ``divisor``."""
+    return -(-size[0] // divisor) * divisor, -(-size[1] // divisor) * divisor

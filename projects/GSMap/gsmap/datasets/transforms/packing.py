@@ -1,0 +1,70 @@
+"""Packing a sample for the model."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from mmcv.transforms import BaseTransform
+from mmdet3d.registry import TRANSFORMS
+from mmdet3d.structures import Det3DDataSample
+
+from gsmap.datasets.errors import BrokenSampleError
+
+META_KEYS = (
+    "sample_idx", "token", "scene", "map_name", "timestamp_ns", "img_path", "cam_names",
+    "lidar2img", "cam2img", "lidar2cam", "img_aug_matrix", "img_shape", "ori_shape",
+    "lidar2global", "lidar2ego", "can_bus", "x_range", "y_range", "eval_ann_info",
+)  # fmt: skip
+TARGET_KEYS = ("gt_instances_3d", "gt_depth", "gt_seg", "gt_pv_seg")
+_MATRIX_KEYS = ("lidar2img", "cam2img", "lidar2cam", "img_aug_matrix")
+
+
+@TRANSFORMS.register_module()
+class PackMapInputs(BaseTransform):
+    """Pack images, points, targets and metainfo as ``docs/architecture.md`` says.
+
+    Whatever of the targets earlier transforms have made is packed; matrices become arrays (V, 4,
+    4).
+
+    Args:
+        meta_keys: Metainfo besides ``META_KEYS``.
+        with_points: Whether loaded points go to the model; they may have served for targets only.
+    """
+
+    def __init__(self, meta_keys: Sequence[str] = (), with_points: bool = True) -> None:
+        self.with_points = with_points
+        self.meta_keys = (*META_KEYS, *meta_keys)
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Pack the sample.
+
+        Raises:
+            BrokenSampleError: If an image holds NaN or infinity.
+        """
+        inputs = {}
+        if "img" in results:
+            inputs["img"] = self._images(results)
+        if self.with_points and "points" in results:
+            inputs["points"] = results["points"].tensor
+        sample = Det3DDataSample()
+        for key in TARGET_KEYS:
+            if key in results:
+                setattr(sample, key, results[key])
+        metainfo = {key: results[key] for key in self.meta_keys if key in results}
+        metainfo |= {key: np.stack(metainfo[key]) for key in _MATRIX_KEYS if key in metainfo}
+        sample.set_metainfo(metainfo)
+        return {"inputs": inputs, "data_samples": sample}
+
+    def _images(self, results: dict[str, Any]) -> torch.Tensor:
+        """Stack the images, channels first. (V, 3, H, W)."""
+        for name, img in zip(results["cam_names"], results["img"], strict=True):
+            # one pass: the sum is finite only if every value is
+            if img.dtype.kind == "f" and not np.isfinite(img.sum(dtype=np.float64)):
+                raise BrokenSampleError(
+                    f"sample {results['token']!r}, camera {name}: the image holds NaN or infinity "
+                    f"({results['images'][name]['img_path']}); check the file and the transforms "
+                    "before packing."
+                )
+        stacked = np.stack([img.transpose(2, 0, 1) for img in results["img"]])
+        return torch.from_numpy(np.ascontiguousarray(stacked))
