@@ -8,7 +8,7 @@ from mmengine.structures import InstanceData
 
 from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
 from gsmap.visualization.map_visualization_hook import picture_name
-from gsmap.visualization.map_visualizer import read_image
+from gsmap.visualization.map_visualizer import images_from_inputs, read_image
 
 CLASSES = ("divider", "ped_crossing", "boundary")
 
@@ -188,9 +188,20 @@ def test_bad_arguments(tmp_path):
 
 
 def test_missing_and_truncated_images_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"No image at .*gone.jpg"):
-        read_image(tmp_path / "gone.jpg")
-    broken = tmp_path / "broken.jpg"
-    broken.write_bytes(b"\xff\xd8\xff\xe0 not an image")
-    with pytest.raises(ValueError, match=r"broken.jpg is not a readable image"):
-        read_image(broken)
+    with pytest.raises(ValueError, match=r"a: no image at .*gone.jpg"):
+        read_image(tmp_path / "gone.jpg", "a")
+    whole = cv2.imencode(".jpg", np.zeros((90, 160, 3), np.uint8))[1].tobytes()
+    for content, message in ((whole[:-20], "is truncated"), (b"x\xff\xd9", "is not an image")):
+        (tmp_path / "broken.jpg").write_bytes(content)
+        with pytest.raises(ValueError, match=rf"broken.jpg {message}"):
+            read_image(tmp_path / "broken.jpg")
+
+
+def test_inputs_turn_back_into_pictures():
+    bgr = torch.zeros(2, 3, 4, 5)
+    bgr[1, 0], bgr[1, 2, 0, 0] = 200.4, 300.0
+    pictures = images_from_inputs(bgr)
+    assert pictures[1].shape == (4, 5, 3)
+    assert pictures[1][0, 0].tolist() == [255, 0, 200]
+    with pytest.raises(ValueError, match=r"shape \(V, 3, H, W\)"):
+        images_from_inputs(bgr[0])

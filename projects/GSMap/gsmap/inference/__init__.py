@@ -1,1 +1,1 @@
-"""Prediction on samples outside a data set."""
+"""A trained model on recorded samples; ``map_inferencer.MapInferencer`` is the entry."""

@@ -12,6 +12,8 @@ from mmdet3d.registry import VISUALIZERS
 from mmengine.dist import master_only
 from mmengine.visualization import Visualizer
 
+from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.transforms.images import check_image_file
 from gsmap.geometry import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
@@ -23,29 +25,42 @@ from gsmap.visualization.style import MapStyle
 PANELS = ("ground_truth", "prediction", "gaussians", "rasters")
 
 
-def read_image(path: str | Path) -> np.ndarray:
+def read_image(path: str | Path, where: str = "picture") -> np.ndarray:
     """Read an image file.
 
     Args:
         path: The file.
+        where: What it belongs to, for messages.
 
     Returns:
         RGB (h, w, 3) uint8.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is not a whole image.
+        BrokenSampleError: If it is missing, truncated or no image.
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(
-            f"No image at {path}: check the data root, or fetch the file again."
-        )
+    check_image_file(str(path), where)
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
-        raise ValueError(
-            f"{path} is not a readable image (truncated?): fetch or generate it again."
-        )
+        raise BrokenSampleError(f"{where}: {path} is not an image; copy it again.")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
+    """Turn a pipeline's images back into pictures.
+
+    Args:
+        images: BGR, 0 to 255, before normalisation. (V, 3, H, W)
+
+    Returns:
+        RGB pictures, V x (H, W, 3) uint8.
+
+    Raises:
+        ValueError: If the shape is wrong.
+    """
+    if images.ndim != 4 or images.shape[1] != 3:
+        raise ValueError(f"images must have shape (V, 3, H, W), got {tuple(images.shape)}.")
+    pixels = images.flip(1).permute(0, 2, 3, 1).round().clamp(0, 255).to(torch.uint8)
+    return list(pixels.cpu().numpy())
 
 
 def render_masks(elements: MapElements, grid: BEVGrid) -> np.ndarray:
@@ -173,7 +188,8 @@ class MapVisualizer(Visualizer):
             return []
         projections = np.asarray(metainfo["lidar2img"], dtype=np.float64)  # (V, 4, 4)
         if images is None:
-            images = [read_image(path) for path in paths]  # type: ignore[union-attr]
+            where = f"sample {metainfo.get('token')!r}"
+            images = [read_image(path, where) for path in paths]  # type: ignore[union-attr]
             if metainfo.get("img_aug_matrix") is not None:
                 projections = (
                     np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64)) @ projections

@@ -1,0 +1,82 @@
+#!/usr/bin/env python
+"""Run a trained model on samples without ground truth, and draw what it finds.
+
+Example: ``python tools/infer.py CONFIG CHECKPOINT --sample FOLDER --out map.json --show-dir
+pictures``. ``--sample`` takes an annotation file (.arrow), an info file of mmdet3d (.pkl), or a
+folder with one.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from mmengine.config import DictAction
+
+from gsmap.inference.map_inferencer import MapInferencer, select_samples
+from gsmap.visualization.figure import save_figure
+from gsmap.visualization.map_visualization_hook import picture_name
+
+
+def parse_args() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("config", help="config file of the model")
+    parser.add_argument("checkpoint", help="its checkpoint")
+    parser.add_argument(
+        "--sample", type=Path, required=True, help="annotation file, info file or folder"
+    )
+    parser.add_argument("--data-root", type=Path, help="folder that the paths of images start from")
+    parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
+    parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
+    parser.add_argument("--out", type=Path, help="JSON file for the predictions")
+    parser.add_argument("--show-dir", type=Path, help="folder for pictures")
+    parser.add_argument("--format", default="png", choices=["png", "jpg", "webp", "pdf", "svg"])
+    parser.add_argument("--score-thr", type=float, help="smallest drawn score")
+    parser.add_argument(
+        "--ground-z", type=float, help="height of a level ground in the frame, in metres"
+    )
+    parser.add_argument("--width", type=int, help="width of the pictures in pixels")
+    parser.add_argument("--order", action="store_true", help="mark start and direction of elements")
+    parser.add_argument("--lidar", action="store_true", help="draw the LiDAR sweep faintly")
+    parser.add_argument("--device", help="cpu, cuda, cuda:1, ...; a GPU by default if there is one")
+    parser.add_argument(
+        "--cfg-options",
+        nargs="+",
+        action=DictAction,
+        metavar="KEY=VALUE",
+        help="override settings of the config",
+    )
+    return parser.parse_args()
+
+
+def run(args: argparse.Namespace) -> None:
+    if not args.out and not args.show_dir:
+        raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
+    inferencer = MapInferencer(args.config, args.checkpoint, args.device, args.cfg_options)
+    visualizer = inferencer.visualizer
+    visualizer.show_order = args.order
+    visualizer.ground_z_m = args.ground_z if args.ground_z is not None else visualizer.ground_z_m
+    visualizer.width_px = args.width or visualizer.width_px
+    dataset = inferencer.dataset(args.sample, args.data_root)
+    chosen = select_samples(dataset.annotations.column("token"), args.token, args.max_samples)
+    samples = []
+    for index, sample in zip(chosen, inferencer.predict(dataset, chosen), strict=True):
+        samples.append(sample)
+        if args.show_dir:
+            points = inferencer.lidar_points(dataset, index) if args.lidar else None
+            figure = inferencer.draw(sample, score_thr=args.score_thr, points=points)
+            name = picture_name(sample.metainfo["token"], f".{args.format}")
+            print(f"[{len(samples)}/{len(chosen)}] {save_figure(figure, args.show_dir / name)}")
+    if args.out:
+        inferencer.write(args.out, samples)
+        print(f"predictions of {len(samples)} samples: {args.out}")
+
+
+def main() -> None:
+    try:
+        run(parse_args())
+    except (FileNotFoundError, ValueError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()
