@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from ..ops.polyline_raster import soft_line_rasters, soft_polygon_rasters
+from ..ops.polyline_raster import soft_rasters
 
 
 def render_elements(
@@ -26,11 +26,8 @@ def render_elements(
         Masks in [0, 1]. (n, H, W)
     """
     height, width = size
-    pixels = points * points.new_tensor([width, height])
-    lines = soft_line_rasters(pixels[~is_polygon], height, width, line_softness)
-    polygons = soft_polygon_rasters(pixels[is_polygon], height, width, polygon_softness)
-    masks = lines.new_empty(len(points), height, width)
-    return masks.index_put((~is_polygon,), lines).index_put((is_polygon,), polygons)
+    pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
+    return soft_rasters(pixels, height, width, is_polygon, line_softness, polygon_softness)
 
 
 def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
@@ -79,13 +76,10 @@ def rendered_dice_cost(
     with torch.no_grad(), torch.autocast(pred_points.device.type, enabled=False):
         preds, gts = pred_points.float(), gt_points.float()
         targets = render_elements(gts, gt_is_polygon, size, *softness)
-        cost = preds.new_zeros(len(preds), len(gts))
-        for polygon in (False, True):
-            columns = gt_is_polygon == polygon
-            kind = torch.full((len(preds),), polygon, device=preds.device)
-            masks = render_elements(preds, kind, size, *softness)
-            cost[:, columns] = pairwise_dice_loss(masks, targets[columns])
-        return cost
+        lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
+        as_lines = pairwise_dice_loss(render_elements(preds, lines, size, *softness), targets)
+        as_polygons = pairwise_dice_loss(render_elements(preds, ~lines, size, *softness), targets)
+        return torch.where(gt_is_polygon, as_polygons, as_lines)
 
 
 class RenderedDiceLoss(nn.Module):

@@ -1,0 +1,120 @@
+"""Plain torch rasters of polylines and polygons: the definition of right, in any float type."""
+
+import torch
+from torch import Tensor
+
+LENGTH_EPS = 1e-5  # added to an edge's squared length, as in MapVR: an edge may be a single point
+
+
+def edge_distances(pixels: Tensor, starts: Tensor, ends: Tensor, eps: float = 0.0) -> Tensor:
+    """Squared distance of every pixel to the nearest edge.
+
+    The nearest edge is found without gradient, one edge at a time, so that memory does not grow
+    with E.
+
+    Args:
+        pixels: Sample positions. (H, W, 2)
+        starts: First end of each edge, in the unit of ``pixels``. (K, E, 2)
+        ends: Second end of each edge. (K, E, 2)
+        eps: Added to an edge's squared length in the projection.
+
+    Returns:
+        Squared distances, differentiable in the ends of the nearest edge. (K, H, W)
+    """
+    shape = (len(starts), *pixels.shape[:2])
+    with torch.no_grad():
+        nearest = pixels.new_full(shape, torch.inf)
+        owner = torch.zeros(shape, dtype=torch.long, device=pixels.device)
+        for index, (start, end) in enumerate(zip(starts.unbind(1), ends.unbind(1), strict=True)):
+            squared = _segment_distance(pixels, start[:, None, None], end[:, None, None], eps)
+            closer = squared < nearest
+            nearest, owner = torch.where(closer, squared, nearest), owner.where(~closer, index)
+        owner = owner.flatten(1)[..., None].expand(-1, -1, 2)  # (K, HW, 2)
+    start, end = (e.gather(1, owner).reshape(*shape, 2) for e in (starts, ends))
+    return _segment_distance(pixels, start, end, eps)
+
+
+def _segment_distance(pixels: Tensor, start: Tensor, end: Tensor, eps: float) -> Tensor:
+    """Squared distance of points to segments. (..., 2) each -> (...)"""
+    edge, offsets = end - start, pixels - start
+    length2 = (edge.square().sum(-1) + eps).clamp(min=1e-38)
+    along = ((offsets * edge).sum(-1) / length2).clamp(0, 1)
+    return (offsets - along[..., None] * edge).square().sum(-1)
+
+
+def inside_polygon(pixels: Tensor, vertices: Tensor) -> Tensor:
+    """Tell which pixels lie inside each polygon by the even-odd rule.
+
+    Args:
+        pixels: Sample positions. (H, W, 2)
+        vertices: Corners, implicitly closed. (K, V, 2)
+
+    Returns:
+        True inside. (K, H, W)
+    """
+    shape = (len(vertices), *pixels.shape[:2])
+    inside = torch.zeros(shape, dtype=torch.bool, device=vertices.device)
+    x, y = pixels.unbind(-1)
+    for start, end in zip(vertices.unbind(1), vertices.roll(-1, 1).unbind(1), strict=True):
+        (x0, y0), (x1, y1) = start[:, None, None].unbind(-1), end[:, None, None].unbind(-1)
+        straddles = (y0 > y) != (y1 > y)
+        rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)
+        inside ^= straddles & (x < (x1 - x0) * (y - y0) / rise + x0)
+    return inside
+
+
+def soft_rasters_reference(
+    rings: Tensor, is_polygon: Tensor, height: int, width: int, softness: tuple[float, float]
+) -> Tensor:
+    r"""Render closed rings: :math:`\exp(-d^2 / s)`, or :math:`\sigma(\pm d^2 / s)` for polygons.
+
+    Args:
+        rings: Vertices in pixels, sampled at integer positions. (n, V, 2)
+        is_polygon: Which are filled. (n,)
+        height: Rows H.
+        width: Columns W.
+        softness: s for lines and for polygons.
+
+    Returns:
+        Masks. (n, H, W)
+    """
+    x = torch.arange(width, device=rings.device, dtype=rings.dtype)
+    y = torch.arange(height, device=rings.device, dtype=rings.dtype)
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+    distances = edge_distances(pixels, rings, rings.roll(-1, 1), LENGTH_EPS)
+    signed = torch.where(inside_polygon(pixels, rings.detach()), distances, -distances)
+    lines, polygons = torch.exp(-distances / softness[0]), torch.sigmoid(signed / softness[1])
+    return torch.where(is_polygon[:, None, None], polygons, lines)
+
+
+def draw_reference(
+    polylines: Tensor,
+    filled: Tensor,
+    pixels: Tensor,
+    half_width: float,
+    pixel: float,
+    antialias: bool,
+) -> Tensor:
+    """Draw ground-truth masks.
+
+    Args:
+        polylines: Vertices. (K, P, 2)
+        filled: Which are filled as polygons. (K,)
+        pixels: Pixel centres in the unit of ``polylines``. (H, W, 2)
+        half_width: Half a line's width.
+        pixel: Side of the square that is as large as a pixel.
+        antialias: Whether a pixel takes the share that is covered, or 0 or 1.
+
+    Returns:
+        Masks in [0, 1]. (K, H, W)
+    """
+    to_line = edge_distances(pixels, polylines[:, :-1], polylines[:, 1:]).sqrt()
+    to_closing = edge_distances(pixels, polylines[:, -1:], polylines[:, :1]).sqrt()
+    inside = inside_polygon(pixels, polylines)
+    if not antialias:
+        return torch.where(filled[:, None, None], inside, to_line <= half_width).to(pixels.dtype)
+    near, far = (to_line + half_width) / pixel, (to_line - half_width) / pixel
+    lines = (near.clamp(max=0.5) - far.clamp(min=-0.5)).clamp(min=0)
+    to_edge = torch.minimum(to_line, to_closing) / pixel
+    areas = (0.5 + torch.where(inside, to_edge, -to_edge)).clamp(0, 1)
+    return torch.where(filled[:, None, None], areas, lines)
