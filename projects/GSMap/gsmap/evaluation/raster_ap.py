@@ -8,10 +8,9 @@ than two points are dropped, and at most 100 per class and sample count.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
+from gsmap.evaluation import raster_drawing as drawing
 from gsmap.evaluation import raster_kernels as kernels
 from gsmap.evaluation.average_precision import calibration_error, interpolated_ap
 from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray, MapElements
@@ -27,7 +26,6 @@ LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 POLYGON_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
 POLYGON_CLASSES = ("ped_crossing", "stop_line", "intersection", "carpark", "carpark_area")
 RECALL_LIMITS = (1, 10, 100)
-PixelArray = npt.NDArray[np.int32]
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
 
 
@@ -111,20 +109,20 @@ class Masks:
     Args:
         pixels: Bytes 0 or 1 of all crops, one crop after another. (M,)
         boxes: First row, first column, rows and columns of each crop. (N, 4)
-        starts: Where each crop starts in ``pixels``. (N,)
+        starts: Where each crop starts in ``pixels``, and the size of it. (N + 1,)
         labels: Class indices. (N,)
     """
 
-    pixels: kernels.ByteArray
+    pixels: drawing.ByteArray
     boxes: IntArray
     starts: IntArray
     labels: IntArray
 
-    def astuple(self) -> tuple[kernels.ByteArray, IntArray, IntArray, IntArray]:
+    def astuple(self) -> tuple[drawing.ByteArray, IntArray, IntArray, IntArray]:
         """Return the fields in the order in which the kernels take them."""
         return self.pixels, self.boxes, self.starts, self.labels
 
-    def crop(self, index: int) -> kernels.ByteArray:
+    def crop(self, index: int) -> drawing.ByteArray:
         """Return a view of one crop. (rows, columns)"""
         _, _, rows, cols = self.boxes[index]
         start = self.starts[index]
@@ -138,7 +136,7 @@ class Masks:
         return canvas
 
 
-def pixels_from_metres(points: FloatArray, config: RasterConfig) -> PixelArray:
+def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
     """Round points to pixels, halves to even, with the arithmetic of the reference evaluator.
 
     Args:
@@ -146,49 +144,13 @@ def pixels_from_metres(points: FloatArray, config: RasterConfig) -> PixelArray:
         config: Rules.
 
     Returns:
-        Column and row. (M, 2) int32
+        Column and row. (M, 2)
     """
     origin = np.array([config.x_range[0], config.y_range[0]])
     extent = np.array([config.x_range[1], config.y_range[1]]) - origin
     pixels = (points - origin) / extent * np.array([config.width, config.height])
     np.clip(pixels, -_FAR_PX, _FAR_PX, out=pixels)
-    return np.rint(pixels).astype(np.int32)
-
-
-def _boxes(pixels: PixelArray, offsets: IntArray, config: RasterConfig) -> IntArray:
-    """Return the crop that each element and its dilation need; without rows if it is outside."""
-    boxes = np.zeros((len(offsets) - 1, 4), dtype=np.int64)
-    filled = np.flatnonzero(np.diff(offsets) > 0)
-    if not len(filled):
-        return boxes
-    size = np.array([config.height, config.width])
-    starts = offsets[filled]
-    low = np.minimum.reduceat(pixels, starts, axis=0)[:, ::-1].astype(np.int64)  # (row, column)
-    high = np.maximum.reduceat(pixels, starts, axis=0)[:, ::-1].astype(np.int64)
-    inside = ((high >= 0) & (low < size)).all(axis=1)
-    radius = config.dilation_px // 2
-    low, high = np.maximum(low - radius, 0), np.minimum(high + radius + 1, size)
-    boxes[filled] = np.concatenate([low, high - low], axis=1) * inside[:, None]
-    return boxes
-
-
-def _fill(mask: kernels.ByteArray, points: PixelArray) -> None:
-    """Fill a polygon in its crop, without its outline.
-
-    Args:
-        mask: The crop. (rows, columns)
-        points: Corners as column and row. (P, 2)
-    """
-    corners = points.astype(np.int64)
-    edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
-    rows, cols = mask.shape
-    outside = ((edges < 0) | (edges >= (cols, rows))).any(axis=(1, 2))
-    for i in np.flatnonzero(outside):
-        # the outline is drawn between the points where it meets the border; the fill follows it
-        _, *ends = cv2.clipLine((0, 0, cols, rows), *edges[i].tolist())
-        if ends[0][1] != ends[1][1]:
-            edges[i] = ends
-    kernels.fill_even_odd(mask, corners, edges, outside)
+    return np.rint(pixels).astype(np.int64)
 
 
 def rasterize(elements: MapElements, config: RasterConfig) -> Masks:
@@ -201,21 +163,11 @@ def rasterize(elements: MapElements, config: RasterConfig) -> Masks:
         config: Rules.
     """
     pixels = pixels_from_metres(elements.points, config)
-    boxes = _boxes(pixels, elements.offsets, config)
-    sizes = boxes[:, 2] * boxes[:, 3]
-    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)[: len(sizes)]
-    drawn = Masks(np.zeros(int(sizes.sum()), np.uint8), boxes, starts, elements.labels)
-    shifted: PixelArray = pixels - np.repeat(boxes[:, 1::-1], elements.num_points, axis=0).astype(
-        np.int32
-    )
-    for i in np.flatnonzero(sizes):
-        points: PixelArray = shifted[elements.offsets[i] : elements.offsets[i + 1], None]
-        polygon = config.is_polygon[elements.labels[i]]
-        cv2.polylines(drawn.crop(i), [points], polygon, (1,))
-        if polygon:
-            _fill(drawn.crop(i), points[:, 0])
-    dilated = kernels.dilate(drawn.pixels, boxes, starts, config.dilation_px // 2)
-    return Masks(dilated, boxes, starts, elements.labels)
+    radius = config.dilation_px // 2
+    boxes, starts = drawing.crops(pixels, elements.offsets, config.height, config.width, radius)
+    filled = np.array(config.is_polygon)[elements.labels]
+    masks = drawing.draw(pixels, elements.offsets, boxes, starts, filled, radius)
+    return Masks(masks, boxes, starts, elements.labels)
 
 
 def _ranked_predictions(predictions: MapElements, config: RasterConfig) -> IntArray:

@@ -4,54 +4,12 @@ A mask is stored as the crop that holds it: bytes 0 or 1, one crop after another
 """
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray
-
-ByteArray = npt.NDArray[np.uint8]
+from gsmap.evaluation.raster_drawing import ByteArray
 
 _COCO_SLACK = 1.0 - 1e-10  # COCO lowers a threshold of 1, so that equal masks match
-
-
-@njit(cache=True)
-def dilate(masks: ByteArray, boxes: IntArray, starts: IntArray, radius: int) -> ByteArray:
-    """Dilate each crop by a square; what falls outside the crop is lost.
-
-    Args:
-        masks: The crops. (M,)
-        boxes: First row, first column, rows and columns of each crop. (N, 4)
-        starts: Where each crop starts in ``masks``. (N,)
-        radius: Half the side of the square, less the centre: 2 means 5 x 5.
-
-    Returns:
-        The dilated crops, stored alike. (M,)
-    """
-    wide = np.zeros_like(masks)
-    out = np.zeros_like(masks)
-    for i in range(len(boxes)):
-        height, width = boxes[i, 2], boxes[i, 3]
-        size = height * width
-        src = masks[starts[i] : starts[i] + size]
-        mid = wide[starts[i] : starts[i] + size]
-        dst = out[starts[i] : starts[i] + size]
-        for row in range(height):
-            line_in = src[row * width : (row + 1) * width]
-            line_out = mid[row * width : (row + 1) * width]
-            for shift in range(-radius, radius + 1):
-                low, high = max(0, -shift), min(width, width - shift)
-                if low >= high:
-                    continue
-                part_out, part_in = line_out[low:high], line_in[low + shift : high + shift]
-                for x in range(len(part_out)):
-                    part_out[x] |= part_in[x]
-        for row in range(height):
-            line_out = dst[row * width : (row + 1) * width]
-            for other in range(max(0, row - radius), min(height, row + radius + 1)):
-                line_in = mid[other * width : (other + 1) * width]
-                for x in range(width):
-                    line_out[x] |= line_in[x]
-    return out
 
 
 @njit(cache=True)
@@ -203,69 +161,20 @@ def union_areas(
     canvas = np.zeros((height, width), dtype=np.uint8)
     for c in range(num_classes):
         p_which, g_which = pred[3] == c, gt[3] == c
-        if not p_which.any() and not g_which.any():
+        top, bottom = height, 0
+        for boxes, which in ((pred[1], p_which), (gt[1], g_which)):
+            for i in range(len(boxes)):
+                if which[i] and boxes[i, 2]:
+                    top = min(top, boxes[i, 0])
+                    bottom = max(bottom, boxes[i, 0] + boxes[i, 2])
+        if top >= bottom:
             continue
-        canvas[:] = 0
+        canvas[top:bottom] = 0
         _paint(canvas, pred[0], pred[1], pred[2], p_which, 1)
         _paint(canvas, gt[0], gt[1], gt[2], g_which, 2)
-        for row in range(height):
-            both, either = np.uint32(0), np.uint32(0)
-            for value in canvas[row]:
-                both += np.uint32(value == 3)
-                either += np.uint32(value != 0)
-            counts[c, 0] += both
-            counts[c, 1] += either
+        both, either = 0, 0
+        for value in canvas[top:bottom].ravel():
+            both += value == 3
+            either += value != 0
+        counts[c, 0], counts[c, 1] = both, either
     return counts
-
-
-@njit(cache=True)
-def _truncated_quotient(numerator: int, denominator: int) -> int:
-    """Divide integers, rounding towards zero as C does."""
-    quotient = abs(numerator) // abs(denominator)
-    return quotient if (numerator >= 0) == (denominator >= 0) else -quotient
-
-
-@njit(cache=True)
-def fill_even_odd(mask: ByteArray, corners: IntArray, edges: IntArray, cut: BoolArray) -> None:
-    """Fill the inside of a polygon, by the even-odd rule, without its outline.
-
-    Row y holds the pixels between the crossings of the edges that span [y, y + 1), rounded to the
-    nearest pixel. This is OpenCV's rule from 4.8 to 4.10, with which the reference figures were
-    made; before and after, OpenCV sets other pixels along the outline.
-
-    Args:
-        mask: Where to set 1. (rows, columns)
-        corners: The closed outline: column and row of each corner. (P, 2)
-        edges: Two points of each edge i, from corner i to i + 1, that fix its slope: its ends, or
-            where it meets the border of the mask. (P, 2, 2)
-        cut: Which edges leave the mask; OpenCV rounds their crossings down. (P,)
-    """
-    num_edges = len(corners)
-    height, width = mask.shape
-    x_start = np.zeros(num_edges, dtype=np.int64)
-    slope = np.zeros(num_edges, dtype=np.int64)
-    low, high = np.zeros(num_edges, dtype=np.int64), np.zeros(num_edges, dtype=np.int64)
-    for i in range(num_edges):
-        a, b = corners[i], corners[(i + 1) % num_edges]
-        if a[1] == b[1]:
-            continue
-        first, last = edges[i, 0], edges[i, 1]
-        slope[i] = _truncated_quotient((last[0] - first[0]) * 65536, last[1] - first[1])
-        low[i], high[i] = min(a[1], b[1]), max(a[1], b[1])
-        upper = first if a[1] < b[1] else last
-        x_start[i] = upper[0] * 65536 + (low[i] - upper[1]) * slope[i]
-        if not cut[i]:
-            x_start[i] += 32768  # half a pixel, in units of 1/65536
-    crossings = np.zeros(num_edges, dtype=np.int64)
-    for row in range(max(0, low.min()), min(height, high.max())):
-        count = 0
-        for i in range(num_edges):
-            if low[i] <= row < high[i]:
-                crossings[count] = x_start[i] + (row - low[i]) * slope[i]
-                count += 1
-        crossings[:count].sort()
-        for i in range(0, count - 1, 2):
-            left = max(0, crossings[i] >> 16)
-            right = min(width - 1, crossings[i + 1] >> 16)
-            for column in range(left, right + 1):
-                mask[row, column] = 1
