@@ -97,8 +97,8 @@ def _try_log(log_dir: Path, root: Path, options: SampleOptions) -> LogSamples | 
     """Read a log; return the reason where that fails (a bug of ours still stops everything)."""
     try:
         return read_log(log_dir, root, options)
-    except (OSError, ValueError, KeyError, shapely.errors.ShapelyError) as error:
-        return f"{type(error).__name__}: {error}" if isinstance(error, KeyError) else str(error)
+    except (OSError, ValueError, shapely.errors.ShapelyError) as error:
+        return str(error)
 
 
 def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -> None:

@@ -70,7 +70,7 @@ class PoseTable:
             table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
             quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
             translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
-        except (OSError, KeyError) as error:  # pyarrow's ArrowInvalid is a ValueError already
+        except (OSError, KeyError, ValueError) as error:
             raise ValueError(f"{path} is damaged ({error}): download the log again.") from error
         finite = np.isfinite(quaternions).all(1) & np.isfinite(translations).all(1)
         if not finite.all() or len(table) == 0:
@@ -133,7 +133,7 @@ class Argoverse2Log:
                 for name in RING_CAMERAS
                 if name in known
             }
-        except (OSError, KeyError) as error:
+        except (OSError, KeyError, ValueError) as error:
             raise ValueError(f"the calibration in {folder} is damaged ({error}).") from error
 
     @cached_property

@@ -123,7 +123,7 @@ class Argoverse2Map:
 
         Raises:
             FileNotFoundError: If the map is missing.
-            ValueError: If there are several.
+            ValueError: If there are several, or it is damaged.
         """
         found = sorted((log_dir / "map").glob("log_map_archive_*.json"))
         if not found:
@@ -132,7 +132,10 @@ class Argoverse2Map:
             )
         if len(found) > 1:
             raise ValueError(f"{len(found)} maps in {log_dir / 'map'}, expected one: {found}.")
-        return cls(ArgoverseStaticMap.from_json(found[0]))
+        try:
+            return cls(ArgoverseStaticMap.from_json(found[0]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{found[0]} is damaged ({error}): download it again.") from error
 
     @property
     def invalid_counts(self) -> dict[str, int]:
