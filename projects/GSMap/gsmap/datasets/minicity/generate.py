@@ -30,7 +30,21 @@ from gsmap.datasets.minicity.scene import Records, SceneMaker, SceneTask
 from gsmap.datasets.minicity.town import Town, make_town
 
 MARKER = "minicity.json"
-TABLES = ["category", "attribute", "visibility", "instance", "sensor", "calibrated_sensor", "ego_pose", "log", "scene", "sample", "sample_data", "sample_annotation", "map"]
+TABLES = [
+    "category",
+    "attribute",
+    "visibility",
+    "instance",
+    "sensor",
+    "calibrated_sensor",
+    "ego_pose",
+    "log",
+    "scene",
+    "sample",
+    "sample_data",
+    "sample_annotation",
+    "map",
+]
 CATEGORIES = ("vehicle.car", "vehicle.truck", "vehicle.bus.rigid", "human.pedestrian.adult")
 ATTRIBUTES = ("vehicle.moving", "vehicle.parked", "pedestrian.standing")
 LOGGER = logging.getLogger(__name__)

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmap.datasets.minicity.curves import Array
-from gsmap.datasets.minicity.meshes import Vehicle
 from gsmap.datasets.minicity.texture import GroundTexture
+from gsmap.datasets.minicity.vehicles import Vehicle
 
 BEAMS = 32
 COLUMNS = 720
@@ -73,15 +73,15 @@ def scan(
         np.linalg.norm(boxes[:, :8].reshape(-1, 4, 2) - origin[:2], axis=-1).min(1) < RANGE_M
     ]
     entry = _entry_distances(origin[:2], level, near)
-    for k in range(len(near)):
-        columns = np.flatnonzero(np.isfinite(entry[:, k]))
-        if not len(columns):
-            continue
-        at = origin[2] + slope[:, None] * entry[columns, k][None]
-        hit = (at > 0) & (at < near[k, 8]) & (entry[columns, k][None] < reach[:, columns])
-        rows, local = np.nonzero(hit)
-        reach[rows, columns[local]] = entry[columns[local], k]
-        struck[rows, columns[local]] = k
+    column, box = np.nonzero(np.isfinite(entry))
+    # Far hits first: of several hits of one ray, the nearest is written last and stays.
+    order = np.argsort(-entry[column, box], kind="stable")
+    column, box = column[order], box[order]
+    distance = entry[column, box]
+    at = origin[2] + slope[:, None] * distance
+    rows, hit = np.nonzero((at > 0) & (at < near[box, 8]))
+    reach[rows, column[hit]] = distance[hit]
+    struck[rows, column[hit]] = box[hit]
     rows, columns = np.nonzero(reach / np.cos(elevation)[:, None] < RANGE_M)
     distance = reach[rows, columns] + rng.normal(0, RANGE_NOISE_M, len(rows))
     world = np.column_stack(

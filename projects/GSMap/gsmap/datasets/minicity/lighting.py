@@ -1,14 +1,17 @@
 """Weather and light, and what they do to a picture."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from gsmap.datasets.minicity.camera import Camera
 from gsmap.datasets.minicity.curves import Array
 from gsmap.datasets.minicity.texture import Image
 
+NOISE_PX = 1024
 BGR = tuple[float, float, float]
 
 
@@ -95,7 +98,8 @@ def render_sky(camera: Camera, lighting: Lighting) -> Image:
     rise = np.clip(directions[2] / np.linalg.norm(directions, axis=0), 0, 1) ** 0.6
     top, low = np.array(lighting.sky_top), np.array(lighting.haze)
     column = (low + rise[:, None] * (top - low)).astype(np.uint8)
-    return np.ascontiguousarray(np.broadcast_to(column[:, None], (camera.height, camera.width, 3)))
+    size = (camera.width, camera.height)
+    return cv2.resize(column[:, None], size, interpolation=cv2.INTER_NEAREST)
 
 
 def haze_ground(image: Image, camera: Camera, lighting: Lighting, ground_z_m: float) -> None:
@@ -124,27 +128,28 @@ def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:
     if lighting.streaks:
         _draw_streaks(image, lighting, rng)
     rows, columns = image.shape[:2]
-    tile = _sensor_noise(round(lighting.noise * 2))
-    top, left = (int(v) for v in rng.integers(0, 256, 2))
-    repeats = (-(-(rows + top) // 512), -(-(columns + left) // 512), 1)
-    noise = (
-        np.tile(tile, repeats)[top : top + rows, left : left + columns]
-        if max(repeats) > 1
-        else (tile[top : top + rows, left : left + columns])
-    )
+    tile = _sensor_noise(lighting.noise)
+    room = (max(1, NOISE_PX - rows), max(1, NOISE_PX - columns))
+    top, left = (int(v) for v in rng.integers(0, room))
+    wraps = rows + top > NOISE_PX or columns + left > NOISE_PX
+    if wraps:
+        repeats = (-(-(rows + top) // NOISE_PX), -(-(columns + left) // NOISE_PX), 1)
+        tile = np.tile(tile, repeats)
+    noise = tile[top : top + rows, left : left + columns]
     return cv2.add(image, noise, dtype=cv2.CV_8U)
 
 
-_NOISE: dict[int, np.ndarray] = {}
+@lru_cache(maxsize=1)
+def _unit_noise() -> NDArray[np.float32]:
+    rng = np.random.default_rng(7)
+    gray = rng.standard_normal((NOISE_PX, NOISE_PX, 1), np.float32)
+    return gray + 0.5 * rng.standard_normal((NOISE_PX, NOISE_PX, 3), np.float32)
 
 
-def _sensor_noise(half_levels: int) -> np.ndarray:
-    """A fixed tile of noise with a standard deviation of ``half_levels / 2``. (512, 512, 3)"""
-    if half_levels not in _NOISE:
-        rng = np.random.default_rng(half_levels)
-        noise = rng.standard_normal((512, 512, 1)) + 0.5 * rng.standard_normal((512, 512, 3))
-        _NOISE[half_levels] = np.round(noise * half_levels / 2).astype(np.int16)
-    return _NOISE[half_levels]
+@lru_cache(maxsize=8)
+def _sensor_noise(deviation: float) -> NDArray[np.int16]:
+    """A fixed tile of noise, grey levels. (NOISE_PX, NOISE_PX, 3)"""
+    return np.round(_unit_noise() * deviation).astype(np.int16)
 
 
 def _draw_streaks(image: Image, lighting: Lighting, rng: np.random.Generator) -> None:

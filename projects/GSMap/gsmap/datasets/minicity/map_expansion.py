@@ -15,7 +15,23 @@ from gsmap.datasets.minicity.paint import divider_pieces, has_center_line, lane_
 from gsmap.datasets.minicity.roads import Lane, Road
 from gsmap.datasets.minicity.town import Town, road_surface
 
-LAYERS = ["polygon", "line", "node", "drivable_area", "road_segment", "road_block", "lane", "ped_crossing", "walkway", "stop_line", "carpark_area", "road_divider", "lane_divider", "traffic_light", "lane_connector"]
+LAYERS = [
+    "polygon",
+    "line",
+    "node",
+    "drivable_area",
+    "road_segment",
+    "road_block",
+    "lane",
+    "ped_crossing",
+    "walkway",
+    "stop_line",
+    "carpark_area",
+    "road_divider",
+    "lane_divider",
+    "traffic_light",
+    "lane_connector",
+]
 MASK_RESOLUTION_M = 0.1
 PIECE_M = 4.0
 

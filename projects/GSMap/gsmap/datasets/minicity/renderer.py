@@ -8,15 +8,19 @@ from numpy.typing import NDArray
 
 from gsmap.datasets.minicity.camera import NEAR_M, Camera, clip_near
 from gsmap.datasets.minicity.curves import Array
-from gsmap.datasets.minicity.ground import render_ground
+from gsmap.datasets.minicity.ground import render_ground, sample_height
 from gsmap.datasets.minicity.lighting import Lighting, finish, haze_ground, render_sky
-from gsmap.datasets.minicity.meshes import FrozenMesh, Mesh, Vehicle, merge, vehicle_mesh
+from gsmap.datasets.minicity.meshes import FrozenMesh, Mesh, merge
 from gsmap.datasets.minicity.scene_map import MATERIALS, HeightGrid, SceneMap
 from gsmap.datasets.minicity.texture import SHIFT, GroundTexture, Image, darken, paint_ground
+from gsmap.datasets.minicity.vehicles import Vehicle, vehicle_mesh
 
 FAR_M = 160.0
 SMALL_FAR_M = 90.0
 MIN_PIXELS = 1.2
+BACKDROP_RADIUS_M = 26.0
+SMALL_RADIUS_M = 9.0
+SHADOW_FAR_M = 45.0
 
 
 class SceneRenderer:
@@ -81,8 +85,6 @@ class SceneRenderer:
     def _ground_below(self, camera: Camera) -> float:
         if self.height is None:
             return self.ground_z_m
-        from gsmap.datasets.minicity.ground import sample_height
-
         return float(sample_height(self.height, camera.center[None, :2])[0])
 
 
@@ -100,8 +102,11 @@ def render_camera(
 def _shade_under(image: Image, camera: Camera, vehicles: list[Vehicle], lighting: Lighting) -> None:
     """Darken the ground under vehicles and in their shadows, in place."""
     mask: Image | None = None
+    dark = 255 * (0.52 if lighting.shadow > 0 else 0.62)
+    forward = camera.cam_from_world[2, :3]
     for vehicle in vehicles:
-        if np.linalg.norm(vehicle.center[:2] - camera.center[:2]) > 45:
+        sight = vehicle.center - camera.center
+        if np.hypot(sight[0], sight[1]) > SHADOW_FAR_M or sight @ forward < -SMALL_RADIUS_M:
             continue
         base = vehicle_shadow(vehicle, lighting)
         z = float(vehicle.center[2] - vehicle.size[2] / 2)
@@ -113,10 +118,7 @@ def _shade_under(image: Image, camera: Camera, vehicles: list[Vehicle], lighting
             continue
         if mask is None:
             mask = np.full(image.shape[:2], 255, np.uint8)
-        hull = cv2.convexHull(_fixed(px))
-        cv2.fillConvexPoly(
-            mask, hull, 255 * (0.52 if lighting.shadow > 0 else 0.62), cv2.LINE_AA, SHIFT
-        )
+        cv2.fillConvexPoly(mask, _fixed(px), dark, cv2.LINE_AA, SHIFT)
     if mask is not None:
         cv2.multiply(image, cv2.merge([mask] * 3), dst=image, scale=1 / 255)
 
@@ -149,6 +151,7 @@ def draw_mesh(image: Image, camera: Camera, mesh: FrozenMesh, lighting: Lighting
     """Paint a mesh into a picture, far objects first, buildings before all else, in place."""
     distance = np.linalg.norm(mesh.anchors - camera.center, axis=1)
     shown = distance < np.where(mesh.backdrop, FAR_M, SMALL_FAR_M)
+    shown &= in_view(camera, mesh)
     shown &= ~hidden_by_buildings(camera, mesh, shown, distance)
     veil = 1 - np.exp(-distance / lighting.haze_m)
     drawables = _visible_quads(camera, mesh, shown, distance, lighting) + _visible_discs(
@@ -186,6 +189,7 @@ def _visible_quads(
     )
     keep = ~whole | ~(outside | small | decal_far)
     colors = _lit(mesh.colors[index], normal[facing & in_front], mesh.glow[index], camera, lighting)
+    depth = np.linalg.norm(corners.mean(1), axis=1)
     fixed = _fixed(px)
     found = []
     for k in np.flatnonzero(keep):
@@ -196,13 +200,8 @@ def _visible_quads(
             continue
         else:
             polygon = _fixed(camera.to_pixels(clip_near(corners[k])))
-        depth = float(np.linalg.norm(corners[k].mean(0)))
-        order = (
-            int(not mesh.backdrop[group]),
-            -float(distance[group]),
-            int(mesh.layers[face]),
-            -depth,
-        )
+        backdrop, layer = bool(mesh.backdrop[group]), int(mesh.layers[face])
+        order = (int(not backdrop), -float(distance[group]), layer, -float(depth[k]))
         found.append((_Drawable(order, polygon, None, colors[k]), group))
     return found
 
@@ -236,6 +235,19 @@ def _visible_discs(
         order = (1, -float(distance[group]), 9, -float(np.linalg.norm(centers[k])))
         found.append((_Drawable(order, None, disc, mesh.disc_colors[index[k]] * light), group))
     return found
+
+
+def in_view(camera: Camera, mesh: FrozenMesh) -> NDArray[np.bool_]:
+    """Whether an object may touch the picture, judged by a sphere about its anchor. (G,)"""
+    at = camera.to_camera(mesh.anchors)
+    radius = np.where(mesh.backdrop, BACKDROP_RADIUS_M, SMALL_RADIUS_M)
+    focal, cx = camera.intrinsics[0, 0], camera.intrinsics[0, 2]
+    seen = at[:, 2] > -radius
+    for side, edge in ((-at[:, 0], cx), (at[:, 0], camera.width - cx)):
+        # distance beyond the plane through the camera and this edge of the picture
+        beyond = (side * focal - at[:, 2] * edge) / np.hypot(focal, edge)
+        seen &= beyond < radius
+    return seen
 
 
 def hidden_by_buildings(

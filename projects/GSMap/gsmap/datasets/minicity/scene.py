@@ -16,7 +16,6 @@ from gsmap.datasets.minicity.lighting import Lighting, random_lighting
 from gsmap.datasets.minicity.meshes import (
     FrozenMesh,
     Mesh,
-    Vehicle,
     add_building,
     add_pole,
     add_tree,
@@ -32,10 +31,12 @@ from gsmap.datasets.minicity.rig import (
 )
 from gsmap.datasets.minicity.town import Town
 from gsmap.datasets.minicity.traffic import Actor, Drive, make_actors, plan_ego
+from gsmap.datasets.minicity.vehicles import Vehicle
 
 SAMPLE_PERIOD_S = 0.5
 GROUND_MARGIN_M = 48.0
 BOX_REACH_M = 55.0
+BOX_SLACK_M = 0.05
 JPEG_QUALITY = 90
 FIRST_TIMESTAMP_US = 1_600_000_000_000_000
 Records = dict[str, list[dict[str, Any]]]
@@ -93,7 +94,7 @@ class SceneMaker:
         track = np.array([self.ego.pose(float(t))[:2] for t in times])
         low, high = track.min(0) - GROUND_MARGIN_M, track.max(0) + GROUND_MARGIN_M
         bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        resolution = float(np.clip(0.0625 * 800 / self.config.image_width, 0.05, 0.125))
+        resolution = float(np.clip(0.0625 * 800 / self.config.image_width, 0.05, 0.09))
         mesh, shadows = _surroundings(self.town, track, self.lighting)
         scene_map = make_scene_map(self.town, bounds)
         return SceneRenderer(
@@ -297,11 +298,12 @@ class SceneMaker:
 
 
 def _points_in_box(points: Array, vehicle: Vehicle) -> int:
-    local = points - vehicle.center
-    near = local[np.abs(local[:, :2]).max(1) < vehicle.size[0]]
+    dx, dy = points[:, 0] - vehicle.center[0], points[:, 1] - vehicle.center[1]
+    near = (np.abs(dx) < vehicle.size[0]) & (np.abs(dy) < vehicle.size[0])
+    dx, dy, dz = dx[near], dy[near], points[near, 2] - vehicle.center[2]
     c, s = np.cos(vehicle.yaw_rad), np.sin(vehicle.yaw_rad)
-    turned = np.column_stack([near[:, :2] @ np.array([[c, -s], [s, c]]), near[:, 2]])
-    return int((np.abs(turned) <= np.array(vehicle.size) / 2 + 0.05).all(1).sum())
+    local = np.stack([c * dx + s * dy, c * dy - s * dx, dz], axis=1)
+    return int((np.abs(local) <= np.array(vehicle.size) / 2 + BOX_SLACK_M).all(1).sum())
 
 
 def _surroundings(town: Town, track: Array, lighting: Lighting) -> tuple[FrozenMesh, list[Array]]:

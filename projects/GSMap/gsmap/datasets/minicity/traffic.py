@@ -1,14 +1,17 @@
 """Who is on the street: the ego vehicle's drive, other traffic, parked vehicles and people."""
 
+import math
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmap.datasets.minicity.curves import Array, arc_lengths, interpolate, resample, tangents
-from gsmap.datasets.minicity.meshes import Color, Vehicle
+from gsmap.datasets.minicity.curves import Array, arc_lengths, resample, tangents
+from gsmap.datasets.minicity.meshes import Color
 from gsmap.datasets.minicity.roads import Lane
 from gsmap.datasets.minicity.town import Town
+from gsmap.datasets.minicity.vehicles import Vehicle
 
 KINDS: list[tuple[str, tuple[float, float, float], float]] = [
     ("vehicle.car", (4.5, 1.85, 1.55), 0.78),
@@ -26,6 +29,7 @@ PAINTS: list[Color] = [
 ]
 REACH_M = 75.0
 CLEARANCE_M = 6.5
+SWING_M = 6.0
 
 
 @dataclass(frozen=True)
@@ -49,22 +53,26 @@ class Drive:
     shift_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Prepare the path's tables."""
-        object.__setattr__(self, "_lengths", arc_lengths(self.path))
-        object.__setattr__(self, "_tangents", tangents(self.path))
+        """Prepare the path's tables; plain lists, since ``pose`` reads single entries very often."""
+        lengths = arc_lengths(self.path)
+        rows = np.column_stack([self.path, tangents(self.path)])
+        object.__setattr__(self, "_lengths", lengths.tolist())
+        object.__setattr__(self, "_rows", rows.tolist())
 
     def pose(self, time_s: float) -> tuple[float, float, float]:
         """x, y and heading at a time."""
-        lengths: Array = self._lengths  # type: ignore[attr-defined]
-        at = float(np.clip(self.start_m + self.speed * time_s, 0.0, lengths[-1]))
-        point = interpolate(self.path, lengths, np.array([at]))[0]
-        step = interpolate(self._tangents, lengths, np.array([at]))[0]  # type: ignore[attr-defined]
-        step = step / np.linalg.norm(step)
-        phase = self.swing_rad + at / 6.0
-        side = self.shift_m + self.swing_m * np.sin(phase)
-        slope = self.swing_m * np.cos(phase) / 6.0
-        x, y = point + side * np.array([-step[1], step[0]])
-        return float(x), float(y), float(np.arctan2(step[1], step[0]) + np.arctan(slope))
+        lengths: list[float] = self._lengths  # type: ignore[attr-defined]
+        rows: list[list[float]] = self._rows  # type: ignore[attr-defined]
+        at = min(max(self.start_m + self.speed * time_s, 0.0), lengths[-1])
+        i = min(max(bisect_right(lengths, at) - 1, 0), len(lengths) - 2)
+        share = (at - lengths[i]) / (lengths[i + 1] - lengths[i])
+        x, y, dx, dy = (a + share * (b - a) for a, b in zip(rows[i], rows[i + 1], strict=True))
+        norm = math.hypot(dx, dy)
+        dx, dy = dx / norm, dy / norm
+        phase = self.swing_rad + at / SWING_M
+        side = self.shift_m + self.swing_m * math.sin(phase)
+        slope = self.swing_m * math.cos(phase) / SWING_M
+        return x - side * dy, y + side * dx, math.atan2(dy, dx) + math.atan(slope)
 
 
 def follow_lanes(town: Town, first: Lane, length_m: float, rng: np.random.Generator) -> Array:
@@ -181,7 +189,7 @@ def _near(points: Array, track: Array, reach_m: float) -> bool:
 
 
 def _moving(town: Town, track: Array, density: float, rng: np.random.Generator) -> list[Actor]:
-    actors = []
+    actors: list[Actor] = []
     for lane in town.lanes.values():
         if not _near(lane.center[::6], track, REACH_M):
             continue
@@ -197,7 +205,7 @@ def _moving(town: Town, track: Array, density: float, rng: np.random.Generator) 
 
 
 def _parked(town: Town, track: Array, density: float, rng: np.random.Generator) -> list[Actor]:
-    actors = []
+    actors: list[Actor] = []
     for road in town.roads:
         section = road.section
         if not _near(road.center[::6], track, REACH_M):
@@ -225,7 +233,7 @@ def _parked(town: Town, track: Array, density: float, rng: np.random.Generator) 
 
 
 def _people(town: Town, track: Array, rng: np.random.Generator) -> list[Actor]:
-    actors = []
+    actors: list[Actor] = []
     for road in town.roads:
         if not _near(road.center[::6], track, REACH_M):
             continue
