@@ -25,7 +25,9 @@ import gsmap.layers.grid_mask
 import gsmap.matching.map_assigner
 import gsmap.matching.map_coder
 import gsmap.matching.match_costs
-import gsmap.matching.raster_costs  # noqa: F401
+import gsmap.matching.raster_costs
+import gsmap.visualization.map_visualization_hook
+import gsmap.visualization.map_visualizer  # noqa: F401
 from gsmap.losses.raster import RasterLoss
 
 # The losses are plain torch modules, usable without OpenMMLab; they enter the registry here.

@@ -21,6 +21,7 @@ from gsmap.visualization.map_elements import MapElements
 from gsmap.visualization.style import MapStyle
 
 DPI = 150
+_WIDTH = 1500  # px at DPI, for which everything is laid out
 VECTOR_SUFFIXES = (".pdf", ".svg")
 RASTER_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _MARGIN, _GAP, _HEADER, _TICKS, _TITLE = 26, 6, 52, 38, 34  # px at DPI
@@ -81,6 +82,51 @@ def _panel_boxes(count: int, aspect: float, width: float, top: float) -> tuple[l
         for i in range(count)
     ]
     return boxes, top + _TITLE + height + _TICKS
+
+
+def _side_boxes(
+    rows: Sequence[Sequence[float]], aspect: float, width: float, top: float
+) -> tuple[list[list[_Box]], list[_Box], float]:
+    """Place one bird's-eye view to the right of the cameras, as high as they are together.
+
+    The cameras' height grows linearly with the width that they get, ``slope * width + offset``, so
+    the width at which both heights agree has a closed form.
+    """
+    usable = width - 2 * _MARGIN
+    slope = sum(1 / sum(row) for row in rows)
+    offset = _GAP * (len(rows) - 1) - sum(_GAP * (len(row) - 1) / sum(row) for row in rows)
+    frame = _TITLE + _TICKS  # px above and below the panel
+    taken = 2 * _TICKS + aspect * (offset - frame)
+    camera_width = (usable - taken) / (1 + aspect * slope)
+    boxes, bottom = _justified_rows(rows, camera_width + 2 * _MARGIN, top)
+    height = bottom - top - frame
+    left = width - _MARGIN - height * aspect
+    return boxes, [_Box(left, top + _TITLE, height * aspect, height)], bottom
+
+
+def _layout(
+    rows: Sequence[Sequence[float]], num_panels: int, grid: BEVGrid, view: FrameView
+) -> tuple[list[list[_Box]], list[_Box], float]:
+    """Place all pictures: a single panel beside the cameras, several below them.
+
+    Args:
+        rows: Aspect ratios (width / height) of the cameras in each row.
+        num_panels: Number of bird's-eye views.
+        grid: Extent of the map.
+        view: Orientation of the frame.
+
+    Returns:
+        The boxes of the camera rows and of the panels, and the lower edge of all.
+    """
+    left, right, low, high = display_extent(grid, view)
+    aspect = (right - left) / (high - low)
+    if num_panels == 1 and len(rows) > 1:
+        return _side_boxes(rows, aspect, _WIDTH, _HEADER)
+    boxes, bottom = _justified_rows(rows, _WIDTH, _HEADER)
+    if not num_panels:
+        return boxes, [], bottom
+    top = bottom + (_GAP if rows else 0)
+    return boxes, *_panel_boxes(num_panels, aspect, _WIDTH, top)
 
 
 def _add_axes(figure: Figure, box: _Box) -> Axes:
@@ -152,19 +198,12 @@ def compose_figure(
     """
     if not cameras and not panels:
         raise ValueError("compose_figure needs at least one camera or one panel.")
-    scale = 1500 / width_px  # boxes are laid out at 1500 px and the dots per inch follow
+    scale = _WIDTH / width_px  # boxes are laid out for one width and the dots per inch follow
     rows = arrange_cameras(cameras, view)
     aspects = [[c.image.shape[1] / c.image.shape[0] for c in row] for row in rows]
-    camera_boxes, bottom = _justified_rows(aspects, 1500, _HEADER)
-    panel_boxes: list[_Box] = []
-    if panels:
-        left, right, low, high = display_extent(grid, view)
-        aspect = (right - left) / (high - low)
-        panel_boxes, bottom = _panel_boxes(
-            len(panels), aspect, 1500, bottom + (_GAP if rows else 0)
-        )
+    camera_boxes, panel_boxes, bottom = _layout(aspects, len(panels), grid, view)
     figure = Figure(
-        figsize=(1500 / DPI, (bottom + _MARGIN / 2) / DPI), dpi=DPI / scale, facecolor="white"
+        figsize=(_WIDTH / DPI, (bottom + _MARGIN / 2) / DPI), dpi=DPI / scale, facecolor="white"
     )
     FigureCanvasAgg(figure)
     with matplotlib.rc_context({"font.family": style.font_family}):

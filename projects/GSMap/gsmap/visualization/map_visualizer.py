@@ -59,7 +59,7 @@ def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
     """
     if images.ndim != 4 or images.shape[1] != 3:
         raise ValueError(f"images must have shape (V, 3, H, W), got {tuple(images.shape)}.")
-    pixels = images.flip(1).permute(0, 2, 3, 1).round().clamp(0, 255).to(torch.uint8)
+    pixels = images.flip(1).permute(0, 2, 3, 1).float().round().clamp(0, 255).to(torch.uint8)
     return list(pixels.cpu().numpy())
 
 
