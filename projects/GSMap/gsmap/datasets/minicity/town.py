@@ -20,6 +20,15 @@ from gsmap.datasets.minicity.network import (
 from gsmap.datasets.minicity.roads import CROSSING_GAP_M, STOP_LINE_M, Lane, Road
 
 MAX_SIDE = 8
+LARGEST_HOUSE_M = 22.0
+WALLS = [
+    (150, 165, 190),
+    (120, 140, 175),
+    (175, 180, 185),
+    (110, 125, 150),
+    (165, 160, 150),
+    (95, 105, 130),
+]
 
 
 @dataclass(frozen=True)
@@ -170,7 +179,8 @@ def _add_surroundings(town: Town, rng: np.random.Generator) -> None:
     parks = [Polygon(p.outline).union(Polygon(p.driveway)) for p in town.carparks]
     town.drivable = shapely.union_all([streets, *parks])
     around = shapely.union_all([p.buffer(0) for p in pavements])
-    pieces = shapely.get_parts(around.difference(town.drivable))
+    raised = shapely.union_all(medians)
+    pieces = shapely.get_parts(around.difference(town.drivable).difference(raised))
     town.walkways = [p for p in pieces if p.geom_type == "Polygon" and p.area > 0.5]
     _add_buildings(
         town, shapely.union_all([blocked.buffer(0.6), *[p.buffer(1.0) for p in parks]]), rng
@@ -207,42 +217,41 @@ def _add_carparks(town: Town, blocked: Polygon, rng: np.random.Generator) -> Non
         blocked = blocked.union(Polygon(outline).buffer(0.5))
 
 
-_WALLS = [
-    (150, 165, 190),
-    (120, 140, 175),
-    (175, 180, 185),
-    (110, 125, 150),
-    (165, 160, 150),
-    (95, 105, 130),
-]
-
-
 def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> None:
+    """Line both sides of every road with houses that touch neither a surface nor one another."""
     shapely.prepare(blocked)
+    built = np.full((0, 2), np.inf)
     for road in town.roads:
         dense = rng.random() < 0.75
         for sign, kerb in ((1, road.section.left_m), (-1, -road.section.right_m)):
             at = float(rng.uniform(0, 10))
             while at < road.length_m - 5:
-                front, depth = float(rng.uniform(8, 16)), float(rng.uniform(8, 12))
+                front = float(rng.uniform(8, 16))
                 setback = road.style.walkway_m + float(rng.uniform(1.0, 3.0 if dense else 9.0))
                 middle = min(at + front / 2, road.length_m - 0.1)
-                center = road.point(middle, sign * (kerb + setback + depth / 2))
-                footprint = rectangle(center, road.direction(middle), front, depth)
-                height = float(rng.uniform(4, 9) if rng.random() < 0.6 else rng.uniform(9, 22))
-                shade = rng.uniform(0.75, 1.15)
-                color = tuple(float(c * shade) for c in _WALLS[int(rng.integers(len(_WALLS)))])
+                house = _draw_building(road, middle, sign * (kerb + setback), front, rng)
                 at += front + float(rng.uniform(0.5, 3.0) if dense else rng.uniform(4, 25))
-                polygon = Polygon(footprint)
-                if blocked.intersects(polygon):
-                    continue
-                if any(
-                    np.linalg.norm(b.footprint.mean(0) - center) < 22
-                    and Polygon(b.footprint).intersects(polygon)
-                    for b in town.buildings
+                outline, center = Polygon(house.footprint), house.footprint.mean(0)
+                near = np.flatnonzero(np.abs(built - center).max(1, initial=0.0) < LARGEST_HOUSE_M)
+                if blocked.intersects(outline) or any(
+                    outline.intersects(Polygon(town.buildings[k].footprint)) for k in near
                 ):
                     continue
-                town.buildings.append(Building(footprint, height, color))
+                town.buildings.append(house)
+                built = np.concatenate([built, center[None]])
+
+
+def _draw_building(
+    road: Road, at_m: float, front_offset_m: float, front_m: float, rng: np.random.Generator
+) -> Building:
+    """A house whose front lies ``front_offset_m`` to the left of a road (to the right if negative)."""
+    depth = float(rng.uniform(8, 12))
+    center = road.point(at_m, front_offset_m + np.sign(front_offset_m) * depth / 2)
+    footprint = rectangle(center, road.direction(at_m), front_m, depth)
+    height = float(rng.uniform(4, 9) if rng.random() < 0.6 else rng.uniform(9, 22))
+    shade = float(rng.uniform(0.75, 1.15))
+    blue, green, red = WALLS[int(rng.integers(len(WALLS)))]
+    return Building(footprint, height, (blue * shade, green * shade, red * shade))
 
 
 def _add_furniture(town: Town, rng: np.random.Generator) -> None:
