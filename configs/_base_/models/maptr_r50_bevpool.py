@@ -9,4 +9,5 @@ model = dict(
         bev_size=(200, 100),
         embed_dims=256,
         depth_range=(1.0, 35.0, 0.5),
+        camera_aware=False,
         loss_depth_weight=0.0))

@@ -1,5 +1,6 @@
 """MapTR: state, forward pass, targets, assignment, losses and gradients."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -8,6 +9,7 @@ import torch
 from mmengine.structures import InstanceData
 
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
+from gsmap.checkpoints.key_map import find_key_map
 from gsmap.heads.map_head import MapHead
 from gsmap.layers.bev_encoders.gkt import gather_weighted, kernel_offsets
 
@@ -35,12 +37,16 @@ def state_rows(golden: Golden, name: str, config: str) -> Iterator[Row]:
     own = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     wrong = set(own.items()) ^ {(key, tuple(value.shape)) for key, value in renamed.items()}
     yield Row(name, "keys or shapes that differ", len(wrong), 0)
+    unused = find_key_map(shapes).unused
     trainable = sum(p.numel() for p in model.parameters() if p.requires_grad)
+    for key in unused:  # upstream trains them too, without effect
+        if listed["state"][key].get("requires_grad"):
+            trainable += math.prod(shapes[key])
     yield Row(name, "trainable parameters", abs(trainable - listed["trainable_params"]), 0)
     back = upstream_from_ours(model.state_dict())
     lost = set(shapes.items()) ^ {(key, tuple(value.shape)) for key, value in back.items()}
     yield Row(name, "keys lost on the way back", len(lost), 0)
-    original = golden.upstream_state(name)
+    original = {k: v for k, v in golden.upstream_state(name).items() if k not in unused}
     changed = max(largest_difference(back[key], value) for key, value in original.items())
     yield Row(name, "weights on the way back", changed, 0)
 
@@ -100,10 +106,10 @@ def decoded_rows(
     ours, theirs = order(labels, pts), order(data["dec_labels"], data["dec_pts"])
     yield Row(name, "dec_labels", largest_difference(labels[ours], data["dec_labels"][theirs]), 0)
     yield Row(name, "dec_pts (m)", largest_difference(pts[ours], data["dec_pts"][theirs]), 0.01)
-    boxes = np.concatenate([pts.min(1), pts.max(1)], -1)
-    yield Row(
-        name, "dec_boxes (m)", largest_difference(boxes[ours], data["dec_boxes"][theirs]), 0.01
-    )
+    if "dec_boxes" in data:
+        boxes = np.concatenate([pts.min(1), pts.max(1)], -1)[ours]
+        reference = data["dec_boxes"][theirs]
+        yield Row(name, "dec_boxes (m)", largest_difference(boxes, reference), 0.01)
     scores = np.sort(result.scores_3d.numpy()), np.sort(data["dec_scores"])
     yield Row(name, "dec_scores", largest_difference(*scores), score_atol)
 
@@ -189,7 +195,7 @@ def loss_rows(
         ours = [losses[layer + key].item() for layer in layers]
         yield Row(name, f"{key} (relative)", largest_relative(ours, data[key]), 1e-4)
     # without ground truth nothing reaches the points
-    sum(losses.values()).backward()
+    torch.stack(list(losses.values())).sum().backward()
     for key, tensor in (("grad_cls", scores), ("grad_pts", pts)):
         grad = torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
         yield Row(name, f"{key} (relative)", relative_norm(grad, data[key]), 1e-3)
