@@ -28,7 +28,9 @@ import gsmap.matching.match_costs
 import gsmap.matching.raster_costs
 import gsmap.visualization.map_visualization_hook
 import gsmap.visualization.map_visualizer  # noqa: F401
+from gsmap.losses.dice import RenderedDiceLoss
 from gsmap.losses.raster import RasterLoss
 
 # The losses are plain torch modules, usable without OpenMMLab; they enter the registry here.
 MODELS.register_module(module=RasterLoss)
+MODELS.register_module(module=RenderedDiceLoss)

@@ -1,11 +1,18 @@
 """GSMap's raster loss: weighted L1 and structural dissimilarity between soft masks (Eq. 12)."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.utils.checkpoint import checkpoint
+
+from ..ops._numba import is_fused
+from .raster_cpu import raster_loss_sums
 
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # the usual constants for values in [0, 1]
 MIN_FOREGROUND = 0.005  # a smaller ground truth counts as this share of the raster (about 9 m^2)
+NORMALIZATIONS = ("foreground", "pixels")
 
 
 def gaussian_window(size: int, sigma: float, like: Tensor) -> Tensor:
@@ -44,6 +51,35 @@ def dssim_map(preds: Tensor, targets: Tensor, size: int = 11, sigma: float = 1.5
     return 1 - numerator / denominator
 
 
+def raster_loss_sums_reference(
+    preds: Tensor, targets: Tensor, window_size: int, window_sigma: float, weight: float
+) -> Tensor:
+    """Sum what Eq. 12 is made of over each instance's pixels.
+
+    Args:
+        preds: Masks in [0, 1]. (n, H, W)
+        targets: Masks in [0, 1]. (n, H, W)
+        window_size: Side of SSIM's window in pixels, odd.
+        window_sigma: Standard deviation of SSIM's window in pixels.
+        weight: Weight of a pixel of the ground truth; w = 1 + (weight - 1) t.
+
+    Returns:
+        sum w |p - t|, sum w t, sum (w - 1), sum (1 - SSIM) and the number of pixels whose window
+        sees the target. (n, 5)
+    """
+    excess = (weight - 1) * targets
+    weights = 1 + excess
+    reach = F.max_pool2d(targets[:, None], window_size, 1, window_size // 2)[:, 0]
+    sums = (
+        weights * (preds - targets).abs(),
+        weights * targets,
+        excess,
+        dssim_map(preds, targets, window_size, window_sigma),
+        (reach > 0).to(preds.dtype),
+    )
+    return torch.stack([values.sum((1, 2)) for values in sums], -1)
+
+
 def raster_loss(
     preds: Tensor,
     targets: Tensor,
@@ -52,6 +88,7 @@ def raster_loss(
     normalize: str = "foreground",
     window_size: int = 11,
     window_sigma: float = 1.5,
+    backend: str = "auto",
 ) -> Tensor:
     r"""Per-instance raster loss :math:`\alpha D_w + (1 - \alpha) L_{D-SSIM}` (GSMap Eq. 12).
 
@@ -61,6 +98,8 @@ def raster_loss(
     whatever the size of the element or of the raster, and empty background adds nothing. With
     ``normalize="pixels"`` both are plain means over the raster's pixels (weighted by w).
 
+    Nothing but the masks is kept for the backward pass; the rest is computed again.
+
     Args:
         preds: Rendered masks in [0, 1]. (n, H, W)
         targets: Ground-truth masks in [0, 1]. (n, H, W)
@@ -69,35 +108,40 @@ def raster_loss(
         normalize: ``"foreground"`` or ``"pixels"``.
         window_size: Side of SSIM's window in pixels, odd.
         window_sigma: Standard deviation of SSIM's window in pixels.
+        backend: ``"reference"``, ``"cpu"`` (fused), or ``"auto"``.
 
     Returns:
-        One value per instance. (n,)
+        One value per instance, differentiable in ``preds``. (n,)
 
     Raises:
-        ValueError: If the shapes disagree or ``normalize`` is unknown.
+        ValueError: If the shapes disagree, or ``normalize`` or ``backend`` does not serve.
     """
     if preds.ndim != 3 or preds.shape != targets.shape:
         raise ValueError(
             "preds and targets must both have shape (n, H, W), "
             f"got {tuple(preds.shape)} and {tuple(targets.shape)}."
         )
-    if normalize not in ("foreground", "pixels"):
-        raise ValueError(f"normalize must be 'foreground' or 'pixels', got {normalize!r}.")
+    if normalize not in NORMALIZATIONS:
+        raise ValueError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
+    dtype = torch.promote_types(preds.dtype, torch.float32)
+    preds, targets = preds.to(dtype), targets.detach().to(dtype)
     with torch.autocast(preds.device.type, enabled=False):
-        dtype = torch.promote_types(preds.dtype, torch.float32)
-        preds, targets = preds.to(dtype), targets.detach().to(dtype)
-        weights = 1 + (foreground_weight - 1) * targets
-        l1 = (weights * (preds - targets).abs()).sum((1, 2))
-        dissimilarity = dssim_map(preds, targets, window_size, window_sigma).sum((1, 2))
-        if normalize == "pixels":
-            area = weights.sum((1, 2))
-            seen = torch.full_like(area, preds[0].numel())
+        if is_fused(backend, preds):
+            window = gaussian_window(window_size, window_sigma, preds)
+            constants = SSIM_C1, SSIM_C2, foreground_weight
+            sums = raster_loss_sums(preds, targets, window, *constants)
         else:
-            floor = MIN_FOREGROUND * preds[0].numel()
-            area = (weights * targets).sum((1, 2)).clamp(min=foreground_weight * floor)
-            reach = F.max_pool2d(targets[:, None], window_size, 1, window_size // 2)[:, 0]
-            seen = (reach > 0).sum((1, 2)).clamp(min=floor)
-        return alpha * l1 / area + (1 - alpha) * dissimilarity / seen
+            settings = window_size, window_sigma, foreground_weight
+            sums = checkpoint(
+                raster_loss_sums_reference, preds, targets, *settings, use_reentrant=False
+            )
+        l1, foreground, excess, dissimilarity, seen = sums.unbind(-1)
+        pixels = math.prod(preds.shape[1:])
+        if normalize == "pixels":
+            return alpha * l1 / (pixels + excess) + (1 - alpha) * dissimilarity / pixels
+        floor = MIN_FOREGROUND * pixels
+        l1 = l1 / foreground.clamp(min=foreground_weight * floor)
+        return alpha * l1 + (1 - alpha) * dissimilarity / seen.clamp(min=floor)
 
 
 class RasterLoss(nn.Module):
@@ -129,8 +173,8 @@ class RasterLoss(nn.Module):
             raise ValueError(f"alpha must lie in [0, 1], got {alpha}.")
         if foreground_weight <= 0:
             raise ValueError(f"foreground_weight must be > 0, got {foreground_weight}.")
-        if normalize not in ("foreground", "pixels"):
-            raise ValueError(f"normalize must be 'foreground' or 'pixels', got {normalize!r}.")
+        if normalize not in NORMALIZATIONS:
+            raise ValueError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
         if window_size < 1 or window_size % 2 == 0:
             raise ValueError(f"window_size must be odd and >= 1, got {window_size}.")
         if window_sigma <= 0:

@@ -1,10 +1,11 @@
-"""Matching cost between rendered masks (GSMap Eq. 9)."""
+"""Matching costs between rendered masks: GSMap's soft IoU (Eq. 9) and MapVR's dice."""
 
 import torch
 from mmdet3d.registry import TASK_UTILS
 from mmengine.structures import InstanceData
 from torch import Tensor
 
+from ..losses.dice import rendered_dice_cost
 from ..ops.soft_iou import pairwise_soft_iou
 
 
@@ -60,3 +61,54 @@ class IoUCost:
                     f"IoUCost needs {name}.rasters: use a head that renders masks for matching."
                 )
         return self.weight * raster_iou_cost(pred_instances.rasters, gt_instances.rasters)
+
+
+@TASK_UTILS.register_module()
+class RenderedDiceCost:
+    """Dice loss of softly rendered points, each pair rendered as the ground truth's class.
+
+    Args:
+        weight: Weight of the cost.
+        size: Rows and columns of the rasters.
+        line_softness: Softness of lines in square pixels.
+        polygon_softness: Softness of polygons in square pixels.
+        polygon_classes: Classes that are rendered as filled polygons.
+    """
+
+    def __init__(
+        self,
+        weight: float = 10.0,
+        size: tuple[int, int] = (128, 64),
+        line_softness: float = 2.0,
+        polygon_softness: float = 4.0,
+        polygon_classes: tuple[int, ...] = (1,),
+    ) -> None:
+        self.weight, self.size = weight, (int(size[0]), int(size[1]))
+        self.softness = (line_softness, polygon_softness)
+        self.polygon_classes = tuple(polygon_classes)
+
+    def __call__(
+        self,
+        pred_instances: InstanceData,
+        gt_instances: InstanceData,
+        img_meta: dict[str, object] | None = None,
+        **kwargs: object,
+    ) -> Tensor:
+        """Return the weighted cost of every prediction and ground truth.
+
+        Args:
+            pred_instances: With normalised ``pts`` (N, P, 2).
+            gt_instances: With ``labels`` (K,) and normalised ``pts_shifts`` (K, S, P, 2), the first
+                of which is the annotated order.
+            img_meta: Not used.
+            kwargs: Not used.
+
+        Returns:
+            Costs. (N, K)
+        """
+        labels = gt_instances.labels
+        is_polygon = torch.isin(labels, labels.new_tensor(self.polygon_classes))
+        points = gt_instances.pts_shifts[:, 0]
+        return self.weight * rendered_dice_cost(
+            pred_instances.pts, points, is_polygon, self.size, *self.softness
+        )

@@ -19,6 +19,27 @@ SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filli
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
 
+def is_fused(backend: str, tensor: torch.Tensor) -> bool:
+    """Tell whether the fused CPU kernels are wanted and serve a tensor.
+
+    Args:
+        backend: ``"reference"``, ``"cpu"``, or ``"auto"``: the kernels where they serve.
+        tensor: What they are to work on.
+
+    Raises:
+        ValueError: If ``backend`` is unknown, or ``"cpu"`` and the kernels do not serve.
+    """
+    if backend not in ("auto", "reference", "cpu"):
+        raise ValueError(f"backend must be 'auto', 'reference' or 'cpu', got {backend!r}.")
+    serves = HAS_NUMBA and tensor.device.type == "cpu" and tensor.dtype == torch.float32
+    if backend == "cpu" and not serves:
+        raise ValueError(
+            "backend 'cpu' needs numba and float32 tensors on the CPU, "
+            f"got {tensor.dtype} on {tensor.device}: use 'auto'."
+        )
+    return serves and backend != "reference"
+
+
 def run_in_threads(kernel: Callable[[int, int], None], count: int, pixels: int) -> None:
     """Call ``kernel(first, last)`` on slices of ``range(count)``, one per torch thread.
 

@@ -4,12 +4,11 @@ import torch
 from torch import Tensor
 
 from ..geometry.bev_grid import BEVGrid
-from ._numba import HAS_NUMBA
+from ._numba import is_fused
 from .polyline_cpu import draw_cpu, soft_rasters_cpu
 from .polyline_reference import draw_reference, soft_rasters_reference
 
 LANE_GAP_PX = 0.01  # how far MapVR moves a line's way back: both form a polygon
-BACKENDS = ("auto", "reference", "cpu")
 
 
 def draw_polylines(
@@ -50,7 +49,7 @@ def draw_polylines(
     dx, dy = grid.pixel_size_m
     half_width_m, pixel_m = width_m / 2, (dx * dy) ** 0.5
     with torch.autocast(polylines.device.type, enabled=False):
-        if _is_fused(backend, polylines):
+        if is_fused(backend, polylines):
             origin = grid.x_range[0], grid.y_range[0]
             size = grid.height, grid.width
             return draw_cpu(
@@ -103,7 +102,7 @@ def soft_rasters(
         back = vertices.flip(1) + LANE_GAP_PX
         stay = vertices[:, -1:].expand_as(vertices)  # a polygon's ring is padded by its last corner
         rings = torch.cat([vertices, torch.where(flags[:, None, None], stay, back)], 1)
-        if _is_fused(backend, rings):
+        if is_fused(backend, rings):
             return soft_rasters_cpu(rings, flags, height, width, line_softness, polygon_softness)
         softness = line_softness, polygon_softness
         return soft_rasters_reference(rings, flags, height, width, softness)
@@ -119,16 +118,3 @@ def _flags(flags: Tensor | None, name: str, elements: Tensor) -> Tensor:
             f"got {flags.dtype} of shape {tuple(flags.shape)}."
         )
     return flags
-
-
-def _is_fused(backend: str, elements: Tensor) -> bool:
-    """Tell whether the fused CPU kernels are wanted and serve."""
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {BACKENDS}, got {backend!r}.")
-    serves = HAS_NUMBA and elements.device.type == "cpu" and elements.dtype == torch.float32
-    if backend == "cpu" and not serves:
-        raise ValueError(
-            "backend 'cpu' needs numba and float32 tensors on the CPU, "
-            f"got {elements.dtype} on {elements.device}: use 'auto'."
-        )
-    return serves and backend != "reference"

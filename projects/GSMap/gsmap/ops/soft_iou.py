@@ -3,8 +3,12 @@
 import torch
 from torch import Tensor
 
+from ._numba import is_fused, run_in_threads
 
-def pairwise_soft_iou(preds: Tensor, targets: Tensor, eps: float = 1e-6) -> Tensor:
+
+def pairwise_soft_iou(
+    preds: Tensor, targets: Tensor, eps: float = 1e-6, backend: str = "auto"
+) -> Tensor:
     r"""Soft IoU of every prediction with every ground truth, without an (N, K, H, W) tensor.
 
     :math:`\sum_p \min(a, b) / \sum_p \max(a, b)`; since min + max = a + b, only the minimum is
@@ -14,12 +18,14 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, eps: float = 1e-6) -> Tens
         preds: Masks in [0, 1]. (N, H, W)
         targets: Masks in [0, 1]. (K, H, W)
         eps: Added to the union, so that two empty masks have IoU 0.
+        backend: ``"reference"`` (plain torch), ``"cpu"`` (fused), or ``"auto"``: the fused kernel
+            where it serves and no gradient is asked for.
 
     Returns:
-        IoU in [0, 1]. (N, K)
+        IoU in [0, 1]; without gradient from the fused kernel. (N, K)
 
     Raises:
-        ValueError: If the shapes disagree.
+        ValueError: If the shapes disagree or ``backend`` does not serve.
     """
     if preds.ndim != 3 or targets.ndim != 3 or preds.shape[1:] != targets.shape[1:]:
         raise ValueError(
@@ -28,8 +34,44 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, eps: float = 1e-6) -> Tens
         )
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds, targets = preds.to(dtype).flatten(1), targets.to(dtype).flatten(1)  # (N, HW), (K, HW)
+    if (
+        backend == "auto"
+        and torch.is_grad_enabled()
+        and (preds.requires_grad or targets.requires_grad)
+    ):
+        backend = "reference"
+    if is_fused(backend, preds):
+        preds, targets = preds.detach(), targets.detach()
+        minima = pairwise_minima_cpu(preds, targets)
+    else:
+        minima = _pairwise_minima(preds, targets)
+    union = preds.sum(-1)[:, None] + targets.sum(-1) - minima
+    return minima / (union + eps)
+
+
+def _pairwise_minima(preds: Tensor, targets: Tensor) -> Tensor:
+    """Sum the minimum of every pair, one target at a time. (N, HW), (K, HW) -> (N, K)"""
     if not len(targets):
         return preds.new_zeros(len(preds), 0)
-    intersection = torch.stack([torch.minimum(preds, target).sum(-1) for target in targets], -1)
-    union = preds.sum(-1)[:, None] + targets.sum(-1) - intersection
-    return intersection / (union + eps)
+    return torch.stack([torch.minimum(preds, target).sum(-1) for target in targets], -1)
+
+
+@torch.library.custom_op("gsmap::pairwise_minima", mutates_args=(), device_types="cpu")
+def pairwise_minima_cpu(preds: Tensor, targets: Tensor) -> Tensor:
+    """Sum the minimum of every pair of flat float32 masks. (N, HW), (K, HW) -> (N, K)"""
+    from .soft_iou_kernels import list_pixels, sum_minima
+
+    minima = torch.empty(len(preds), len(targets), dtype=torch.float32)
+    starts, pixels, values = list_pixels(targets.contiguous().numpy())
+    array, out = preds.contiguous().numpy(), minima.numpy()
+    run_in_threads(
+        lambda first, last: sum_minima(array, starts, pixels, values, out, first, last),
+        len(preds),
+        len(pixels),
+    )
+    return minima
+
+
+@pairwise_minima_cpu.register_fake
+def _(preds, targets):  # type: ignore[no-untyped-def]
+    return preds.new_empty(preds.shape[0], targets.shape[0])

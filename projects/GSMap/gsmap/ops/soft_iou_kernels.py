@@ -1,0 +1,56 @@
+# numba infers the types of its kernels:
+# mypy: disable-error-code="no-untyped-def"
+"""Fused CPU kernel (numba): the sums of minima of every pair of masks.
+
+A target is 0 almost everywhere, and so is the minimum: each target's pixels that are not 0 are
+listed once, and every prediction is read at those alone. Rows of predictions are shared out among
+threads; a sum runs in a fixed order in one thread, so two runs give the same bits.
+"""
+
+import numpy as np
+from numba import njit
+
+
+@njit(nogil=True, cache=True)
+def list_pixels(targets):
+    """List the pixels that are not 0.
+
+    Args:
+        targets: Flat masks, float32. (K, pixels)
+
+    Returns:
+        Where each target's list starts (K + 1,), the pixels' indices and their values.
+    """
+    starts = np.zeros(len(targets) + 1, np.int64)
+    for k in range(len(targets)):
+        starts[k + 1] = starts[k] + np.count_nonzero(targets[k])
+    indices, values = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
+    for k in range(len(targets)):
+        position = starts[k]
+        for pixel in range(targets.shape[1]):
+            if targets[k, pixel] != 0:
+                indices[position], values[position] = pixel, targets[k, pixel]
+                position += 1
+    return starts, indices, values
+
+
+@njit(nogil=True, cache=True)
+def sum_minima(preds, starts, indices, values, out, first, last):
+    """Write the sums of minima of predictions ``first`` to ``last - 1`` with every target.
+
+    Args:
+        preds: Flat masks, float32. (N, pixels)
+        starts: From :func:`list_pixels`. (K + 1,)
+        indices: From :func:`list_pixels`.
+        values: From :func:`list_pixels`.
+        out: Written to, float32. (N, K)
+        first: First prediction.
+        last: One past the last prediction.
+    """
+    for n in range(first, last):
+        pred = preds[n]
+        for k in range(len(starts) - 1):
+            total = 0.0
+            for i in range(starts[k], starts[k + 1]):
+                total += min(pred[indices[i]], values[i])
+            out[n, k] = total
