@@ -3,8 +3,13 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
-from gsmap.evaluation.elements import MapElements
+from gsmap.evaluation.chamfer_ap import (
+    ChamferConfig,
+    chamfer_report,
+    match_chamfer,
+    resample_polylines,
+)
+from gsmap.evaluation.elements import MapElements, map_elements
 from gsmap.evaluation.matches import FrameMatches
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
 from gsmap.evaluation.report import MetricReport
@@ -19,6 +24,8 @@ class EvaluationConfig:
     Args:
         chamfer: Rules of AP_chamfer, or None to leave it out.
         raster: Rules of AP_raster, or None to leave it out.
+        ground_truth_points: If set, ground truth is first resampled to that many points, such as
+            the 20 of the training targets; by default it keeps its full resolution.
 
     Raises:
         ValueError: If both are left out, or their classes differ.
@@ -26,10 +33,13 @@ class EvaluationConfig:
 
     chamfer: ChamferConfig | None
     raster: RasterConfig | None
+    ground_truth_points: int | None = None
 
     def __post_init__(self) -> None:
         if self.chamfer is None and self.raster is None:
             raise ValueError(f"name at least one metric of {METRIC_NAMES}.")
+        if self.ground_truth_points is not None and self.ground_truth_points < 2:
+            raise ValueError(f"ground_truth_points must be >= 2, got {self.ground_truth_points}.")
         if self.chamfer and self.raster and self.chamfer.classes != self.raster.classes:
             raise ValueError(
                 "both metrics must have the same classes, got "
@@ -57,6 +67,21 @@ class SampleMatches:
     by_metric: dict[str, FrameMatches]
 
 
+def with_points(elements: MapElements, num_points: int) -> MapElements:
+    """Return elements with a fixed number of points at equal arc lengths.
+
+    Args:
+        elements: Polylines and rings; those of fewer than two points are kept as they are.
+        num_points: Number of points of each.
+    """
+    points = resample_polylines(elements, num_points)
+    polylines = [
+        points[i] if count >= 2 else elements.polyline(i)
+        for i, count in enumerate(elements.num_points)
+    ]
+    return map_elements(polylines, elements.labels, elements.scores)
+
+
 def match_sample(
     token: str, predictions: MapElements, ground_truth: MapElements, config: EvaluationConfig
 ) -> SampleMatches:
@@ -68,6 +93,8 @@ def match_sample(
         ground_truth: Its ground truth.
         config: Metrics and their rules.
     """
+    if config.ground_truth_points is not None:
+        ground_truth = with_points(ground_truth, config.ground_truth_points)
     found: dict[str, FrameMatches] = {}
     if config.chamfer:
         found["chamfer"] = match_chamfer(predictions, ground_truth, config.chamfer, token)

@@ -45,7 +45,7 @@ class MapMetric(BaseMetric):
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
 
     Raises:
-        ValueError: If a metric is unknown, or there is nothing to do.
+        ValueError: If a metric is unknown, there is nothing to do, or ``pc_range`` is malformed.
     """
 
     default_prefix = None
@@ -66,22 +66,29 @@ class MapMetric(BaseMetric):
             raise ValueError(f"eval must name metrics of {METRIC_NAMES}, got {list(eval)}.")
         self.eval = tuple(eval)
         self.out_file = out_file
-        self._classes = tuple(classes) if classes else None
-        self._pc_range = tuple(pc_range) if pc_range else None
+        self._settings: dict[str, Any] = {"classes": classes}
+        if pc_range is not None:
+            if len(pc_range) != 6:
+                raise ValueError(f"pc_range must hold 6 values, got {len(pc_range)}.")
+            self._settings["x_range"] = (pc_range[0], pc_range[3])
+            self._settings["y_range"] = (pc_range[1], pc_range[4])
         self._thresholds = tuple(thresholds)
         self._polygon_classes = tuple(polygon_classes)
 
-    def _from_dataset(self, value: Any, key: str) -> Any:
-        """Return a setting, or the data set's metainfo under the same name."""
-        found = value or (self.dataset_meta or {}).get(key)
+    def _setting(self, key: str) -> Any:
+        """Return a setting, or the data set's metainfo of the same name."""
+        found = self._settings.get(key) or (self.dataset_meta or {}).get(key)
         if found is None:
-            raise ValueError(f"MapMetric needs {key}: set it, or give the data set it as metainfo.")
+            raise ValueError(
+                f"MapMetric knows no {key}: set classes and pc_range, or use a data set whose "
+                "metainfo has them."
+            )
         return tuple(found)
 
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the classes."""
-        return self._from_dataset(self._classes, "classes")
+        return self._setting("classes")
 
     @property
     def config(self) -> EvaluationConfig | None:
@@ -92,8 +99,8 @@ class MapMetric(BaseMetric):
         if "chamfer" in self.eval:
             chamfer = ChamferConfig(self.classes, self._thresholds)
         if "raster" in self.eval:
-            x0, y0, _, x1, y1, _ = self._from_dataset(self._pc_range, "pc_range")
-            raster = RasterConfig(self.classes, self._polygon_classes, (x0, x1), (y0, y1))
+            x_range, y_range = (self._setting(key) for key in ("x_range", "y_range"))
+            raster = RasterConfig(self.classes, self._polygon_classes, x_range, y_range)
         return EvaluationConfig(chamfer, raster)
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:

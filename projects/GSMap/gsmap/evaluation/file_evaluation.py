@@ -1,0 +1,260 @@
+"""Score a result file against a ground-truth file, sample by sample, in one or more processes."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from gsmap.evaluation.elements import MapElements, empty_elements, map_elements
+from gsmap.evaluation.evaluator import EvaluationConfig, SampleMatches, match_sample, reports
+from gsmap.evaluation.json_index import JsonSamples
+from gsmap.evaluation.report import MetricReport
+from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, elements_from_vectors
+from gsmap.evaluation.worker_pool import map_unordered
+
+CHUNK = 64  # samples per task: large enough to hide the hand-over, small enough to share evenly
+
+
+class Samples(Protocol):
+    """Elements of many samples, by position."""
+
+    @property
+    def tokens(self) -> list[str]:
+        """Names of the samples."""
+
+    def elements(self, index: int) -> tuple[MapElements, Counter[str]]:
+        """Return the elements of one sample and what is to be said about them."""
+
+
+@dataclass
+class JsonElements:
+    """Elements of a JSON file.
+
+    Args:
+        samples: The file.
+        labels: Label of each class.
+        scored: Whether its vectors have a confidence.
+    """
+
+    samples: JsonSamples
+    labels: dict[str, int]
+    scored: bool
+
+    @property
+    def tokens(self) -> list[str]:
+        """Names of the samples."""
+        return self.samples.tokens
+
+    def elements(self, index: int) -> tuple[MapElements, Counter[str]]:
+        """Return the elements of one sample, with counts of 3D and of unknown elements.
+
+        Args:
+            index: Position in ``tokens``.
+
+        Raises:
+            ValueError: If the sample is malformed; the message names it.
+        """
+        vectors = self.samples.vectors(index)
+        try:
+            found = elements_from_vectors(vectors, self.labels, self.scored)
+        except ValueError as error:
+            token = self.tokens[index]
+            raise ValueError(f"{self.samples.path}, sample {token!r}: {error}") from error
+        notes: Counter[str] = Counter()
+        if (found.labels < 0).any():
+            notes.update(v["cls_name"] for v in vectors if v["cls_name"] not in self.labels)
+        notes["3D"] = sum(1 for v in vectors if len(v["pts"]) and len(v["pts"][0]) == 3)
+        return found, notes
+
+
+class ArrowElements:
+    """Ground truth of an annotation file.
+
+    Args:
+        path: The file.
+        classes: Names of the classes to score.
+
+    Raises:
+        ValueError: If the file lacks one of the classes.
+    """
+
+    def __init__(self, path: str | Path, classes: Sequence[str]):
+        from gsmap.datasets.annotation_file import AnnotationFile  # loads pyarrow
+
+        self.file = AnnotationFile(path)
+        known = self.file.meta.classes
+        missing = [name for name in classes if name not in known]
+        if missing:
+            raise ValueError(f"{path} has the classes {known}, not {missing}.")
+        self._names = known
+        self._labels = [classes.index(name) if name in classes else -1 for name in known]
+        self.tokens: list[str] = self.file.column("token")
+
+    def elements(self, index: int) -> tuple[MapElements, Counter[str]]:
+        """Return the elements of one sample, with counts of 3D and of unknown elements.
+
+        Args:
+            index: Position in ``tokens``.
+
+        Raises:
+            ValueError: If the sample has no ground truth.
+        """
+        sample = self.file[index]
+        if sample.instances is None:
+            raise ValueError(
+                f"{self.file.path}, sample {sample.token!r} has no ground truth: it cannot be "
+                "scored."
+            )
+        labels = [self._labels[instance.label] for instance in sample.instances]
+        notes = Counter(self._names[i.label] for i in sample.instances if self._labels[i.label] < 0)
+        notes["3D"] = len(labels) if self.file.meta.dim == 3 else 0
+        return map_elements([i.points for i in sample.instances], labels), notes
+
+
+def open_ground_truth(path: str | Path, classes: Sequence[str]) -> Samples:
+    """Open ground truth: our annotation file, or MapTR's and MapVR's JSON.
+
+    Args:
+        path: ``*.json`` with ``{"GTs": [...]}``, or an annotation file.
+        classes: Names of the classes to score.
+    """
+    if Path(path).suffix.lower() == ".json":
+        labels = {name: i for i, name in enumerate(classes)}
+        return JsonElements(JsonSamples(path, GROUND_TRUTH_KEY), labels, scored=False)
+    return ArrowElements(path, classes)
+
+
+@dataclass
+class _ChunkJob:
+    """Matches the samples of one task; picklable."""
+
+    results: Samples
+    truth: Samples
+    config: EvaluationConfig
+
+    def __call__(
+        self, pairs: Sequence[tuple[int, int]]
+    ) -> tuple[list[SampleMatches], Counter[str], Counter[str]]:
+        matches = []
+        pred_notes: Counter[str] = Counter()
+        gt_notes: Counter[str] = Counter()
+        for result_index, truth_index in pairs:
+            predictions = empty_elements()
+            if result_index >= 0:
+                predictions, found = self.results.elements(result_index)
+                pred_notes.update(found)
+            ground_truth, found = self.truth.elements(truth_index)
+            gt_notes.update(found)
+            gt_notes["degenerate"] += int((ground_truth.num_points < 2).sum())
+            token = self.truth.tokens[truth_index]
+            matches.append(match_sample(token, predictions, ground_truth, self.config))
+        return matches, pred_notes, gt_notes
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Outcome of an evaluation.
+
+    Args:
+        reports: One report per metric.
+        notes: What the reader should know: elements left out, z ignored, samples without results.
+    """
+
+    reports: list[MetricReport]
+    notes: list[str]
+
+
+def pair_by_token(
+    results: Sequence[str], truth: Sequence[str], allow_mismatch: bool
+) -> tuple[list[tuple[int, int]], list[str]]:
+    """Pair results with ground truth.
+
+    Args:
+        results: Tokens of the results.
+        truth: Tokens of the ground truth.
+        allow_mismatch: Count a sample without results as without predictions, and leave results
+            without ground truth out; otherwise both are errors.
+
+    Returns:
+        Positions in both lists, -1 for no result, one pair per ground-truth sample; and notes.
+
+    Raises:
+        ValueError: If the tokens differ and that is not allowed.
+    """
+    position = {token: i for i, token in enumerate(results)}
+    pairs = [(position.pop(token, -1), i) for i, token in enumerate(truth)]
+    missing = [truth[i] for result, i in pairs if result < 0]
+    notes = []
+    if missing:
+        notes.append(f"{len(missing)} samples have no results, such as {missing[0]!r}")
+    if position:
+        notes.append(
+            f"{len(position)} results have no ground truth, such as {next(iter(position))!r}"
+        )
+    if notes and not allow_mismatch:
+        raise ValueError(
+            "; ".join(notes) + ": score the split that was predicted, or allow the mismatch."
+        )
+    if missing:
+        notes[0] += ": counted as without predictions"
+    if position:
+        notes[-1] += ": left out"
+    return pairs, notes
+
+
+def _notes(pred: Counter[str], truth: Counter[str]) -> list[str]:
+    """Say what was counted on the way."""
+    notes = []
+    if pred.pop("3D", 0) + truth.pop("3D", 0):
+        notes.append("some elements have 3D points: z is ignored, both metrics are planar")
+    degenerate = truth.pop("degenerate", 0)
+    if degenerate:
+        notes.append(
+            f"{degenerate} ground truths have fewer than two points: they count, nothing can match"
+        )
+    for name, counts in (("predictions", pred), ("ground truths", truth)):
+        for cls, number in sorted((+counts).items()):
+            notes.append(f"{number} {name} of class {cls!r} are not scored")
+    return notes
+
+
+def evaluate_files(
+    results_path: str | Path,
+    truth_path: str | Path,
+    config: EvaluationConfig,
+    num_workers: int = 1,
+    allow_mismatch: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Score a result file.
+
+    Args:
+        results_path: Results in MapTR's JSON form.
+        truth_path: Ground truth: an annotation file, or MapTR's JSON.
+        config: Metrics and their rules.
+        num_workers: Number of processes.
+        allow_mismatch: See ``pair_by_token``.
+        progress: Called with the number of samples done and in all.
+
+    Raises:
+        FileNotFoundError: If a file does not exist.
+        ValueError: If a file is malformed or the samples differ.
+    """
+    labels = {name: i for i, name in enumerate(config.classes)}
+    results = JsonElements(JsonSamples(results_path, RESULTS_KEY), labels, scored=True)
+    truth = open_ground_truth(truth_path, config.classes)
+    pairs, notes = pair_by_token(results.tokens, truth.tokens, allow_mismatch)
+    chunks = [pairs[i : i + CHUNK] for i in range(0, len(pairs), CHUNK)]
+    matches: list[SampleMatches] = []
+    pred_notes: Counter[str] = Counter()
+    gt_notes: Counter[str] = Counter()
+    job: Callable[[Any], Any] = _ChunkJob(results, truth, config)
+    outcomes: Iterable[Any] = map_unordered(job, chunks, num_workers)
+    for found, of_pred, of_gt in outcomes:
+        matches += found
+        pred_notes.update(of_pred)
+        gt_notes.update(of_gt)
+        if progress is not None:
+            progress(len(matches), len(pairs))
+    return Evaluation(reports(matches, config), notes + _notes(pred_notes, gt_notes))

@@ -1,0 +1,162 @@
+#!/usr/bin/env python
+"""Score the result file of any model: AP_chamfer and AP_raster.
+
+Examples:
+    python tools/evaluate.py results.json data/nuscenes/annotations_val.arrow --eval chamfer raster
+    python tools/evaluate.py results.json nuscenes_map_anns_val.json --eval chamfer --hard
+"""
+
+# ruff: noqa: E402 - numpy reads these variables when it is imported
+import os
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")  # idle threads would only stand in the workers' way
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+from gsmap.evaluation.chamfer_ap import (
+    CHAMFER_THRESHOLDS,
+    HARD_CHAMFER_THRESHOLDS,
+    ChamferConfig,
+)
+from gsmap.evaluation.evaluator import METRIC_NAMES, EvaluationConfig, flat_metrics
+from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files
+from gsmap.evaluation.raster_ap import POLYGON_CLASSES, RasterConfig
+from gsmap.evaluation.report import format_table
+
+DEFAULT_CLASSES = ("divider", "ped_crossing", "boundary")
+DEFAULT_RANGE = (-15.0, -30.0, 15.0, 30.0)
+
+
+def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("results", type=Path, help="results in MapTR's JSON form")
+    parser.add_argument(
+        "ground_truth", type=Path, help="annotation file (*.arrow), or JSON with a list of GTs"
+    )
+    parser.add_argument("--eval", nargs="+", default=list(METRIC_NAMES), choices=METRIC_NAMES)
+    parser.add_argument(
+        "--thresholds", nargs="+", type=float, help="of AP_chamfer, in metres (0.5 1.0 1.5)"
+    )
+    parser.add_argument("--hard", action="store_true", help="AP_chamfer at 0.2, 0.5 and 1.0 m")
+    parser.add_argument("--classes", nargs="+", help="default: the annotation file's, or MapTR's")
+    parser.add_argument(
+        "--polygon-classes",
+        nargs="*",
+        default=list(POLYGON_CLASSES),
+        help="classes that AP_raster fills",
+    )
+    parser.add_argument(
+        "--range",
+        nargs=4,
+        type=float,
+        metavar=("X0", "Y0", "X1", "Y1"),
+        help="canvas of AP_raster in metres: the annotation file's, or nuScenes' -15 -30 15 30; "
+        "Argoverse 2: -30 -15 30 15",
+    )
+    parser.add_argument(
+        "--gt-points", type=int, help="resample ground truth to that many points first (raw)"
+    )
+    parser.add_argument(
+        "--keep-pred-points",
+        action="store_true",
+        help="AP_chamfer: compare predictions at their own points, not at 100",
+    )
+    parser.add_argument(
+        "--keep-gt-points",
+        action="store_true",
+        help="AP_chamfer: compare ground truth at its own vertices, not at 100 points",
+    )
+    parser.add_argument(
+        "--allow-mismatch",
+        action="store_true",
+        help="samples without results count as empty, results without ground truth are left out",
+    )
+    parser.add_argument("--workers", type=int, default=1, help="number of processes")
+    parser.add_argument("--out", type=Path, help="write all figures as flat JSON")
+    parser.add_argument("--pr-curves", type=Path, help="draw PR curves and calibration")
+    args = parser.parse_args(argv)
+    if args.hard and args.thresholds:
+        parser.error("--hard and --thresholds exclude each other")
+    return args
+
+
+def config_from(args: argparse.Namespace) -> EvaluationConfig:
+    """Join the arguments with what the annotation file says."""
+    classes, extent = args.classes, args.range
+    if args.ground_truth.suffix.lower() != ".json":
+        from gsmap.datasets.annotation_file import AnnotationFile
+
+        meta = AnnotationFile(args.ground_truth).meta
+        classes = classes or meta.classes
+        extent = extent or (meta.x_range[0], meta.y_range[0], meta.x_range[1], meta.y_range[1])
+    classes = tuple(classes or DEFAULT_CLASSES)
+    x0, y0, x1, y1 = extent or DEFAULT_RANGE
+    chamfer = raster = None
+    if "chamfer" in args.eval:
+        thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
+        chamfer = ChamferConfig(
+            classes,
+            tuple(thresholds or CHAMFER_THRESHOLDS),
+            resample_predictions=not args.keep_pred_points,
+            resample_ground_truth=not args.keep_gt_points,
+        )
+    if "raster" in args.eval:
+        raster = RasterConfig(classes, tuple(args.polygon_classes), (x0, x1), (y0, y1))
+    return EvaluationConfig(chamfer, raster, args.gt_points)
+
+
+def show_progress(done: int, total: int) -> None:
+    if sys.stderr.isatty():
+        end = "\n" if done == total else ""
+        print(f"\r{done} / {total} samples", end=end, file=sys.stderr, flush=True)
+
+
+def report(outcome: Evaluation, args: argparse.Namespace) -> None:
+    for found in outcome.reports:
+        print(format_table(found) + "\n")
+    for note in outcome.notes:
+        print(f"note: {note}")
+    if args.out:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        partial = args.out.with_name(f"{args.out.name}.partial")
+        partial.write_text(json.dumps(flat_metrics(outcome.reports), indent=1) + "\n")
+        partial.replace(args.out)
+        print(f"figures: {args.out}")
+    if args.pr_curves:
+        from gsmap.evaluation.curves import draw_curves
+
+        draw_curves(outcome.reports, args.pr_curves)
+        print(f"curves: {args.pr_curves}")
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = parse_args(argv)
+    start = time.perf_counter()
+    try:
+        config = config_from(args)
+        outcome = evaluate_files(
+            args.results,
+            args.ground_truth,
+            config,
+            args.workers,
+            args.allow_mismatch,
+            show_progress,
+        )
+    except (ValueError, OSError, RuntimeError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    report(outcome, args)
+    number = int(next(iter(outcome.reports)).metrics[f"{outcome.reports[0].name}/num_samples"])
+    print(f"{number} samples in {time.perf_counter() - start:.1f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
