@@ -21,3 +21,31 @@ def shared_dir() -> Path:
 def golden_dir(shared_dir: Path) -> Path:
     """Reference inputs and outputs of earlier systems."""
     return shared_dir / "golden"
+
+
+@pytest.fixture(scope="session")
+def minicity_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny MiniCity: two scenes (train, val) of two samples, six cameras of 400 x 225."""
+    from gsmap.datasets.minicity.generate import generate
+
+    root = tmp_path_factory.mktemp("minicity") / "root"
+    generate(
+        root=root,
+        scenes=2,
+        seed=0,
+        image_size=(400, 225),
+        samples_per_scene=2,
+        sweeps_per_sample=1,
+        val_scenes=1,
+        workers=1,
+    )
+    return root
+
+
+@pytest.fixture(scope="session")
+def minicity_annotations(minicity_root: Path) -> dict[str, Path]:
+    """The annotation files of ``minicity_root`` by split, in its root."""
+    from gsmap.datasets.converters.nuscenes import NuScenesOptions, convert_nuscenes
+
+    convert_nuscenes(NuScenesOptions(minicity_root, "v1.0-trainval", dataset="minicity"))
+    return {split: minicity_root / f"gsmap_minicity_{split}.arrow" for split in ("train", "val")}

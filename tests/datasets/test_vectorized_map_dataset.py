@@ -1,0 +1,244 @@
+"""The data set on a generated MiniCity: what it hands on, and what it says of bad input."""
+
+import pickle
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from mmengine.config import Config
+
+from gsmap.datasets.annotation_file import AnnotationFile, write_annotations
+from gsmap.datasets.errors import BrokenSampleError
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs/_base_/datasets"
+CAMERAS = (
+    "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def build():
+    from mmdet3d.registry import DATASETS
+    from mmengine.registry import init_default_scope
+
+    import gsmap.registered  # noqa: F401
+
+    init_default_scope("mmdet3d")
+    return lambda **config: DATASETS.build({"type": "VectorizedMapDataset", **config})
+
+
+def dataset_config(name: str, loader: str, root: Path, **changes) -> dict:
+    config = Config.fromfile(CONFIGS / f"{name}.py")[loader].dataset
+    config.update(data_root=str(root), ann_file=config.ann_file.replace("nuscenes", "minicity"))
+    config.update(changes)
+    return config
+
+
+@pytest.fixture
+def copied_root(minicity_root: Path, minicity_annotations: dict[str, Path], tmp_path: Path) -> Path:
+    """A copy whose files a test may damage."""
+    root = tmp_path / "root"
+    shutil.copytree(minicity_root / "samples", root / "samples")
+    for path in minicity_annotations.values():
+        shutil.copy(path, root)
+    return root
+
+
+def test_a_training_sample_is_packed_as_the_contract_says(
+    build, minicity_root, minicity_annotations
+):
+    data = build(**dataset_config("minicity", "train_dataloader", minicity_root))[0]
+    meta, truth = data["data_samples"].metainfo, data["data_samples"].gt_instances_3d
+    assert data["inputs"]["img"].shape == (6, 3, 90, 160)
+    assert data["inputs"]["img"].dtype == torch.float32
+    assert meta["cam_names"] == list(CAMERAS)
+    assert meta["img_shape"] == (90, 160)
+    count = len(truth)
+    assert truth.pts.shape == (count, 20, 2)
+    assert truth.pts_shifts.shape == (count, 19, 20, 2)
+    assert truth.boxes.shape == (count, 4)
+    assert truth.labels_3d.dtype == torch.int64
+    assert truth.closed.tolist() == [label == 1 for label in truth.labels_3d.tolist()]
+    np.testing.assert_array_equal(meta["eval_ann_info"]["labels"], truth.labels_3d)
+    ends = truth.pts[:, [0, -1]]
+    wanted = [line[[0, -1]] for line in meta["eval_ann_info"]["polylines"]]
+    np.testing.assert_allclose(ends, wanted, atol=1e-5)
+    for name in ("lidar2img", "cam2img", "lidar2cam", "img_aug_matrix"):
+        assert meta[name].shape == (6, 4, 4)
+    np.testing.assert_allclose(meta["img_aug_matrix"][0], np.diag([0.4, 0.4, 1, 1]))
+    np.testing.assert_allclose(
+        meta["lidar2img"][2],
+        meta["img_aug_matrix"][2] @ meta["cam2img"][2] @ meta["lidar2cam"][2],
+    )
+    assert meta["can_bus"].shape == (18,)
+
+
+def test_lidar_points_meet_their_depths_in_the_cameras(build, minicity_root, minicity_annotations):
+    config = dataset_config("nuscenes_depth_seg", "train_dataloader", minicity_root)
+    data = build(**config)[0]["data_samples"]
+    depth, lidar2img = data.gt_depth, data.metainfo["lidar2img"][0]
+    assert depth.shape == (6, 128, 224)  # 112 x 200, padded to multiples of 32
+    row, col = (int(v) for v in torch.nonzero(depth[0])[0])
+    frame_from_img = np.linalg.inv(lidar2img)
+    d = float(depth[0, row, col])
+    point = frame_from_img @ np.array([col * d, row * d, d, 1])
+    path = minicity_root / build(**config).sample(0).lidar.path
+    points = np.fromfile(path, np.float32).reshape(-1, 5)[:, :3]
+    # a pixel is as wide as the point may be off
+    pixel_m = d * np.abs(frame_from_img[:3, :2]).sum()
+    assert np.linalg.norm(points - point[:3], axis=1).min() < pixel_m
+    assert data.gt_seg.shape == (1, 200, 100)
+    assert data.gt_pv_seg.shape == (6, 1, 4, 7)
+    assert 0 < data.gt_seg.mean() < 0.5
+    assert 0 < data.gt_pv_seg.mean() < 1
+
+
+def test_sweeps_lie_where_the_key_frame_does(build, minicity_root, minicity_annotations):
+    config = dataset_config("nuscenes_lidar", "val_dataloader", minicity_root)
+    points = build(**config)[1]["inputs"]["points"]
+    now, before = points[points[:, 4] == 0], points[points[:, 4] > 0]
+    assert len(before) > 100
+    # the ground of both lies at one height, though the vehicle has moved
+    near = (now[:, :2].norm(dim=1) < 8).nonzero()[:, 0]
+    near_before = (before[:, :2].norm(dim=1) < 8).nonzero()[:, 0]
+    assert float(now[near, 2].median()) == pytest.approx(
+        float(before[near_before, 2].median()), abs=0.1
+    )
+
+
+def test_shuffled_images_come_from_another_sample_with_this_one_s_calibration(
+    build, minicity_root, minicity_annotations
+):
+    plain = build(ann_file="gsmap_minicity_val.arrow", data_root=str(minicity_root))
+    mixed = build(
+        ann_file="gsmap_minicity_val.arrow", data_root=str(minicity_root), shuffle_images_seed=3
+    )
+    own, other = plain.get_data_info(0), mixed.get_data_info(0)
+    assert own["token"] == other["token"]
+    for name in CAMERAS:
+        assert (
+            other["images"][name]["img_path"] == plain.get_data_info(1)["images"][name]["img_path"]
+        )
+        np.testing.assert_array_equal(
+            own["images"][name]["lidar2cam"], other["images"][name]["lidar2cam"]
+        )
+
+
+def test_camera_subset_and_indices(build, minicity_root, minicity_annotations):
+    dataset = build(
+        ann_file="gsmap_minicity_val.arrow",
+        data_root=str(minicity_root),
+        cameras=["CAM_BACK", "CAM_FRONT"],
+        indices=[1],
+    )
+    assert len(dataset) == 1
+    info = dataset.get_data_info(0)
+    assert info["cam_names"] == ["CAM_BACK", "CAM_FRONT"]
+    assert info["token"] == AnnotationFile(minicity_annotations["val"])[1].token
+    assert dataset.metainfo["classes"] == ("divider", "ped_crossing", "boundary")
+
+
+def test_it_pickles_small_for_workers(build, minicity_root, minicity_annotations):
+    dataset = build(**dataset_config("minicity", "val_dataloader", minicity_root))
+    data = pickle.dumps(dataset)
+    assert len(data) < 10_000
+    assert pickle.loads(data).sample(1).token == dataset.sample(1).token
+
+
+def test_it_tests_without_ground_truth_and_refuses_to_train(
+    build, minicity_root, minicity_annotations, tmp_path
+):
+    file = AnnotationFile(minicity_annotations["val"])
+    samples = list(file)
+    for sample in samples:
+        sample.instances = None
+    write_annotations(tmp_path / "bare.arrow", file.meta, samples)
+    config = dataset_config("minicity", "val_dataloader", minicity_root)
+    config.ann_file = str(tmp_path / "bare.arrow")
+    packed = build(**config)[0]["data_samples"]
+    assert packed.metainfo["eval_ann_info"] is None
+    with pytest.raises(ValueError, match=r"2 samples .* have no ground truth"):
+        build(ann_file=config.ann_file, data_root=str(minicity_root))
+
+
+def test_samples_without_elements_train_only_if_asked(build, minicity_annotations, tmp_path):
+    file = AnnotationFile(minicity_annotations["val"])
+    samples = list(file)
+    samples[0].instances = []
+    write_annotations(tmp_path / "some.arrow", file.meta, samples)
+    assert len(build(ann_file=str(tmp_path / "some.arrow"))) == 1
+    assert len(build(ann_file=str(tmp_path / "some.arrow"), filter_empty_gt=False)) == 2
+    assert len(build(ann_file=str(tmp_path / "some.arrow"), test_mode=True)) == 2
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"classes": ["divider"]}, "classes .*config asks for"),
+        ({"pc_range": [-30, -15, -2, 30, 15, 2]}, "x_range .*config asks for"),
+        ({"split": "train"}, "split val, the config asks for train"),
+        ({"frame": "ego"}, "frame lidar, the config asks for ego"),
+        ({"broken_samples": "ignore"}, "broken_samples"),
+        ({"broken_samples": "skip", "test_mode": True}, "a test must see every sample"),
+        ({"pc_range": [1, 2]}, "6 values"),
+    ],
+)
+def test_what_does_not_fit_is_refused(build, minicity_annotations, option, message):
+    with pytest.raises(ValueError, match=message):
+        build(ann_file=str(minicity_annotations["val"]), **option)
+
+
+def test_missing_truncated_and_foreign_images_are_named(build, copied_root):
+    dataset = build(**dataset_config("minicity", "val_dataloader", copied_root))
+    path = copied_root / dataset.sample(0).cameras[1].path
+    name, token = dataset.sample(0).cameras[1].name, dataset.sample(0).token
+    path.write_bytes(path.read_bytes()[:-3000])
+    with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*truncated"):
+        dataset[0]
+    path.write_bytes(b"no picture \xff\xd9")
+    with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*not an image"):
+        dataset[0]
+    path.unlink()
+    with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*no image at .*data_root"):
+        dataset[0]
+
+
+def test_broken_samples_are_skipped_and_counted_on_demand(build, copied_root):
+    config = dataset_config("minicity", "train_dataloader", copied_root, broken_samples="skip")
+    dataset = build(**config)
+    token = dataset.sample(0).token
+    (copied_root / dataset.sample(0).cameras[0].path).unlink()
+    for _ in range(2):
+        assert dataset[0]["data_samples"].metainfo["token"] == dataset.sample(1).token
+    assert list(dataset.broken_tokens) == [token]
+    (copied_root / dataset.sample(1).cameras[0].path).unlink()
+    with pytest.raises(RuntimeError, match=r"in a row are broken.*no image"):
+        dataset[1]
+
+
+def test_an_absent_camera_is_named(build, minicity_annotations, minicity_root, tmp_path):
+    file = AnnotationFile(minicity_annotations["val"])
+    samples = list(file)
+    del samples[0].cameras[0]
+    write_annotations(tmp_path / "five.arrow", file.meta, samples)
+    config = dataset_config("minicity", "val_dataloader", minicity_root)
+    config.ann_file = str(tmp_path / "five.arrow")
+    with pytest.raises(BrokenSampleError, match=f"{samples[0].token}.*no camera 'CAM_FRONT'"):
+        build(**config)[0]
+
+
+def test_nan_in_an_image_is_named(build, copied_root):
+    config = dataset_config("minicity", "val_dataloader", copied_root)
+    config.pipeline[0].update(color_type="unchanged")
+    dataset = build(**config)
+    info = dataset.get_data_info(0)
+    for number, camera in enumerate(info["images"].values()):
+        image = np.zeros((20, 40, 3), np.float32)
+        image[2:12, 4:14] = np.nan if number == 2 else 0
+        camera["img_path"] = str(copied_root / f"{number}.tiff")
+        cv2.imwrite(camera["img_path"], image)
+    with pytest.raises(BrokenSampleError, match="CAM_FRONT_LEFT: the image holds NaN"):
+        dataset.pipeline(info)
