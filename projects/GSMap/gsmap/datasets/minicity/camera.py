@@ -58,7 +58,7 @@ class Camera:
 
 
 def clip_near(polygon: Array, near_m: float = NEAR_M) -> Array:
-    """The part of a convex polygon with z >= ``near_m``. (n, 3) -> (m, 3), m = 0 where nothing is left"""
+    """The part of a convex polygon with z >= ``near_m``, perhaps nothing. (n, 3) -> (m, 3)"""
     kept = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if a[2] >= near_m:

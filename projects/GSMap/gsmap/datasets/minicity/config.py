@@ -56,8 +56,9 @@ class MiniCityConfig:
             raise ValueError(f"val_scenes must be in 1..{self.scenes - 1}, got {self.val_scenes}.")
         if self.num_val > MAX_VAL_SCENES or self.num_train > MAX_TRAIN_SCENES:
             raise ValueError(
-                f"the official nuScenes split names at most {MAX_TRAIN_SCENES} training and {MAX_VAL_SCENES} "
-                f"validation scenes, got {self.num_train} and {self.num_val}: ask for fewer scenes."
+                f"the official nuScenes split names at most {MAX_TRAIN_SCENES} training and "
+                f"{MAX_VAL_SCENES} validation scenes, got {self.num_train} and {self.num_val}: "
+                "ask for fewer scenes."
             )
 
     @property
@@ -80,7 +81,7 @@ def _digest(parts: tuple) -> bytes:
 
 
 def make_rng(*parts: object) -> np.random.Generator:
-    """A random generator that depends on ``parts`` alone, not on the order of calls or on the process."""
+    """A random generator that depends on ``parts`` alone, not on the process or its past."""
     return np.random.default_rng(np.frombuffer(_digest(parts), dtype=np.uint32).tolist())
 
 

@@ -12,14 +12,14 @@ def arc_lengths(points: Array) -> Array:
 
 
 def resample(points: Array, spacing_m: float) -> Array:
-    """Points at equal distances of about ``spacing_m`` along a polyline, both ends kept. (n, 2) -> (m, 2)"""
+    """Equally spaced points along a polyline, about ``spacing_m`` apart. (n, 2) -> (m, 2)"""
     lengths = arc_lengths(points)
     count = max(2, round(lengths[-1] / spacing_m) + 1)
     return interpolate(points, lengths, np.linspace(0.0, lengths[-1], count))
 
 
 def interpolate(values: Array, lengths: Array, at: Array) -> Array:
-    """Rows of ``values``, given at arc lengths ``lengths``, linearly interpolated at arc lengths ``at``."""
+    """Rows of ``values``, which belong to arc lengths ``lengths``, interpolated at ``at``."""
     return np.stack([np.interp(at, lengths, column) for column in values.T], axis=-1)
 
 

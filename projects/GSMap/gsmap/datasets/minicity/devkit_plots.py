@@ -1,6 +1,7 @@
 """Makes the devkit's map pictures work beside shapely 2.
 
-``descartes``, with which nuscenes-devkit draws polygons, was last released before shapely 2 and reads rings as arrays.
+``descartes``, with which nuscenes-devkit draws polygons, was last released before shapely 2 and
+reads rings as arrays.
 """
 
 import descartes

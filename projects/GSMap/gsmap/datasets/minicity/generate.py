@@ -78,8 +78,8 @@ def generate(
 ) -> bool:
     """Generate a MiniCity data set.
 
-    The same arguments give the same bytes whatever the number of workers. Files are written beside ``root`` and
-    moved there when all are complete.
+    The same arguments give the same bytes whatever the number of workers. Files are written beside
+    ``root`` and moved there when all are complete.
 
     Args:
         root: Folder to make. If it holds the same data set already, nothing is done.
@@ -130,18 +130,20 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
         keys = sorted(k for k in {*found, *wanted} if found.get(k) != wanted.get(k))
         differences = ", ".join(f"{k} is {found.get(k)}, asked for {wanted.get(k)}" for k in keys)
         raise ValueError(
-            f"{root} holds another MiniCity data set ({differences}): choose another --root or remove that folder."
+            f"{root} holds another MiniCity data set ({differences}): "
+            "choose another --root or remove that folder."
         )
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise ValueError(
-            f"{root} exists and is not a complete MiniCity data set: choose another --root or remove it."
+            f"{root} exists and is not a complete MiniCity data set: "
+            "choose another --root or remove it."
         )
     return False
 
 
 @contextmanager
 def _partial_folder(root: Path) -> Iterator[Path]:
-    """A locked folder beside ``root`` to write into; it is gone afterwards unless it was renamed."""
+    """A locked folder beside ``root`` to write into, gone afterwards unless it was renamed."""
     root.parent.mkdir(parents=True, exist_ok=True)
     partial = root.with_name(f"{root.name}.partial")
     partial.mkdir(exist_ok=True)

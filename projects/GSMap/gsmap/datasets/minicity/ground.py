@@ -1,7 +1,8 @@
 """The ground in a camera's image, filtered so that thin paint survives at a distance.
 
-Far away a pixel covers much more ground along the line of sight than across it. A plain mip-map would blur a lane line of
-15 cm away, so image rows are grouped into bands, each sampled several times per row from the level that fits its width.
+Far away a pixel covers much more ground along the line of sight than across it. A plain mip-map
+would blur a lane line of 15 cm away, so image rows are grouped into bands, each sampled several
+times per row from the level that fits its width.
 """
 
 from dataclasses import dataclass
@@ -38,7 +39,10 @@ class Band:
 
 
 def ground_from_pixel(camera: Camera, ground_z_m: float) -> Array:
-    """Homography from pixels to world x, y on the plane z = ``ground_z_m``; its third row is < 0 below the horizon. (3, 3)"""
+    """Homography from pixels to world x, y on the plane z = ``ground_z_m``. (3, 3)
+
+    Its third row gives the vertical part of the viewing direction: negative below the horizon.
+    """
     ray = camera.world_from_pixel
     center = camera.center
     height = center[2] - ground_z_m
@@ -55,7 +59,7 @@ def make_bands(
     column = np.full(rows.shape, (camera.width - 1) / 2)
     center = homography @ np.stack([column, rows - 0.5, np.ones(rows.shape)])
     beside = homography @ np.stack([column + 1, rows - 0.5, np.ones(rows.shape)])
-    # A tilted camera sees the horizon at another row in each corner; the row counts if any corner is below it.
+    # A tilted camera sees the horizon at another row on each side: one end below it is enough.
     edges = homography[2] @ np.stack([[0, camera.width - 1], [0, 0], [1, 1]]) + np.outer(
         rows, [homography[2, 1]] * 2
     )
@@ -116,7 +120,7 @@ def render_ground(
         background: What is seen where no ground is. (H, W, 3)
         border: Colour of ground outside the texture, BGR.
         ground_z_m: Height of flat ground, used where ``height`` is None.
-        height: Height of the ground; its value below the camera is the plane that bands are planned on.
+        height: Height of the ground; bands are planned for the plane below the camera.
 
     Returns:
         The picture. (H, W, 3)
@@ -194,7 +198,7 @@ def _hits(
 ) -> Array:
     """World x, y where each sample's ray meets uneven ground, by fixed-point iteration. (h, w, 2)
 
-    Solved on a grid of every ``COARSE_PX``-th column and linear in between: roads are smooth at that scale.
+    Solved in every ``COARSE_PX``-th column and linear in between: roads are smooth at that scale.
     """
     columns = np.unique(np.append(np.arange(0, size[0], COARSE_PX), size[0] - 1)).astype(float)
     u, v = np.meshgrid(columns, np.arange(size[1], dtype=float))

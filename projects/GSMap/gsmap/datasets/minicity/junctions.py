@@ -43,7 +43,7 @@ class Connector:
 
 
 def mouth(road: Road, at_start: bool) -> Array:
-    """Vertices of a road's mouth from its right to its left kerb, looking out of the junction. (n, 2)"""
+    """A road's mouth from its right to its left kerb, seen from the junction. (n, 2)"""
     offsets = road.section.all_offsets
     points = np.stack([road.line(o)[0 if at_start else -1] for o in offsets])
     return points if at_start else points[::-1]

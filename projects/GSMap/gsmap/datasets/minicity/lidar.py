@@ -31,7 +31,7 @@ def vehicle_footprints(vehicles: list[Vehicle]) -> Array:
 
 
 def _entry_distances(origin: Array, directions: Array, boxes: Array) -> Array:
-    """Horizontal distance at which rays from ``origin`` enter each rectangle, inf where they miss. (A, n)"""
+    """Distances at which level rays enter each rectangle, inf where they miss. (A, n)"""
     corners = boxes[:, :8].reshape(-1, 4, 2) - origin
     start, edge = corners, np.roll(corners, -1, axis=1) - corners
     dx, dy = directions[:, 0, None, None], directions[:, 1, None, None]

@@ -160,6 +160,11 @@ def _draw_streaks(image: Image, lighting: Lighting, rng: np.random.Generator) ->
     lengths = rng.uniform(8, 30, lighting.streaks) * scale
     for (x, y), length in zip(starts, lengths, strict=True):
         cv2.line(
-            veil, (int(x), int(y)), (int(x + 0.15 * length), int(y + length)), 70, 1, cv2.LINE_AA
+            veil,
+            (int(x), int(y)),
+            (int(x + 0.15 * length), int(y + length)),
+            (70.0,),
+            1,
+            cv2.LINE_AA,
         )
     cv2.add(image, cv2.merge([veil] * 3), dst=image)

@@ -1,6 +1,7 @@
 """A town in the format of the nuScenes map expansion."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +138,7 @@ class MapWriter:
 
     def _divider(self, layer: str, points: Array, segment: str) -> None:
         line = self.line(points)
-        extra = (
+        extra: dict[str, Any] = (
             {"road_segment_token": segment}
             if layer == "road_divider"
             else {"lane_divider_segments": []}
@@ -178,13 +179,13 @@ class MapWriter:
         return token
 
     def _center(self, token: str, center: Array) -> None:
-        """A centre line as straight pieces of an arc-line path; such a path may hold bends, these have none."""
+        """A centre line as an arc-line path of straight pieces."""
         lengths = arc_lengths(center)
         count = max(1, round(lengths[-1] / PIECE_M))
         at = np.linspace(0.0, lengths[-1], count + 1)
         points = np.stack([np.interp(at, lengths, column) for column in center.T], axis=1)
         pieces = []
-        for a, b in zip(points[:-1], points[1:], strict=True):
+        for a, b in pairwise(points):
             yaw = float(np.arctan2(b[1] - a[1], b[0] - a[0]))
             length = float(np.linalg.norm(b - a))
             pieces.append(
@@ -248,7 +249,7 @@ def write_map(root: Path, town: Town, seed: int) -> str:
         flipped = [
             np.round(np.column_stack([r[:, 0], size - r[:, 1]])).astype(np.int32) for r in rings
         ]
-        cv2.fillPoly(mask, flipped, 255.0)
+        cv2.fillPoly(mask, flipped, (255.0,))
     name = f"maps/{make_token(seed, town.name, 'mask')}.png"
     if not cv2.imwrite(str(root / name), mask):
         raise OSError(f"could not write {root / name}.")

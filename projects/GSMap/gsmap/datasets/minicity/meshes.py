@@ -25,7 +25,7 @@ Color = tuple[float, float, float]
 
 @dataclass
 class Mesh:
-    """Quads and discs, grouped by the object that they belong to. ``add_*`` fill it, ``freeze`` makes arrays of it.
+    """Quads and discs, grouped by the object that they belong to; ``freeze`` makes arrays of them.
 
     Attributes:
         quads: Corners, anticlockwise seen from outside. Each (4, 3)
@@ -66,7 +66,7 @@ class Mesh:
 
     def add_disc(self, center: Array, radius_m: float, color: Color) -> None:
         """Add a disc to the current object."""
-        self.discs.append((*(float(c) for c in center), radius_m))
+        self.discs.append((float(center[0]), float(center[1]), float(center[2]), radius_m))
         self.disc_colors.append(color)
         self.disc_groups.append(len(self.anchors) - 1)
 

@@ -23,7 +23,7 @@ class Node:
     Attributes:
         position: Centre in metres. (2,)
         turn_rad: Angle by which its four arms are turned from the axes.
-        neighbours: Node index per arm, the arms at 0, 90, 180, 270 degrees (plus the turn); None where no road leaves.
+        neighbours: Node index per arm, at 0, 90, 180, 270 degrees plus the turn, or None.
     """
 
     position: Array
@@ -145,7 +145,7 @@ def _join(first: Array, second: Array) -> Array:
 
 
 def make_chains(nodes: list[Node], seed: int, name: str) -> list[Chain]:
-    """All streets of the network. A node of degree two is a bend of its street, any other an end."""
+    """All streets; a node of degree two is a bend of its street, any other an end."""
     chains = []
     used: set[tuple[int, int]] = set()
     for i, node in enumerate(nodes):
@@ -188,8 +188,8 @@ def _half_widths(chain: Chain, at_start: bool) -> tuple[float, float]:
 def mouth_distances(arms: list[tuple[float, float, float]], corner_m: float) -> list[float]:
     """How far from a junction's centre each of its roads has to end.
 
-    Two neighbouring kerbs meet at ``(w2 + w1 cos(phi)) / sin(phi)`` along the first road, ``phi`` being the angle
-    between the roads and ``w`` the half widths; the corner's radius is added.
+    Two neighbouring kerbs meet at ``(w2 + w1 cos(phi)) / sin(phi)`` along the first road, ``phi``
+    being the angle between the roads and ``w`` the half widths; the corner's radius is added.
 
     Args:
         arms: (angle in radians, left half width, right half width) of the roads, anticlockwise.
@@ -218,7 +218,7 @@ def make_roads(
     """Cut the streets back to their junctions.
 
     Returns:
-        The roads and, per node, the list of (road index, at its start, angle) anticlockwise by angle.
+        The roads and, per node, (road index, at its start, angle) anticlockwise by angle.
     """
     meetings: list[list[tuple[int, bool, float]]] = [[] for _ in nodes]
     for c, chain in enumerate(chains):

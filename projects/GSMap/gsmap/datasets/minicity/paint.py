@@ -1,5 +1,7 @@
 """A town as the renderer sees it: what its map says, laid out as surfaces, kerbs and paint."""
 
+from itertools import pairwise
+
 import numpy as np
 import shapely
 from shapely.geometry import Polygon, box
@@ -19,7 +21,7 @@ from gsmap.datasets.minicity.town import Town, road_surface
 
 
 def make_scene_map(town: Town, bounds: tuple[float, float, float, float]) -> SceneMap:
-    """The part of a town inside ``bounds`` (xmin, ymin, xmax, ymax), as surfaces, kerbs and paint."""
+    """The surfaces, kerbs and paint of a town inside ``bounds`` (xmin, ymin, xmax, ymax)."""
     window = box(*bounds)
     scene = SceneMap()
     scene.surfaces += [Surface(p, "walkway") for p in town.walkways if p.intersects(window)]
@@ -81,7 +83,9 @@ def has_center_line(road: Road) -> bool:
 
 def road_markings(road: Road) -> list[Marking]:
     """All paint on a road."""
-    style, white, yellow = road.style, [], []
+    style = road.style
+    white: list[Array] = []
+    yellow: list[Array] = []
     for start, end in divider_pieces(road):
         for at in lane_divider_offsets(road):
             white += dashed_line(road.line(at, start, end), style.line_m, *style.dash_m)
@@ -124,7 +128,7 @@ def _crossing_paint(road: Road, start: float, end: float) -> list[Array]:
         offsets = np.linspace(right + 0.15, left - 0.15, 6)
         sides = [np.stack([road.point(at, float(o)) for o in offsets]) for at in (start, end)]
         if road.style.crossing == "zebra":
-            painted += zebra(*sides)
+            painted += zebra(sides[0], sides[1])
         else:
             painted += [piece for side in sides for piece in solid_line(side, 0.3)]
     return painted
@@ -162,7 +166,7 @@ def _arrows(road: Road) -> list[Array]:
         at = stop[0] - 7.0 if sign > 0 else stop[1] + 7.0
         forward = unit(road.direction(at)) * sign
         side = np.array([-forward[1], forward[0]])
-        for inner, outer in zip(edges[:-1], edges[1:], strict=True):
+        for inner, outer in pairwise(edges):
             base = road.point(at, 0.5 * (inner + outer))
             painted.append(base + _ARROW[:, :1] * forward + _ARROW[:, 1:] * side)
     return painted

@@ -28,7 +28,8 @@ class SceneRenderer:
 
     Args:
         scene_map: Surfaces, kerbs, paint and height of the ground.
-        bounds: xmin, ymin, xmax, ymax of the ground that is painted, world metres: about 50 m around every camera.
+        bounds: xmin, ymin, xmax, ymax of the ground that is painted, world metres: about 50 m
+            around every camera.
         lighting: Light and weather.
         resolution_m: Edge of a ground pixel; 0.06 suits images 800 pixels wide, 0.12 images of 400.
         rng: Source of the surface's noise.
@@ -73,7 +74,7 @@ class SceneRenderer:
             The picture, BGR. (H, W, 3)
         """
         sky = render_sky(camera, self.lighting)
-        border = tuple(float(c) for c in MATERIALS["grass"])
+        border = MATERIALS["grass"]
         image = render_ground(camera, self.lit_texture, sky, border, self.ground_z_m, self.height)
         _shade_under(image, camera, vehicles, self.lighting)
         haze_ground(image, camera, self.lighting, self._ground_below(camera))
@@ -91,7 +92,7 @@ class SceneRenderer:
 def render_camera(
     scene_map: SceneMap, camera: Camera, lighting: Lighting, vehicles: list[Vehicle], seed: int = 0
 ) -> Image:
-    """One picture of a scene; for many of one scene make a ``SceneRenderer`` once. (H, W, 3), BGR"""
+    """One picture, BGR; for many of one scene make a ``SceneRenderer`` once. (H, W, 3)"""
     x, y = camera.center[:2]
     resolution = 0.06 * 800 / max(camera.width, 400)
     rng = np.random.default_rng(seed)
@@ -118,7 +119,7 @@ def _shade_under(image: Image, camera: Camera, vehicles: list[Vehicle], lighting
             continue
         if mask is None:
             mask = np.full(image.shape[:2], 255, np.uint8)
-        cv2.fillConvexPoly(mask, _fixed(px), dark, cv2.LINE_AA, SHIFT)
+        cv2.fillConvexPoly(mask, _fixed(px), (dark,), cv2.LINE_AA, SHIFT)
     if mask is not None:
         cv2.multiply(image, cv2.merge([mask] * 3), dst=image, scale=1 / 255)
 
@@ -209,7 +210,7 @@ def _visible_quads(
 def _lit(
     colors: Array, normals_cam: Array, glow: NDArray[np.bool_], camera: Camera, lighting: Lighting
 ) -> Array:
-    """Colours of faces under the sky and the sun, their outward normals given in the camera's frame. (F, 3)"""
+    """Colours of faces under sky and sun; outward normals in the camera's frame. (F, 3)"""
     unit = normals_cam / np.maximum(np.linalg.norm(normals_cam, axis=1, keepdims=True), 1e-9)
     up, sun = camera.cam_from_world[:3, 2], camera.cam_from_world[:3, :3] @ lighting.sun
     light = lighting.ambient * (0.9 + 0.1 * unit @ up) + lighting.direct * np.maximum(unit @ sun, 0)

@@ -1,4 +1,4 @@
-"""The sensors of MiniCity's car: six cameras and a roof LiDAR, placed much as on the nuScenes car."""
+"""The sensors of MiniCity's car: six cameras and a LiDAR, placed much as on the nuScenes car."""
 
 from dataclasses import dataclass
 

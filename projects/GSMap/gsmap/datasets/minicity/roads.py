@@ -1,6 +1,7 @@
 """One road between two junctions: its cross-section, lanes, lines and painted style."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +14,7 @@ STOP_LINE_M = 0.45
 
 @dataclass(frozen=True)
 class CrossSection:
-    """Lanes across a road. Offsets are metres to the left of the centre line; forward lanes lie on the right.
+    """Lanes across a road; offsets are metres left of the centre line, forward lanes lie right.
 
     Attributes:
         forward: Lanes along the centre line.
@@ -53,7 +54,7 @@ class CrossSection:
 
     @property
     def all_offsets(self) -> list[float]:
-        """Every offset at which a lane, median or kerb edge meets a junction, from right to left."""
+        """Offsets at which a lane, median or kerb edge meets a junction, from right to left."""
         edges = {self.right_m, self.left_m, *self.forward_edges, *self.backward_edges}
         return sorted(edges)
 
@@ -166,17 +167,11 @@ class Road:
         return np.concatenate([right, self.line(left_m, start_m, end_m)[::-1]])
 
     def band_with_mouths(self, right_m: float, left_m: float) -> Array:
-        """The whole band, its ends carrying every vertex that the junctions' mouths have there. (n, 2)"""
+        """The whole band, its ends with every vertex that the junctions' mouths have. (n, 2)"""
         between = [o for o in self.section.all_offsets if right_m < o < left_m]
-        end = [self.line(o)[-1] for o in between]
-        start = [self.line(o)[0] for o in reversed(between)]
-        parts = [
-            self.line(right_m),
-            *([end] if end else []),
-            self.line(left_m)[::-1],
-            *([start] if start else []),
-        ]
-        return np.concatenate(parts)
+        end = np.array([self.line(o)[-1] for o in between]).reshape(-1, 2)
+        start = np.array([self.line(o)[0] for o in reversed(between)]).reshape(-1, 2)
+        return np.concatenate([self.line(right_m), end, self.line(left_m)[::-1], start])
 
     def direction(self, at_m: float) -> float:
         """Heading of the centre line at an arc length, in radians."""
@@ -206,7 +201,7 @@ class Road:
             (True, self.section.forward_edges),
             (False, self.section.backward_edges),
         ):
-            for i, (inner, outer) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+            for i, (inner, outer) in enumerate(pairwise(edges)):
                 center = self.line(0.5 * (inner + outer))
                 nodes = (self.start_node, self.end_node)
                 if not forward:
@@ -215,7 +210,7 @@ class Road:
         return found
 
     def add_crossing(self, start_m: float, depth_m: float, at_start: bool, stop: bool) -> None:
-        """Put a crossing near one end, with a stop line before it on the lanes that come in, and clear the paint."""
+        """Put a crossing near one end, perhaps with a stop line before it, and clear the paint."""
         far = start_m + depth_m
         clear = far + (STOP_GAP_M + STOP_LINE_M if stop else 0.3)
         if at_start:

@@ -2,12 +2,14 @@
 
 from collections import defaultdict
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from gsmap.datasets.minicity.config import MiniCityConfig, make_rng, make_token
 from gsmap.datasets.minicity.curves import Array
@@ -209,7 +211,7 @@ class SceneMaker:
     def _stem(self, channel: str, time_s: float) -> str:
         return f"minicity-{self.task.name}__{channel}__{self.timestamp_us(time_s)}"
 
-    def _sweep(self, k: int, j: int, samples: list[str]) -> Array:
+    def _sweep(self, k: int, j: int, samples: list[str]) -> NDArray[np.float32]:
         """Write sweep ``j`` after key frame ``k``; number 0 is the key frame's own. (N, 5)"""
         time_s = (k + j / (self.config.sweeps_per_sample + 1)) * SAMPLE_PERIOD_S
         boxes = np.concatenate(
@@ -240,10 +242,10 @@ class SceneMaker:
     def _link_lidar(self) -> None:
         sweeps = [d for d in self.records["sample_data"] if "LIDAR_TOP" in d["filename"]]
         sweeps.sort(key=lambda d: d["timestamp"])
-        for before, after in zip(sweeps[:-1], sweeps[1:], strict=True):
+        for before, after in pairwise(sweeps):
             before["next"], after["prev"] = after["token"], before["token"]
 
-    def _annotate(self, k: int, sample: str, cloud: Array) -> None:
+    def _annotate(self, k: int, sample: str, cloud: NDArray[np.float32]) -> None:
         time_s = k * SAMPLE_PERIOD_S
         pose = self.ego_pose(time_s) @ ego_from_lidar()
         points = cloud[:, :3] @ pose[:3, :3].T + pose[:3, 3]
@@ -282,7 +284,7 @@ class SceneMaker:
         for box in self.records["sample_annotation"]:
             by_instance[box["instance_token"]].append(box)
         for token, boxes in by_instance.items():
-            for before, after in zip(boxes[:-1], boxes[1:], strict=True):
+            for before, after in pairwise(boxes):
                 before["next"], after["prev"] = after["token"], before["token"]
             self.records["instance"].append(
                 {

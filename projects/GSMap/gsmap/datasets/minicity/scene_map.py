@@ -1,4 +1,4 @@
-"""What the renderer is told about the ground: surfaces, kerbs, paint and height. It knows nothing of towns or data sets."""
+"""What the renderer is told about the ground: surfaces, kerbs, paint and height."""
 
 from dataclasses import dataclass, field
 
@@ -66,7 +66,8 @@ class HeightGrid:
         """Refuse holes: the renderer would show them as cliffs."""
         if self.height_m.ndim != 2 or not np.isfinite(self.height_m).all():
             raise ValueError(
-                f"height_m must be a finite (rows, columns) array, got shape {self.height_m.shape} with "
+                f"height_m must be a finite (rows, columns) array, got shape "
+                f"{self.height_m.shape} with "
                 f"{int((~np.isfinite(self.height_m)).sum())} non-finite cells: fill them first."
             )
 

@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from gsmap.datasets.minicity.curves import Array
@@ -13,7 +14,7 @@ from gsmap.datasets.minicity.scene_map import MATERIALS, PAINTS, SceneMap
 SHIFT = 4
 TILE_PX = 1024
 LEVELS = 6
-Image = NDArray[np.uint8]
+Image = MatLike
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,8 @@ def _noise_tiles() -> tuple[Image, Image]:
     return flat, grain
 
 
-def _tiled(tile: Image, shape: tuple[int, int], start: tuple[int, int]) -> Image:
-    rolled = np.roll(tile, start, axis=(0, 1))
+def _tiled(tile: Image, shape: tuple[int, int], start: list[int]) -> Image:
+    rolled = np.roll(tile, tuple(start), axis=(0, 1))
     repeats = [-(-n // TILE_PX) for n in shape]
     return np.tile(rolled, repeats)[: shape[0], : shape[1]]
 
@@ -88,11 +89,11 @@ def paint_ground(
     """
     origin = np.array(bounds[:2])
     columns, rows = (int(np.ceil(e)) for e in (np.array(bounds[2:]) - origin) / resolution_m)
-    starts = [tuple(int(v) for v in rng.integers(0, TILE_PX, 2)) for _ in range(2)]
+    starts = rng.integers(0, TILE_PX, (2, 2)).tolist()
     blotches, grain = (
         _tiled(t, (rows, columns), s) for t, s in zip(_noise_tiles(), starts, strict=True)
     )
-    color = np.empty((rows, columns, 3), np.uint8)
+    color: Image = np.empty((rows, columns, 3), np.uint8)
     color[:] = MATERIALS["grass"]
     for surface in scene.surfaces:
         shade = [min(255.0, c * surface.tone) for c in MATERIALS[surface.material]]
@@ -111,7 +112,7 @@ def paint_ground(
             painted[window] = np.maximum(painted[window], alpha)
     gray = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)
     reflectivity = cv2.addWeighted(gray, 0.12, painted, 0.45, 0)
-    levels = [color]
+    levels: list[Image] = [color]
     for _ in range(LEVELS - 1):
         half = (max(1, levels[-1].shape[1] // 2), max(1, levels[-1].shape[0] // 2))
         even = levels[-1][: 2 * half[1], : 2 * half[0]]
@@ -130,7 +131,7 @@ def _paint_kerbs(color: Image, scene: SceneMap, origin: Array, resolution_m: flo
 def _coat(
     outlines: list[Array], wear: float, blotches: Image, origin: Array, resolution_m: float
 ) -> tuple[tuple[slice, slice], Image] | None:
-    """Opacity of paint where it lies, worn off in blotches, and the window of the texture that it covers."""
+    """The window of the texture that paint covers, and its opacity, worn off in blotches."""
     if not outlines:
         return None
     px = [_pixels(outline, origin, resolution_m) for outline in outlines]
@@ -143,7 +144,7 @@ def _coat(
     mask = np.zeros((int(high[1] - low[1]), int(high[0] - low[0])), np.uint8)
     shift = (low << SHIFT).astype(np.int32)
     for outline in px:
-        cv2.fillPoly(mask, [outline - shift], 255.0, cv2.LINE_AA, SHIFT)
+        cv2.fillPoly(mask, [outline - shift], (255.0,), cv2.LINE_AA, SHIFT)
     # Opaque where the noise stays below 1 - wear, bare above, with a soft edge between.
     limit = np.arange(256) / 255.0
     left = np.clip((1.0 - wear - limit) * 5 + 0.35, 0.12, 0.97)
@@ -177,10 +178,10 @@ def darken(texture: GroundTexture, outlines: list[Array], strength: float) -> Gr
     if not outlines or strength <= 0:
         return texture
     shape = texture.levels[0].shape[:2]
-    light = np.full(shape, 255, np.uint8)
+    light: Image = np.full(shape, 255, np.uint8)
     for outline in outlines:
         px = _pixels(outline, texture.origin, texture.resolution_m)
-        cv2.fillPoly(light, [px], 255 * (1 - strength), cv2.LINE_AA, SHIFT)
+        cv2.fillPoly(light, [px], (255 * (1 - strength),), cv2.LINE_AA, SHIFT)
     size = 2 * max(1, round(0.15 / texture.resolution_m)) + 1
     light = cv2.blur(light, (size, size))
     levels = []

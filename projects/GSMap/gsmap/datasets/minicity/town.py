@@ -1,4 +1,4 @@
-"""A whole town: roads, junctions, crossings, car parks, buildings and street furniture, from a seed alone."""
+"""A whole town: roads, junctions, crossings, car parks, buildings and street furniture."""
 
 from dataclasses import dataclass, field
 
@@ -244,7 +244,7 @@ def _add_buildings(town: Town, blocked: Polygon, rng: np.random.Generator) -> No
 def _draw_building(
     road: Road, at_m: float, front_offset_m: float, front_m: float, rng: np.random.Generator
 ) -> Building:
-    """A house whose front lies ``front_offset_m`` to the left of a road (to the right if negative)."""
+    """A house whose front lies ``front_offset_m`` left of a road (right if negative)."""
     depth = float(rng.uniform(8, 12))
     center = road.point(at_m, front_offset_m + np.sign(front_offset_m) * depth / 2)
     footprint = rectangle(center, road.direction(at_m), front_m, depth)

@@ -53,7 +53,7 @@ class Drive:
     shift_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Prepare the path's tables; plain lists, since ``pose`` reads single entries very often."""
+        """Prepare the path's tables: plain lists, since ``pose`` reads single entries."""
         lengths = arc_lengths(self.path)
         rows = np.column_stack([self.path, tangents(self.path)])
         object.__setattr__(self, "_lengths", lengths.tolist())
@@ -88,7 +88,7 @@ def follow_lanes(town: Town, first: Lane, length_m: float, rng: np.random.Genera
 
 
 def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator) -> Drive:
-    """The ego vehicle's drive: scenes of one town start on different roads, half of them close to a junction."""
+    """The ego vehicle's drive; scenes of one town start on different roads, often at junctions."""
     order = np.random.default_rng(len(town.roads)).permutation(len(town.roads))
     for attempt in range(60):
         road = town.roads[int(order[(scene + attempt * 7) % len(order)])]
@@ -110,7 +110,7 @@ def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator
                 path, speed, start, swing, float(rng.uniform(0, 6.28)), float(rng.normal(0, 0.2))
             )
     raise RuntimeError(
-        f"town {town.name} has no drive of {duration_s} s: this is a bug in MiniCity, please report the seed."
+        f"town {town.name} has no drive of {duration_s} s: please report this with the seed."
     )
 
 

@@ -23,7 +23,7 @@ class Vehicle:
     """A vehicle or a person at one moment.
 
     Attributes:
-        category: nuScenes category name; ``human.*`` is drawn as a person, ``vehicle.car`` with a cabin.
+        category: nuScenes category; ``human.*`` is drawn as a person, ``vehicle.car`` with a cabin.
         center: x, y, z of the box's centre in the world. (3,)
         yaw_rad: Heading.
         size: Length, width, height in metres.
@@ -42,7 +42,7 @@ class Vehicle:
 
 
 def _body(size: Size, back: float, front: float, width: float) -> Array:
-    """A rectangle in shares of a vehicle's size, from -0.5 at its back to 0.5 at its front. (4, 2)"""
+    """A rectangle in shares of a vehicle's size, -0.5 at its back, 0.5 at its front. (4, 2)"""
     center = np.array([(back + front) / 2 * size[0], 0.0])
     return rectangle(center, 0.0, (front - back) * size[0], width * size[1])
 
