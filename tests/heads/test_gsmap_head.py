@@ -79,6 +79,16 @@ def test_with_maptr_weights_the_points_and_scores_are_maptrs_exactly():
     assert torch.equal(actual["all_cls_scores"], expected["all_cls_scores"])
 
 
+def test_the_guided_attention_is_as_large_as_maptrs_and_drops_as_much():
+    decoder = {**MAPTR["decoder"], "layer": {**MAPTR["decoder"]["layer"], "dropout": 0.25}}
+    plain = build(MAPTR, decoder=decoder).decoder.layers[0].cross_attn
+    guided = build(GSMAP, decoder=decoder).decoder.layers[0].cross_attn
+    assert type(guided) is not type(plain)
+    assert guided.dropout.p == plain.dropout.p == 0.25
+    shapes = [{k: v.shape for k, v in part.state_dict().items()} for part in (plain, guided)]
+    assert shapes[0] == shapes[1]
+
+
 def test_every_parameter_learns():
     head = build(GSMAP)
     for step in range(2):  # what feeds a matrix of zeros learns from the second step on

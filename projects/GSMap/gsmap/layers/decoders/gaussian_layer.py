@@ -83,11 +83,17 @@ class GaussianDecoderLayer(MapDecoderLayer):
                 nn.Linear(embed_hidden_dims, embed_dims),
             )
 
-    def build_cross_attention(self, *args: Any, **kwargs: Any) -> DeformableAttention:
+    def build_cross_attention(
+        self, embed_dims: int, num_heads: int, num_sampling_points: int, dropout: float
+    ) -> DeformableAttention:
         """Return the attention that `sample_bev` uses."""
         if self._attention_space is None:
-            return super().build_cross_attention(*args, **kwargs)
-        return GaussianDeformableAttention(self._attention_space, *args, **kwargs)
+            return super().build_cross_attention(
+                embed_dims, num_heads, num_sampling_points, dropout
+            )
+        return GaussianDeformableAttention(
+            self._attention_space, embed_dims, num_heads, num_sampling_points, dropout=dropout
+        )
 
     def init_weights(self) -> None:
         """Initialise as the layer does; the embedding's last matrix starts at zero."""
