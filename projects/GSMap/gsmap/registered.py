@@ -12,6 +12,7 @@ import gsmap.detectors.map_detector
 import gsmap.engine.checkpoint_io
 import gsmap.evaluation.map_metric
 import gsmap.heads.gsmap_head
+import gsmap.heads.gsmap_maptrv2_head
 import gsmap.heads.map_head
 import gsmap.heads.maptrv2_head
 import gsmap.layers.bev_encoders.bev_query_encoder
@@ -19,6 +20,7 @@ import gsmap.layers.bev_encoders.bevformer
 import gsmap.layers.bev_encoders.gkt
 import gsmap.layers.bev_encoders.lss
 import gsmap.layers.decoders.decoupled_layer
+import gsmap.layers.decoders.gaussian_decoupled_layer
 import gsmap.layers.decoders.gaussian_layer
 import gsmap.layers.decoders.map_decoder
 import gsmap.layers.grid_mask
