@@ -25,6 +25,9 @@ def parse_args() -> argparse.Namespace:
         "--sample", type=Path, required=True, help="annotation file, info file or folder"
     )
     parser.add_argument("--data-root", type=Path, help="folder that the paths of images start from")
+    parser.add_argument(
+        "--allow-missing-cameras", action="store_true", help="leave absent cameras blank"
+    )
     parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
     parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
     parser.add_argument("--out", type=Path, help="JSON file for the predictions")
@@ -56,10 +59,11 @@ def run(args: argparse.Namespace) -> None:
     visualizer.show_order = args.order
     visualizer.ground_z_m = args.ground_z if args.ground_z is not None else visualizer.ground_z_m
     visualizer.width_px = args.width or visualizer.width_px
-    dataset = inferencer.dataset(args.sample, args.data_root)
+    dataset = inferencer.dataset(args.sample, args.data_root, args.allow_missing_cameras)
     chosen = select_samples(dataset.annotations.column("token"), args.token, args.max_samples)
+    found = inferencer.predict(dataset, chosen, allow_missing_cameras=args.allow_missing_cameras)
     samples = []
-    for index, sample in zip(chosen, inferencer.predict(dataset, chosen), strict=True):
+    for index, sample in zip(chosen, found, strict=True):
         samples.append(sample)
         if args.show_dir:
             points = inferencer.lidar_points(dataset, index) if args.lidar else None

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from gsmap.inference.plain_pickle import load_plain_pickle
 from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView, resolve_frame_view
 
 
@@ -49,3 +50,22 @@ def test_resolution_by_data_set():
         resolve_frame_view({"frame": "map"})
     with pytest.raises(ValueError, match="forward must be"):
         FrameView("z", (0, 0, 0), (-1, 1, 1))
+
+
+def test_ground_of_a_real_sweep(shared_dir):
+    folder = shared_dir / "nuscenes_sample"
+    lidar = load_plain_pickle(next(folder.glob("*.pkl")))["data_list"][0]["lidar_points"]
+    points = np.fromfile(folder / lidar["lidar_path"], np.float32).reshape(-1, 5)[:, :3]
+    distance = np.hypot(points[:, 0], points[:, 1])
+    road = points[(distance > 3) & (distance < 25) & (np.abs(points[:, 0]) < 8)]
+    view = FRAME_VIEWS["lidar"].tilted(np.array(lidar["lidar2ego"]))
+    plane = np.array(view.ground)
+    inputs = np.column_stack([road[:, :2], np.ones(len(road))])
+    for width in np.geomspace(0.5, 0.05, 12):  # fit, each time with fewer points off the road
+        near = np.abs(road[:, 2] - inputs @ plane) < width
+        plane = np.linalg.lstsq(inputs[near], road[near, 2], rcond=None)[0]
+    assert near.sum() > 5000
+    assert abs(plane[2] - view.ground[2]) < 0.01
+    assert np.degrees(np.linalg.norm(plane[:2] - view.ground[:2])) < 0.3
+    level = FRAME_VIEWS["lidar"]
+    assert np.degrees(np.linalg.norm(plane[:2] - level.ground[:2])) > 1.0  # why the tilt matters

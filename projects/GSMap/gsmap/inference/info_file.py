@@ -11,12 +11,15 @@ from gsmap.datasets.annotation_record import CameraRecord, LidarRecord, MapSampl
 from gsmap.inference.plain_pickle import load_plain_pickle
 
 
-def read_info_file(path: str | Path, data_root: str | Path | None = None) -> list[MapSample]:
+def read_info_file(
+    path: str | Path, data_root: str | Path | None = None, allow_missing_cameras: bool = False
+) -> list[MapSample]:
     """Read the samples of an info file: cameras, LiDAR and poses, without map elements.
 
     Args:
         path: A pickle with ``metainfo`` and ``data_list``. It is read without running code from it.
         data_root: Folder that image and LiDAR paths start from; that of the file by default.
+        allow_missing_cameras: Whether to leave out a camera whose image does not exist.
 
     Returns:
         The samples, in the LIDAR_TOP frame, with paths relative to ``data_root``.
@@ -34,7 +37,8 @@ def read_info_file(path: str | Path, data_root: str | Path | None = None) -> lis
             "code convert with mmdet3d's tools/dataset_converters/update_infos_to_v2.py."
         )
     return [
-        _sample(info, root, f"{path}, sample {i}") for i, info in enumerate(content["data_list"])
+        _sample(info, root, f"{path}, sample {i}", allow_missing_cameras)
+        for i, info in enumerate(content["data_list"])
     ]
 
 
@@ -83,15 +87,29 @@ def _camera(name: str, info: Mapping[str, Any], root: Path, where: str) -> Camer
     )
 
 
-def _sample(info: Mapping[str, Any], root: Path, where: str) -> MapSample:
+def _cameras(
+    images: Mapping[str, Any], root: Path, where: str, allow_missing: bool
+) -> list[CameraRecord]:
+    """Read the cameras that have an image and a calibration."""
+    cameras = []
+    for name, info in images.items():
+        if not info.get("img_path") or info.get("lidar2cam") is None:
+            continue
+        try:
+            cameras.append(_camera(name, info, root, where))
+        except FileNotFoundError:
+            if not allow_missing:
+                raise
+    if not cameras:
+        raise ValueError(f"{where} has no camera with an image and a calibration.")
+    return cameras
+
+
+def _sample(info: Mapping[str, Any], root: Path, where: str, allow_missing: bool) -> MapSample:
     """Turn one entry of ``data_list`` into a sample."""
     try:
-        images, lidar = info["images"], info["lidar_points"]
-        cameras = [
-            _camera(name, camera, root, where)
-            for name, camera in images.items()
-            if camera.get("img_path") and camera.get("lidar2cam") is not None
-        ]
+        lidar = info["lidar_points"]
+        cameras = _cameras(info["images"], root, where, allow_missing)
         ego_from_lidar = _matrix(lidar["lidar2ego"], 4, f"{where}: lidar2ego")
         global_from_ego = _matrix(info["ego2global"], 4, f"{where}: ego2global")
         timestamp_ns = round(float(info["timestamp"]) * 1e9)
@@ -100,8 +118,6 @@ def _sample(info: Mapping[str, Any], root: Path, where: str) -> MapSample:
             f"{where} lacks {error}; GSMap needs images (img_path, cam2img, lidar2cam), "
             "lidar_points (lidar2ego), ego2global and timestamp."
         ) from error
-    if not cameras:
-        raise ValueError(f"{where} has no camera with an image and a calibration.")
     record = None
     if lidar.get("lidar_path"):
         path = _locate(lidar["lidar_path"], "LIDAR_TOP", root, f"{where}, LiDAR")

@@ -20,6 +20,7 @@ from gsmap.datasets.annotation_file import write_annotations
 from gsmap.datasets.annotation_record import AnnotationMeta, MapSample
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.evaluation.map_metric import MapMetric
+from gsmap.inference.blank_cameras import BlankCameraDataset
 from gsmap.inference.checkpoint import load_weights
 from gsmap.inference.info_file import read_info_file
 from gsmap.visualization.map_visualizer import MapVisualizer
@@ -151,7 +152,10 @@ class MapInferencer:
         return MapVisualizer(name=f"inferencer-{id(self)}", **options)
 
     def dataset(
-        self, source: str | Path | Sequence[MapSample], data_root: str | Path | None = None
+        self,
+        source: str | Path | Sequence[MapSample],
+        data_root: str | Path | None = None,
+        allow_missing_cameras: bool = False,
     ) -> VectorizedMapDataset:
         """Open samples as the config's test data set.
 
@@ -160,6 +164,7 @@ class MapInferencer:
                 samples in the LIDAR_TOP frame.
             data_root: Folder that image paths start from; that of an info file, or else the
                 config's, by default.
+            allow_missing_cameras: Whether an info file may name images that do not exist.
 
         Returns:
             The data set, with the test pipeline.
@@ -172,7 +177,8 @@ class MapInferencer:
             path = find_sample_file(source)
             if path.suffix == ".pkl":
                 data_root = path.parent if data_root is None else data_root
-                path = self._annotation_file(read_info_file(path, data_root))
+                samples = read_info_file(path, data_root, allow_missing_cameras)
+                path = self._annotation_file(samples)
         else:
             path = self._annotation_file(source)
         options: dict[str, Any] = dict(self.cfg.test_dataloader.dataset)
@@ -233,6 +239,7 @@ class MapInferencer:
         indices: Sequence[int] | None = None,
         batch_size: int = 1,
         num_workers: int = 0,
+        allow_missing_cameras: bool = False,
     ) -> Iterator[Det3DDataSample]:
         """Run the model.
 
@@ -241,11 +248,17 @@ class MapInferencer:
             indices: Which samples; all by default.
             batch_size: Samples per forward pass.
             num_workers: Processes that read images.
+            allow_missing_cameras: Whether cameras that a sample lacks are left blank.
 
         Yields:
             The samples in order, with ``pred_instances_3d`` on the CPU.
+
+        Raises:
+            ValueError: If a file of a sample is missing or damaged, or a camera is absent.
         """
-        chosen: Dataset = dataset if indices is None else Subset(dataset, list(indices))
+        chosen: Dataset = BlankCameraDataset(dataset, allow_missing_cameras)
+        if indices is not None:
+            chosen = Subset(chosen, list(indices))
         loader = DataLoader(
             chosen, batch_size=batch_size, num_workers=num_workers, collate_fn=pseudo_collate
         )

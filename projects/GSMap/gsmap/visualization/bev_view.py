@@ -269,7 +269,7 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
     draw_vehicle(ax, view, style)
     elements = panel.elements
     if elements is None or len(elements) == 0:
-        note = "unknown" if elements is None else "nothing here"
+        note = "unknown" if elements is None else "no elements"
         ax.text(0, extent[2] + 2, note, fontsize=7, color=style.muted, ha="center")
         return
     if panel.rasters is not None:

@@ -175,7 +175,8 @@ class MapVisualizer(Visualizer):
             metainfo: Meta data of the sample; without ``img_path`` and ``images`` there are no
                 cameras.
             images: RGB images in the geometry that the model sees (after augmentation); None reads
-                the original files and takes the augmentation out of the projections.
+                the original files and takes the augmentation out of the projections; a camera whose
+                path is None is left out.
 
         Returns:
             One view per camera.
@@ -187,18 +188,19 @@ class MapVisualizer(Visualizer):
         if images is None and paths is None:
             return []
         projections = np.asarray(metainfo["lidar2img"], dtype=np.float64)  # (V, 4, 4)
+        names = metainfo.get("cam_names") or [f"camera {i}" for i in range(len(projections))]
         if images is None:
             where = f"sample {metainfo.get('token')!r}"
-            images = [read_image(path, where) for path in paths]  # type: ignore[union-attr]
             if metainfo.get("img_aug_matrix") is not None:
-                projections = (
-                    np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64)) @ projections
-                )
+                unscaled = np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64))
+                projections = unscaled @ projections
+            there = [i for i, path in enumerate(paths) if path is not None]  # type: ignore[arg-type]
+            images = [read_image(paths[i], where) for i in there]  # type: ignore[index]
+            names, projections = [names[i] for i in there], projections[there]
         if len(images) != len(projections):
             raise ValueError(
                 f"A sample has {len(images)} images, but {len(projections)} projections."
             )
-        names = metainfo.get("cam_names") or [f"camera {i}" for i in range(len(images))]
         return [CameraView(*fields) for fields in zip(names, images, projections, strict=True)]
 
     def _bev_panels(
