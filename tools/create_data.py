@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Make annotation files: ``python tools/create_data.py {minicity,nuscenes,av2,export} --help``.
+"""Make data and annotation files: ``python tools/create_data.py COMMAND --help``.
 
 Each command lives in the package as a module with ``add_arguments(parser)`` and ``run(arguments,
 command)``, imported only when it is asked for.
@@ -14,6 +14,10 @@ COMMANDS = {
     "minicity": ("gsmap.datasets.minicity.cli", "generate the MiniCity data set"),
     "nuscenes": ("gsmap.datasets.converters.nuscenes_cli", "convert nuScenes or MiniCity"),
     "av2": ("gsmap.datasets.converters.argoverse2", "convert Argoverse 2 logs"),
+    "av2-render": (
+        "gsmap.datasets.converters.argoverse2_render",
+        "render camera images for real Argoverse 2 logs",
+    ),
     "export": ("gsmap.datasets.converters.export", "write an annotation file's vectors as JSON"),
 }
 

@@ -114,6 +114,19 @@ def write_map(log_dir: Path, content: dict | None = None) -> None:
     path.write_text(json.dumps(content or road_map()))
 
 
+def write_heights(log_dir: Path, slope: float = 0.0, cell_m: float = 0.5) -> None:
+    """Write the ground height of x = -70 .. 70, y = -70 .. 70 around the road's origin."""
+    count = round(140 / cell_m)
+    along = (np.arange(count) + 0.5) * cell_m - 70.0
+    heights = np.tile(ORIGIN[2] + slope * along, (count, 1)).astype(np.float16)
+    heights[:10, :10] = np.nan
+    folder = log_dir / "map"
+    np.save(folder / f"{log_dir.name}_ground_height_surface____PIT.npy", heights)
+    corner = [float(v) for v in 70.0 - ORIGIN[:2]]
+    similarity = {"R": [1.0, 0.0, 0.0, 1.0], "t": corner, "s": 1 / cell_m}
+    (folder / f"{log_dir.name}___img_Sim2_city.json").write_text(json.dumps(similarity))
+
+
 def write_poses(log_dir: Path, times_ns: np.ndarray) -> None:
     """Write poses along y = 0, from x = 0 at ``START_NS``."""
     x = (times_ns - START_NS) * 1e-9 * SPEED_M_S
@@ -143,6 +156,7 @@ def write_log(log_dir: Path, seconds: float = 1.0, content: dict | None = None) 
     sweeps = START_NS + np.arange(0, int(seconds * 1e9), SWEEP_EVERY_NS)
     images = START_NS + np.arange(0, int(seconds * 1e9), IMAGE_EVERY_NS) + IMAGE_DELAY_NS
     write_map(log_dir, content)
+    write_heights(log_dir)
     write_poses(log_dir, np.sort(np.concatenate([sweeps, images])))
     write_calibration(log_dir)
     folders = {log_dir / "sensors" / "lidar": (sweeps, ".feather")}

@@ -251,7 +251,7 @@ def test_the_tool_converts_and_names_its_command(tmp_path):
     done = subprocess.run(command, cwd=REPO, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "samples: val 2" in done.stdout
-    meta = AnnotationFile(tmp_path / "map_val.arrow").meta
+    meta = AnnotationFile(tmp_path / "gsmap_av2_val.arrow").meta
     assert "av2 --root" in meta.command
     assert meta.options == {"at": "auto", "rate_hz": 2.0, "compat": "maptrv2", "num_sweeps": 0}
 

@@ -49,7 +49,7 @@ class Argoverse2Options:
     @property
     def target(self) -> Path:
         """The annotation file."""
-        return (self.out_dir or self.root) / f"map_{self.split}{self.tag}.arrow"
+        return (self.out_dir or self.root) / f"gsmap_av2_{self.split}{self.tag}.arrow"
 
 
 def convert_argoverse2(
@@ -191,7 +191,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--split", default="val", choices=("train", "val", "test"))
     parser.add_argument(
-        "--out-dir", type=Path, help="where map_<split>.arrow goes (default: the data root)"
+        "--out-dir", type=Path, help="where gsmap_av2_<split>.arrow goes (default: the data root)"
     )
     parser.add_argument(
         "--at",

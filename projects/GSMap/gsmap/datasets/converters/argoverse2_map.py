@@ -32,6 +32,24 @@ MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
 NO_LANE = -1
 
 
+def find_map(log_dir: Path) -> Path:
+    """Return the file that holds a log's vector map.
+
+    Args:
+        log_dir: The log's folder, which holds ``map/log_map_archive_*.json``.
+
+    Raises:
+        FileNotFoundError: If it is missing.
+        ValueError: If there are several.
+    """
+    found = sorted((log_dir / "map").glob("log_map_archive_*.json"))
+    if not found:
+        raise FileNotFoundError(f"no map/log_map_archive_*.json in {log_dir}: download it again.")
+    if len(found) > 1:
+        raise ValueError(f"{len(found)} maps in {log_dir / 'map'}, expected one: {found}.")
+    return found[0]
+
+
 class GeometryLayer:
     """Geometries of one kind of a log's map, with a spatial index.
 
@@ -125,17 +143,11 @@ class Argoverse2Map:
             FileNotFoundError: If the map is missing.
             ValueError: If there are several, or it is damaged.
         """
-        found = sorted((log_dir / "map").glob("log_map_archive_*.json"))
-        if not found:
-            raise FileNotFoundError(
-                f"no map/log_map_archive_*.json in {log_dir}: download it again."
-            )
-        if len(found) > 1:
-            raise ValueError(f"{len(found)} maps in {log_dir / 'map'}, expected one: {found}.")
+        path = find_map(log_dir)
         try:
-            return cls(ArgoverseStaticMap.from_json(found[0]))
+            return cls(ArgoverseStaticMap.from_json(path))
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{found[0]} is damaged ({error}): download it again.") from error
+            raise ValueError(f"{path} is damaged ({error}): download it again.") from error
 
     @property
     def invalid_counts(self) -> dict[str, int]:
