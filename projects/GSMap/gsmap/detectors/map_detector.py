@@ -46,11 +46,14 @@ class MapDetector(Base3DDetector):
 
     def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
         """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
+        if self.img_backbone is None:
+            raise ValueError("the model has no img_backbone, so it takes no images.")
         batch = len(imgs)
         images = imgs.flatten(0, 1)
         if self.training and self.img_augment is not None:
             images = self.img_augment(images)
-        feats = self.img_backbone(images)
+        # channels last is what CPU and tensor-core convolutions are fastest with
+        feats = self.img_backbone(images.contiguous(memory_format=torch.channels_last))
         if self.img_neck is not None:
             feats = self.img_neck(feats)
         return [feat.unflatten(0, (batch, -1)) for feat in feats]

@@ -124,7 +124,8 @@ class MapHead(BaseModule):
         init_matrices(self.decoder)
         xavier_init(self.reference_points, distribution="uniform", bias=0.0)
         for branch in self.cls_branches:
-            nn.init.constant_(branch[-1].bias, bias_init_with_prob(_PRIOR_PROBABILITY))
+            *_, bias = branch.parameters()  # of the logits
+            nn.init.constant_(bias, bias_init_with_prob(_PRIOR_PROBABILITY))
 
     def queries(self) -> tuple[Tensor, Tensor]:
         """Return position and content of every point query, instance by instance. 2 x (N * P, C)"""

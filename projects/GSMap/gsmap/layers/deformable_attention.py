@@ -10,31 +10,37 @@ from mmengine.model import BaseModule, constant_init, xavier_init
 from torch import Tensor, nn
 
 _SAMPLING_WEIGHTS = ("sampling_offsets.weight", "attention_weights.weight")
+_IM2COL_STEP = 64
+_CORNERS = 4
 
 
-def bilinear_rows(locations: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Turn sampling locations into the four surrounding cells of a map and their bilinear weights.
+def bilinear_cells(
+    locations: Tensor, weights: Tensor, shape: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Turn weighted sampling locations into the cells around them and their weights.
 
     The value of a cell lies at its centre; outside the map everything is zero
     (``align_corners=False`` and zero padding, as in ``grid_sample``).
 
     Args:
-        locations: Points (x, y), [0, 1] over the map. (..., 2)
+        locations: Points (x, y), [0, 1] over the map. (..., S, 2)
+        weights: Their weights. (..., S)
         shape: Rows and columns of the map.
 
     Returns:
-        Row-major cell indices, clamped to the map, and weights, zero where the cell is outside. 2 x
-        (..., 4)
+        Row-major cell indices, clamped to the map, and weights, zero outside. 2 x (..., 4 S)
     """
     height, width = shape
     x, y = locations[..., 0] * width - 0.5, locations[..., 1] * height - 0.5
     x0, y0 = x.detach().floor(), y.detach().floor()
-    cols = torch.stack([x0, x0 + 1, x0, x0 + 1], -1)  # (..., 4)
-    rows = torch.stack([y0, y0, y0 + 1, y0 + 1], -1)
-    weights = (1 - (x[..., None] - cols).abs()) * (1 - (y[..., None] - rows).abs())
-    inside = (cols >= 0) & (cols < width) & (rows >= 0) & (rows < height)
-    cells = rows.clamp(0, height - 1) * width + cols.clamp(0, width - 1)
-    return cells.long(), weights * inside
+    right, lower = x - x0, y - y0
+    cells, cell_weights = [], []
+    for col, wx in ((x0, 1 - right), (x0 + 1, right)):
+        for row, wy in ((y0, 1 - lower), (y0 + 1, lower)):
+            inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+            cells.append(row.clamp(0, height - 1) * width + col.clamp(0, width - 1))
+            cell_weights.append(wx * wy * weights * inside)
+    return torch.cat(cells, -1).long(), torch.cat(cell_weights, -1)
 
 
 def deformable_sample(
@@ -55,35 +61,52 @@ def deformable_sample(
         Weighted sums, heads concatenated. (B, Q, heads * C)
     """
     batch, num_cells, heads, channels = value.shape
-    if value.is_cuda and get_compiling_cuda_version() != "not available":
+    if has_compiled_op(value):
         shapes = torch.tensor([shape], device=value.device)
-        start = shapes.new_zeros(1)
         return MultiScaleDeformableAttnFunction.apply(
             value.contiguous(),
             shapes,
-            start,
+            shapes.new_zeros(1),
             locations[:, :, :, None].contiguous(),
             weights[:, :, :, None].contiguous(),
-            64,
+            _IM2COL_STEP,
         )
-    cells, corner_weights = bilinear_rows(locations, shape)  # (B, Q, heads, S, 4)
-    sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1, 1)
-    head = torch.arange(heads, device=value.device).view(1, 1, -1, 1, 1)
+    cells, cell_weights = bilinear_cells(locations, weights, shape)  # (B, Q, heads, 4 S)
+    sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1)
+    head = torch.arange(heads, device=value.device).view(1, 1, -1, 1)
     rows = (sample * num_cells + cells) * heads + head
-    bags = rows.flatten(3).flatten(0, 2)  # (B * Q * heads, 4 S)
-    bag_weights = (weights[..., None] * corner_weights).flatten(3).flatten(0, 2)
-    table = value.reshape(-1, channels)
-    out = F.embedding_bag(bags, table, per_sample_weights=bag_weights.to(table.dtype), mode="sum")
-    return out.view(batch, -1, heads * channels)
+    return sum_rows(value.reshape(-1, channels), rows, cell_weights).flatten(2)
 
 
-class DeformableAttention(BaseModule):
-    """Multi-head deformable attention on one map.
+def has_compiled_op(value: Tensor) -> bool:
+    """Return whether mmcv's compiled deformable attention can run on a tensor."""
+    return value.is_cuda and get_compiling_cuda_version() != "not available"
 
-    It has the parameters of mmcv's ``MultiScaleDeformableAttention`` for one level.
 
-    Subclasses change where it looks by overriding :meth:`sampling_locations`. The residual is left
-    to the caller.
+def sum_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """Sum weighted rows of a table.
+
+    Args:
+        table: The table. (R, C)
+        rows: Row indices. (..., S)
+        weights: Their weights. (..., S)
+
+    Returns:
+        The sums, without a tensor of all the rows in between. (..., C)
+    """
+    out = F.embedding_bag(
+        rows.reshape(-1, rows.shape[-1]),
+        table,
+        per_sample_weights=weights.reshape(-1, rows.shape[-1]).to(table.dtype),
+        mode="sum",
+    )
+    return out.view(*rows.shape[:-1], table.shape[-1])
+
+
+class SamplingAttention(BaseModule):
+    """The learned parts of deformable attention on one map.
+
+    They are those of mmcv's ``MultiScaleDeformableAttention`` for one level.
 
     Args:
         embed_dims: Channels C of the map and of the output.
@@ -133,6 +156,25 @@ class DeformableAttention(BaseModule):
         """Return the offsets, in cells, that every query starts with. (heads, S, 2)"""
         return directional_offsets(self.num_heads, self.num_points)
 
+    def offsets_in_cells(self, query: Tensor) -> Tensor:
+        """Return the learned offsets (x, y) in cells. (B, Q, heads, S, 2)"""
+        return (
+            self.sampling_offsets(query).float().unflatten(-1, (self.num_heads, self.num_points, 2))
+        )
+
+    def weights(self, query: Tensor) -> Tensor:
+        """Return the attention weights, of sum one over a head's points. (B, Q, heads, S)"""
+        logits = self.attention_weights(query).float()
+        return logits.unflatten(-1, (self.num_heads, self.num_points)).softmax(-1)
+
+
+class DeformableAttention(SamplingAttention):
+    """Multi-head deformable attention on one map; the residual is left to the caller.
+
+    Subclasses change where it looks by overriding :meth:`sampling_locations`. Its arguments are
+    those of :class:`SamplingAttention`.
+    """
+
     def sampling_locations(
         self, query: Tensor, reference: Tensor, shape: tuple[int, int]
     ) -> Tensor:
@@ -151,17 +193,6 @@ class DeformableAttention(BaseModule):
         size = offsets.new_tensor([shape[1], shape[0]])
         return reference[:, :, None, None, :2] + offsets / size
 
-    def offsets_in_cells(self, query: Tensor) -> Tensor:
-        """Return the learned offsets (x, y) in cells. (B, Q, heads, S, 2)"""
-        return (
-            self.sampling_offsets(query).float().unflatten(-1, (self.num_heads, self.num_points, 2))
-        )
-
-    def weights(self, query: Tensor) -> Tensor:
-        """Return the attention weights, of sum one over a head's points. (B, Q, heads, S)"""
-        logits = self.attention_weights(query).float()
-        return logits.unflatten(-1, (self.num_heads, self.num_points)).softmax(-1)
-
     def forward(self, query: Tensor, reference: Tensor, feats: Tensor) -> Tensor:
         """Sample the map for each query.
 
@@ -174,12 +205,41 @@ class DeformableAttention(BaseModule):
         Returns:
             Attended features, without the residual. (B, Q, C)
         """
-        height, width = feats.shape[-2:]
-        value = self.value_proj(feats.flatten(2).transpose(1, 2)).float()  # (B, H * W, C)
-        value = value.unflatten(-1, (self.num_heads, -1))
-        locations = self.sampling_locations(query, reference, (height, width))
-        sampled = deformable_sample(value, (height, width), locations, self.weights(query))
+        shape = (feats.shape[-2], feats.shape[-1])
+        tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)
+        locations, weights = self.sampling_locations(query, reference, shape), self.weights(query)
+        # Projection and sampling commute: projecting after it pays when few cells are looked at.
+        if weights.numel() * _CORNERS < tokens[..., 0].numel() * self.num_heads and not (
+            has_compiled_op(tokens)
+        ):
+            sampled = self.sample_then_project(tokens, shape, locations, weights)
+        else:
+            value = self.value_proj(tokens).float().unflatten(-1, (self.num_heads, -1))
+            sampled = deformable_sample(value, shape, locations, weights)
         return self.dropout(self.output_proj(sampled))
+
+    def sample_then_project(
+        self, tokens: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor
+    ) -> Tensor:
+        """Return what sampling the projected map would, by projecting each head's sample.
+
+        Args:
+            tokens: The map, row-major. (B, H * W, C)
+            shape: Rows and columns of the map.
+            locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
+            weights: Attention weights. (B, Q, heads, S)
+
+        Returns:
+            Projected samples, heads concatenated. (B, Q, C)
+        """
+        cells, cell_weights = bilinear_cells(locations, weights, shape)
+        sample = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
+        table = tokens.float().reshape(-1, tokens.shape[-1])
+        sampled = sum_rows(table, sample * tokens.shape[1] + cells, cell_weights)
+        weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C', C)
+        bias = self.value_proj.bias.view(self.num_heads, -1)
+        projected = torch.einsum("bqhc,hdc->bqhd", sampled, weight)
+        return (projected + cell_weights.sum(-1, keepdim=True) * bias).flatten(2)
 
 
 def directional_offsets(num_heads: int, num_points: int) -> Tensor:

@@ -11,7 +11,8 @@ from mmengine.structures import InstanceData
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
 from gsmap.checkpoints.key_map import find_key_map
 from gsmap.heads.map_head import MapHead
-from gsmap.layers.bev_encoders.gkt import gather_weighted, kernel_offsets
+from gsmap.layers.bev_encoders.gkt import kernel_offsets
+from gsmap.layers.deformable_attention import sum_rows
 
 from .golden import Golden
 from .registry import check
@@ -69,7 +70,7 @@ def check_kernel_attention(golden: Golden, name: str) -> Iterator[Row]:
     sample = torch.arange(batch).view(-1, 1, 1, 1)
     rows = (sample * num_pixels + pixels) * heads + torch.arange(heads).view(-1, 1)
     weights = torch.from_numpy(data["weights"])[:, :, :, 0]
-    out = gather_weighted(value, rows.flatten(0, 1), weights.flatten(0, 1))
+    out = sum_rows(value.flatten(0, 2), rows, weights)
     reference = data["out"].reshape(out.shape)
     yield Row(name, "out", largest_difference(out, reference), 1e-5)
     offsets = kernel_offsets((3, 5))

@@ -65,7 +65,8 @@ def relative_norm(ours: ArrayLike, reference: ArrayLike) -> float:
         ours, reference = _pair(ours, reference)
     except ValueError:
         return float("inf")
-    return float(np.linalg.norm(ours - reference) / max(np.linalg.norm(reference), 1e-12))
+    size = float(np.linalg.norm(reference))
+    return float(np.linalg.norm(ours - reference)) / max(size, 1e-12)
 
 
 def fraction_beyond(ours: ArrayLike, reference: ArrayLike, limit: float) -> float:

@@ -181,7 +181,9 @@ class BEVQueryEncoder(BaseModule):
         )
         self.can_bus_mlp.add_module("norm", nn.LayerNorm(embed_dims))
         layer = {"cross_attn": cross_attn, "embed_dims": embed_dims, **(layer_cfg or {})}
-        self.layers = nn.ModuleList(BEVEncoderLayer(**layer) for _ in range(num_layers))
+        layers = [BEVEncoderLayer(**layer) for _ in range(num_layers)]
+        self.num_heights: int = layers[0].cross_attn.num_heights
+        self.layers = nn.ModuleList(layers)
         nn.init.normal_(self.level_embeds)
         nn.init.normal_(self.cams_embeds)
 
@@ -247,8 +249,6 @@ class BEVQueryEncoder(BaseModule):
         """Project every cell's pillar into every camera."""
         # Differs from upstream for batches: it takes the set of seen cells from the first sample
         # for all.
-        points = pillar_points(
-            self.grid, self.z_range, self.layers[0].cross_attn.num_heights, device
-        )
+        points = pillar_points(self.grid, self.z_range, self.num_heights, device)
         matrices = stack_matrices(img_metas, "lidar2img", device)
         return project_pillars(points, matrices, img_metas[0]["batch_input_shape"])

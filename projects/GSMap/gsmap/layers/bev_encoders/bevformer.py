@@ -4,13 +4,13 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.layers.deformable_attention import DeformableAttention, deformable_sample
+from gsmap.layers.deformable_attention import SamplingAttention, deformable_sample
 
 from .projection import PillarProjection
 
 
 @MODELS.register_module()
-class SpatialCrossAttention(DeformableAttention):
+class SpatialCrossAttention(SamplingAttention):
     """Attention from BEV cells to the cameras that see them, around their projected pillars.
 
     Sample s belongs to pillar height ``s % num_heights``. Sums over cameras are divided by the

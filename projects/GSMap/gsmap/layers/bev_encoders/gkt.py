@@ -1,10 +1,11 @@
 """Geometry-guided kernel attention (GKT) in plain torch: fixed kernels around projected cells."""
 
 import torch
-import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule, constant_init, xavier_init
 from torch import Tensor, nn
+
+from gsmap.layers.deformable_attention import sum_rows
 
 from .projection import PillarProjection
 
@@ -103,45 +104,22 @@ class GeometryKernelAttention(BaseModule):
             Attended features, without the residual. (B, Q, C)
         """
         batch, num_queries = query.shape[:2]
-        num_views, feat_shape = img_feats.shape[1], img_feats.shape[-2:]
+        num_views, (height, width) = img_feats.shape[1], img_feats.shape[-2:]
         value = self.value_proj(img_feats.flatten(3).transpose(2, 3))  # (B, V, h * w, C)
         weights = (
             self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1)).softmax(-1)
         )
 
-        sample, view, cell = projection.visible.nonzero(
-            as_tuple=True
-        )  # T seen pairs of cell and camera
-        pixels = kernel_cells(
-            projection.uv[sample, view, cell], self.offsets, feat_shape
-        )  # (T, heads, S)
+        sample, view, cell = projection.visible.nonzero(as_tuple=True)  # T pairs that see
+        uv = projection.uv[sample, view, cell]  # (T, heads, 2)
+        pixels = kernel_cells(uv, self.offsets, (height, width))  # (T, heads, S)
         image = (sample * num_views + view).view(-1, 1, 1)
         head = torch.arange(self.num_heads, device=query.device).view(1, -1, 1)
-        rows = (image * (feat_shape[0] * feat_shape[1]) + pixels) * self.num_heads + head
-        out = gather_weighted(
-            value.unflatten(-1, (self.num_heads, -1)), rows, weights[sample, cell]
-        )
+        rows = (image * (height * width) + pixels) * self.num_heads + head
+        table = value.float().reshape(-1, value.shape[-1] // self.num_heads)
+        out = sum_rows(table, rows, weights[sample, cell]).flatten(1)  # (T, C)
 
         target = sample * num_queries + cell
         summed = out.new_zeros(batch * num_queries, out.shape[-1]).index_add(0, target, out)
         count = projection.visible.sum(1).clamp(min=1)  # (B, Q)
         return self.output_proj(summed.view(batch, num_queries, -1) / count[..., None])
-
-
-def gather_weighted(value: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """Sum weighted rows of a value table per query and head.
-
-    Args:
-        value: Any leading axes, heads and channels last; flattened, its rows are what ``rows``
-            counts. (..., heads, C)
-        rows: Row indices into the flattened table. (T, heads, S)
-        weights: Weights. (T, heads, S)
-
-    Returns:
-        Weighted sums, heads concatenated. (T, heads * C)
-    """
-    num, heads, samples = rows.shape
-    table = value.reshape(-1, value.shape[-1]).float()
-    weights = weights.reshape(-1, samples).to(table.dtype)
-    bags = F.embedding_bag(rows.reshape(-1, samples), table, per_sample_weights=weights, mode="sum")
-    return bags.view(num, heads * value.shape[-1])
