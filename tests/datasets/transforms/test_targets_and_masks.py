@@ -1,0 +1,109 @@
+"""Targets and masks: values worked by hand, and the reference's own."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsmap.datasets.annotation_record import MapInstance
+from gsmap.datasets.transforms.map_targets import FormatMapTargets, map_targets
+from gsmap.datasets.transforms.masks import MakeBEVMask, MakePVMask
+
+RANGES = {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0)}
+
+
+def golden_instances(golden_dir: Path, name: str) -> list[MapInstance]:
+    elements = json.loads((golden_dir / "models/gt_A.json").read_text())["sets"][name]
+    return [MapInstance(e["label"], np.array(e["pts"])) for e in elements]
+
+
+def test_targets_of_a_line_that_leaves_the_range():
+    line = MapInstance(2, np.array([[14.0, 0], [18.0, 0]]))
+    targets = map_targets([line], 3, **RANGES)
+    np.testing.assert_allclose(targets.pts[0, :, 0], [14, 15, 15])
+    np.testing.assert_allclose(targets.pts_shifts[0, 1, :, 0], [15, 15, 14])
+    np.testing.assert_allclose(targets.boxes[0], [14, 0, 15, 0])
+    assert targets.labels_3d.tolist() == [2]
+    assert targets.closed.tolist() == [False]
+
+
+def test_no_element_gives_empty_targets_of_the_right_shape():
+    targets = map_targets([], 20, **RANGES)
+    assert targets.pts.shape == (0, 20, 2)
+    assert targets.pts_shifts.shape == (0, 19, 20, 2)
+    assert targets.boxes.shape == (0, 4)
+    assert targets.labels_3d.dtype == torch.int64
+    assert targets.closed.dtype == torch.bool
+
+
+def test_three_coordinates_are_kept_or_refused():
+    line = MapInstance(0, np.array([[0.0, 0, 1], [0, 2, 3]]))
+    np.testing.assert_allclose(map_targets([line], 3, **RANGES, dim=3).pts[0, 1], [0, 1, 2])
+    assert map_targets([line], 3, **RANGES).pts.shape == (1, 3, 2)
+    flat = MapInstance(0, np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="dim 3"):
+        map_targets([flat], 3, **RANGES, dim=3)
+
+
+def test_a_sample_without_truth_is_refused():
+    with pytest.raises(ValueError, match=r"'a' has no ground truth"):
+        FormatMapTargets().transform({"map_instances": None, "token": "a", **RANGES})
+
+
+@pytest.mark.parametrize("name", ["closed", "many"])
+def test_targets_equal_the_reference(golden_dir: Path, name: str):
+    wanted = np.load(golden_dir / f"models/maptr_loss_{name}_A.npz")
+    targets = map_targets(golden_instances(golden_dir, name), 20, **RANGES)
+    # the tolerance that the reference states for its targets
+    np.testing.assert_allclose(targets.pts, wanted["gt_fixed_pts"], atol=1e-4)
+    np.testing.assert_allclose(targets.pts_shifts, wanted["gt_shift_pts"], atol=1e-4)
+    np.testing.assert_allclose(targets.boxes, wanted["gt_bbox"], atol=1e-4)
+
+
+def test_orders_of_a_ring_with_many_vertices_are_among_the_reference_s(golden_dir: Path):
+    (ring,) = golden_instances(golden_dir, "bigring")
+    orders = map_targets([ring], 20, **RANGES).pts_shifts[0].numpy()
+    count = len(ring.points) - 1
+    for order in orders:
+        starts = np.abs(ring.points[:count] - order[0]).max(axis=1)
+        assert starts.min() < 1e-4
+    assert len(np.unique(orders[:, 0].round(4), axis=0)) == 19
+
+
+def test_a_bev_mask_has_row_0_at_the_smallest_y():
+    line = MapInstance(0, np.array([[-15.0, -30.0], [15.0, -30.0]]))
+    mask = MakeBEVMask((200, 100), thickness_px=1).transform({"map_instances": [line], **RANGES})
+    assert mask["gt_seg"].shape == (1, 200, 100)
+    assert mask["gt_seg"][0, 0].sum() == 100
+    assert mask["gt_seg"][0, 1:].sum() == 0
+
+
+def test_a_camera_mask_draws_what_lies_in_front():
+    """The camera looks along +y from 1.6 m above ground; the line crosses its axis 10 m ahead.
+
+    At depth 10 the ground lies 16 px below the centre (focal length 100): row 5 + 1.6 at stride 10.
+    """
+    lidar2img = np.array([[100, 50, 0, 0], [0, 50, -100, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+    ahead = MapInstance(0, np.array([[-1.9, 10], [1.9, 10]]))
+    behind = MapInstance(0, np.array([[-2.0, -10], [2, -10]]))
+    results = {"map_instances": [ahead, behind], "lidar2img": [lidar2img], "img_shape": (100, 100)}
+    transform = MakePVMask(stride=10, pad_size_divisor=20, ground_z_m=-1.6)
+    mask = transform.transform(results)["gt_pv_seg"]
+    assert mask.shape == (1, 1, 10, 10)
+    assert mask[0, 0].nonzero().tolist() == [[6, col] for col in (3, 4, 5, 6)]
+
+
+@pytest.mark.parametrize("size", ["reduced", "full"])
+@pytest.mark.parametrize("name", ["closed", "many"])
+def test_masks_equal_the_reference(golden_dir: Path, name: str, size: str):
+    wanted = np.load(golden_dir / f"models/maptrv2_loss_{size}_{name}_A.npz")
+    cameras = json.loads((golden_dir / "models/cameras_A.json").read_text())
+    lidar2img = [np.array(matrix) for matrix in cameras[size]["lidar2img"]]
+    shape = tuple(cameras[size]["padded_hw"])
+    instances = golden_instances(golden_dir, name)
+    results = {"map_instances": instances, "lidar2img": lidar2img, "img_shape": shape, **RANGES}
+    results = MakePVMask().transform(MakeBEVMask().transform(results))
+    np.testing.assert_array_equal(results["gt_seg"], wanted["gt_seg"])
+    np.testing.assert_array_equal(results["gt_pv_seg"], wanted["gt_pv_seg"])
