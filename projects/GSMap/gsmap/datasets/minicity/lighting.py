@@ -12,6 +12,7 @@ from gsmap.datasets.minicity.curves import Array
 from gsmap.datasets.minicity.texture import Image
 
 NOISE_PX = 1024
+WET_SLOPE = 0.12
 BGR = tuple[float, float, float]
 
 
@@ -91,10 +92,9 @@ def random_lighting(rng: np.random.Generator) -> Lighting:
 
 def render_sky(camera: Camera, lighting: Lighting) -> Image:
     """The sky's gradient from the horizon upwards. (H, W, 3)"""
-    ray = camera.world_from_pixel
     rows = np.arange(camera.height)
     pixels = np.stack([np.full(rows.shape, camera.width / 2), rows, np.ones(rows.shape)])
-    directions = ray @ pixels
+    directions = camera.world_from_pixel @ pixels
     rise = np.clip(directions[2] / np.linalg.norm(directions, axis=0), 0, 1) ** 0.6
     top, low = np.array(lighting.sky_top), np.array(lighting.haze)
     column = (low + rise[:, None] * (top - low)).astype(np.uint8)
@@ -102,17 +102,19 @@ def render_sky(camera: Camera, lighting: Lighting) -> Image:
     return cv2.resize(column[:, None], size, interpolation=cv2.INTER_NEAREST)
 
 
-def haze_ground(image: Image, camera: Camera, lighting: Lighting, ground_z_m: float) -> None:
-    """Blend the ground into the haze with distance and let a wet road mirror the sky, in place."""
-    ray = camera.world_from_pixel
-    rows = np.arange(camera.height)
-    pixels = np.stack([np.full(rows.shape, camera.width / 2), rows, np.ones(rows.shape)])
-    directions = ray @ pixels
-    slope = -directions[2] / np.linalg.norm(directions, axis=0)
-    distance = (camera.center[2] - ground_z_m) / np.maximum(slope, 1e-3)
-    veil = 1 - np.exp(-distance / lighting.haze_m)
-    veil = np.maximum(veil, lighting.wet * np.exp(-np.maximum(slope, 0) / 0.12))
-    touched = np.flatnonzero((veil > 0.02) & (slope > 0))
+def haze_ground(image: Image, distance_m: Array, eye_m: float, lighting: Lighting) -> None:
+    """Blend the ground into the haze and let a wet road mirror the sky, in place.
+
+    Args:
+        image: Picture with the ground. (H, W, 3)
+        distance_m: Distance of the ground in each row, inf where none is seen. (H,)
+        eye_m: Height of the camera above the ground.
+        lighting: Haze and wetness.
+    """
+    veil = 1 - np.exp(-distance_m / lighting.haze_m)
+    slope = eye_m / np.maximum(distance_m, 0.1)
+    veil = np.maximum(veil, lighting.wet * np.exp(-slope / WET_SLOPE))
+    touched = np.flatnonzero((veil > 0.02) & np.isfinite(distance_m))
     if not len(touched):
         return
     window = slice(int(touched[0]), int(touched[-1]) + 1)

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from gsmap.datasets.minicity.camera import NEAR_M, Camera, clip_near
 from gsmap.datasets.minicity.curves import Array
-from gsmap.datasets.minicity.ground import render_ground, sample_height
+from gsmap.datasets.minicity.ground import render_flat_ground, render_uneven_ground
 from gsmap.datasets.minicity.lighting import Lighting, finish, haze_ground, render_sky
 from gsmap.datasets.minicity.meshes import FrozenMesh, Mesh, merge
 from gsmap.datasets.minicity.scene_map import MATERIALS, HeightGrid, SceneMap
+from gsmap.datasets.minicity.terrain import sample_height
 from gsmap.datasets.minicity.texture import SHIFT, GroundTexture, Image, darken, paint_ground
 from gsmap.datasets.minicity.vehicles import Vehicle, vehicle_mesh
 
@@ -75,9 +76,17 @@ class SceneRenderer:
         """
         sky = render_sky(camera, self.lighting)
         border = MATERIALS["grass"]
-        image = render_ground(camera, self.lit_texture, sky, border, self.ground_z_m, self.height)
+        if self.height is None:
+            image, distance = render_flat_ground(
+                camera, self.lit_texture, sky, border, self.ground_z_m
+            )
+        else:
+            image, distance = render_uneven_ground(
+                camera, self.lit_texture, sky, border, self.height
+            )
         _shade_under(image, camera, vehicles, self.lighting)
-        haze_ground(image, camera, self.lighting, self._ground_below(camera))
+        eye_m = float(camera.center[2]) - self._ground_below(camera)
+        haze_ground(image, distance, eye_m, self.lighting)
         eye = camera.center[:2]
         near = [v for v in vehicles if np.linalg.norm(v.center[:2] - eye) < SMALL_FAR_M]
         draw_mesh(image, camera, merge(self.static, vehicle_mesh(near)), self.lighting)

@@ -252,6 +252,9 @@ class SceneMaker:
         for vehicle in (actor.at(time_s) for actor in self.actors):
             if np.linalg.norm(vehicle.center[:2] - pose[:2, 3]) > BOX_REACH_M:
                 continue
+            struck = _points_in_box(points, vehicle)
+            if not struck:
+                continue
             length, width, height = vehicle.size
             turned = world_from_ego(0.0, 0.0, vehicle.yaw_rad)
             person = vehicle.category.startswith("human")
@@ -272,7 +275,7 @@ class SceneMaker:
                     "rotation": quaternion(turned),
                     "prev": "",
                     "next": "",
-                    "num_lidar_pts": _points_in_box(points, vehicle),
+                    "num_lidar_pts": struck,
                     "num_radar_pts": 0,
                     "category": vehicle.category,
                 }
