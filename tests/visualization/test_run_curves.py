@@ -83,5 +83,5 @@ def test_unfinished_last_line_is_dropped_but_a_broken_one_is_named(tmp_path):
 def test_missing_log_and_no_runs(tmp_path):
     with pytest.raises(FileNotFoundError, match="No vis_data/scalars"):
         read_run(tmp_path)
-    with pytest.raises(ValueError, match="at least one run"):
+    with pytest.raises(ValueError, match="at least one run that logged"):
         plot_runs([])

@@ -113,6 +113,13 @@ def _parts_of_loss(run: RunLog) -> list[str]:
 
 
 def _finish(ax: Axes, title: str, x_label: str) -> None:
+    """Set what all plots share; the y axis is logarithmic if the values span a decade."""
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.lines])
+    if len(values) and values.min() > 0 and values.max() > 10 * values.min():
+        ax.set_yscale("log")
+        ax.yaxis.set_major_formatter("{x:g}")
+    elif len(values) and values.min() >= 0:
+        ax.set_ylim(0, 1.08 * max(values.max(), 1e-9))
     ax.set_title(title, fontsize=10, loc="left")
     ax.set_xlabel(x_label, fontsize=8)
     ax.tick_params(labelsize=8)
@@ -120,8 +127,20 @@ def _finish(ax: Axes, title: str, x_label: str) -> None:
     ax.set_axisbelow(True)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=7.5, frameon=False)
+    ax.legend(fontsize=7.5, frameon=False)
+
+
+def _plot_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
+    """Draw the validation metrics, one colour per run."""
+    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
+        for name, style in zip(
+            run.metrics, ("-", "--", ":", "-.") * len(run.metrics), strict=False
+        ):
+            label = f"{run.name}: {name}" if len(runs) > 1 else name
+            series = run.series(name, validation=True)
+            ax.plot(*series, style, color=colour, marker=".", label=label)
+    by_epoch = any("epoch" in record for run in runs for record in run.train)
+    _finish(ax, "validation", "epoch" if by_epoch else "iteration")
 
 
 def plot_runs(runs: Sequence[RunLog]) -> Figure:
@@ -134,34 +153,26 @@ def plot_runs(runs: Sequence[RunLog]) -> Figure:
         The figure.
 
     Raises:
-        ValueError: If there is no run.
+        ValueError: If there is no run, or none that logged a loss.
     """
-    if not runs:
-        raise ValueError("plot_runs needs at least one run.")
-    figure = Figure(figsize=(13, 3.8), dpi=150, layout="constrained")
+    if not any(run.train for run in runs):
+        raise ValueError("plot_runs needs at least one run that logged a loss.")
+    validated = any(run.val for run in runs)
+    columns = 3 if validated else 2
+    figure = Figure(figsize=(4.4 * columns, 3.8), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
-    total, parts, metrics = figure.subplots(1, 3)
+    total, parts, *metrics = figure.subplots(1, columns)
     for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
         steps, values = run.series("loss")
         total.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
         total.plot(steps, smoothed(values, 10), color=colour, linewidth=1.6, label=run.name)
-        for name, style in zip(
-            run.metrics, ("-", "--", ":", "-.") * len(run.metrics), strict=False
-        ):
-            label = f"{run.name}: {name}" if len(runs) > 1 else name
-            metrics.plot(
-                *run.series(name, validation=True), style, color=colour, marker=".", label=label
-            )
+    _finish(total, "training loss", "iteration")
     for name, colour in zip(_parts_of_loss(runs[-1]), _COLOURS * 8, strict=False):
         steps, values = runs[-1].series(name)
         parts.plot(steps, smoothed(values, 10), color=colour, linewidth=1.4, label=name)
-    if any((run.series("loss")[1] > 0).any() for run in runs):
-        total.set_yscale("log")
-        parts.set_yscale("log")
-    metrics.set_ylim(bottom=0)
-    _finish(total, "training loss", "iteration")
     _finish(parts, f"its parts, last decoder layer ({runs[-1].name})", "iteration")
-    _finish(metrics, "validation", "epoch")
+    if validated:
+        _plot_metrics(metrics[0], runs)
     return figure
 
 
