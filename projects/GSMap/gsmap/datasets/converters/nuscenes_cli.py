@@ -1,8 +1,6 @@
 """Command line of the nuScenes converter: ``tools/create_data.py nuscenes``."""
 
 import argparse
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from tqdm import tqdm
@@ -52,11 +50,30 @@ def dataset_name(root: Path) -> str:
     return "minicity" if (root / "minicity.json").is_file() else "nuscenes"
 
 
-@contextmanager
-def progress_bar(title: str) -> Iterator[tqdm]:
-    """Show a progress bar whose total is set later."""
-    with tqdm(desc=title, unit="sample", smoothing=0.05) as bar:
-        yield bar
+class ProgressBar:
+    """A bar that appears when the work begins.
+
+    Args:
+        title: What it shows on its left.
+    """
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._bar: tqdm | None = None
+
+    def __call__(self, kind: str, count: int) -> None:
+        """Take ("samples", total) once, then ("", done) as often as needed."""
+        if kind:
+            self._bar = tqdm(desc=self._title, unit="sample", total=count, smoothing=0.05)
+        elif self._bar is not None:
+            self._bar.update(count)
+
+    def __enter__(self) -> "ProgressBar":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:
@@ -83,12 +100,6 @@ def run(arguments: argparse.Namespace, command: str) -> str:
         tag=arguments.tag,
         command=command,
     )
-    with progress_bar(f"{options.dataset} {options.version}") as bar:
-
-        def advance(kind: str, count: int) -> None:
-            if kind:
-                bar.reset(total=count)
-            else:
-                bar.update(count)
-
-        return convert_nuscenes(options, advance).text()
+    with ProgressBar(f"{options.dataset} {options.version}") as progress:
+        summary = convert_nuscenes(options, progress)
+    return summary.text()
