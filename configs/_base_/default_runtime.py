@@ -12,6 +12,8 @@ default_hooks = dict(
     checkpoint=dict(type='CheckpointHook', interval=1, max_keep_ckpts=3),
     sampler_seed=dict(type='DistSamplerSeedHook'),
     visualization=dict(type='MapVisualizationHook', draw=False))
+val_evaluator = dict(type='MapMetric', eval=['chamfer'])
+test_evaluator = dict(type='MapMetric', eval=['chamfer', 'raster'])
 vis_backends = [dict(type='LocalVisBackend'), dict(type='TensorboardVisBackend')]
 visualizer = dict(type='MapVisualizer', name='visualizer', vis_backends=vis_backends)
 log_processor = dict(type='LogProcessor', window_size=50, by_epoch=True)
