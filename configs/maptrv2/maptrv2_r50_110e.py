@@ -1,0 +1,7 @@
+# MapTRv2 on nuScenes as published: ResNet-50, 110 epochs, 4 x 8 samples per step.
+_base_ = [
+    '../_base_/datasets/nuscenes_depth_seg.py',
+    '../_base_/models/maptrv2_r50.py',
+    '../_base_/schedules/cosine_110e.py',
+    '../_base_/default_runtime.py',
+]
