@@ -228,3 +228,13 @@ def render_backward(gaussians, frame, grads, out, first, last):
             _accumulate(gaussian, frame, steps, trans, True)
         for p in range(gaussians.shape[1]):
             _gaussian_gradient(gaussians[n, p], frame, steps, grads[n], trans, out[n, p])
+
+
+@njit(nogil=True, cache=True, fastmath=FASTMATH)
+def fill_exponentials(values, repeats):
+    """Take 2^x of every value (<= 0), again and again: what the floor is counted in."""
+    out = np.empty_like(values)
+    for _ in range(repeats):
+        for k in range(len(values)):
+            out[k] = exp2_float32(values[k])
+    return out

@@ -1,0 +1,20 @@
+"""Measure speed and memory: ``python tools/benchmark.py SUBCOMMAND --help``."""
+
+import argparse
+
+from gsmap.benchmarks import raster
+
+SUBCOMMANDS = (raster.add_parser,)  # each adds its own parser, with ``run`` as a default
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    subparsers = parser.add_subparsers(required=True)
+    for add_parser in SUBCOMMANDS:
+        add_parser(subparsers)
+    args = parser.parse_args()
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()
