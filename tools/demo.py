@@ -1,0 +1,188 @@
+#!/usr/bin/env python
+"""GSMap from nothing to pictures on MiniCity: generate, convert, train, test, draw (``make demo``).
+
+What is done is skipped on the next run; an interrupted training goes on where it stopped.
+"""
+
+import argparse
+import hashlib
+import json
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+REPO = Path(__file__).resolve().parents[1]
+CONFIGS = {
+    "GSMap": "projects/GSMap/configs/gsmap_maptr_r18_minicity.py",
+    "MapTR": "configs/maptr/maptr_r18_minicity.py",
+}
+CLASSES = ("divider", "ped_crossing", "boundary")
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much of everything a run makes.
+
+    Attributes:
+        scenes: Scenes of MiniCity; a fifth of them is for validation.
+        samples: Key frames per scene.
+        epochs: Training epochs.
+        image_size: Size of the images in pixels.
+        models: Which models to train.
+    """
+
+    scenes: int
+    samples: int
+    epochs: int
+    image_size: str = "400x225"
+    models: tuple[str, ...] = ("GSMap", "MapTR")
+
+
+BUDGETS = {
+    "tiny": Budget(scenes=5, samples=2, epochs=1, image_size="200x112"),
+    "demo": Budget(scenes=150, samples=5, epochs=6),
+    "long": Budget(scenes=600, samples=5, epochs=48),
+}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command of the demo.
+
+    Attributes:
+        title: What it does.
+        command: Its arguments, the script first.
+        products: What it must have made.
+    """
+
+    title: str
+    command: list[str]
+    products: list[Path]
+
+    def stamp(self, folder: Path) -> Path:
+        """Return the file that says that this very command has succeeded."""
+        digest = hashlib.sha256(shlex.join(self.command).encode()).hexdigest()[:12]
+        return folder / ".done" / f"{self.title.replace(' ', '-')}-{digest}"
+
+    def run(self, folder: Path, position: str) -> None:
+        """Run the command unless it is done; stop the demo if it fails."""
+        stamp = self.stamp(folder)
+        if stamp.exists() and all(product.exists() for product in self.products):
+            print(f"{position} {self.title}: done before, skipped", flush=True)
+            return
+        print(f"{position} {self.title}: {shlex.join(['python', *self.command])}", flush=True)
+        started = time.monotonic()
+        status = subprocess.run([sys.executable, *self.command], cwd=REPO, check=False).returncode
+        missing = [str(product) for product in self.products if not product.exists()]
+        if status or missing:
+            reason = f"made no {', '.join(missing)}" if not status else f"ended with {status}"
+            sys.exit(f"{position} {self.title} {reason}; run the command above to see why.")
+        stamp.parent.mkdir(parents=True, exist_ok=True)
+        stamp.write_text(f"{time.monotonic() - started:.0f} s\n")
+        print(f"{position} {self.title}: {time.monotonic() - started:.0f} s", flush=True)
+
+
+def data_steps(folder: Path, budget: Budget) -> Iterable[Step]:
+    """Yield what makes the data set and scores a model that does not look at it."""
+    root = folder / f"minicity-{budget.scenes}x{budget.samples}"
+    splits = [root / f"gsmap_minicity_{split}.arrow" for split in ("train", "val")]
+    command = f"--scenes {budget.scenes} --samples-per-scene {budget.samples} --seed 0"
+    yield Step(
+        "generate MiniCity",
+        ["tools/create_data.py", "minicity", "--root", str(root), *command.split()]
+        + ["--image-size", budget.image_size],
+        [root / "minicity.json"],
+    )
+    yield Step(
+        "convert it",
+        ["tools/create_data.py", "nuscenes", "--root", str(root), "--dataset", "minicity"],
+        splits,
+    )
+    metrics = folder / "prior.json"
+    yield Step(
+        "score the prior",
+        ["tools/map_prior.py", *map(str, splits), "--out", str(metrics)],
+        [metrics],
+    )
+
+
+def model_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
+    """Yield what trains, tests and draws a model."""
+    config, work = CONFIGS[name], folder / name.lower()
+    root = folder / f"minicity-{budget.scenes}x{budget.samples}"
+    options = [f"{part}_dataloader.dataset.data_root={root}/" for part in ("train", "val", "test")]
+    schedule = [
+        f"train_cfg.max_epochs={budget.epochs}",
+        f"train_cfg.val_interval={budget.epochs}",
+        f"param_scheduler.1.T_max={budget.epochs}",
+    ]
+    checkpoint = work / f"epoch_{budget.epochs}.pth"
+    yield Step(
+        f"train {name}",
+        ["tools/train.py", config, "--work-dir", str(work), "--resume"]
+        + ["--cfg-options", *options, *schedule],
+        [checkpoint],
+    )
+    test = ["tools/test.py", config, str(checkpoint), "--eval", "chamfer", "raster"]
+    metrics, pictures = work / "metrics.json", work / "pictures"
+    yield Step(
+        f"test and draw {name}",
+        [*test, "--work-dir", str(work / "test"), "--metrics-out", str(metrics)]
+        + ["--out", str(work / "results.json"), "--show-dir", str(pictures)]
+        + ["--show-interval", "10", "--cfg-options", *options],
+        [metrics, pictures],
+    )
+    shuffled = work / "metrics_shuffled.json"
+    yield Step(
+        f"test {name} on images of other samples",
+        [*test, "--work-dir", str(work / "shuffled"), "--metrics-out", str(shuffled)]
+        + ["--shuffle-images", "0", "--cfg-options", *options],
+        [shuffled],
+    )
+
+
+def table(folder: Path, budget: Budget) -> str:
+    """Return the figures of all models as a Markdown table."""
+    rows = {"same map everywhere (prior)": folder / "prior.json"}
+    for name in budget.models:
+        rows[name] = folder / name.lower() / "metrics.json"
+        rows[f"{name}, images of other samples"] = folder / name.lower() / "metrics_shuffled.json"
+    head = ["model", *(f"{metric} {c}" for metric in ("chamfer", "raster") for c in CLASSES)]
+    head[4:4], head[8:8] = ["**chamfer mAP**"], ["**raster mAP**"]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    for name, path in rows.items():
+        figures = json.loads(path.read_text())
+        keys = [[f"{metric}/{c}/AP" for c in CLASSES] for metric in ("chamfer", "raster")]
+        keys = [*keys[0], "chamfer/mAP", *keys[1], "raster/mAP"]
+        cells = [f"{100 * figures[key]:.1f}" if key in figures else "" for key in keys]
+        lines.append("| " + " | ".join([name, *cells]) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--dir", default="demo", help="where everything goes")
+    parser.add_argument("--budget", choices=BUDGETS, default="demo", help="how long to train")
+    args = parser.parse_args()
+    budget, folder = BUDGETS[args.budget], Path(args.dir).resolve() / args.budget
+    started = time.monotonic()
+    steps = list(data_steps(folder, budget))
+    for name in budget.models:
+        steps += model_steps(name, folder, budget)
+    for number, step in enumerate(steps, 1):
+        step.run(folder, f"[{number}/{len(steps)}]")
+    summary = table(folder, budget)
+    (folder / "summary.md").write_text(summary + "\n")
+    print(f"\nAP in percent on MiniCity's validation towns, {budget.epochs} epochs\n\n{summary}\n")
+    for name in budget.models:
+        pictures = sorted((folder / name.lower() / "pictures").iterdir())
+        print(f"{name}: {len(pictures)} pictures, e.g. {pictures[0]}")
+    print(f"{(time.monotonic() - started) / 60:.1f} minutes. Figures: {folder / 'summary.md'}")
+
+
+if __name__ == "__main__":
+    main()

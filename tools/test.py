@@ -1,0 +1,76 @@
+#!/usr/bin/env python
+"""Test a model: ``python tools/test.py CONFIG CHECKPOINT --eval chamfer raster``."""
+
+import argparse
+from pathlib import Path
+
+from mmengine.config import Config
+from mmengine.fileio import dump
+from mmengine.runner import Runner
+
+from gsmap.engine.launch import add_common_arguments, load_config
+
+
+def parse_args() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("config", help="config file")
+    parser.add_argument("checkpoint", help="checkpoint file, ours or in the format of MapTR")
+    parser.add_argument(
+        "--eval",
+        nargs="*",
+        choices=["chamfer", "raster"],
+        default=["chamfer", "raster"],
+        help="metrics; none at all with --out only writes the predictions",
+    )
+    parser.add_argument("--out", metavar="FILE.json", help="write the predictions (MapTR's form)")
+    parser.add_argument("--metrics-out", metavar="FILE.json", help="write the figures")
+    parser.add_argument("--show-dir", metavar="DIR", help="draw the samples into this folder")
+    parser.add_argument(
+        "--show-interval", type=int, default=1, metavar="N", help="draw every N-th sample"
+    )
+    parser.add_argument(
+        "--shuffle-images",
+        type=int,
+        metavar="SEED",
+        help="give every sample another one's images: what a model scores that does not look",
+    )
+    add_common_arguments(parser)
+    return parser.parse_args()
+
+
+def apply_options(cfg: Config, args: argparse.Namespace) -> None:
+    """Put the tool's own options into the config."""
+    cfg.load_from = args.checkpoint
+    cfg.resume = False
+    cfg.test_evaluator = {
+        "type": "MapMetric",
+        **(cfg.get("test_evaluator") or {}),
+        "eval": args.eval,
+        "out_file": args.out,
+    }
+    if args.show_dir:
+        cfg.default_hooks.visualization.update(
+            draw=True,
+            interval=args.show_interval,
+            test_out_dir=str(Path(args.show_dir).resolve()),
+        )
+    if args.shuffle_images is not None:
+        cfg.test_dataloader.dataset.shuffle_images_seed = args.shuffle_images
+
+
+def main() -> None:
+    args = parse_args()
+    if not Path(args.checkpoint).is_file():
+        raise SystemExit(f"There is no checkpoint {args.checkpoint}.")
+    if not args.eval and not args.out:
+        raise SystemExit("Nothing to do: name a metric after --eval, or a file after --out.")
+    cfg = load_config(args)
+    apply_options(cfg, args)
+    runner = Runner.from_cfg(cfg)
+    metrics = runner.test()
+    if args.metrics_out and runner.rank == 0:
+        dump(metrics, args.metrics_out, indent=2)
+
+
+if __name__ == "__main__":
+    main()
