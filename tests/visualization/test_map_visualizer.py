@@ -61,7 +61,10 @@ def test_panels_follow_what_the_sample_has(tmp_path):
     assert titles(visualizer.draw_sample(make_sample(tmp_path, gaussians=False))) == full[:2]
     sample = make_sample(tmp_path, truth=False)
     assert titles(visualizer.draw_sample(sample)) == full[1:]
-    assert titles(visualizer.draw_sample(sample, score_thr=0.99)) == full[1:]
+    silent = visualizer.draw_sample(sample, score_thr=0.99)
+    assert titles(silent) == full[1:]
+    notes = {text.get_text() for ax in silent.axes for text in ax.texts}
+    assert "no score reaches 0.99 (highest 0.9)" in notes
     assert titles(visualizer.draw_sample(make_sample(tmp_path), draw_pred=False)) == full[:1]
 
 

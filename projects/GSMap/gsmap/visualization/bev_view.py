@@ -22,6 +22,7 @@ class BEVPanel:
     Args:
         title: Heading of the panel.
         elements: Map elements, or None for an empty panel.
+        note: What to say where there are no elements.
         lines: Whether to draw the polylines.
         vertices: Whether to mark their vertices.
         order: Whether to mark the start and the direction of each.
@@ -34,6 +35,7 @@ class BEVPanel:
 
     title: str
     elements: MapElements | None
+    note: str = "no elements"
     lines: bool = True
     vertices: bool = False
     order: bool = False
@@ -269,8 +271,7 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
     draw_vehicle(ax, view, style)
     elements = panel.elements
     if elements is None or len(elements) == 0:
-        note = "unknown" if elements is None else "no elements"
-        ax.text(0, extent[2] + 2, note, fontsize=7, color=style.muted, ha="center")
+        ax.text(0, extent[2] + 2, panel.note, fontsize=7, color=style.muted, ha="center")
         return
     if panel.rasters is not None:
         _draw_rasters(ax, panel, grid, view, style)

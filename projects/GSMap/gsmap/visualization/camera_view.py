@@ -15,7 +15,7 @@ from gsmap.visualization.map_elements import MapElements
 from gsmap.visualization.style import MapStyle
 
 _STEP_M = 1.0  # a line's width follows its depth in steps of this length
-_NOMINAL_WIDTH_IN = 3.2  # on a panel of this width lines have the widths of the style
+_NOMINAL_SIZE_IN = 2.4  # on a panel of this size (root of its area) lines have the style's widths
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,8 @@ def draw_camera(
         interpolation="nearest",
         zorder=1,
     )
-    scale = ax.get_window_extent().width / ax.figure.dpi / _NOMINAL_WIDTH_IN
+    box = ax.get_window_extent()
+    scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN
     if elements is not None and len(elements):
         _draw_areas(ax, elements, camera, view, style)
         _draw_polylines(ax, elements, camera, view, style, scale)

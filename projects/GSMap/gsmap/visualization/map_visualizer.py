@@ -74,6 +74,14 @@ def render_masks(elements: MapElements, grid: BEVGrid) -> np.ndarray:
         return render_gaussians(means, scales, rotations, grid).numpy()
 
 
+def _note(data_sample: Any, score_thr: float) -> str:
+    """Say why there is no prediction to draw."""
+    everything = predicted_elements(data_sample)
+    if everything is None or not len(everything) or everything.scores is None:
+        return "no elements"
+    return f"no score reaches {score_thr:g} (highest {everything.scores.max():.2g})"
+
+
 @VISUALIZERS.register_module()
 class MapVisualizer(Visualizer):
     """Draws samples: the map over the cameras, and bird's-eye views of truth and prediction.
@@ -204,7 +212,11 @@ class MapVisualizer(Visualizer):
         return [CameraView(*fields) for fields in zip(names, images, projections, strict=True)]
 
     def _bev_panels(
-        self, truth: MapElements | None, found: MapElements | None, points: np.ndarray | None
+        self,
+        truth: MapElements | None,
+        found: MapElements | None,
+        points: np.ndarray | None,
+        note: str,
     ) -> list[BEVPanel]:
         """Choose the bird's-eye views that the sample has data for."""
         panels = []
@@ -215,6 +227,7 @@ class MapVisualizer(Visualizer):
                 BEVPanel(
                     "Prediction",
                     found,
+                    note,
                     vertices=self.show_vertices,
                     order=self.show_order,
                     scores=self.show_scores,
@@ -223,10 +236,10 @@ class MapVisualizer(Visualizer):
             )
         if found is not None and found.has_gaussians:
             if "gaussians" in self.panels:
-                panels.append(BEVPanel("Gaussians (1$\\sigma$)", found, gaussians=True))
+                panels.append(BEVPanel("Gaussians (1$\\sigma$)", found, note, gaussians=True))
             if "rasters" in self.panels:
                 masks = render_masks(found, self.grid) if len(found) else None
-                panels.append(BEVPanel("Rendered masks", found, lines=False, rasters=masks))
+                panels.append(BEVPanel("Rendered masks", found, note, lines=False, rasters=masks))
         return panels
 
     def draw_sample(
@@ -268,7 +281,7 @@ class MapVisualizer(Visualizer):
             )
         return compose_figure(
             self.cameras(meta, images),
-            self._bev_panels(truth, found, points),
+            self._bev_panels(truth, found, points, _note(data_sample, threshold)),
             self.grid,
             self.frame_view(meta),
             self.style,
