@@ -19,7 +19,7 @@ from .registry import check
 from .report import Row, fraction_beyond, largest_difference, largest_relative, relative_norm
 from .targets import gt_instances
 
-CONFIG = "_base_/models/maptr_r50.py"
+CONFIG = "maptr/maptr_r50_24e.py"
 STATE = "maptr_r50_state.json"
 SAMPLES = {
     "empty": [("reduced", "empty")],

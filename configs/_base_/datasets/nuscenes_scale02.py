@@ -1,0 +1,21 @@
+# nuScenes with images at 0.2 of their size, 24 samples per GPU, for MapTR nano.
+_base_ = './nuscenes.py'
+
+_scale = dict(type='ScaleImages', scale=0.2)
+
+train_dataloader = dict(
+    batch_size=24,
+    dataset=dict(pipeline=[
+        dict(type='LoadCameraImages'),
+        dict(
+            type='MultiViewWrapper',
+            transforms=[dict(type='PhotoMetricDistortion3D')],
+            override_aug_config=False,  # each camera its own, as in MapTR
+            collected_keys=[]),
+        _scale,
+        dict(type='FormatMapTargets', num_points=20),
+        dict(type='PackMapInputs'),
+    ]))
+val_dataloader = dict(
+    dataset=dict(pipeline=[dict(type='LoadCameraImages'), _scale, dict(type='PackMapInputs')]))
+test_dataloader = val_dataloader

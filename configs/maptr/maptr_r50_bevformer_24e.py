@@ -1,0 +1,7 @@
+# MapTR with BEVFormer's encoder on nuScenes, 24 epochs.
+_base_ = [
+    '../_base_/datasets/nuscenes.py',
+    '../_base_/models/maptr_r50_bevformer.py',
+    '../_base_/schedules/cosine_24e.py',
+    '../_base_/default_runtime.py',
+]

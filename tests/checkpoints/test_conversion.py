@@ -1,0 +1,148 @@
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from mmengine.runner.checkpoint import load_checkpoint
+from model_cases import build_small
+from torch import nn
+
+from gsmap.checkpoints.convert import (
+    convert_state,
+    ours_from_upstream,
+    read_state,
+    upstream_from_ours,
+)
+from gsmap.checkpoints.key_map import MAPTR, MAPTR_BEVFORMER, find_key_map
+from gsmap.checkpoints.parameters import count_parameters
+from gsmap.checkpoints.strict import adapt_state, neutral_keys
+
+REPO = Path(__file__).resolve().parents[2]
+LAYER = "pts_bbox_head.transformer.encoder.layers.0."
+PAIRS = {
+    "img_backbone.layer1.0.conv1.weight": "img_backbone.layer1.0.conv1.weight",
+    "pts_bbox_head.transformer.level_embeds": "bev_encoder.level_embeds",
+    "pts_bbox_head.transformer.can_bus_mlp.norm.bias": "bev_encoder.can_bus_mlp.norm.bias",
+    "pts_bbox_head.transformer.decoder.layers.11.attentions.0.attn.in_proj_weight": (
+        "map_head.decoder.layers.11.self_attn.in_proj_weight"
+    ),
+    "pts_bbox_head.transformer.decoder.layers.3.attentions.1.value_proj.bias": (
+        "map_head.decoder.layers.3.cross_attn.value_proj.bias"
+    ),
+    "pts_bbox_head.reg_branches.5.4.weight": "map_head.reg_branches.5.4.weight",
+    LAYER + "attentions.1.output_proj.weight": "bev_encoder.layers.0.cross_attn.output_proj.weight",
+}
+
+
+@pytest.mark.parametrize(("upstream", "ours"), PAIRS.items())
+def test_names_by_hand_in_both_directions(upstream, ours):
+    assert MAPTR.to_ours(upstream) == ours
+    assert MAPTR.to_upstream(ours) == upstream
+
+
+def test_the_architecture_is_found_by_its_keys():
+    deformable = LAYER + "attentions.1.deformable_attention.sampling_offsets.bias"
+    assert find_key_map([deformable, "img_neck.x"]) is MAPTR_BEVFORMER
+    assert find_key_map([MAPTR_BEVFORMER.to_ours(deformable)]) is MAPTR_BEVFORMER
+    assert find_key_map([LAYER + "attentions.1.attention.value_proj.bias"]) is MAPTR
+
+
+def test_a_state_survives_the_way_to_upstream_and_back():
+    state = build_small().state_dict()
+    upstream, done = convert_state(state)
+    assert done == "maptr: gsmap to upstream"
+    assert torch.equal(upstream["pts_bbox_head.code_weights"], torch.ones(4))
+    back, done = convert_state(upstream)
+    assert done == "maptr: upstream to gsmap"
+    assert back.keys() == state.keys()
+    assert all(torch.equal(back[key], state[key]) for key in state)
+
+
+def test_unknown_keys_are_named():
+    with pytest.raises(ValueError, match=r"no maptr model has: pts_bbox_head\.riddle"):
+        ours_from_upstream({"pts_bbox_head.riddle": torch.ones(1)})
+    with pytest.raises(ValueError, match=r"upstream's maptr does not have: map_head\.riddle"):
+        upstream_from_ours({"map_head.riddle": torch.ones(1)})
+
+
+def test_an_upstream_file_loads_as_it_is(tmp_path):
+    source, target = build_small(seed=1), build_small(seed=2)
+    upstream, _ = convert_state(source.state_dict())
+    path = tmp_path / "upstream.pth"
+    torch.save({"meta": {"epoch": 24}, "state_dict": upstream}, path)
+    load_checkpoint(target, str(path))  # what load_from does
+    ours, theirs = source.state_dict(), target.state_dict()
+    assert all(torch.equal(ours[key], theirs[key]) for key in ours)
+
+
+@pytest.mark.parametrize("upstream", [False, True])
+def test_missing_left_over_and_reshaped_keys_are_errors_that_name_them(tmp_path, upstream):
+    model = build_small()
+    state = dict(model.state_dict())
+    state["map_head.cls_branches.0.6.bias"] = torch.zeros(7)
+    del state["map_head.reference_points.bias"]
+    state["map_head.cls_branches.9.0.weight"] = torch.zeros(1)
+    if upstream:
+        state = upstream_from_ours(state)
+    path = tmp_path / "wrong.pth"
+    torch.save({"state_dict": state}, path)
+    with pytest.raises(ValueError, match="does not fit the model") as error:
+        load_checkpoint(model, str(path))
+    message = str(error.value)
+    assert "missing: map_head.reference_points.bias" in message
+    assert "left over: map_head.cls_branches.9.0.weight" in message
+    assert "map_head.cls_branches.0.6.bias (7,) instead of (3,)" in message
+
+
+class Extended(nn.Module):
+    """A model that adds ``extra`` to ``base``."""
+
+    neutral_keys = ("extra.",)
+
+    def __init__(self):
+        super().__init__()
+        self.base = nn.Linear(2, 2)
+        self.extra = nn.Linear(2, 2)
+
+
+def test_neutral_keys_may_be_missing_together_only():
+    model = nn.ModuleDict({"head": Extended()})
+    expected = model.state_dict()
+    neutral = neutral_keys(model)
+    assert neutral == {"head.extra.weight", "head.extra.bias"}
+    without = {key: value for key, value in expected.items() if "extra" not in key}
+    adapt_state(dict(without), expected, "", neutral)
+    with pytest.raises(ValueError, match=r"missing: head\.extra\.bias\."):
+        adapt_state({**without, "head.extra.weight": torch.ones(2, 2)}, expected, "", neutral)
+
+
+def test_a_file_of_something_else_is_refused(tmp_path):
+    path = tmp_path / "other.pth"
+    torch.save({"state_dict": {"epoch": 3}}, path)
+    with pytest.raises(ValueError, match="holds no state dict of tensors"):
+        read_state(path)
+
+
+def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch, capsys):
+    state = build_small().state_dict()
+    source, target = tmp_path / "ours.pth", tmp_path / "upstream.pth"
+    torch.save({"state_dict": state}, source)
+    monkeypatch.setattr(sys, "argv", ["convert_checkpoint.py", str(source), str(target)])
+    tool = str(REPO / "tools/convert_checkpoint.py")
+    runpy.run_path(tool, run_name="__main__")
+    assert "maptr: gsmap to upstream" in capsys.readouterr().out
+    upstream = read_state(target)
+    assert all(torch.equal(upstream[MAPTR.to_upstream(key)], state[key]) for key in state)
+    with pytest.raises(SystemExit, match="exists already"):
+        runpy.run_path(tool, run_name="__main__")
+    assert sorted(tmp_path.iterdir()) == [source, target]
+
+
+def test_parameters_are_counted_by_module():
+    model = nn.Sequential(nn.Linear(2, 3), nn.ReLU(), nn.Sequential(nn.Linear(3, 1)))
+    model[0].bias.requires_grad_(False)
+    counts = {count.module: (count.total, count.trainable) for count in count_parameters(model, 1)}
+    assert counts == {"": (13, 10), "0": (9, 6), "2": (4, 4)}
+    with pytest.raises(ValueError, match="depth must be >= 0, got -1"):
+        count_parameters(model, -1)

@@ -1,0 +1,83 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsmap.verification.golden import Golden
+from gsmap.verification.registry import run_checks
+from gsmap.verification.report import (
+    Row,
+    format_table,
+    fraction_beyond,
+    largest_difference,
+    largest_relative,
+    relative_norm,
+)
+
+REPO = Path(__file__).resolve().parents[2]
+FILES = [
+    "maptr_r50_state.json",
+    "ops_gka_*.npz",
+    "maptr_r50_forward_reduced_*.npz",
+    "maptr_r50_forward_full_*.npz",
+    "maptr_gt_*.npz",
+    "maptr_loss_empty_*.npz",
+    "maptr_loss_closed_*.npz",
+    "maptr_loss_many_*.npz",
+    "maptr_loss_batch3_*.npz",
+]
+
+
+@pytest.fixture(scope="module")
+def golden(golden_dir):
+    return Golden(golden_dir / "models", REPO / "configs")
+
+
+@pytest.mark.parametrize("files", FILES)
+def test_maptr_agrees_with_the_reference(golden, files):
+    rows = list(run_checks(golden, files))
+    assert all(row.passed for row in rows), "\n" + format_table(rows)
+
+
+def test_a_wrong_weight_is_noticed(golden):
+    head = golden.model("maptr/maptr_r50_24e.py", "maptr_r50_state.json").map_head
+    bias = head.reg_branches[2][-1].bias.data
+    bias += 0.1
+    try:
+        rows = list(run_checks(golden, "maptr_r50_forward_reduced_*.npz"))
+    finally:
+        bias -= 0.1
+    failed = {row.quantity for row in rows if not row.passed}
+    assert {"all_pts_preds", "all_cls_scores", "dec_pts (m)"} <= failed
+
+
+def test_a_folder_without_the_variant_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="no reference file of variant 'Z'"):
+        list(run_checks(Golden(tmp_path, REPO / "configs", variant="Z")))
+
+
+def test_missing_recipes_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"weights_recipe\.py: give the folder"):
+        _ = Golden(tmp_path, REPO / "configs").weights
+
+
+def test_measures_of_deviation_by_hand():
+    ours, reference = [1.0, 2.0, 3.5], [1.0, 2.5, 3.0]
+    assert largest_difference(ours, reference) == 0.5
+    assert largest_relative(ours, reference) == pytest.approx(0.2)
+    assert relative_norm([3.0, 4.0], [0.0, 4.0]) == pytest.approx(0.75)
+    assert fraction_beyond(ours, reference, 0.4) == pytest.approx(2 / 3)
+
+
+def test_another_shape_or_a_nan_never_passes():
+    for measure in (largest_difference, largest_relative, relative_norm):
+        assert measure([1.0], [1.0, 2.0]) == np.inf
+    assert not Row("f", "q", largest_difference([np.nan], [1.0]), 1.0).passed
+    assert fraction_beyond([np.nan, 1.0], [1.0, 1.0], 0.1) == 0.5
+
+
+def test_the_table_says_which_row_missed():
+    table = format_table([Row("a.npz", "x", 1e-6, 1e-4), Row("b.npz", "y", 2.0, 0)])
+    lines = table.splitlines()
+    assert lines[2].split() == ["a.npz", "x", "1.00e-06", "1e-04", "ok"]
+    assert lines[3].split() == ["b.npz", "y", "2.00e+00", "0e+00", "MISS"]
