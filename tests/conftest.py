@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
 
 REPO = Path(__file__).resolve().parents[1]
 
@@ -49,3 +50,16 @@ def minicity_annotations(minicity_root: Path) -> dict[str, Path]:
 
     convert_nuscenes(NuScenesOptions(minicity_root, "v1.0-trainval", dataset="minicity"))
     return {split: minicity_root / f"gsmap_minicity_{split}.arrow" for split in ("train", "val")}
+
+
+@pytest.fixture
+def poisoned_empty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fill every new tensor that a kernel is to write with NaN."""
+    for name in ("empty", "empty_like"):
+        original = getattr(torch, name)
+
+        def poisoned(*args, original=original, **kwargs):
+            result = original(*args, **kwargs)
+            return result.fill_(torch.nan) if result.is_floating_point() else result
+
+        monkeypatch.setattr(torch, name, poisoned)

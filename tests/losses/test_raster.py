@@ -81,6 +81,7 @@ def test_equal_masks_cost_nothing(backend):
     )
 
 
+@pytest.mark.usefixtures("poisoned_empty")
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.parametrize(
     ("shape", "share"), [((21, 33), 0.3), ((21, 33), 0.005), ((7, 4), 0.3), ((40, 50), 0.0)]

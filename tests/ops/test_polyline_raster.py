@@ -59,6 +59,7 @@ def test_ring_is_filled_or_outlined(backend):
     assert (outlined[[0, 1, 2], [2, 1, 3]] == 1).all()
 
 
+@pytest.mark.usefixtures("poisoned_empty")
 @pytest.mark.parametrize("antialias", [True, False])
 def test_fused_drawing_equals_the_float64_reference(antialias):
     grid = BEVGrid((-15, 15), (-30, 30), 41, 33)
@@ -108,6 +109,7 @@ def test_soft_rasters_equal_the_golden_ones(golden_dir, backend):
         torch.testing.assert_close(mask, torch.from_numpy(golden[name]), atol=1e-5, rtol=0)
 
 
+@pytest.mark.usefixtures("poisoned_empty")
 @pytest.mark.parametrize("count", [1, 2, 9])
 def test_fused_soft_rasters_equal_the_float64_reference(count):
     vertices, kinds = random_vertices(count), yes(True, False, True, False, False, True)

@@ -20,6 +20,7 @@ def test_values_worked_by_hand(backend):
     torch.testing.assert_close(iou, torch.tensor([[1.0], [0.4], [0.0]]))
 
 
+@pytest.mark.usefixtures("poisoned_empty")
 def test_fused_kernel_equals_every_pair_in_float64():
     preds, targets = sparse_masks(7, 0), sparse_masks(5, 1)
     pairs = preds.double()[:, None], targets.double()[None]

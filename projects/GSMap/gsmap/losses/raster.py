@@ -133,7 +133,12 @@ def raster_loss(
         else:
             settings = window_size, window_sigma, foreground_weight
             sums = checkpoint(
-                raster_loss_sums_reference, preds, targets, *settings, use_reentrant=False
+                raster_loss_sums_reference,
+                preds,
+                targets,
+                *settings,
+                use_reentrant=False,
+                preserve_rng_state=False,  # nothing is random, and saving it would wait for a GPU
             )
         l1, foreground, excess, dissimilarity, seen = sums.unbind(-1)
         pixels = math.prod(preds.shape[1:])

@@ -1,0 +1,72 @@
+import argparse
+import platform
+import time
+
+import pytest
+import torch
+
+from gsmap.benchmarks import raster
+from gsmap.benchmarks.measure import MIB, Cost, markdown_table, measure
+from gsmap.geometry.bev_grid import BEVGrid
+
+CPU = torch.device("cpu")
+needs_proc = pytest.mark.skipif(platform.system() != "Linux", reason="reads /proc")
+
+
+@needs_proc
+def test_peak_is_what_a_call_had_in_use_at_once():
+    """Two tensors of 64 MiB, one after the other: 64 MiB; both kept: 128 MiB."""
+
+    def one_after_the_other():
+        for _ in range(2):
+            torch.ones(16 * MIB)
+
+    def together():
+        return torch.ones(16 * MIB), torch.ones(16 * MIB)
+
+    # pages that the process touches beside the tensors: a few MiB
+    assert abs(measure(one_after_the_other, CPU, 1).peak_bytes / MIB - 64) < 8
+    assert abs(measure(together, CPU, 1).peak_bytes / MIB - 128) < 8
+
+
+@needs_proc
+def test_waiting_takes_wall_time_and_no_processor_time():
+    cost = measure(lambda: time.sleep(0.05), CPU, 2)
+    assert cost.wall_s >= 0.05
+    assert cost.cpu_s < 0.04
+    assert cost.time_s(CPU) == cost.cpu_s
+
+
+def test_cost_scales_with_the_work():
+    assert Cost(1.0, 2.0, 30).scaled(1.5) == Cost(1.5, 3.0, 45)
+
+
+def test_table():
+    assert markdown_table(("a", "b"), [(1, "x")]) == "| a | b |\n| --- | --- |\n| 1 | x |\n"
+
+
+def test_floor_counts_the_pixels_of_the_ellipse():
+    """Two Gaussians of 1 m: radius sqrt(2 ln 1e6) = 5.257 m, so 86.8 pixels of 1 m each."""
+    grid = BEVGrid((0, 40), (0, 40), 40, 40)
+    means = torch.tensor([[[10.0, 10.0], [30.0, 30.0]]])
+    pixels = raster.ellipse_pixels((means, torch.ones(1, 2, 2), torch.zeros(1, 2)), grid)
+    assert abs(pixels - 2 * 86.8) < 8  # the circle's rim crosses about 40 pixels
+
+
+@needs_proc
+def test_command_writes_its_tables(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(raster, "SIZES", ((16, 8),))
+    monkeypatch.setattr(raster, "SCALES_M", ((1.0, 0.4),))
+    parser = argparse.ArgumentParser()
+    raster.add_parser(parser.add_subparsers())
+    out = tmp_path / "table.md"
+    threads = torch.get_num_threads()
+    args = parser.parse_args(
+        f"raster --instances 8 --reference-instances 2 --repeats 1 --threads 1 --out {out}".split()
+    )
+    args.run(args)
+    torch.set_num_threads(threads)
+    text = out.read_text()
+    assert "| 16 x 8 | 1 x 0.4 |" in text
+    assert "| draw 2 ground truths |" in text
+    assert text in capsys.readouterr().out
