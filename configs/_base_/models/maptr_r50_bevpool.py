@@ -1,4 +1,5 @@
-# MapTR on BEV features pooled from predicted depth (LSS), without depth supervision.
+# MapTR on BEV features pooled along predicted depth (LSS), without depth supervision and without the camera-aware
+# depth net of MapTRv2.
 _base_ = './maptr_r50.py'
 
 model = dict(
@@ -9,5 +10,6 @@ model = dict(
         bev_size=(200, 100),
         embed_dims=256,
         depth_range=(1.0, 35.0, 0.5),
+        camera_aware=False,
         camera_aware=False,
         loss_depth_weight=0.0))

@@ -18,6 +18,7 @@ import gsmap.heads.maptrv2_head
 import gsmap.layers.bev_encoders.bev_query_encoder
 import gsmap.layers.bev_encoders.bevformer
 import gsmap.layers.bev_encoders.gkt
+import gsmap.layers.bev_encoders.lidar
 import gsmap.layers.bev_encoders.lss
 import gsmap.layers.decoders.decoupled_layer
 import gsmap.layers.decoders.gaussian_decoupled_layer

@@ -14,26 +14,33 @@ from gsmap.checkpoints.strict import adapt_state, neutral_keys
 
 @MODELS.register_module()
 class MapDetector(Base3DDetector):
-    """Image backbone and neck, BEV encoder, map head.
+    """Image backbone and neck, BEV encoder, map head; with LiDAR, its encoder and their fusion.
 
     Args:
-        bev_encoder: Config of the BEV encoder.
         map_head: Config of the head.
+        bev_encoder: Config of the cameras' BEV encoder; None for a model without cameras.
         img_backbone: Config of the image backbone; None for a model without cameras.
         img_neck: Config of the image neck, or None.
         img_augment: Config of an augmentation of the normalised images in training (GridMask), or
             None.
+        lidar_encoder: Config of the LiDAR's BEV encoder; None for a model without LiDAR.
+        bev_fuser: Config of the fusion of both, with cameras and LiDAR.
         data_preprocessor: As in mmdet3d.
         init_cfg: As in mmengine.
+
+    Raises:
+        ValueError: If there is neither camera nor LiDAR, or both but no fusion.
     """
 
     def __init__(
         self,
-        bev_encoder: dict,
         map_head: dict,
+        bev_encoder: dict | None = None,
         img_backbone: dict | None = None,
         img_neck: dict | None = None,
         img_augment: dict | None = None,
+        lidar_encoder: dict | None = None,
+        bev_fuser: dict | None = None,
         data_preprocessor: dict | None = None,
         init_cfg: dict | None = None,
     ) -> None:
@@ -41,7 +48,13 @@ class MapDetector(Base3DDetector):
         self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
         self.img_neck = MODELS.build(img_neck) if img_neck else None
         self.img_augment = MODELS.build(img_augment) if img_augment else None
-        self.bev_encoder = MODELS.build(bev_encoder)
+        if not (bev_encoder or lidar_encoder):
+            raise ValueError("a model needs a bev_encoder (cameras), a lidar_encoder or both.")
+        if bool(bev_fuser) != bool(bev_encoder and lidar_encoder):
+            raise ValueError("bev_fuser belongs to a model of cameras and LiDAR, and to no other.")
+        self.bev_encoder = MODELS.build(bev_encoder) if bev_encoder else None
+        self.lidar_encoder = MODELS.build(lidar_encoder) if lidar_encoder else None
+        self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
         self.map_head = MODELS.build(map_head)
 
     def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
@@ -62,12 +75,18 @@ class MapDetector(Base3DDetector):
         self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
     ) -> dict[str, Tensor]:
         """Return the BEV encoder's outputs: ``bev_feats`` (B, C, H, W) and what its losses need."""
-        imgs = batch_inputs["imgs"]
-        img_shape = tuple(imgs.shape[-2:])
-        img_metas = [
-            {**sample.metainfo, "batch_input_shape": img_shape} for sample in batch_data_samples
-        ]
-        return self.bev_encoder(self.extract_img_feats(imgs), img_metas)
+        outputs: dict[str, Tensor] = {}
+        if self.bev_encoder is not None:
+            imgs = batch_inputs["imgs"]
+            shape = {"batch_input_shape": tuple(imgs.shape[-2:])}
+            img_metas = [{**sample.metainfo, **shape} for sample in batch_data_samples]
+            outputs = self.bev_encoder(self.extract_img_feats(imgs), img_metas)
+        if self.lidar_encoder is not None:
+            feats = self.lidar_encoder(batch_inputs["voxels"], len(batch_data_samples))
+            if self.bev_fuser is not None:
+                feats = self.bev_fuser(outputs["bev_feats"], feats)
+            outputs = {**outputs, "bev_feats": feats}
+        return outputs
 
     def loss(
         self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
@@ -79,7 +98,7 @@ class MapDetector(Base3DDetector):
         """
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         losses = self.map_head.loss(outputs, batch_data_samples)
-        if hasattr(self.bev_encoder, "loss"):
+        if self.bev_encoder is not None and hasattr(self.bev_encoder, "loss"):
             losses.update(self.bev_encoder.loss(outputs, batch_data_samples))
         self._check_finite(losses, batch_data_samples)
         return losses

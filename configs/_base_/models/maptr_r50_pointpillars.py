@@ -1,0 +1,39 @@
+# MapTR with cameras and LiDAR: PointPillars of 0.15 m, fused with the cameras' BEV features by one convolution.
+_base_ = './maptr_r50.py'
+
+_pc_range = [-15.0, -30.0, -2.0, 15.0, 30.0, 2.0]
+_voxel_size = [0.15, 0.15, 4.0]
+
+model = dict(
+    data_preprocessor=dict(
+        voxel=True,
+        voxel_layer=dict(
+            max_num_points=20,
+            point_cloud_range=_pc_range,
+            voxel_size=_voxel_size,
+            max_voxels=(30000, 40000))),
+    lidar_encoder=dict(
+        type='LidarEncoder',
+        voxel_encoder=dict(
+            type='PillarFeatureNet',
+            in_channels=5,
+            feat_channels=[64],
+            voxel_size=_voxel_size,
+            point_cloud_range=_pc_range,
+            norm_cfg=dict(type='BN1d', eps=1e-3, momentum=0.01),
+            legacy=False),
+        middle_encoder=dict(type='PointPillarsScatter', in_channels=64, output_shape=[400, 200]),
+        backbone=dict(
+            type='SECOND',
+            in_channels=64,
+            layer_nums=[3, 5, 5],
+            layer_strides=[2, 2, 2],
+            out_channels=[64, 128, 256]),
+        neck=dict(
+            type='SECONDFPN',
+            in_channels=[64, 128, 256],
+            upsample_strides=[1, 2, 4],
+            out_channels=[128, 128, 128]),
+        bev_size=(200, 100)),
+    bev_fuser=dict(
+        type='ConvFuser', camera_channels=256, lidar_channels=384, out_channels=256))

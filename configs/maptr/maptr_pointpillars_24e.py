@@ -1,0 +1,7 @@
+# MapTR with LiDAR alone (PointPillars) on nuScenes, 24 epochs.
+_base_ = [
+    '../_base_/datasets/nuscenes_lidar.py',
+    '../_base_/models/maptr_pointpillars.py',
+    '../_base_/schedules/cosine_24e.py',
+    '../_base_/default_runtime.py',
+]

@@ -1,0 +1,7 @@
+# A small MapTR with LiDAR alone for MiniCity.
+_base_ = [
+    '../_base_/datasets/minicity_lidar.py',
+    '../_base_/models/maptr_pointpillars_minicity.py',
+    '../_base_/schedules/minicity.py',
+    '../_base_/default_runtime.py',
+]

@@ -1,0 +1,7 @@
+# MapTR with cameras and LiDAR (SECOND) on nuScenes, 24 epochs; needs a GPU or spconv.
+_base_ = [
+    '../_base_/datasets/nuscenes_lidar.py',
+    '../_base_/models/maptr_r50_second.py',
+    '../_base_/schedules/cosine_24e.py',
+    '../_base_/default_runtime.py',
+]

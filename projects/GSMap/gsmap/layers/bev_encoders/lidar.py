@@ -1,0 +1,100 @@
+"""BEV features from LiDAR with mmdet3d's own modules, and their fusion with the cameras'."""
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from mmcv.cnn import ConvModule
+from mmdet3d.models.layers.spconv import IS_SPCONV2_AVAILABLE
+from mmdet3d.models.middle_encoders import SparseEncoder
+from mmdet3d.registry import MODELS
+from mmengine.model import BaseModule
+from torch import Tensor
+
+
+@MODELS.register_module()
+class LidarEncoder(BaseModule):
+    """Voxels to BEV features: PointPillars or SECOND, according to its parts.
+
+    The data preprocessor voxelises (``voxel=True``), with the extent of the map as its range.
+
+    Args:
+        voxel_encoder: Config of the encoder of each voxel's points.
+        middle_encoder: Config of what spreads the voxels over the plane.
+        backbone: Config of the 2D backbone, or None.
+        neck: Config of the neck, or None; its first output is used.
+        bev_size: Rows and columns of the output, to which the features are interpolated.
+        init_cfg: As in mmengine.
+    """
+
+    def __init__(
+        self,
+        voxel_encoder: dict,
+        middle_encoder: dict,
+        backbone: dict | None = None,
+        neck: dict | None = None,
+        bev_size: tuple[int, int] = (200, 100),
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(init_cfg)
+        self.voxel_encoder = MODELS.build(voxel_encoder)
+        self.middle_encoder = MODELS.build(middle_encoder)
+        self.backbone = MODELS.build(backbone) if backbone else None
+        self.neck = MODELS.build(neck) if neck else None
+        self.bev_size = tuple(bev_size)
+
+    def forward(self, voxels: dict[str, Tensor], batch_size: int) -> Tensor:
+        """Encode the voxels of a batch.
+
+        Args:
+            voxels: ``voxels`` (M, points, channels), ``num_points`` (M,) and ``coors`` (M, 4):
+                sample, z, y, x.
+            batch_size: Number of samples B.
+
+        Returns:
+            BEV features, row 0 at the smallest y. (B, C, H, W)
+
+        Raises:
+            RuntimeError: If a sparse encoder is to run on the CPU without spconv.
+        """
+        coors = voxels["coors"]
+        if isinstance(self.middle_encoder, SparseEncoder) and not (
+            IS_SPCONV2_AVAILABLE or coors.is_cuda
+        ):
+            raise RuntimeError(
+                "the sparse LiDAR encoder needs a GPU or the package spconv (2.x); without them "
+                "use a PointPillars config."
+            )
+        points = self.voxel_encoder(voxels["voxels"], voxels["num_points"], coors)
+        feats = self.middle_encoder(points, coors, batch_size)
+        if self.backbone is not None:
+            feats = self.backbone(feats)
+        if self.neck is not None:
+            feats = self.neck(feats)
+        feats = feats[0] if isinstance(feats, (list, tuple)) else feats
+        if feats.shape[-2:] != self.bev_size:
+            feats = F.interpolate(feats, self.bev_size, mode="bilinear", align_corners=False)
+        return feats
+
+
+@MODELS.register_module()
+class ConvFuser(ConvModule):
+    """One convolution over the concatenated BEV features of cameras and LiDAR.
+
+    Args:
+        camera_channels: Channels of the cameras' features.
+        lidar_channels: Channels of the LiDAR's features.
+        out_channels: Channels of the result.
+        kwargs: Further arguments of mmcv's ``ConvModule``.
+    """
+
+    def __init__(
+        self, camera_channels: int, lidar_channels: int, out_channels: int, **kwargs: Any
+    ) -> None:
+        kwargs = {"kernel_size": 3, "padding": 1, "bias": False, **kwargs}
+        kwargs.setdefault("norm_cfg", {"type": "BN"})
+        super().__init__(camera_channels + lidar_channels, out_channels, **kwargs)
+
+    def forward(self, camera_feats: Tensor, lidar_feats: Tensor) -> Tensor:
+        """Fuse both, of one size. 2 x (B, C, H, W) -> (B, C, H, W)"""
+        return super().forward(torch.cat([camera_feats, lidar_feats], 1))
