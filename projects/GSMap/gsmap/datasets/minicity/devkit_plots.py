@@ -16,6 +16,7 @@ def polygon_path(polygon: Polygon | MultiPolygon) -> Path:
     rings = [
         np.asarray(ring.coords)[:, :2]
         for part in get_parts(polygon)
+        if not part.is_empty
         for ring in (part.exterior, *part.interiors)
     ]
     if not rings:

@@ -134,17 +134,20 @@ def _coat(
     """The window of the texture that paint covers, and its opacity, worn off in blotches."""
     if not outlines:
         return None
-    px = [_pixels(outline, origin, resolution_m) for outline in outlines]
-    everything = np.concatenate(px) >> SHIFT
+    # Drawn twice as fine and averaged: OpenCV rounds level edges to whole pixels.
+    px = [_pixels(outline, origin, resolution_m / 2) for outline in outlines]
+    everything = np.concatenate(px) >> (SHIFT + 1)
     low = np.maximum(everything.min(0) - 2, 0)
     high = np.minimum(everything.max(0) + 3, blotches.shape[::-1])
     if (high <= low).any():
         return None
     window = (slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0])))
-    mask = np.zeros((int(high[1] - low[1]), int(high[0] - low[0])), np.uint8)
-    shift = (low << SHIFT).astype(np.int32)
+    columns, rows = (int(n) for n in high - low)
+    fine = np.zeros((2 * rows, 2 * columns), np.uint8)
+    shift = (2 * low << SHIFT).astype(np.int32)
     for outline in px:
-        cv2.fillPoly(mask, [outline - shift], (255.0,), cv2.LINE_AA, SHIFT)
+        cv2.fillPoly(fine, [outline - shift], (255.0,), cv2.LINE_AA, SHIFT)
+    mask = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)
     # Opaque where the noise stays below 1 - wear, bare above, with a soft edge between.
     limit = np.arange(256) / 255.0
     left = np.clip((1.0 - wear - limit) * 5 + 0.35, 0.12, 0.97)
