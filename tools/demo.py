@@ -93,8 +93,15 @@ def data_steps(folder: Path, budget: Budget) -> Iterable[Step]:
     command = f"--scenes {budget.scenes} --samples-per-scene {budget.samples} --seed 0"
     yield Step(
         "generate MiniCity",
-        ["tools/create_data.py", "minicity", "--root", str(root), *command.split()]
-        + ["--image-size", budget.image_size],
+        [
+            "tools/create_data.py",
+            "minicity",
+            "--root",
+            str(root),
+            *command.split(),
+            "--image-size",
+            budget.image_size,
+        ],
         [root / "minicity.json"],
     )
     yield Step(
@@ -114,8 +121,9 @@ def model_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
     """Yield what trains, tests and draws a model."""
     config, work = CONFIGS[name], folder / name.lower()
     root = folder / f"minicity-{budget.scenes}x{budget.samples}"
-    options = [f"{part}_dataloader.dataset.data_root={root}/" for part in ("train", "val", "test")]
-    schedule = [
+    options = [
+        "--cfg-options",
+        *(f"{part}_dataloader.dataset.data_root={root}/" for part in ("train", "val", "test")),
         f"train_cfg.max_epochs={budget.epochs}",
         f"train_cfg.val_interval={budget.epochs}",
         f"param_scheduler.1.T_max={budget.epochs}",
@@ -123,24 +131,32 @@ def model_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
     checkpoint = work / f"epoch_{budget.epochs}.pth"
     yield Step(
         f"train {name}",
-        ["tools/train.py", config, "--work-dir", str(work), "--resume"]
-        + ["--cfg-options", *options, *schedule],
+        [
+            "tools/train.py",
+            config,
+            "--work-dir",
+            str(work),
+            "--resume",
+            "--cfg-options",
+            *options,
+            *schedule,
+        ],
         [checkpoint],
     )
     test = ["tools/test.py", config, str(checkpoint), "--eval", "chamfer", "raster"]
     metrics, pictures = work / "metrics.json", work / "pictures"
+    drawing = ["--show-dir", str(pictures), "--show-interval", "10"]
+    drawing += ["--out", str(work / "results.json"), "--metrics-out", str(metrics)]
     yield Step(
         f"test and draw {name}",
-        [*test, "--work-dir", str(work / "test"), "--metrics-out", str(metrics)]
-        + ["--out", str(work / "results.json"), "--show-dir", str(pictures)]
-        + ["--show-interval", "10", "--cfg-options", *options],
+        [*test, "--work-dir", str(work / "test"), *drawing, *options],
         [metrics, pictures],
     )
     shuffled = work / "metrics_shuffled.json"
+    shuffling = ["--shuffle-images", "0", "--metrics-out", str(shuffled)]
     yield Step(
         f"test {name} on images of other samples",
-        [*test, "--work-dir", str(work / "shuffled"), "--metrics-out", str(shuffled)]
-        + ["--shuffle-images", "0", "--cfg-options", *options],
+        [*test, "--work-dir", str(work / "shuffled"), *shuffling, *options],
         [shuffled],
     )
 
