@@ -11,5 +11,4 @@ model = dict(
         embed_dims=256,
         depth_range=(1.0, 35.0, 0.5),
         camera_aware=False,
-        camera_aware=False,
         loss_depth_weight=0.0))
