@@ -131,16 +131,7 @@ def model_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
     checkpoint = work / f"epoch_{budget.epochs}.pth"
     yield Step(
         f"train {name}",
-        [
-            "tools/train.py",
-            config,
-            "--work-dir",
-            str(work),
-            "--resume",
-            "--cfg-options",
-            *options,
-            *schedule,
-        ],
+        ["tools/train.py", config, "--work-dir", str(work), "--resume", *options],
         [checkpoint],
     )
     test = ["tools/test.py", config, str(checkpoint), "--eval", "chamfer", "raster"]
