@@ -1,0 +1,27 @@
+# Real Argoverse 2 roads with rendered pictures (docs/argoverse2.md), a quarter of the real size, halved again.
+# `python tools/create_data.py av2-render --root data/av2 --out data/av2_rendered` makes them,
+# `python tools/create_data.py av2 --root data/av2_rendered` the annotation files, each once per split.
+_base_ = './av2.py'
+
+data_root = 'data/av2_rendered/'
+_load = [dict(type='LoadCameraImages', to_float32=False), dict(type='ScaleImages', scale=0.5)]
+
+train_dataloader = dict(
+    batch_size=4,
+    num_workers=1,
+    dataset=dict(
+        data_root=data_root,
+        pipeline=[
+            *_load,
+            dict(
+                type='MultiViewWrapper',
+                transforms=[dict(type='PhotoMetricDistortion3D')],
+                override_aug_config=False,
+                collected_keys=[]),
+            dict(type='FormatMapTargets', num_points=20),
+            dict(type='PackMapInputs'),
+        ]))
+val_dataloader = dict(
+    num_workers=1,
+    dataset=dict(data_root=data_root, pipeline=[*_load, dict(type='PackMapInputs')]))
+test_dataloader = val_dataloader

@@ -1,0 +1,7 @@
+# A small MapTR on rendered Argoverse 2 logs, trained from scratch on two CPU cores.
+_base_ = [
+    '../_base_/datasets/av2_rendered.py',
+    '../_base_/models/maptr_r18_av2_rendered.py',
+    '../_base_/schedules/minicity.py',
+    '../_base_/default_runtime.py',
+]
