@@ -15,8 +15,8 @@ from gaussian_cases import (
 )
 
 from gsmap.geometry.bev_grid import BEVGrid
-from gsmap.ops import gaussian_raster
-from gsmap.ops.gaussian_raster import api, render_gaussians
+from gsmap.ops import backends, gaussian_raster
+from gsmap.ops.gaussian_raster import render_gaussians
 
 BACKENDS = ["reference", "cpu"]
 
@@ -178,10 +178,16 @@ import sys
 import torch
 from gaussian_cases import CASES, ODD_GRID, compare_with_reference, render_with_gradients
 from gsmap.ops.gaussian_raster import render_gaussians
+from gsmap.ops.soft_iou import pairwise_soft_iou
 
 torch.set_num_threads(1)
 for case in sys.argv[1:]:
     compare_with_reference(case, "triton")
+preds, targets = torch.rand(3, 21, 77), torch.rand(2, 21, 77)  # more pixels than a block
+iou = pairwise_soft_iou(preds, targets, backend="triton")
+exact = pairwise_soft_iou(preds.double(), targets.double(), backend="reference")
+torch.testing.assert_close(iou, exact.float())
+assert pairwise_soft_iou(preds, targets[:0], backend="triton").shape == (3, 0)
 upstream = torch.randn(2, 21, 33)
 runs = [render_with_gradients(CASES["two"][0], ODD_GRID, "triton", upstream) for _ in range(2)]
 assert torch.equal(runs[0][0], runs[1][0])
@@ -205,7 +211,7 @@ QUICK_IN_TRITON = ("one", "two", "thin", "far off", "on pixel centres", "one pix
     ],
     ids=["quick", "rest"],
 )
-def test_triton_backend_equals_float64_reference_in_the_interpreter(cases):
+def test_triton_kernels_equal_the_float64_reference_in_the_interpreter(cases):
     """A process of its own: Triton reads ``TRITON_INTERPRET`` when it is imported."""
     pytest.importorskip("triton")
     paths = [str(Path(__file__).parent), str(Path(gaussian_raster.__file__).parents[3])]
@@ -226,7 +232,13 @@ def test_triton_kernels_compile_for_a_gpu():
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource, compile
 
+    from gsmap.ops import soft_iou_triton
     from gsmap.ops.gaussian_raster import triton_kernels
+
+    def check_compiles(source):
+        compiled = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 4})
+        assert compiled.asm["cubin"]
+        assert ".local" not in compiled.asm["ptx"]
 
     sizes = {"count": "i32", "height": "i32", "width": "i32", "TILE": "constexpr"}
     frame = dict.fromkeys(("x_min", "y_min", "step_x", "step_y"), "fp32")
@@ -236,9 +248,15 @@ def test_triton_kernels_compile_for_a_gpu():
     ):
         signature = dict.fromkeys(pointers, "*fp32") | sizes | frame
         source = ASTSource(fn=kernel, signature=signature, constexprs={"TILE": triton_kernels.TILE})
-        compiled = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 4})
-        assert compiled.asm["cubin"]
-        assert ".local" not in compiled.asm["ptx"]
+        check_compiles(source)
+    signature = dict.fromkeys(("preds", "targets", "minima"), "*fp32")
+    check_compiles(
+        ASTSource(
+            fn=soft_iou_triton.minima_kernel,
+            signature=signature | {"pixels": "i32", "BLOCK": "constexpr"},
+            constexprs={"BLOCK": soft_iou_triton.BLOCK},
+        )
+    )
 
 
 def _train_one_rank(rank, folder):
@@ -266,7 +284,7 @@ def test_gradients_are_averaged_over_ranks(tmp_path):
 
 def test_without_numba_the_reference_renders_after_a_warning(monkeypatch):
     gaussians = random_gaussians(2, 5, 0.5, 3)
-    monkeypatch.setattr(api, "HAS_NUMBA", False)
+    monkeypatch.setattr(backends, "HAS_NUMBA", False)
     with pytest.warns(UserWarning, match="pip install numba"):
         masks = render_gaussians(*gaussians, ODD_GRID)
     assert torch.equal(masks, render_gaussians(*gaussians, ODD_GRID, "reference"))

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
-from ..ops._numba import is_fused
+from ..ops.backends import choose_backend
 from .raster_cpu import raster_loss_sums
 
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # the usual constants for values in [0, 1]
@@ -126,7 +126,7 @@ def raster_loss(
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds, targets = preds.to(dtype), targets.detach().to(dtype)
     with torch.autocast(preds.device.type, enabled=False):
-        if is_fused(backend, preds):
+        if choose_backend(backend, preds, ("cpu",)) == "cpu":
             window = gaussian_window(window_size, window_sigma, preds)
             constants = SSIM_C1, SSIM_C2, foreground_weight
             sums = raster_loss_sums(preds, targets, window, *constants)

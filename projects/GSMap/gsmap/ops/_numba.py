@@ -5,39 +5,16 @@ Numba's cache watches the file of a kernel alone: delete ``__pycache__`` after a
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from importlib.util import find_spec
 from itertools import pairwise
 
 import numpy as np
 import torch
 
-HAS_NUMBA = find_spec("numba") is not None
 SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filling so many
 
 # Associative sums may be split into vector lanes (always in the same way, so results repeat);
 # NaN and infinity keep their meaning.
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
-
-
-def is_fused(backend: str, tensor: torch.Tensor) -> bool:
-    """Tell whether the fused CPU kernels are wanted and serve a tensor.
-
-    Args:
-        backend: ``"reference"``, ``"cpu"``, or ``"auto"``: the kernels where they serve.
-        tensor: What they are to work on.
-
-    Raises:
-        ValueError: If ``backend`` is unknown, or ``"cpu"`` and the kernels do not serve.
-    """
-    if backend not in ("auto", "reference", "cpu"):
-        raise ValueError(f"backend must be 'auto', 'reference' or 'cpu', got {backend!r}.")
-    serves = HAS_NUMBA and tensor.device.type == "cpu" and tensor.dtype == torch.float32
-    if backend == "cpu" and not serves:
-        raise ValueError(
-            "backend 'cpu' needs numba and float32 tensors on the CPU, "
-            f"got {tensor.dtype} on {tensor.device}: use 'auto'."
-        )
-    return serves and backend != "reference"
 
 
 def run_in_threads(kernel: Callable[[int, int], None], count: int, pixels: int) -> None:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from ..geometry.bev_grid import BEVGrid
-from ._numba import is_fused
+from .backends import choose_backend
 from .polyline_cpu import draw_cpu, soft_rasters_cpu
 from .polyline_reference import draw_reference, soft_rasters_reference
 
@@ -49,7 +49,7 @@ def draw_polylines(
     dx, dy = grid.pixel_size_m
     half_width_m, pixel_m = width_m / 2, (dx * dy) ** 0.5
     with torch.autocast(polylines.device.type, enabled=False):
-        if is_fused(backend, polylines):
+        if choose_backend(backend, polylines, ("cpu",)) == "cpu":
             origin = grid.x_range[0], grid.y_range[0]
             size = grid.height, grid.width
             return draw_cpu(
@@ -102,7 +102,7 @@ def soft_rasters(
         back = vertices.flip(1) + LANE_GAP_PX
         stay = vertices[:, -1:].expand_as(vertices)  # a polygon's ring is padded by its last corner
         rings = torch.cat([vertices, torch.where(flags[:, None, None], stay, back)], 1)
-        if is_fused(backend, rings):
+        if choose_backend(backend, rings, ("cpu",)) == "cpu":
             return soft_rasters_cpu(rings, flags, height, width, line_softness, polygon_softness)
         softness = line_softness, polygon_softness
         return soft_rasters_reference(rings, flags, height, width, softness)

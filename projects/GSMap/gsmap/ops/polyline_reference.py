@@ -1,16 +1,20 @@
 """Plain torch rasters of polylines and polygons: the definition of right, in any float type."""
 
+import math
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
+BLOCK_VALUES = 1 << 22  # how many distances are held at a time
 LENGTH_EPS = 1e-5  # added to an edge's squared length, as in MapVR: an edge may be a single point
 
 
 def edge_distances(pixels: Tensor, starts: Tensor, ends: Tensor, eps: float = 0.0) -> Tensor:
     """Squared distance of every pixel to the nearest edge.
 
-    The nearest edge is found without gradient, one edge at a time, so that memory does not grow
-    with E.
+    The nearest edge is found without gradient, a block of edges at a time, so that memory does not
+    grow with E.
 
     Args:
         pixels: Sample positions. (H, W, 2)
@@ -25,13 +29,24 @@ def edge_distances(pixels: Tensor, starts: Tensor, ends: Tensor, eps: float = 0.
     with torch.no_grad():
         nearest = pixels.new_full(shape, torch.inf)
         owner = torch.zeros(shape, dtype=torch.long, device=pixels.device)
-        for index, (start, end) in enumerate(zip(starts.unbind(1), ends.unbind(1), strict=True)):
-            squared = _segment_distance(pixels, start[:, None, None], end[:, None, None], eps)
+        for first, start, end in _edge_blocks(shape, starts, ends):
+            squared, index = _segment_distance(pixels, start, end, eps).min(1)
             closer = squared < nearest
-            nearest, owner = torch.where(closer, squared, nearest), owner.where(~closer, index)
+            nearest = torch.where(closer, squared, nearest)
+            owner = torch.where(closer, index + first, owner)
         owner = owner.flatten(1)[..., None].expand(-1, -1, 2)  # (K, HW, 2)
     start, end = (e.gather(1, owner).reshape(*shape, 2) for e in (starts, ends))
     return _segment_distance(pixels, start, end, eps)
+
+
+def _edge_blocks(
+    shape: tuple[int, ...], starts: Tensor, ends: Tensor
+) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """Cut edges (K, E, 2) into blocks (K, b, 1, 1, 2), each with its first edge's index."""
+    size = max(1, BLOCK_VALUES // max(1, math.prod(shape)))
+    for first in range(0, starts.shape[1], size):
+        block = slice(first, first + size)
+        yield first, starts[:, block, None, None], ends[:, block, None, None]
 
 
 def _segment_distance(pixels: Tensor, start: Tensor, end: Tensor, eps: float) -> Tensor:
@@ -53,14 +68,14 @@ def inside_polygon(pixels: Tensor, vertices: Tensor) -> Tensor:
         True inside. (K, H, W)
     """
     shape = (len(vertices), *pixels.shape[:2])
-    inside = torch.zeros(shape, dtype=torch.bool, device=vertices.device)
+    crossings = torch.zeros(shape, dtype=torch.long, device=vertices.device)
     x, y = pixels.unbind(-1)
-    for start, end in zip(vertices.unbind(1), vertices.roll(-1, 1).unbind(1), strict=True):
-        (x0, y0), (x1, y1) = start[:, None, None].unbind(-1), end[:, None, None].unbind(-1)
+    for _, start, end in _edge_blocks(shape, vertices, vertices.roll(-1, 1)):
+        (x0, y0), (x1, y1) = start.unbind(-1), end.unbind(-1)
         straddles = (y0 > y) != (y1 > y)
         rise = torch.where(y1 == y0, torch.ones_like(y0), y1 - y0)
-        inside ^= straddles & (x < (x1 - x0) * (y - y0) / rise + x0)
-    return inside
+        crossings += (straddles & (x < (x1 - x0) * (y - y0) / rise + x0)).sum(1)
+    return crossings % 2 == 1
 
 
 def soft_rasters_reference(

@@ -1,9 +1,12 @@
 """Soft intersection over union of masks: sum(min) / sum(max)."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
-from ._numba import is_fused, run_in_threads
+from ._numba import run_in_threads
+from .backends import choose_backend
 
 
 def pairwise_soft_iou(
@@ -18,11 +21,11 @@ def pairwise_soft_iou(
         preds: Masks in [0, 1]. (N, H, W)
         targets: Masks in [0, 1]. (K, H, W)
         eps: Added to the union, so that two empty masks have IoU 0.
-        backend: ``"reference"`` (plain torch), ``"cpu"`` (fused), or ``"auto"``: the fused kernel
-            where it serves and no gradient is asked for.
+        backend: ``"reference"`` (plain torch), ``"cpu"`` or ``"triton"`` (fused), or ``"auto"``: a
+            fused kernel where it serves and no gradient is asked for.
 
     Returns:
-        IoU in [0, 1]; without gradient from the fused kernel. (N, K)
+        IoU in [0, 1]; without gradient from the fused kernels. (N, K)
 
     Raises:
         ValueError: If the shapes disagree or ``backend`` does not serve.
@@ -34,30 +37,26 @@ def pairwise_soft_iou(
         )
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds, targets = preds.to(dtype).flatten(1), targets.to(dtype).flatten(1)  # (N, HW), (K, HW)
-    if (
-        backend == "auto"
-        and torch.is_grad_enabled()
-        and (preds.requires_grad or targets.requires_grad)
-    ):
+    wants_gradient = torch.is_grad_enabled() and (preds.requires_grad or targets.requires_grad)
+    if backend == "auto" and wants_gradient:
         backend = "reference"
-    if is_fused(backend, preds):
+    backend = choose_backend(backend, preds)
+    if backend != "reference":
         preds, targets = preds.detach(), targets.detach()
-        minima = pairwise_minima_cpu(preds, targets)
-    else:
-        minima = _pairwise_minima(preds, targets)
+    minima = MINIMA[backend](preds, targets)
     union = preds.sum(-1)[:, None] + targets.sum(-1) - minima
     return minima / (union + eps)
 
 
-def _pairwise_minima(preds: Tensor, targets: Tensor) -> Tensor:
+def _minima_reference(preds: Tensor, targets: Tensor) -> Tensor:
     """Sum the minimum of every pair, one target at a time. (N, HW), (K, HW) -> (N, K)"""
     if not len(targets):
         return preds.new_zeros(len(preds), 0)
     return torch.stack([torch.minimum(preds, target).sum(-1) for target in targets], -1)
 
 
-@torch.library.custom_op("gsmap::pairwise_minima", mutates_args=(), device_types="cpu")
-def pairwise_minima_cpu(preds: Tensor, targets: Tensor) -> Tensor:
+@torch.library.custom_op("gsmap::pairwise_minima_cpu", mutates_args=())
+def _minima_cpu(preds: Tensor, targets: Tensor) -> Tensor:
     """Sum the minimum of every pair of flat float32 masks. (N, HW), (K, HW) -> (N, K)"""
     from .soft_iou_kernels import list_pixels, sum_minima
 
@@ -72,6 +71,26 @@ def pairwise_minima_cpu(preds: Tensor, targets: Tensor) -> Tensor:
     return minima
 
 
-@pairwise_minima_cpu.register_fake
+@_minima_cpu.register_fake
 def _(preds, targets):  # type: ignore[no-untyped-def]
     return preds.new_empty(preds.shape[0], targets.shape[0])
+
+
+@torch.library.custom_op("gsmap::pairwise_minima_triton", mutates_args=())
+def _minima_triton(preds: Tensor, targets: Tensor) -> Tensor:
+    """Sum the minimum of every pair of flat float32 masks. (N, HW), (K, HW) -> (N, K)"""
+    from .soft_iou_triton import pairwise_minima
+
+    return pairwise_minima(preds, targets)
+
+
+@_minima_triton.register_fake
+def _(preds, targets):  # type: ignore[no-untyped-def]
+    return preds.new_empty(preds.shape[0], targets.shape[0])
+
+
+MINIMA: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "reference": _minima_reference,
+    "cpu": _minima_cpu,
+    "triton": _minima_triton,
+}

@@ -1,5 +1,5 @@
 """Rendering of 2D Gaussians to soft masks (GSMap Eq. 6): one function, several backends."""
 
-from .api import BACKENDS, render_gaussians
+from .api import render_gaussians
 
-__all__ = ["BACKENDS", "render_gaussians"]
+__all__ = ["render_gaussians"]

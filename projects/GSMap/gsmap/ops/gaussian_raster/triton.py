@@ -1,15 +1,12 @@
 """The Triton backend: torch operators around the kernels. Importable without Triton."""
 
 import math
-from importlib.util import find_spec
 
 import torch
 from torch import Tensor
 
 from .fused import Frame, fused_renderer
 from .reference import SQUARED_REACH
-
-HAS_TRITON = find_spec("triton") is not None
 
 
 def _pack(means: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:
