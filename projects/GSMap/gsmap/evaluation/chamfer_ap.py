@@ -200,18 +200,18 @@ def match_chamfer(
     """
     num_classes = len(config.classes)
     kept = (predictions.num_points >= 2) & _known(predictions.labels, num_classes)
+    best, distance = nearest_by_chamfer(predictions, ground_truth, config, config.thresholds[-1])
     rows = np.flatnonzero(kept)
     rows = rows[np.argsort(-predictions.scores[rows], kind="stable")]
-    ranked = predictions.select(rows)
-    best, distance = nearest_by_chamfer(ranked, ground_truth, config, config.thresholds[-1])
+    best, distance = best[rows], distance[rows]
     thresholds = np.asarray(config.thresholds)
     matched = kernels.assign(best, distance, len(ground_truth), thresholds)
     known_gts = ground_truth.labels[_known(ground_truth.labels, num_classes)]
     return FrameMatches(
         token=token,
         pred_index=rows,
-        labels=ranked.labels,
-        scores=ranked.scores,
+        labels=predictions.labels[rows],
+        scores=predictions.scores[rows],
         matched_gt=matched,
         quality=np.where(matched[:, -1] >= 0, distance, np.nan),
         num_gts=np.bincount(known_gts, minlength=num_classes),

@@ -23,8 +23,8 @@ class Samples(Protocol):
     def tokens(self) -> list[str]:
         """Names of the samples."""
 
-    def elements(self, index: int) -> tuple[MapElements, Counter[str]]:
-        """Return the elements of one sample and what is to be said about them."""
+    def elements(self, indices: Sequence[int]) -> tuple[list[MapElements], Counter[str]]:
+        """Return the elements of some samples and what is to be said about them."""
 
 
 @dataclass
@@ -46,26 +46,39 @@ class JsonElements:
         """Names of the samples."""
         return self.samples.tokens
 
-    def elements(self, index: int) -> tuple[MapElements, Counter[str]]:
-        """Return the elements of one sample, with counts of 3D and of unknown elements.
+    def elements(self, indices: Sequence[int]) -> tuple[list[MapElements], Counter[str]]:
+        """Return the elements of some samples, with counts of 3D and of unknown elements.
 
         Args:
-            index: Position in ``tokens``.
+            indices: Positions in ``tokens``.
 
         Raises:
-            ValueError: If the sample is malformed; the message names it.
+            ValueError: If a sample is malformed; the message names it.
         """
+        # pyarrow starts a thread when it is loaded, which must not be before the workers are forked
+        from gsmap.evaluation.json_batch import parse_batch
+
+        pieces = [self.samples.piece(i) for i in indices]
+        tokens = [self.tokens[i] for i in indices]
+        batch = parse_batch(pieces, tokens, self.labels, self.scored)
+        parsed = batch or [self._parse(i) for i in indices]
+        notes: Counter[str] = Counter()
+        for index, (elements, is_3d) in zip(indices, parsed, strict=True):
+            notes["3D"] += len(elements) if is_3d else 0
+            if (elements.labels < 0).any():
+                names = (v["cls_name"] for v in self.samples.vectors(index))
+                notes.update(name for name in names if name not in self.labels)
+        return [elements for elements, _ in parsed], notes
+
+    def _parse(self, index: int) -> tuple[MapElements, bool]:
+        """Parse one sample of any form; the message of an error names it."""
         vectors = self.samples.vectors(index)
         try:
-            found = elements_from_vectors(vectors, self.labels, self.scored)
+            elements = elements_from_vectors(vectors, self.labels, self.scored)
         except ValueError as error:
             token = self.tokens[index]
             raise ValueError(f"{self.samples.path}, sample {token!r}: {error}") from error
-        notes: Counter[str] = Counter()
-        if (found.labels < 0).any():
-            notes.update(v["cls_name"] for v in vectors if v["cls_name"] not in self.labels)
-        notes["3D"] = sum(1 for v in vectors if len(v["pts"]) and len(v["pts"][0]) == 3)
-        return found, notes
+        return elements, any(len(p) == 3 for v in vectors for p in v["pts"][:1])
 
 
 class ArrowElements:
@@ -91,25 +104,31 @@ class ArrowElements:
         self._labels = [classes.index(name) if name in classes else -1 for name in known]
         self.tokens: list[str] = self.file.column("token")
 
-    def elements(self, index: int) -> tuple[MapElements, Counter[str]]:
-        """Return the elements of one sample, with counts of 3D and of unknown elements.
+    def elements(self, indices: Sequence[int]) -> tuple[list[MapElements], Counter[str]]:
+        """Return the elements of some samples, with counts of 3D and of unknown elements.
 
         Args:
-            index: Position in ``tokens``.
+            indices: Positions in ``tokens``.
 
         Raises:
-            ValueError: If the sample has no ground truth.
+            ValueError: If a sample has no ground truth.
         """
-        sample = self.file[index]
-        if sample.instances is None:
-            raise ValueError(
-                f"{self.file.path}, sample {sample.token!r} has no ground truth: it cannot be "
-                "scored."
+        found = []
+        notes: Counter[str] = Counter()
+        for index in indices:
+            sample = self.file[index]
+            if sample.instances is None:
+                raise ValueError(
+                    f"{self.file.path}, sample {sample.token!r} has no ground truth: it cannot be "
+                    "scored."
+                )
+            labels = [self._labels[instance.label] for instance in sample.instances]
+            notes.update(
+                self._names[i.label] for i in sample.instances if self._labels[i.label] < 0
             )
-        labels = [self._labels[instance.label] for instance in sample.instances]
-        notes = Counter(self._names[i.label] for i in sample.instances if self._labels[i.label] < 0)
-        notes["3D"] = len(labels) if self.file.meta.dim == 3 else 0
-        return map_elements([i.points for i in sample.instances], labels), notes
+            notes["3D"] += len(labels) if self.file.meta.dim == 3 else 0
+            found.append(map_elements([i.points for i in sample.instances], labels))
+        return found, notes
 
 
 def open_ground_truth(path: str | Path, classes: Sequence[str]) -> Samples:
@@ -136,19 +155,16 @@ class _ChunkJob:
     def __call__(
         self, pairs: Sequence[tuple[int, int]]
     ) -> tuple[list[SampleMatches], Counter[str], Counter[str]]:
+        with_result = [pair[0] for pair in pairs if pair[0] >= 0]
+        found, pred_notes = self.results.elements(with_result)
+        predictions = dict(zip(with_result, found, strict=True))
+        truth, gt_notes = self.truth.elements([pair[1] for pair in pairs])
         matches = []
-        pred_notes: Counter[str] = Counter()
-        gt_notes: Counter[str] = Counter()
-        for result_index, truth_index in pairs:
-            predictions = empty_elements()
-            if result_index >= 0:
-                predictions, found = self.results.elements(result_index)
-                pred_notes.update(found)
-            ground_truth, found = self.truth.elements(truth_index)
-            gt_notes.update(found)
+        for (result_index, truth_index), ground_truth in zip(pairs, truth, strict=True):
             gt_notes["degenerate"] += int((ground_truth.num_points < 2).sum())
             token = self.truth.tokens[truth_index]
-            matches.append(match_sample(token, predictions, ground_truth, self.config))
+            predicted = predictions.get(result_index, empty_elements())
+            matches.append(match_sample(token, predicted, ground_truth, self.config))
         return matches, pred_notes, gt_notes
 
 

@@ -17,9 +17,13 @@ from numba import njit
 from gsmap.evaluation.elements import IntArray
 
 _TOKEN = re.compile(rb'"sample_token"\s*:\s*("(?:[^"\\]|\\.)*")')
-_QUOTE, _BACKSLASH, _COLON = ord('"'), ord("\\"), ord(":")
-_OPEN, _CLOSE = (ord("{"), ord("[")), (ord("}"), ord("]"))
-_SPACES = (ord(" "), ord("\n"), ord("\r"), ord("\t"))
+_QUOTE, _BACKSLASH = ord('"'), ord("\\")
+_PLAIN, _STRING, _OBJECT, _LIST, _END, _BETWEEN = range(6)  # what a byte begins
+_KIND = np.zeros(256, dtype=np.uint8)
+_KIND[[ord(c) for c in '"{[]}: \n\r\t']] = [
+    *(_STRING, _OBJECT, _LIST, _END, _END),
+    *(_BETWEEN,) * 5,
+]
 
 
 @njit(cache=True)
@@ -47,27 +51,27 @@ def _item_spans(data: npt.NDArray[np.uint8], key: npt.NDArray[np.uint8]) -> IntA
     count, depth, position, size = 0, 0, 0, len(data)
     matched = inside = ended = False  # the key was just read; its list is open; it was closed
     while position < size and not ended:
-        byte = data[position]
-        if byte == _QUOTE:
+        kind = _KIND[data[position]]
+        if kind == _PLAIN:
+            matched = False
+        elif kind == _STRING:
             string = data[position : _string_end(data, position) + 1]
             position += len(string) - 1
             matched = depth == 1 and len(string) == len(key) and bool((string == key).all())
-        elif byte in _OPEN:
-            inside = inside or (matched and depth == 1 and byte == _OPEN[1])
+        elif kind == _END:
+            depth -= 1
+            if inside and depth == 2:
+                spans[count, 1] = position + 1
+                count += 1
+            ended = inside and depth == 1
+        elif kind != _BETWEEN:
+            inside = inside or (matched and depth == 1 and kind == _LIST)
             matched = False
             if inside and depth == 2:
                 if count == len(spans):
                     spans = np.concatenate((spans, np.empty_like(spans)))
                 spans[count, 0] = position
             depth += 1
-        elif byte in _CLOSE:
-            depth -= 1
-            if inside and depth == 2:
-                spans[count, 1] = position + 1
-                count += 1
-            ended = inside and depth == 1
-        elif byte != _COLON and byte not in _SPACES:
-            matched = False
         position += 1
     return spans[:count] if ended else np.full((1, 2), -1, dtype=np.int64)
 
@@ -125,6 +129,15 @@ class JsonSamples:
             raise ValueError(f"{self.path}: a sample at byte {start} has no sample_token.")
         return str(json.loads(found.group(1)))
 
+    def piece(self, index: int) -> bytes:
+        """Return the text of one sample.
+
+        Args:
+            index: Position in ``tokens``.
+        """
+        start, stop = self._spans[index]
+        return self._data[start:stop]
+
     def vectors(self, index: int) -> list[dict[str, Any]]:
         """Parse the vectors of one sample.
 
@@ -134,9 +147,8 @@ class JsonSamples:
         Raises:
             ValueError: If the sample is not valid JSON, or not of the expected form.
         """
-        start, stop = self._spans[index]
         try:
-            sample = json.loads(self._data[start:stop])
+            sample = json.loads(self.piece(index))
             vectors = sample["vectors"]
         except (json.JSONDecodeError, KeyError) as error:
             raise ValueError(f"{self.path}, sample {self.tokens[index]!r}: {error!r}.") from error
