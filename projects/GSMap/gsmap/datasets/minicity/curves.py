@@ -20,7 +20,10 @@ def resample(points: Array, spacing_m: float) -> Array:
 
 def interpolate(values: Array, lengths: Array, at: Array) -> Array:
     """Rows of ``values``, which belong to arc lengths ``lengths``, interpolated at ``at``."""
-    return np.stack([np.interp(at, lengths, column) for column in values.T], axis=-1)
+    left = np.clip(np.searchsorted(lengths, at, side="right") - 1, 0, len(lengths) - 2)
+    span = np.maximum(lengths[left + 1] - lengths[left], 1e-12)
+    share = np.clip((at - lengths[left]) / span, 0.0, 1.0)[:, None]
+    return values[left] + share * (values[left + 1] - values[left])
 
 
 def subline(points: Array, start_m: float, end_m: float) -> Array:

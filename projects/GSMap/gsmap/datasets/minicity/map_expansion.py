@@ -7,7 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from shapely.geometry import Polygon
+import shapely
+from shapely.geometry import MultiPolygon, Polygon
 
 from gsmap.datasets.minicity.config import make_token
 from gsmap.datasets.minicity.curves import Array, arc_lengths, strip
@@ -46,13 +47,15 @@ class MapWriter:
     """
 
     def __init__(self, town: Town, seed: int) -> None:
-        self.town, self.seed = town, seed
+        self.town = town
+        self._prefixes = {layer: make_token(seed, town.name, layer)[:24] for layer in LAYERS}
         self.tables: dict[str, list[dict[str, Any]]] = {layer: [] for layer in LAYERS}
         self.arclines: dict[str, list[dict[str, Any]]] = {}
         self.connectivity: dict[str, dict[str, list[str]]] = {}
 
     def _token(self, layer: str) -> str:
-        return make_token(self.seed, self.town.name, layer, len(self.tables[layer]))
+        """The next token of a layer: a prefix of its own, then a running number."""
+        return f"{self._prefixes[layer]}{len(self.tables[layer]):08x}"
 
     def _nodes(self, points: Array) -> list[str]:
         tokens = []
@@ -201,6 +204,11 @@ class MapWriter:
         self.connectivity[token] = {"incoming": [], "outgoing": []}
 
 
+def polygon_parts(area: Polygon | MultiPolygon) -> list[Polygon]:
+    """The polygons that an area consists of."""
+    return [part for part in shapely.get_parts(area) if not part.is_empty]
+
+
 def town_to_map(town: Town, seed: int) -> dict[str, Any]:
     """A town as the content of a map expansion file."""
     writer = MapWriter(town, seed)
@@ -220,7 +228,7 @@ def town_to_map(town: Town, seed: int) -> dict[str, Any]:
         writer.connectivity[token] = {"incoming": [source], "outgoing": [target]}
         writer.connectivity[source]["outgoing"].append(token)
         writer.connectivity[target]["incoming"].append(token)
-    parts = getattr(town.drivable, "geoms", [town.drivable])
+    parts = polygon_parts(town.drivable)
     writer.add("drivable_area", polygon_tokens=[writer.polygon(p) for p in parts])
     for walkway in town.walkways:
         writer.add("walkway", polygon_token=writer.polygon(walkway))
@@ -242,7 +250,7 @@ def write_map(root: Path, town: Town, seed: int) -> str:
     (expansion / f"{town.name}.json").write_text(json.dumps(town_to_map(town, seed)))
     size = round(town.size_m / MASK_RESOLUTION_M)
     mask = np.zeros((size, size), np.uint8)
-    for polygon in getattr(town.drivable, "geoms", [town.drivable]):
+    for polygon in polygon_parts(town.drivable):
         rings = [
             np.array(r.coords) / MASK_RESOLUTION_M for r in (polygon.exterior, *polygon.interiors)
         ]

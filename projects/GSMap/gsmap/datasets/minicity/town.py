@@ -101,11 +101,13 @@ def make_town(name: str, seed: int, num_scenes: int) -> Town:
     Args:
         name: Location name; two names with one seed give unrelated towns.
         seed: Seed of the data set.
-        num_scenes: Scenes that will be driven in it: decides its size.
+        num_scenes: Scenes that will be driven in it: decides its size; 0 gives an empty town.
 
     Returns:
         The town, its polygons valid.
     """
+    if num_scenes == 0:
+        return Town(name, 2 * MARGIN_M, [], [], {}, {})
     side = town_side(num_scenes)
     nodes = make_nodes(side, seed, name)
     roads, meetings = make_roads(nodes, make_chains(nodes, seed, name), seed, name)
