@@ -1,3 +1,4 @@
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from gsmap.checkpoints.convert import (
     read_state,
     upstream_from_ours,
 )
-from gsmap.checkpoints.key_map import MAPTR, MAPTR_BEVFORMER, find_key_map
+from gsmap.checkpoints.key_map import KEY_MAPS, MAPTR, MAPTR_BEVFORMER, find_key_map
 from gsmap.checkpoints.parameters import count_parameters
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
 
@@ -146,3 +147,16 @@ def test_parameters_are_counted_by_module():
     assert counts == {"": (13, 10), "0": (9, 6), "2": (4, 4)}
     with pytest.raises(ValueError, match="depth must be >= 0, got -1"):
         count_parameters(model, -1)
+
+
+def test_every_unused_key_is_documented():
+    text = (REPO / "docs/migration.md").read_text()
+    for key_map in KEY_MAPS:
+        for key, unused in key_map.unused.items():
+            assert key in text or key.endswith(tuple(_suffixes(text))), key
+            assert unused.reason
+
+
+def _suffixes(text):
+    """Return the abbreviated keys of the table's rows, as ``.norm.bias``."""
+    return re.findall(r"`(\.[\w.]+)`", text)
