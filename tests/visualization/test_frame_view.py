@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gsmap.inference.plain_pickle import load_plain_pickle
+from gsmap.datasets.plain_pickle import load_plain_pickle
 from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView, resolve_frame_view
 
 

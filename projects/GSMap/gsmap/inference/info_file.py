@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from gsmap.datasets.annotation_record import CameraRecord, LidarRecord, MapSample
-from gsmap.inference.plain_pickle import load_plain_pickle
+from gsmap.datasets.plain_pickle import load_plain_pickle
 
 
 def read_info_file(
@@ -33,8 +33,9 @@ def read_info_file(
     content = load_plain_pickle(path)
     if not isinstance(content, Mapping) or not isinstance(content.get("data_list"), list):
         raise ValueError(
-            f"{path} is not an info file of mmdet3d's format v2 (no data_list); files of older "
-            "code convert with mmdet3d's tools/dataset_converters/update_infos_to_v2.py."
+            f"{path} is not an info file of mmdet3d's format v2 (no data_list); those of MapTR and "
+            "MapTRv2 convert with tools/convert_infos.py, older ones of mmdet3d with its "
+            "tools/dataset_converters/update_infos_to_v2.py."
         )
     return [
         _sample(info, root, f"{path}, sample {i}", allow_missing_cameras)

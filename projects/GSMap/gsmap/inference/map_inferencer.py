@@ -17,7 +17,7 @@ from mmengine.utils import import_modules_from_strings
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from gsmap.datasets.annotation_file import write_annotations
-from gsmap.datasets.annotation_record import AnnotationMeta, MapSample
+from gsmap.datasets.annotation_record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.evaluation.map_metric import MapMetric
 from gsmap.inference.blank_cameras import BlankCameraDataset
@@ -161,7 +161,7 @@ class MapInferencer:
 
         Args:
             source: An annotation file, an info file of mmdet3d, a folder with one of them, or
-                samples in the LIDAR_TOP frame.
+                samples in the frame of the config.
             data_root: Folder that image paths start from; that of an info file, or else the
                 config's, by default.
             allow_missing_cameras: Whether an info file may name images that do not exist.
@@ -178,9 +178,10 @@ class MapInferencer:
             if path.suffix == ".pkl":
                 data_root = path.parent if data_root is None else data_root
                 samples = read_info_file(path, data_root, allow_missing_cameras)
-                path = self._annotation_file(samples)
+                path = self._annotation_file(samples, "lidar")
         else:
-            path = self._annotation_file(source)
+            frame = self.cfg.test_dataloader.dataset.get("frame") or "lidar"
+            path = self._annotation_file(source, frame)
         options: dict[str, Any] = dict(self.cfg.test_dataloader.dataset)
         options |= {"ann_file": str(path.resolve()), "test_mode": True, "split": None}
         if data_root is not None:
@@ -189,13 +190,17 @@ class MapInferencer:
         self.visualizer.dataset_meta = dataset.metainfo
         return dataset
 
-    def _annotation_file(self, samples: Sequence[MapSample]) -> Path:
+    def _annotation_file(self, samples: Sequence[MapSample], frame: str) -> Path:
         """Write samples to an annotation file that lives as long as the inferencer."""
-        x_min, y_min, _, x_max, y_max, _ = self.cfg.model.map_head.pc_range
+        options = self.cfg.test_dataloader.dataset
+        x_min, y_min, _, x_max, y_max, _ = (
+            options.get("pc_range") or self.cfg.model.map_head.pc_range
+        )
         meta = AnnotationMeta(
             dataset="samples",
-            frame="lidar",
+            frame=frame,
             split="test",
+            classes=tuple(options.get("classes") or CLASSES),
             x_range=(x_min, x_max),
             y_range=(y_min, y_max),
             command="tools/infer.py",
