@@ -11,7 +11,7 @@ from mmengine.structures import InstanceData
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
 from gsmap.checkpoints.key_map import find_key_map
 from gsmap.heads.map_head import MapHead
-from gsmap.layers.bev_encoders.gkt import kernel_offsets
+from gsmap.layers.bev_encoders.gkt import border_pixels, kernel_offsets
 from gsmap.layers.deformable_attention import sum_rows
 
 from .golden import Golden
@@ -64,9 +64,9 @@ def check_kernel_attention(golden: Golden, name: str) -> Iterator[Row]:
     data = golden.read_arrays(name)
     value = torch.from_numpy(data["value"])  # (B, h * w, heads, C)
     batch, num_pixels, heads, _ = value.shape
-    width = int(data["spatial_shapes"][0, 1])
+    height, width = data["spatial_shapes"][0].tolist()
     place = torch.from_numpy(data["loc_xy"])[:, :, :, 0]  # (B, Q, heads, S, 2)
-    pixels = place[..., 1] * width + place[..., 0]
+    pixels = border_pixels(place, (height, width))
     sample = torch.arange(batch).view(-1, 1, 1, 1)
     rows = (sample * num_pixels + pixels) * heads + torch.arange(heads).view(-1, 1)
     weights = torch.from_numpy(data["weights"])[:, :, :, 0]

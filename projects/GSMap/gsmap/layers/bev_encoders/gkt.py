@@ -41,7 +41,12 @@ def kernel_cells(uv: Tensor, offsets: Tensor, shape: tuple[int, int]) -> Tensor:
     """
     height, width = shape
     position = uv * uv.new_tensor([width, height])
-    position = torch.round(position[..., None, :] + offsets.to(uv))
+    return border_pixels(torch.round(position[..., None, :] + offsets.to(uv)), shape)
+
+
+def border_pixels(position: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return row-major indices of pixels (x, y), moved onto the map. (..., 2) -> (...)"""
+    height, width = shape
     cols = position[..., 0].clamp(0, width - 1)
     rows = position[..., 1].clamp(0, height - 1)
     return (rows * width + cols).long()
