@@ -19,6 +19,7 @@ from .measure import MIB, Cost, markdown_table, measure
 SIZES = ((128, 64), (200, 100), (256, 128), (480, 240))
 SCALES_M = ((1.0, 0.4), (0.2, 0.2), (5.0, 5.0))
 POINTS = 20
+RATE_REPEATS = 20
 FLOOR_DENSITY = 1e-6  # pixels where a Gaussian is below need no exponential
 Gaussians = tuple[Tensor, Tensor, Tensor]
 
@@ -90,34 +91,32 @@ def ellipse_pixels(gaussians: Gaussians, grid: BEVGrid) -> int:
     return total
 
 
-def floor_seconds(pixels: float, mask_bytes: int, device: torch.device) -> float:
-    """Return the time that nobody can beat: masks written and read once, two exponentials a pixel.
-
-    The rates are measured here: writing to new memory, reading, and exponentials in the cache.
-    """
+def byte_seconds(device: torch.device) -> float:
+    """Measure the time to write a byte to new memory and to read it again."""
     size = 8 * MIB
-    write = measure(lambda: torch.empty(size, device=device).fill_(0.5), device).time_s(device)
+    write = measure(lambda: torch.empty(size, device=device).fill_(0.5), device, RATE_REPEATS)
     data = torch.ones(size, device=device)
-    read = measure(lambda: data.sum(), device).time_s(device)
-    seconds_per_byte = (write + read) / (4 * size)
-    return mask_bytes * seconds_per_byte + 2 * pixels * exponential_seconds(device)
+    read = measure(lambda: data.sum(), device, RATE_REPEATS)
+    return (write.time_s(device) + read.time_s(device)) / (4 * size)
 
 
 def exponential_seconds(device: torch.device) -> float:
     """Measure the time of one exponential: the kernels' own on the CPU, torch's elsewhere."""
     if device.type != "cpu":
         values = torch.rand(1 << 24, device=device)
-        return measure(lambda: values.exp_(), device).wall_s / values.numel()
+        return measure(lambda: values.exp_(), device, RATE_REPEATS).wall_s / values.numel()
     from ..ops.gaussian_raster.cpu_kernels import fill_exponentials
 
     array = -torch.rand(1 << 12).numpy()
-    return measure(lambda: fill_exponentials(array, 256), device).cpu_s / (256 * len(array))
+    cost = measure(lambda: fill_exponentials(array, 256), device, RATE_REPEATS)
+    return cost.cpu_s / (256 * len(array))
 
 
 def rendering_table(args: argparse.Namespace) -> str:
     """Measure the renderers at every size and scale."""
     device = torch.device(args.device)
     backend = "triton" if device.type == "cuda" else "cpu"
+    per_byte_s, per_exponential_s = byte_seconds(device), exponential_seconds(device)
     rows = []
     for height, width in SIZES:
         grid = BEVGrid((-15, 15), (-30, 30), height, width)
@@ -132,10 +131,15 @@ def rendering_table(args: argparse.Namespace) -> str:
             reference = measure_renderer(few, grid, upstream, "reference", 2).scaled(factor)
             fused = measure_renderer(gaussians, grid, upstream, backend, args.repeats)
             pixels = ellipse_pixels(few, grid) * factor
-            floor_s = floor_seconds(pixels, 4 * upstream.numel(), device)
+            # nobody can beat: masks written and read once, two exponentials per pixel
+            floor_s = 4 * upstream.numel() * per_byte_s + 2 * pixels * per_exponential_s
             name = f"{height} x {width}", " x ".join(f"{s:g}" for s in scales_m)
             rows.append([*name, *rendering_row(reference, fused, floor_s, mapvr, upstream)])
-    return markdown_table(
+    rates = (
+        f"Floor: {per_byte_s * 1e12:.0f} ps per byte of a mask, written and read once, and "
+        f"{per_exponential_s * 1e12:.0f} ps per exponential, measured in this run.\n\n"
+    )
+    return rates + markdown_table(
         (
             "raster",
             "sigma (m)",
