@@ -75,6 +75,27 @@ def test_lidar_sweeps_between_key_frames_are_chained_in_time(nusc: NuScenes) -> 
     ]
 
 
+def test_can_bus_messages_follow_the_ego_poses(nusc: NuScenes, minicity_root: Path) -> None:
+    from nuscenes.can_bus.can_bus_api import NuScenesCanBus
+
+    scene = nusc.scene[0]
+    messages = NuScenesCanBus(dataroot=str(minicity_root)).get_messages(scene["name"], "pose")
+    times = np.array([m["utime"] for m in messages])
+    np.testing.assert_array_equal(np.diff(times), 20_000)
+    first, last = (nusc.get("sample", scene[f"{end}_sample_token"]) for end in ("first", "last"))
+    places = []
+    for sample in (first, last):
+        data = nusc.get("sample_data", sample["data"]["LIDAR_TOP"])
+        pose = nusc.get("ego_pose", data["ego_pose_token"])
+        message = messages[int(np.argmin(np.abs(times - sample["timestamp"])))]
+        np.testing.assert_allclose(message["pos"], pose["translation"], atol=1e-5)
+        np.testing.assert_allclose(message["orientation"], pose["rotation"], atol=1e-5)
+        places.append(pose["translation"])
+    between = [m for m in messages if first["timestamp"] <= m["utime"] <= last["timestamp"]]
+    travelled = np.mean([m["vel"][0] for m in between]) * 0.5
+    assert travelled == pytest.approx(np.linalg.norm(np.subtract(*places)), rel=0.03)
+
+
 def test_annotated_boxes_hold_the_lidar_points_that_they_claim(nusc: NuScenes) -> None:
     from nuscenes.utils.data_classes import LidarPointCloud
     from nuscenes.utils.geometry_utils import points_in_box

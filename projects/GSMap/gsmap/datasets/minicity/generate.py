@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import shutil
+import signal
 import threading
 from collections import defaultdict
 from collections.abc import Iterator
@@ -170,6 +171,7 @@ def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: boo
     for channel in (*(m.channel for m in CAMERAS), "LIDAR_TOP"):
         (root / "samples" / channel).mkdir(parents=True)
     (root / "sweeps" / "LIDAR_TOP").mkdir(parents=True)
+    (root / "can_bus").mkdir()
     tasks = plan_scenes(config)
     towns = {
         name: make_town(name, config.seed, sum(t.location == name for t in tasks))
@@ -234,6 +236,7 @@ _WORKER: dict[str, Any] = {}
 
 def _start_worker(root: Path, config: MiniCityConfig, towns: dict[str, Town]) -> None:
     """Prepare a worker process; it ends as soon as its parent does, even if that is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and ends the pool
     cv2.setNumThreads(1)
     _WORKER.update(root=root, config=config, towns=towns)
     parent = parent_process()

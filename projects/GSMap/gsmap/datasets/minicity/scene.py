@@ -1,5 +1,6 @@
 """One scene of MiniCity: drives it, takes its pictures and sweeps, and writes its records."""
 
+import json
 from collections import defaultdict
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,6 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from gsmap.datasets.minicity.can_bus import pose_messages
 from gsmap.datasets.minicity.config import MiniCityConfig, make_rng, make_token
 from gsmap.datasets.minicity.curves import Array
 from gsmap.datasets.minicity.lidar import footprint_array, scan, vehicle_footprints
@@ -133,6 +135,9 @@ class SceneMaker:
                     self._sweep(k, j, samples)
         self._link_lidar()
         self._link_annotations()
+        messages = pose_messages(self.ego_pose, self.timestamp_us(0.0), self.duration_s)
+        path = self.root / "can_bus" / f"{self.task.name}_pose.json"
+        path.write_text(json.dumps(messages))
         return dict(self.records)
 
     def timestamp_us(self, time_s: float) -> int:
