@@ -18,26 +18,10 @@ from gsmap.layers.deformable_attention import (
     init_matrices,
 )
 
+from .img_metas import stack_matrices
 from .projection import PillarProjection, pillar_points, project_pillars
 
 _NUM_CAN_BUS = 18
-
-
-def stack_matrices(img_metas: Sequence[dict[str, Any]], key: str, device: torch.device) -> Tensor:
-    """Stack a per-camera matrix field of the batch's meta dicts to float32. (B, V, 4, 4)
-
-    Raises:
-        ValueError: If a sample lacks the field.
-    """
-    for meta in img_metas:
-        if key not in meta:
-            raise ValueError(
-                f"sample {meta.get('token')!r} has no {key!r} in its meta info: add it to "
-                "Pack3DDetInputs."
-            )
-    return torch.as_tensor(
-        np.stack([np.asarray(meta[key]) for meta in img_metas]), dtype=torch.float32, device=device
-    )
 
 
 class BEVSelfAttention(DeformableAttention):
@@ -250,5 +234,7 @@ class BEVQueryEncoder(BaseModule):
         # Differs from upstream for batches: it takes the set of seen cells from the first sample
         # for all.
         points = pillar_points(self.grid, self.z_range, self.num_heights, device)
-        matrices = stack_matrices(img_metas, "lidar2img", device)
+        matrices = torch.as_tensor(
+            stack_matrices(img_metas, "lidar2img"), dtype=torch.float32, device=device
+        )
         return project_pillars(points, matrices, img_metas[0]["batch_input_shape"])

@@ -16,21 +16,7 @@ from gsmap.losses.auxiliary import depth_bins, depth_loss, num_depth_bins
 from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
 
 from .depth_net import CameraAwareDepthNet, PlainDepthNet
-
-
-def stack_matrices(img_metas: Sequence[dict[str, Any]], key: str) -> np.ndarray:
-    """Stack one matrix field of the samples' metainfo, in float64. (B, ..., 4, 4)
-
-    Raises:
-        ValueError: If a sample lacks the field.
-    """
-    for meta in img_metas:
-        if key not in meta:
-            raise ValueError(
-                f"sample {meta.get('token')!r} has no {key!r} in its metainfo: "
-                "pack it in the pipeline."
-            )
-    return np.stack([np.asarray(meta[key], dtype=np.float64) for meta in img_metas])
+from .img_metas import stack_matrices
 
 
 @MODELS.register_module()
