@@ -25,6 +25,7 @@ _WIDTH = 1500  # px at DPI, for which everything is laid out
 VECTOR_SUFFIXES = (".pdf", ".svg")
 RASTER_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _MARGIN, _GAP, _HEADER, _TICKS, _TITLE = 26, 6, 52, 38, 34  # px at DPI
+_LONGEST_TITLE = 66  # characters beside the legend of three classes
 _TALLEST = 0.5  # of a camera row or a BEV panel, as a share of the figure's width
 
 
@@ -140,6 +141,8 @@ def _add_axes(figure: Figure, box: _Box) -> Axes:
 def _draw_header(figure: Figure, title: str, style: MapStyle) -> None:
     """Write the title on the left and the legend of classes on the right."""
     width, height = figure.get_size_inches() * DPI
+    if len(title) > _LONGEST_TITLE:
+        title = title[: _LONGEST_TITLE - 1] + "\N{HORIZONTAL ELLIPSIS}"
     figure.text(
         _MARGIN / width, 1 - _HEADER / 2 / height, title, fontsize=9, color=style.ink, va="center"
     )

@@ -74,6 +74,13 @@ def render_masks(elements: MapElements, grid: BEVGrid) -> np.ndarray:
         return render_gaussians(means, scales, rotations, grid).numpy()
 
 
+def _title(scene: str | None, token: str | None) -> str:
+    """Join scene and token; a token that begins with the scene's name stands alone."""
+    if scene and token and token.startswith(scene):
+        scene = None
+    return "  \N{MIDDLE DOT}  ".join(str(part) for part in (scene, token) if part)
+
+
 def _note(data_sample: Any, score_thr: float) -> str:
     """Say why there is no prediction to draw."""
     everything = predicted_elements(data_sample)
@@ -276,9 +283,7 @@ class MapVisualizer(Visualizer):
         found = predicted_elements(data_sample, threshold, self.max_num) if draw_pred else None
         first, second = (found, truth) if self.camera_source == "prediction" else (truth, found)
         if title is None:
-            title = "  \N{MIDDLE DOT}  ".join(
-                str(meta[key]) for key in ("scene", "token") if meta.get(key)
-            )
+            title = _title(meta.get("scene"), meta.get("token"))
         return compose_figure(
             self.cameras(meta, images),
             self._bev_panels(truth, found, points, _note(data_sample, threshold)),
