@@ -149,6 +149,8 @@ def test_half_precision_inputs_are_rendered_in_float32():
     expected = render_gaussians(*(value.float() for value in gaussians), ODD_GRID, "cpu")
     assert masks.dtype == torch.float32
     assert torch.equal(masks, expected)
+    mixed = gaussians[0].float(), gaussians[1], gaussians[2]
+    assert torch.equal(render_gaussians(*mixed, ODD_GRID, "cpu"), expected)
 
 
 def test_compiled_model_keeps_values_and_gradients():
@@ -304,7 +306,7 @@ def test_auto_renders_float64_in_float64():
         ({"means": torch.zeros(5, 3)}, r"means must have shape \(\.\.\., P, 2\)"),
         ({"scales": torch.ones(4, 2)}, r"scales must have shape \(5, 2\)"),
         ({"rotations": torch.ones(5, 1)}, r"rotations must have shape \(5,\)"),
-        ({"rotations": torch.zeros(5).double()}, "rotations must be torch.float32"),
+        ({"rotations": torch.zeros(5, device="meta")}, "rotations must be on cpu"),
     ],
 )
 def test_bad_arguments_are_named(change, match):
@@ -319,9 +321,9 @@ def test_bad_arguments_are_named(change, match):
 
 
 def test_backends_refuse_what_they_cannot_compute():
-    with pytest.raises(TypeError, match="floating point"):
+    with pytest.raises(TypeError, match="scales must be floating point"):
         render_gaussians(
-            torch.zeros(5, 2).long(), torch.ones(5, 2).long(), torch.zeros(5).long(), ODD_GRID
+            torch.zeros(5, 2), torch.ones(5, 2, dtype=torch.long), torch.zeros(5), ODD_GRID
         )
     double = [value.double() for value in random_gaussians(1, 2, 1, 2)]
     with pytest.raises(ValueError, match="computes in float32"):

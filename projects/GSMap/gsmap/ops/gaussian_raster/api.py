@@ -23,7 +23,8 @@ def render_gaussians(
     r"""Render each map element's 2D Gaussians to a soft occupancy raster.
 
     A pixel :math:`p` takes :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6), with :math:`G_i` from
-    Eq. 2. Half-precision inputs are computed in float32, also under autocast.
+    Eq. 2. Inputs of several types are computed in the widest, and at least in float32, also under
+    autocast.
 
     Args:
         means: Centres (x, y) in metres, in the frame of ``grid``. (..., P, 2)
@@ -38,10 +39,12 @@ def render_gaussians(
 
     Raises:
         TypeError: If an input is not floating point.
-        ValueError: If the shapes, types or devices disagree, or ``backend`` does not serve.
+        ValueError: If the shapes or devices disagree, or ``backend`` does not serve.
     """
     _check(means, scales, rotations)
-    dtype = torch.promote_types(means.dtype, torch.float32)
+    dtype = torch.float32
+    for tensor in (means, scales, rotations):
+        dtype = torch.promote_types(dtype, tensor.dtype)
     means, scales, rotations = means.to(dtype), scales.to(dtype), rotations.to(dtype)
     with torch.autocast(means.device.type, enabled=False):
         render = RENDERERS[choose_backend(backend, means)]
@@ -60,10 +63,8 @@ def _check(means: Tensor, scales: Tensor, rotations: Tensor) -> None:
             raise ValueError(
                 f"{name} must have shape {tuple(shape)} to match means, got {tuple(tensor.shape)}."
             )
-        if tensor.dtype != means.dtype or tensor.device != means.device:
-            raise ValueError(
-                f"{name} must be {means.dtype} on {means.device} like means, "
-                f"got {tensor.dtype} on {tensor.device}."
-            )
-    if not means.dtype.is_floating_point:
-        raise TypeError(f"means must be floating point, got {means.dtype}.")
+        if tensor.device != means.device:
+            raise ValueError(f"{name} must be on {means.device} like means, got {tensor.device}.")
+    for name, tensor in (("means", means), ("scales", scales), ("rotations", rotations)):
+        if not tensor.dtype.is_floating_point:
+            raise TypeError(f"{name} must be floating point, got {tensor.dtype}.")
