@@ -213,7 +213,7 @@ def match_chamfer(
         labels=predictions.labels[rows],
         scores=predictions.scores[rows],
         matched_gt=matched,
-        quality=np.where(matched[:, -1] >= 0, distance, np.nan),
+        quality=np.where((matched >= 0).any(axis=1), distance, np.nan),
         num_gts=np.bincount(known_gts, minlength=num_classes),
     )
 

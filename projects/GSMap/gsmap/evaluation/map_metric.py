@@ -48,7 +48,7 @@ class MapMetric(BaseMetric):
         ValueError: If a metric is unknown, there is nothing to do, or ``pc_range`` is malformed.
     """
 
-    default_prefix = None
+    default_prefix = ""  # the keys carry the name of the metric already
 
     def __init__(
         self,

@@ -21,8 +21,8 @@ class FrameMatches:
         labels: Class index. (N,)
         scores: Confidence. (N,)
         matched_gt: Position of the matched ground truth among those given, or -1. (N, T)
-        quality: Chamfer distance in metres, or IoU, of the match at the loosest threshold; NaN
-            without one. (N,)
+        quality: Chamfer distance in metres of the match (NaN without one at any threshold), or IoU
+            of the match at the loosest threshold (NaN without one). (N,)
         num_gts: Number of ground truths of each class. (C,)
         areas: Pixels in the intersection and in the union of all predictions and all ground truths
             of each class; only AP_raster fills it. (C, 2)

@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+
+from gsmap.evaluation.chamfer_ap import (
+    ChamferConfig,
+    chamfer_distance,
+    chamfer_report,
+    match_chamfer,
+    nearest_by_chamfer,
+    resample_polylines,
+)
+from gsmap.evaluation.elements import map_elements
+
+CONFIG = ChamferConfig(("divider", "boundary"))
+
+
+def upright(x: float, low: float = -20.0, high: float = 20.0) -> list[list[float]]:
+    return [[x, low], [x, high]]
+
+
+def test_resampling_walks_equal_arc_lengths_round_a_corner():
+    """Six points on an L of length 3 + 2: one metre apart.
+
+    .. code-block:: text
+
+        o-o-o      (0,3) (1,3) (2,3)
+        |
+        o          (0,2)
+        o          (0,1)
+        o          (0,0)
+    """
+    elements = map_elements([[[0, 0], [0, 3], [2, 3]]], [0])
+    want = [[0, 0], [0, 1], [0, 2], [0, 3], [1, 3], [2, 3]]
+    np.testing.assert_allclose(resample_polylines(elements, 6)[0], want, atol=1e-12)
+
+
+def test_resampling_of_repeated_points_zero_length_and_no_points():
+    elements = map_elements([[[0, 0], [0, 0], [4, 0], [4, 0]], [[1, 2], [1, 2]], []], [0, 0, 0])
+    points = resample_polylines(elements, 3)
+    assert points.tolist() == [[[0, 0], [2, 0], [4, 0]], [[1, 2]] * 3, [[0, 0]] * 3]
+
+
+def test_chamfer_distance_is_the_mean_of_both_directions():
+    """From {0} to {0, 3}: 0; back: (0 + 3) / 2; mean 0.75."""
+    first, second = np.array([[0.0, 0.0]]), np.array([[0.0, 0.0], [3.0, 0.0]])
+    assert chamfer_distance(first, second) == 0.75
+    assert chamfer_distance(second, first) == 0.75
+    with pytest.raises(ValueError, match="n >= 1"):
+        chamfer_distance(first, np.empty((0, 2)))
+
+
+def test_hand_worked_ap():
+    """Two ground truths G, three predictions; only their distance to the nearest G counts.
+
+    .. code-block:: text
+
+        x:  0.0  0.3                 8.0      8.7     14
+            G    A (0.9)             G        B (0.8) C (0.7)
+
+        at 0.5 m:  A hits, B and C miss    precision 1, 1/2, 1/3   recall 1/2, 1/2, 1/2
+                   AP = 1/2 * 1
+        at 1.0 m:  A and B hit             precision 1, 1, 2/3     recall 1/2, 1, 1
+                   AP = 1
+        boundary has no ground truth and counts as 0 in the mean over classes.
+    """
+    gt = map_elements([upright(0.0), upright(8.0)], [0, 0])
+    pred = map_elements([upright(14.0), upright(0.3), upright(8.7)], [0] * 3, [0.7, 0.9, 0.8])
+    matches = match_chamfer(pred, gt, CONFIG, "a")
+    assert matches.pred_index.tolist() == [1, 2, 0]
+    assert matches.matched_gt.tolist() == [[0, 0, 0], [-1, 1, 1], [-1, -1, -1]]
+    metrics = chamfer_report([matches], CONFIG).metrics
+    assert metrics["chamfer/divider/AP@0.5"] == 0.5
+    assert metrics["chamfer/divider/AP@1.0"] == 1.0
+    assert metrics["chamfer/divider/recall@0.5"] == 0.5
+    assert metrics["chamfer/divider/AP"] == pytest.approx(2.5 / 3)
+    assert metrics["chamfer/AP@0.5"] == 0.5  # the mean over the classes that have ground truth
+    assert metrics["chamfer/mAP"] == pytest.approx(2.5 / 6)
+    assert metrics["chamfer/divider/error_m@1.5"] == pytest.approx(0.5)  # of 0.3 and 0.7
+    assert metrics["chamfer/boundary/error_m@1.5"] == -1.0
+
+
+def test_precision_envelope_lifts_an_early_miss():
+    """Miss (0.9), hit (0.8), hit (0.7) of two: precision 0, 1/2, 2/3, envelope 2/3 throughout.
+
+    AP = 1/2 * 2/3 + 1/2 * 2/3.
+    """
+    gt = map_elements([upright(0.0), upright(8.0)], [0, 0])
+    pred = map_elements([upright(4.0), upright(0.0), upright(8.0)], [0] * 3, [0.9, 0.8, 0.7])
+    metrics = chamfer_report([match_chamfer(pred, gt, CONFIG)], CONFIG).metrics
+    assert metrics["chamfer/divider/AP@0.5"] == pytest.approx(2 / 3)
+
+
+def test_no_second_choice():
+    """Both predictions are nearest to the left line; the second does not get the right one."""
+    gt = map_elements([upright(0.0), upright(1.0)], [0, 0])
+    pred = map_elements([upright(0.1), upright(0.2)], [0, 0], [0.9, 0.8])
+    assert match_chamfer(pred, gt, CONFIG).matched_gt[:, 2].tolist() == [0, -1]
+
+
+def test_threshold_is_inclusive_and_classes_do_not_mix():
+    gt = map_elements([upright(0.0), upright(0.5)], [0, 1])
+    pred = map_elements([upright(0.5)], [0], [0.9])
+    assert match_chamfer(pred, gt, CONFIG).matched_gt.tolist() == [[0, 0, 0]]
+
+
+def test_error_of_a_match_that_exists_at_the_tight_threshold_only():
+    """At 1.5 m the first prediction (1.2 m) takes the line; at 0.5 m the second one (0.1 m) has it."""
+    gt = map_elements([upright(0.0)], [0])
+    pred = map_elements([upright(1.2), upright(0.1)], [0, 0], [0.9, 0.8])
+    matches = match_chamfer(pred, gt, CONFIG)
+    assert matches.matched_gt.tolist() == [[-1, -1, 0], [0, 0, -1]]
+    metrics = chamfer_report([matches], CONFIG).metrics
+    assert metrics["chamfer/divider/error_m@0.5"] == pytest.approx(0.1)
+    assert metrics["chamfer/divider/error_m@1.5"] == pytest.approx(1.2)
+
+
+def test_unknown_classes_and_short_lines():
+    """Label 7 is nobody's; a prediction of one point is dropped, such a ground truth counts."""
+    gt = map_elements([upright(0.0), [[1, 1]], upright(3.0)], [0, 0, 7])
+    pred = map_elements([[[0, 0]], upright(0.0), upright(3.0)], [0, 0, 7], [0.9, 0.8, 0.7])
+    matches = match_chamfer(pred, gt, CONFIG)
+    assert matches.pred_index.tolist() == [1]
+    assert matches.num_gts.tolist() == [2, 0]
+
+
+def test_equal_scores_keep_their_order():
+    """At 0.5 m the first of two equal scores misses: precision 0, 1/2."""
+    gt = map_elements([upright(0.0)], [0])
+    pred = map_elements([upright(0.9), upright(0.1)], [0, 0], [0.5, 0.5])
+    metrics = chamfer_report([match_chamfer(pred, gt, CONFIG)], CONFIG).metrics
+    assert metrics["chamfer/divider/AP@0.5"] == 0.5
+    assert metrics["chamfer/divider/AP@1.0"] == 1.0  # the first takes the line, the second misses
+
+
+def test_branch_and_bound_finds_what_brute_force_finds():
+    rng = np.random.default_rng(3)
+    walks = np.cumsum(rng.normal(size=(40, 12, 2)), axis=1) + rng.uniform(-15, 15, (40, 1, 2))
+    pred, gt = map_elements(list(walks[:20]), [0] * 20), map_elements(list(walks[20:]), [0] * 20)
+    best, distance = nearest_by_chamfer(pred, gt, CONFIG, max_distance=6.0)
+    p, g = resample_polylines(pred, 100), resample_polylines(gt, 100)
+    for i in range(20):
+        nn = np.linalg.norm(p[i][:, None] - g[:, None, :, :], axis=-1)  # (K, 100, 100)
+        brute = (nn.min(2).mean(1) + nn.min(1).mean(1)) / 2
+        if brute.min() <= 6.0 and best[i] >= 0:
+            assert best[i] == brute.argmin()
+            assert distance[i] == pytest.approx(brute.min(), abs=1e-12)
+    assert (best >= 0).sum() >= 5  # so that the comparison says something
+
+
+def test_bad_configuration_is_refused():
+    with pytest.raises(ValueError, match="must not be empty"):
+        ChamferConfig(())
+    with pytest.raises(ValueError, match="> 0 m"):
+        ChamferConfig(("divider",), (0.0, 1.0))
+    with pytest.raises(ValueError, match="num_points"):
+        ChamferConfig(("divider",), num_points=1)
