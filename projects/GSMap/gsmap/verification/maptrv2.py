@@ -23,7 +23,7 @@ from .registry import check
 from .report import Row, fraction_beyond, largest_difference, largest_relative
 from .targets import X_RANGE_M, Y_RANGE_M, gt_instances
 
-CONFIG = "_base_/models/maptrv2_r50.py"
+CONFIG = "maptrv2/maptrv2_r50_24e.py"
 STATE = "maptrv2_r50_state.json"
 STRIDE = 32
 CLS_ATOL, PTS_ATOL = 2e-3, 3e-4
