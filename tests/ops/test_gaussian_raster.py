@@ -1,5 +1,6 @@
 import math
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from gaussian_cases import (
     render_with_gradients,
 )
 
+from gsmap.benchmarks.measure import measure
 from gsmap.geometry.bev_grid import BEVGrid
 from gsmap.ops import backends, gaussian_raster
 from gsmap.ops.gaussian_raster import render_gaussians
@@ -111,6 +113,20 @@ def test_runs_and_thread_counts_give_the_same_bits():
     torch.set_num_threads(threads)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.skipif(platform.system() != "Linux", reason="peak memory is read from /proc")
+@pytest.mark.parametrize("count", [1, 64])
+def test_memory_is_that_of_the_masks_whatever_the_number_of_gaussians(count):
+    grid = BEVGrid((-15, 15), (-30, 30), 200, 100)
+    leaves = [value.requires_grad_() for value in random_gaussians(400, count, 0.2, 1, grid)]
+    upstream = torch.ones(400, 200, 100)
+
+    def call():
+        return torch.autograd.grad(render_gaussians(*leaves, grid, "cpu"), leaves, upstream)
+
+    # beside the masks (31 MiB): parameters in float64 and a mask per thread
+    assert measure(call, torch.device("cpu"), 1).peak_bytes < 1.5 * 4 * upstream.numel()
 
 
 def test_second_backward_pass_gives_the_same_gradient():
