@@ -48,15 +48,15 @@ CASES = {
 }
 
 
-def render_with_gradients(gaussians, grid, backend, upstream):
+def render_with_gradients(gaussians, grid, backend, upstream, device="cpu"):
     """Return the masks and the gradients of ``sum(masks * upstream)`` in all three inputs."""
-    leaves = [value.clone().requires_grad_() for value in gaussians]
+    leaves = [value.to(device, copy=True).requires_grad_() for value in gaussians]
     masks = render_gaussians(*leaves, grid, backend=backend)
-    masks.backward(upstream.to(masks.dtype))
-    return masks.detach(), [leaf.grad for leaf in leaves]
+    masks.backward(upstream.to(masks))
+    return masks.detach().cpu(), [leaf.grad.cpu() for leaf in leaves]
 
 
-def compare_with_reference(case, backend):
+def compare_with_reference(case, backend, device="cpu"):
     """Assert that a backend gives the masks and gradients of the float64 reference.
 
     A product of P factors in float32 errs by about P eps (64 * 6e-8), so atol is 1e-5; gradients
@@ -66,7 +66,7 @@ def compare_with_reference(case, backend):
     upstream = torch.randn(
         len(gaussians[0]), grid.height, grid.width, generator=torch.Generator().manual_seed(1)
     )
-    masks, grads = render_with_gradients(gaussians, grid, backend, upstream)
+    masks, grads = render_with_gradients(gaussians, grid, backend, upstream, device)
     exact = [value.double() for value in gaussians]
     true_masks, true_grads = render_with_gradients(exact, grid, "reference", upstream)
     torch.testing.assert_close(masks, true_masks.float(), atol=1e-5, rtol=0)

@@ -17,10 +17,14 @@ from gaussian_cases import (
 
 from gsmap.benchmarks.measure import measure
 from gsmap.geometry.bev_grid import BEVGrid
+from gsmap.losses.raster import raster_loss
 from gsmap.ops import backends, gaussian_raster
 from gsmap.ops.gaussian_raster import render_gaussians
+from gsmap.ops.polyline_raster import draw_polylines
+from gsmap.ops.soft_iou import pairwise_soft_iou
 
 BACKENDS = ["reference", "cpu"]
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
 
 def unit_grid(height, width):
@@ -242,6 +246,26 @@ def test_triton_kernels_equal_the_float64_reference_in_the_interpreter(cases):
         check=False,
     )
     assert result.returncode == 0, result.stderr
+
+
+@needs_gpu
+@pytest.mark.parametrize("case", CASES)
+def test_triton_backend_equals_float64_reference_on_a_gpu(case):
+    compare_with_reference(case, "triton", "cuda")
+
+
+@needs_gpu
+def test_nothing_waits_for_a_gpu():
+    leaves = [value.cuda().requires_grad_() for value in random_gaussians(2, 5, 0.5, 3)]
+    render_gaussians(*leaves, ODD_GRID).sum().backward()  # compiles
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        masks = render_gaussians(*leaves, ODD_GRID)
+        targets = draw_polylines(leaves[0].detach(), ODD_GRID)
+        pairwise_soft_iou(masks.detach(), targets)
+        raster_loss(masks, targets).sum().backward()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
 
 
 def test_triton_kernels_compile_for_a_gpu():
