@@ -8,6 +8,7 @@ command)``, imported only when it is asked for.
 import argparse
 import importlib
 import shlex
+import signal
 import sys
 
 COMMANDS = {
@@ -22,7 +23,13 @@ COMMANDS = {
 }
 
 
+def stop(number: int, _frame: object) -> None:
+    """Leave through the clean-up of half-written files, as Ctrl-C does."""
+    sys.exit(128 + number)
+
+
 def main() -> None:
+    signal.signal(signal.SIGTERM, stop)
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -13,6 +13,7 @@ import pytest
 import shapely
 
 from gsmap.datasets.annotation_file import AnnotationFile
+from gsmap.datasets.converters import nuscenes
 from gsmap.datasets.converters.export import export_json
 from gsmap.datasets.converters.nuscenes import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.converters.nuscenes_map import MapLayers, NuScenesLocalMap
@@ -121,7 +122,10 @@ def apart(a: shapely.LineString, b: shapely.LineString) -> float:
     )
 
 
-def test_vectors_equal_the_reference(reference_root: Path, golden_dir: Path, tmp_path: Path):
+def test_vectors_equal_the_reference(
+    reference_root: Path, golden_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(nuscenes, "_FRAMES_PER_WORKER", 1)
     options = NuScenesOptions(reference_root, "v1.0-mini", out_dir=tmp_path, workers=2)
     summary = convert_nuscenes(options)
     assert dict(summary.samples) == {"mini_train": 32, "mini_val": 32}

@@ -39,7 +39,7 @@ _OFFICIAL_SPLITS = {
     "v1.0-mini": ("mini_train", "mini_val"),
     "v1.0-test": ("test",),
 }
-_LIST_EVERY_FILE_UP_TO = 5
+_FRAMES_PER_WORKER = 500  # a process takes about as long to start as these take
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,8 @@ class _Conversion:
                 yield np.array([s.global_from_frame for s in waiting[-1]]).reshape(-1, 4, 4)
 
         arguments = (self.layers(location), options.classes, options.x_range, options.y_range)
-        workers = min(options.workers, len(scenes))
+        frames = sum(scene["nbr_samples"] for scene in scenes)
+        workers = max(1, min(options.workers, len(scenes), frames // _FRAMES_PER_WORKER))
         for results in ordered_map(_instances_of, poses(), workers, _prepare, arguments):
             yield waiting.pop(0), results
 

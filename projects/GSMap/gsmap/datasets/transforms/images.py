@@ -6,7 +6,6 @@ from typing import Any
 import mmcv
 import numpy as np
 from mmcv.transforms import BaseTransform
-from mmdet3d.datasets.transforms import LoadMultiViewImageFromFiles
 from mmdet3d.registry import TRANSFORMS
 
 from gsmap.datasets.errors import BrokenSampleError
@@ -39,53 +38,82 @@ def check_image_file(path: str, where: str) -> None:
         raise BrokenSampleError(f"{where}: {path} is truncated ({size} bytes); copy it again.")
 
 
-@TRANSFORMS.register_module()
-class LoadCameraImages(LoadMultiViewImageFromFiles):
-    """Load the images of all cameras as mmdet3d does, naming sample and file when one is damaged.
+def read_image(path: str, where: str, color_type: str = "color") -> np.ndarray:
+    """Read an image file and make sure that it is whole.
 
-    Images of different size are padded at the bottom and right to the largest. Adds ``lidar2img``,
-    ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``.
+    Args:
+        path: The file.
+        where: Sample and camera, for the message.
+        color_type: As in ``mmcv.imfrombytes``.
+
+    Returns:
+        The image, BGR unless ``color_type`` says otherwise. (H, W, 3)
+
+    Raises:
+        BrokenSampleError: If it is missing, truncated or no image.
+    """
+    check_image_file(path, where)
+    content = Path(path).read_bytes()
+    image = mmcv.imfrombytes(content, flag=color_type)
+    if image is None:
+        raise BrokenSampleError(
+            f"{where}: {path} is not an image that OpenCV can decode; copy it again."
+        )
+    return image
+
+
+@TRANSFORMS.register_module()
+class LoadCameraImages(BaseTransform):
+    """Load the images of all cameras, naming sample and file when one is damaged.
+
+    Adds the keys of mmdet3d's ``LoadMultiViewImageFromFiles`` that others read, and ``lidar2img``,
+    ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. Images of different size are padded at
+    the bottom and right to the largest. mmdet3d's transform stacks the images along a last axis and
+    takes strided views of that: copies that cost as much as decoding, and would make each later
+    step slower.
 
     Args:
         to_float32: Whether to convert to float32 before anything else.
         color_type: As in ``mmcv.imfrombytes``.
-        backend_args: As in mmdet3d.
     """
 
-    def __init__(
-        self, to_float32: bool = True, color_type: str = "color", backend_args: dict | None = None
-    ) -> None:
-        super().__init__(to_float32, color_type, backend_args)
+    def __init__(self, to_float32: bool = True, color_type: str = "color") -> None:
+        self.to_float32 = to_float32
+        self.color_type = color_type
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Load ``results['images']``."""
-        for name, camera in results["images"].items():
-            where = f"sample {results['token']!r}, camera {name}"
-            check_image_file(camera["img_path"], where)
-        try:
-            results = super().transform(results)
-        except (AttributeError, ValueError, OSError) as error:
-            raise BrokenSampleError(self._undecodable(results)) from error
-        results["img_path"] = results["filename"]
-        results["img_aug_matrix"] = [np.eye(4) for _ in results["img"]]
+        """Load ``results['images']``.
+
+        Raises:
+            BrokenSampleError: If an image is missing or damaged.
+        """
+        cameras = results["images"]
+        images = [
+            read_image(
+                camera["img_path"], f"sample {results['token']!r}, camera {name}", self.color_type
+            )
+            for name, camera in cameras.items()
+        ]
+        height = max(image.shape[0] for image in images)
+        width = max(image.shape[1] for image in images)
+        results["img"] = [self._prepared(image, (height, width)) for image in images]
+        results["img_shape"] = results["ori_shape"] = results["pad_shape"] = (height, width)
+        results["num_views"] = len(images)
+        results["img_path"] = [camera["img_path"] for camera in cameras.values()]
+        results["cam2img"] = [camera["cam2img"] for camera in cameras.values()]
+        results["lidar2cam"] = [camera["lidar2cam"] for camera in cameras.values()]
+        results["img_aug_matrix"] = [np.eye(4) for _ in images]
         results["lidar2img"] = [
             cam2img @ lidar2cam
             for cam2img, lidar2cam in zip(results["cam2img"], results["lidar2cam"], strict=True)
         ]
         return results
 
-    def _undecodable(self, results: dict[str, Any]) -> str:
-        """Say which image cannot be decoded."""
-        for name, camera in results["images"].items():
-            if mmcv.imread(camera["img_path"], flag=self.color_type) is None:
-                return (
-                    f"sample {results['token']!r}, camera {name}: {camera['img_path']} is not an "
-                    f"image that OpenCV can decode; copy it again."
-                )
-        return (
-            f"sample {results['token']!r}: its images do not fit together; do all of them have the "
-            f"same number of channels?"
-        )
+    def _prepared(self, image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Pad an image to the common size and convert it. (H, W, 3)."""
+        if image.shape[:2] != size:
+            image = mmcv.impad(image, shape=size, pad_val=0)
+        return image.astype(np.float32) if self.to_float32 else image
 
 
 @TRANSFORMS.register_module()
