@@ -8,7 +8,7 @@ from mmengine.structures import InstanceData
 
 from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
 from gsmap.visualization.map_visualization_hook import picture_name
-from gsmap.visualization.map_visualizer import images_from_inputs, read_image
+from gsmap.visualization.map_visualizer import images_from_inputs
 
 CLASSES = ("divider", "ped_crossing", "boundary")
 
@@ -191,13 +191,24 @@ def test_bad_arguments(tmp_path):
 
 
 def test_missing_and_truncated_images_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"a: no image at .*gone.jpg"):
-        read_image(tmp_path / "gone.jpg", "a")
-    whole = cv2.imencode(".jpg", np.zeros((90, 160, 3), np.uint8))[1].tobytes()
-    for content, message in ((whole[:-20], "is truncated"), (b"x\xff\xd9", "is not an image")):
-        (tmp_path / "broken.jpg").write_bytes(content)
-        with pytest.raises(ValueError, match=rf"broken.jpg {message}"):
-            read_image(tmp_path / "broken.jpg")
+    visualizer = make_visualizer("broken")
+    meta = make_sample(tmp_path).metainfo
+    second = tmp_path / "camera1.jpg"
+    second.write_bytes(second.read_bytes()[:-20])
+    with pytest.raises(ValueError, match=r"'scene/1': .*camera1.jpg is truncated"):
+        visualizer.cameras(meta)
+    second.unlink()
+    with pytest.raises(ValueError, match=r"'scene/1': no image at .*camera1.jpg"):
+        visualizer.cameras(meta)
+
+
+def test_colours_of_files_are_kept(tmp_path):
+    sample = make_sample(tmp_path, cameras=1)
+    red = np.zeros((90, 160, 3), np.uint8)
+    red[..., 2] = 200  # BGR
+    cv2.imwrite(sample.metainfo["img_path"][0], red)
+    (view,) = make_visualizer("colours").cameras(sample.metainfo)
+    assert np.abs(view.image.mean((0, 1)) - [200, 0, 0]).max() < 5  # JPEG is lossy
 
 
 def test_inputs_turn_back_into_pictures():

@@ -12,8 +12,7 @@ from mmdet3d.registry import VISUALIZERS
 from mmengine.dist import master_only
 from mmengine.visualization import Visualizer
 
-from gsmap.datasets.errors import BrokenSampleError
-from gsmap.datasets.transforms.images import check_image_file
+from gsmap.datasets.transforms.images import read_image
 from gsmap.geometry import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
@@ -23,26 +22,6 @@ from gsmap.visualization.map_elements import MapElements, ground_truth_elements,
 from gsmap.visualization.style import MapStyle
 
 PANELS = ("ground_truth", "prediction", "gaussians", "rasters")
-
-
-def read_image(path: str | Path, where: str = "picture") -> np.ndarray:
-    """Read an image file.
-
-    Args:
-        path: The file.
-        where: What it belongs to, for messages.
-
-    Returns:
-        RGB (h, w, 3) uint8.
-
-    Raises:
-        BrokenSampleError: If it is missing, truncated or no image.
-    """
-    check_image_file(str(path), where)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise BrokenSampleError(f"{where}: {path} is not an image; copy it again.")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
@@ -197,7 +176,8 @@ class MapVisualizer(Visualizer):
             One view per camera.
 
         Raises:
-            ValueError: If the numbers of images and projections disagree.
+            ValueError: If the numbers of images and projections disagree, or a file is missing or
+                damaged.
         """
         paths = metainfo.get("img_path")
         if images is None and paths is None:
@@ -210,7 +190,8 @@ class MapVisualizer(Visualizer):
                 unscaled = np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64))
                 projections = unscaled @ projections
             there = [i for i, path in enumerate(paths) if path is not None]  # type: ignore[arg-type]
-            images = [read_image(paths[i], where) for i in there]  # type: ignore[index]
+            found = [read_image(paths[i], where) for i in there]  # type: ignore[index]
+            images = [cv2.cvtColor(image, cv2.COLOR_BGR2RGB) for image in found]
             names, projections = [names[i] for i in there], projections[there]
         if len(images) != len(projections):
             raise ValueError(
