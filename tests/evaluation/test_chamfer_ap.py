@@ -104,7 +104,7 @@ def test_threshold_is_inclusive_and_classes_do_not_mix():
 
 
 def test_error_of_a_match_that_exists_at_the_tight_threshold_only():
-    """At 1.5 m the first prediction (1.2 m) takes the line; at 0.5 m the second one (0.1 m) has it."""
+    """At 1.5 m the first prediction, 1.2 m away, has the line; at 0.5 m the second, 0.1 m away."""
     gt = map_elements([upright(0.0)], [0])
     pred = map_elements([upright(1.2), upright(0.1)], [0, 0], [0.9, 0.8])
     matches = match_chamfer(pred, gt, CONFIG)

@@ -69,8 +69,10 @@ def _flatten(polylines: Sequence[Any]) -> tuple[FloatArray, list[int]]:
     dims = set(map(len, rows))
     if not dims:
         return np.empty((0, 2)), counts
-    if len(dims) > 1 or not dims <= {2, 3}:
+    if not dims <= {2, 3}:
         raise ValueError(f"points have {sorted(dims)} coordinates")
+    if len(dims) > 1:
+        rows, dims = [row[:2] for row in rows], {2}
     flat = array("d", chain.from_iterable(rows))  # twice as fast as np.array on nested lists
     return np.frombuffer(flat).reshape(len(rows), dims.pop())[:, :2], counts
 

@@ -1,0 +1,266 @@
+"""Result files: reading, pairing by token, the command line, the worker pool."""
+
+import importlib.util
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from golden_data import CLASSES, CONFIG
+
+from gsmap.datasets.annotation_file import (
+    AnnotationMeta,
+    MapInstance,
+    MapSample,
+    write_annotations,
+)
+from gsmap.evaluation.elements import map_elements
+from gsmap.evaluation.file_evaluation import ArrowElements, JsonElements, evaluate_files
+from gsmap.evaluation.json_index import JsonSamples
+from gsmap.evaluation.results_json import (
+    elements_from_vectors,
+    gaussian_extras,
+    vectors_of,
+    write_results,
+)
+from gsmap.evaluation.worker_pool import map_unordered
+
+REPO = Path(__file__).resolve().parents[2]
+LABELS = {name: i for i, name in enumerate(CLASSES)}
+LINE, RING = [[0.0, -20.0], [0.0, 20.0]], [[2.0, 2.0], [6.0, 2.0], [6.0, 8.0], [2.0, 2.0]]
+
+
+def vector(points: list, name: str, score: float | None = None) -> dict:
+    found = {"pts": points, "pts_num": len(points), "cls_name": name, "type": LABELS.get(name, 9)}
+    return found if score is None else {**found, "confidence_level": score}
+
+
+def truth_of(count: int) -> list[tuple[str, list[dict]]]:
+    return [
+        (f"t{i}", [vector(LINE, "divider"), vector(RING, "ped_crossing")]) for i in range(count)
+    ]
+
+
+def results_of(count: int) -> list[tuple[str, list[dict]]]:
+    """The line is found everywhere, the ring in every second sample."""
+    return [
+        (f"t{i}", [vector(LINE, "divider", 0.9)] + [vector(RING, "ped_crossing", 0.8)] * (i % 2))
+        for i in range(count)
+    ]
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    results, truth = tmp_path / "results.json", tmp_path / "truth.json"
+    write_results(results, reversed(results_of(8)), {"use_camera": True})
+    write_results(truth, truth_of(8), key="GTs")
+    return results, truth
+
+
+def command():
+    spec = importlib.util.spec_from_file_location("evaluate_tool", REPO / "tools/evaluate.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.main
+
+
+def test_command_writes_flat_figures_of_samples_paired_by_token(files, tmp_path, capsys):
+    out, curves = tmp_path / "metrics.json", tmp_path / "curves.png"
+    arguments = [*map(str, files), "--out", str(out), "--pr-curves", str(curves)]
+    assert command()([*arguments, "--eval", "chamfer", "raster"]) == 0
+    metrics = json.loads(out.read_text())
+    assert metrics["chamfer/divider/AP@0.5"] == 1.0
+    assert metrics["chamfer/ped_crossing/AP"] == 0.5
+    assert metrics["chamfer/mAP"] == 0.5  # boundary has no ground truth and counts as 0
+    assert metrics["raster/ped_crossing/AP"] == pytest.approx(51 / 101)
+    assert metrics["raster/boundary/AP"] == -1.0
+    assert metrics["raster/mAP"] == pytest.approx((1 + 51 / 101) / 2)
+    assert metrics["raster/num_samples"] == 8
+    assert curves.read_bytes().startswith(b"\x89PNG")
+    assert "mAP_chamfer = 0.500000" in capsys.readouterr().out
+
+
+def test_annotation_file_and_json_give_the_same_figures(files, tmp_path):
+    instances = [MapInstance(0, np.array(LINE)), MapInstance(1, np.array(RING))]
+    samples = [MapSample(f"t{i}", "s", "", i, [], np.eye(4), instances=instances) for i in range(8)]
+    arrow = tmp_path / "truth.arrow"
+    write_annotations(arrow, AnnotationMeta("minicity", "lidar", "val"), samples)
+    outs = [tmp_path / "json.json", tmp_path / "arrow.json"]
+    for truth, out in zip((files[1], arrow), outs, strict=True):
+        assert command()([str(files[0]), str(truth), "--out", str(out)]) == 0
+    assert outs[0].read_text() == outs[1].read_text()
+
+
+def test_two_workers_give_the_same_digits(tmp_path):
+    results, truth = tmp_path / "results.json", tmp_path / "truth.json"
+    write_results(results, results_of(150))
+    write_results(truth, truth_of(150), key="GTs")
+    one, two = (evaluate_files(results, truth, CONFIG, n).reports for n in (1, 2))
+    assert [r.metrics for r in one] == [r.metrics for r in two]
+
+
+def test_missing_and_unknown_samples_are_an_error_unless_allowed(tmp_path):
+    results, truth = tmp_path / "results.json", tmp_path / "truth.json"
+    write_results(results, results_of(3))
+    write_results(truth, truth_of(4)[1:], key="GTs")
+    with pytest.raises(ValueError, match=r"1 samples have no results, such as 't3'.*'t0'"):
+        evaluate_files(results, truth, CONFIG)
+    found = evaluate_files(results, truth, CONFIG, allow_mismatch=True)
+    assert found.reports[0].metrics["chamfer/divider/recall@0.5"] == pytest.approx(2 / 3)
+    assert "counted as without predictions" in found.notes[0]
+    assert "left out" in found.notes[1]
+
+
+def test_z_other_classes_and_single_points_are_said(tmp_path):
+    results, truth = tmp_path / "results.json", tmp_path / "truth.json"
+    line_3d = [[*point, 1.5] for point in LINE]
+    write_results(results, [("a", [vector(line_3d, "divider", 0.9), vector(LINE, "kerb", 0.5)])])
+    write_results(
+        truth, [("a", [vector(LINE, "divider"), vector([[0, 0]], "boundary")])], key="GTs"
+    )
+    found = evaluate_files(results, truth, CONFIG)
+    assert found.reports[0].metrics["chamfer/divider/AP"] == 1.0
+    assert found.reports[0].metrics["chamfer/boundary/num_gts"] == 1
+    text = "; ".join(found.notes)
+    assert "z is ignored" in text
+    assert "1 ground truths have fewer than two points" in text
+    assert "1 predictions of class 'kerb' are not scored" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ('{"GTs": []}', "no complete list under 'results'"),
+        ('{"results": {"a": 1}}', "no complete list"),
+        ('{"results": [{"sample_token": "t0", "vectors": []}', "no complete list"),
+        ('{"results": [{"vectors": []}]}', "no sample_token"),
+        ('{"results": [{"sample_token": "t0", "vectors": [{"pts": [}]}]}', "no complete list|t0"),
+        ('{"results": [{"sample_token": "t0"}]}', "t0.*vectors"),
+        (
+            '{"results": [{"sample_token": "t0", "vectors": []},'
+            '{"sample_token": "t0", "vectors": []}]}',
+            "more than once",
+        ),
+        (
+            '{"results": [{"sample_token": "t0", "vectors": [{"pts": [[0, 0], [1, 1]],'
+            '"cls_name": "divider"}]}]}',
+            "t0.*confidence_level",
+        ),
+        (
+            '{"results": [{"sample_token": "t0", "vectors": [{"pts": [[0, 0], [NaN, 1]],'
+            '"cls_name": "divider", "confidence_level": 1}]}]}',
+            "t0.*not finite",
+        ),
+        (
+            '{"results": [{"sample_token": "t0", "vectors": [{"pts": [[0, 0], [1]],'
+            '"cls_name": "divider", "confidence_level": 1}]}]}',
+            "t0.*coordinates",
+        ),
+    ],
+)
+def test_malformed_results_name_the_file_and_the_sample(tmp_path, text, message):
+    results, truth = tmp_path / "results.json", tmp_path / "truth.json"
+    results.write_text(text)
+    write_results(truth, truth_of(1), key="GTs")
+    with pytest.raises(ValueError, match=message):
+        evaluate_files(results, truth, CONFIG)
+    assert command()([str(results), str(truth)]) == 1
+
+
+def test_index_reads_any_layout_of_the_file(tmp_path):
+    path = tmp_path / "odd.json"
+    path.write_text(
+        '{"meta": {"results": [1], "text": "a \\" ] } [ {"}, "other": [[{}], "results"],\n'
+        ' "results" : [ {"vectors": [], "extra": {"deep": [{}]}, "sample_token": "x\\u0041"},\n'
+        '{"sample_token": "b]", "vectors": [ ]} ], "tail": [{}]}'
+    )
+    samples = JsonSamples(path, "results")
+    assert samples.tokens == ["xA", "b]"]
+    assert samples.vectors(0) == []
+
+
+def test_fast_and_plain_parsers_agree(files):
+    source = JsonElements(JsonSamples(files[0], "results"), LABELS, scored=True)
+    fast, _ = source.elements(range(8))
+    for i, elements in enumerate(fast):
+        plain = elements_from_vectors(source.samples.vectors(i), LABELS, scored=True)
+        for name in ("points", "offsets", "labels", "scores"):
+            np.testing.assert_array_equal(getattr(elements, name), getattr(plain, name))
+
+
+def test_written_predictions_read_back(tmp_path):
+    elements = map_elements([LINE, RING], [0, 1], [0.25, 0.1 + 0.2])
+    extras = gaussian_extras(np.ones((2, 3, 2)), np.zeros((2, 3)))
+    vectors = vectors_of(elements, CLASSES, extras)
+    path = tmp_path / "new" / "out.json"
+    write_results(path, [("a", vectors)])
+    back = JsonSamples(path, "results").vectors(0)
+    assert back[1]["confidence_level"] == 0.1 + 0.2
+    assert back[1]["gaussian_scales"] == [[1.0, 1.0]] * 3
+    assert back[0]["pts"] == LINE
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_interrupted_writing_leaves_nothing(tmp_path):
+    def broken():
+        yield "a", []
+        raise KeyError("b")
+
+    with pytest.raises(KeyError):
+        write_results(tmp_path / "out.json", broken())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_annotation_file_without_ground_truth_or_class_is_refused(tmp_path):
+    arrow = tmp_path / "truth.arrow"
+    sample = MapSample("t0", "s", "", 0, [], np.eye(4))
+    write_annotations(arrow, AnnotationMeta("minicity", "lidar", "val"), [sample])
+    with pytest.raises(ValueError, match="'t0' has no ground truth"):
+        ArrowElements(arrow, CLASSES).elements([0])
+    with pytest.raises(ValueError, match="stop_line"):
+        ArrowElements(arrow, ("divider", "stop_line"))
+
+
+def double(value: int) -> int:
+    return 2 * value
+
+
+def die(value: int) -> int:
+    if value == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return value
+
+
+def sleep(value: int) -> int:
+    time.sleep(300 if value == 3 else 0)
+    return value
+
+
+def fail(value: int) -> int:
+    raise ValueError(f"task {value}")
+
+
+def test_pool_returns_every_result():
+    assert sorted(map_unordered(double, range(20), 2)) == list(range(0, 40, 2))
+    assert list(map_unordered(double, [1], 4)) == [2]
+    with pytest.raises(ValueError, match="num_workers"):
+        list(map_unordered(double, [1], 0))
+
+
+@pytest.mark.parametrize(
+    ("function", "error", "message", "patience_s"),
+    [
+        (die, RuntimeError, "worker process died", 60),
+        (sleep, TimeoutError, "within 3 s", 3),
+        (fail, ValueError, "task", 60),
+    ],
+)
+def test_pool_ends_when_a_worker_dies_stalls_or_fails(function, error, message, patience_s):
+    start = time.monotonic()
+    with pytest.raises(error, match=message):
+        list(map_unordered(function, range(8), 2, stall_timeout_s=patience_s))
+    assert time.monotonic() - start < 50  # the stalled task would sleep for 300 s

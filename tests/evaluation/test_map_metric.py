@@ -1,0 +1,102 @@
+"""The metric class as the runner calls it: batches, ranks, padding."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+mmengine = pytest.importorskip("mmengine")
+pytest.importorskip("mmdet3d")
+
+from golden_data import CLASSES  # noqa: E402
+from mmdet3d.registry import METRICS  # noqa: E402
+from mmdet3d.structures import Det3DDataSample  # noqa: E402
+from mmengine.evaluator import Evaluator  # noqa: E402
+from mmengine.structures import InstanceData  # noqa: E402
+
+from gsmap.evaluation import map_metric  # noqa: E402
+from gsmap.evaluation.json_index import JsonSamples  # noqa: E402
+
+RANGES = {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0)}
+
+
+def sample(token: str, shift: float, truth: bool = True) -> Det3DDataSample:
+    """A divider predicted ``shift`` metres beside itself."""
+    y = torch.linspace(-20, 20, 20)
+    line = torch.stack([torch.zeros(20), y], dim=1)
+    info = {"polylines": [line.numpy()], "labels": np.array([0])} if truth else None
+    found = Det3DDataSample(metainfo={"token": token, "eval_ann_info": info})
+    found.pred_instances_3d = InstanceData(
+        pts=(line + torch.tensor([shift, 0.0]))[None],
+        scores_3d=torch.tensor([1.0 - shift / 10]),
+        labels_3d=torch.tensor([0]),
+        scales=torch.ones(1, 20, 2),
+        rotations=torch.zeros(1, 20),
+    )
+    return found
+
+
+def build(**settings) -> Evaluator:
+    evaluator = Evaluator(METRICS.build({"type": "MapMetric", **settings}))
+    evaluator.dataset_meta = {"classes": CLASSES, **RANGES}
+    return evaluator
+
+
+def test_figures_through_the_runner_do_not_count_padding():
+    evaluator = build()
+    evaluator.process([sample("a", 0.1), sample("b", 0.8)])
+    evaluator.process([sample("c", 0.3), sample("a", 0.1)])  # the last batch is padded
+    metrics = evaluator.evaluate(3)
+    assert metrics["chamfer/divider/AP@0.5"] == pytest.approx(2 / 3)
+    assert metrics["chamfer/divider/AP@1.0"] == 1.0
+    assert metrics["chamfer/divider/num_preds"] == 3
+    assert metrics["raster/num_samples"] == 3
+
+
+def test_any_order_and_any_split_over_ranks_gives_the_same_digits(monkeypatch):
+    samples = [sample(f"s{i}", 0.07 * i) for i in range(9)]
+    alone = build()
+    alone.process(samples)
+    want = alone.evaluate(9)
+    ranks = [build(), build()]
+    for rank, evaluator in enumerate(ranks):
+        evaluator.process([*samples[rank::2], samples[0]][:5][::-1])
+    metric = ranks[0].metrics[0]
+    metric.results += ranks[1].metrics[0].results  # what collect_results hands to the first rank
+    assert metric.evaluate(9) == want
+
+
+def test_results_are_written_with_gaussians_and_without_ground_truth(tmp_path):
+    path = tmp_path / "results.json"
+    evaluator = build(eval=[], out_file=str(path))
+    evaluator.process([sample("b", 0.2, truth=False), sample("a", 0.1, truth=False)])
+    assert evaluator.evaluate(2) == {}
+    written = JsonSamples(path, "results")
+    assert written.tokens == ["a", "b"]
+    vector = written.vectors(1)[0]
+    assert vector["cls_name"] == "divider"
+    assert vector["pts"][0] == pytest.approx([0.2, -20.0])
+    assert len(vector["gaussian_rotations"]) == 20
+    assert json.loads(path.read_text())["meta"]["classes"] == list(CLASSES)
+
+
+def test_samples_without_ground_truth_and_bad_settings_are_refused():
+    with pytest.raises(ValueError, match="sample x has no ground truth"):
+        build().process([sample("x", 0.1, truth=False)])
+    with pytest.raises(ValueError, match="eval must name metrics"):
+        map_metric.MapMetric(eval=["mIoU"])
+    with pytest.raises(ValueError, match="eval must name metrics"):
+        map_metric.MapMetric(eval=[])
+    with pytest.raises(ValueError, match="6 values"):
+        map_metric.MapMetric(pc_range=[0, 1])
+    nameless = Evaluator(map_metric.MapMetric())
+    with pytest.raises(ValueError, match="knows no classes"):
+        nameless.process([sample("x", 0.1)])
+
+
+def test_a_prediction_that_is_not_finite_names_its_sample():
+    broken = sample("bad", 0.1)
+    broken.pred_instances_3d.pts[0, 3, 0] = float("nan")
+    with pytest.raises(ValueError, match=r"sample bad.*not finite"):
+        build().process([broken])

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
+from gsmap.evaluation.elements import map_elements
+from gsmap.evaluation.prior import PriorConfig, fit_prior
+
+CHAMFER = ChamferConfig(("divider", "ped_crossing"))
+RING = np.array([[3.0, 3], [7, 3], [7, 6], [3, 6], [3, 3]])
+
+
+def line(x: float) -> np.ndarray:
+    return np.array([[x, -20.0], [x, 20.0]])
+
+
+def score(prior, truth) -> dict[str, float]:
+    return chamfer_report(
+        [match_chamfer(prior, t, CHAMFER, str(i)) for i, t in enumerate(truth)], CHAMFER
+    ).metrics
+
+
+def test_the_same_map_everywhere_is_found_exactly():
+    truth = [map_elements([line(0.0), line(5.0), RING], [0, 0, 1])] * 6
+    prior = fit_prior(truth, CHAMFER)
+    assert len(prior) == 3
+    assert score(prior, truth)["chamfer/mAP"] == 1.0
+
+
+def test_scores_order_elements_by_how_often_they_are_right():
+    """The line at 0 is there always, the one at 6 in two of four samples."""
+    truth = [
+        map_elements([line(0.0), line(6.0)][: 1 + i % 2], [0, 0][: 1 + i % 2]) for i in range(4)
+    ]
+    prior = fit_prior(truth, CHAMFER)
+    x = [round(float(prior.polyline(i)[0, 0]), 6) for i in range(len(prior))]
+    assert x == [0.0, 6.0]
+    assert prior.scores[0] == pytest.approx(1.0)
+    assert prior.scores[1] == pytest.approx(0.05 + 0.95 * 0.5)
+    # of 6 ground truths the first element finds 4; then miss, hit (5 of 6), miss, hit (6 of 8)
+    want = 4 / 6 + 1 / 6 * 5 / 6 + 1 / 6 * 6 / 8
+    assert score(prior, truth)["chamfer/divider/AP@0.5"] == pytest.approx(want)
+
+
+def test_refinement_moves_an_element_to_the_middle_of_what_it_matches():
+    """Lines within +-0.9 m, every second one turned: only the middle is within 1.0 m of all."""
+    truth = [
+        map_elements([line(x)[::-1] if i % 2 else line(x)], [0])
+        for i, x in enumerate(np.linspace(-0.9, 0.9, 7))
+    ]
+    prior = fit_prior(truth, CHAMFER, PriorConfig(max_elements=1, max_candidates=1, seed=1))
+    assert abs(prior.polyline(0)[:, 0]).max() < 0.4
+    assert score(prior, truth)["chamfer/divider/AP@1.0"] == 1.0
+
+
+def test_rings_that_start_elsewhere_are_averaged_as_rings():
+    rings = [
+        np.concatenate([np.roll(RING[:-1], k, axis=0), np.roll(RING[:-1], k, axis=0)[:1]])
+        for k in range(4)
+    ]
+    truth = [map_elements([ring + 0.1 * i], [1]) for i, ring in enumerate(rings)]
+    prior = fit_prior(truth, CHAMFER, PriorConfig(max_elements=1))
+    assert score(prior, truth)["chamfer/ped_crossing/AP"] == 1.0
+
+
+def test_the_number_of_elements_is_limited_and_fitting_is_deterministic():
+    rng = np.random.default_rng(0)
+    truth = [map_elements([line(x) for x in rng.uniform(-15, 15, 6)], [0] * 6) for _ in range(20)]
+    config = PriorConfig(max_elements=5, max_candidates=30)
+    first, second = fit_prior(truth, CHAMFER, config), fit_prior(truth, CHAMFER, config)
+    assert len(first) == 5
+    np.testing.assert_array_equal(first.points, second.points)
+    assert (np.diff(first.scores) <= 0).all()
+    larger = fit_prior(truth, CHAMFER, PriorConfig(max_elements=10, max_candidates=30))
+    found = [score(p, truth)["chamfer/mAP"] for p in (first, larger)]
+    assert found[1] >= found[0] > 0
+
+
+def test_no_ground_truth_is_an_error():
+    with pytest.raises(ValueError, match="no ground truth"):
+        fit_prior([map_elements([], [])], CHAMFER)
