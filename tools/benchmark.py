@@ -2,9 +2,10 @@
 
 import argparse
 
-from gsmap.benchmarks import raster
+from gsmap.benchmarks import evaluation, raster
 
-SUBCOMMANDS = (raster.add_parser,)  # each adds its own parser, with ``run`` as a default
+# each adds its own parser, with ``run`` as a default
+SUBCOMMANDS = (evaluation.add_parser, raster.add_parser)
 
 
 def main() -> None:
