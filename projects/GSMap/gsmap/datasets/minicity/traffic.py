@@ -28,7 +28,6 @@ PAINTS: list[Color] = [
     (70, 150, 200),
 ]
 REACH_M = 75.0
-CLEARANCE_M = 6.5
 SWING_M = 6.0
 
 
@@ -154,34 +153,33 @@ def _stand(model: Vehicle, x: float, y: float, yaw: float) -> Actor:
 
 def make_actors(town: Town, ego: Drive, duration_s: float, rng: np.random.Generator) -> list[Actor]:
     """Traffic around the ego vehicle's drive; nobody touches it or one another."""
-    times = np.linspace(0.0, duration_s, 8)
-    ego_track = np.array([ego.pose(float(t))[:2] for t in times])
+    times = np.linspace(0.0, duration_s, 8).tolist()
+    ego_track = np.array([ego.pose(t)[:2] for t in times])
     density = float(rng.uniform(0.25, 1.0))
     candidates = _moving(town, ego_track, density, rng) + _parked(town, ego_track, density, rng)
     candidates += _people(town, ego_track, rng)
     kept: list[Actor] = []
     tracks: list[NDArray[np.float64]] = []
     for actor in candidates:
-        track = np.array([[v.center[0], v.center[1]] for v in (actor.at(float(t)) for t in times)])
-        person = actor.model.category.startswith("human")
-        reach = actor.model.size[0] / 2
-        gap = float(np.linalg.norm(track - ego_track, axis=1).min())
-        # Beside the ego vehicle a lane's width is enough for one that is parked.
-        need = (
-            2.5
-            if person
-            else (2.8 + reach * 0.35 if actor.drive is None else CLEARANCE_M * 0.55 + reach)
-        )
-        if gap < need:
-            continue
-        if any(
-            np.linalg.norm(track - t, axis=1).min() < (0.7 if person else 1.2 + reach * 0.6)
-            for t in tracks
+        track = np.array([actor.at(t).center[:2] for t in times])
+        to_ego, to_others = _room(actor)
+        if all(
+            np.linalg.norm(track - other, axis=1).min() >= gap
+            for other, gap in [(ego_track, to_ego), *((t, to_others) for t in tracks)]
         ):
-            continue
-        kept.append(actor)
-        tracks.append(track)
+            kept.append(actor)
+            tracks.append(track)
     return kept
+
+
+def _room(actor: Actor) -> tuple[float, float]:
+    """Least distance in metres that an actor keeps from the ego vehicle and from the others."""
+    if actor.model.category.startswith("human"):
+        return 2.5, 0.7
+    half = actor.model.size[0] / 2
+    # What is parked may stand beside the ego vehicle; what moves may come at it lengthwise.
+    to_ego = 2.8 + 0.35 * half if actor.drive is None else 3.6 + half
+    return to_ego, 1.2 + 0.6 * half
 
 
 def _near(points: Array, track: Array, reach_m: float) -> bool:
