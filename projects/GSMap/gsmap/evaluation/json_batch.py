@@ -6,8 +6,10 @@ the sample.
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.json
 
@@ -55,6 +57,15 @@ def parse_batch(
     return _elements(table.column("vectors").combine_chunks(), labels, scored)
 
 
+def _values(array: pa.Array, dtype: type[np.generic]) -> npt.NDArray[Any]:
+    """View the numbers of an Arrow array; its own ``to_numpy`` would load pandas."""
+    stored = array.buffers()[1]
+    if stored is None or not len(array):
+        return np.zeros(0, dtype)
+    offset = array.offset * np.dtype(dtype).itemsize
+    return np.frombuffer(stored, dtype, count=len(array), offset=offset)
+
+
 def _elements(
     vectors: pa.ListArray, labels: dict[str, int], scored: bool
 ) -> list[tuple[MapElements, bool]] | None:
@@ -66,21 +77,20 @@ def _elements(
         columns.append(flat.field("confidence_level"))
     if any(column.null_count for column in (vectors, flat, points, points.values, *columns)):
         return None
-    dims = np.diff(points.offsets.to_numpy())
+    dims = np.diff(_values(points.offsets, np.int32))
     dim = int(dims[0]) if len(dims) else 2
     if dim not in (2, 3) or (dims != dim).any():
         return None
-    xy = points.values.to_numpy().reshape(-1, dim)[:, :2]
-    names = columns[1].dictionary_encode()
-    codes = np.array([labels.get(name, -1) for name in names.dictionary.to_pylist()], np.int64)
-    label = codes[names.indices.to_numpy()] if len(codes) else np.zeros(0, np.int64)
-    score = columns[2].to_numpy() if scored else np.ones(len(label))
+    xy = _values(points.values, np.float64).reshape(-1, dim)[:, :2]
+    names = columns[1].to_pylist()
+    label = np.array([labels.get(name, -1) for name in names], dtype=np.int64)
+    score = _values(columns[2], np.float64) if scored else np.ones(len(label))
     if not (np.isfinite(xy).all() and np.isfinite(score).all()):
         return None
     xy = np.ascontiguousarray(xy)
-    starts = columns[0].offsets.to_numpy().astype(np.int64)
+    starts = _values(columns[0].offsets, np.int32).astype(np.int64)
     found = []
-    bounds = vectors.offsets.to_numpy()
+    bounds = _values(vectors.offsets, np.int32)
     for first, last in pairwise(bounds):
         begin = starts[first]
         elements = MapElements(
