@@ -28,6 +28,7 @@ from gsmap.datasets.converters.argoverse2 import (
     convert_argoverse2,
     parse_rate,
 )
+from gsmap.datasets.converters.argoverse2_benchmark import measure_extraction
 from gsmap.datasets.converters.argoverse2_log import (
     BROKEN_LOGS,
     MAP_CHANGE_LOGS,
@@ -291,3 +292,10 @@ def test_the_closest_time_within_the_tolerance():
     assert closest_ns(times, 251, 50) == 300
     assert closest_ns(times, 40, 50) is None
     assert closest_ns(times[:0], 40, 50) is None
+
+
+def test_the_benchmark_times_every_set_of_classes(tmp_path):
+    write_log(tmp_path / "val" / "log-a")
+    result = measure_extraction(tmp_path, stride=10)
+    assert result["frames"] == 3  # 30 poses
+    assert all(value > 0 for value in result.values())
