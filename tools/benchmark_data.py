@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 
 from gsmap.datasets import benchmarks
+from gsmap.datasets.memory_benchmark import measure_memory
 
 
 def loading(args: argparse.Namespace) -> dict[str, float]:
@@ -38,6 +39,10 @@ def argoverse2(args: argparse.Namespace) -> dict[str, float]:
     return measure_extraction(args.root, args.split, args.stride)
 
 
+def memory(args: argparse.Namespace) -> dict[str, float]:
+    return measure_memory(args.root, args.version, tuple(args.copies))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     commands = parser.add_subparsers(required=True)
@@ -60,6 +65,11 @@ def main() -> None:
     command.add_argument("--split", default="val")
     command.add_argument("--stride", type=int, default=10, help="every N-th pose")
     command.set_defaults(run=argoverse2)
+    command = commands.add_parser("memory", help="peak of the conversion, extrapolated")
+    command.add_argument("root", type=Path)
+    command.add_argument("--version", default="v1.0-mini")
+    command.add_argument("--copies", type=int, nargs=2, default=(16, 48))
+    command.set_defaults(run=memory)
     args = parser.parse_args()
     result = args.run(args)
     print(json.dumps({name: round(value, 4) for name, value in result.items()}, indent=1))

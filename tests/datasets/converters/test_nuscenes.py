@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import shapely
 
 from gsmap.datasets.annotation_file import AnnotationFile
 from gsmap.datasets.converters import nuscenes
+from gsmap.datasets.converters.argoverse2_lanes import LaneLinks
 from gsmap.datasets.converters.export import export_json
 from gsmap.datasets.converters.nuscenes import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.converters.nuscenes_map import MapLayers, NuScenesLocalMap
@@ -40,7 +42,7 @@ def local_map(classes: tuple[str, ...], **layers: list) -> NuScenesLocalMap:
     for name in classes:
         if name not in ("divider", "boundary"):
             polygons.setdefault(name, np.empty(0, object))
-    return NuScenesLocalMap(MapLayers("town", lines, polygons, {}), classes)
+    return NuScenesLocalMap(MapLayers("town", lines, polygons, Counter()), classes)
 
 
 def pose(x: float, y: float, yaw_deg: float) -> np.ndarray:
@@ -98,6 +100,21 @@ def test_an_island_inside_stays_a_ring_however_its_chunks_fall():
     assert len(arc.points) > 20
     assert np.abs(arc.points[[0, -1], 0]).max() == pytest.approx(14.8)
     assert town.instances(pose(40, 0, 0)) == []
+
+
+def test_centre_lines_follow_each_way_through_a_fork():
+    """One lane splits into two connectors: two paths, both cut at the patch's upper edge."""
+    layers = MapLayers("town", {}, {}, Counter())
+    layers.centerlines = [
+        np.array([[0, -40, 0], [0, 0, 0.0]]),
+        np.array([[0, 0, 0], [0, 40, 0.0]]),
+        np.array([[0, 0, 0], [10, 40, 0.0]]),
+    ]
+    layers.links = LaneLinks([[], [0], [0]], [[1, 2], [], []])
+    town = NuScenesLocalMap(layers, ("centerline",))
+    found = sorted((i.points for i in town.instances(pose(0, 0, 0))), key=lambda p: p[-1, 0])
+    np.testing.assert_allclose([line[0] for line in found], [[0, -30], [0, -30]], atol=1e-9)
+    np.testing.assert_allclose([line[-1] for line in found], [[0, 30], [7.5, 30]], atol=1e-9)
 
 
 def test_an_unknown_class_is_refused():
@@ -245,12 +262,14 @@ def test_a_truncated_table_is_named_and_nothing_stays_behind(options, tmp_path: 
 
 
 def test_extended_classes_are_closed_rings(options: NuScenesOptions, tmp_path: Path):
-    classes = ("divider", "ped_crossing", "boundary", "stop_line", "intersection", "carpark_area")
+    extended = ("stop_line", "intersection", "carpark_area", "centerline")
+    classes = ("divider", "ped_crossing", "boundary", *extended)
     summary = convert_nuscenes(replace(options, classes=classes, tag="_extended"))
     assert summary.instances["intersection"] + summary.instances["stop_line"] > 0
+    assert summary.instances["centerline"] > 0
     for sample in AnnotationFile(tmp_path / "out/gsmap_nuscenes_train_extended.arrow"):
         for instance in sample.instances:
-            if instance.label >= 3:
+            if 3 <= instance.label < 6:
                 np.testing.assert_array_equal(instance.points[0], instance.points[-1])
 
 

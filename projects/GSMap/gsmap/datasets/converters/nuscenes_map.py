@@ -6,14 +6,15 @@ near.
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 
 from gsmap.datasets.annotation_record import MapInstance
+from gsmap.datasets.converters.argoverse2_lanes import LaneLinks, LanePaths
 from gsmap.datasets.converters.argoverse2_rules import rings_of
 from gsmap.datasets.converters.local_map import LocalPatch, OutlineIndex
 from gsmap.geometry.polylines import Points
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 LINE_LAYERS = ("road_divider", "lane_divider")
 SURFACE_LAYERS = ("road_segment", "lane")
 AREA_CLASSES = ("ped_crossing", "stop_line", "intersection", "carpark_area")
-MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:])
+MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:], "centerline")
 OUTLINE_MARGIN_M = 0.2
+CENTERLINE_STEP_M = 0.5
 _POLYGON, _LINE = 3, 1  # shapely type ids
 
 
@@ -38,16 +40,42 @@ class MapLayers:
         lines: Lines by layer. each (n,) of LineString
         polygons: Valid polygons by layer or class. each (n,) of Polygon
         skipped: How many elements were left out, by reason.
+        centerlines: Centre line of each lane and lane connector. each (n, 3)
+        links: Which of these lead into which.
     """
 
     name: str
     lines: dict[str, np.ndarray]
     polygons: dict[str, np.ndarray]
     skipped: Counter[str]
+    centerlines: list[np.ndarray] = field(default_factory=list)
+    links: LaneLinks = field(default_factory=lambda: LaneLinks([], []))
 
 
-def _is_intersection(record: dict[str, Any]) -> bool:
-    return bool(record.get("is_intersection", False))
+def _read_lines(nusc_map: "NuScenesMap", layer: str, skipped: Counter[str]) -> np.ndarray:
+    """Return the lines of a layer; those without two nodes are counted. (n,) of LineString."""
+    found = []
+    for record in getattr(nusc_map, layer):
+        tokens = nusc_map.get("line", record["line_token"])["node_tokens"]
+        if len(tokens) < 2:
+            skipped[f"{layer} without two nodes"] += 1
+        else:
+            found.append(nusc_map.extract_line(record["line_token"]))
+    return np.array(found, dtype=object)
+
+
+def _read_polygons(nusc_map: "NuScenesMap", name: str, skipped: Counter[str]) -> np.ndarray:
+    """Return the polygons of a layer or class; invalid ones are counted. (n,) of Polygon."""
+    records: list[dict[str, Any]] = getattr(
+        nusc_map, "road_segment" if name == "intersection" else name
+    )
+    if name == "intersection":
+        records = [record for record in records if record.get("is_intersection", False)]
+    polygons = [nusc_map.extract_polygon(record["polygon_token"]) for record in records]
+    valid = [polygon for polygon in polygons if polygon.is_valid and not polygon.is_empty]
+    if len(valid) < len(polygons):
+        skipped[f"invalid {name} polygon"] += len(polygons) - len(valid)
+    return np.array(valid, dtype=object)
 
 
 def read_layers(nusc_map: "NuScenesMap", classes: Collection[str]) -> MapLayers:
@@ -60,42 +88,38 @@ def read_layers(nusc_map: "NuScenesMap", classes: Collection[str]) -> MapLayers:
     Returns:
         The layers; lines without two nodes and invalid polygons are left out and counted.
     """
-    nodes = {node["token"]: (node["x"], node["y"]) for node in nusc_map.node}
     skipped: Counter[str] = Counter()
-
-    def lines(layer: str) -> np.ndarray:
-        found = []
-        for record in getattr(nusc_map, layer):
-            points = [
-                nodes[token] for token in nusc_map.get("line", record["line_token"])["node_tokens"]
-            ]
-            if len(points) < 2:
-                skipped[f"{layer} without two nodes"] += 1
-            else:
-                found.append(shapely.LineString(points))
-        return np.array(found, dtype=object)
-
-    def polygons(layer: str, keep: Callable[[dict[str, Any]], bool] | None = None) -> np.ndarray:
-        found = []
-        for record in getattr(nusc_map, layer):
-            if keep is not None and not keep(record):
-                continue
-            polygon = nusc_map.extract_polygon(record["polygon_token"])
-            if polygon.is_valid and not polygon.is_empty:
-                found.append(polygon)
-            else:
-                skipped[f"invalid {layer} polygon"] += 1
-        return np.array(found, dtype=object)
-
-    areas: dict[str, np.ndarray] = {}
+    names = set(AREA_CLASSES) & set(classes)
     if "boundary" in classes:
-        areas |= {layer: polygons(layer) for layer in SURFACE_LAYERS}
-    for name in set(AREA_CLASSES) & set(classes):
-        areas[name] = (
-            polygons("road_segment", _is_intersection) if name == "intersection" else polygons(name)
-        )
-    marks = {layer: lines(layer) for layer in LINE_LAYERS} if "divider" in classes else {}
-    return MapLayers(nusc_map.map_name, marks, areas, skipped)
+        names |= set(SURFACE_LAYERS)
+    areas = {name: _read_polygons(nusc_map, name, skipped) for name in sorted(names)}
+    marks = {}
+    if "divider" in classes:
+        marks = {layer: _read_lines(nusc_map, layer, skipped) for layer in LINE_LAYERS}
+    layers = MapLayers(nusc_map.map_name, marks, areas, skipped)
+    if "centerline" in classes:
+        _read_centerlines(nusc_map, layers)
+    return layers
+
+
+def _read_centerlines(nusc_map: "NuScenesMap", layers: MapLayers) -> None:
+    """Add the centre lines of lanes and lane connectors, and how they follow one another."""
+    tokens = []
+    for record in (*nusc_map.lane, *nusc_map.lane_connector):
+        poses = nusc_map.discretize_lanes([record["token"]], CENTERLINE_STEP_M)[record["token"]]
+        if len(poses) < 2:
+            layers.skipped["lane without a centre line"] += 1
+            continue
+        line = np.zeros((len(poses), 3))
+        line[:, :2] = np.array(poses)[:, :2]
+        layers.centerlines.append(line)
+        tokens.append(record["token"])
+    neighbours = [nusc_map.connectivity.get(token, {}) for token in tokens]
+    layers.links = LaneLinks.from_ids(
+        tokens,
+        [links.get("incoming", []) for links in neighbours],
+        [links.get("outgoing", []) for links in neighbours],
+    )
 
 
 class NuScenesLocalMap:
@@ -136,6 +160,9 @@ class NuScenesLocalMap:
         surface = [layers.polygons[name] for name in SURFACE_LAYERS if name in layers.polygons]
         outlines = shapely.get_parts(shapely.union_all([shapely.union_all(p) for p in surface]))
         self._outlines = OutlineIndex(rings_of(outlines, exterior_ccw=False))
+        self._lane_paths = LanePaths(layers.centerlines, layers.links)
+        lanes = [shapely.LineString(line[:, :2]) for line in layers.centerlines]
+        self._lane_tree = shapely.STRtree(lanes)
 
     def instances(self, global_from_frame: np.ndarray) -> list[MapInstance]:
         """Return the map elements around a pose.
@@ -157,11 +184,22 @@ class NuScenesLocalMap:
             return self._dividers(patch)
         if name == "boundary":
             return self._outlines.cut(patch, OUTLINE_MARGIN_M)
+        if name == "centerline":
+            return self._centerlines(patch)
         return self._area_outlines(name, patch)
+
+    def _centerlines(self, patch: LocalPatch) -> list[Points]:
+        near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
+        paths = shapely.force_2d(self._lane_paths.simplified(near.tolist()))
+        return self._cut(paths, patch)
 
     def _dividers(self, patch: LocalPatch) -> list[Points]:
         near = np.sort(self._line_tree.query(patch.polygon, predicate="intersects"))
-        pieces = shapely.get_parts(shapely.intersection(self._lines[near], patch.polygon))
+        return self._cut(self._lines[near], patch)
+
+    def _cut(self, lines: np.ndarray, patch: LocalPatch) -> list[Points]:
+        """Return the parts of lines inside the patch, in the frame. each (n, 2)."""
+        pieces = shapely.get_parts(shapely.intersection(lines, patch.polygon))
         pieces = pieces[(shapely.get_type_id(pieces) == _LINE) & (shapely.length(pieces) > 0)]
         return _vertices(patch.to_local(pieces))
 
