@@ -58,6 +58,7 @@ def sample(num_cams: int, height: int, width: int) -> Det3DDataSample:
             "cam2img": eyes,
             "lidar2cam": eyes,
             "img_aug_matrix": eyes,
+            "lidar2ego": np.eye(4),
             "batch_input_shape": (height, width),
         }
     )
@@ -88,8 +89,7 @@ def profile(model: torch.nn.Module, args: argparse.Namespace) -> dict[str, float
         features = timed("image neck", model.img_neck, features)
         features = [feature.unflatten(0, (1, -1)) for feature in features]
         bev = timed("BEV encoder", model.bev_encoder, features, [data_sample.metainfo])
-        outputs = timed("decoder and branches", model.map_head, bev)
-        timed("decoding", model.map_head.predict_by_feat, outputs, [data_sample.metainfo])
+        timed("map head", model.map_head.predict, bev, [data_sample])
     return {part: min(values[1:]) for part, values in times.items()}
 
 

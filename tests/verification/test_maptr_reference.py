@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsmap.verification.golden import Golden
-from gsmap.verification.registry import run_checks
+from gsmap.verification.registry import plan, run_checks
 from gsmap.verification.report import (
     Row,
     format_table,
@@ -17,6 +17,7 @@ from gsmap.verification.report import (
 REPO = Path(__file__).resolve().parents[2]
 FILES = [
     "maptr_r50_state.json",
+    "mapvr_r50_state.json",
     "ops_gka_*.npz",
     "maptr_r50_forward_reduced_*.npz",
     "maptr_r50_forward_full_*.npz",
@@ -54,6 +55,14 @@ def test_a_wrong_weight_is_noticed(golden):
 def test_a_folder_without_the_variant_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no reference file of variant 'Z'"):
         list(run_checks(Golden(tmp_path, REPO / "configs", variant="Z")))
+
+
+def test_files_without_a_check_are_listed(tmp_path):
+    for name in ("riddle_B.npz", "riddle_A.npz", "riddle_state.json", "maptr_loss_many_B.npz"):
+        (tmp_path / name).touch()
+    chosen, unchecked = plan(Golden(tmp_path, REPO / "configs", variant="B"))
+    assert [name for name, _ in chosen] == ["maptr_loss_many_B.npz"]
+    assert unchecked == ["riddle_B.npz", "riddle_state.json"]
 
 
 def test_missing_recipes_are_named(tmp_path):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from mmengine.structures import InstanceData
+from scipy.optimize import linear_sum_assignment
 
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
 from gsmap.checkpoints.key_map import find_key_map
@@ -16,11 +17,13 @@ from gsmap.layers.deformable_attention import sum_rows
 
 from .golden import Golden
 from .registry import check
-from .report import Row, fraction_beyond, largest_difference, largest_relative, relative_norm
+from .report import Row, largest_difference, largest_relative, relative_norm
 from .targets import gt_instances
 
 CONFIG = "maptr/maptr_r50_24e.py"
 STATE = "maptr_r50_state.json"
+_OTHER_CLASS_M = 1e3  # keeps detections of different classes from being paired
+_MEAN_SHARE = 0.1  # a cell's mean over its channels moves less than its channels do
 SAMPLES = {
     "empty": [("reduced", "empty")],
     "closed": [("reduced", "closed")],
@@ -52,9 +55,9 @@ def state_rows(golden: Golden, name: str, config: str) -> Iterator[Row]:
     yield Row(name, "weights on the way back", changed, 0)
 
 
-@check(STATE)
+@check(STATE, "mapvr_r50_state.json")
 def check_state(golden: Golden, name: str) -> Iterator[Row]:
-    """Compare MapTR's state with ours."""
+    """Compare the state of MapTR, which is also MapVR's, with ours."""
     yield from state_rows(golden, name, CONFIG)
 
 
@@ -97,34 +100,40 @@ def head_rows(
 def decoded_rows(
     name: str, data: dict[str, np.ndarray], result: InstanceData, score_atol: float = 5e-4
 ) -> Iterator[Row]:
-    """Compare decoded detections, both sorted by label and points, as scores may tie."""
-
-    def order(labels: np.ndarray, pts: np.ndarray) -> np.ndarray:
-        keys = np.round(pts.reshape(len(pts), -1)[:, ::-1], 1).T
-        return np.lexsort([*keys, labels])
-
+    """Compare decoded detections, paired by class and points, as scores may tie."""
     labels, pts = result.labels_3d.numpy(), result.pts.numpy()
-    ours, theirs = order(labels, pts), order(data["dec_labels"], data["dec_pts"])
-    yield Row(name, "dec_labels", largest_difference(labels[ours], data["dec_labels"][theirs]), 0)
-    yield Row(name, "dec_pts (m)", largest_difference(pts[ours], data["dec_pts"][theirs]), 0.01)
+    if pts.shape != data["dec_pts"].shape:
+        yield Row(name, "number of detections", abs(len(pts) - len(data["dec_pts"])), 0)
+        return
+    distance = np.abs(pts[:, None] - data["dec_pts"]).max((-1, -2))
+    other_class = labels[:, None] != data["dec_labels"]
+    ours, theirs = linear_sum_assignment(distance + _OTHER_CLASS_M * other_class)
+    yield Row(name, "dec_labels", float(other_class[ours, theirs].sum()), 0)
+    yield Row(name, "dec_pts (m)", float(distance[ours, theirs].max(initial=0.0)), 0.01)
     if "dec_boxes" in data:
         boxes = np.concatenate([pts.min(1), pts.max(1)], -1)[ours]
-        reference = data["dec_boxes"][theirs]
-        yield Row(name, "dec_boxes (m)", largest_difference(boxes, reference), 0.01)
-    scores = np.sort(result.scores_3d.numpy()), np.sort(data["dec_scores"])
-    yield Row(name, "dec_scores", largest_difference(*scores), score_atol)
+        off = largest_difference(boxes, data["dec_boxes"][theirs])
+        yield Row(name, "dec_boxes (m)", off, 0.01)
+    scores = result.scores_3d.numpy()[ours]
+    off = largest_difference(scores, data["dec_scores"][theirs])
+    yield Row(name, "dec_scores", off, score_atol)
 
 
 def bev_rows(
     name: str, data: dict[str, np.ndarray], bev: torch.Tensor, atol: float, fraction: float
 ) -> Iterator[Row]:
-    """Compare BEV features: the mean of every cell, and all channels of a subset."""
-    mean = fraction_beyond(bev.mean(0), data["bev_embed_channel_mean"], atol)
-    yield Row(name, f"cells with mean BEV off by > {atol:g}", mean, fraction)
-    rows, cols = (torch.from_numpy(data[key]) for key in ("bev_rows", "bev_cols"))
-    subset = bev[:, rows][:, :, cols].flatten(1).T
-    off = fraction_beyond(subset, data["bev_embed_sub"], atol)
-    yield Row(name, f"channels of cells off by > {atol:g}", off, fraction)
+    """Compare BEV features: the mean of every cell, and all channels of a subset.
+
+    A tie in rounding a position can change a whole cell. The means tell which cells those are;
+    there may be few, and the subset is compared at the others.
+    """
+    off = np.abs(bev.mean(0).numpy() - data["bev_embed_channel_mean"]) > atol * _MEAN_SHARE
+    yield Row(name, "fraction of BEV cells that differ", float(off.mean()), fraction)
+    rows, cols = data["bev_rows"], data["bev_cols"]
+    subset = bev.numpy()[:, rows][:, :, cols].reshape(len(bev), -1).T  # (cells, C)
+    same = ~off[rows][:, cols].ravel()
+    deviation = largest_difference(subset[same], data["bev_embed_sub"][same])
+    yield Row(name, "channels of the other cells", deviation, atol)
 
 
 @check("maptr_r50_forward_*_{variant}.npz")

@@ -50,7 +50,7 @@ def plan(golden: Golden) -> tuple[list[tuple[str, Check]], list[str]]:
     unchecked = [
         name
         for name in names
-        if fnmatchcase(name, f"*_{golden.variant}.npz") and name not in covered
+        if name.endswith((f"_{golden.variant}.npz", "_state.json")) and name not in covered
     ]
     return chosen, unchecked
 
