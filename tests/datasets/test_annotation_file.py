@@ -1,6 +1,7 @@
 """Annotation files: what is written comes back, and a wrong or half file is refused."""
 
 import pickle
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -196,3 +197,16 @@ def test_meta_refuses_bad_values():
         AnnotationMeta("x", "ego", "val", x_range=(1, 1))
     with pytest.raises(ValueError, match="classes"):
         AnnotationMeta("x", "ego", "val", classes=("a", "a"))
+
+
+def test_a_full_disk_leaves_the_old_file_alone(tmp_path: Path):
+    write_annotations(tmp_path / "a.arrow", META, [sample(1)])
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # writing more fails
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_annotations(tmp_path / "a.arrow", META, [sample(i) for i in range(300)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert AnnotationFile(tmp_path / "a.arrow")[0].token == "token1"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.arrow"]

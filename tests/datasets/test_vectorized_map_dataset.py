@@ -205,6 +205,17 @@ def test_missing_truncated_and_foreign_images_are_named(build, copied_root):
         dataset[0]
 
 
+def test_missing_and_truncated_points_are_named(build, copied_root):
+    dataset = build(**dataset_config("nuscenes_depth_seg", "train_dataloader", copied_root))
+    path = copied_root / dataset.sample(0).lidar.path
+    path.write_bytes(path.read_bytes()[:-6])
+    with pytest.raises(BrokenSampleError, match=f"{dataset.sample(0).token}.*copy it again"):
+        dataset[0]
+    path.unlink()
+    with pytest.raises(BrokenSampleError, match="no LiDAR file at"):
+        dataset[0]
+
+
 def test_broken_samples_are_skipped_and_counted_on_demand(build, copied_root):
     config = dataset_config("minicity", "train_dataloader", copied_root, broken_samples="skip")
     dataset = build(**config)

@@ -4,7 +4,7 @@ _base_ = './nuscenes.py'
 train_dataloader = dict(
     dataset=dict(pipeline=[
         dict(type='LoadCameraImages'),
-        dict(type='LoadPointsFromFile', coord_type='LIDAR', load_dim=5, use_dim=5),
+        dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5),
         dict(
             type='MultiViewWrapper',
             transforms=[dict(type='PhotoMetricDistortion3D')],

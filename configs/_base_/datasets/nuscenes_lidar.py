@@ -2,7 +2,7 @@
 _base_ = './nuscenes.py'
 
 _points = [
-    dict(type='LoadPointsFromFile', coord_type='LIDAR', load_dim=5, use_dim=5),
+    dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5),
     dict(
         type='LoadPointsFromMultiSweeps',
         sweeps_num=9,

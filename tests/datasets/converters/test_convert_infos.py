@@ -35,7 +35,7 @@ def nuscenes_info(sample: MapSample) -> dict:
         "lidar_path": f"./data/nuscenes/{sample.lidar.path}",
         "token": sample.token,
         "prev": "",
-        "can_bus": np.zeros(18),
+        "can_bus": np.array([*sample.can_bus[:16], 0, 0]),
         "sweeps": [
             sensor_info(s.path, s.frame_from_lidar, s.timestamp_ns // 1000)
             for s in sample.lidar.sweeps

@@ -124,8 +124,10 @@ class AnnotationWriter:
                 self._sink.close()
                 os.replace(self._partial, self.path)
         finally:
-            self._sink.close()
-            self._partial.unlink(missing_ok=True)
+            try:
+                self._sink.close()
+            finally:
+                self._partial.unlink(missing_ok=True)
 
 
 def write_annotations(path: str | Path, meta: AnnotationMeta, samples: Iterable[MapSample]) -> int:

@@ -1,13 +1,40 @@
 """LiDAR points: the annotation frame, and sparse depth maps for supervision."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from mmcv.transforms import BaseTransform
+from mmdet3d.datasets.transforms import LoadPointsFromFile
 from mmdet3d.registry import TRANSFORMS
 
+from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.transforms.masks import padded_size
+
+
+@TRANSFORMS.register_module()
+class LoadLidarPoints(LoadPointsFromFile):
+    """mmdet3d's ``LoadPointsFromFile``, naming sample and file when one is missing or cut short."""
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Load ``results['lidar_points']``.
+
+        Raises:
+            BrokenSampleError: If the sample has no LiDAR, or its file is missing or truncated.
+        """
+        if "lidar_points" not in results:
+            raise BrokenSampleError(f"sample {results['token']!r} has no LiDAR sweep.")
+        path = Path(results["lidar_points"]["lidar_path"])
+        if not path.is_file():
+            raise BrokenSampleError(f"sample {results['token']!r}: no LiDAR file at {path}.")
+        size = path.stat().st_size
+        if size == 0 or size % (4 * self.load_dim):  # float32 values
+            raise BrokenSampleError(
+                f"sample {results['token']!r}: {path} has {size} bytes, not a multiple of "
+                f"{self.load_dim} float32 values: copy it again, or correct load_dim."
+            )
+        return super().transform(results)
 
 
 @TRANSFORMS.register_module()
