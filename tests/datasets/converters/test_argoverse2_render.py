@@ -30,7 +30,7 @@ from gsmap.datasets.converters.argoverse2_render import (
     scaled_camera,
 )
 from gsmap.datasets.converters.argoverse2_scene import height_grid, lane_paint, make_scene
-from gsmap.datasets.minicity.ground import sample_height
+from gsmap.datasets.minicity.terrain import sample_height
 
 X, Y = ORIGIN[:2]
 AROUND = (X - 30, Y - 20, X + 30, Y + 20)

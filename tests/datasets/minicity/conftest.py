@@ -10,7 +10,7 @@ SIZE = (320, 180)
 
 
 @pytest.fixture(scope="session")
-def minicity_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("minicity") / "root"
     assert generate(
         root, scenes=3, seed=28, image_size=SIZE, samples_per_scene=2, workers=0, progress=False

@@ -23,13 +23,13 @@ LOCATIONS = (
 
 
 @pytest.fixture(scope="module")
-def nusc(minicity_root: Path) -> NuScenes:
-    return NuScenes("v1.0-trainval", str(minicity_root), verbose=False)
+def nusc(small_root: Path) -> NuScenes:
+    return NuScenes("v1.0-trainval", str(small_root), verbose=False)
 
 
 @pytest.fixture(scope="module")
-def maps(minicity_root: Path) -> dict[str, NuScenesMap]:
-    return {name: NuScenesMap(str(minicity_root), name) for name in LOCATIONS}
+def maps(small_root: Path) -> dict[str, NuScenesMap]:
+    return {name: NuScenesMap(str(small_root), name) for name in LOCATIONS}
 
 
 def pixels_of(nusc: NuScenes, token: str, ground: np.ndarray) -> np.ndarray:

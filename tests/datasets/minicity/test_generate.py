@@ -28,8 +28,8 @@ def digests(root: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def nusc(minicity_root: Path) -> NuScenes:
-    return NuScenes("v1.0-trainval", str(minicity_root), verbose=False)
+def nusc(small_root: Path) -> NuScenes:
+    return NuScenes("v1.0-trainval", str(small_root), verbose=False)
 
 
 def test_devkit_finds_every_sensor_file_of_every_sample(nusc: NuScenes) -> None:
@@ -75,11 +75,11 @@ def test_lidar_sweeps_between_key_frames_are_chained_in_time(nusc: NuScenes) -> 
     ]
 
 
-def test_can_bus_messages_follow_the_ego_poses(nusc: NuScenes, minicity_root: Path) -> None:
+def test_can_bus_messages_follow_the_ego_poses(nusc: NuScenes, small_root: Path) -> None:
     from nuscenes.can_bus.can_bus_api import NuScenesCanBus
 
     scene = nusc.scene[0]
-    messages = NuScenesCanBus(dataroot=str(minicity_root)).get_messages(scene["name"], "pose")
+    messages = NuScenesCanBus(dataroot=str(small_root)).get_messages(scene["name"], "pose")
     times = np.array([m["utime"] for m in messages])
     np.testing.assert_array_equal(np.diff(times), 20_000)
     first, last = (nusc.get("sample", scene[f"{end}_sample_token"]) for end in ("first", "last"))
@@ -121,22 +121,22 @@ def test_same_bytes_in_one_process_and_in_two(tmp_path: Path) -> None:
     assert digests(tmp_path / "a") == digests(tmp_path / "b")
 
 
-def test_another_seed_gives_other_maps_and_pictures(tmp_path: Path, minicity_root: Path) -> None:
+def test_another_seed_gives_other_maps_and_pictures(tmp_path: Path, small_root: Path) -> None:
     generate(tmp_path / "a", 2, seed=12, workers=0, **TINY)
     name = f"maps/expansion/{VAL_LOCATIONS[0]}.json"
-    first, second = (json.loads((r / name).read_text()) for r in (tmp_path / "a", minicity_root))
+    first, second = (json.loads((r / name).read_text()) for r in (tmp_path / "a", small_root))
     assert first["node"][0] != second["node"][0]
     tokens = [{node["token"] for node in m["node"]} for m in (first, second)]
     assert not tokens[0] & tokens[1]
 
 
-def test_running_again_changes_nothing_and_other_arguments_are_refused(minicity_root: Path) -> None:
-    before = (minicity_root / MARKER).stat().st_mtime_ns
+def test_running_again_changes_nothing_and_other_arguments_are_refused(small_root: Path) -> None:
+    before = (small_root / MARKER).stat().st_mtime_ns
     arguments = {"seed": 28, "image_size": (320, 180), "samples_per_scene": 2}
-    assert generate(minicity_root, 3, workers=0, progress=False, **arguments) is False
-    assert (minicity_root / MARKER).stat().st_mtime_ns == before
+    assert generate(small_root, 3, workers=0, progress=False, **arguments) is False
+    assert (small_root / MARKER).stat().st_mtime_ns == before
     with pytest.raises(ValueError, match="seed is 28, asked for 12"):
-        generate(minicity_root, 3, workers=0, progress=False, **{**arguments, "seed": 12})
+        generate(small_root, 3, workers=0, progress=False, **{**arguments, "seed": 12})
 
 
 def test_a_folder_with_other_files_is_refused_and_left_alone(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """A pinhole camera in the world."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -37,12 +38,12 @@ class Camera:
         if not (np.isfinite(self.intrinsics).all() and np.isfinite(self.cam_from_world).all()):
             raise ValueError("intrinsics and cam_from_world must be finite.")
 
-    @property
+    @cached_property
     def center(self) -> Array:
         """Position in the world. (3,)"""
         return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
 
-    @property
+    @cached_property
     def world_from_pixel(self) -> Array:
         """Maps (u, v, 1) to a viewing direction in the world. (3, 3)"""
         return self.cam_from_world[:3, :3].T @ np.linalg.inv(self.intrinsics)

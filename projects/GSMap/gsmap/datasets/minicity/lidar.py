@@ -22,12 +22,16 @@ def footprint_array(footprints: list[Array], heights: list[float]) -> Array:
 
 def vehicle_footprints(vehicles: list[Vehicle]) -> Array:
     """The rectangles of vehicles and people. (n, 9)"""
-    rows = []
-    for v in vehicles:
-        c, s = np.cos(v.yaw_rad), np.sin(v.yaw_rad)
-        half = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * v.size[:2]
-        rows.append(half @ np.array([[c, s], [-s, c]]) + v.center[:2])
-    return footprint_array(rows, [v.size[2] for v in vehicles])
+    if not vehicles:
+        return np.zeros((0, 9))
+    yaw = np.array([v.yaw_rad for v in vehicles])
+    size, center = np.array([v.size for v in vehicles]), np.array([v.center for v in vehicles])
+    forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * size[:, :1] / 2
+    left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) * size[:, 1:2] / 2
+    middle = center[:, :2]
+    corners = [middle + forward + left, middle - forward + left, middle - forward - left]
+    corners.append(middle + forward - left)
+    return np.column_stack([*corners, size[:, 2]])
 
 
 def _entry_distances(origin: Array, directions: Array, boxes: Array) -> Array:

@@ -1,5 +1,6 @@
 """The sensors of MiniCity's car: six cameras and a LiDAR, placed much as on the nuScenes car."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,11 +71,16 @@ def ego_from_lidar() -> Array:
 
 
 def world_from_ego(x: float, y: float, yaw: float, pitch: float = 0.0, roll: float = 0.0) -> Array:
-    """Pose of the car on the ground. (4, 4)"""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
-    pose[:3, 3] = (x, y, 0.0)
-    return pose
+    """Pose of the car on the ground: turned by roll, then pitch, then yaw. (4, 4)"""
+    (cy, sy), (cp, sp), (cr, sr) = ((math.cos(a), math.sin(a)) for a in (yaw, pitch, roll))
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y],
+            [-sp, cp * sr, cp * cr, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def mounted_camera(mount: CameraMount, width: int, height: int, ego_pose: Array) -> Camera:

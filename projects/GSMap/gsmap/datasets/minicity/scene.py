@@ -1,6 +1,7 @@
 """One scene of MiniCity: drives it, takes its pictures and sweeps, and writes its records."""
 
 import json
+import math
 from collections import defaultdict
 from dataclasses import dataclass
 from itertools import pairwise
@@ -261,7 +262,7 @@ class SceneMaker:
             if not struck:
                 continue
             length, width, height = vehicle.size
-            turned = world_from_ego(0.0, 0.0, vehicle.yaw_rad)
+            half_turn = vehicle.yaw_rad / 2
             person = vehicle.category.startswith("human")
             attribute = (
                 "pedestrian.standing"
@@ -277,7 +278,7 @@ class SceneMaker:
                     "attribute_tokens": [make_token("attribute", attribute)],
                     "translation": vehicle.center.tolist(),
                     "size": [width, length, height],
-                    "rotation": quaternion(turned),
+                    "rotation": [math.cos(half_turn), 0.0, 0.0, math.sin(half_turn)],
                     "prev": "",
                     "next": "",
                     "num_lidar_pts": struck,
