@@ -219,3 +219,27 @@ def test_gsmap_predicts_gaussians_of_one_to_one_queries():
     result = gsmap_on_maptrv2().eval().predict(bev(), [sample(0)])[0]
     assert result.scales.shape == result.pts.shape
     assert result.rotations.shape == result.pts.shape[:2]
+
+
+def instance_queries(head):
+    return head.state_dict()["instance_embedding.weight"]
+
+
+@pytest.mark.parametrize("num_one2many", [2, 6, 9])
+def test_checkpoint_with_another_number_of_further_queries(num_one2many):
+    loaded = instance_queries(build(num_one2many=num_one2many)).clone()
+    head = build()
+    own = instance_queries(head).clone()
+    state = {"map_head.instance_embedding.weight": loaded}
+    head.fit_state(state, "map_head.")
+    fitted = state["map_head.instance_embedding.weight"]
+    both = min(len(loaded), len(own))
+    assert fitted.shape == own.shape
+    assert torch.equal(fitted[:both], loaded[:both])
+    assert torch.equal(fitted[both:], own[both:])
+
+
+def test_checkpoint_with_fewer_predicting_queries_is_left_for_the_strict_check():
+    state = {"map_head.instance_embedding.weight": torch.zeros(N - 1, 2 * C)}
+    build().fit_state(state, "map_head.")
+    assert state["map_head.instance_embedding.weight"].shape == (N - 1, 2 * C)

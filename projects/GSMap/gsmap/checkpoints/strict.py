@@ -1,6 +1,6 @@
 """Strict loading: every key is used and every weight is loaded, or an error names it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from torch import Tensor, nn
 
@@ -33,7 +33,11 @@ def neutral_keys(model: nn.Module, prefix: str = "") -> set[str]:
 
 
 def adapt_state(
-    state: dict[str, Tensor], expected: Mapping[str, Tensor], prefix: str, neutral: set[str]
+    state: dict[str, Tensor],
+    expected: Mapping[str, Tensor],
+    prefix: str,
+    neutral: set[str],
+    fit: Callable[[dict[str, Tensor]], None] | None = None,
 ) -> None:
     """Rename upstream's keys in place, then compare the state with what the model expects.
 
@@ -45,6 +49,7 @@ def adapt_state(
         expected: The model's state dict.
         prefix: Prefix of both.
         neutral: Keys from :func:`neutral_keys`.
+        fit: Changes the renamed state in place before it is compared, or None.
 
     Raises:
         ValueError: If a key is missing, left over or of another shape.
@@ -53,6 +58,8 @@ def adapt_state(
     if is_upstream(own):
         state.clear()
         state.update({prefix + key: value for key, value in ours_from_upstream(own).items()})
+    if fit is not None:
+        fit(state)
     missing = {
         key for key in expected if key not in state and not key.endswith("num_batches_tracked")
     }

@@ -142,5 +142,16 @@ class MapDetector(Base3DDetector):
         Raises:
             ValueError: If a key is missing, left over or of another shape.
         """
-        adapt_state(state_dict, self.state_dict(prefix=prefix), prefix, neutral_keys(self, prefix))
+        adapt_state(
+            state_dict,
+            self.state_dict(prefix=prefix),
+            prefix,
+            neutral_keys(self, prefix),
+            lambda state: self._fit_state(state, prefix),
+        )
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def _fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Let the head fit a checkpoint's training-only parts to its own size."""
+        if hasattr(self.map_head, "fit_state"):
+            self.map_head.fit_state(state, f"{prefix}map_head.")

@@ -1,11 +1,13 @@
 """MapTRv2's head: what it adds to MapTR's are one-to-many queries and auxiliary segmentation."""
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
+from mmengine.logging import print_log
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
@@ -67,6 +69,30 @@ class OneToManyHead(MapHead):
         device = self.instance_embedding.weight.device
         further = torch.arange(self.num_instances, device=device) >= self.num_one2one
         return further[:, None] != further
+
+    def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Fit the instance queries of a checkpoint with another number of further queries.
+
+        Those that predict are the first ones and are taken as they are. Surplus further queries are
+        cut off; missing ones keep their initial values. A log line says so.
+
+        Args:
+            state: The checkpoint's state dict; changed in place.
+            prefix: Prefix of the head's keys.
+        """
+        key = f"{prefix}instance_embedding.weight"
+        own = self.instance_embedding.weight.detach()
+        loaded = state.get(key)
+        if loaded is None or len(loaded) < self.num_one2one or loaded.shape == own.shape:
+            return
+        kept = loaded[: len(own)]
+        state[key] = torch.cat([kept, own[len(kept) :].to(kept)])
+        print_log(
+            f"{key}: the checkpoint has {len(loaded)} instance queries, the model {len(own)}; the "
+            f"{self.num_one2one} that predict are taken, the further ones cut off or left as new.",
+            "current",
+            logging.WARNING,
+        )
 
     def loss_by_feat(
         self,
