@@ -107,32 +107,29 @@ class Masks:
     """The masks of N elements as crops of the canvas.
 
     Args:
-        pixels: Bytes 0 or 1 of all crops, one crop after another. (M,)
-        boxes: First row, first column, rows and columns of each crop. (N, 4)
-        starts: Where each crop starts in ``pixels``, and the size of it. (N + 1,)
+        words: Packed pixels of all crops, one crop after another (``raster_drawing``). (M,)
+        boxes: First row, first word, rows and words of each crop. (N, 4)
+        starts: Where each crop starts in ``words``, and the size of it. (N + 1,)
         labels: Class indices. (N,)
     """
 
-    pixels: drawing.ByteArray
+    words: drawing.WordArray
     boxes: IntArray
     starts: IntArray
     labels: IntArray
 
-    def astuple(self) -> tuple[drawing.ByteArray, IntArray, IntArray, IntArray]:
+    def astuple(self) -> tuple[drawing.WordArray, IntArray, IntArray, IntArray]:
         """Return the fields in the order in which the kernels take them."""
-        return self.pixels, self.boxes, self.starts, self.labels
-
-    def crop(self, index: int) -> drawing.ByteArray:
-        """Return a view of one crop. (rows, columns)"""
-        _, _, rows, cols = self.boxes[index]
-        start = self.starts[index]
-        return self.pixels[start : start + rows * cols].reshape(rows, cols)
+        return self.words, self.boxes, self.starts, self.labels
 
     def full(self, index: int, height: int, width: int) -> BoolArray:
         """Return one mask on the whole canvas. (H, W)"""
+        top, left, rows, words = self.boxes[index]
+        packed = self.words[self.starts[index] : self.starts[index + 1]].astype("<u8")
+        bits = np.unpackbits(packed.view(np.uint8), bitorder="little").reshape(rows, 64 * words)
         canvas = np.zeros((height, width), dtype=np.bool_)
-        top, left, rows, cols = self.boxes[index]
-        canvas[top : top + rows, left : left + cols] = self.crop(index)
+        columns = min(64 * int(words), width - 64 * int(left))
+        canvas[top : top + rows, 64 * left : 64 * left + columns] = bits[:, :columns]
         return canvas
 
 
@@ -166,7 +163,7 @@ def rasterize(elements: MapElements, config: RasterConfig) -> Masks:
     radius = config.dilation_px // 2
     boxes, starts = drawing.crops(pixels, elements.offsets, config.height, config.width, radius)
     filled = np.array(config.is_polygon)[elements.labels]
-    masks = drawing.draw(pixels, elements.offsets, boxes, starts, filled, radius)
+    masks = drawing.draw(pixels, elements.offsets, boxes, starts, filled, config.width, radius)
     return Masks(masks, boxes, starts, elements.labels)
 
 

@@ -3,6 +3,8 @@
 The pixels are those of OpenCV 4.8 to 4.10 (8-connected lines of one pixel, even-odd fill), with
 which the reference figures were made. OpenCV before and after fills other pixels along the outline
 of a polygon, enough to move an AP in the third digit; so the rule stands here, for every version.
+
+A mask is a crop of the canvas, 64 pixels of a row to a word: bit b of word w is column 64 w + b.
 """
 
 import numpy as np
@@ -11,8 +13,9 @@ from numba import njit
 
 from gsmap.evaluation.elements import BoolArray, IntArray
 
-ByteArray = npt.NDArray[np.uint8]
+WordArray = npt.NDArray[np.uint64]
 
+_ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _ONE = 65536  # crossings are in 1/65536 of a pixel
 
 
@@ -30,9 +33,9 @@ def crops(
         radius: Half the side of the dilating square, less the centre.
 
     Returns:
-        First row, first column, rows and columns of each crop, zero for an element without points
-        or outside the canvas (N, 4); where each crop starts in one flat array, and that array's
-        size (N + 1,).
+        First row, first word, rows and words of each crop, zero for an element without points or
+        outside the canvas (N, 4); where each crop starts in one flat array of words, and that
+        array's size (N + 1,).
     """
     boxes = np.zeros((len(offsets) - 1, 4), dtype=np.int64)
     starts = np.zeros(len(offsets), dtype=np.int64)
@@ -42,22 +45,28 @@ def crops(
             x_low, x_high = pixels[start:stop, 0].min(), pixels[start:stop, 0].max()
             y_low, y_high = pixels[start:stop, 1].min(), pixels[start:stop, 1].max()
             if x_high >= 0 and y_high >= 0 and x_low < width and y_low < height:
-                top, left = max(y_low - radius, 0), max(x_low - radius, 0)
-                boxes[i, 0], boxes[i, 1] = top, left
+                top, first_word = max(y_low - radius, 0), max(x_low - radius, 0) // 64
+                boxes[i, 0], boxes[i, 1] = top, first_word
                 boxes[i, 2] = min(y_high + radius + 1, height) - top
-                boxes[i, 3] = min(x_high + radius + 1, width) - left
+                boxes[i, 3] = min(x_high + radius, width - 1) // 64 + 1 - first_word
         starts[i + 1] = starts[i] + boxes[i, 2] * boxes[i, 3]
     return boxes, starts
 
 
 @njit(cache=True)
-def _stamp(mask: ByteArray, row: int, left: int, right: int, radius: int) -> None:
+def _stamp(mask: WordArray, width: int, row: int, left: int, right: int, radius: int) -> None:
     """Set the pixels ``left`` to ``right`` of a row, dilated by a square, inside the mask."""
-    height, width = mask.shape
-    low, high = max(left - radius, 0), min(right + radius + 1, width)
-    for y in range(max(row - radius, 0), min(row + radius + 1, height)):
-        for x in range(low, high):
-            mask[y, x] = 1
+    low, high = max(left - radius, 0), min(right + radius, width - 1)
+    first, last = low >> 6, high >> 6
+    head, tail = _ALL << np.uint64(low & 63), _ALL >> np.uint64(63 - (high & 63))
+    for y in range(max(row - radius, 0), min(row + radius + 1, mask.shape[0])):
+        if first == last:
+            mask[y, first] |= head & tail
+        else:
+            mask[y, first] |= head
+            for word in range(first + 1, last):
+                mask[y, word] = _ALL
+            mask[y, last] |= tail
 
 
 @njit(cache=True)
@@ -108,7 +117,7 @@ def clip_segment(a: IntArray, b: IntArray, height: int, width: int) -> bool:
 
 
 @njit(cache=True)
-def _draw_segment(mask: ByteArray, start: IntArray, end: IntArray, radius: int) -> None:
+def _draw_segment(mask: WordArray, width: int, start: IntArray, end: IntArray, radius: int) -> None:
     """Draw an 8-connected segment between two points inside the mask, dilated."""
     if end[0] < start[0]:
         start, end = end, start
@@ -123,31 +132,34 @@ def _draw_segment(mask: ByteArray, start: IntArray, end: IntArray, radius: int) 
         aside = error < 0
         error += (2 * major if aside else 0) - 2 * minor
         if steep or aside:
-            _stamp(mask, y, run, x, radius)
+            _stamp(mask, width, y, run, x, radius)
             y += down
             x += 1 if (aside or not steep) else 0
             run = x
         else:
             x += 1
-    _stamp(mask, y, run, x, radius)
+    _stamp(mask, width, y, run, x, radius)
 
 
 @njit(cache=True)
-def _fill(mask: ByteArray, corners: IntArray, edges: IntArray, cut: BoolArray, radius: int) -> None:
+def _fill(
+    mask: WordArray, width: int, corners: IntArray, edges: IntArray, cut: BoolArray, radius: int
+) -> None:
     """Fill the inside of a polygon by the even-odd rule, dilated.
 
     Row y holds the pixels between the crossings of the edges that span [y, y + 1), rounded to the
     nearest pixel.
 
     Args:
-        mask: Where to set 1. (rows, columns)
+        mask: Where to set bits. (rows, words)
+        width: Columns of the mask.
         corners: Column and row of each corner. (P, 2)
         edges: Two points of the edge from each corner to the next, that fix its slope: its ends,
             or where it meets the border of the mask. (P, 2, 2)
         cut: Which edges leave the mask; their crossings are rounded down. (P,)
         radius: Half the side of the dilating square, less the centre.
     """
-    num_edges, height, width = len(corners), mask.shape[0], mask.shape[1]
+    num_edges, height = len(corners), mask.shape[0]
     x_start, slope = np.zeros(num_edges, np.int64), np.zeros(num_edges, np.int64)
     low, high = np.zeros(num_edges, np.int64), np.zeros(num_edges, np.int64)
     for i in range(num_edges):
@@ -170,7 +182,7 @@ def _fill(mask: ByteArray, corners: IntArray, edges: IntArray, cut: BoolArray, r
         for i in range(0, count - 1, 2):
             left, right = max(0, crossings[i] // _ONE), min(width - 1, crossings[i + 1] // _ONE)
             if left <= right:
-                _stamp(mask, row, left, right, radius)
+                _stamp(mask, width, row, left, right, radius)
 
 
 @njit(cache=True)
@@ -180,8 +192,9 @@ def draw(
     boxes: IntArray,
     starts: IntArray,
     filled: BoolArray,
+    canvas_width: int,
     radius: int,
-) -> ByteArray:
+) -> WordArray:
     """Draw and dilate all elements, each in its crop.
 
     Args:
@@ -190,17 +203,19 @@ def draw(
         boxes: Crops, from ``crops``. (N, 4)
         starts: Where they start, from ``crops``. (N + 1,)
         filled: Which elements are polygons. (N,)
+        canvas_width: Columns of the canvas.
         radius: Half the side of the dilating square, less the centre.
 
     Returns:
-        The crops, one after another: bytes 0 or 1. (starts[-1],)
+        The crops, one after another. (starts[-1],)
     """
-    masks = np.zeros(starts[-1], dtype=np.uint8)
+    masks = np.zeros(starts[-1], dtype=np.uint64)
     for i in range(len(boxes)):
-        top, left, height, width = boxes[i]
+        top, left, height = boxes[i, 0], 64 * boxes[i, 1], boxes[i, 2]
         if height == 0:
             continue
-        mask = masks[starts[i] : starts[i + 1]].reshape((height, width))
+        width = min(64 * boxes[i, 3], canvas_width - left)
+        mask = masks[starts[i] : starts[i + 1]].reshape((height, boxes[i, 3]))
         corners = pixels[offsets[i] : offsets[i + 1]] - np.array([left, top])
         num_edges = len(corners) - (0 if filled[i] else 1)
         edges = np.zeros((num_edges, 2, 2), dtype=np.int64)
@@ -213,9 +228,9 @@ def draw(
             if cut[j]:
                 visible = clip_segment(edges[j, 0], edges[j, 1], height, width)
             if visible:
-                _draw_segment(mask, edges[j, 0], edges[j, 1], radius)
+                _draw_segment(mask, width, edges[j, 0], edges[j, 1], radius)
             if edges[j, 0, 1] == edges[j, 1, 1]:  # it says nothing about the slope
                 edges[j, 0], edges[j, 1] = corners[j], corners[(j + 1) % len(corners)]
         if filled[i]:
-            _fill(mask, corners, edges, cut, radius)
+            _fill(mask, width, corners, edges, cut, radius)
     return masks
