@@ -19,6 +19,8 @@ FILES = [
     "maptr_r50_state.json",
     "mapvr_r50_state.json",
     "ops_gka_*.npz",
+    "mapvr_rasters_*.npz",
+    "mapvr_dice_*.npz",
     "maptr_r50_forward_reduced_*.npz",
     "maptr_r50_forward_full_*.npz",
     "maptr_gt_*.npz",
@@ -35,7 +37,7 @@ def golden(golden_dir):
 
 
 @pytest.mark.parametrize("files", FILES)
-def test_maptr_agrees_with_the_reference(golden, files):
+def test_ours_agrees_with_the_reference(golden, files):
     rows = list(run_checks(golden, files))
     assert all(row.passed for row in rows), "\n" + format_table(rows)
 
