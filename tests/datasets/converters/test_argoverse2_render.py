@@ -13,6 +13,7 @@ from argoverse2_road import (
     write_log,
     write_map,
 )
+from av2.datasets.sensor.av2_sensor_dataloader import AV2SensorDataLoader
 from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 
 from gsmap.datasets.annotation_file import AnnotationFile
@@ -141,6 +142,21 @@ def test_a_rendered_log_reads_like_a_real_one(rendered):
         ego_from_cam = np.linalg.inv(camera.cam_from_frame)  # taken at the sample's time
         np.testing.assert_allclose(ego_from_cam[:3, 3], [1.6, 0.0, 1.4], atol=1e-9)
     assert not list((out / "val").glob(".*"))
+
+
+def test_the_official_api_reads_a_rendered_log(rendered):
+    _, out, annotations = rendered
+    loader = AV2SensorDataLoader(data_dir=out / "val", labels_dir=out / "val")
+    assert list(loader.get_log_ids()) == ["log-a"]
+    sample = annotations[1]
+    for camera in sample.cameras:
+        path = loader.get_closest_img_fpath("log-a", camera.name, sample.timestamp_ns)
+        assert path == out / camera.path
+        official = loader.get_log_pinhole_camera("log-a", camera.name)
+        assert (official.width_px, official.height_px) == (camera.width, camera.height)
+        np.testing.assert_allclose(official.intrinsics.K, camera.intrinsics)
+    pose = loader.get_city_SE3_ego("log-a", sample.timestamp_ns).transform_matrix
+    np.testing.assert_allclose(pose, sample.global_from_frame)
 
 
 def test_labels_project_onto_what_is_painted(rendered):
