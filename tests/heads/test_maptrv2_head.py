@@ -207,6 +207,10 @@ def test_bad_numbers_are_named():
 
 def test_gsmap_starts_at_maptrv2s_points():
     maptrv2, gsmap_head = build().eval(), gsmap_on_maptrv2().eval()
+    for (
+        parameter
+    ) in maptrv2.parameters():  # as if trained: the sampling offsets are no round numbers
+        parameter.data += 0.1 * torch.randn_like(parameter)
     left = gsmap_head.load_state_dict(maptrv2.state_dict(), strict=False)
     assert not left.unexpected_keys
     assert all("gaussian_" in key for key in left.missing_keys)

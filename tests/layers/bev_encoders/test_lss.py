@@ -129,3 +129,14 @@ def test_training_reaches_every_parameter():
     outputs = module([feats(1, 2)], [meta(2)])
     outputs["bev_feats"].square().sum().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in module.parameters())
+
+
+def test_mixed_precision_keeps_depth_and_pooling_in_float32():
+    module = encoder()
+    exact = module([feats()], [meta()])
+    with torch.autocast("cpu", torch.bfloat16):
+        outputs = module([feats()], [meta()])
+        loss = module.loss(outputs, [sample_with_depth(2.5)])["loss_depth"]
+    assert outputs["depth"].dtype == loss.dtype == torch.float32
+    assert outputs["bev_feats"].isfinite().all()
+    torch.testing.assert_close(outputs["depth"], exact["depth"], atol=0.02, rtol=0)

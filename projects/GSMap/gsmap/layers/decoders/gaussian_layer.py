@@ -37,12 +37,13 @@ class GaussianDeformableAttention(DeformableAttention):
         Returns:
             Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
         """
-        grid = self.space.grid.resized(*shape)
-        cell_m = reference.new_tensor(grid.pixel_size_m)
-        frames = self.space.frames(reference)[:, :, None, None]  # (B, Q, 1, 1, 2, 2)
-        offsets_m = self.offsets_in_cells(query) * cell_m  # (B, Q, heads, S, 2)
-        turned_m = (frames * offsets_m[..., None, :]).sum(-1)
-        return reference[:, :, None, None, :2] + turned_m / reference.new_tensor(grid.extent_m)
+        cell_m = reference.new_tensor(self.space.grid.resized(*shape).pixel_size_m)
+        # The frames act on metres; brought to cells, the identity stays the identity bit by bit.
+        frames = self.space.frames(reference) * (cell_m / cell_m[:, None])  # (B, Q, 2, 2)
+        offsets = self.offsets_in_cells(query)  # (B, Q, heads, S, 2)
+        turned = (frames[:, :, None, None] * offsets[..., None, :]).sum(-1)
+        size = offsets.new_tensor([shape[1], shape[0]])
+        return reference[:, :, None, None, :2] + turned / size
 
 
 @MODELS.register_module()
