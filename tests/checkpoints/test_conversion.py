@@ -6,7 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 from mmengine.runner.checkpoint import load_checkpoint
-from model_cases import build_small
+from model_cases import (
+    build_small,
+    make_images,
+    make_samples,
+    small_config,
+    straight_elements,
+)
 from torch import nn
 
 from gsmap.checkpoints.convert import (
@@ -77,6 +83,22 @@ def test_an_upstream_file_loads_as_it_is(tmp_path):
     assert all(torch.equal(ours[key], theirs[key]) for key in ours)
 
 
+def test_gsmap_starts_where_an_upstream_maptr_checkpoint_ended(tmp_path):
+    maptr = build_small(seed=1).eval()
+    head = {**small_config().map_head, "type": "GSMapHead"}
+    gsmap = build_small(seed=2, map_head=head).eval()
+    path = tmp_path / "upstream.pth"
+    torch.save({"state_dict": upstream_from_ours(maptr.state_dict())}, path)
+    load_checkpoint(gsmap, str(path))
+    images, samples = make_images(1), make_samples(straight_elements())
+    with torch.no_grad():
+        expected, outputs = maptr._forward(images, samples), gsmap._forward(images, samples)
+    assert torch.equal(outputs["all_pts_preds"], expected["all_pts_preds"])
+    assert torch.equal(outputs["all_cls_scores"], expected["all_cls_scores"])
+    with pytest.raises(ValueError, match=r"does not have: .*map_head\.gaussian_init"):
+        upstream_from_ours(gsmap.state_dict())
+
+
 @pytest.mark.parametrize("upstream", [False, True])
 def test_missing_left_over_and_reshaped_keys_are_errors_that_name_them(tmp_path, upstream):
     model = build_small()
@@ -113,7 +135,10 @@ def test_neutral_keys_may_be_missing_together_only():
     neutral = neutral_keys(model)
     assert neutral == {"head.extra.weight", "head.extra.bias"}
     without = {key: value for key, value in expected.items() if "extra" not in key}
-    adapt_state(dict(without), expected, "", neutral)
+    state = dict(without)
+    adapt_state(state, expected, "", neutral)
+    assert state.keys() == expected.keys()
+    assert torch.equal(state["head.extra.weight"], model["head"].extra.weight)
     with pytest.raises(ValueError, match=r"missing: head\.extra\.bias\."):
         adapt_state({**without, "head.extra.weight": torch.ones(2, 2)}, expected, "", neutral)
 

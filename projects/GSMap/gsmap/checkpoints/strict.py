@@ -41,8 +41,8 @@ def adapt_state(
 ) -> None:
     """Rename upstream's keys in place, then compare the state with what the model expects.
 
-    Batch counters of BatchNorm may be missing, as in old checkpoints. Neutral keys may be missing
-    all together.
+    Batch counters of BatchNorm may be missing, as in old checkpoints. Neutral keys, which then
+    stay as they are, may be missing all together.
 
     Args:
         state: The checkpoint's state dict; changed in place.
@@ -65,6 +65,7 @@ def adapt_state(
     }
     if neutral <= missing:
         missing -= neutral
+        state.update({key: expected[key] for key in neutral})  # they stay as they are
     left_over = [key for key in state if key not in expected]
     reshaped = [
         f"{key} {tuple(value.shape)} instead of {tuple(expected[key].shape)}"
