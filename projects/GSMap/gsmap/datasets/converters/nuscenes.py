@@ -24,6 +24,7 @@ from gsmap.datasets.converters.nuscenes_map import (
 from gsmap.datasets.converters.splits import overlap_share, read_split_file, resolve_scenes
 from gsmap.datasets.converters.summary import ConversionSummary
 from gsmap.datasets.converters.worker_pool import ordered_map
+from gsmap.geometry.rigid import invert_rigid
 
 if TYPE_CHECKING:
     from gsmap.datasets.converters.nuscenes_tables import NuScenesTables
@@ -203,7 +204,7 @@ class _Conversion:
                 self.summary.add_problem(f"sample left out: {error}", record["token"])
                 continue
             self._count_missing(sample)
-            pose = sample.global_from_frame @ np.linalg.inv(sample.ego_from_frame)
+            pose = sample.global_from_frame @ invert_rigid(sample.ego_from_frame)
             can_bus = self.can_bus.signals(sample.scene, sample.timestamp_ns, pose)
             samples.append(replace(sample, can_bus=can_bus))
         return samples

@@ -12,6 +12,7 @@ from nuscenes.utils.geometry_utils import transform_matrix
 from pyquaternion import Quaternion
 
 from gsmap.datasets.annotation_record import CameraRecord, LidarRecord, MapSample, SweepRecord
+from gsmap.geometry.rigid import invert_rigid
 
 CAMERAS = (
     "CAM_FRONT",
@@ -182,13 +183,13 @@ class SampleReader:
                     int(data["width"] or 0),
                     int(data["height"] or 0),
                     intrinsics,
-                    np.linalg.inv(global_from_cam) @ global_from_frame,
+                    invert_rigid(global_from_cam) @ global_from_frame,
                 )
             )
         return cameras
 
     def _sweeps(self, lidar: dict[str, Any], global_from_frame: np.ndarray) -> list[SweepRecord]:
-        frame_from_global = np.linalg.inv(global_from_frame)
+        frame_from_global = invert_rigid(global_from_frame)
         sweeps: list[SweepRecord] = []
         token = lidar["prev"]
         while token and len(sweeps) < self._max_sweeps:
