@@ -204,13 +204,20 @@ def _reference_table(frames: list[Record], count: int) -> str:
     return markdown_table(header, rows)
 
 
+def _say(text: str) -> None:
+    """Show what is measured while the rest still runs."""
+    print(text, file=sys.stderr, flush=True)  # noqa: T201 (a command's progress)
+
+
 def run(args: argparse.Namespace) -> None:
     """Measure, print and write the tables."""
     given = json.loads(args.frames.read_text())["frames"] if args.frames else None
     frames = given or generated_frames(320)
+    reference = _reference_table(frames, args.reference_samples)
+    _say(reference)
     parts = [
         f"Matching alone, processor time a frame, {args.reference_samples} samples:\n",
-        _reference_table(frames, args.reference_samples),
+        reference,
         "\nThe whole command, start, reading and printing included:\n",
     ]
     rows = []
@@ -225,6 +232,7 @@ def run(args: argparse.Namespace) -> None:
                 (["chamfer", "raster"], 2),
             ):
                 cost = _evaluate(files, metrics, workers)
+                _say(f"{count} samples, {metrics}, {workers} processes: {cost}")
                 rows.append(
                     [
                         str(count),
