@@ -147,6 +147,19 @@ def test_it_pickles_small_for_workers(build, minicity_root, minicity_annotations
     assert pickle.loads(data).sample(1).token == dataset.sample(1).token
 
 
+def test_it_repeats_and_goes_through_workers(build, minicity_root, minicity_annotations):
+    from mmdet3d.registry import DATASETS
+    from mmengine.runner import Runner
+
+    loader = Config.fromfile(CONFIGS / "minicity.py").train_dataloader
+    dataset = dataset_config("minicity", "train_dataloader", minicity_root)
+    loader.dataset = {"type": "RepeatDataset", "times": 3, "dataset": dataset}
+    assert len(DATASETS.build(loader.dataset)) == 6
+    batches = list(Runner.build_dataloader(loader, seed=0))
+    assert sum(len(batch["data_samples"]) for batch in batches) == 6
+    assert batches[0]["inputs"]["img"][0].shape == (6, 3, 90, 160)
+
+
 def test_it_tests_without_ground_truth_and_refuses_to_train(
     build, minicity_root, minicity_annotations, tmp_path
 ):
