@@ -11,7 +11,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -234,19 +235,19 @@ def _add_fixed_tables(tables: dict[str, list[dict[str, Any]]], config: MiniCityC
 _WORKER: dict[str, Any] = {}
 
 
-def _start_worker(root: Path, config: MiniCityConfig, towns: dict[str, Town]) -> None:
-    """Prepare a worker process; it ends as soon as its parent does, even if that is killed."""
+def _start_worker(
+    root: Path, config: MiniCityConfig, towns: dict[str, Town], lifeline: Connection
+) -> None:
+    """Prepare a worker, which ends as soon as its parent lets go of the lifeline, even by dying."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and ends the pool
     cv2.setNumThreads(1)
     _WORKER.update(root=root, config=config, towns=towns)
-    parent = parent_process()
-    if parent is not None:
 
-        def end_with_parent() -> None:
-            parent.join()
-            os._exit(1)
+    def end_with_parent() -> None:
+        lifeline.poll(None)
+        os._exit(1)
 
-        threading.Thread(target=end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 def _make_scene(task: SceneTask) -> Records:
@@ -276,14 +277,20 @@ def _run_scenes(
                 done[task.name] = maker.make()
                 bar.update(per_scene)
             return done
+        context = get_context("spawn")
+        lifeline, held = context.Pipe(duplex=False)
         pool = ProcessPoolExecutor(
-            workers, get_context("spawn"), initializer=_start_worker, initargs=(root, config, towns)
+            workers, context, initializer=_start_worker, initargs=(root, config, towns, lifeline)
         )
         try:
             futures = {pool.submit(_make_scene, task): task.name for task in tasks}
             for future in as_completed(futures):
                 done[futures[future]] = future.result()
                 bar.update(per_scene)
+        except BaseException:
+            held.close()  # workers stop in the middle of their scenes
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+            held.close()
     return done
