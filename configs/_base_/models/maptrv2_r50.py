@@ -1,15 +1,15 @@
 # MapTRv2 with ResNet-50, as published for nuScenes: depth lifting supervised by LiDAR, one-to-many queries,
 # decoupled self-attention, auxiliary masks. Loads upstream's checkpoints (40.30 M trainable parameters there,
-# of which 40.22 M are in use).
+# of which 40.23 M are in use).
 _base_ = './maptr_r50.py'
 
-pc_range = [-15.0, -30.0, -10.0, 15.0, 30.0, 10.0]
+_pc_range = [-15.0, -30.0, -10.0, 15.0, 30.0, 10.0]
 
 model = dict(
     bev_encoder=dict(
         _delete_=True,
         type='LSSEncoder',
-        pc_range=pc_range,
+        pc_range=_pc_range,
         bev_size=(200, 100),
         embed_dims=256,
         depth_range=(1.0, 35.0, 0.5),
@@ -17,7 +17,7 @@ model = dict(
         loss_depth_weight=3.0),
     map_head=dict(
         type='MapTRv2Head',
-        pc_range=pc_range,
+        pc_range=_pc_range,
         num_instances=50,
         num_one2many=300,
         num_repeats=6,
