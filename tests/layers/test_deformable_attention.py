@@ -48,6 +48,21 @@ def test_bilinear_weights_by_hand():
     torch.testing.assert_close(total, torch.tensor([0.25, 0.0, 0.0, 0.0]))
 
 
+def test_a_location_that_is_not_a_number_poisons_its_own_sample_only():
+    value, locations, weights = random_problem(torch.float32)
+    with torch.no_grad():
+        clean = deformable_sample(value, SHAPE, locations, weights)
+        locations[0, 3, 1, 2, 0] = float("nan")
+        locations[1, 2, 0, 0] = float("inf")
+        out = deformable_sample(value, SHAPE, locations, weights)
+    poisoned = torch.zeros(2, 9, 4, 6, dtype=torch.bool)
+    poisoned[0, 3, 1] = poisoned[1, 2, 0] = True
+    assert out.unflatten(-1, (4, 6))[poisoned].isnan().all()
+    torch.testing.assert_close(
+        out.unflatten(-1, (4, 6))[~poisoned], clean.unflatten(-1, (4, 6))[~poisoned]
+    )
+
+
 def test_sum_rows_equals_the_plain_sum():
     torch.manual_seed(0)
     table, rows, weights = torch.randn(8, 3), torch.randint(8, (2, 4, 5)), torch.rand(2, 4, 5)

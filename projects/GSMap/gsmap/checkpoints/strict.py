@@ -85,8 +85,8 @@ def adapt_state(
         raise ValueError(
             "the checkpoint does not fit the model; "
             + "; ".join(problems)
-            + ". Load it with the config it was trained "
-            "with; docs/migration.md lists the architectures that load."
+            + ". Load it with the config it was trained with; docs/migration.md lists the "
+            "architectures that load."
         )
 
 

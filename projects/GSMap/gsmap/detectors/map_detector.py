@@ -130,8 +130,7 @@ class MapDetector(Base3DDetector):
             tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
             raise FloatingPointError(
                 f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
-                "truth, then at the "
-                "learning rate and at the loss scale of mixed precision."
+                "truth, then at the learning rate and at the loss scale of mixed precision."
             )
 
     def _load_from_state_dict(

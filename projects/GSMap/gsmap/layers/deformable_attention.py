@@ -28,7 +28,8 @@ def bilinear_cells(
         shape: Rows and columns of the map.
 
     Returns:
-        Row-major cell indices, clamped to the map, and weights, zero outside. 2 x (..., 4 S)
+        Row-major cell indices and weights, both zero outside the map; a location that is not a
+        number has a valid index and its weight is not a number. 2 x (..., 4 S)
     """
     height, width = shape
     x, y = locations[..., 0] * width - 0.5, locations[..., 1] * height - 0.5
@@ -38,7 +39,7 @@ def bilinear_cells(
     for col, wx in ((x0, 1 - right), (x0 + 1, right)):
         for row, wy in ((y0, 1 - lower), (y0 + 1, lower)):
             inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
-            cells.append(row.clamp(0, height - 1) * width + col.clamp(0, width - 1))
+            cells.append(torch.where(inside, row * width + col, 0))
             cell_weights.append(wx * wy * weights * inside)
     return torch.cat(cells, -1).long(), torch.cat(cell_weights, -1)
 

@@ -93,6 +93,6 @@ class MapAssigner:
             token = (img_meta or {}).get("token", "unknown")
             raise FloatingPointError(
                 f"{what} of sample {token!r} is not finite before the assignment: look at the "
-                "sample's images and "
-                "ground truth, then at the learning rate and at the loss scale of mixed precision."
+                "sample's images and ground truth, then at the learning rate and at the loss scale "
+                "of mixed precision."
             )

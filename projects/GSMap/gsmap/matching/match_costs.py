@@ -24,8 +24,8 @@ def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
     if pts.shape[-2:] != pts_shifts.shape[-2:]:
         raise ValueError(
             f"predictions of {tuple(pts.shape[-2:])} points and ground truth of "
-            f"{tuple(pts_shifts.shape[-2:])} "
-            "do not fit: set the same number of points in the head and in the pipeline."
+            f"{tuple(pts_shifts.shape[-2:])} do not fit: set the same number of points in the head "
+            "and in the pipeline."
         )
     num_gts, num_orders = pts_shifts.shape[:2]
     distances = torch.cdist(pts.flatten(1), pts_shifts.flatten(0, 1).flatten(1), p=1)
