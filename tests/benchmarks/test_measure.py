@@ -57,13 +57,12 @@ def test_floor_counts_the_pixels_of_the_ellipse():
 def test_command_writes_its_tables(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(raster, "SIZES", ((16, 8),))
     monkeypatch.setattr(raster, "SCALES_M", ((1.0, 0.4),))
+    monkeypatch.setattr(raster, "RATE_REPEATS", 1)
     parser = argparse.ArgumentParser()
     raster.add_parser(parser.add_subparsers())
     out = tmp_path / "table.md"
     threads = torch.get_num_threads()
-    args = parser.parse_args(
-        f"raster --instances 8 --reference-instances 2 --repeats 1 --threads 1 --out {out}".split()
-    )
+    args = parser.parse_args(f"raster --instances 8 --repeats 1 --threads 1 --out {out}".split())
     args.run(args)
     torch.set_num_threads(threads)
     text = out.read_text()

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 MIB = 2**20
+M_MMAP_THRESHOLD = -3  # of glibc's mallopt
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ def measure(function: Callable[[], object], device: torch.device, repeats: int =
         repeats: Number of timed calls.
 
     Raises:
-        RuntimeError: If the system does not tell a process's peak memory (only Linux does).
+        RuntimeError: If the system does not tell a process's peak memory (only Linux, with glibc,
+            does).
     """
     function()
     peak = _peak_bytes(function, device)
@@ -76,10 +78,13 @@ def _peak_bytes(function: Callable[[], object], device: torch.device) -> int:
         return torch.cuda.max_memory_allocated(device) - before
     if platform.system() != "Linux":
         raise RuntimeError("Peak memory on the CPU is read from /proc, which only Linux has.")
-    ctypes.CDLL(None).malloc_trim(0)  # freed memory that is kept for reuse would hide the next use
+    libc = ctypes.CDLL(None)
+    libc.mallopt(M_MMAP_THRESHOLD, 64 * 1024)  # tensors go back to the system when they are freed,
+    libc.malloc_trim(0)  # as memory kept for reuse would hide the next use or add to it
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = _status_bytes("VmRSS")
     function()
+    libc.mallopt(M_MMAP_THRESHOLD, 32 * MIB)  # what glibc arrives at by itself
     return max(_status_bytes("VmHWM") - before, 0)
 
 

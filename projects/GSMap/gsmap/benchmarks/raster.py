@@ -20,6 +20,9 @@ SIZES = ((128, 64), (200, 100), (256, 128), (480, 240))
 SCALES_M = ((1.0, 0.4), (0.2, 0.2), (5.0, 5.0))
 POINTS = 20
 RATE_REPEATS = 20
+# The reference is measured on as many instances as fill a tensor of this size and scaled up: it is
+# linear in them. Smaller tensors are kept by malloc when they are freed, and blur its peak memory.
+REFERENCE_BYTES = 36 * MIB
 FLOOR_DENSITY = 1e-6  # pixels where a Gaussian is below need no exponential
 Gaussians = tuple[Tensor, Tensor, Tensor]
 
@@ -31,12 +34,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument(
         "--instances", type=int, default=360, help="15 matched x batch 4 x 6 decoder layers"
-    )
-    parser.add_argument(
-        "--reference-instances",
-        type=int,
-        default=12,
-        help="the reference is measured on so many, and scaled up: it is linear in them",
     )
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, help="write the tables to this file, too")
@@ -124,7 +121,7 @@ def rendering_table(args: argparse.Namespace) -> str:
         mapvr = measure_soft_lines(lines, grid, upstream, args.repeats)
         for scales_m in SCALES_M:
             gaussians = gaussians_along(lines, scales_m)
-            count = min(args.reference_instances, args.instances)
+            count = min(args.instances, math.ceil(REFERENCE_BYTES / (4 * POINTS * height * width)))
             few = gaussians[0][:count], gaussians[1][:count], gaussians[2][:count]
             factor = args.instances / count
             reference = measure_renderer(few, grid, upstream, "reference", 2).scaled(factor)
