@@ -99,14 +99,25 @@ def test_height_follows_the_slope_and_fills_holes(tmp_path):
     write_heights(tmp_path, slope=0.1)
     heights = GroundHeightLayer.from_file(tmp_path / "map")
     points = np.array([[X, Y], [X + 20, Y - 10]])
-    grid = height_grid(heights, AROUND)
+    everywhere = shapely.box(X - 70, Y - 70, X + 70, Y + 70)
+    grid = height_grid(heights, AROUND, everywhere)
     # float16 keeps heights near 20 m to 1/64 m.
     np.testing.assert_allclose(sample_height(grid, points), [20.0, 22.0], atol=1 / 64)
-    corner = height_grid(heights, (X - 70, Y - 70, X, Y))
+    corner = height_grid(heights, (X - 70, Y - 70, X, Y), everywhere)
     assert np.isfinite(corner.height_m).all()
     assert sample_height(corner, np.array([[X - 69, Y - 69]]))[0] == pytest.approx(13.5, abs=0.3)
-    with pytest.raises(ValueError, match="no ground height is known"):
-        height_grid(heights, (X - 70, Y - 70, X - 69, Y - 69))
+    with pytest.raises(ValueError, match="no ground height is known on the road"):
+        height_grid(heights, (X - 70, Y - 70, X - 69, Y - 69), everywhere)
+
+
+def test_away_from_the_road_the_height_at_its_edge_goes_on(tmp_path):
+    """What is stored beyond x = 5 m is a slope that nothing visible stands on."""
+    write_map(tmp_path)
+    write_heights(tmp_path, slope=0.5)
+    heights = GroundHeightLayer.from_file(tmp_path / "map")
+    grid = height_grid(heights, AROUND, shapely.box(X - 30, Y - 20, X + 5, Y + 20))
+    height = sample_height(grid, np.array([[X - 10, Y], [X + 12, Y], [X + 25, Y]]))
+    np.testing.assert_allclose(height, [15.0, 22.4, 22.4], atol=0.2)
 
 
 def test_scaled_pictures_keep_their_corners(tmp_path):

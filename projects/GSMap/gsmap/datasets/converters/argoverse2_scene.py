@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from av2.map.lane_segment import LaneMarkType
-from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
+from av2.map.map_api import ROI_ISOCONTOUR_M, ArgoverseStaticMap, GroundHeightLayer
 from scipy import ndimage
 
 from gsmap.datasets.minicity.scene_map import (
@@ -51,7 +51,7 @@ def make_scene(
     window = shapely.box(*bounds)
     areas = [shapely.Polygon(a.xyz[:, :2]) for a in static_map.get_scenario_vector_drivable_areas()]
     road = shapely.union_all([shapely.make_valid(a) for a in areas if a.intersects(window)])
-    scene = SceneMap(height=height_grid(heights, bounds))
+    scene = SceneMap(height=height_grid(heights, bounds, road.buffer(ROI_ISOCONTOUR_M)))
     scene.surfaces += [
         Surface(p, "walkway") for p in _polygons(road.buffer(WALKWAY_WIDTH_M, join_style="mitre"))
     ]
@@ -123,12 +123,17 @@ def _stroke(line: np.ndarray, kind: str) -> list[np.ndarray]:
     return solid_line(line, LINE_WIDTH_M)
 
 
-def height_grid(heights: GroundHeightLayer, bounds: Bounds) -> HeightGrid:
-    """Return the ground height inside bounds, smoothed, with holes filled from their surroundings.
+def height_grid(
+    heights: GroundHeightLayer, bounds: Bounds, trusted: shapely.Geometry
+) -> HeightGrid:
+    """Return the ground height inside bounds, smoothed, and outwards as it is at the edge.
+
+    Away from the road the stored heights include what stands there, up to tall spikes.
 
     Args:
         heights: The log's ground height.
         bounds: xmin, ymin, xmax, ymax in the city frame, in metres.
+        trusted: Where the stored heights count, in the city frame.
 
     Raises:
         ValueError: If no height is known inside the bounds, or the grid is turned.
@@ -142,12 +147,16 @@ def height_grid(heights: GroundHeightLayer, bounds: Bounds) -> HeightGrid:
     low = np.clip(np.floor(corners[0]).astype(int), 0, (columns - 1, rows - 1))
     high = np.clip(np.ceil(corners[1]).astype(int), low + 1, (columns, rows))
     part = heights.array[low[1] : high[1], low[0] : high[0]].astype(np.float64)
-    known = np.isfinite(part)
+    origin = (low + 0.5) * cell_m - to_grid.t  # p_grid = s (p_city + t), cells centred at + 0.5
+    x, y = (
+        start + np.arange(n) * cell_m for start, n in zip(origin, part.shape[::-1], strict=True)
+    )
+    shapely.prepare(trusted)
+    known = np.isfinite(part) & shapely.contains_xy(trusted, *np.meshgrid(x, y))
     if not known.any():
-        raise ValueError(f"no ground height is known inside {bounds}.")
+        raise ValueError(f"no ground height is known on the road inside {bounds}.")
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     filled = ndimage.gaussian_filter(part[tuple(nearest)], HEIGHT_SMOOTHING_M / cell_m)
-    origin = (low + 0.5) * cell_m - to_grid.t  # p_grid = s (p_city + t), cells centred at + 0.5
     return HeightGrid(origin, cell_m, filled)
 
 
