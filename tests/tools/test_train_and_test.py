@@ -1,0 +1,126 @@
+"""The command-line tools, as a user runs them: train, be killed, resume, two processes, test."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[2]
+CONFIG = """
+_base_ = '{repo}/projects/GSMap/configs/gsmap_maptr_r18_minicity.py'
+_data = dict(data_root='{root}')
+_heads = dict(embed_dims=16, num_heads=4, ffn_dims=16)
+model = dict(
+    img_backbone=dict(base_channels=8),
+    img_neck=dict(in_channels={channels}, out_channels=16),
+    bev_encoder=dict(embed_dims=16, bev_size=(20, 10), layer_cfg=dict(num_heads=4, ffn_dims=16)),
+    map_head=dict(embed_dims=16, num_instances=5, decoder=dict(num_layers=2, layer=_heads)))
+train_dataloader = dict(batch_size=1, num_workers=0, persistent_workers=False, dataset=_data)
+val_dataloader = dict(num_workers=0, persistent_workers=False, dataset=_data)
+test_dataloader = dict(num_workers=0, persistent_workers=False, dataset=_data)
+train_cfg = dict(max_epochs=3, val_interval=9)
+param_scheduler = []
+default_hooks = dict(logger=dict(interval=1))
+"""
+
+
+@pytest.fixture(scope="module")
+def config(minicity_root, minicity_annotations, tmp_path_factory) -> Path:
+    """A config of a very small GSMap on a very small MiniCity."""
+    from mmengine.config import Config
+
+    path = REPO / "configs/_base_/models/maptr_r18_minicity.py"
+    neck = Config.fromfile(path, import_custom_modules=False).model.img_neck
+    wide = Config.fromfile(path, import_custom_modules=False).model.img_backbone.base_channels
+    channels = [8 * c // wide for c in neck.in_channels]
+    target = tmp_path_factory.mktemp("config") / "tiny.py"
+    target.write_text(CONFIG.format(repo=REPO, root=f"{minicity_root}/", channels=channels))
+    return target
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHON": sys.executable, "PORT": "29613"}
+
+
+def run(*command: object) -> str:
+    """Run a command to its end and return what it printed."""
+    done = subprocess.run(
+        [str(part) for part in command], cwd=REPO, env=environment(), text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def trained(config, tmp_path_factory) -> Path:
+    """The work folder of a run that was killed with SIGKILL after its first epoch, then resumed."""
+    work = tmp_path_factory.mktemp("work")
+    command = [sys.executable, "tools/train.py", str(config), "--work-dir", str(work), "--resume"]
+    with subprocess.Popen(
+        command, cwd=REPO, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT
+    ) as training:
+        last = work / "last_checkpoint"
+        while not last.exists() and training.poll() is None:
+            time.sleep(0.02)
+        training.send_signal(signal.SIGKILL)
+    assert training.returncode == -signal.SIGKILL, "the run ended before it could be killed"
+    (work / "killed_after").write_text(Path(last.read_text()).name)
+    (work / "resumed.log").write_text(run(*command))
+    return work
+
+
+def test_a_killed_training_goes_on_where_it_stopped(trained):
+    log = (trained / "resumed.log").read_text()
+    killed_after = (trained / "killed_after").read_text()
+    assert f"{killed_after}" in log
+    first = int(killed_after.removeprefix("epoch_").removesuffix(".pth")) + 1
+    epochs = [n for n in (1, 2, 3) if f"Epoch(train)  [{n}]" in log or f"Epoch(train) [{n}]" in log]
+    assert epochs == list(range(first, 4))
+    assert (trained / "epoch_3.pth").exists()
+    assert not list(trained.glob(".*"))  # nothing half-written is left
+
+
+def test_one_and_two_processes_score_and_write_the_same(config, trained, tmp_path):
+    options = ["--eval", "chamfer", "raster", "--work-dir", tmp_path / "work"]
+    one, two = tmp_path / "one", tmp_path / "two"
+    for folder in (one, two):
+        folder.mkdir()
+    run(
+        sys.executable, "tools/test.py", config, trained / "epoch_3.pth", *options,
+        "--metrics-out", one / "metrics.json", "--out", one / "results.json",
+        "--show-dir", one / "pictures",
+    )  # fmt: skip
+    run(
+        "tools/dist_test.sh", config, trained / "epoch_3.pth", 2, *options,
+        "--metrics-out", two / "metrics.json", "--out", two / "results.json",
+    )  # fmt: skip
+    assert json.loads((one / "metrics.json").read_text()) == json.loads(
+        (two / "metrics.json").read_text()
+    )
+    results = json.loads((one / "results.json").read_text())
+    assert results == json.loads((two / "results.json").read_text())
+    assert len(results["results"]) == 2
+    assert len(list((one / "pictures").iterdir())) == 2
+
+
+def test_two_processes_train_one_model(config, tmp_path):
+    log = run("tools/dist_train.sh", config, 2, "--work-dir", tmp_path, "--cfg-options",
+              "train_cfg.max_epochs=1")  # fmt: skip
+    assert (tmp_path / "epoch_1.pth").exists()
+    assert "Distributed training: True" in log
+    assert "[1][1/1]" in log.replace(" ", "")  # two samples on two ranks: one iteration
+
+
+def test_a_missing_checkpoint_is_named(config):
+    done = subprocess.run(
+        [sys.executable, "tools/test.py", str(config), "nowhere.pth"],
+        cwd=REPO, env=environment(), text=True, capture_output=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "There is no checkpoint nowhere.pth" in done.stderr
