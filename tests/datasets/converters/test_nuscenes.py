@@ -146,10 +146,9 @@ def test_vectors_equal_the_reference(
     options = NuScenesOptions(reference_root, "v1.0-mini", out_dir=tmp_path, workers=2)
     summary = convert_nuscenes(options)
     assert dict(summary.samples) == {"mini_train": 32, "mini_val": 32}
-    frames = []
-    for split in ("mini_train", "mini_val"):
-        export_json(tmp_path / f"gsmap_nuscenes_{split}.arrow", tmp_path / "out.json")
-        frames += json.loads((tmp_path / "out.json").read_text())["frames"]
+    files = [tmp_path / f"gsmap_nuscenes_{split}.arrow" for split in ("mini_train", "mini_val")]
+    assert export_json(files, tmp_path / "out.json") == 64
+    frames = json.loads((tmp_path / "out.json").read_text())["frames"]
     wanted = vector_set(json.loads((golden_dir / "data/E6_A.json").read_text())["frames"])
     found = vector_set(frames)
     assert found.keys() == wanted.keys()

@@ -242,7 +242,8 @@ def validate_sample(sample: MapSample, meta: AnnotationMeta) -> None:
     if sample.can_bus is not None:
         _check_array(sample.can_bus, (CAN_BUS_SIZE,), "can_bus", token)
     if sample.lidar is not None:
-        for record in (sample.lidar, *sample.lidar.sweeps):
+        records: list[LidarRecord | SweepRecord] = [sample.lidar, *sample.lidar.sweeps]
+        for record in records:
             _check_relative(record.path, "LiDAR path", token)
             _check_array(record.frame_from_lidar, (4, 4), "frame_from_lidar", token)
     if sample.instances is not None:

@@ -5,7 +5,8 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -62,38 +63,42 @@ def log_frame_record(sample: MapSample, row: int) -> dict[str, Any]:
     }
 
 
-def export_json(annotations: Path, target: Path) -> int:
-    """Write an annotation file's ground truth as JSON; the file appears when it is whole.
+def export_json(annotations: Path | Sequence[Path], target: Path) -> int:
+    """Write the ground truth of annotation files as one JSON; it appears when it is whole.
 
     Args:
-        annotations: Annotation file.
+        annotations: Annotation file, or several splits of one data set.
         target: JSON file to write.
 
     Returns:
         Number of samples written.
 
     Raises:
-        ValueError: If a sample has no ground truth.
+        ValueError: If a sample has no ground truth, or the files differ in data set, frame, classes
+            or range.
     """
-    file = AnnotationFile(annotations)
-    meta = file.meta
-    head = {
-        "dataset": meta.dataset, "split": meta.split, "frame": meta.frame, "classes": meta.classes,
-        "x_range": meta.x_range, "y_range": meta.y_range, "versions": meta.versions,
-    }  # fmt: skip
+    paths = [annotations] if isinstance(annotations, Path) else list(annotations)
+    files = [AnnotationFile(path) for path in paths]
+    meta = files[0].meta
+    same = {
+        name: getattr(meta, name) for name in ("dataset", "frame", "classes", "x_range", "y_range")
+    }
+    for file in files:
+        file.require(**same)
+    head = {**same, "split": [file.meta.split for file in files], "versions": meta.versions}
     partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with partial.open("w") as out:
             out.write(f'{{"meta": {json.dumps(head)}, "frames": [')
-            for number, record in enumerate(_records(file)):
+            for number, record in enumerate(chain.from_iterable(_records(file) for file in files)):
                 out.write(",\n" if number else "\n")
                 json.dump(record, out)
             out.write("\n]}\n")
         os.replace(partial, target)
     finally:
         partial.unlink(missing_ok=True)
-    return len(file)
+    return sum(len(file) for file in files)
 
 
 def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
@@ -117,7 +122,7 @@ def _known(file: AnnotationFile) -> Iterator[MapSample]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py export``."""
-    parser.add_argument("annotations", type=Path, help="annotation file (.arrow)")
+    parser.add_argument("annotations", type=Path, nargs="+", help="annotation files (.arrow)")
     parser.add_argument("target", type=Path, help="JSON file to write")
 
 

@@ -63,7 +63,8 @@ def resolve_scenes(
     """
     known = {name: name for name in names.values()} | dict(names)
     resolved: dict[str, list[str]] = {}
-    missing, seen = [], set()
+    missing: list[str] = []
+    seen: set[str] = set()
     for split, entries in splits.items():
         chosen = {known[entry] for entry in entries if entry in known}
         missing += [entry for entry in entries if entry not in known]
