@@ -57,6 +57,7 @@ def test_floor_counts_the_pixels_of_the_ellipse():
 def test_command_writes_its_tables(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(raster, "SIZES", ((16, 8),))
     monkeypatch.setattr(raster, "SCALES_M", ((1.0, 0.4),))
+    monkeypatch.setattr(raster, "TRAINING_SIZE", (16, 8))
     monkeypatch.setattr(raster, "RATE_REPEATS", 1)
     parser = argparse.ArgumentParser()
     raster.add_parser(parser.add_subparsers())

@@ -19,6 +19,7 @@ from .measure import MIB, Cost, markdown_table, measure
 SIZES = ((128, 64), (200, 100), (256, 128), (480, 240))
 SCALES_M = ((1.0, 0.4), (0.2, 0.2), (5.0, 5.0))
 POINTS = 20
+TRAINING_SIZE = (200, 100)
 RATE_REPEATS = 20
 # The reference is measured on as many instances as fill a tensor of this size and scaled up: it is
 # linear in them. Smaller tensors are kept by malloc when they are freed, and blur its peak memory.
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> None:
     parts = [
         f"Rendering {args.instances} x {POINTS} Gaussians, forward + backward ({where}):\n",
         rendering_table(args),
-        f"\nThe rest of the training path at 200 x 100 ({where}):\n",
+        f"\nThe rest of the training path at {TRAINING_SIZE[0]} x {TRAINING_SIZE[1]} ({where}):\n",
         training_table(args),
     ]
     report = "\n".join(parts)
@@ -200,7 +201,7 @@ def rendering_row(
 def training_table(args: argparse.Namespace) -> str:
     """Measure what a training step does beside rendering, fused and as the reference."""
     device = torch.device(args.device)
-    grid = BEVGrid((-15, 15), (-30, 30), 200, 100)
+    grid = BEVGrid((-15, 15), (-30, 30), *TRAINING_SIZE)
     matched = args.instances // 4
     lines = random_polylines(matched, grid).to(device)
     targets = draw_polylines(lines, grid)
