@@ -25,7 +25,7 @@ def small_config() -> dict:
     heads = {"embed_dims": 16, "num_heads": 4, "ffn_dims": 16}
     overrides = {
         "img_backbone": {"base_channels": 8},
-        "img_neck": {"in_channels": [64], "out_channels": 16},
+        "img_neck": {"in_channels": [16, 32, 64], "out_channels": [8, 4, 4]},
         "bev_encoder": {
             "embed_dims": 16,
             "bev_size": (12, 6),

@@ -6,6 +6,8 @@ _dim = 128
 _pc_range = [-15.0, -30.0, -10.0, 15.0, 30.0, 10.0]
 
 model = dict(
+    img_backbone=dict(strides=(1, 2, 2, 1), out_indices=(3,)),
+    img_neck=dict(in_channels=[192], out_channels=[128], upsample_strides=[1]),
     bev_encoder=dict(
         _delete_=True,
         type='LSSEncoder',

@@ -1,9 +1,9 @@
-"""GSMap's head on MapTRv2."""
+"""GSMap's head on MapTRv2, and on MapTR with an auxiliary mask."""
 
 from mmdet3d.registry import MODELS
 
 from .gsmap_head import GSMapHead
-from .maptrv2_head import MapTRv2Head
+from .maptrv2_head import MapTRv2Head, SegmentationHead
 
 
 @MODELS.register_module()
@@ -14,3 +14,8 @@ class GSMapV2Head(GSMapHead, MapTRv2Head):
     """
 
     default_layer = "GaussianDecoupledLayer"
+
+
+@MODELS.register_module()
+class GSMapSegmentationHead(GSMapHead, SegmentationHead):
+    """GSMap's head with masks that only help training; the parameters are those of its bases."""
