@@ -60,6 +60,8 @@ def small(cfg: Config) -> Config:
         if part:
             part.init_cfg = None
     cfg.model.map_head.decoder.num_layers = 2
+    if "num_cams" in (cfg.model.get("bev_encoder") or {}):
+        cfg.model.bev_encoder.num_cams = 6  # MiniCity's
     return cfg
 
 
@@ -77,9 +79,10 @@ def ego_annotations(minicity_root: Path, tmp_path_factory) -> Path:
 def one_batch(cfg: Config, part: str, root: Path, ego_annotations: Path) -> dict:
     """Return a batch of one sample of MiniCity that went through the config's own pipeline."""
     dataset = cfg[f"{part}_dataloader"].dataset
-    split = "train" if part == "train" else "val"
     folder = ego_annotations if dataset.frame == "ego" else root
-    dataset.update(data_root=str(root), ann_file=str(folder / f"gsmap_minicity_{split}.arrow"))
+    dataset.update(
+        data_root=str(root), ann_file=str(folder / f"gsmap_minicity_{dataset.split}.arrow")
+    )
     dataset.update(frame="lidar", cameras=None)
     return pseudo_collate([DATASETS.build(dataset)[0]])
 

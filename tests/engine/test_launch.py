@@ -22,15 +22,6 @@ def test_options_override_and_the_work_folder_takes_the_config_name(tmp_path):
     assert load_config(parse(str(path), "--work-dir", "elsewhere")).work_dir == "elsewhere"
 
 
-def test_processes_talk_through_gloo_without_a_gpu(tmp_path, monkeypatch):
-    path = tmp_path / "tiny.py"
-    path.write_text("env_cfg = dict(dist_cfg=dict(backend='nccl'))\n")
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    assert load_config(parse(str(path))).env_cfg.dist_cfg.backend == "gloo"
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    assert load_config(parse(str(path))).env_cfg.dist_cfg.backend == "nccl"
-
-
 def test_a_missing_config_is_named():
     with pytest.raises(SystemExit, match=r"no config file nowhere\.py"):
         load_config(parse("nowhere.py"))

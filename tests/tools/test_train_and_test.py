@@ -18,7 +18,7 @@ _heads = dict(embed_dims=16, num_heads=4, ffn_dims=16)
 model = dict(
     img_backbone=dict(base_channels=8),
     img_neck=dict(in_channels=[16, 32, 64], out_channels=[8, 4, 4]),
-    bev_encoder=dict(embed_dims=16, bev_size=(20, 10), layer_cfg=dict(num_heads=4, ffn_dims=16)),
+    bev_encoder=dict(embed_dims=16, bev_size=(50, 25), layer_cfg=dict(num_heads=4, ffn_dims=16)),
     map_head=dict(embed_dims=16, num_instances=5, decoder=dict(num_layers=2, layer=_heads)))
 train_dataloader = dict(batch_size=1, num_workers=0, persistent_workers=False, dataset=_data)
 val_dataloader = dict(num_workers=0, persistent_workers=False, dataset=_data)

@@ -21,11 +21,13 @@ KNOWN_KEYS = frozenset(
         "default_scope",
         "env_cfg",
         "experiment_name",
+        "find_unused_parameters",
         "launcher",
         "load_from",
         "log_level",
         "log_processor",
         "model",
+        "model_wrapper_cfg",
         "optim_wrapper",
         "param_scheduler",
         "randomness",
@@ -80,10 +82,25 @@ def load_config(args: argparse.Namespace) -> Config:
         cfg.work_dir = args.work_dir
     elif cfg.get("work_dir") is None:
         cfg.work_dir = str(Path("work_dirs") / Path(args.config).stem)
-    if not torch.cuda.is_available():
-        cfg.merge_from_dict({"env_cfg.dist_cfg.backend": "gloo"})
     check_config(cfg)
+    if args.launcher == "pytorch" and not torch.cuda.is_available():
+        join_on_cpu(cfg)
     return cfg
+
+
+def join_on_cpu(cfg: Config) -> None:
+    """Let the processes of torchrun work together without a GPU, which mmengine takes for granted.
+
+    The process group is made here, as mmengine would first choose a CUDA device, and the model is
+    wrapped without device numbers.
+    """
+    torch.distributed.init_process_group("gloo")
+    cfg.model_wrapper_cfg = {
+        "type": "MMDistributedDataParallel",
+        "device_ids": None,
+        "find_unused_parameters": cfg.get("find_unused_parameters", False),
+        "broadcast_buffers": False,
+    }
 
 
 def check_config(cfg: Config) -> None:

@@ -1,0 +1,16 @@
+# The small GSMap on four samples of MiniCity, trained and tested on the same four: it must reach an mAP_chamfer above 0.9.
+_base_ = './gsmap_maptr_r18_minicity.py'
+
+_four = dict(indices=4)
+_epochs = 500
+train_dataloader = dict(batch_size=4, dataset=_four)
+val_dataloader = dict(
+    dataset=dict(ann_file='gsmap_minicity_train.arrow', split='train', **_four))
+test_dataloader = val_dataloader
+param_scheduler = [
+    dict(type='LinearLR', start_factor=0.1, by_epoch=False, begin=0, end=50),
+    dict(type='CosineAnnealingLR', by_epoch=True, T_max=_epochs, eta_min_ratio=1e-2),
+]
+train_cfg = dict(max_epochs=_epochs, val_interval=100)
+default_hooks = dict(
+    checkpoint=dict(interval=100, max_keep_ckpts=1), logger=dict(interval=1))
