@@ -26,7 +26,7 @@ def make_config():
             "model.bev_encoder.num_cams": 2,
             "model.bev_encoder.bev_size": (10, 6),
             "model.img_backbone.base_channels": 8,
-            "model.img_neck.in_channels": [64],
+            "model.img_neck.in_channels": [16, 32, 64],
             "model.map_head.num_instances": 6,
             "model.map_head.coder.max_num": 6,
             "visualizer.width_px": 400,
