@@ -12,6 +12,8 @@ from gsmap.datasets.annotation_record import CAN_BUS_SIZE
 class CanBusReader:
     """Read the ``pose`` messages of scenes; without the expansion the signals are zero.
 
+    So are those of the scenes that the devkit itself refuses (161 to 176, 309 to 314).
+
     Args:
         dataroot: Data root; the expansion lies in its folder ``can_bus``.
     """
@@ -29,7 +31,8 @@ class CanBusReader:
         self._scene, self._messages = scene, []
         if (self._dataroot / "can_bus" / f"{scene}_pose.json").is_file():
             api = NuScenesCanBus(dataroot=str(self._dataroot))
-            self._messages = api.get_messages(scene, "pose", print_warnings=False)
+            if int(scene[-4:]) not in api.can_blacklist:  # scenes whose signals are unreliable
+                self._messages = api.get_messages(scene, "pose", print_warnings=False)
         self._times = np.array([message["utime"] for message in self._messages])
 
     def signals(self, scene: str, timestamp_ns: int, global_from_ego: np.ndarray) -> np.ndarray:
