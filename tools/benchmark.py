@@ -2,10 +2,10 @@
 
 import argparse
 
-from gsmap.benchmarks import evaluation, raster
+from gsmap.benchmarks import evaluation, model_commands, raster
 
 # each adds its own parser, with ``run`` as a default
-SUBCOMMANDS = (evaluation.add_parser, raster.add_parser)
+SUBCOMMANDS = (evaluation.add_parser, model_commands.add_parser, raster.add_parser)
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ from mmengine.config import Config
 from mmengine.registry import init_default_scope
 
 from gsmap import registered  # noqa: F401
+from gsmap.benchmarks.model import ring_of_cameras
 
 
 def parse_args() -> argparse.Namespace:
@@ -28,20 +29,6 @@ def parse_args() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def ring_of_cameras(num_cams: int, height: int, width: int) -> np.ndarray:
-    """Return projections of level cameras that look outward at equal angles, 90 degrees wide."""
-    intrinsics = np.eye(4)
-    intrinsics[:3, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]]
-    matrices = []
-    for angle in np.arange(num_cams) * (2 * np.pi / num_cams):
-        camera = np.eye(4)  # camera x right, y down, z forward; frame x right, y forward, z up
-        camera[0, :2] = np.cos(angle), np.sin(angle)
-        camera[1, :3] = 0, 0, -1
-        camera[2, :3] = -np.sin(angle), np.cos(angle), 0
-        matrices.append(intrinsics @ camera)
-    return np.stack(matrices)
-
-
 def build(config: str, device: str) -> torch.nn.Module:
     cfg = Config.fromfile(config)
     init_default_scope("mmdet3d")
@@ -49,7 +36,7 @@ def build(config: str, device: str) -> torch.nn.Module:
 
 
 def sample(num_cams: int, height: int, width: int) -> Det3DDataSample:
-    matrices = ring_of_cameras(num_cams, height, width)
+    matrices = ring_of_cameras(num_cams, (height, width))
     eyes = np.stack([np.eye(4)] * num_cams)
     return Det3DDataSample(
         metainfo={

@@ -44,6 +44,11 @@ def bilinear_cells(
     return torch.cat(cells, -1).long(), torch.cat(cell_weights, -1)
 
 
+def at_least_float32(values: Tensor) -> Tensor:
+    """Return half-precision values in float32, others as they are: coordinates need the digits."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
+
+
 def deformable_sample(
     value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor
 ) -> Tensor:
@@ -159,13 +164,12 @@ class SamplingAttention(BaseModule):
 
     def offsets_in_cells(self, query: Tensor) -> Tensor:
         """Return the learned offsets (x, y) in cells. (B, Q, heads, S, 2)"""
-        return (
-            self.sampling_offsets(query).float().unflatten(-1, (self.num_heads, self.num_points, 2))
-        )
+        offsets = at_least_float32(self.sampling_offsets(query))
+        return offsets.unflatten(-1, (self.num_heads, self.num_points, 2))
 
     def weights(self, query: Tensor) -> Tensor:
         """Return the attention weights, of sum one over a head's points. (B, Q, heads, S)"""
-        logits = self.attention_weights(query).float()
+        logits = at_least_float32(self.attention_weights(query))
         return logits.unflatten(-1, (self.num_heads, self.num_points)).softmax(-1)
 
 
@@ -215,7 +219,8 @@ class DeformableAttention(SamplingAttention):
         ):
             sampled = self.sample_then_project(tokens, shape, locations, weights)
         else:
-            value = self.value_proj(tokens).float().unflatten(-1, (self.num_heads, -1))
+            value = at_least_float32(self.value_proj(tokens))
+            value = value.unflatten(-1, (self.num_heads, -1))
             sampled = deformable_sample(value, shape, locations, weights)
         return self.dropout(self.output_proj(sampled))
 
@@ -235,7 +240,7 @@ class DeformableAttention(SamplingAttention):
         """
         cells, cell_weights = bilinear_cells(locations, weights, shape)
         sample = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
-        table = tokens.float().reshape(-1, tokens.shape[-1])
+        table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])
         sampled = sum_rows(table, sample * tokens.shape[1] + cells, cell_weights)
         weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C', C)
         bias = self.value_proj.bias.view(self.num_heads, -1)

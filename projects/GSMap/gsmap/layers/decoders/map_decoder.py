@@ -10,7 +10,7 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.layers.deformable_attention import DeformableAttention
+from gsmap.layers.deformable_attention import DeformableAttention, at_least_float32
 
 
 def refine_reference(reference: Tensor, offsets: Tensor) -> Tensor:
@@ -24,7 +24,7 @@ def refine_reference(reference: Tensor, offsets: Tensor) -> Tensor:
         offsets: Predicted offsets. (..., D)
 
     Returns:
-        The refined reference, float32. (..., D)
+        The refined reference, at least float32. (..., D)
 
     Raises:
         ValueError: If the shapes disagree.
@@ -34,7 +34,7 @@ def refine_reference(reference: Tensor, offsets: Tensor) -> Tensor:
             f"offsets must have shape {tuple(reference.shape)} of reference, got "
             f"{tuple(offsets.shape)}."
         )
-    reference, offsets = reference.float(), offsets.float()
+    reference, offsets = at_least_float32(reference), at_least_float32(offsets)
     centres = (inverse_sigmoid(reference[..., :2], eps=1e-5) + offsets[..., :2]).sigmoid()
     return torch.cat([centres, reference[..., 2:] + offsets[..., 2:]], -1)
 
