@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,7 @@ def run_fps(args: argparse.Namespace) -> None:
         model, size = build(path, args), tuple(args.size)
         model.eval()
         inputs, samples = random_batch(model, 1, size, args.device)
-
-        @torch.no_grad()
-        def predict(model=model, inputs=inputs, samples=samples) -> None:
-            with torch.autocast(args.device, torch.float16, enabled=args.fp16):
-                model.predict(inputs, samples)
-
+        predict = partial(predict_once, model, inputs, samples, args)
         cost = measure(predict, torch.device(args.device), args.repeats)
         rows.append((Path(path).stem, cost.time_s(torch.device(args.device)), cost.peak_bytes))
     first = rows[0][1]
@@ -67,6 +63,18 @@ def run_step(args: argparse.Namespace) -> None:
             for name, raster, s, peak in rows
         ],
     )
+
+
+@torch.no_grad()
+def predict_once(
+    model: Any,
+    inputs: dict[str, torch.Tensor],
+    samples: list[Det3DDataSample],
+    args: argparse.Namespace,
+) -> None:
+    """Run a model from images to decoded elements."""
+    with torch.autocast(args.device, torch.float16, enabled=args.fp16):
+        model.predict(inputs, samples)
 
 
 def training_step(
