@@ -1,0 +1,42 @@
+import argparse
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsmap.benchmarks import model_commands
+
+REPO = Path(__file__).resolve().parents[2]
+
+
+def run(*arguments: str) -> None:
+    parser = argparse.ArgumentParser()
+    model_commands.add_parser(parser.add_subparsers(required=True))
+    args = parser.parse_args([*arguments, "--size", "64", "96", "--repeats", "1"])
+    threads = torch.get_num_threads()
+    args.threads = threads
+    args.run(args)
+
+
+def cells(printed: str) -> list[list[str]]:
+    """Return the cells of the table's rows."""
+    lines = [line for line in printed.splitlines() if line.startswith("| ")][2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_frames_per_second_are_those_of_the_time(capsys):
+    run("fps", str(REPO / "configs/maptr/maptr_r18_nano_110e.py"))
+    ((name, seconds, fps, ratio, _),) = cells(capsys.readouterr().out)
+    assert name == "maptr_r18_nano_110e"
+    assert float(fps) == pytest.approx(1 / float(seconds), rel=0.1)
+    assert ratio == "1.000"
+
+
+def test_a_step_is_measured_for_every_raster_of_gsmap(capsys):
+    run(
+        "step", str(REPO / "projects/GSMap/configs/gsmap_maptr_r50_24e.py"),
+        "--rasters", "16x8", "20x10",
+    )  # fmt: skip
+    rows = cells(capsys.readouterr().out)
+    assert [row[1] for row in rows] == ["16x8", "20x10"]
+    assert all(float(row[2]) > 0 for row in rows)
