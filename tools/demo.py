@@ -93,7 +93,7 @@ class Step:
 def processes() -> int:
     """Return how many processes train together: one per GPU, or per core without a GPU.
 
-    On a CPU two processes of one thread each train twice as fast as one of two threads.
+    On a CPU a process of one thread per core uses the cores better than threads of one process.
     """
     return torch.cuda.device_count() or len(os.sched_getaffinity(0))
 
