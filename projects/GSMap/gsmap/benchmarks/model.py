@@ -103,9 +103,7 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
     if cfg.model.get("img_backbone"):
         cfg.model.img_backbone.init_cfg = None
     torch.manual_seed(0)
-    model = MODELS.build(cfg.model)
-    model.init_weights()
-    return model.to(args.device)
+    return MODELS.build(cfg.model).to(args.device)
 
 
 def random_batch(
