@@ -13,8 +13,9 @@ help:
 setup:
 	@tools/setup_env.sh $(VENV)
 
+# One thread: on a machine that does other work too, threads that wait for each other cost far more than they give.
 test: setup
-	$(PY) -m pytest $(ARGS)
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest $(ARGS)
 
 lint: setup
 	$(PY) -m ruff check .
