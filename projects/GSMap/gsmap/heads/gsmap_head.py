@@ -44,7 +44,6 @@ class GSMapHead(MapHead):
     """
 
     default_layer = "GaussianDecoderLayer"
-    reference_dims = 5
     neutral_keys = ("gaussian_init.", "gaussian_branches.")
 
     def __init__(

@@ -64,8 +64,6 @@ class MapHead(BaseModule):
         init_cfg: As in mmengine.
     """
 
-    reference_dims = 2
-
     def __init__(
         self,
         num_classes: int,
