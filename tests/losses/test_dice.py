@@ -3,10 +3,10 @@ import pytest
 import torch
 
 from gsmap.losses.dice import (
+    ElementRenderer,
     RenderedDiceLoss,
     dice_loss,
     pairwise_dice_loss,
-    render_elements,
     rendered_dice_cost,
 )
 
@@ -29,9 +29,9 @@ def test_dice_worked_by_hand():
 def test_pairs_are_rendered_as_the_ground_truths_class():
     """A ring costs nothing against itself in either class, and its area differs from its edge."""
     ring = torch.tensor([[[0.2, 0.2], [0.8, 0.2], [0.8, 0.8], [0.2, 0.8], [0.2, 0.2]]])
-    kinds = torch.tensor([True, False])
-    cost = rendered_dice_cost(ring, ring.repeat(2, 1, 1), kinds, (32, 32))
-    area, edge = render_elements(ring.repeat(2, 1, 1), kinds, (32, 32))
+    labels, renderer = torch.tensor([2, 0]), ElementRenderer((32, 32), polygon_classes=(2,))
+    cost = rendered_dice_cost(ring, ring.repeat(2, 1, 1), labels, renderer)
+    area, edge = renderer.render(ring.repeat(2, 1, 1), torch.tensor([True, False]))
     assert area[16, 16] > 0.99
     assert edge[16, 16] < 1e-6
     expected = torch.stack([dice_loss(m[None], m[None])[0] for m in (area, edge)])
@@ -48,7 +48,8 @@ def test_loss_and_true_gradient_equal_the_golden_ones(golden):
 
 
 def test_cost_equals_the_golden_one(golden):
-    cost = 10 * rendered_dice_cost(golden["cost_pred"], golden["gt"], golden["labels"] == 1)
+    renderer = ElementRenderer((128, 64))
+    cost = 10 * rendered_dice_cost(golden["cost_pred"], golden["gt"], golden["labels"], renderer)
     torch.testing.assert_close(cost, golden["cost_w10"], rtol=1e-4, atol=1e-5)
 
 

@@ -6,7 +6,7 @@ pytest.importorskip("mmdet3d")
 from mmdet3d.registry import TASK_UTILS
 from mmengine.structures import InstanceData
 
-from gsmap.losses.dice import rendered_dice_cost
+from gsmap.losses.dice import ElementRenderer, rendered_dice_cost
 from gsmap.matching.raster_costs import IoUCost, RenderedDiceCost
 
 
@@ -30,7 +30,8 @@ def test_dice_cost_renders_the_annotated_order_as_its_class():
     shifts = torch.stack([points[:2], points[:2].flip(1)], 1)
     gts = InstanceData(labels=torch.tensor([1, 0]), pts_shifts=shifts)
     values = RenderedDiceCost(weight=10.0, size=(24, 16))(InstanceData(pts=points), gts)
-    expected = rendered_dice_cost(points, points[:2], torch.tensor([True, False]), (24, 16))
+    renderer = ElementRenderer((24, 16))
+    expected = rendered_dice_cost(points, points[:2], gts.labels, renderer)
     torch.testing.assert_close(values, 10 * expected)
     assert values[:, 0].argmin() == 0
     assert values[:, 1].argmin() == 1

@@ -1,33 +1,57 @@
 """MapVR's dice loss between softly rendered elements, and the same as a matching cost."""
 
+from dataclasses import dataclass
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 from ..ops.polyline_raster import soft_rasters
 
 
-def render_elements(
-    points: Tensor,
-    is_polygon: Tensor,
-    size: tuple[int, int],
-    line_softness: float = 2.0,
-    polygon_softness: float = 4.0,
-) -> Tensor:
-    """Render map elements as MapVR does: lines or filled polygons, by their class.
+@dataclass(frozen=True)
+class ElementRenderer:
+    """Renders map elements as MapVR does: lines or filled polygons, by their class.
 
     Args:
-        points: Vertices (x, y), normalised to [0, 1] over the raster. (n, P, 2)
-        is_polygon: Which elements are polygons. (n,)
-        size: Rows H and columns W.
+        size: Rows H and columns W of the masks.
         line_softness: Softness of lines in square pixels.
         polygon_softness: Softness of polygons in square pixels.
+        polygon_classes: Classes that are rendered as filled polygons.
 
-    Returns:
-        Masks in [0, 1]. (n, H, W)
+    Raises:
+        ValueError: If a softness is not > 0.
     """
-    height, width = size
-    pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
-    return soft_rasters(pixels, height, width, is_polygon, line_softness, polygon_softness)
+
+    size: tuple[int, int]
+    line_softness: float = 2.0
+    polygon_softness: float = 4.0
+    polygon_classes: tuple[int, ...] = (1,)
+
+    def __post_init__(self) -> None:
+        softness = self.line_softness, self.polygon_softness
+        if min(softness) <= 0:
+            raise ValueError(f"softness must be > 0, got {softness[0]} and {softness[1]}.")
+
+    def is_polygon(self, labels: Tensor) -> Tensor:
+        """Return which elements are rendered as polygons. (n,) -> (n,)"""
+        return torch.isin(labels, labels.new_tensor(self.polygon_classes))
+
+    def render(self, points: Tensor, is_polygon: Tensor) -> Tensor:
+        """Render elements.
+
+        Args:
+            points: Vertices (x, y), normalised to [0, 1] over the raster. (n, P, 2)
+            is_polygon: Which elements are polygons. (n,)
+
+        Returns:
+            Masks in [0, 1]. (n, H, W)
+        """
+        height, width = self.size
+        pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
+        return soft_rasters(
+            pixels, height, width, is_polygon, self.line_softness, self.polygon_softness
+        )
 
 
 def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
@@ -52,34 +76,27 @@ def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
 
 
 def rendered_dice_cost(
-    pred_points: Tensor,
-    gt_points: Tensor,
-    gt_is_polygon: Tensor,
-    size: tuple[int, int] = (128, 64),
-    line_softness: float = 2.0,
-    polygon_softness: float = 4.0,
+    pred_points: Tensor, gt_points: Tensor, gt_labels: Tensor, renderer: ElementRenderer
 ) -> Tensor:
     """Dice loss of every prediction with every ground truth, each rendered as the latter's class.
 
     Args:
         pred_points: Normalised points. (N, P, 2)
         gt_points: Normalised points. (K, P, 2)
-        gt_is_polygon: Which ground truths are polygons. (K,)
-        size: Rows and columns of the rasters.
-        line_softness: Softness of lines in square pixels.
-        polygon_softness: Softness of polygons in square pixels.
+        gt_labels: Class of each ground truth. (K,)
+        renderer: How elements become masks.
 
     Returns:
         Costs, without gradient. (N, K)
     """
-    softness = (line_softness, polygon_softness)
+    is_polygon = renderer.is_polygon(gt_labels)
     with torch.no_grad(), torch.autocast(pred_points.device.type, enabled=False):
         preds, gts = pred_points.float(), gt_points.float()
-        targets = render_elements(gts, gt_is_polygon, size, *softness)
+        targets = renderer.render(gts, is_polygon)
         lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
-        as_lines = pairwise_dice_loss(render_elements(preds, lines, size, *softness), targets)
-        as_polygons = pairwise_dice_loss(render_elements(preds, ~lines, size, *softness), targets)
-        return torch.where(gt_is_polygon, as_polygons, as_lines)
+        as_lines = pairwise_dice_loss(renderer.render(preds, lines), targets)
+        as_polygons = pairwise_dice_loss(renderer.render(preds, ~lines), targets)
+        return torch.where(is_polygon, as_polygons, as_lines)
 
 
 class RenderedDiceLoss(nn.Module):
@@ -88,25 +105,15 @@ class RenderedDiceLoss(nn.Module):
     Args:
         loss_weight: Weight of the loss.
         size: Rows and columns of the rasters.
-        line_softness: Softness of lines in square pixels.
-        polygon_softness: Softness of polygons in square pixels.
-        polygon_classes: Classes that are rendered as filled polygons.
+        rendering: Further settings of `ElementRenderer`.
     """
 
     def __init__(
-        self,
-        loss_weight: float = 15.0,
-        size: tuple[int, int] = (256, 128),
-        line_softness: float = 2.0,
-        polygon_softness: float = 4.0,
-        polygon_classes: tuple[int, ...] = (1,),
+        self, loss_weight: float = 15.0, size: tuple[int, int] = (256, 128), **rendering: Any
     ) -> None:
         super().__init__()
-        if min(line_softness, polygon_softness) <= 0:
-            raise ValueError(f"softness must be > 0, got {line_softness} and {polygon_softness}.")
-        self.loss_weight, self.size = loss_weight, (int(size[0]), int(size[1]))
-        self.softness = (line_softness, polygon_softness)
-        self.polygon_classes = tuple(polygon_classes)
+        self.loss_weight = loss_weight
+        self.renderer = ElementRenderer(size, **rendering)
 
     def forward(
         self,
@@ -130,13 +137,10 @@ class RenderedDiceLoss(nn.Module):
             return pred_points.float().sum() * 0
         with torch.autocast(pred_points.device.type, enabled=False):
             dtype = torch.promote_types(pred_points.dtype, torch.float32)
-            classes = gt_labels.new_tensor(self.polygon_classes)
-            is_polygon = torch.isin(gt_labels, classes)
-            preds = render_elements(pred_points.to(dtype), is_polygon, self.size, *self.softness)
+            is_polygon = self.renderer.is_polygon(gt_labels)
+            preds = self.renderer.render(pred_points.to(dtype), is_polygon)
             with torch.no_grad():
-                targets = render_elements(
-                    gt_points.to(dtype), is_polygon, self.size, *self.softness
-                )
+                targets = self.renderer.render(gt_points.to(dtype), is_polygon)
             losses = dice_loss(preds, targets)
         count = len(pred_points) if avg_factor is None else avg_factor
         return self.loss_weight * losses.sum() / count

@@ -1,11 +1,13 @@
 """Matching costs between rendered masks: GSMap's soft IoU (Eq. 9) and MapVR's dice."""
 
+from typing import Any
+
 import torch
 from mmdet3d.registry import TASK_UTILS
 from mmengine.structures import InstanceData
 from torch import Tensor
 
-from ..losses.dice import rendered_dice_cost
+from ..losses.dice import ElementRenderer, rendered_dice_cost
 from ..ops.soft_iou import pairwise_soft_iou
 
 
@@ -70,22 +72,14 @@ class RenderedDiceCost:
     Args:
         weight: Weight of the cost.
         size: Rows and columns of the rasters.
-        line_softness: Softness of lines in square pixels.
-        polygon_softness: Softness of polygons in square pixels.
-        polygon_classes: Classes that are rendered as filled polygons.
+        rendering: Further settings of `ElementRenderer`.
     """
 
     def __init__(
-        self,
-        weight: float = 10.0,
-        size: tuple[int, int] = (128, 64),
-        line_softness: float = 2.0,
-        polygon_softness: float = 4.0,
-        polygon_classes: tuple[int, ...] = (1,),
+        self, weight: float = 10.0, size: tuple[int, int] = (128, 64), **rendering: Any
     ) -> None:
-        self.weight, self.size = weight, (int(size[0]), int(size[1]))
-        self.softness = (line_softness, polygon_softness)
-        self.polygon_classes = tuple(polygon_classes)
+        self.weight = weight
+        self.renderer = ElementRenderer(size, **rendering)
 
     def __call__(
         self,
@@ -106,9 +100,10 @@ class RenderedDiceCost:
         Returns:
             Costs. (N, K)
         """
-        labels = gt_instances.labels
-        is_polygon = torch.isin(labels, labels.new_tensor(self.polygon_classes))
-        points = gt_instances.pts_shifts[:, 0]
-        return self.weight * rendered_dice_cost(
-            pred_instances.pts, points, is_polygon, self.size, *self.softness
+        cost = rendered_dice_cost(
+            pred_instances.pts,
+            gt_instances.pts_shifts[:, 0],
+            gt_instances.labels,
+            self.renderer,
         )
+        return self.weight * cost

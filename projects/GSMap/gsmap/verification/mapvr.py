@@ -4,15 +4,14 @@ from collections.abc import Iterator
 
 import torch
 
-from gsmap.losses.dice import RenderedDiceLoss, rendered_dice_cost
+from gsmap.losses.dice import ElementRenderer, RenderedDiceLoss, rendered_dice_cost
 from gsmap.ops.polyline_raster import soft_rasters
 
 from .golden import Golden
 from .registry import check
 from .report import Row, largest_difference, largest_relative, relative_norm
 
-POLYGON_CLASS = 1
-COST_WEIGHT = 10.0
+COST_WEIGHT, COST_RENDERER = 10.0, ElementRenderer((128, 64))
 # How the suffix of a raster's name says it was rendered: whether as a polygon. Boundaries of
 # polygons and hard masks serve nothing in MapVR's training and have no counterpart here.
 KINDS = {"lane_boundary_s2": False, "as_lane_s2": False, "mask_s4": True}
@@ -51,6 +50,6 @@ def check_dice(golden: Golden, name: str) -> Iterator[Row]:
         yield Row(name, f"{case}: loss (relative)", off, 1e-4)
         off = relative_norm(pred.grad, data[f"{case}_grad_analytic"])
         yield Row(name, f"{case}: true gradient (relative)", off, 1e-3)
-        cost = rendered_dice_cost(data[f"{case}_cost_pred"], gt, labels == POLYGON_CLASS)
+        cost = rendered_dice_cost(data[f"{case}_cost_pred"], gt, labels, COST_RENDERER)
         off = largest_difference(COST_WEIGHT * cost, data[f"{case}_cost_w10"])
         yield Row(name, f"{case}: cost", off, 1e-4)
