@@ -3,11 +3,9 @@
 import argparse
 
 from mmdet3d.registry import MODELS
-from mmengine.config import Config
-from mmengine.registry import init_default_scope
 
-from gsmap import registered  # noqa: F401
 from gsmap.checkpoints.parameters import count_parameters
+from gsmap.engine.launch import read_config
 
 
 def parse_args() -> argparse.Namespace:
@@ -19,9 +17,7 @@ def parse_args() -> argparse.Namespace:
 
 def main() -> None:
     args = parse_args()
-    cfg = Config.fromfile(args.config)
-    init_default_scope("mmdet3d")
-    counts = count_parameters(MODELS.build(cfg.model), args.depth)
+    counts = count_parameters(MODELS.build(read_config(args.config).model), args.depth)
     width = max(len(count.module) for count in counts)
     print(f"{'module'.ljust(width)}  {'all':>12}  {'trainable':>12}")
     for count in counts:

@@ -10,11 +10,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from mmengine.config import DictAction
-
+from gsmap.engine.launch import add_config_options
 from gsmap.inference.map_inferencer import MapInferencer, select_samples
-from gsmap.visualization.figure import save_figure
-from gsmap.visualization.map_visualization_hook import picture_name
+from gsmap.visualization.pictures import add_picture_arguments, save_picture
 
 
 def parse_args() -> argparse.Namespace:
@@ -31,23 +29,15 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
     parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
     parser.add_argument("--out", type=Path, help="JSON file for the predictions")
-    parser.add_argument("--show-dir", type=Path, help="folder for pictures")
-    parser.add_argument("--format", default="png", choices=["png", "jpg", "webp", "pdf", "svg"])
+    add_picture_arguments(parser, folder=None, picture_format="png")
     parser.add_argument("--score-thr", type=float, help="smallest drawn score")
     parser.add_argument(
         "--ground-z", type=float, help="height of a level ground in the frame, in metres"
     )
     parser.add_argument("--width", type=int, help="width of the pictures in pixels")
-    parser.add_argument("--order", action="store_true", help="mark start and direction of elements")
     parser.add_argument("--lidar", action="store_true", help="draw the LiDAR sweep faintly")
     parser.add_argument("--device", help="cpu, cuda, cuda:1, ...; a GPU by default if there is one")
-    parser.add_argument(
-        "--cfg-options",
-        nargs="+",
-        action=DictAction,
-        metavar="KEY=VALUE",
-        help="override settings of the config",
-    )
+    add_config_options(parser)
     return parser.parse_args()
 
 
@@ -68,8 +58,9 @@ def run(args: argparse.Namespace) -> None:
         if args.show_dir:
             points = inferencer.lidar_points(dataset, index) if args.lidar else None
             figure = inferencer.draw(sample, score_thr=args.score_thr, points=points)
-            name = picture_name(sample.metainfo["token"], f".{args.format}")
-            print(f"[{len(samples)}/{len(chosen)}] {save_figure(figure, args.show_dir / name)}")
+            token = sample.metainfo["token"]
+            path = save_picture(figure, args.show_dir, token, f".{args.format}")
+            print(f"[{len(samples)}/{len(chosen)}] {path}")
     if args.out:
         inferencer.write(args.out, samples)
         print(f"predictions of {len(samples)} samples: {args.out}")

@@ -12,11 +12,9 @@ import numpy as np
 import torch
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
-from mmengine.config import Config
-from mmengine.registry import init_default_scope
 
-from gsmap import registered  # noqa: F401
 from gsmap.benchmarks.model import ring_of_cameras
+from gsmap.engine.launch import read_config
 
 
 def parse_args() -> argparse.Namespace:
@@ -27,12 +25,6 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--device", default="cpu")
     return parser.parse_args()
-
-
-def build(config: str, device: str) -> torch.nn.Module:
-    cfg = Config.fromfile(config)
-    init_default_scope("mmdet3d")
-    return MODELS.build(cfg.model).to(device).eval()
 
 
 def sample(num_cams: int, height: int, width: int) -> Det3DDataSample:
@@ -84,7 +76,8 @@ def main() -> None:
     args = parse_args()
     torch.set_num_threads(args.threads)
     for config in args.configs:
-        parts = profile(build(config, args.device), args)
+        model = MODELS.build(read_config(config).model)
+        parts = profile(model.to(args.device).eval(), args)
         backbone = parts["image backbone"]
         parts["total"] = sum(parts.values())
         print(f"{config}, {args.size[0]} x {args.size[1]}, {args.threads} threads")

@@ -103,6 +103,22 @@ def test_one_and_two_processes_score_and_write_the_same(config, trained, tmp_pat
     assert len(list((one / "pictures").iterdir())) == 2
 
 
+def test_the_data_set_and_what_a_model_finds_are_drawn(config, trained, minicity_root, tmp_path):
+    browsed, found = tmp_path / "browsed", tmp_path / "found"
+    run(
+        sys.executable, "tools/browse_dataset.py", config, "--num", "1", "--show-dir", browsed,
+        "--format", "png",
+    )  # fmt: skip
+    run(
+        sys.executable, "tools/infer.py", config, trained / "epoch_3.pth", "--max-samples", "1",
+        "--sample", minicity_root / "gsmap_minicity_val.arrow", "--show-dir", found, "--order",
+        "--out", tmp_path / "map.json", "--cfg-options", "visualizer.width_px=400",
+    )  # fmt: skip
+    (result,) = json.loads((tmp_path / "map.json").read_text())["results"]
+    assert [path.name for path in found.iterdir()] == [f"{result['sample_token']}.png"]
+    assert len(list(browsed.glob("*.png"))) == 1
+
+
 def test_two_processes_train_one_model(config, tmp_path):
     log = run("tools/dist_train.sh", config, 2, "--work-dir", tmp_path, "--cfg-options",
               "train_cfg.max_epochs=1")  # fmt: skip

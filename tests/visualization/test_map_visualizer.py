@@ -7,8 +7,8 @@ from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
 from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
-from gsmap.visualization.map_visualization_hook import picture_name
 from gsmap.visualization.map_visualizer import images_from_inputs
+from gsmap.visualization.pictures import picture_name
 
 CLASSES = ("divider", "ped_crossing", "boundary")
 

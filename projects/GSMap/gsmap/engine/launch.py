@@ -1,4 +1,4 @@
-"""What the training and test tools share: reading a config, checking it, the work folder."""
+"""What the tools share: reading a config, changing it, checking it, the work folder."""
 
 import argparse
 import difflib
@@ -7,6 +7,8 @@ from pathlib import Path
 
 import torch
 from mmengine.config import Config, DictAction
+from mmengine.registry import init_default_scope
+from mmengine.utils import import_modules_from_strings
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 KNOWN_KEYS = frozenset(
@@ -48,9 +50,8 @@ KNOWN_KEYS = frozenset(
 )
 
 
-def add_common_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every OpenMMLab tool has."""
-    parser.add_argument("--work-dir", help="folder for logs, checkpoints and pictures")
+def add_config_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--cfg-options``, for the second argument of `read_config`."""
     parser.add_argument(
         "--cfg-options",
         nargs="+",
@@ -58,8 +59,40 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="override settings, e.g. train_dataloader.batch_size=2",
     )
+
+
+def add_common_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that every OpenMMLab tool has."""
+    parser.add_argument("--work-dir", help="folder for logs, checkpoints and pictures")
+    add_config_options(parser)
     parser.add_argument("--launcher", choices=["none", "pytorch", "slurm", "mpi"], default="none")
     parser.add_argument("--local_rank", "--local-rank", type=int, default=0)
+
+
+def read_config(config: str | Path | Config, cfg_options: dict | None = None) -> Config:
+    """Return a config with overrides applied, ready to build from.
+
+    What it registers is imported, and its scope is made the default one.
+
+    Args:
+        config: A config file, or a ``Config``, which is left as it is.
+        cfg_options: Overrides, by dotted name.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+    """
+    if isinstance(config, Config):
+        cfg = Config(config.to_dict())
+    else:
+        if not Path(config).is_file():
+            raise FileNotFoundError(
+                f"There is no config file {config}; those of GSMap are in projects/GSMap/configs."
+            )
+        cfg = Config.fromfile(config)
+    cfg.merge_from_dict(cfg_options or {})
+    import_modules_from_strings(**cfg.get("custom_imports", {"imports": ["gsmap.registered"]}))
+    init_default_scope(cfg.get("default_scope", "mmdet3d"))
+    return cfg
 
 
 def load_config(args: argparse.Namespace) -> Config:
@@ -71,12 +104,11 @@ def load_config(args: argparse.Namespace) -> Config:
         SystemExit: If the file does not exist.
         ValueError: If the config cannot mean what was intended (see `check_config`).
     """
-    if not Path(args.config).is_file():
-        raise SystemExit(f"There is no config file {args.config}.")
     os.environ.setdefault("LOCAL_RANK", str(args.local_rank))
-    cfg = Config.fromfile(args.config)
-    if args.cfg_options:
-        cfg.merge_from_dict(args.cfg_options)
+    try:
+        cfg = read_config(args.config, args.cfg_options)
+    except FileNotFoundError as error:
+        raise SystemExit(str(error)) from None
     cfg.launcher = args.launcher
     if args.work_dir:
         cfg.work_dir = args.work_dir

@@ -12,13 +12,12 @@ from mmdet3d.registry import DATASETS, MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.config import Config
 from mmengine.dataset import pseudo_collate
-from mmengine.registry import init_default_scope
-from mmengine.utils import import_modules_from_strings
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from gsmap.datasets.annotation_file import write_annotations
 from gsmap.datasets.annotation_record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+from gsmap.engine.launch import read_config
 from gsmap.evaluation.map_metric import MapMetric
 from gsmap.inference.blank_cameras import BlankCameraDataset
 from gsmap.inference.checkpoint import load_weights
@@ -58,24 +57,6 @@ def find_sample_file(source: str | Path) -> Path:
     return source
 
 
-def read_config(config: str | Path | Config, cfg_options: dict | None = None) -> Config:
-    """Return a config with overrides applied; a given ``Config`` is left as it is.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-    """
-    if isinstance(config, Config):
-        cfg = Config(config.to_dict())
-    else:
-        if not Path(config).is_file():
-            raise FileNotFoundError(
-                f"There is no config {config}; those of GSMap are in projects/GSMap/configs."
-            )
-        cfg = Config.fromfile(config)
-    cfg.merge_from_dict(cfg_options or {})
-    return cfg
-
-
 def select_samples(
     tokens: Sequence[str], wanted: Sequence[str] | None = None, max_num: int | None = None
 ) -> list[int]:
@@ -99,11 +80,20 @@ def select_samples(
         if unknown:
             raise ValueError(f"No sample has the token {unknown[0]!r}; there are {len(tokens)}.")
         chosen = [position[token] for token in wanted]
-    if max_num is None or max_num >= len(chosen):
-        return chosen
+    return [chosen[i] for i in spread_evenly(len(chosen), max_num)]
+
+
+def spread_evenly(count: int, max_num: int | None = None) -> list[int]:
+    """Return at most ``max_num`` of the indices below ``count``, spread evenly.
+
+    Raises:
+        ValueError: If ``max_num`` is smaller than 1.
+    """
+    if max_num is None or max_num >= count:
+        return list(range(count))
     if max_num < 1:
         raise ValueError(f"max_num must be >= 1, got {max_num}.")
-    return [chosen[i] for i in np.linspace(0, len(chosen) - 1, max_num).round().astype(int)]
+    return np.linspace(0, count - 1, max_num).round().astype(int).tolist()
 
 
 class MapInferencer:
@@ -128,10 +118,6 @@ class MapInferencer:
         cfg_options: dict | None = None,
     ):
         self.cfg = read_config(config, cfg_options)
-        import_modules_from_strings(
-            **self.cfg.get("custom_imports", {"imports": ["gsmap.registered"]})
-        )
-        init_default_scope(self.cfg.get("default_scope", "mmdet3d"))
         self.model = MODELS.build(self.cfg.model)
         if checkpoint is not None:
             load_weights(self.model, checkpoint)

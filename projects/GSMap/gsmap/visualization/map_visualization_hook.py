@@ -1,8 +1,6 @@
 """Draws samples while a model is validated or tested."""
 
-import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +9,8 @@ from mmengine.hooks import Hook
 from mmengine.runner import Runner
 from mmengine.visualization import Visualizer
 
-from gsmap.visualization.figure import save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer
-
-
-def picture_name(token: str, suffix: str) -> str:
-    """Return a file name made of a sample's token, without characters that a file system minds."""
-    return re.sub(r"[^\w.+=-]", "_", token) + suffix
+from gsmap.visualization.pictures import picture_name, save_picture
 
 
 def _points(data_batch: Any, index: int) -> np.ndarray | None:
@@ -126,10 +119,7 @@ class MapVisualizationHook(Hook):
             figure = self._visualizer(runner).draw_sample(
                 sample, score_thr=self.score_thr, points=_points(data_batch, index)
             )
-            save_figure(
-                figure,
-                Path(self.test_out_dir) / picture_name(sample.metainfo["token"], self.suffix),
-            )
+            save_picture(figure, self.test_out_dir, sample.metainfo["token"], self.suffix)
             self._drawn += 1
 
     def after_test_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
