@@ -7,14 +7,15 @@ _cameras = [
     'ring_front_center', 'ring_front_right', 'ring_front_left', 'ring_rear_right', 'ring_rear_left',
     'ring_side_right', 'ring_side_left'
 ]
+_photometric = dict(
+    type='MultiViewWrapper',
+    transforms=[dict(type='PhotoMetricDistortion3D')],
+    override_aug_config=False,  # each camera its own, as in MapTR
+    collected_keys=[])
 _train_pipeline = [
     dict(type='LoadCameraImages'),
     dict(type='ScaleImages', scale=0.3),
-    dict(
-        type='MultiViewWrapper',
-        transforms=[dict(type='PhotoMetricDistortion3D')],
-        override_aug_config=False,  # each camera its own, as in MapTR
-        collected_keys=[]),
+    _photometric,
     dict(type='FormatMapTargets', num_points=20),
     dict(type='PackMapInputs'),
 ]

@@ -13,11 +13,7 @@ train_dataloader = dict(
         data_root=data_root,
         pipeline=[
             *_load,
-            dict(
-                type='MultiViewWrapper',
-                transforms=[dict(type='PhotoMetricDistortion3D')],
-                override_aug_config=False,
-                collected_keys=[]),
+            _base_._photometric,
             dict(type='FormatMapTargets', num_points=20),
             dict(type='PackMapInputs'),
         ]))

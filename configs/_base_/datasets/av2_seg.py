@@ -5,11 +5,7 @@ train_dataloader = dict(
     dataset=dict(pipeline=[
         dict(type='LoadCameraImages'),
         dict(type='ScaleImages', scale=0.3),
-        dict(
-            type='MultiViewWrapper',
-            transforms=[dict(type='PhotoMetricDistortion3D')],
-            override_aug_config=False,  # each camera its own, as in MapTR
-            collected_keys=[]),
+        _base_._photometric,
         dict(type='FormatMapTargets', num_points=20),
         dict(type='MakeBEVMask', size=(100, 200)),
         dict(type='MakePVMask', stride=32, ground_z_m=-0.3),  # the origin is the rear axle

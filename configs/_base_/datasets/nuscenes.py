@@ -5,14 +5,15 @@ data_root = 'data/nuscenes/'
 _cameras = [
     'CAM_FRONT', 'CAM_FRONT_RIGHT', 'CAM_FRONT_LEFT', 'CAM_BACK', 'CAM_BACK_LEFT', 'CAM_BACK_RIGHT'
 ]
+_photometric = dict(
+    type='MultiViewWrapper',
+    transforms=[dict(type='PhotoMetricDistortion3D')],
+    override_aug_config=False,  # each camera its own, as in MapTR
+    collected_keys=[])
 _load = [dict(type='LoadCameraImages')]
 _train_pipeline = [
     *_load,
-    dict(
-        type='MultiViewWrapper',
-        transforms=[dict(type='PhotoMetricDistortion3D')],
-        override_aug_config=False,  # each camera its own, as in MapTR
-        collected_keys=[]),
+    _photometric,
     dict(type='ScaleImages', scale=0.5),
     dict(type='FormatMapTargets', num_points=20),
     dict(type='PackMapInputs'),

@@ -7,11 +7,7 @@ train_dataloader = dict(
     batch_size=24,
     dataset=dict(pipeline=[
         dict(type='LoadCameraImages'),
-        dict(
-            type='MultiViewWrapper',
-            transforms=[dict(type='PhotoMetricDistortion3D')],
-            override_aug_config=False,  # each camera its own, as in MapTR
-            collected_keys=[]),
+        _base_._photometric,
         _scale,
         dict(type='FormatMapTargets', num_points=20),
         dict(type='PackMapInputs'),
