@@ -1,7 +1,9 @@
 """Whole models on random inputs: frames per second, and the cost of a training step."""
 
 import argparse
-from collections.abc import Callable
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,55 +16,83 @@ from mmengine.config import Config
 from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
 
-from .measure import MIB, markdown_table, measure
+from .measure import MIB, Cost, markdown_table, measure
 
 
 def run_fps(args: argparse.Namespace) -> None:
     """Measure and print the frames per second of every config."""
-    rows = []
-    for path in args.configs:
-        model, size = build(path, args), tuple(args.size)
-        model.eval()
-        inputs, samples = random_batch(model, 1, size, args.device)
-        predict = partial(predict_once, model, inputs, samples, args)
-        cost = measure(predict, torch.device(args.device), args.repeats)
-        rows.append((Path(path).stem, cost.time_s(torch.device(args.device)), cost.peak_bytes))
-    first = rows[0][1]
+    costs = in_fresh_processes(frame_cost, [(path, args) for path in args.configs])
+    rows = [(path, cost.time_s(torch.device(args.device)), cost) for path, cost in costs]
+    _, first, _ = rows[0]
     report(
         args,
         ["model", "s a frame", "FPS", "FPS, ratio to the first", "peak memory (MiB)"],
         [
-            [name, f"{s:.3f}", f"{1 / s:.2f}", f"{first / s:.3f}", f"{peak / MIB:.0f}"]
-            for name, s, peak in rows
+            [
+                *(Path(path).stem, f"{s:.3f}", f"{1 / s:.2f}", f"{first / s:.3f}"),
+                f"{cost.peak_bytes / MIB:.0f}",
+            ]
+            for path, s, cost in rows
         ],
     )
 
 
 def run_step(args: argparse.Namespace) -> None:
     """Measure and print forward, losses and backward of every config and raster size."""
-    rows = []
+    tasks = []
     for path in args.configs:
         sizes = args.rasters if "GSMap" in Config.fromfile(path).model.map_head.type else [""]
-        for raster in sizes:
-            model = build(path, args, raster)
-            model.train()
-            inputs, samples = random_batch(model, args.batch, tuple(args.size), args.device)
-            step = training_step(model, inputs, samples, args)
-            cost = measure(step, torch.device(args.device), args.repeats)
-            seconds = cost.time_s(torch.device(args.device))
-            rows.append((Path(path).stem, raster, seconds, cost.peak_bytes))
-    _, _, first_s, first_peak = rows[0]
+        tasks += [(path, args, raster) for raster in sizes]
+    costs = [cost for _, cost in in_fresh_processes(step_cost, tasks)]
+    seconds = [cost.time_s(torch.device(args.device)) for cost in costs]
+    peaks = [cost.peak_bytes for cost in costs]
     report(
         args,
         ["model", "raster", "s a step", "ratio", "peak memory (MiB)", "ratio"],
         [
             [
-                *(name, raster, f"{s:.3f}", f"{s / first_s:.3f}"),
-                *(f"{peak / MIB:.0f}", f"{peak / first_peak:.3f}"),
+                *(Path(path).stem, raster, f"{s:.3f}", f"{s / seconds[0]:.3f}"),
+                *(f"{peak / MIB:.0f}", f"{peak / peaks[0]:.3f}"),
             ]
-            for name, raster, s, peak in rows
+            for (path, _, raster), s, peak in zip(tasks, seconds, peaks, strict=True)
         ],
     )
+
+
+def in_fresh_processes(
+    task: Callable[..., Cost], arguments: Sequence[tuple[Any, ...]]
+) -> list[tuple[str, Cost]]:
+    """Call ``task`` on every tuple of arguments, each in a process of its own, one at a time.
+
+    What an earlier model leaves behind in the allocator would count as memory of the next one.
+
+    Returns:
+        The first argument of every call, and its result.
+    """
+    context = multiprocessing.get_context("spawn")
+    results = []
+    for each in arguments:
+        with ProcessPoolExecutor(1, mp_context=context) as pool:
+            results.append((each[0], pool.submit(task, *each).result()))
+    return results
+
+
+def frame_cost(path: str, args: argparse.Namespace) -> Cost:
+    """Measure a config's way from images to decoded elements."""
+    model = build(path, args)
+    model.eval()
+    inputs, samples = random_batch(model, 1, tuple(args.size), args.device)
+    predict = partial(predict_once, model, inputs, samples, args)
+    return measure(predict, torch.device(args.device), args.repeats)
+
+
+def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
+    """Measure a config's training step, with another raster size if one is given."""
+    model = build(path, args, raster)
+    model.train()
+    inputs, samples = random_batch(model, args.batch, tuple(args.size), args.device)
+    step = training_step(model, inputs, samples, args)
+    return measure(step, torch.device(args.device), args.repeats)
 
 
 @torch.no_grad()
@@ -96,6 +126,7 @@ def training_step(
 
 def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
     """Build a config's model with random weights, with another raster size if one is given."""
+    torch.set_num_threads(args.threads)
     init_default_scope("mmdet3d")
     cfg = Config.fromfile(path)
     if raster:

@@ -23,10 +23,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def _run(args: argparse.Namespace) -> None:
     """Run a subcommand."""
-    import torch
-
-    import gsmap.registered  # noqa: F401
     from gsmap.benchmarks import model
 
-    torch.set_num_threads(args.threads)
     {"fps": model.run_fps, "step": model.run_step}[args.subcommand](args)
