@@ -75,6 +75,7 @@ def convert_argoverse2(
     log_dirs = select_logs(find_split(options.root, options.split), options.logs)
     log_dirs = _drop_listed(log_dirs, options.keep_map_changes, summary)
     read = partial(_try_log, root=options.root, options=options.samples)
+    sweep_offsets_ns: list[int] = []
     with AnnotationWriter(options.target, _meta(options, log_dirs)) as writer:
         results = ordered_map(read, log_dirs, min(options.workers, max(len(log_dirs), 1)))
         for done, (log_dir, result) in enumerate(zip(log_dirs, results, strict=True), 1):
@@ -85,12 +86,20 @@ def convert_argoverse2(
                     writer.write(sample)
                     summary.add_sample(options.split, sample)
                 _add_problems(summary, log_dir.name, result)
+                sweep_offsets_ns += result.sweep_offsets_ns
             if advance is not None:
                 advance(done, len(log_dirs))
         if not len(writer):
             raise RuntimeError(f"no sample is left for {options.target}:\n{summary.text()}")
+        summary.notes.append(_lidar_note(sweep_offsets_ns, len(writer)))
     summary.notes.append(f"written to {options.target}")
     return summary
+
+
+def _lidar_note(offsets_ns: Sequence[int], samples: int) -> str:
+    """Say how many samples name a LiDAR sweep, and how far in time the farthest lies."""
+    named = f"LiDAR sweep named by {len(offsets_ns)} of {samples} samples"
+    return f"{named}, at most {max(offsets_ns) / 1e6:.0f} ms away" if offsets_ns else named
 
 
 def _try_log(log_dir: Path, root: Path, options: SampleOptions) -> LogSamples | str:

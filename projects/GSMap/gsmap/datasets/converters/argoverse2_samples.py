@@ -82,11 +82,13 @@ class LogSamples:
         samples: The samples, in the order of time.
         left_out: How many samples were left out, by reason.
         invalid: How many invalid polygons the map holds, by kind; they take no part.
+        sweep_offsets_ns: How far in time the LiDAR sweep of each sample that names one lies.
     """
 
     samples: list[MapSample] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     invalid: Counter[str] = field(default_factory=Counter)
+    sweep_offsets_ns: list[int] = field(default_factory=list)
 
 
 def read_log(log_dir: Path, root: Path, options: SampleOptions) -> LogSamples:
@@ -111,9 +113,14 @@ def read_log(log_dir: Path, root: Path, options: SampleOptions) -> LogSamples:
     builder = _SampleBuilder(log, log_map, log_dir.relative_to(root).as_posix(), options)
     for timestamp_ns in times.tolist():
         try:
-            result.samples.append(builder.build(timestamp_ns))
+            sample = builder.build(timestamp_ns)
         except _LeftOut as reason:
             result.left_out[str(reason)] += 1
+            continue
+        result.samples.append(sample)
+        if sample.lidar is not None:
+            sweep_ns = int(Path(sample.lidar.path).stem)
+            result.sweep_offsets_ns.append(abs(sweep_ns - timestamp_ns))
     return result
 
 

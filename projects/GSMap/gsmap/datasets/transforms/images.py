@@ -68,9 +68,10 @@ class LoadCameraImages(BaseTransform):
 
     Adds the keys of mmdet3d's ``LoadMultiViewImageFromFiles`` that others read, and ``lidar2img``,
     ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. Images of different size are padded at
-    the bottom and right to the largest. mmdet3d's transform stacks the images along a last axis and
-    takes strided views of that: copies that cost as much as decoding, and would make each later
-    step slower.
+    the bottom and right to the largest; ``raw_shapes`` are (height, width) before that.
+
+    mmdet3d's transform stacks the images along a last axis and takes strided views of that: copies
+    that cost as much as decoding, and would make each later step slower.
 
     Args:
         to_float32: Whether to convert to float32 before anything else.
@@ -98,6 +99,7 @@ class LoadCameraImages(BaseTransform):
         width = max(image.shape[1] for image in images)
         results["img"] = [self._prepared(image, (height, width)) for image in images]
         results["img_shape"] = results["ori_shape"] = results["pad_shape"] = (height, width)
+        results["raw_shapes"] = [image.shape[:2] for image in images]
         results["num_views"] = len(images)
         results["img_path"] = [camera["img_path"] for camera in cameras.values()]
         results["cam2img"] = [camera["cam2img"] for camera in cameras.values()]

@@ -1,48 +1,136 @@
-"""LiDAR points: the annotation frame, and sparse depth maps for supervision."""
+"""LiDAR points: sweep files, the annotation frame, and sparse depth maps for supervision."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import torch
 from mmcv.transforms import BaseTransform
-from mmdet3d.datasets.transforms import LoadPointsFromFile
+from mmdet3d.datasets.transforms import LoadPointsFromFile, LoadPointsFromMultiSweeps
 from mmdet3d.registry import TRANSFORMS
+from pyarrow import feather
 
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.transforms.masks import padded_size
 
+# Argoverse 2's columns in the order of their use; the first five mean what nuScenes' values mean.
+FEATHER_COLUMNS = ("x", "y", "z", "intensity", "laser_number", "offset_ns")
+
+
+def read_points(path: str, load_dim: int) -> np.ndarray:
+    """Read a LiDAR sweep of nuScenes (float32 values) or Argoverse 2 (``.feather``).
+
+    Args:
+        path: The file.
+        load_dim: Values per point; of a ``.feather`` file the first of ``FEATHER_COLUMNS``.
+
+    Returns:
+        Points: x, y, z in metres in the frame of the file, intensity from 0 to 255, number of the
+        laser, and of a ``.feather`` file the time since the sweep's in nanoseconds. (n, load_dim)
+
+    Raises:
+        BrokenSampleError: If the file is missing, cut short or holds something else.
+        ValueError: If a ``.feather`` file cannot have so many values.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise BrokenSampleError(
+            f"no LiDAR file at {path}: correct data_root, download it, or take a config without "
+            "LiDAR."
+        )
+    if file.suffix == ".feather":
+        return _read_feather(path, load_dim)
+    size = file.stat().st_size
+    if size == 0 or size % (4 * load_dim):  # float32 values
+        raise BrokenSampleError(
+            f"{path} has {size} bytes, not a multiple of {load_dim} float32 values: copy it again, "
+            "or correct load_dim."
+        )
+    return np.fromfile(path, np.float32).reshape(-1, load_dim)
+
+
+def _read_feather(path: str, load_dim: int) -> np.ndarray:
+    """Read a sweep of Argoverse 2. (n, load_dim)."""
+    if load_dim > len(FEATHER_COLUMNS):
+        raise ValueError(
+            f"load_dim must be at most {len(FEATHER_COLUMNS)} for {path}, got {load_dim}."
+        )
+    names = FEATHER_COLUMNS[:load_dim]
+    try:
+        table = feather.read_table(path, columns=list(names))
+        columns = [table[name].to_numpy().astype(np.float32) for name in names]
+    except (pa.ArrowException, OSError, ValueError, TypeError) as error:
+        raise BrokenSampleError(
+            f"{path} is not a whole LiDAR sweep ({error}): download it again."
+        ) from error
+    if not table.num_rows:
+        raise BrokenSampleError(f"{path} holds no point: download it again.")
+    return np.stack(columns, -1)
+
+
+def _naming_sample(
+    transform: Callable[[dict[str, Any]], dict[str, Any]], results: dict[str, Any]
+) -> dict[str, Any]:
+    """Apply a transform; what it says of a broken file is preceded by the sample's token."""
+    try:
+        return transform(results)
+    except BrokenSampleError as error:
+        raise BrokenSampleError(f"sample {results['token']!r}: {error}") from error
+
 
 @TRANSFORMS.register_module()
 class LoadLidarPoints(LoadPointsFromFile):
-    """mmdet3d's ``LoadPointsFromFile``, naming sample and file when one is missing or cut short."""
+    """mmdet3d's ``LoadPointsFromFile``, with checks and for Argoverse 2's files too."""
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Load ``results['lidar_points']``.
 
         Raises:
-            BrokenSampleError: If the sample has no LiDAR, or its file is missing or truncated.
+            BrokenSampleError: If the sample has no LiDAR, or its file is missing or damaged.
         """
         if "lidar_points" not in results:
-            raise BrokenSampleError(f"sample {results['token']!r} has no LiDAR sweep.")
-        path = Path(results["lidar_points"]["lidar_path"])
-        if not path.is_file():
-            raise BrokenSampleError(f"sample {results['token']!r}: no LiDAR file at {path}.")
-        size = path.stat().st_size
-        if size == 0 or size % (4 * self.load_dim):  # float32 values
             raise BrokenSampleError(
-                f"sample {results['token']!r}: {path} has {size} bytes, not a multiple of "
-                f"{self.load_dim} float32 values: copy it again, or correct load_dim."
+                f"sample {results['token']!r} has no LiDAR sweep: make the annotation file from "
+                "data with LiDAR, or take a config without it."
             )
-        return super().transform(results)
+        return _naming_sample(super().transform, results)
+
+    def _load_points(self, pts_filename: str) -> np.ndarray:
+        return read_points(pts_filename, self.load_dim).reshape(-1)
+
+
+@TRANSFORMS.register_module()
+class LoadLidarSweeps(LoadPointsFromMultiSweeps):
+    """mmdet3d's ``LoadPointsFromMultiSweeps``, with checks and for Argoverse 2's files too.
+
+    The fifth value of each point becomes the sweep's age in seconds.
+    """
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Add points of ``results['lidar_sweeps']``.
+
+        Raises:
+            BrokenSampleError: If the file of a sweep is missing or damaged.
+        """
+        return _naming_sample(super().transform, results)
+
+    def _load_points(self, pts_filename: str) -> np.ndarray:
+        if not Path(pts_filename).is_file():
+            raise BrokenSampleError(
+                f"no earlier LiDAR sweep at {pts_filename}: download the sweeps, or make the "
+                "annotation file again with --max-sweeps 0."
+            )
+        return read_points(pts_filename, self.load_dim).reshape(-1)
 
 
 @TRANSFORMS.register_module()
 class PointsToFrame(BaseTransform):
     """Move the points of a sensor that is not the annotation frame into it.
 
-    Comes between ``LoadPointsFromFile`` and ``LoadPointsFromMultiSweeps`` (whose sweeps are moved
-    already); on nuScenes it changes nothing.
+    Comes between ``LoadLidarPoints`` and ``LoadLidarSweeps`` (whose sweeps are moved already); on
+    nuScenes it changes nothing.
     """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
@@ -77,17 +165,18 @@ class MakeDepthMap(BaseTransform):
         """Project the points into each camera."""
         points = results["points"].tensor[:, :3].numpy().astype(np.float64)
         homogeneous = np.concatenate([points, np.ones((len(points), 1))], -1)
-        height, width = results["img_shape"]
-        padded = padded_size((height, width), self.pad_size_divisor)
+        padded = padded_size(results["img_shape"], self.pad_size_divisor)
         depths = np.zeros((len(results["lidar2img"]), *padded), np.float32)
-        for target, lidar2img in zip(depths, results["lidar2img"], strict=True):
+        for view, (target, lidar2img) in enumerate(zip(depths, results["lidar2img"], strict=True)):
             u, v, depth = (homogeneous @ lidar2img.T)[:, :3].T
             keep = (depth >= self.depth_range[0]) & (depth < self.depth_range[1])
             depth = depth[keep]
             col, row = np.round(u[keep] / depth), np.round(v[keep] / depth)
-            inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+            scale = results["img_aug_matrix"][view]
+            rows, cols = np.round(results["raw_shapes"][view] * scale[[1, 0], [1, 0]])
+            inside = (col >= 0) & (col < cols) & (row >= 0) & (row < rows)  # not in the padding
             far_first = np.argsort(-depth[inside], kind="stable")  # the nearest is written last
-            rows, cols = row[inside][far_first].astype(int), col[inside][far_first].astype(int)
-            target[rows, cols] = depth[inside][far_first]
+            pixels = row[inside][far_first].astype(int), col[inside][far_first].astype(int)
+            target[pixels] = depth[inside][far_first]
         results["gt_depth"] = torch.from_numpy(depths)
         return results

@@ -1,0 +1,9 @@
+# MapTRv2 on Argoverse 2 with depth supervision by LiDAR, 6 epochs, 4 x 8 samples per step.
+_base_ = [
+    '../_base_/datasets/av2_depth_seg.py',
+    '../_base_/models/maptrv2_r50_av2.py',
+    '../_base_/schedules/cosine_6e.py',
+    '../_base_/default_runtime.py',
+]
+train_dataloader = dict(batch_size=4)
+model = dict(bev_encoder=dict(loss_depth_weight=3.0))
