@@ -229,6 +229,15 @@ def test_missing_and_truncated_points_are_named(build, copied_root):
         dataset[0]
 
 
+def test_a_missing_earlier_sweep_is_named_with_the_remedy(build, copied_root):
+    dataset = build(**dataset_config("nuscenes_lidar", "val_dataloader", copied_root))
+    sample = dataset.sample(1)
+    path = copied_root / sample.lidar.sweeps[0].path
+    message = f"{sample.token}.*no earlier LiDAR sweep at {path}.*--max-sweeps 0"
+    with pytest.raises(BrokenSampleError, match=message):
+        dataset[1]
+
+
 def test_broken_samples_are_skipped_and_counted_on_demand(build, copied_root):
     config = dataset_config("minicity", "train_dataloader", copied_root, broken_samples="skip")
     dataset = build(**config)

@@ -4,7 +4,7 @@ _base_ = './minicity.py'
 train_dataloader = dict(
     dataset=dict(pipeline=[
         dict(type='LoadCameraImages', to_float32=False),
-        dict(type='LoadPointsFromFile', coord_type='LIDAR', load_dim=5, use_dim=5),
+        dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5),
         dict(type='ScaleImages', scale=0.4),
         dict(
             type='MultiViewWrapper',

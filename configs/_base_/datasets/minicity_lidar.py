@@ -2,7 +2,7 @@
 _base_ = './minicity.py'
 
 _points = [
-    dict(type='LoadPointsFromFile', coord_type='LIDAR', load_dim=5, use_dim=5),
+    dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5),
     dict(type='PointsToFrame'),
 ]
 train_dataloader = dict(

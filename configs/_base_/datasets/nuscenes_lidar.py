@@ -4,7 +4,7 @@ _base_ = './nuscenes.py'
 _points = [
     dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5),
     dict(
-        type='LoadPointsFromMultiSweeps',
+        type='LoadLidarSweeps',
         sweeps_num=9,
         use_dim=[0, 1, 2, 3, 4],
         pad_empty_sweeps=True,
@@ -13,7 +13,7 @@ _points = [
 _test_points = [
     _points[0],
     dict(
-        type='LoadPointsFromMultiSweeps',
+        type='LoadLidarSweeps',
         sweeps_num=9,
         use_dim=[0, 1, 2, 3, 4],
         pad_empty_sweeps=True,
