@@ -64,7 +64,7 @@ def profile(model: torch.nn.Module, args: argparse.Namespace) -> dict[str, float
         return result
 
     for _ in range(args.repeats + 1):  # the first is a warm-up
-        features = timed("image backbone", model.img_backbone, images[0])
+        features = timed("image backbone", model.folded_backbone, model.img_backbone, images[0])
         features = timed("image neck", model.img_neck, features)
         features = [feature.unflatten(0, (1, -1)) for feature in features]
         bev = timed("BEV encoder", model.bev_encoder, features, [data_sample.metainfo])

@@ -10,6 +10,7 @@ from mmdet3d.structures import Det3DDataSample
 from torch import Tensor
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
+from gsmap.layers.folded_backbone import FoldedBackbone
 
 
 @MODELS.register_module()
@@ -46,6 +47,7 @@ class MapDetector(Base3DDetector):
     ) -> None:
         super().__init__(data_preprocessor=data_preprocessor, init_cfg=init_cfg)
         self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
+        self.folded_backbone = FoldedBackbone()
         self.img_neck = MODELS.build(img_neck) if img_neck else None
         self.img_augment = MODELS.build(img_augment) if img_augment else None
         if not (bev_encoder or lidar_encoder):
@@ -66,7 +68,8 @@ class MapDetector(Base3DDetector):
         if self.training and self.img_augment is not None:
             images = self.img_augment(images)
         # channels last is what CPU and tensor-core convolutions are fastest with
-        feats = self.img_backbone(images.contiguous(memory_format=torch.channels_last))
+        images = images.contiguous(memory_format=torch.channels_last)
+        feats = self.folded_backbone(self.img_backbone, images)
         if self.img_neck is not None:
             feats = self.img_neck(feats)
         return [feat.unflatten(0, (batch, -1)) for feat in feats]

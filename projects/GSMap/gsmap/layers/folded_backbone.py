@@ -1,0 +1,46 @@
+"""A backbone for inference, with its batch norms folded into its convolutions."""
+
+import copy
+
+import torch
+from mmcv.cnn import fuse_conv_bn
+from mmdet.models.backbones import ResNet
+from torch import Tensor, nn
+
+
+class FoldedBackbone:
+    """Runs a backbone; in inference a copy whose batch norms are part of its convolutions.
+
+    With fixed statistics a batch norm is a scale and a shift per channel, which the convolution
+    before it can do by itself; what is saved is one pass over every feature map. The copy, as large
+    as the backbone, is made when it is first needed, made again when a weight has changed, and
+    dropped in training. The backbone itself, and so every checkpoint, stays as it is.
+
+    Only ResNets are folded: mmcv's folding takes each norm to follow the convolution registered
+    before it, which other backbones need not keep.
+    """
+
+    def __init__(self) -> None:
+        self.folded: nn.Module | None = None
+        self.state: list[tuple[int, int]] = []  # address and version of the backbone's tensors
+
+    def __call__(self, backbone: nn.Module, images: Tensor) -> tuple[Tensor, ...]:
+        """Return the backbone's feature maps. (n, 3, H, W) -> tuple of (n, C, h, w)"""
+        if not can_be_folded(backbone):
+            self.folded = None
+            return backbone(images)
+        tensors = [*backbone.parameters(), *backbone.buffers()]
+        state = [(tensor.data_ptr(), tensor._version) for tensor in tensors]
+        if self.folded is None or state != self.state:
+            self.folded, self.state = fuse_conv_bn(copy.deepcopy(backbone)), state
+        return self.folded(images)
+
+
+def can_be_folded(backbone: nn.Module) -> bool:
+    """Return whether a folded copy of the backbone would do the same as it does, now."""
+    if torch.is_grad_enabled() or torch.compiler.is_compiling() or not isinstance(backbone, ResNet):
+        return False
+    return not any(
+        module.training or module._forward_hooks or module._forward_pre_hooks
+        for module in backbone.modules()
+    )
