@@ -165,3 +165,17 @@ def test_extended_classes_become_targets_that_both_metrics_score(minicity_root, 
     for name in found & set(test.classes[3:]):
         assert figures[f"chamfer/{name}/AP"] == pytest.approx(1)
         assert figures[f"raster/{name}/AP"] > 0.9  # 20 points do not hold every corner
+
+
+@pytest.mark.parametrize(
+    ("name", "steps"),
+    [
+        ("maptr/maptr_r50_24e", ["MultiViewWrapper", "ScaleImages"]),
+        ("maptr/maptr_r50_second_24e", ["MultiViewWrapper", "ScaleImages"]),
+        ("maptrv2/maptrv2_r50_24e", ["ScaleImages", "MultiViewWrapper"]),
+        ("maptrv2/maptrv2_r50_av2_6e", ["ScaleImages", "MultiViewWrapper"]),
+    ],
+)
+def test_colours_are_distorted_before_or_after_scaling_as_in_the_original(name, steps):
+    pipeline = load(REPO / f"configs/{name}.py").train_dataloader.dataset.pipeline
+    assert [step.type for step in pipeline if step.type in steps] == steps

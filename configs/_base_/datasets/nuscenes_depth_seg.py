@@ -5,12 +5,8 @@ train_dataloader = dict(
     dataset=dict(pipeline=[
         dict(type='LoadCameraImages'),
         dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5),
-        dict(
-            type='MultiViewWrapper',
-            transforms=[dict(type='PhotoMetricDistortion3D')],
-            override_aug_config=False,  # each camera its own, as in MapTR
-            collected_keys=[]),
         dict(type='ScaleImages', scale=0.5),
+        _base_._photometric,
         dict(type='FormatMapTargets', num_points=20),
         dict(type='MakeDepthMap'),
         dict(type='MakeBEVMask', size=(200, 100)),
