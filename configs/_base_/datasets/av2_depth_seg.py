@@ -7,11 +7,7 @@ train_dataloader = dict(
         dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5),
         dict(type='PointsToFrame'),
         dict(type='ScaleImages', scale=0.3),
-        dict(
-            type='MultiViewWrapper',
-            transforms=[dict(type='PhotoMetricDistortion3D')],
-            override_aug_config=False,  # each camera its own, as in MapTR
-            collected_keys=[]),
+        _base_._photometric,
         dict(type='FormatMapTargets', num_points=20),
         dict(type='MakeDepthMap'),
         dict(type='MakeBEVMask', size=(100, 200)),

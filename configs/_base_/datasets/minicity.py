@@ -7,14 +7,15 @@ _cameras = [
     'CAM_FRONT', 'CAM_FRONT_RIGHT', 'CAM_FRONT_LEFT', 'CAM_BACK', 'CAM_BACK_LEFT', 'CAM_BACK_RIGHT'
 ]
 _scale = 0.4
+_photometric = dict(
+    type='MultiViewWrapper',
+    transforms=[dict(type='PhotoMetricDistortion3D')],
+    override_aug_config=False,  # each camera its own, as in MapTR
+    collected_keys=[])
 _train_pipeline = [
     dict(type='LoadCameraImages', to_float32=False),
     dict(type='ScaleImages', scale=_scale),
-    dict(
-        type='MultiViewWrapper',
-        transforms=[dict(type='PhotoMetricDistortion3D')],
-        override_aug_config=False,  # each camera its own, as in MapTR
-        collected_keys=[]),
+    _photometric,
     dict(type='FormatMapTargets', num_points=20),
     dict(type='PackMapInputs'),
 ]

@@ -6,11 +6,7 @@ train_dataloader = dict(
         dict(type='LoadCameraImages', to_float32=False),
         dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5),
         dict(type='ScaleImages', scale=0.4),
-        dict(
-            type='MultiViewWrapper',
-            transforms=[dict(type='PhotoMetricDistortion3D')],
-            override_aug_config=False,  # each camera its own, as in MapTR
-            collected_keys=[]),
+        _base_._photometric,
         dict(type='FormatMapTargets', num_points=20),
         dict(type='MakeDepthMap'),
         dict(type='MakeBEVMask', size=(50, 25), thickness_px=1),

@@ -10,11 +10,7 @@ train_dataloader = dict(
         dict(type='LoadCameraImages', to_float32=False),
         *_points,
         dict(type='ScaleImages', scale=0.4),
-        dict(
-            type='MultiViewWrapper',
-            transforms=[dict(type='PhotoMetricDistortion3D')],
-            override_aug_config=False,  # each camera its own, as in MapTR
-            collected_keys=[]),
+        _base_._photometric,
         dict(type='FormatMapTargets', num_points=20),
         dict(type='PackMapInputs'),
     ]))

@@ -24,11 +24,7 @@ train_dataloader = dict(
     dataset=dict(pipeline=[
         dict(type='LoadCameraImages'),
         *_points,
-        dict(
-            type='MultiViewWrapper',
-            transforms=[dict(type='PhotoMetricDistortion3D')],
-            override_aug_config=False,  # each camera its own, as in MapTR
-            collected_keys=[]),
+        _base_._photometric,
         dict(type='ScaleImages', scale=0.5),
         dict(type='FormatMapTargets', num_points=20),
         dict(type='PackMapInputs'),
