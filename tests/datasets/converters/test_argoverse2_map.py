@@ -15,8 +15,8 @@ from gsmap.datasets.converters.argoverse2_rules import (
     drop_duplicates,
     merge_parallel,
     merge_until_stable,
-    rings_of,
 )
+from gsmap.datasets.converters.local_map import rings_of
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ import shapely
 
 from gsmap.datasets.annotation_file import AnnotationFile
 from gsmap.datasets.converters import nuscenes
-from gsmap.datasets.converters.argoverse2_lanes import LaneLinks
 from gsmap.datasets.converters.export import export_json
+from gsmap.datasets.converters.lane_graph import LaneLinks
 from gsmap.datasets.converters.nuscenes import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.converters.nuscenes_map import MapLayers, NuScenesLocalMap
 

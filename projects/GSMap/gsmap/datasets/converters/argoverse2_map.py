@@ -13,7 +13,6 @@ import shapely
 from av2.map.lane_segment import LaneMarkType, LaneSegment
 from av2.map.map_api import ArgoverseStaticMap
 
-from gsmap.datasets.converters.argoverse2_lanes import ROUND_DECIMALS, LaneLinks, LanePaths
 from gsmap.datasets.converters.argoverse2_rules import (
     EDGE_MARGIN_M,
     EgoPatch,
@@ -24,8 +23,9 @@ from gsmap.datasets.converters.argoverse2_rules import (
     merge_parallel,
     merge_until_stable,
     points_of,
-    rings_of,
 )
+from gsmap.datasets.converters.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths
+from gsmap.datasets.converters.local_map import rings_of
 
 COMPAT_MODES = ("maptrv2", "maptr")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")

@@ -84,16 +84,6 @@ def clip_polygons(polygons: np.ndarray, patch: EgoPatch) -> tuple[np.ndarray, np
     return pieces[keep], owner[keep]
 
 
-def rings_of(polygons: np.ndarray, exterior_ccw: bool) -> np.ndarray:
-    """Return all rings, exteriors turned as asked and holes the other way round. (rings,)"""
-    rings, owner = shapely.get_rings(polygons, return_index=True)
-    is_exterior = np.ones(len(rings), dtype=bool)
-    is_exterior[1:] = owner[1:] != owner[:-1]  # a polygon's first ring is its exterior
-    turn = shapely.is_ccw(rings) != (is_exterior == exterior_ccw)
-    rings[turn] = shapely.reverse(rings[turn])
-    return rings
-
-
 def cut_rings(rings: np.ndarray, box: shapely.Polygon) -> tuple[np.ndarray, np.ndarray]:
     """Return what of each ring lies in the box, its pieces joined where they touch.
 

@@ -72,6 +72,24 @@ class LocalPatch:
         return shapely.transform(geometries, self.points_to_local)
 
 
+def rings_of(polygons: np.ndarray, exterior_ccw: bool) -> np.ndarray:
+    """Return all rings of polygons, exteriors turned as asked and holes the other way round.
+
+    Args:
+        polygons: Polygons. (n,)
+        exterior_ccw: Whether exteriors run anticlockwise.
+
+    Returns:
+        Rings, polygon by polygon, the exterior first. (rings,)
+    """
+    rings, owner = shapely.get_rings(polygons, return_index=True)
+    is_exterior = np.ones(len(rings), dtype=bool)
+    is_exterior[1:] = owner[1:] != owner[:-1]  # a polygon's first ring is its exterior
+    turn = shapely.is_ccw(rings) != (is_exterior == exterior_ccw)
+    rings[turn] = shapely.reverse(rings[turn])
+    return rings
+
+
 class OutlineIndex:
     """Rings of a whole map, indexed in short chunks, so that a patch touches only what is near.
 

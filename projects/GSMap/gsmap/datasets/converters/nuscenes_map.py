@@ -14,9 +14,8 @@ import numpy as np
 import shapely
 
 from gsmap.datasets.annotation_record import MapInstance
-from gsmap.datasets.converters.argoverse2_lanes import LaneLinks, LanePaths
-from gsmap.datasets.converters.argoverse2_rules import rings_of
-from gsmap.datasets.converters.local_map import LocalPatch, OutlineIndex
+from gsmap.datasets.converters.lane_graph import LaneLinks, LanePaths
+from gsmap.datasets.converters.local_map import LocalPatch, OutlineIndex, rings_of
 from gsmap.geometry.polylines import Points
 
 if TYPE_CHECKING:

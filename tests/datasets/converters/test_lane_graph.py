@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import shapely
 
-from gsmap.datasets.converters import argoverse2_lanes
-from gsmap.datasets.converters.argoverse2_lanes import LaneLinks, LanePaths
+from gsmap.datasets.converters import lane_graph
+from gsmap.datasets.converters.lane_graph import LaneLinks, LanePaths
 
 
 def line(*xy: tuple[float, float]) -> np.ndarray:
@@ -60,7 +60,7 @@ def test_a_closed_loop_has_neither_source_nor_sink():
 
 
 def test_too_many_paths_are_refused(monkeypatch):
-    monkeypatch.setattr(argoverse2_lanes, "MAX_PATHS", 1)
+    monkeypatch.setattr(lane_graph, "MAX_PATHS", 1)
     lanes = [line((0, 0), (10, 0)), line((10, 0), (20, 5)), line((10, 0), (20, -5))]
     with pytest.raises(ValueError, match="more than 1 paths"):
         paths(lanes, [[1, 2], [], []])

@@ -1,4 +1,4 @@
-"""The lane graph of an Argoverse 2 log: which lane boundaries join to one line (MapTRv2)."""
+"""The lane graph of a map: which lines along lanes join to one (MapTRv2)."""
 
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ Edge = tuple[tuple[int, ...], int]
 
 @dataclass(frozen=True)
 class LaneLinks:
-    """How the lanes of a log follow one another; a lane is named by its position in the log.
+    """How the lanes of a map follow one another; a lane is named by its position in the map.
 
     Args:
         predecessors: For each lane, the lanes that lead into it.
@@ -34,7 +34,7 @@ class LaneLinks:
         predecessors: Sequence[Iterable[Hashable]],
         successors: Sequence[Iterable[Hashable]],
     ) -> "LaneLinks":
-        """Translate lane ids to positions; ids of lanes outside the log's map are left out."""
+        """Translate lane ids to positions; ids of lanes outside the map are left out."""
         position = {lane_id: i for i, lane_id in enumerate(ids)}
 
         def translate(neighbours: Iterable[Hashable]) -> list[int]:
@@ -44,19 +44,19 @@ class LaneLinks:
 
 
 class LanePaths:
-    """One polyline per lane of a log, and the simple paths through any subset of them.
+    """One polyline per lane of a map, and the simple paths through any subset of them.
 
     The graph has a node for every polyline point (rounded to 1 mm, so that lanes may share nodes),
     an edge between consecutive points, and an edge from the end of each lane to the start of each
     of its successors. A path runs from a node that nothing leads to, to a node that leads nowhere,
     without visiting a node twice.
 
-    Points that only one lane of the log has can neither start, end nor branch a path; they are
-    folded into the edges once per log, so that the search for paths in a frame takes about one step
+    Points that only one lane of the map has can neither start, end nor branch a path; they are
+    folded into the edges once per map, so that the search for paths in a frame takes about one step
     per lane instead of one per point.
 
     Args:
-        polylines: Points of each lane's line, in metres, city frame. list of (n >= 2, 3)
+        polylines: Points of each lane's line, in metres, map frame. list of (n >= 2, 3)
         links: Which lanes follow which.
 
     Raises:
@@ -93,10 +93,10 @@ class LanePaths:
         lanes.
 
         Args:
-            lanes: Positions of the lanes that take part, in the order of the log.
+            lanes: Positions of the lanes that take part, in the order of the map.
 
         Returns:
-            3-D line strings in the city frame. (paths,)
+            3-D line strings in the map frame. (paths,)
 
         Raises:
             ValueError: If the lanes allow more than ``MAX_PATHS`` paths.
