@@ -1,76 +1,21 @@
-import copy
-
 import pytest
 import torch
-from mmdet3d.registry import MODELS
+from head_cases import GAUSSIANS, HEAD, along_y, bev, build_head, elements, with_layer
 from mmengine.structures import InstanceData
 
-import gsmap.registered  # noqa: F401
 from gsmap.geometry.bev_grid import BEVGrid
 from gsmap.layers.decoders.gaussian_layer import GaussianDecoderLayer
 from gsmap.ops.gaussian_raster import render_gaussians
 
-MAPTR = {
-    "type": "MapHead",
-    "num_classes": 3,
-    "pc_range": [-15.0, -30.0, -2.0, 15.0, 30.0, 2.0],
-    "num_instances": 6,
-    "num_points": 5,
-    "embed_dims": 16,
-    "decoder": {
-        "type": "MapDecoder",
-        "num_layers": 2,
-        "layer": {"embed_dims": 16, "num_heads": 4, "ffn_dims": 32, "dropout": 0.0},
-    },
-    "assigner": {
-        "type": "MapAssigner",
-        "match_costs": [
-            {"type": "mmdet.FocalLossCost", "weight": 2.0},
-            {"type": "OrderedPointsCost", "weight": 5.0},
-        ],
-    },
-    "coder": {"type": "MapCoder", "max_num": 8, "post_center_range": [-20, -35, 20, 35]},
-    "loss_cls": {"type": "mmdet.FocalLoss", "use_sigmoid": True, "loss_weight": 2.0},
-    "loss_weights": {"pts": 5.0, "dir": 0.005},
-}
-GSMAP = {
-    **MAPTR,
-    "type": "GSMapHead",
-    "loss_raster": {"type": "RasterLoss", "loss_weight": 10.0},
-    "iou_cost": {"type": "IoUCost", "weight": 2.0},
-    "raster_size": (40, 20),
-    "cost_raster_size": (80, 40),
-}
-
-
-def build(config, **settings):
-    torch.manual_seed(0)
-    head = MODELS.build(copy.deepcopy({**config, **settings}))
-    head.init_weights()
-    return head
-
-
-def elements(*lines, labels=None):
-    """Return the ground truth of one sample from straight lines ((x0, y0), (x1, y1)) in metres."""
-    ends = torch.tensor(lines, dtype=torch.float32).view(-1, 2, 2)
-    steps = torch.linspace(0, 1, 5)[:, None]
-    pts = ends[:, :1] * (1 - steps) + ends[:, 1:] * steps
-    labels = torch.zeros(len(pts), dtype=torch.long) if labels is None else torch.tensor(labels)
-    shifts = torch.stack([pts, pts.flip(1)], 1)
-    return InstanceData(labels_3d=labels, pts=pts, pts_shifts=shifts)
-
-
+MAPTR = {**HEAD, "num_instances": 6}
+RASTERS = {"raster_size": (40, 20), "cost_raster_size": (80, 40)}
+GSMAP = {**MAPTR, **GAUSSIANS, **RASTERS, "type": "GSMapHead"}
 LANES = elements(((-3, -20), (-3, 20)), ((3, -20), (4, 20)), labels=[0, 2])
 EMPTY = elements()
 
 
-def bev(batch=1):
-    generator = torch.Generator().manual_seed(1)
-    return {"bev_feats": torch.randn(batch, 16, 10, 5, generator=generator)}
-
-
 def test_with_maptr_weights_the_points_and_scores_are_maptrs_exactly():
-    maptr, gsmap_head = build(MAPTR).eval(), build(GSMAP).eval()
+    maptr, gsmap_head = build_head(MAPTR).eval(), build_head(GSMAP).eval()
     left = gsmap_head.load_state_dict(maptr.state_dict(), strict=False)
     assert not left.unexpected_keys
     assert all("gaussian_" in key for key in left.missing_keys)
@@ -80,9 +25,9 @@ def test_with_maptr_weights_the_points_and_scores_are_maptrs_exactly():
 
 
 def test_the_guided_attention_is_as_large_as_maptrs_and_drops_as_much():
-    decoder = {**MAPTR["decoder"], "layer": {**MAPTR["decoder"]["layer"], "dropout": 0.25}}
-    plain = build(MAPTR, decoder=decoder).decoder.layers[0].cross_attn
-    guided = build(GSMAP, decoder=decoder).decoder.layers[0].cross_attn
+    decoder = with_layer(MAPTR, dropout=0.25)
+    plain = build_head(MAPTR, decoder=decoder).decoder.layers[0].cross_attn
+    guided = build_head(GSMAP, decoder=decoder).decoder.layers[0].cross_attn
     assert type(guided) is not type(plain)
     assert guided.dropout.p == plain.dropout.p == 0.25
     shapes = [{k: v.shape for k, v in part.state_dict().items()} for part in (plain, guided)]
@@ -90,7 +35,7 @@ def test_the_guided_attention_is_as_large_as_maptrs_and_drops_as_much():
 
 
 def test_every_parameter_learns():
-    head = build(GSMAP)
+    head = build_head(GSMAP)
     for step in range(2):  # what feeds a matrix of zeros learns from the second step on
         losses = head.loss_by_feat(head(bev(2)), [LANES, EMPTY], [{}, {}])
         head.zero_grad()
@@ -103,7 +48,7 @@ def test_every_parameter_learns():
 
 
 def test_each_layer_has_its_raster_loss_or_only_the_last():
-    every, last = build(GSMAP), build(GSMAP, raster_layers="last")
+    every, last = build_head(GSMAP), build_head(GSMAP, raster_layers="last")
     outputs = every(bev())
     names = {"loss_cls", "loss_pts", "loss_dir", "loss_raster"}
     assert set(every.loss_by_feat(outputs, [LANES], [{}])) == names | {f"d0.{n}" for n in names}
@@ -129,7 +74,7 @@ def perfect_outputs(head, gt, scales=(0.0, 0.0), rotation=0.0):
 
 
 def test_a_band_along_the_line_has_a_smaller_raster_loss_than_one_across_it():
-    head = build(GSMAP)
+    head = build_head(GSMAP)
     lane = elements(((-3, -20), (-3, 20)))
     along = head.loss_by_feat(perfect_outputs(head, lane, scales=(0.0, 3.0)), [lane], [{}])
     across = head.loss_by_feat(perfect_outputs(head, lane, scales=(3.0, 0.0)), [lane], [{}])
@@ -138,7 +83,7 @@ def test_a_band_along_the_line_has_a_smaller_raster_loss_than_one_across_it():
 
 
 def test_the_raster_loss_reaches_centres_scales_and_angles():
-    head = build(GSMAP)
+    head = build_head(GSMAP)
     lane = elements(((-3, -20), (-1, 20)))
     outputs = perfect_outputs(head, lane, scales=(0.2, 0.7), rotation=0.3)
     loss = head.loss_by_feat(outputs, [lane], [{}])["loss_raster"]
@@ -150,7 +95,7 @@ def test_the_raster_loss_reaches_centres_scales_and_angles():
 
 def test_matching_reads_the_rendered_masks():
     """Two predictions at the same points: the one whose Gaussians lie along the line is matched."""
-    head = build(GSMAP)
+    head = build_head(GSMAP)
     lane = elements(((-3, -20), (-3, 20)))
     outputs = perfect_outputs(head, lane)
     references = outputs["all_references"].detach().clone()
@@ -163,7 +108,7 @@ def test_matching_reads_the_rendered_masks():
     targets = head.get_targets(predictions, [head.prepare_gt(lane)], [{}])
     assert targets.matches[0].query_inds.tolist() == [1]
 
-    blind = build(GSMAP, iou_cost=None)
+    blind = build_head(GSMAP, iou_cost=None)
     predictions = blind.layer_predictions(outputs, 1)
     assert "rasters" not in predictions[0]
     targets = blind.get_targets(predictions, [blind.prepare_gt(lane)], [{}])
@@ -171,7 +116,7 @@ def test_matching_reads_the_rendered_masks():
 
 
 def test_the_masks_of_matching_carry_no_gradient():
-    head = build(GSMAP)
+    head = build_head(GSMAP)
     predictions = head.layer_predictions(head(bev()), 1)
     assert predictions[0].rasters.shape == (6, 80, 40)
     assert not predictions[0].rasters.requires_grad
@@ -179,7 +124,7 @@ def test_the_masks_of_matching_carry_no_gradient():
 
 
 def test_the_rendered_mask_is_that_of_the_predicted_gaussians():
-    head = build(GSMAP).eval()
+    head = build_head(GSMAP).eval()
     outputs = head(bev())
     (result,) = head.predict_by_feat(outputs, [{}])
     grid = BEVGrid((-15, 15), (-30, 30), 40, 20)
@@ -190,7 +135,7 @@ def test_the_rendered_mask_is_that_of_the_predicted_gaussians():
 
 
 def test_no_ground_truth_gives_only_a_classification_loss():
-    head = build(GSMAP)
+    head = build_head(GSMAP)
     losses = head.loss_by_feat(head(bev()), [EMPTY], [{}])
     assert losses["loss_cls"] > 0
     assert losses["loss_raster"] == losses["loss_pts"] == losses["loss_dir"] == 0
@@ -198,8 +143,8 @@ def test_no_ground_truth_gives_only_a_classification_loss():
 
 
 def test_more_ground_truth_than_queries_is_matched_as_far_as_it_goes():
-    head = build(GSMAP)
-    crowd = elements(*[((x, -20), (x, 20)) for x in range(-9, 9, 2)])
+    head = build_head(GSMAP)
+    crowd = elements(*along_y(*range(-9, 9, 2)))
     losses = head.loss_by_feat(head(bev()), [crowd], [{}])
     assert all(torch.isfinite(loss) for loss in losses.values())
     assert losses["loss_raster"] > 0
@@ -208,15 +153,15 @@ def test_more_ground_truth_than_queries_is_matched_as_far_as_it_goes():
 def test_filled_classes_have_filled_masks():
     square = torch.tensor([[[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-4, -4]]])
     gt = InstanceData(labels_3d=torch.tensor([1]), pts=square, pts_shifts=square[:, None])
-    hollow, filled = build(GSMAP), build(GSMAP, filled_classes=(1,))
+    hollow, filled = build_head(GSMAP), build_head(GSMAP, filled_classes=(1,))
     assert hollow.prepare_gt(gt).masks[0, 20, 10] == 0
     assert filled.prepare_gt(gt).masks[0, 20, 10] == 1
 
 
 @pytest.mark.parametrize("part", ["guide_sampling", "embed_gaussians"])
 def test_parts_of_the_guided_layer_switch_off_by_themselves(part):
-    decoder = {**GSMAP["decoder"], "layer": {**GSMAP["decoder"]["layer"], part: False}}
-    head, full = build(GSMAP, decoder=decoder), build(GSMAP)
+    decoder = with_layer(GSMAP, **{part: False})
+    head, full = build_head(GSMAP, decoder=decoder), build_head(GSMAP)
     for changed in (head, full):  # Gaussians that are not the first ones any more
         torch.nn.init.constant_(changed.gaussian_init.bias, 0.5)
     layer = full.decoder.layers[0]
@@ -230,14 +175,10 @@ def test_parts_of_the_guided_layer_switch_off_by_themselves(part):
 
 
 def test_a_plain_layer_may_stand_under_the_head():
-    decoder = {
-        **GSMAP["decoder"],
-        "layer": {"type": "MapDecoderLayer", **MAPTR["decoder"]["layer"]},
-    }
-    head = build(GSMAP, decoder=decoder)
+    head = build_head(GSMAP, decoder=with_layer(GSMAP, type="MapDecoderLayer"))
     assert "loss_raster" in head.loss_by_feat(head(bev()), [LANES], [{}])
 
 
 def test_unknown_raster_layers_are_refused():
     with pytest.raises(ValueError, match="raster_layers must be 'all' or 'last', got 'first'"):
-        build(GSMAP, raster_layers="first")
+        build_head(GSMAP, raster_layers="first")

@@ -1,91 +1,44 @@
 """MapTRv2's head: two groups of queries, their losses, auxiliary masks."""
 
-import copy
 import math
 
 import pytest
 import torch
-from mmdet3d.registry import MODELS
+from head_cases import GAUSSIANS, HEAD, C, N, P, along_y, bev, build_head, elements, with_layer
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
-import gsmap.registered  # noqa: F401
-
-N, P, C = 4, 5, 16
 CONFIG = {
+    **HEAD,
     "type": "MapTRv2Head",
-    "num_classes": 3,
-    "pc_range": [-15.0, -30.0, -10.0, 15.0, 30.0, 10.0],
-    "num_instances": N,
-    "num_points": P,
-    "embed_dims": C,
     "num_one2many": 6,
     "num_repeats": 3,
-    "decoder": {
-        "type": "MapDecoder",
-        "num_layers": 2,
-        "layer": {
-            "type": "DecoupledDecoderLayer",
-            "num_points": P,
-            "embed_dims": C,
-            "num_heads": 4,
-            "ffn_dims": 32,
-            "dropout": 0.0,
-        },
-    },
-    "assigner": {
-        "type": "MapAssigner",
-        "match_costs": [
-            {"type": "mmdet.FocalLossCost", "weight": 2.0},
-            {"type": "OrderedPointsCost", "weight": 5.0},
-        ],
-    },
-    "coder": {"type": "MapCoder", "max_num": 8, "post_center_range": [-20, -35, 20, 35]},
-    "loss_cls": {"type": "mmdet.FocalLoss", "use_sigmoid": True, "loss_weight": 2.0},
-    "loss_weights": {"pts": 5.0, "dir": 0.005},
+    "decoder": with_layer(HEAD, type="DecoupledDecoderLayer", num_points=P),
     "bev_seg": {"weight": 1.0, "pos_weight": 4.0},
     "pv_seg": {"weight": 2.0, "pos_weight": 1.0},
 }
+GSMAP = {
+    **CONFIG,
+    **GAUSSIANS,
+    "type": "GSMapV2Head",
+    "decoder": with_layer(CONFIG, type="GaussianDecoupledLayer"),
+    "raster_size": (20, 10),
+    "cost_raster_size": (20, 10),
+}
 
 
-def build(**settings):
-    torch.manual_seed(0)
-    head = MODELS.build(copy.deepcopy({**CONFIG, **settings}))
-    head.init_weights()
-    return head
+def build(config=CONFIG, **settings):
+    return build_head(config, **settings)
 
 
-def gsmap_on_maptrv2(**settings):
-    decoder = copy.deepcopy(CONFIG["decoder"])
-    decoder["layer"]["type"] = "GaussianDecoupledLayer"
-    raster = {
-        "loss_raster": {"type": "RasterLoss", "loss_weight": 10.0},
-        "iou_cost": {"type": "IoUCost", "weight": 2.0},
-        "raster_size": (20, 10),
-        "cost_raster_size": (20, 10),
-    }
-    return build(type="GSMapV2Head", decoder=decoder, **raster, **settings)
-
-
-def bev(batch: int = 1) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(1)
-    return {
-        "bev_feats": torch.randn(batch, C, 10, 5, generator=generator),
-        "img_feats": torch.randn(batch, 2, C, 3, 4, generator=generator),
-    }
-
-
-def elements(num: int) -> InstanceData:
-    """Straight lines along y, one metre apart."""
-    y = torch.linspace(-20, 20, P).expand(num, P)
-    pts = torch.stack([torch.arange(num, dtype=torch.float32)[:, None].expand(num, P), y], -1)
-    shifts = torch.stack([pts, pts.flip(1)], 1)
-    return InstanceData(labels_3d=torch.arange(num) % 3, pts=pts, pts_shifts=shifts)
+def lines(num: int) -> InstanceData:
+    """Straight lines along y, one metre apart, of all classes in turn."""
+    return elements(*along_y(*range(num)), labels=[i % 3 for i in range(num)])
 
 
 def sample(num: int) -> Det3DDataSample:
     result = Det3DDataSample(metainfo={"token": "a"})
-    result.gt_instances_3d = elements(num)
+    result.gt_instances_3d = lines(num)
     result.gt_seg = torch.zeros(1, 10, 5)
     result.gt_seg[0, 2] = 1
     result.gt_pv_seg = torch.zeros(2, 1, 3, 4)
@@ -121,7 +74,7 @@ def test_every_ground_truth_is_matched_once_and_then_several_times():
     outputs = head(bev())
     first, further = head.split_groups(outputs)
     assert further["all_cls_scores"].shape[2] == 6
-    gt = elements(2)
+    gt = lines(2)
     losses = head.loss_by_feat(outputs, [gt], [{"token": "a"}])
     predictions = head.layer_predictions(further, 1)
     repeated = InstanceData.cat([gt] * 3)
@@ -130,7 +83,7 @@ def test_every_ground_truth_is_matched_once_and_then_several_times():
     assert counts.tolist() == [3, 3]  # k = 3 queries for each of the two elements
     expected = head.matched_losses(predictions, [head.prepare_gt(repeated)], targets)["loss_pts"]
     torch.testing.assert_close(losses["loss_pts_one2many"], expected)
-    alone = MODELS.build(copy.deepcopy(CONFIG)).train()
+    alone = build().train()
     alone.load_state_dict(head.state_dict())
     first_losses = super(type(head), alone).loss_by_feat(first, [gt], [{"token": "a"}])
     torch.testing.assert_close(losses["loss_pts"], first_losses["loss_pts"])
@@ -138,22 +91,22 @@ def test_every_ground_truth_is_matched_once_and_then_several_times():
 
 def test_more_repeats_than_queries_match_every_query():
     head = build().train()
-    losses = head.loss_by_feat(head(bev()), [elements(4)], [{"token": "a"}])
+    losses = head.loss_by_feat(head(bev()), [lines(4)], [{"token": "a"}])
     assert losses["loss_pts_one2many"].isfinite()  # 12 copies for 6 queries
 
 
 def test_weight_of_the_further_queries():
     plain, halved = build().train(), build(one2many_weight=0.5).train()
-    args = ([elements(2)], [{"token": "a"}])
+    args = ([lines(2)], [{"token": "a"}])
     one, half = (head.loss_by_feat(head(bev()), *args) for head in (plain, halved))
     torch.testing.assert_close(half["loss_cls_one2many"], one["loss_cls_one2many"] / 2)
     torch.testing.assert_close(half["loss_cls"], one["loss_cls"])
 
 
 @pytest.mark.parametrize("num", [0, 1, 3])
-@pytest.mark.parametrize("make", [build, gsmap_on_maptrv2])
-def test_losses_reach_every_parameter(make, num):
-    head = make().train()
+@pytest.mark.parametrize("config", [CONFIG, GSMAP], ids=["MapTRv2", "GSMap"])
+def test_losses_reach_every_parameter(config, num):
+    head = build(config).train()
     losses = head.loss(bev(), [sample(num)])
     assert {"loss_cls", "d0.loss_cls_one2many", "loss_seg", "loss_pv_seg"} <= set(losses)
     sum(losses.values()).backward()
@@ -165,7 +118,7 @@ def test_losses_reach_every_parameter(make, num):
 
 def test_no_further_queries_is_plain_maptr():
     head = build(num_one2many=0).train()
-    losses = head.loss_by_feat(head(bev()), [elements(2)], [{"token": "a"}])
+    losses = head.loss_by_feat(head(bev()), [lines(2)], [{"token": "a"}])
     assert not [name for name in losses if "one2many" in name]
     assert head.attention_mask() is None
 
@@ -206,7 +159,7 @@ def test_bad_numbers_are_named():
 
 
 def test_gsmap_starts_at_maptrv2s_points():
-    maptrv2, gsmap_head = build().eval(), gsmap_on_maptrv2().eval()
+    maptrv2, gsmap_head = build().eval(), build(GSMAP).eval()
     for (
         parameter
     ) in maptrv2.parameters():  # as if trained: the sampling offsets are no round numbers
@@ -220,7 +173,7 @@ def test_gsmap_starts_at_maptrv2s_points():
 
 
 def test_gsmap_predicts_gaussians_of_one_to_one_queries():
-    result = gsmap_on_maptrv2().eval().predict(bev(), [sample(0)])[0]
+    result = build(GSMAP).eval().predict(bev(), [sample(0)])[0]
     assert result.scales.shape == result.pts.shape
     assert result.rotations.shape == result.pts.shape[:2]
 

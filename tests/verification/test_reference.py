@@ -1,3 +1,6 @@
+"""Our models against the reference, with the code of ``tools/verify_reference.py``."""
+
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +31,11 @@ FILES = [
     "maptr_loss_closed_*.npz",
     "maptr_loss_many_*.npz",
     "maptr_loss_batch3_*.npz",
+    "maptrv2_r50_state.json",
+    "maptrv2_r50_forward_reduced_*.npz",
+    "maptrv2_r50_forward_full_*.npz",
+    "maptrv2_loss_reduced_closed_*.npz",
+    "maptrv2_loss_reduced_many_*.npz",
 ]
 
 
@@ -42,16 +50,35 @@ def test_ours_agrees_with_the_reference(golden, files):
     assert all(row.passed for row in rows), "\n" + format_table(rows)
 
 
+@contextmanager
+def shifted(parameter, offset):
+    """Make a parameter of a shared model wrong, for a while."""
+    right = parameter.detach().clone()
+    parameter.data += offset
+    try:
+        yield
+    finally:
+        parameter.data.copy_(right)
+
+
+def missed(golden, files):
+    """Return the quantities that do not agree."""
+    return {row.quantity for row in run_checks(golden, files) if not row.passed}
+
+
 def test_a_wrong_weight_is_noticed(golden):
     head = golden.model("maptr/maptr_r50_24e.py", "maptr_r50_state.json").map_head
-    bias = head.reg_branches[2][-1].bias.data
-    bias += 0.1
-    try:
-        rows = list(run_checks(golden, "maptr_r50_forward_reduced_*.npz"))
-    finally:
-        bias -= 0.1
-    failed = {row.quantity for row in rows if not row.passed}
-    assert {"all_pts_preds", "all_cls_scores", "dec_pts (m)"} <= failed
+    with shifted(head.reg_branches[2][-1].bias, 0.1):
+        found = missed(golden, "maptr_r50_forward_reduced_*.npz")
+    assert {"all_pts_preds", "all_cls_scores", "dec_pts (m)"} <= found
+
+
+def test_a_wrong_depth_weight_is_noticed(golden):
+    encoder = golden.model("maptrv2/maptrv2_r50_24e.py", "maptrv2_r50_state.json").bev_encoder
+    with shifted(encoder.depth_net.depth_conv[-1].bias[0], 1.0):
+        found = missed(golden, "maptrv2_r50_forward_reduced_*.npz")
+    assert {"depth", "fraction of BEV cells that differ"} <= found
+    assert "pv_seg" not in found  # it does not depend on depth
 
 
 def test_a_folder_without_the_variant_is_refused(tmp_path):
