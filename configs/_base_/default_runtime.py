@@ -16,7 +16,7 @@ val_evaluator = dict(type='MapMetric', eval=['chamfer'])
 test_evaluator = dict(type='MapMetric', eval=['chamfer', 'raster'])
 vis_backends = [dict(type='LocalVisBackend'), dict(type='TensorboardVisBackend')]
 visualizer = dict(type='MapVisualizer', name='visualizer', vis_backends=vis_backends)
-log_processor = dict(type='LogProcessor', window_size=50, by_epoch=True)
+log_processor = dict(type='MapLogProcessor', window_size=50, by_epoch=True)
 log_level = 'INFO'
 load_from = None
 resume = False

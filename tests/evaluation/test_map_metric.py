@@ -67,6 +67,16 @@ def test_any_order_and_any_split_over_ranks_gives_the_same_digits(monkeypatch):
     assert metric.evaluate(9) == want
 
 
+@pytest.mark.parametrize(("prefix", "key"), [(None, "chamfer/mAP"), ("a", "a/chamfer/mAP")])
+def test_keys_have_a_prefix_only_if_asked_for_and_mmengine_does_not_warn(prefix, key, monkeypatch):
+    said = []
+    monkeypatch.setattr("mmengine.evaluator.metric.print_log", lambda text, **_: said.append(text))
+    evaluator = build(eval=["chamfer"], prefix=prefix)
+    evaluator.process([sample("a", 0.1)])
+    assert key in evaluator.evaluate(1)
+    assert not said
+
+
 def test_results_are_written_with_gaussians_and_without_ground_truth(tmp_path):
     path = tmp_path / "results.json"
     evaluator = build(eval=[], out_file=str(path))

@@ -10,6 +10,7 @@ import gsmap.datasets.transforms.points
 import gsmap.datasets.vectorized_map_dataset
 import gsmap.detectors.map_detector
 import gsmap.engine.checkpoint_io
+import gsmap.engine.log_processor
 import gsmap.evaluation.map_metric
 import gsmap.heads.gsmap_head
 import gsmap.heads.gsmap_maptrv2_head

@@ -1,0 +1,34 @@
+"""Log lines of evaluations that can be read."""
+
+import re
+from typing import Any
+
+from mmdet3d.registry import LOG_PROCESSORS
+from mmengine.runner import LogProcessor, Runner
+
+# All figures of MapMetric but the APs of classes and groups and their means
+_DETAIL = re.compile(r"(.*/)?(chamfer|raster)/(?!.*\bm?AP$)")
+
+
+@LOG_PROCESSORS.register_module()
+class MapLogProcessor(LogProcessor):
+    """mmengine's log processor, whose line after an evaluation names only the main figures.
+
+    `MapMetric` has some 180 figures and logs its tables itself. Backends such as TensorBoard, JSON
+    logs and ``tools/test.py --metrics-out`` get all of them.
+    """
+
+    def get_log_after_epoch(
+        self, runner: Runner, batch_idx: int, mode: str, with_non_scalar: bool = False
+    ) -> tuple[dict[str, Any], str]:
+        """Return all figures of an evaluation, and the log line with the main ones.
+
+        Args:
+            runner: The runner.
+            batch_idx: Index of the last batch.
+            mode: ``val`` or ``test``.
+            with_non_scalar: Whether to return what is no number, too.
+        """
+        figures, line = super().get_log_after_epoch(runner, batch_idx, mode, with_non_scalar)
+        items = line.split("  ")  # mmengine joins its "name: value" so
+        return figures, "  ".join(item for item in items if not _DETAIL.match(item.split(": ")[0]))
