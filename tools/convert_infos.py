@@ -5,17 +5,16 @@ import argparse
 import shlex
 import sys
 
-from gsmap.datasets.converters.convert_infos import add_arguments, run
+from gsmap.datasets.converters.command_line import run_command
 
 
-def main() -> None:
+def convert() -> str:
+    from gsmap.datasets.converters.convert_infos import add_arguments, run
+
     parser = argparse.ArgumentParser(description=__doc__)
     add_arguments(parser)
-    try:
-        print(run(parser.parse_args(), shlex.join(["python", *sys.argv])))
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    return run(parser.parse_args(), shlex.join(["python", *sys.argv]))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(convert)

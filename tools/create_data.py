@@ -8,8 +8,9 @@ command)``, imported only when it is asked for.
 import argparse
 import importlib
 import shlex
-import signal
 import sys
+
+from gsmap.datasets.converters.command_line import run_command
 
 COMMANDS = {
     "minicity": ("gsmap.datasets.minicity.cli", "generate the MiniCity data set"),
@@ -23,13 +24,8 @@ COMMANDS = {
 }
 
 
-def stop(number: int, _frame: object) -> None:
-    """Leave through the clean-up of half-written files, as Ctrl-C does."""
-    sys.exit(128 + number)
-
-
-def main() -> None:
-    signal.signal(signal.SIGTERM, stop)
+def make() -> str | None:
+    """Run the command that is asked for and return its report."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -41,14 +37,8 @@ def main() -> None:
             importlib.import_module(module).add_arguments(subparser)
     arguments = parser.parse_args()
     module, _ = COMMANDS[arguments.command]
-    typed = shlex.join(["python", *sys.argv])
-    try:
-        result = importlib.import_module(module).run(arguments, typed)
-    except (OSError, ValueError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
-    if result is not None:
-        print(result)
+    return importlib.import_module(module).run(arguments, shlex.join(["python", *sys.argv]))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(make)

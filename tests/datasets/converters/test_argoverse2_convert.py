@@ -26,7 +26,6 @@ from gsmap.datasets.converters.argoverse2 import (
     Argoverse2Options,
     SampleOptions,
     convert_argoverse2,
-    parse_rate,
 )
 from gsmap.datasets.converters.argoverse2_benchmark import measure_extraction
 from gsmap.datasets.converters.argoverse2_log import (
@@ -37,6 +36,7 @@ from gsmap.datasets.converters.argoverse2_log import (
     closest_ns,
 )
 from gsmap.datasets.converters.argoverse2_samples import sample_times, thin_out
+from gsmap.datasets.converters.command_line import parse_rate
 from gsmap.datasets.converters.export import export_json
 
 REPO = Path(__file__).resolve().parents[3]

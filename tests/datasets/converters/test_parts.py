@@ -33,6 +33,23 @@ def hang(value: int) -> int:
     return value
 
 
+def write_and_wait(path: Path) -> None:
+    """Stand for a task that writes for long, and cleans up after itself."""
+    try:
+        path.write_text("half")
+        time.sleep(60)
+    finally:
+        path.unlink()
+
+
+def fail_once_others_write(path: Path) -> None:
+    if path.name == "1":
+        while not path.with_name("0").exists():
+            time.sleep(0.02)
+        raise ValueError("bad")
+    write_and_wait(path)
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_order_with_the_initializer_applied(workers: int):
     results = list(ordered_map(add_offset, range(20), workers, set_offset, (100,)))
@@ -62,6 +79,16 @@ def test_a_dead_worker_and_a_hung_one_end_with_words():
     assert time.monotonic() - start < 15
     with pytest.raises(ValueError, match="workers"):
         list(ordered_map(hang, [1], 0))
+
+
+def test_what_ends_early_stops_the_tasks_under_way_through_their_clean_up(tmp_path):
+    started = time.monotonic()
+    tasks = [tmp_path / str(number) for number in range(8)]
+    results = ordered_map(fail_once_others_write, reversed(tasks[:2]), 2)
+    with pytest.raises(ValueError, match="bad"):
+        next(results)
+    assert list(tmp_path.iterdir()) == []
+    assert time.monotonic() - started < 50
 
 
 def test_split_files_are_checked(tmp_path: Path):

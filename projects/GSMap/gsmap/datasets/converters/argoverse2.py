@@ -16,8 +16,9 @@ from gsmap.datasets.annotation_record import CLASSES, AnnotationMeta
 from gsmap.datasets.converters.argoverse2_log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_split
 from gsmap.datasets.converters.argoverse2_map import COMPAT_MODES
 from gsmap.datasets.converters.argoverse2_samples import LogSamples, SampleOptions, read_log
+from gsmap.datasets.converters.command_line import add_file_options, add_log_options
 from gsmap.datasets.converters.summary import ConversionSummary
-from gsmap.datasets.converters.worker_pool import default_workers, ordered_map
+from gsmap.datasets.converters.worker_pool import ordered_map
 
 
 @dataclass(frozen=True)
@@ -195,21 +196,12 @@ def _fingerprint(log_dirs: Iterable[Path]) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the converter's options to a parser."""
-    parser.add_argument(
-        "--root", type=Path, required=True, help="folder that holds train, val and test"
-    )
-    parser.add_argument("--split", default="val", choices=("train", "val", "test"))
-    parser.add_argument(
-        "--out-dir", type=Path, help="where gsmap_av2_<split>.arrow goes (default: the data root)"
-    )
+    add_log_options(parser)
     parser.add_argument(
         "--at",
         default="auto",
         help="times: lidar, cameras, auto (sweeps where there are some, else images) "
         "or poses:N, every N-th row of the pose table without sensor data (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--rate", type=parse_rate, default=2.0, help="samples per second, such as 2hz, or all"
     )
     parser.add_argument("--dim", type=int, default=2, choices=(2, 3), help="coordinates per point")
     parser.add_argument(
@@ -220,46 +212,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--centerline", action="store_true", help="add the class centerline")
     parser.add_argument(
-        "--x-range", type=float, nargs=2, default=(-30.0, 30.0), metavar=("MIN", "MAX")
-    )
-    parser.add_argument(
-        "--y-range", type=float, nargs=2, default=(-15.0, 15.0), metavar=("MIN", "MAX")
-    )
-    parser.add_argument(
-        "--max-sweeps", type=int, default=0, help="earlier LiDAR sweeps to list per sample"
-    )
-    parser.add_argument(
-        "--logs", nargs="+", default=(), metavar="LOG", help="only these (ids, or how they begin)"
-    )
-    parser.add_argument(
         "--keep-map-changes",
         action="store_true",
         help="keep the four logs whose map was changed on purpose",
     )
-    parser.add_argument(
-        "--workers", type=int, default=default_workers(), help="processes (default: all cores)"
-    )
-    parser.add_argument("--tag", default="", help="appended to the file name, such as _maptr")
-
-
-def parse_rate(text: str) -> float | None:
-    """Read a rate such as ``2hz``, ``2.5`` or ``all``.
-
-    Args:
-        text: What the user wrote.
-
-    Returns:
-        Samples per second, or None for all.
-
-    Raises:
-        ValueError: If it is neither a positive number nor ``all``.
-    """
-    if text.lower() == "all":
-        return None
-    rate = float(text.lower().removesuffix("hz"))
-    if not rate > 0:
-        raise ValueError(f"rate must be > 0, got {text}.")
-    return rate
+    add_file_options(parser, x_range=(-30.0, 30.0), y_range=(-15.0, 15.0), max_sweeps=0)
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:

@@ -18,12 +18,13 @@ from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 from av2.utils.io import read_feather
 from tqdm import tqdm
 
-from gsmap.datasets.converters.argoverse2 import parse_rate, select_logs
+from gsmap.datasets.converters.argoverse2 import select_logs
 from gsmap.datasets.converters.argoverse2_log import RING_CAMERAS, Argoverse2Log, find_split
 from gsmap.datasets.converters.argoverse2_map import find_map
 from gsmap.datasets.converters.argoverse2_samples import thin_out
 from gsmap.datasets.converters.argoverse2_scene import make_scene
-from gsmap.datasets.converters.worker_pool import default_workers, ordered_map
+from gsmap.datasets.converters.command_line import add_log_options, add_workers_option
+from gsmap.datasets.converters.worker_pool import ordered_map
 from gsmap.datasets.minicity.camera import Camera
 from gsmap.datasets.minicity.lighting import random_lighting
 from gsmap.datasets.minicity.renderer import SceneRenderer
@@ -260,26 +261,17 @@ def render_logs(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the renderer's options to a parser."""
-    parser.add_argument(
-        "--root", type=Path, required=True, help="folder that holds train, val and test"
-    )
-    parser.add_argument("--split", default="val", choices=("train", "val", "test"))
+    add_log_options(parser)
     parser.add_argument("--out", type=Path, required=True, help="data root to make")
     parser.add_argument(
         "--out-split", choices=("train", "val", "test"), help="split there (default: the same)"
     )
-    parser.add_argument(
-        "--logs", nargs="+", default=(), metavar="LOG", help="only these (ids, or how they begin)"
-    )
-    parser.add_argument("--rate", type=parse_rate, default=2.0, help="pictures per second, or all")
     parser.add_argument("--scale", type=float, default=0.25, help="of the real image size")
     parser.add_argument(
         "--calibration-from", metavar="LOG", help="log whose calibration fills in for a missing one"
     )
     parser.add_argument("--max-frames", type=int, help="moments per log, evenly spread")
-    parser.add_argument(
-        "--workers", type=int, default=default_workers(), help="processes (default: all cores)"
-    )
+    add_workers_option(parser)
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:

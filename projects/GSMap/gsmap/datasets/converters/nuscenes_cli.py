@@ -6,9 +6,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from gsmap.datasets.annotation_record import CLASSES
+from gsmap.datasets.converters.command_line import add_file_options
 from gsmap.datasets.converters.nuscenes import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.converters.nuscenes_map import MAP_CLASSES
-from gsmap.datasets.converters.worker_pool import default_workers
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,30 +19,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--version", default="v1.0-trainval", help="version folder (default: %(default)s)"
     )
-    parser.add_argument(
-        "--out-dir",
-        type=Path,
-        help="where gsmap_<dataset>_<split>.arrow go (default: the data root)",
-    )
     parser.add_argument("--dataset", help="name in the files (default: minicity or nuscenes)")
     parser.add_argument("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
     parser.add_argument(
         "--classes", nargs="+", default=list(CLASSES), choices=MAP_CLASSES, metavar="CLASS",
         help=f"classes in label order, of {', '.join(MAP_CLASSES)} (default: the first three)",
     )  # fmt: skip
-    parser.add_argument(
-        "--x-range", type=float, nargs=2, default=(-15.0, 15.0), metavar=("MIN", "MAX")
-    )
-    parser.add_argument(
-        "--y-range", type=float, nargs=2, default=(-30.0, 30.0), metavar=("MIN", "MAX")
-    )
-    parser.add_argument(
-        "--max-sweeps", type=int, default=10, help="earlier LiDAR sweeps to list per sample"
-    )
-    parser.add_argument(
-        "--workers", type=int, default=default_workers(), help="processes (default: all cores)"
-    )
-    parser.add_argument("--tag", default="", help="appended to the file names, such as _extended")
+    add_file_options(parser, x_range=(-15.0, 15.0), y_range=(-30.0, 30.0), max_sweeps=10)
 
 
 def dataset_name(root: Path) -> str:

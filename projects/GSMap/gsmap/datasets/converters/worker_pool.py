@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, TimeoutError
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 Task = TypeVar("Task")
@@ -18,10 +19,51 @@ def default_workers() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@contextmanager
+def spared_from_signals() -> Iterator[None]:
+    """Let processes that start in this block ignore Ctrl-C and ``kill`` from their first moment.
+
+    A starting process would answer Ctrl-C, which a terminal sends to all, with a traceback. What
+    this process is sent meanwhile reaches it at the end of the block.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Worker:
+    """State of a worker process: whether it is to stop, and whether it is at a task."""
+
+    stopping = False
+    busy = False
+
+
 def _start_worker(initializer: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C for all
+    signal.signal(signal.SIGTERM, _stop_worker)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
     if initializer is not None:
         initializer(*arguments)
+
+
+def _stop_worker(number: int, _frame: object) -> None:
+    """Leave the task at hand through its clean-up, and take up no other."""
+    _Worker.stopping = True
+    if _Worker.busy:  # in between, results are on their way and must not be cut off
+        raise SystemExit(128 + number)
+
+
+def _work(function: Callable[[Task], Result], task: Task) -> Result:
+    """Do a task in a worker unless it is to stop."""
+    _Worker.busy = True
+    try:
+        if _Worker.stopping:
+            raise SystemExit(128 + signal.SIGTERM)
+        return function(task)
+    finally:
+        _Worker.busy = False
 
 
 def ordered_map(
@@ -35,7 +77,8 @@ def ordered_map(
     """Apply a function to tasks in worker processes and yield the results in order.
 
     At most three tasks per worker are under way, so that neither tasks nor results pile up. With
-    one worker everything runs in this process.
+    one worker everything runs in this process. Whatever ends it early, such as an error or Ctrl-C,
+    stops the tasks under way, through their own clean-up.
 
     Args:
         function: A module-level function.
@@ -61,8 +104,10 @@ def ordered_map(
         return
     context = multiprocessing.get_context("spawn")  # no copies of this process's tables
     pool = ProcessPoolExecutor(workers, context, _start_worker, (initializer, arguments))
+    done = False
     try:
         yield from _in_order(pool, function, tasks, 3 * workers, timeout_s)
+        done = True
     except BrokenProcessPool as error:
         raise RuntimeError(
             "a worker process died, most likely for want of memory: run again with fewer --workers."
@@ -75,6 +120,9 @@ def ordered_map(
             "stands."
         ) from error
     finally:
+        if not done:
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
         pool.shutdown(cancel_futures=True)
 
 
@@ -88,7 +136,8 @@ def _in_order(
     """Keep at most ``limit`` tasks in the pool and yield the oldest one's result."""
     pending: deque[Future[Result]] = deque()
     for task in tasks:
-        pending.append(pool.submit(function, task))
+        with spared_from_signals():
+            pending.append(pool.submit(_work, function, task))
         if len(pending) == limit:
             yield pending.popleft().result(timeout_s)
     while pending:

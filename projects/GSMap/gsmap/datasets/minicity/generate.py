@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 from tqdm import tqdm
 
+from gsmap.datasets.converters.worker_pool import spared_from_signals
 from gsmap.datasets.minicity.config import (
     TRAIN_LOCATIONS,
     VAL_LOCATIONS,
@@ -240,6 +241,7 @@ def _start_worker(
 ) -> None:
     """Prepare a worker, which ends as soon as its parent lets go of the lifeline, even by dying."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and ends the pool
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     cv2.setNumThreads(1)
     _WORKER.update(root=root, config=config, towns=towns)
 
@@ -283,7 +285,8 @@ def _run_scenes(
             workers, context, initializer=_start_worker, initargs=(root, config, towns, lifeline)
         )
         try:
-            futures = {pool.submit(_make_scene, task): task.name for task in tasks}
+            with spared_from_signals():
+                futures = {pool.submit(_make_scene, task): task.name for task in tasks}
             for future in as_completed(futures):
                 done[futures[future]] = future.result()
                 bar.update(per_scene)
