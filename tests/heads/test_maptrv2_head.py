@@ -77,11 +77,11 @@ def test_every_ground_truth_is_matched_once_and_then_several_times():
     gt = lines(2)
     losses = head.loss_by_feat(outputs, [gt], [{"token": "a"}])
     predictions = head.layer_predictions(further, 1)
-    repeated = InstanceData.cat([gt] * 3)
-    targets = head.get_targets(predictions, [head.prepare_gt(repeated)], [{"token": "a"}])
-    counts = torch.bincount(targets.matches[0].gt_inds % 2)
+    prepared = [head.prepare_gt(gt)]
+    targets = head.get_targets(predictions, prepared, [{"token": "a"}], repeats=3)
+    counts = torch.bincount(targets.matches[0].gt_inds)
     assert counts.tolist() == [3, 3]  # k = 3 queries for each of the two elements
-    expected = head.matched_losses(predictions, [head.prepare_gt(repeated)], targets)["loss_pts"]
+    expected = head.matched_losses(predictions, prepared, targets)["loss_pts"]
     torch.testing.assert_close(losses["loss_pts_one2many"], expected)
     alone = build().train()
     alone.load_state_dict(head.state_dict())
@@ -176,6 +176,43 @@ def test_gsmap_predicts_gaussians_of_one_to_one_queries():
     result = build(GSMAP).eval().predict(bev(), [sample(0)])[0]
     assert result.scales.shape == result.pts.shape
     assert result.rotations.shape == result.pts.shape[:2]
+
+
+def test_every_mask_is_drawn_once_for_both_groups(monkeypatch):
+    head, drawn = build(GSMAP).train(), []
+    draw = head.draw_gt
+    monkeypatch.setattr(head, "draw_gt", lambda gt, grid: drawn.append(len(gt)) or draw(gt, grid))
+    head.loss_by_feat(head(bev()), [lines(2)], [{"token": "a"}])
+    assert drawn == [2, 2]  # for the loss, and for matching
+
+
+def test_the_raster_loss_of_the_further_queries_compares_with_the_matched_masks():
+    """The same Gaussians against the same elements cost the further queries what the first pay."""
+    gt = lines(2)
+    head = build(GSMAP, num_instances=2, num_one2many=4, num_repeats=2).train()
+    outputs = head(bev())
+    references = torch.zeros_like(outputs["all_references"])
+    references[..., :2] = head.grid.norm_from_metres(gt.pts).repeat(3, 1, 1)  # three times both
+    scores = torch.zeros_like(outputs["all_cls_scores"])
+    outputs.update(
+        all_references=references, all_pts_preds=references[..., :2], all_cls_scores=scores
+    )
+    losses = head.loss_by_feat(outputs, [gt], [{"token": "a"}])
+    assert losses["loss_pts"] < 1e-5
+    torch.testing.assert_close(losses["loss_raster_one2many"], losses["loss_raster"])
+    crossed = head.prepare_gt(gt)
+    crossed.masks = crossed.masks.flip(0)
+    others = head.losses_by_layer(outputs, [crossed], [{"token": "a"}])
+    assert others["loss_raster_one2many"] > 1.1 * losses["loss_raster_one2many"]
+
+
+def test_the_further_queries_can_do_without_the_raster_loss():
+    every, first = build(GSMAP).train(), build(GSMAP, raster_one2many=False).train()
+    args = ([lines(2)], [{"token": "a"}])
+    expected, losses = (head.loss_by_feat(head(bev()), *args) for head in (every, first))
+    assert set(expected) - set(losses) == {"loss_raster_one2many", "d0.loss_raster_one2many"}
+    for name, loss in losses.items():  # what is matched with what does not change
+        torch.testing.assert_close(loss, expected[name])
 
 
 def instance_queries(head):

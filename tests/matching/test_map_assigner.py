@@ -37,6 +37,14 @@ def test_the_sum_of_costs_decides_not_each_ground_truth_alone():
     assert match.gt_inds.tolist() == [1, 0]
 
 
+def test_repeated_ground_truth_gets_its_closest_predictions():
+    pred = predictions(LINE + 0.01, LINE.flip(0) + 0.31, LINE + 0.6, LINE, LINE + 0.3)
+    match = make_assigner().assign(pred, ground_truth(LINE, LINE + 0.3), repeats=2)
+    assert match.query_inds.tolist() == [0, 1, 3, 4]
+    assert match.gt_inds.tolist() == [0, 1, 0, 1]
+    assert match.order_inds.tolist() == [0, 1, 0, 0]
+
+
 def test_the_class_cost_breaks_ties():
     scores = torch.tensor([[-5.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
     costs = [{"type": "mmdet.FocalLossCost", "weight": 2.0}, {"type": "OrderedPointsCost"}]

@@ -164,7 +164,8 @@ class GSMapHead(MapHead):
     ) -> dict[str, Tensor]:
         """Add the raster loss of the matched predictions of one layer (Eqs. 10 and 12)."""
         losses = super().matched_losses(predictions, gts, targets)
-        if self.loss_raster is not None and "references" in predictions[0]:
+        has_fields = "references" in predictions[0] and "masks" in gts[0]
+        if self.loss_raster is not None and has_fields:
             references = gather_matched(predictions, targets.matches, "references")
             pairs = zip(gts, targets.matches, strict=True)
             masks = torch.cat([gt.masks[match.gt_inds] for gt, match in pairs])

@@ -190,7 +190,7 @@ class MapHead(BaseModule):
         batch_gt_instances: Sequence[InstanceData],
         batch_img_metas: Sequence[dict[str, Any]],
     ) -> dict[str, Tensor]:
-        """Return the losses of every decoder layer.
+        """Prepare the ground truth and return the losses of every decoder layer.
 
         Args:
             outputs: What :meth:`forward` returned.
@@ -204,15 +204,25 @@ class MapHead(BaseModule):
         Raises:
             FloatingPointError: If a matching cost is not finite.
         """
-        losses = {}
         with torch.autocast(outputs["all_pts_preds"].device.type, enabled=False):
             gts = [self.prepare_gt(gt) for gt in batch_gt_instances]
-            num_layers = len(outputs["all_cls_scores"])
-            for layer in range(num_layers):
-                predictions = self.layer_predictions(outputs, layer)
-                layer_losses = self.loss_by_feat_single(predictions, gts, batch_img_metas)
-                prefix = "" if layer == num_layers - 1 else f"d{layer}."
-                losses.update({f"{prefix}{name}": value for name, value in layer_losses.items()})
+            return self.losses_by_layer(outputs, gts, batch_img_metas)
+
+    def losses_by_layer(
+        self,
+        outputs: dict[str, Tensor],
+        gts: Sequence[InstanceData],
+        batch_img_metas: Sequence[dict[str, Any]],
+        repeats: int = 1,
+    ) -> dict[str, Tensor]:
+        """Return every layer's losses; each ground truth is matched to ``repeats`` queries."""
+        losses = {}
+        num_layers = len(outputs["all_cls_scores"])
+        for layer in range(num_layers):
+            predictions = self.layer_predictions(outputs, layer)
+            layer_losses = self.loss_by_feat_single(predictions, gts, batch_img_metas, repeats)
+            prefix = "" if layer == num_layers - 1 else f"d{layer}."
+            losses.update({f"{prefix}{name}": value for name, value in layer_losses.items()})
         return losses
 
     def prepare_gt(self, gt_instances: InstanceData) -> InstanceData:
@@ -232,9 +242,10 @@ class MapHead(BaseModule):
         predictions: Sequence[InstanceData],
         gts: Sequence[InstanceData],
         batch_img_metas: Sequence[dict[str, Any]],
+        repeats: int = 1,
     ) -> dict[str, Tensor]:
         """Match one layer's predictions and return its losses."""
-        targets = self.get_targets(predictions, gts, batch_img_metas)
+        targets = self.get_targets(predictions, gts, batch_img_metas, repeats)
         scores = torch.cat([prediction.scores for prediction in predictions])
         losses = {"loss_cls": self.loss_cls(scores, targets.labels, avg_factor=targets.avg_factor)}
         losses.update(self.matched_losses(predictions, gts, targets))
@@ -245,11 +256,12 @@ class MapHead(BaseModule):
         predictions: Sequence[InstanceData],
         gts: Sequence[InstanceData],
         batch_img_metas: Sequence[dict[str, Any]],
+        repeats: int = 1,
     ) -> MapTargets:
         """Match every sample's predictions with its ground truth and collect the targets."""
         matches, labels, pts = [], [], []
         for prediction, gt, meta in zip(predictions, gts, batch_img_metas, strict=True):
-            match = self.assigner.assign(prediction, gt, meta)
+            match = self.assigner.assign(prediction, gt, meta, repeats)
             sample_labels = gt.labels.new_full((len(prediction.scores),), self.num_classes)
             sample_labels[match.query_inds] = gt.labels[match.gt_inds]
             matches.append(match)

@@ -94,22 +94,27 @@ class OneToManyHead(MapHead):
             logging.WARNING,
         )
 
-    def loss_by_feat(
+    def losses_by_layer(
         self,
         outputs: dict[str, Tensor],
-        batch_gt_instances: Sequence[InstanceData],
+        gts: Sequence[InstanceData],
         batch_img_metas: Sequence[dict[str, Any]],
+        repeats: int = 1,
     ) -> dict[str, Tensor]:
         """Return the losses of both groups; those of the further queries end in ``_one2many``."""
         first, further = self.split_groups(outputs)
-        losses = super().loss_by_feat(first, batch_gt_instances, batch_img_metas)
+        losses = super().losses_by_layer(first, gts, batch_img_metas, repeats)
         if further["all_cls_scores"].shape[2]:
-            repeated = [repeat_instances(gt, self.num_repeats) for gt in batch_gt_instances]
-            more = super().loss_by_feat(further, repeated, batch_img_metas)
+            gts = [self.further_gt(gt) for gt in gts]
+            more = super().losses_by_layer(further, gts, batch_img_metas, self.num_repeats)
             losses.update(
                 {f"{name}_one2many": self.one2many_weight * loss for name, loss in more.items()}
             )
         return losses
+
+    def further_gt(self, gt: InstanceData) -> InstanceData:
+        """Return what the further queries read of a sample's prepared ground truth: all of it."""
+        return gt
 
     def split_groups(
         self, outputs: dict[str, Tensor]
@@ -210,11 +215,6 @@ class SegmentationHead(MapHead):
 @MODELS.register_module()
 class MapTRv2Head(SegmentationHead, OneToManyHead):
     """MapTR's head with one-to-many queries and auxiliary segmentation (MapTRv2)."""
-
-
-def repeat_instances(gt_instances: InstanceData, times: int) -> InstanceData:
-    """Return the ground truth of a sample ``times`` times over, list after list."""
-    return InstanceData.cat([gt_instances] * times)
 
 
 def gt_field(sample: Det3DDataSample, name: str) -> Tensor:

@@ -1,9 +1,10 @@
-"""One-to-one assignment of predictions to annotated map elements."""
+"""Assignment of predictions to annotated map elements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from mmdet3d.registry import TASK_UTILS
 from mmengine.structures import InstanceData
@@ -49,8 +50,9 @@ class MapAssigner:
         pred_instances: InstanceData,
         gt_instances: InstanceData,
         img_meta: dict[str, Any] | None = None,
+        repeats: int = 1,
     ) -> MapMatch:
-        """Match each ground truth to one prediction.
+        """Match each ground truth to ``repeats`` predictions.
 
         Args:
             pred_instances: ``scores`` logits (N, classes), ``pts`` normalised (N, P, 2), and what
@@ -58,9 +60,10 @@ class MapAssigner:
             gt_instances: ``labels`` (K,), ``pts_shifts`` normalised (K, S, P, 2), and what further
                 costs read.
             img_meta: Meta dict of the sample; its ``token`` names the sample in errors.
+            repeats: To how many predictions each ground truth is matched.
 
         Returns:
-            The matched pairs, min(N, K) of them.
+            The matched pairs, min(N, K * repeats) of them.
 
         Raises:
             FloatingPointError: If a cost (or, without ground truth, a score) is not finite.
@@ -73,8 +76,9 @@ class MapAssigner:
         total = torch.stack([cost.float() for cost in costs]).cpu()  # (costs, N, K)
         for cost, values in zip(self.match_costs, total, strict=True):
             self._check_finite(values, type(cost).__name__, img_meta)
-        rows, cols = linear_sum_assignment(total.sum(0).numpy())
-        queries, gts = torch.from_numpy(rows).to(device), torch.from_numpy(cols).to(device)
+        rows, cols = linear_sum_assignment(np.tile(total.sum(0).numpy(), repeats))
+        queries = torch.from_numpy(rows).to(device)
+        gts = torch.from_numpy(cols % len(gt_instances)).to(device)
         return MapMatch(
             queries,
             gts,

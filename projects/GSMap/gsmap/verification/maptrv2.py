@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsmap.datasets.annotation_record import MapInstance
 from gsmap.datasets.transforms.masks import MakeBEVMask, MakePVMask
-from gsmap.heads.maptrv2_head import MapTRv2Head, repeat_instances
+from gsmap.heads.maptrv2_head import MapTRv2Head
 from gsmap.losses.auxiliary import depth_bins
 from gsmap.ops.bev_pool import cell_indices
 
@@ -138,9 +138,8 @@ def check_loss(golden: Golden, name: str) -> Iterator[Row]:
     with all_queries(head):
         outputs = head(bev_outputs)
     first, further = head.split_groups(outputs)
-    repeated = repeat_instances(gt, head.num_repeats)
-    yield from match_rows(name, data, "one2one", head, first, gt, meta, len(gt))
-    yield from match_rows(name, data, "one2many", head, further, repeated, meta, len(gt))
+    for group, part, repeats in (("one2one", first, 1), ("one2many", further, head.num_repeats)):
+        yield from match_rows(name, data, group, head, part, gt, meta, repeats)
     losses = head.loss_by_feat(outputs, [gt], [meta])
     losses.update(head.segmentation_losses(outputs, [sample]))
     losses.update(model.bev_encoder.loss(bev_outputs, [sample]))
@@ -193,17 +192,17 @@ def match_rows(
     outputs: dict[str, Tensor],
     gt: InstanceData,
     meta: dict[str, Any],
-    num_gts: int,
+    repeats: int,
 ) -> Iterator[Row]:
     """Compare the matches of all layers; copies of one ground truth stand for each other."""
     prepared = head.prepare_gt(gt)
     different = total = 0
     for layer in range(len(outputs["all_cls_scores"])):
         predictions = head.layer_predictions(outputs, layer)
-        match = head.get_targets(predictions, [prepared], [meta]).matches[0]
-        ours = zip(match.query_inds, match.gt_inds % num_gts, match.order_inds, strict=True)
+        match = head.get_targets(predictions, [prepared], [meta], repeats).matches[0]
+        ours = zip(match.query_inds, match.gt_inds, match.order_inds, strict=True)
         listed = data[f"match_{group}_l{layer}"]
-        reference = {(q, g % num_gts, order) for q, g, order in listed.tolist()}
+        reference = {(q, g % len(gt), order) for q, g, order in listed.tolist()}
         different += len(reference - {tuple(map(int, triple)) for triple in ours})
         total += len(listed)
     yield Row(name, f"share of {group} matches that differ", different / total, FLIPPED)
