@@ -4,7 +4,6 @@ import json
 
 import pytest
 import torch
-from mmdet3d.registry import LOG_PROCESSORS
 from mmengine.evaluator import BaseMetric, Evaluator
 from mmengine.runner import Runner
 
@@ -36,15 +35,16 @@ class Model(torch.nn.Module):
 
 @pytest.mark.parametrize("hierarchy", [False, True])
 def test_the_log_line_is_short_and_the_json_log_complete(hierarchy, tmp_path):
-    processor = {"type": "mmdet3d.MapLogProcessor", "log_with_hierarchy": hierarchy}
+    processor = {"type": "MapLogProcessor", "log_with_hierarchy": hierarchy}
     runner = Runner(
         Model(),
         str(tmp_path),
         val_dataloader=torch.utils.data.DataLoader([0]),
         val_cfg={},
         val_evaluator=Evaluator(Figures()),
-        log_processor=LOG_PROCESSORS.build(processor),
+        log_processor=processor,
         experiment_name=f"figures-{hierarchy}",
+        default_scope="mmdet3d",  # it outlives the runner
     )
     figures = runner.val()
     assert set(figures) == {*MAIN, *DETAILS, *OTHERS}
