@@ -24,7 +24,7 @@ from gsmap.evaluation.chamfer_ap import (
     ChamferConfig,
 )
 from gsmap.evaluation.evaluator import METRIC_NAMES, EvaluationConfig, flat_metrics
-from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files
+from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files, read_arrow_index
 from gsmap.evaluation.raster_ap import POLYGON_CLASSES, RasterConfig
 from gsmap.evaluation.report import format_table
 
@@ -91,11 +91,9 @@ def config_from(args: argparse.Namespace) -> EvaluationConfig:
     """Join the arguments with what the annotation file says."""
     classes, extent = args.classes, args.range
     if args.ground_truth.suffix.lower() != ".json":
-        from gsmap.datasets.annotation_file import AnnotationFile
-
-        meta = AnnotationFile(args.ground_truth).meta
-        classes = classes or meta.classes
-        extent = extent or (meta.x_range[0], meta.y_range[0], meta.x_range[1], meta.y_range[1])
+        index = read_arrow_index(args.ground_truth, args.workers)
+        classes = classes or index.classes
+        extent = extent or index.extent
     classes = tuple(classes or DEFAULT_CLASSES)
     x0, y0, x1, y1 = extent or DEFAULT_RANGE
     chamfer = raster = None
@@ -159,4 +157,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # without 0.15 s of taking the compiled code down

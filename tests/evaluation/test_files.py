@@ -4,6 +4,8 @@ import importlib.util
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -26,7 +28,7 @@ from gsmap.evaluation.results_json import (
     vectors_of,
     write_results,
 )
-from gsmap.evaluation.worker_pool import map_unordered
+from gsmap.evaluation.worker_pool import map_unordered, run_apart
 
 REPO = Path(__file__).resolve().parents[2]
 LABELS = {name: i for i, name in enumerate(CLASSES)}
@@ -100,6 +102,25 @@ def test_two_workers_give_the_same_digits(tmp_path):
     write_results(truth, truth_of(150), key="GTs")
     one, two = (evaluate_files(results, truth, CONFIG, n).reports for n in (1, 2))
     assert [r.metrics for r in one] == [r.metrics for r in two]
+
+
+@pytest.mark.parametrize("form", ["json", "arrow"])
+def test_command_with_two_processes_writes_the_same_file(tmp_path, form):
+    results, truth = tmp_path / "results.json", tmp_path / f"truth.{form}"
+    write_results(results, results_of(70))
+    instances = [MapInstance(0, np.array(LINE)), MapInstance(1, np.array(RING))]
+    rows = [MapSample(f"t{i}", "s", "", i, [], np.eye(4), instances=instances) for i in range(70)]
+    if form == "arrow":
+        write_annotations(truth, AnnotationMeta("minicity", "lidar", "val"), rows)
+    else:
+        write_results(truth, truth_of(70), key="GTs")
+    written = []
+    for workers in ("1", "2"):
+        out = tmp_path / f"{workers}.json"
+        tool = [sys.executable, str(REPO / "tools/evaluate.py"), str(results), str(truth)]
+        subprocess.run([*tool, "--workers", workers, "--out", str(out)], check=True, timeout=300)
+        written.append(out.read_bytes())
+    assert written[0] == written[1]
 
 
 def test_missing_and_unknown_samples_are_an_error_unless_allowed(tmp_path):
@@ -183,6 +204,34 @@ def test_index_reads_any_layout_of_the_file(tmp_path):
     assert samples.vectors(0) == []
 
 
+def test_quick_index_equals_the_exact_one(files):
+    for path, key in zip(files, ("results", "GTs"), strict=True):
+        quick, exact = (JsonSamples(path, key, exact) for exact in (False, True))
+        assert quick.tokens == exact.tokens
+        assert [quick.piece(i) for i in range(8)] == [exact.piece(i) for i in range(8)]
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [
+        '{"sample_token": "a", "vectors": []}, {"vectors": [], "sample_token": "b"}',
+        '{"sample_token": "a", "was": [{"k": 1}, {"sample_token": "c"}], "vectors": []},'
+        '{"sample_token": "b", "vectors": []}',
+        '{"sample_token": "a", "vectors": []}, {"sample_token": "b", "vectors": []}],'
+        '"more": [{"sample_token": "c"}, {"sample_token": "d"}',
+        '{"sample_token":"a","text":"}, {\\"sample_token\\": 1}","vectors":[]} , \n'
+        '{"sample_token":"b","vectors":[]}',
+    ],
+)
+def test_samples_that_a_quick_index_cuts_wrongly_are_read_well(tmp_path, samples):
+    results, truth = tmp_path / "results.json", tmp_path / "truth.json"
+    results.write_text(f'{{"meta": {{}}, "results": [{samples}]}}')
+    write_results(truth, [("a", []), ("b", [vector(LINE, "divider")])], key="GTs")
+    for workers in (1, 2):
+        metrics = evaluate_files(results, truth, CONFIG, workers).reports[0].metrics
+        assert metrics["chamfer/num_samples"] == 2
+
+
 def test_fast_and_plain_parsers_agree(files):
     source = JsonElements(JsonSamples(files[0], "results"), LABELS, scored=True)
     fast, _ = source.elements(range(8))
@@ -264,3 +313,24 @@ def test_pool_ends_when_a_worker_dies_stalls_or_fails(function, error, message, 
     with pytest.raises(error, match=message):
         list(map_unordered(function, range(8), 2, stall_timeout_s=patience_s))
     assert time.monotonic() - start < 50  # the stalled task would sleep for 300 s
+
+
+def test_function_apart_returns_its_result_or_its_error():
+    assert run_apart(double, 4) == 8
+    with pytest.raises(ValueError, match="task 5"):
+        run_apart(fail, 5)
+
+
+def test_workers_that_cannot_start_do_not_hang(tmp_path):
+    """A module without a main guard is run again by each new worker, which then dies; what the
+    worker was to be sent is longer than a pipe takes."""
+    script = tmp_path / "unguarded.py"
+    script.write_text(
+        "import functools, operator, threading\n"
+        "from gsmap.evaluation.worker_pool import map_unordered\n"
+        "threading.Thread(target=threading.Event().wait, args=(40,), daemon=True).start()\n"
+        "print(list(map_unordered(functools.partial(operator.contains, bytes(10**6)), [1, 2], 2)))"
+    )
+    found = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
+    assert found.returncode == 1
+    assert "RuntimeError" in found.stderr

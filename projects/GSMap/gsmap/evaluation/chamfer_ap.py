@@ -16,6 +16,8 @@ from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray, MapElemen
 from gsmap.evaluation.matches import (
     ClassDetections,
     FrameMatches,
+    MatchTable,
+    as_table,
     detections_per_class,
     unique_by_token,
 )
@@ -239,18 +241,20 @@ def _class_figures(found: ClassDetections, thresholds: tuple[float, ...]) -> dic
     return figures
 
 
-def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> MetricReport:
+def chamfer_report(
+    matches: MatchTable | Iterable[FrameMatches], config: ChamferConfig
+) -> MetricReport:
     """Compute AP_chamfer from the matches of all samples.
 
     A class without ground truth counts as 0 in ``mAP``, as in MapTR, but not in the mean per
     threshold.
 
     Args:
-        matches: Records of all samples, in any order; repeated tokens count once.
+        matches: All samples, in any order; repeated tokens count once.
         config: Rules.
     """
-    records = unique_by_token(matches)
-    per_class = detections_per_class(records, len(config.classes), len(config.thresholds))
+    table = unique_by_token(as_table(matches))
+    per_class = detections_per_class(table, len(config.classes), len(config.thresholds))
     metrics: dict[str, float] = {}
     curves: list[Curve] = []
     for name, found in zip(config.classes, per_class, strict=True):
@@ -265,7 +269,7 @@ def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> Me
         aps = [metrics[f"{name}/AP@{key}"] for name in present]
         metrics[f"AP@{key}"] = float(np.mean(aps)) if aps else 0.0
     metrics["mAP"] = float(np.mean([metrics[f"{name}/AP"] for name in config.classes]))
-    metrics["num_samples"] = float(len(records))
+    metrics["num_samples"] = float(len(table))
     return MetricReport(
         "chamfer",
         {"class": config.classes},

@@ -1,6 +1,6 @@
 """Both metrics over a stream of samples: match each sample once, keep only its matches."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from gsmap.evaluation.chamfer_ap import (
@@ -10,7 +10,7 @@ from gsmap.evaluation.chamfer_ap import (
     resample_polylines,
 )
 from gsmap.evaluation.elements import MapElements, map_elements
-from gsmap.evaluation.matches import FrameMatches
+from gsmap.evaluation.matches import FrameMatches, MatchTable, as_table
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
 from gsmap.evaluation.report import MetricReport
 
@@ -110,13 +110,44 @@ def reports(samples: Iterable[SampleMatches], config: EvaluationConfig) -> list[
         samples: Matches in any order; repeated tokens count once.
         config: Metrics and their rules.
     """
+    return table_reports(tables_of(samples, config), config)
+
+
+def tables_of(samples: Iterable[SampleMatches], config: EvaluationConfig) -> dict[str, MatchTable]:
+    """Join the matches of samples to a table of each metric.
+
+    Args:
+        samples: Matches of each sample.
+        config: Metrics and their rules.
+    """
     records = list(samples)
+    names = [name for name in METRIC_NAMES if getattr(config, name)]
+    return {name: as_table(record.by_metric[name] for record in records) for name in names}
+
+
+def table_reports(tables: Mapping[str, MatchTable], config: EvaluationConfig) -> list[MetricReport]:
+    """Compute the metrics from tables of all samples.
+
+    Args:
+        tables: The table of each metric.
+        config: Metrics and their rules.
+    """
     found = []
     if config.chamfer:
-        found.append(chamfer_report((r.by_metric["chamfer"] for r in records), config.chamfer))
+        found.append(chamfer_report(tables["chamfer"], config.chamfer))
     if config.raster:
-        found.append(raster_report((r.by_metric["raster"] for r in records), config.raster))
+        found.append(raster_report(tables["raster"], config.raster))
     return found
+
+
+def load_kernels(config: EvaluationConfig) -> None:
+    """Load the compiled code that matching needs, by matching a small sample.
+
+    Args:
+        config: Metrics and their rules.
+    """
+    line = map_elements([[[0.0, 0.0], [1.0, 1.0]]], [0])
+    match_sample("", line, line, config)
 
 
 def flat_metrics(found: Sequence[MetricReport]) -> dict[str, float]:

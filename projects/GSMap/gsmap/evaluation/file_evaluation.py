@@ -1,19 +1,32 @@
 """Score a result file against a ground-truth file, sample by sample, in one or more processes."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from gsmap.evaluation.elements import MapElements, empty_elements, map_elements
-from gsmap.evaluation.evaluator import EvaluationConfig, SampleMatches, match_sample, reports
+from gsmap.evaluation.evaluator import (
+    METRIC_NAMES,
+    EvaluationConfig,
+    load_kernels,
+    match_sample,
+    table_reports,
+    tables_of,
+)
 from gsmap.evaluation.json_index import JsonSamples
+from gsmap.evaluation.matches import MatchTable, join_tables
 from gsmap.evaluation.report import MetricReport
 from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, elements_from_vectors
-from gsmap.evaluation.worker_pool import map_unordered
+from gsmap.evaluation.worker_pool import map_unordered, run_apart
 
-CHUNK = 64  # samples per task: large enough to hide the hand-over, small enough to share evenly
+if TYPE_CHECKING:
+    from gsmap.datasets.annotation_file import AnnotationFile
+
+CHUNK = 32  # samples per task: large enough to hide the hand-over, small enough to share evenly
 
 
 class Samples(Protocol):
@@ -81,8 +94,46 @@ class JsonElements:
         return elements, any(len(p) == 3 for v in vectors for p in v["pts"][:1])
 
 
+@dataclass(frozen=True)
+class ArrowIndex:
+    """What is read of an annotation file before its samples.
+
+    Args:
+        classes: Names of its classes.
+        extent: Smallest x and y, largest x and y in metres.
+        dim: Coordinates per point.
+        tokens: Names of the samples.
+    """
+
+    classes: tuple[str, ...]
+    extent: tuple[float, float, float, float]
+    dim: int
+    tokens: list[str]
+
+
+def _arrow_index(path: str | Path) -> ArrowIndex:
+    """Read the index in this process, which loads pyarrow and its threads."""
+    from gsmap.datasets.annotation_file import AnnotationFile
+
+    file = AnnotationFile(path)
+    (x0, x1), (y0, y1) = file.meta.x_range, file.meta.y_range
+    tokens: list[str] = file.column("token")
+    return ArrowIndex(tuple(file.meta.classes), (x0, y0, x1, y1), file.meta.dim, tokens)
+
+
+def read_arrow_index(path: str | Path, num_workers: int = 1) -> ArrowIndex:
+    """Read the index of an annotation file.
+
+    Args:
+        path: The file.
+        num_workers: Number of processes that will read the samples: with more than one the index is
+            read in a process of its own, so that the workers can still be forked.
+    """
+    return run_apart(_arrow_index, path) if num_workers > 1 else _arrow_index(path)
+
+
 class ArrowElements:
-    """Ground truth of an annotation file.
+    """Ground truth of an annotation file; each process opens the file when it reads a sample.
 
     Args:
         path: The file.
@@ -93,16 +144,20 @@ class ArrowElements:
     """
 
     def __init__(self, path: str | Path, classes: Sequence[str]):
-        from gsmap.datasets.annotation_file import AnnotationFile  # loads pyarrow
-
-        self.file = AnnotationFile(path)
-        known = self.file.meta.classes
-        missing = [name for name in classes if name not in known]
+        index = _arrow_index(path)
+        missing = [name for name in classes if name not in index.classes]
         if missing:
-            raise ValueError(f"{path} has the classes {known}, not {missing}.")
-        self._names = known
-        self._labels = [classes.index(name) if name in classes else -1 for name in known]
-        self.tokens: list[str] = self.file.column("token")
+            raise ValueError(f"{path} has the classes {index.classes}, not {missing}.")
+        self.path, self.tokens = path, index.tokens
+        self._names, self._dim = index.classes, index.dim
+        self._labels = [classes.index(name) if name in classes else -1 for name in index.classes]
+
+    @cached_property
+    def file(self) -> "AnnotationFile":
+        """The file."""
+        from gsmap.datasets.annotation_file import AnnotationFile
+
+        return AnnotationFile(self.path)
 
     def elements(self, indices: Sequence[int]) -> tuple[list[MapElements], Counter[str]]:
         """Return the elements of some samples, with counts of 3D and of unknown elements.
@@ -126,21 +181,22 @@ class ArrowElements:
             notes.update(
                 self._names[i.label] for i in sample.instances if self._labels[i.label] < 0
             )
-            notes["3D"] += len(labels) if self.file.meta.dim == 3 else 0
+            notes["3D"] += len(labels) if self._dim == 3 else 0
             found.append(map_elements([i.points for i in sample.instances], labels))
         return found, notes
 
 
-def open_ground_truth(path: str | Path, classes: Sequence[str]) -> Samples:
+def open_ground_truth(path: str | Path, classes: Sequence[str], exact: bool = True) -> Samples:
     """Open ground truth: our annotation file, or MapTR's and MapVR's JSON.
 
     Args:
         path: ``*.json`` with ``{"GTs": [...]}``, or an annotation file.
         classes: Names of the classes to score.
+        exact: See ``JsonSamples``.
     """
     if Path(path).suffix.lower() == ".json":
         labels = {name: i for i, name in enumerate(classes)}
-        return JsonElements(JsonSamples(path, GROUND_TRUTH_KEY), labels, scored=False)
+        return JsonElements(JsonSamples(path, GROUND_TRUTH_KEY, exact), labels, scored=False)
     return ArrowElements(path, classes)
 
 
@@ -154,18 +210,19 @@ class _ChunkJob:
 
     def __call__(
         self, pairs: Sequence[tuple[int, int]]
-    ) -> tuple[list[SampleMatches], Counter[str], Counter[str]]:
+    ) -> tuple[dict[str, MatchTable], Counter[str], Counter[str]]:
         with_result = [pair[0] for pair in pairs if pair[0] >= 0]
         found, pred_notes = self.results.elements(with_result)
         predictions = dict(zip(with_result, found, strict=True))
         truth, gt_notes = self.truth.elements([pair[1] for pair in pairs])
+        predictions[-1] = empty_elements()
         matches = []
         for (result_index, truth_index), ground_truth in zip(pairs, truth, strict=True):
             gt_notes["degenerate"] += int((ground_truth.num_points < 2).sum())
             token = self.truth.tokens[truth_index]
-            predicted = predictions.get(result_index, empty_elements())
+            predicted = predictions[result_index]
             matches.append(match_sample(token, predicted, ground_truth, self.config))
-        return matches, pred_notes, gt_notes
+        return tables_of(matches, self.config), pred_notes, gt_notes
 
 
 @dataclass(frozen=True)
@@ -257,20 +314,47 @@ def evaluate_files(
         FileNotFoundError: If a file does not exist.
         ValueError: If a file is malformed or the samples differ.
     """
-    labels = {name: i for i, name in enumerate(config.classes)}
-    results = JsonElements(JsonSamples(results_path, RESULTS_KEY), labels, scored=True)
-    truth = open_ground_truth(truth_path, config.classes)
-    pairs, notes = pair_by_token(results.tokens, truth.tokens, allow_mismatch)
+
+    def read(exact: bool) -> tuple[_ChunkJob, list[tuple[int, int]], list[str]]:
+        labels = {name: i for i, name in enumerate(config.classes)}
+        samples = JsonSamples(results_path, RESULTS_KEY, exact)
+        results = JsonElements(samples, labels, scored=True)
+        truth = open_ground_truth(truth_path, config.classes, exact)
+        pairs, notes = pair_by_token(results.tokens, truth.tokens, allow_mismatch)
+        return _ChunkJob(results, truth, config), pairs, notes
+
+    def evaluate(exact: bool) -> Evaluation:
+        if num_workers > 1:  # what workers share is loaded while another process reads the indices
+            found = run_apart(read, exact, meanwhile=lambda: load_kernels(config))
+        else:
+            found = read(exact)
+        return _score(*found, num_workers, progress)
+
+    if not allow_mismatch:  # with it some samples are never parsed, which alone proves a quick cut
+        with suppress(ValueError):  # what is wrong, if anything is, the exact way tells
+            return evaluate(exact=False)
+    return evaluate(exact=True)
+
+
+def _score(
+    job: _ChunkJob,
+    pairs: Sequence[tuple[int, int]],
+    notes: list[str],
+    num_workers: int,
+    progress: Callable[[int, int], None] | None,
+) -> Evaluation:
+    """Match all pairs of samples and compute the metrics."""
     chunks = [pairs[i : i + CHUNK] for i in range(0, len(pairs), CHUNK)]
-    matches: list[SampleMatches] = []
+    tables: list[dict[str, MatchTable]] = []
     pred_notes: Counter[str] = Counter()
     gt_notes: Counter[str] = Counter()
-    job: Callable[[Any], Any] = _ChunkJob(results, truth, config)
-    outcomes: Iterable[Any] = map_unordered(job, chunks, num_workers)
-    for found, of_pred, of_gt in outcomes:
-        matches += found
+    done = 0
+    for found, of_pred, of_gt in map_unordered(job, chunks, num_workers):
+        tables.append(found)
         pred_notes.update(of_pred)
         gt_notes.update(of_gt)
+        done += len(next(iter(found.values())))
         if progress is not None:
-            progress(len(matches), len(pairs))
-    return Evaluation(reports(matches, config), notes + _notes(pred_notes, gt_notes))
+            progress(done, len(pairs))
+    joined = {name: join_tables([t[name] for t in tables if name in t]) for name in METRIC_NAMES}
+    return Evaluation(table_reports(joined, job.config), notes + _notes(pred_notes, gt_notes))

@@ -87,7 +87,7 @@ def _elements(
     score = _values(columns[2], np.float64) if scored else np.ones(len(label))
     if not (np.isfinite(xy).all() and np.isfinite(score).all()):
         return None
-    xy = np.ascontiguousarray(xy)
+    xy = np.array(xy)  # contiguous, and writable: compiled code is then loaded for one type
     starts = _values(columns[0].offsets, np.int32).astype(np.int64)
     found = []
     bounds = _values(vectors.offsets, np.int32)

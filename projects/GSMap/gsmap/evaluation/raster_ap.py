@@ -17,6 +17,8 @@ from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray, MapElemen
 from gsmap.evaluation.matches import (
     ClassDetections,
     FrameMatches,
+    MatchTable,
+    as_table,
     detections_per_class,
     unique_by_token,
 )
@@ -220,15 +222,16 @@ def match_raster(
     )
 
 
-def _mean_iou(records: Sequence[FrameMatches], label: int) -> float:
+def _mean_iou(table: MatchTable, label: int) -> float:
     """Mean over the samples with predictions or ground truth of the class; -1 without any."""
-    ious = []
-    for record in records:
-        assert record.areas is not None
-        shared, union = record.areas[label]
-        if union or record.num_gts[label] or (record.labels == label).any():
-            ious.append(shared / union if union else 0.0)
-    return float(np.mean(ious)) if ious else UNDEFINED
+    if not len(table):
+        return UNDEFINED
+    assert table.areas is not None
+    shared, union = table.areas[:, label].T
+    predicted = np.bincount(table.sample[table.labels == label], minlength=len(table))
+    counts = (union > 0) | (table.num_gts[:, label] > 0) | (predicted > 0)
+    ious = shared[counts] / np.maximum(union[counts], 1)  # nothing is shared where union is 0
+    return float(np.mean(ious)) if len(ious) else UNDEFINED
 
 
 def _class_figures(found: ClassDetections, thresholds: tuple[float, ...]) -> dict[str, float]:
@@ -266,23 +269,25 @@ def _group_figures(metrics: dict[str, float], names: Sequence[str]) -> dict[str,
     return {k: _mean_of_defined(metrics[f"{name}/{k}"] for name in names) for k in averaged}
 
 
-def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> MetricReport:
+def raster_report(
+    matches: MatchTable | Iterable[FrameMatches], config: RasterConfig
+) -> MetricReport:
     """Compute AP_raster from the matches of all samples.
 
     A class without ground truth is left out of the means.
 
     Args:
-        matches: Records of all samples, in any order; repeated tokens count once.
+        matches: All samples, in any order; repeated tokens count once.
         config: Rules.
     """
-    records = unique_by_token(matches)
+    table = unique_by_token(as_table(matches))
     num_thresholds = len(config.line_thresholds)
-    per_class = detections_per_class(records, len(config.classes), num_thresholds)
+    per_class = detections_per_class(table, len(config.classes), num_thresholds)
     metrics: dict[str, float] = {}
     curves: list[Curve] = []
     for c, (name, found) in enumerate(zip(config.classes, per_class, strict=True)):
         thresholds = config.thresholds_of(c)
-        figures = {**_class_figures(found, thresholds), "mIoU": _mean_iou(records, c)}
+        figures = {**_class_figures(found, thresholds), "mIoU": _mean_iou(table, c)}
         metrics.update({f"{name}/{key}": value for key, value in figures.items()})
         curves += [
             Curve(name, threshold, found.scores, found.hits[:, t], found.num_gts)
@@ -296,7 +301,7 @@ def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> Metr
     for group, names in groups.items():
         means = _group_figures(metrics, names)
         metrics.update({f"{group}/{key}": value for key, value in means.items()})
-    metrics["num_samples"] = float(len(records))
+    metrics["num_samples"] = float(len(table))
     by_class = {name: config.thresholds_of(c) for c, name in enumerate(config.classes)}
     return MetricReport(
         "raster", groups, by_class, {f"raster/{k}": v for k, v in metrics.items()}, curves
