@@ -1,7 +1,9 @@
-# A small MapTR on rendered Argoverse 2 logs, trained from scratch on two CPU cores.
+# A small MapTR on rendered Argoverse 2 logs, trained from scratch on two CPU cores; the BEV mask as on MiniCity.
 _base_ = [
     '../_base_/datasets/av2_rendered.py',
     '../_base_/models/maptr_r18_av2_rendered.py',
     '../_base_/schedules/minicity.py',
     '../_base_/default_runtime.py',
 ]
+
+model = dict(map_head=dict(type='SegmentationHead', bev_seg=dict(weight=2.0, pos_weight=4.0)))

@@ -1,10 +1,10 @@
-# Real Argoverse 2 roads with rendered pictures (docs/argoverse2.md), a quarter of the real size, halved again.
+# Real Argoverse 2 roads with rendered pictures (docs/argoverse2.md), a quarter of the real size, a quarter of that again.
 # `python tools/create_data.py av2-render --root data/av2 --out data/av2_rendered` makes them,
 # `python tools/create_data.py av2 --root data/av2_rendered` the annotation files, each once per split.
 _base_ = './av2.py'
 
 data_root = 'data/av2_rendered/'
-_load = [dict(type='LoadCameraImages', to_float32=False), dict(type='ScaleImages', scale=0.5)]
+_load = [dict(type='LoadCameraImages', to_float32=False), dict(type='ScaleImages', scale=0.25)]
 
 train_dataloader = dict(
     batch_size=4,
@@ -15,6 +15,7 @@ train_dataloader = dict(
             *_load,
             _base_._photometric,
             dict(type='FormatMapTargets', num_points=20),
+            dict(type='MakeBEVMask', size=(25, 50), thickness_px=1),
             dict(type='PackMapInputs'),
         ]))
 val_dataloader = dict(

@@ -3,7 +3,7 @@ _base_ = '../../../configs/maptr/maptr_r18_av2_rendered.py'
 
 model = dict(
     map_head=dict(
-        type='GSMapHead',
+        type='GSMapSegmentationHead',
         decoder=dict(layer=dict(type='GaussianDecoderLayer')),
         raster_size=(64, 128),
         cost_raster_size=(32, 64),
