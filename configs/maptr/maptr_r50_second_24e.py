@@ -1,4 +1,4 @@
-# MapTR with cameras and LiDAR (SECOND) on nuScenes, 24 epochs; needs a GPU or spconv.
+# MapTR with cameras and LiDAR (SECOND) on nuScenes, 24 epochs; trains on a GPU, tests on a CPU with spconv.
 _base_ = [
     '../_base_/datasets/nuscenes_lidar.py',
     '../_base_/models/maptr_r50_second.py',

@@ -1,5 +1,5 @@
 # MapTR with cameras and LiDAR as in MapTR's fusion config: SECOND's sparse encoder on voxels of 0.1 x 0.1 x 0.2 m,
-# fused by one convolution. It needs a GPU or spconv.
+# fused by one convolution. It trains on a GPU; with the package spconv it tests on a CPU too.
 _base_ = './maptr_r50.py'
 
 model = dict(

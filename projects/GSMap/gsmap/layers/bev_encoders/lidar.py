@@ -55,16 +55,12 @@ class LidarEncoder(BaseModule):
             BEV features, row 0 at the smallest y. (B, C, H, W)
 
         Raises:
-            RuntimeError: If a sparse encoder is to run on the CPU without spconv.
+            RuntimeError: If a sparse encoder is to run on the CPU without spconv, or to train
+                there, which spconv cannot do.
         """
         coors = voxels["coors"]
-        if isinstance(self.middle_encoder, SparseEncoder) and not (
-            IS_SPCONV2_AVAILABLE or coors.is_cuda
-        ):
-            raise RuntimeError(
-                "the sparse LiDAR encoder needs a GPU or the package spconv (2.x); without them "
-                "use a PointPillars config."
-            )
+        if isinstance(self.middle_encoder, SparseEncoder) and not coors.is_cuda:
+            check_sparse_on_cpu(trains=self.training and torch.is_grad_enabled())
         points = self.voxel_encoder(voxels["voxels"], voxels["num_points"], coors)
         feats = self.middle_encoder(points, coors, batch_size)
         if self.backbone is not None:
@@ -75,6 +71,20 @@ class LidarEncoder(BaseModule):
         if feats.shape[-2:] != self.bev_size:
             feats = F.interpolate(feats, self.bev_size, mode="bilinear", align_corners=False)
         return feats
+
+
+def check_sparse_on_cpu(trains: bool) -> None:
+    """Raise RuntimeError where sparse convolutions do not work on the CPU."""
+    if trains:
+        raise RuntimeError(
+            "the sparse LiDAR encoder trains on a GPU only (spconv's backward pass needs CUDA): "
+            "on a CPU use a PointPillars config."
+        )
+    if not IS_SPCONV2_AVAILABLE:
+        raise RuntimeError(
+            "the sparse LiDAR encoder needs a GPU or the package spconv (2.x); without them "
+            "use a PointPillars config."
+        )
 
 
 @MODELS.register_module()
