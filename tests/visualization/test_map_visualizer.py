@@ -6,6 +6,7 @@ from mmdet3d.registry import HOOKS, VISUALIZERS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
+import gsmap.visualization.map_visualization_hook  # noqa: F401 (registers the hook)
 from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
 from gsmap.visualization.map_visualizer import images_from_inputs
 from gsmap.visualization.pictures import picture_name

@@ -34,7 +34,7 @@ class MapStyle:
     """
 
     classes: Sequence[str] = ("divider", "ped_crossing", "boundary")
-    closed_classes: Sequence[str] = ("ped_crossing",)
+    closed_classes: Sequence[str] = ("ped_crossing", "stop_line", "intersection", "carpark_area")
     font_family: str = "DejaVu Sans"
     bev_line_pt: float = 1.6
     camera_line_pt: float = 1.7
