@@ -162,6 +162,27 @@ def test_an_error_in_a_worker_reaches_the_caller(tmp_path: Path) -> None:
         generate_module._run_scenes(tmp_path, config, plan_scenes(config), {}, 1, False)
 
 
+def test_workers_that_cannot_start_end_the_run(tmp_path: Path) -> None:
+    """A program read from standard input cannot be imported by a new process, which dies."""
+    root = tmp_path / "root"
+    program = f"""
+from pathlib import Path
+from gsmap.datasets.minicity.generate import generate
+generate(root=Path({str(root)!r}), scenes=2, seed=0, image_size=(64, 36), samples_per_scene=1)
+"""
+    done = subprocess.run(
+        [sys.executable, "-"],
+        input=program,
+        text=True,
+        capture_output=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "RuntimeError: a worker process died" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_second_run_into_the_same_root_is_refused(tmp_path: Path) -> None:
     partial = tmp_path / "root.partial"
     partial.mkdir()

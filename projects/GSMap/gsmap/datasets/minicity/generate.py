@@ -4,16 +4,19 @@ import fcntl
 import json
 import logging
 import os
+import pickle
 import shutil
 import signal
 import threading
 from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -236,14 +239,12 @@ def _add_fixed_tables(tables: dict[str, list[dict[str, Any]]], config: MiniCityC
 _WORKER: dict[str, Any] = {}
 
 
-def _start_worker(
-    root: Path, config: MiniCityConfig, towns: dict[str, Town], lifeline: Connection
-) -> None:
+def _start_worker(root: Path, config: MiniCityConfig, towns: Path, lifeline: Connection) -> None:
     """Prepare a worker, which ends as soon as its parent lets go of the lifeline, even by dying."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and ends the pool
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     cv2.setNumThreads(1)
-    _WORKER.update(root=root, config=config, towns=towns)
+    _WORKER.update(root=root, config=config, towns=pickle.loads(towns.read_bytes()))
 
     def end_with_parent() -> None:
         lifeline.poll(None)
@@ -279,21 +280,39 @@ def _run_scenes(
                 done[task.name] = maker.make()
                 bar.update(per_scene)
             return done
-        context = get_context("spawn")
-        lifeline, held = context.Pipe(duplex=False)
-        pool = ProcessPoolExecutor(
-            workers, context, initializer=_start_worker, initargs=(root, config, towns, lifeline)
-        )
-        try:
-            with spared_from_signals():
-                futures = {pool.submit(_make_scene, task): task.name for task in tasks}
-            for future in as_completed(futures):
-                done[futures[future]] = future.result()
+        with TemporaryDirectory() as folder:
+            # Through a file: what is handed to a new process goes through a pipe, and if it is long
+            # and the process dies before it reads it, this one would wait for ever.
+            saved = Path(folder, "towns.pickle")
+            saved.write_bytes(pickle.dumps(towns))
+            for name, records in _make_in_workers(root, config, tasks, saved, workers):
+                done[name] = records
                 bar.update(per_scene)
-        except BaseException:
-            held.close()  # workers stop in the middle of their scenes
-            raise
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-            held.close()
     return done
+
+
+def _make_in_workers(
+    root: Path, config: MiniCityConfig, tasks: list[SceneTask], towns: Path, workers: int
+) -> Iterator[tuple[str, Records]]:
+    """Make all scenes in worker processes; yield their names and records as they are done."""
+    context = get_context("spawn")
+    lifeline, held = context.Pipe(duplex=False)
+    arguments = (root, config, towns, lifeline)
+    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=arguments)
+    try:
+        with spared_from_signals():
+            futures = {pool.submit(_make_scene, task): task.name for task in tasks}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BrokenProcessPool as error:
+        raise RuntimeError(
+            "a worker process died: for want of memory (use fewer workers), or because the program "
+            "that called generate() cannot be imported anew (put the call under "
+            "if __name__ == '__main__')."
+        ) from error
+    except BaseException:
+        held.close()  # workers stop in the middle of their scenes
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        held.close()
