@@ -69,6 +69,12 @@ def test_follows_every_change_of_a_weight(backbone: nn.Module, change: str) -> N
     assert change == "moved" or not torch.allclose(before[0], after[0])
 
 
+def test_works_on_a_model_made_in_inference_mode(backbone: nn.Module) -> None:
+    with torch.inference_mode():
+        made = copy.deepcopy(backbone)
+        assert_same(FoldedBackbone()(made, IMAGES), backbone(IMAGES))
+
+
 def test_is_the_backbone_itself_when_it_trains_or_is_watched(backbone: nn.Module) -> None:
     assert not can_be_folded(backbone)  # a gradient may be asked for
     with torch.no_grad():

@@ -30,7 +30,7 @@ class FoldedBackbone:
             self.folded = None
             return backbone(images)
         tensors = [*backbone.parameters(), *backbone.buffers()]
-        state = [(tensor.data_ptr(), tensor._version) for tensor in tensors]
+        state = [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]
         if self.folded is None or state != self.state:
             self.folded, self.state = fuse_conv_bn(copy.deepcopy(backbone)), state
         return self.folded(images)
