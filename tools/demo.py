@@ -46,7 +46,7 @@ class Budget:
 BUDGETS = {
     "tiny": Budget(scenes=5, samples=2, epochs=1, image_size="200x112"),
     "demo": Budget(scenes=150, samples=5, epochs=9),
-    "long": Budget(scenes=600, samples=5, epochs=48),
+    "long": Budget(scenes=400, samples=5, epochs=16),
 }
 
 

@@ -22,17 +22,19 @@ from .measure import MIB, Cost, markdown_table, measure
 def run_fps(args: argparse.Namespace) -> None:
     """Measure and print the frames per second of every config."""
     costs = in_fresh_processes(frame_cost, [(path, args) for path in args.configs])
-    rows = [(path, cost.time_s(torch.device(args.device)), cost) for path, cost in costs]
-    _, first, _ = rows[0]
+    device = torch.device(args.device)
+    first = costs[0][1].time_s(device)
     report(
         args,
-        ["model", "s a frame", "FPS", "FPS, ratio to the first", "peak memory (MiB)"],
+        ["model", "s a frame", "FPS, ratio to the first", "wall s", "FPS", "peak memory (MiB)"],
         [
             [
-                *(Path(path).stem, f"{s:.3f}", f"{1 / s:.2f}", f"{first / s:.3f}"),
+                *(Path(path).stem, f"{cost.time_s(device):.3f}"),
+                f"{first / cost.time_s(device):.3f}",
+                *(f"{cost.wall_s:.3f}", f"{1 / cost.wall_s:.2f}"),
                 f"{cost.peak_bytes / MIB:.0f}",
             ]
-            for path, s, cost in rows
+            for path, cost in costs
         ],
     )
 
