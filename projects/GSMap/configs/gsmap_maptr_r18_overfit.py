@@ -2,7 +2,8 @@
 _base_ = './gsmap_maptr_r18_minicity.py'
 
 _four = dict(indices=4)
-_epochs = 800
+_epochs = 500
+optim_wrapper = dict(optimizer=dict(lr=1.2e-3))
 train_dataloader = dict(batch_size=4, dataset=_four)
 val_dataloader = dict(
     dataset=dict(ann_file='gsmap_minicity_train.arrow', split='train', **_four))
