@@ -99,7 +99,11 @@ def test_ctrl_c_while_workers_render_leaves_nothing_half_written(tmp_path):
 def has_starting_worker(pid: int) -> bool:
     """Whether a worker is in the midst of its imports, which take seconds."""
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    if not any("spawn_main" in Path(f"/proc/{pid}/cmdline").read_text() for pid in children):
+    try:
+        commands = [Path(f"/proc/{child}/cmdline").read_text() for child in children]
+    except OSError:  # one of them has just ended
+        return False
+    if not any("spawn_main" in command for command in commands):
         return False
     time.sleep(0.5)
     return True
