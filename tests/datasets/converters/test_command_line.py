@@ -68,6 +68,8 @@ def interrupt(command: list[str], ready: Callable[[int], bool]) -> subprocess.Co
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # a job in the background ignores Ctrl-C, and hands that on to what it starts
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 120
     while not ready(process.pid):
