@@ -1,6 +1,5 @@
 """Parts of converters: worker pool, splits, table reading, CAN bus."""
 
-import contextlib
 import json
 import os
 import time
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsmap.datasets.converters.splits import overlap_share, read_split_file, resolve_scenes
-from gsmap.datasets.converters.worker_pool import ordered_map, stop_if_told
+from gsmap.datasets.converters.worker_pool import ordered_map
 
 _offset = 0
 
@@ -159,26 +158,3 @@ def test_can_bus_takes_the_latest_message(tmp_path: Path):
     )
     assert (reader.signals("scene-0001", 3_000, quarter_turn)[7:16] == 0).all()
     assert (reader.signals("scene-0002", 5_000, quarter_turn)[7:16] == 0).all()
-
-
-def answer_or_be_deaf(path: Path | None) -> None:
-    """Return at once; with a path, touch it and lose the exception that tells to stop."""
-    if path is None:
-        return
-    path.touch()
-    with contextlib.suppress(SystemExit):
-        time.sleep(60)
-    for _ in range(600):
-        stop_if_told()
-        time.sleep(0.1)
-
-
-def test_a_task_that_lost_its_signal_stops_at_the_next_look(tmp_path: Path) -> None:
-    started = tmp_path / "started"
-    results = ordered_map(answer_or_be_deaf, [None, started], 2)
-    next(results)
-    while not started.exists():
-        time.sleep(0.02)
-    began = time.monotonic()
-    results.close()
-    assert time.monotonic() - began < 30

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
-from mmengine.config import Config
-from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
+
+from gsmap.engine.launch import read_config
 
 from .measure import MIB, Cost, markdown_table, measure
 
@@ -43,7 +43,7 @@ def run_step(args: argparse.Namespace) -> None:
     """Measure and print forward, losses and backward of every config and raster size."""
     tasks = []
     for path in args.configs:
-        sizes = args.rasters if "GSMap" in Config.fromfile(path).model.map_head.type else [""]
+        sizes = args.rasters if "GSMap" in read_config(path).model.map_head.type else [""]
         tasks += [(path, args, raster) for raster in sizes]
     costs = [cost for _, cost in in_fresh_processes(step_cost, tasks)]
     seconds = [cost.time_s(torch.device(args.device)) for cost in costs]
@@ -129,8 +129,7 @@ def training_step(
 def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
     """Build a config's model with random weights, with another raster size if one is given."""
     torch.set_num_threads(args.threads)
-    init_default_scope("mmdet3d")
-    cfg = Config.fromfile(path)
+    cfg = read_config(path)
     if raster:
         cfg.model.map_head.raster_size = tuple(int(side) for side in raster.split("x"))
     if cfg.model.get("img_backbone"):

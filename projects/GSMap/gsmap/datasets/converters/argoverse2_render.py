@@ -24,7 +24,7 @@ from gsmap.datasets.converters.argoverse2_map import find_map
 from gsmap.datasets.converters.argoverse2_samples import thin_out
 from gsmap.datasets.converters.argoverse2_scene import make_scene
 from gsmap.datasets.converters.command_line import add_log_options, add_workers_option
-from gsmap.datasets.converters.worker_pool import ordered_map, stop_if_told
+from gsmap.datasets.converters.worker_pool import ordered_map
 from gsmap.datasets.minicity.camera import Camera
 from gsmap.datasets.minicity.lighting import random_lighting
 from gsmap.datasets.minicity.renderer import SceneRenderer
@@ -182,7 +182,6 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         _copy_log(log_dir, source, partial_dir, options.scale)
         for timestamp_ns in times.tolist():
             for name in RING_CAMERAS:
-                stop_if_told()
                 path = partial_dir / "sensors" / "cameras" / name / f"{timestamp_ns}.jpg"
                 _write_jpeg(path, renderer.render(name, timestamp_ns))
         os.rename(partial_dir, out_dir)

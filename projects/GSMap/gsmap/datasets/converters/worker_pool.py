@@ -55,21 +55,12 @@ def _stop_worker(number: int, _frame: object) -> None:
         raise SystemExit(128 + number)
 
 
-def stop_if_told() -> None:
-    """Leave the task at hand if this worker has been told to stop; for the loops of long tasks.
-
-    The signal raises SystemExit by itself, but Python drops an exception that is raised while
-    compiled code calls back, for example under numba's compiler.
-    """
-    if _Worker.stopping:
-        raise SystemExit(128 + signal.SIGTERM)
-
-
 def _work(function: Callable[[Task], Result], task: Task) -> Result:
     """Do a task in a worker unless it is to stop."""
     _Worker.busy = True
     try:
-        stop_if_told()
+        if _Worker.stopping:
+            raise SystemExit(128 + signal.SIGTERM)
         return function(task)
     finally:
         _Worker.busy = False
