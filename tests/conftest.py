@@ -27,7 +27,7 @@ def golden_dir(shared_dir: Path) -> Path:
 @pytest.fixture(scope="session")
 def minicity_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny MiniCity: two scenes (train, val) of two samples, six cameras of 400 x 225."""
-    from gsmap.datasets.minicity.generate import generate
+    from minicity.generate import generate
 
     root = tmp_path_factory.mktemp("minicity") / "root"
     generate(
@@ -46,7 +46,7 @@ def minicity_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def minicity_annotations(minicity_root: Path) -> dict[str, Path]:
     """The annotation files of ``minicity_root`` by split, in its root."""
-    from gsmap.datasets.converters.nuscenes import NuScenesOptions, convert_nuscenes
+    from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
     convert_nuscenes(NuScenesOptions(minicity_root, "v1.0-trainval", dataset="minicity"))
     return {split: minicity_root / f"gsmap_minicity_{split}.arrow" for split in ("train", "val")}

@@ -14,7 +14,7 @@ from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
 
 import gsmap.registered  # noqa: F401
-from gsmap.datasets.converters.nuscenes import NuScenesOptions, convert_nuscenes
+from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.engine.launch import check_config
 

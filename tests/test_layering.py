@@ -5,79 +5,85 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / "projects/GSMap/gsmap"
-MODEL = {"detectors", "heads", "layers", "matching"}
+REPO = Path(__file__).resolve().parents[1]
+ROOTS = {
+    "gsmap": REPO / "projects/GSMap/gsmap",
+    "minicity": REPO / "projects/MiniCity/minicity",
+    "benchmarks": REPO / "benchmarks",
+    "tools": REPO / "tools",
+}
 OPENMMLAB = {"mmengine", "mmcv", "mmdet", "mmdet3d"}
 
-# part -> the parts it must not import, directly
-FORBIDDEN = {
-    "geometry": MODEL
-    | {"ops", "losses", "datasets", "evaluation", "visualization", "inference", "engine"}
-    | OPENMMLAB,
-    "ops": MODEL
-    | {"losses", "datasets", "evaluation", "visualization", "inference", "engine"}
-    | OPENMMLAB,
-    "losses": MODEL
-    | {"datasets", "evaluation", "visualization", "inference", "engine"}
-    | OPENMMLAB,
-    "matching": {
-        "detectors",
-        "heads",
-        "layers",
+# room -> the rooms that it may import, besides itself and outside packages
+ALLOWED = {
+    "utils": set(),
+    "structures": set(),
+    "ops": {"structures"},
+    "models": {"checkpoints", "ops", "structures"},
+    "checkpoints": {"utils"},
+    "datasets": {"structures", "utils"},
+    "converters": {"datasets", "structures", "utils", "minicity"},
+    "evaluation": {"datasets", "structures", "utils"},
+    "visualization": {"datasets", "ops", "structures", "utils"},
+    "engine": {"utils"},
+    "apis": {
+        "checkpoints",
+        "converters",
         "datasets",
-        "evaluation",
-        "visualization",
-        "inference",
         "engine",
-    },
-    "layers": {
-        "detectors",
-        "heads",
-        "datasets",
         "evaluation",
+        "structures",
+        "utils",
         "visualization",
-        "inference",
-        "engine",
     },
-    "heads": {"detectors", "datasets", "evaluation", "visualization", "inference", "engine"},
-    "detectors": {"datasets", "evaluation", "visualization", "inference", "engine"},
-    "datasets": MODEL | {"losses", "evaluation", "visualization", "inference", "engine"},
-    "evaluation": MODEL | {"losses", "visualization", "inference", "engine"},
-    "visualization": MODEL | {"losses", "inference", "engine"},
+    "minicity": {"utils"},
 }
+FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity")
 
 
-def imported_parts(path: Path) -> set[str]:
-    """Return the parts of the package and the outside packages that a file imports."""
-    parts = set()
+def folder(room: str) -> Path:
+    return ROOTS[room] if room in ROOTS else ROOTS["gsmap"] / room
+
+
+def imported(path: Path) -> set[str]:
+    """Return the rooms and the outside packages that a file imports."""
+    names = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            base = list(path.relative_to(PACKAGE).parts[:-1])
-            if node.level:
-                base = base[: len(base) - node.level + 1]
-                module = ".".join(["gsmap", *base] + ([node.module] if node.module else []))
-            else:
-                module = node.module or ""
-            names = [f"{module}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        for name in names:
-            head, *rest = name.split(".")
-            parts.add(rest[0] if head == "gsmap" and rest else head)
-    return parts
+            assert not node.level, f"{path}: imports are absolute"
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    parts = [name.split(".") for name in names]
+    return {part[1] if part[0] == "gsmap" and len(part) > 1 else part[0] for part in parts}
 
 
-@pytest.mark.parametrize("part", sorted(FORBIDDEN))
-def test_imports_run_down_only(part: str):
-    files = sorted((PACKAGE / part).rglob("*.py"))
-    assert files, f"no files in {part}: was it renamed?"
+@pytest.mark.parametrize("room", sorted(ALLOWED))
+def test_imports_run_down_only(room: str):
+    rooms = set(ALLOWED) | set(ROOTS)
+    files = sorted(folder(room).rglob("*.py"))
+    assert files, f"no files in {room}: was it renamed?"
     for path in files:
-        wrong = imported_parts(path) & FORBIDDEN[part]
-        assert not wrong, f"{path.relative_to(PACKAGE)} imports {sorted(wrong)}"
+        wrong = (imported(path) & rooms) - ALLOWED[room] - {room, "gsmap"}
+        assert not wrong, f"{path.relative_to(REPO)} imports {sorted(wrong)}"
 
 
-def test_the_reader_of_imports_sees_relative_and_absolute_ones():
-    assert imported_parts(PACKAGE / "geometry/__init__.py") == {"geometry"}
-    assert {"mmengine", "torch", "numpy"} <= imported_parts(PACKAGE / "engine/checkpoint_io.py")
+@pytest.mark.parametrize("room", FREE_OF_OPENMMLAB)
+def test_the_lowest_rooms_need_nothing_of_openmmlab(room: str):
+    for path in sorted(folder(room).rglob("*.py")):
+        assert not imported(path) & OPENMMLAB, path.relative_to(REPO)
+
+
+def test_every_room_has_its_arrows():
+    rooms = {path.name for path in ROOTS["gsmap"].iterdir() if (path / "__init__.py").exists()}
+    assert rooms == set(ALLOWED) - {"minicity"}
+
+
+def test_no_two_rooms_import_each_other():
+    for room, below in ALLOWED.items():
+        assert not {other for other in below if room in ALLOWED[other]}, room
+
+
+def test_the_reader_of_imports_sees_what_a_file_imports():
+    assert {"torch", "numpy"} <= imported(ROOTS["gsmap"] / "structures/grid.py")
+    assert "structures" in imported(ROOTS["gsmap"] / "structures/__init__.py")

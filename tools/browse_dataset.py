@@ -10,8 +10,8 @@ import sys
 from mmdet3d.registry import DATASETS
 from mmengine.utils import track_iter_progress
 
+from gsmap.apis.map_inferencer import spread_evenly
 from gsmap.engine.launch import add_config_options, read_config
-from gsmap.inference.map_inferencer import spread_evenly
 from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
 from gsmap.visualization.pictures import add_picture_arguments, save_picture
 

@@ -5,11 +5,11 @@ import argparse
 import shlex
 import sys
 
-from gsmap.datasets.converters.command_line import run_command
+from gsmap.converters.command_line import run_command
 
 
 def convert() -> str:
-    from gsmap.datasets.converters.convert_infos import add_arguments, run
+    from gsmap.converters.infos import add_arguments, run
 
     parser = argparse.ArgumentParser(description=__doc__)
     add_arguments(parser)

@@ -10,17 +10,17 @@ import importlib
 import shlex
 import sys
 
-from gsmap.datasets.converters.command_line import run_command
+from gsmap.converters.command_line import run_command
 
 COMMANDS = {
-    "minicity": ("gsmap.datasets.minicity.cli", "generate the MiniCity data set"),
-    "nuscenes": ("gsmap.datasets.converters.nuscenes_cli", "convert nuScenes or MiniCity"),
-    "av2": ("gsmap.datasets.converters.argoverse2", "convert Argoverse 2 logs"),
+    "minicity": ("minicity.cli", "generate the MiniCity data set"),
+    "nuscenes": ("gsmap.converters.nuscenes.cli", "convert nuScenes or MiniCity"),
+    "av2": ("gsmap.converters.argoverse2.convert", "convert Argoverse 2 logs"),
     "av2-render": (
-        "gsmap.datasets.converters.argoverse2_render",
+        "gsmap.converters.argoverse2.render",
         "render camera images for real Argoverse 2 logs",
     ),
-    "export": ("gsmap.datasets.converters.export", "write an annotation file's vectors as JSON"),
+    "export": ("gsmap.converters.export", "write an annotation file's vectors as JSON"),
 }
 
 

@@ -10,8 +10,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.engine.launch import add_config_options
-from gsmap.inference.map_inferencer import MapInferencer, select_samples
 from gsmap.visualization.pictures import add_picture_arguments, save_picture
 
 

@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from gsmap.datasets.annotation_file import AnnotationFile
+from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.elements import MapElements
 from gsmap.evaluation.evaluator import (

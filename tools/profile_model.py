@@ -13,7 +13,7 @@ import torch
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 
-from gsmap.benchmarks.model import ring_of_cameras
+from benchmarks.model import ring_of_cameras
 from gsmap.engine.launch import read_config
 
 

@@ -5,9 +5,9 @@ import time
 import pytest
 import torch
 
-from gsmap.benchmarks import raster
-from gsmap.benchmarks.measure import MIB, Cost, markdown_table, measure
-from gsmap.geometry.bev_grid import BEVGrid
+from benchmarks import raster
+from benchmarks.measure import MIB, Cost, markdown_table, measure
+from gsmap.structures.grid import BEVGrid
 
 CPU = torch.device("cpu")
 needs_proc = pytest.mark.skipif(platform.system() != "Linux", reason="reads /proc")

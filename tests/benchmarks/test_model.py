@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsmap.benchmarks import model_commands
+from benchmarks import model_commands
 
 REPO = Path(__file__).resolve().parents[2]
 

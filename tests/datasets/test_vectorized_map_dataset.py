@@ -9,7 +9,7 @@ import pytest
 import torch
 from mmengine.config import Config
 
-from gsmap.datasets.annotation_file import AnnotationFile, write_annotations
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.errors import BrokenSampleError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs/_base_/datasets"

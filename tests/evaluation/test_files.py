@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from golden_data import CLASSES, CONFIG
 
-from gsmap.datasets.annotation_file import (
+from gsmap.datasets.annotations.file import (
     AnnotationMeta,
     MapInstance,
     MapSample,

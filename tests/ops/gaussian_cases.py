@@ -4,8 +4,8 @@ import math
 
 import torch
 
-from gsmap.geometry.bev_grid import BEVGrid
 from gsmap.ops.gaussian_raster import render_gaussians
+from gsmap.structures.grid import BEVGrid
 
 ODD_GRID = BEVGrid((-15, 15), (-30, 30), 21, 33)
 

@@ -5,8 +5,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsmap.geometry.bev_grid import BEVGrid
 from gsmap.ops.bev_pool import bev_pool, bev_pool_conv3x3, cell_indices
+from gsmap.structures.grid import BEVGrid
 
 GRID = BEVGrid((-2.0, 2.0), (-3.0, 3.0), height=6, width=4)
 

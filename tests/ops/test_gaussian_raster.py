@@ -15,13 +15,13 @@ from gaussian_cases import (
     render_with_gradients,
 )
 
-from gsmap.benchmarks.measure import measure
-from gsmap.geometry.bev_grid import BEVGrid
-from gsmap.losses.raster import raster_loss
+from benchmarks.measure import measure
+from gsmap.models.losses.raster import raster_loss
 from gsmap.ops import backends, gaussian_raster
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.ops.soft_iou import pairwise_soft_iou
+from gsmap.structures.grid import BEVGrid
 
 BACKENDS = ["reference", "cpu"]
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

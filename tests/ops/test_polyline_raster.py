@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsmap.geometry.bev_grid import BEVGrid
 from gsmap.ops.polyline_raster import draw_polylines, soft_rasters
+from gsmap.structures.grid import BEVGrid
 
 BACKENDS = ["reference", "cpu"]
 METRE_GRID = BEVGrid((0, 5), (0, 4), 4, 5)  # pixels of 1 m

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib import colors as mcolors
 
-from gsmap.geometry import BEVGrid
+from gsmap.structures import BEVGrid
 from gsmap.visualization import (
     FRAME_VIEWS,
     BEVPanel,

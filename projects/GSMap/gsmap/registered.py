@@ -8,32 +8,32 @@ import gsmap.datasets.transforms.masks
 import gsmap.datasets.transforms.packing
 import gsmap.datasets.transforms.points
 import gsmap.datasets.vectorized_map_dataset
-import gsmap.detectors.map_detector
 import gsmap.engine.checkpoint_io
 import gsmap.engine.log_processor
 import gsmap.evaluation.map_metric
-import gsmap.heads.gsmap_head
-import gsmap.heads.gsmap_maptrv2_head
-import gsmap.heads.map_head
-import gsmap.heads.maptrv2_head
-import gsmap.layers.bev_encoders.bev_query_encoder
-import gsmap.layers.bev_encoders.bevformer
-import gsmap.layers.bev_encoders.gkt
-import gsmap.layers.bev_encoders.lidar
-import gsmap.layers.bev_encoders.lss
-import gsmap.layers.decoders.decoupled_layer
-import gsmap.layers.decoders.gaussian_decoupled_layer
-import gsmap.layers.decoders.gaussian_layer
-import gsmap.layers.decoders.map_decoder
-import gsmap.layers.grid_mask
-import gsmap.matching.map_assigner
-import gsmap.matching.map_coder
-import gsmap.matching.match_costs
-import gsmap.matching.raster_costs
+import gsmap.models.bev_encoders.bev_query_encoder
+import gsmap.models.bev_encoders.bevformer
+import gsmap.models.bev_encoders.gkt
+import gsmap.models.bev_encoders.lidar
+import gsmap.models.bev_encoders.lss
+import gsmap.models.decoders.decoupled_layer
+import gsmap.models.decoders.gaussian_decoupled_layer
+import gsmap.models.decoders.gaussian_layer
+import gsmap.models.decoders.map_decoder
+import gsmap.models.detectors.map_detector
+import gsmap.models.heads.gsmap_head
+import gsmap.models.heads.gsmap_maptrv2_head
+import gsmap.models.heads.map_head
+import gsmap.models.heads.maptrv2_head
+import gsmap.models.layers.grid_mask
+import gsmap.models.task_modules.map_assigner
+import gsmap.models.task_modules.map_coder
+import gsmap.models.task_modules.match_costs
+import gsmap.models.task_modules.raster_costs
 import gsmap.visualization.map_visualization_hook
 import gsmap.visualization.map_visualizer  # noqa: F401
-from gsmap.losses.dice import RenderedDiceLoss
-from gsmap.losses.raster import RasterLoss
+from gsmap.models.losses.dice import RenderedDiceLoss
+from gsmap.models.losses.raster import RasterLoss
 
 # The losses are plain torch modules, usable without OpenMMLab; they enter the registry here.
 MODELS.register_module(module=RasterLoss)

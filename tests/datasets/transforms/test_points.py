@@ -15,9 +15,9 @@ from mmengine.registry import init_default_scope
 from pyarrow import feather
 
 import gsmap.registered  # noqa: F401
-from gsmap.datasets.converters.argoverse2 import Argoverse2Options, convert_argoverse2
-from gsmap.datasets.converters.argoverse2_log import RING_CAMERAS
-from gsmap.datasets.converters.argoverse2_samples import SampleOptions
+from gsmap.converters.argoverse2.convert import Argoverse2Options, convert_argoverse2
+from gsmap.converters.argoverse2.log import RING_CAMERAS
+from gsmap.converters.argoverse2.samples import SampleOptions
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.transforms.points import LoadLidarPoints, LoadLidarSweeps, read_points
 

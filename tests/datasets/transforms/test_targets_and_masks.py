@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsmap.datasets.annotation_record import MapInstance
+from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.map_targets import FormatMapTargets, map_targets
 from gsmap.datasets.transforms.masks import MakeBEVMask, MakePVMask
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .key_map import KeyMap, find_key_map, is_upstream
+from gsmap.checkpoints.key_map import KeyMap, find_key_map, is_upstream
 
 
 def ours_from_upstream(

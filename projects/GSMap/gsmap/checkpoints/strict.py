@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping
 
 from torch import Tensor, nn
 
-from .convert import ours_from_upstream
-from .key_map import is_upstream
+from gsmap.checkpoints.convert import ours_from_upstream
+from gsmap.checkpoints.key_map import is_upstream
 
 _SHOWN = 20
 

@@ -9,8 +9,8 @@ from mmdet3d.registry import DATASETS
 from mmengine.dataset import BaseDataset, Compose
 from mmengine.logging import MMLogger, print_log
 
-from gsmap.datasets.annotation_file import AnnotationFile
-from gsmap.datasets.annotation_record import CAN_BUS_SIZE, LidarRecord, MapSample
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import CAN_BUS_SIZE, LidarRecord, MapSample
 from gsmap.datasets.errors import BrokenSampleError
 
 _BROKEN = ("raise", "skip")

@@ -24,7 +24,7 @@ from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, element
 from gsmap.evaluation.worker_pool import map_unordered, run_apart
 
 if TYPE_CHECKING:
-    from gsmap.datasets.annotation_file import AnnotationFile
+    from gsmap.datasets.annotations.file import AnnotationFile
 
 CHUNK = 32  # samples per task: large enough to hide the hand-over, small enough to share evenly
 
@@ -113,7 +113,7 @@ class ArrowIndex:
 
 def _arrow_index(path: str | Path) -> ArrowIndex:
     """Read the index in this process, which loads pyarrow and its threads."""
-    from gsmap.datasets.annotation_file import AnnotationFile
+    from gsmap.datasets.annotations.file import AnnotationFile
 
     file = AnnotationFile(path)
     (x0, x1), (y0, y1) = file.meta.x_range, file.meta.y_range
@@ -155,7 +155,7 @@ class ArrowElements:
     @cached_property
     def file(self) -> "AnnotationFile":
         """The file."""
-        from gsmap.datasets.annotation_file import AnnotationFile
+        from gsmap.datasets.annotations.file import AnnotationFile
 
         return AnnotationFile(self.path)
 

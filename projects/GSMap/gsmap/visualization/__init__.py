@@ -4,12 +4,12 @@
 what is imported here needs numpy, OpenCV and matplotlib alone.
 """
 
-from .bev_view import BEVPanel
-from .camera_view import CameraView
-from .figure import compose_figure, figure_to_rgb, save_figure
-from .frame_view import FRAME_VIEWS, FrameView, resolve_frame_view
-from .map_elements import MapElements, ground_truth_elements, predicted_elements
-from .style import MapStyle
+from gsmap.visualization.bev_view import BEVPanel
+from gsmap.visualization.camera_view import CameraView
+from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure
+from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView, resolve_frame_view
+from gsmap.visualization.map_elements import MapElements, ground_truth_elements, predicted_elements
+from gsmap.visualization.style import MapStyle
 
 __all__ = [
     "FRAME_VIEWS",

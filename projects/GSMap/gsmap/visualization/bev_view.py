@@ -9,7 +9,7 @@ from matplotlib.collections import EllipseCollection, LineCollection, PolyCollec
 from matplotlib.patches import FancyBboxPatch, Polygon
 from matplotlib.patheffects import withStroke
 
-from gsmap.geometry import BEVGrid
+from gsmap.structures import BEVGrid
 from gsmap.visualization.frame_view import FrameView
 from gsmap.visualization.map_elements import MapElements
 from gsmap.visualization.style import MapStyle

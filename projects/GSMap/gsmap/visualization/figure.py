@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from gsmap.geometry import BEVGrid
+from gsmap.structures import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
 from gsmap.visualization.frame_view import FrameView

@@ -13,7 +13,7 @@ from mmengine.dist import master_only
 from mmengine.visualization import Visualizer
 
 from gsmap.datasets.transforms.images import read_image
-from gsmap.geometry import BEVGrid
+from gsmap.structures import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
 from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure

@@ -9,8 +9,8 @@ from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
 from mmengine.structures import InstanceData
 
-from gsmap.datasets.annotation_record import MapInstance
-from gsmap.geometry.polylines import (
+from gsmap.datasets.annotations.record import MapInstance
+from gsmap.structures.polylines import (
     PADDING,
     bounding_boxes,
     clamp,

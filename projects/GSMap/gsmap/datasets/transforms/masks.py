@@ -8,7 +8,7 @@ import torch
 from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
 
-from gsmap.geometry.polylines import resample
+from gsmap.structures.polylines import resample
 
 _PV_SAMPLES = 200
 _MIN_DEPTH = 1e-7

@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
-from ...geometry.bev_grid import BEVGrid
-from ..backends import choose_backend
-from .cpu import render_gaussians_cpu
-from .fused import Renderer
-from .reference import render_gaussians_reference
-from .triton import render_gaussians_triton
+from gsmap.ops.backends import choose_backend
+from gsmap.ops.gaussian_raster.cpu import render_gaussians_cpu
+from gsmap.ops.gaussian_raster.fused import Renderer
+from gsmap.ops.gaussian_raster.reference import render_gaussians_reference
+from gsmap.ops.gaussian_raster.triton import render_gaussians_triton
+from gsmap.structures.grid import BEVGrid
 
 RENDERERS: dict[str, Renderer] = {
     "reference": render_gaussians_reference,

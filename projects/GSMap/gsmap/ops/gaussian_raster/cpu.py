@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from .._numba import run_in_threads
-from .fused import Frame, fused_renderer
+from gsmap.ops._numba import run_in_threads
+from gsmap.ops.gaussian_raster.fused import Frame, fused_renderer
 
 
 def _pack(means: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:
@@ -16,7 +16,7 @@ def _forward(
     means: Tensor, scales: Tensor, rotations: Tensor, frame: Frame, height: int, width: int
 ) -> Tensor:
     """Render masks. (N, H, W)"""
-    from .cpu_kernels import render_forward
+    from gsmap.ops.gaussian_raster.cpu_kernels import render_forward
 
     gaussians = _pack(means, scales, rotations).numpy()
     masks = torch.empty(len(means), height, width, dtype=torch.float32)
@@ -33,7 +33,7 @@ def _backward(
     grads: Tensor, means: Tensor, scales: Tensor, rotations: Tensor, frame: Frame
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients in means, scales and rotations."""
-    from .cpu_kernels import render_backward
+    from gsmap.ops.gaussian_raster.cpu_kernels import render_backward
 
     packed = _pack(means, scales, rotations)
     gaussians, array = packed.numpy(), grads.contiguous().numpy()

@@ -45,8 +45,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from .._numba import FASTMATH, exp2_coefficients
-from .reference import SQUARED_REACH
+from gsmap.ops._numba import FASTMATH, exp2_coefficients
+from gsmap.ops.gaussian_raster.reference import SQUARED_REACH
 
 C0, C1, C2, C3, C4, C5 = exp2_coefficients()
 HALF, ONE, LOWEST = np.float32(0.5), np.float32(1), np.float32(-126)

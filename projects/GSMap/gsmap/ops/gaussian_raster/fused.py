@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...geometry.bev_grid import BEVGrid
+from gsmap.structures.grid import BEVGrid
 
 Frame = tuple[float, float, float, float]  # smallest x and y, pixel size along x and y, in metres
 Forward = Callable[[Tensor, Tensor, Tensor, Frame, int, int], Tensor]

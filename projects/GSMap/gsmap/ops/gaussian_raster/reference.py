@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from ...geometry.bev_grid import BEVGrid
+from gsmap.structures.grid import BEVGrid
 
 MAX_DENSITY = 1 - 1e-6  # keeps log1p finite at a Gaussian's own centre
 CUT = 1e-8  # fused kernels may leave out a Gaussian where its density is below

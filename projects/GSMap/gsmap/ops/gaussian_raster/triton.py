@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from .fused import Frame, fused_renderer
-from .reference import SQUARED_REACH
+from gsmap.ops.gaussian_raster.fused import Frame, fused_renderer
+from gsmap.ops.gaussian_raster.reference import SQUARED_REACH
 
 
 def _pack(means: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:
@@ -23,7 +23,7 @@ def _forward(
     means: Tensor, scales: Tensor, rotations: Tensor, frame: Frame, height: int, width: int
 ) -> Tensor:
     """Render masks. (N, H, W)"""
-    from .triton_kernels import TILE, forward_kernel
+    from gsmap.ops.gaussian_raster.triton_kernels import TILE, forward_kernel
 
     masks = means.new_empty(len(means), height, width)
     if not len(means):
@@ -47,7 +47,7 @@ def _backward(
     grads: Tensor, means: Tensor, scales: Tensor, rotations: Tensor, frame: Frame
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients in means, scales and rotations."""
-    from .triton_kernels import TILE, backward_kernel
+    from gsmap.ops.gaussian_raster.triton_kernels import TILE, backward_kernel
 
     instances, count = rotations.shape
     if not rotations.numel():

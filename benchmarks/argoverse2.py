@@ -1,0 +1,58 @@
+"""How long Argoverse 2 ground truth takes: what docs/benchmarks/argoverse2.md states."""
+
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from gsmap.converters.argoverse2.convert import select_logs
+from gsmap.converters.argoverse2.log import PoseTable, find_split
+from gsmap.converters.argoverse2.map import MAP_CLASSES, Argoverse2Map
+
+_SETS = {
+    "divider": MAP_CLASSES[:1],
+    "ped_crossing": MAP_CLASSES[1:2],
+    "boundary": MAP_CLASSES[2:3],
+    "centerline": MAP_CLASSES[3:],
+    "three_classes": MAP_CLASSES[:3],
+    "with_centerline": MAP_CLASSES,
+}
+
+
+def measure_extraction(root: Path, split: str = "val", stride: int = 10) -> dict[str, float]:
+    """Time the extraction at every N-th pose of a split's logs, in CPU time of this process.
+
+    Args:
+        root: Data root.
+        split: Split of the logs.
+        stride: N.
+
+    Returns:
+        Milliseconds per frame by set of classes, milliseconds per log for its preparation, the
+        number of frames, and the largest resident memory of the process in MB.
+    """
+    log_dirs = select_logs(find_split(root, split))
+    started = time.process_time()
+    maps = [Argoverse2Map.from_log(log_dir) for log_dir in log_dirs]
+    prepared = time.process_time() - started
+    frames = [
+        (log_map, pose)
+        for log_map, log_dir in zip(maps, log_dirs, strict=True)
+        for pose in PoseTable.read(log_dir).city_from_ego[::stride]
+    ]
+
+    def per_frame(extract: Callable[..., object]) -> float:
+        before = time.process_time()
+        for log_map, pose in frames:
+            extract(log_map, pose)
+        return 1e3 * (time.process_time() - before) / len(frames)
+
+    result = {
+        f"maptrv2_{name}_ms": per_frame(lambda m, pose, c=classes: m.extract(pose, c))
+        for name, classes in _SETS.items()
+    }
+    result["maptr_three_classes_ms"] = per_frame(lambda m, pose: m.extract(pose, compat="maptr"))
+    result["preparation_ms_per_log"] = 1e3 * prepared / len(maps)
+    result["frames"] = len(frames)
+    result["max_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return result

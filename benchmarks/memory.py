@@ -1,0 +1,127 @@
+"""How much memory the nuScenes conversion takes as the data set grows."""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
+
+TRAINVAL_SAMPLES = 34_149
+_REFERENCES = {
+    "sample": ("scene_token", "prev", "next"),
+    "sample_data": ("sample_token", "ego_pose_token", "prev", "next"),
+    "ego_pose": (),
+    "scene": ("first_sample_token", "last_sample_token"),
+}
+_SWEEPS_PER_SAMPLE = 9
+
+
+def tile_tables(source: Path, version: str, target: Path, copies: int) -> int:
+    """Write a data root whose scenes are ``copies`` times those of another, without files.
+
+    Each key frame of LiDAR gets nine sweeps before it, as nuScenes has.
+
+    Args:
+        source: Data root to repeat.
+        version: Its version folder.
+        target: Data root to write.
+        copies: How many times.
+
+    Returns:
+        Number of samples.
+    """
+    (target / version).mkdir(parents=True)
+    (target / "maps").symlink_to((source / "maps").resolve())
+    tables = {path.stem: json.loads(path.read_text()) for path in (source / version).glob("*.json")}
+    scenes = tables["scene"]
+    for name, references in _REFERENCES.items():
+        tables[name] = [
+            _renamed(record, references, copy) for copy in range(copies) for record in tables[name]
+        ]
+    _add_sweeps(tables)
+    for name, records in tables.items():
+        (target / version / f"{name}.json").write_text(json.dumps(records))
+    names = [f"{scene['name']}_{copy}" for copy in range(copies) for scene in scenes]
+    (target / version / "splits.json").write_text(json.dumps({"train": names}))
+    return len(tables["sample"])
+
+
+def _renamed(record: dict[str, Any], references: tuple[str, ...], copy: int) -> dict[str, Any]:
+    changed = dict(record, token=f"{record['token']}_{copy}")
+    if "name" in record:
+        changed["name"] = f"{record['name']}_{copy}"
+    for key in references:
+        if record[key]:
+            changed[key] = f"{record[key]}_{copy}"
+    return changed
+
+
+def _add_sweeps(tables: dict[str, list[dict[str, Any]]]) -> None:
+    """Put sweeps between the LiDAR's key frames."""
+    poses = {pose["token"]: pose for pose in tables["ego_pose"]}
+    sweeps = []
+    for record in tables["sample_data"]:
+        if "LIDAR_TOP" not in record["filename"] or not record["is_key_frame"]:
+            continue
+        before = record["prev"]
+        for number in range(_SWEEPS_PER_SAMPLE):
+            token = f"{record['token']}_s{number}"
+            sweep = dict(record, token=token, is_key_frame=False, prev=before)
+            sweep["ego_pose_token"] = f"{record['ego_pose_token']}_s{number}"
+            pose = dict(poses[record["ego_pose_token"]], token=sweep["ego_pose_token"])
+            tables["ego_pose"].append(pose)
+            sweeps.append(sweep)
+            before = token
+        record["prev"] = before
+    tables["sample_data"] += sweeps
+
+
+def peak_of_conversion(root: Path, version: str, out_dir: Path) -> float:
+    """Convert a data root in a fresh process and return its peak memory in MB."""
+    code = (
+        "import sys; from benchmarks.memory import convert_and_print_peak as run;run(*sys.argv[1:])"
+    )
+    command = [sys.executable, "-c", code, str(root), version, str(out_dir)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=dict(os.environ))
+    return float(done.stdout)
+
+
+def convert_and_print_peak(root: str, version: str, out_dir: str) -> None:
+    """Convert in this process and write the peak of its memory in MB to standard output."""
+    convert_nuscenes(NuScenesOptions(Path(root), version, out_dir=Path(out_dir)))
+    peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    sys.stdout.write(f"{peak_kb / 1024}\n")
+
+
+def measure_memory(root: Path, version: str, copies: tuple[int, int]) -> dict[str, float]:
+    """Measure the conversion's peak memory at two sizes and extrapolate to nuScenes trainval.
+
+    Args:
+        root: Data root to repeat.
+        version: Its version folder.
+        copies: How many times, for the two sizes.
+
+    Returns:
+        Sizes, peaks in MB, growth in kB per sample, and the peak extrapolated to 34,149 samples in
+        MB.
+    """
+    samples, peaks = [], []
+    for number in copies:
+        with tempfile.TemporaryDirectory() as folder:
+            target = Path(folder, "root")
+            samples.append(tile_tables(root, version, target, number))
+            peaks.append(peak_of_conversion(target, version, Path(folder, "out")))
+    growth = (peaks[1] - peaks[0]) / (samples[1] - samples[0])
+    return {
+        "samples_small": samples[0],
+        "samples_large": samples[1],
+        "peak_small_mb": peaks[0],
+        "peak_large_mb": peaks[1],
+        "growth_kb_per_sample": 1024 * growth,
+        "trainval_mb": peaks[1] + growth * (TRAINVAL_SAMPLES - samples[1]),
+    }

@@ -1,1 +1,0 @@
-"""Measurements of speed and memory, each a subcommand of ``tools/benchmark.py``."""

@@ -1,0 +1,1 @@
+"""Argoverse 2: logs and maps to annotation files."""

@@ -1,0 +1,268 @@
+"""Local vector maps from the map of one Argoverse 2 log, by the rules of MapTRv2 or of MapTR.
+
+Whatever does not depend on the vehicle's pose is done once per log (polygons, spatial index, lane
+graph); a frame then takes a few vectorised geometry calls. ``docs/argoverse2.md`` states both sets
+of rules.
+"""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+import shapely
+from av2.map.lane_segment import LaneMarkType, LaneSegment
+from av2.map.map_api import ArgoverseStaticMap
+
+from gsmap.converters.argoverse2.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths
+from gsmap.converters.argoverse2.rules import (
+    EDGE_MARGIN_M,
+    EgoPatch,
+    clip_lines,
+    clip_polygons,
+    cut_rings,
+    drop_duplicates,
+    merge_parallel,
+    merge_until_stable,
+    points_of,
+)
+from gsmap.converters.local_map import rings_of
+
+COMPAT_MODES = ("maptrv2", "maptr")
+MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
+NO_LANE = -1
+
+
+def find_map(log_dir: Path) -> Path:
+    """Return the file that holds a log's vector map.
+
+    Args:
+        log_dir: The log's folder, which holds ``map/log_map_archive_*.json``.
+
+    Raises:
+        FileNotFoundError: If it is missing.
+        ValueError: If there are several.
+    """
+    found = sorted((log_dir / "map").glob("log_map_archive_*.json"))
+    if not found:
+        raise FileNotFoundError(f"no map/log_map_archive_*.json in {log_dir}: download it again.")
+    if len(found) > 1:
+        raise ValueError(f"{len(found)} maps in {log_dir / 'map'}, expected one: {found}.")
+    return found[0]
+
+
+class GeometryLayer:
+    """Geometries of one kind of a log's map, with a spatial index.
+
+    Args:
+        geometries: Lines or polygons in the city frame; invalid ones are left out of every answer.
+            (n,)
+    """
+
+    def __init__(self, geometries: Sequence[shapely.Geometry]) -> None:
+        self.geometries = np.array(list(geometries), dtype=object)
+        self._valid = np.flatnonzero(shapely.is_valid(self.geometries))
+        self._tree = shapely.STRtree(self.geometries[self._valid])
+
+    @property
+    def invalid_count(self) -> int:
+        """How many geometries are invalid (self-crossing, for example)."""
+        return len(self.geometries) - len(self._valid)
+
+    def touching(self, patch: EgoPatch) -> np.ndarray:
+        """Return the positions, ascending, of the valid geometries that meet the patch."""
+        return np.sort(self._valid[self._tree.query(patch.polygon, predicate="intersects")])
+
+
+class LaneSide:
+    """The left or right boundaries of a log's lanes: which divide lanes, and how they join.
+
+    Args:
+        polylines: The boundary of each lane on this side. list of (n, 3)
+        neighbours: Position of the lane beyond the boundary; ``NO_LANE`` if it is not in the map.
+            (lanes,)
+        has_neighbour: Whether the lane names a lane beyond the boundary. (lanes,)
+        links: Which lanes follow which.
+    """
+
+    def __init__(
+        self,
+        polylines: Sequence[np.ndarray],
+        neighbours: np.ndarray,
+        has_neighbour: np.ndarray,
+        links: LaneLinks,
+    ) -> None:
+        self.neighbours = neighbours
+        self.has_neighbour = has_neighbour
+        self.paths = LanePaths(polylines, links)
+
+    def dividing(self, lanes: np.ndarray) -> np.ndarray:
+        """Return those of the given lanes that name a neighbour on this side."""
+        return lanes[self.has_neighbour[lanes]]
+
+
+class Argoverse2Map:
+    """The map of one log, prepared for cutting out what the vehicle sees at many poses.
+
+    Args:
+        static_map: The log's map as the official API reads it.
+    """
+
+    def __init__(self, static_map: ArgoverseStaticMap) -> None:
+        self.log_id = static_map.log_id
+        lanes = static_map.get_scenario_lane_segments()
+        links = LaneLinks.from_ids(
+            [s.id for s in lanes], [s.predecessors for s in lanes], [s.successors for s in lanes]
+        )
+        self._lanes = GeometryLayer([shapely.Polygon(s.polygon_boundary) for s in lanes])
+        self._is_intersection = np.array([s.is_intersection for s in lanes], dtype=bool)
+        self._left = _lane_side(lanes, "left", links)
+        self._right = _lane_side(lanes, "right", links)
+        self._centre = LanePaths(
+            [static_map.get_lane_segment_centerline(s.id).round(ROUND_DECIMALS) for s in lanes],
+            links,
+        )
+        self._marked = GeometryLayer(_marked_boundaries(lanes))
+        self._crossings = GeometryLayer(
+            [
+                shapely.Polygon(np.vstack([crossing.edge1.xyz, crossing.edge2.xyz[::-1]]))
+                for crossing in static_map.get_scenario_ped_crossings()
+            ]
+        )
+        self._drivable = GeometryLayer(
+            [shapely.Polygon(area.xyz) for area in static_map.get_scenario_vector_drivable_areas()]
+        )
+
+    @classmethod
+    def from_log(cls, log_dir: Path) -> "Argoverse2Map":
+        """Read the map of a log.
+
+        Args:
+            log_dir: The log's folder, which holds ``map/log_map_archive_*.json``.
+
+        Raises:
+            FileNotFoundError: If the map is missing.
+            ValueError: If there are several, or it is damaged.
+        """
+        path = find_map(log_dir)
+        try:
+            return cls(ArgoverseStaticMap.from_json(path))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path} is damaged ({error}): download it again.") from error
+
+    @property
+    def invalid_counts(self) -> dict[str, int]:
+        """How many invalid polygons of each kind the map holds; they take no part."""
+        return {
+            "lane segments": self._lanes.invalid_count,
+            "crossings": self._crossings.invalid_count,
+            "drivable areas": self._drivable.invalid_count,
+        }
+
+    def extract(
+        self,
+        city_from_ego: np.ndarray,
+        classes: Collection[str] = MAP_CLASSES[:3],
+        compat: str = "maptrv2",
+        x_range: tuple[float, float] = (-30.0, 30.0),
+        y_range: tuple[float, float] = (-15.0, 15.0),
+    ) -> dict[str, list[np.ndarray]]:
+        """Return the map elements around the vehicle, in its frame (x forward, y left, z up).
+
+        Args:
+            city_from_ego: Pose of the vehicle. (4, 4)
+            classes: Which of ``MAP_CLASSES`` to extract.
+            compat: ``maptrv2`` or ``maptr``: whose rules.
+            x_range: Smallest and largest x (forward) in metres.
+            y_range: Smallest and largest y (left) in metres.
+
+        Returns:
+            For each class, the vertices of its elements in metres. list of (n, 3)
+
+        Raises:
+            ValueError: If a class or the rules are unknown, or the pose is malformed.
+        """
+        if compat not in COMPAT_MODES:
+            raise ValueError(f"compat must be one of {COMPAT_MODES}, got {compat!r}.")
+        unknown = set(classes) - set(MAP_CLASSES)
+        if unknown:
+            raise ValueError(f"classes must be among {MAP_CLASSES}, got {sorted(unknown)}.")
+        patch = EgoPatch(np.asarray(city_from_ego, dtype=np.float64), x_range, y_range)
+        lanes = self._lanes.touching(patch)
+        maptr = compat == "maptr"
+        rules = {
+            "divider": self._painted_lines if maptr else self._dividers,
+            "ped_crossing": self._crossing_rings if maptr else self._merged_crossings,
+            "boundary": self._boundaries,
+            "centerline": self._centerlines,
+        }
+        return {name: points_of(rules[name](patch, lanes)) for name in classes}
+
+    def _dividers(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+        """Lines between neighbouring lanes outside intersections (MapTRv2)."""
+        lanes = lanes[~self._is_intersection[lanes]]
+        left, right = self._left.dividing(lanes), self._right.dividing(lanes)
+        # Two lanes share each line: it is taken once, from the lane on its right where that one is
+        # in view.
+        right = right[~np.isin(right, self._left.neighbours[left])]
+        left = left[~np.isin(left, self._right.neighbours[right])]
+        paths = [
+            self._left.paths.simplified(left.tolist()),
+            self._right.paths.simplified(right.tolist()),
+        ]
+        return drop_duplicates(clip_lines(np.concatenate(paths), patch))
+
+    def _centerlines(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+        """Paths along the middle of the lanes (MapTRv2)."""
+        return drop_duplicates(clip_lines(self._centre.simplified(lanes.tolist()), patch))
+
+    def _painted_lines(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+        """Every lane boundary that carries paint, joined where the lines meet (MapTR)."""
+        lines = self._marked.geometries[self._marked.touching(patch)]
+        return merge_until_stable(clip_lines(lines, patch))
+
+    def _merged_crossings(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+        """Crossings, parallel neighbours united, open where the patch cuts them (MapTRv2)."""
+        touching = self._crossings.touching(patch)
+        pieces, owner = clip_polygons(self._crossings.geometries[touching], patch)
+        exteriors = shapely.get_exterior_ring(merge_parallel(pieces, owner))
+        turn = ~shapely.is_ccw(exteriors)
+        exteriors[turn] = shapely.reverse(exteriors[turn])
+        lines, owner = cut_rings(exteriors, patch.box(-EDGE_MARGIN_M))
+        points, line = shapely.get_coordinates(lines, include_z=True, return_index=True)
+        if len(points) == 0:
+            return lines
+        # The pieces of one crossing stay one instance.
+        return shapely.linestrings(points, indices=np.unique(owner, return_inverse=True)[1][line])
+
+    def _crossing_rings(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+        """Each crossing by itself, closed along the patch's edge (MapTR)."""
+        touching = self._crossings.touching(patch)
+        pieces, _ = clip_polygons(self._crossings.geometries[touching], patch)
+        return cut_rings(rings_of(pieces, exterior_ccw=False), patch.box(EDGE_MARGIN_M))[0]
+
+    def _boundaries(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+        """Outline of the drivable area, without the patch's edge (MapTR and MapTRv2)."""
+        touching = self._drivable.touching(patch)
+        pieces, _ = clip_polygons(self._drivable.geometries[touching], patch)
+        area = shapely.get_parts(shapely.union_all(pieces))
+        return cut_rings(rings_of(area, exterior_ccw=False), patch.box(-EDGE_MARGIN_M))[0]
+
+
+def _lane_side(lanes: Sequence[LaneSegment], side: str, links: LaneLinks) -> LaneSide:
+    """Collect one side's boundaries and neighbours of all lanes."""
+    position = {segment.id: i for i, segment in enumerate(lanes)}
+    neighbour_ids = [getattr(segment, f"{side}_neighbor_id") for segment in lanes]
+    return LaneSide(
+        [getattr(segment, f"{side}_lane_boundary").xyz for segment in lanes],
+        np.array([position.get(i, NO_LANE) for i in neighbour_ids], dtype=np.int64),
+        np.array([i is not None for i in neighbour_ids], dtype=bool),
+        links,
+    )
+
+
+def _marked_boundaries(lanes: Sequence[LaneSegment]) -> list[shapely.LineString]:
+    """Return the left and right boundaries that carry paint (an unknown mark counts as paint)."""
+    markings = [m for s in lanes for m in (s.left_lane_marking, s.right_lane_marking)]
+    return [
+        shapely.LineString(m.polyline) for m in markings if m.mark_type is not LaneMarkType.NONE
+    ]

@@ -1,0 +1,296 @@
+"""Render the ring cameras of real Argoverse 2 logs, in the layout of the official data set."""
+
+import argparse
+import os
+import shutil
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow.feather as feather
+import shapely
+from av2.geometry.camera.pinhole_camera import PinholeCamera
+from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
+from av2.utils.io import read_feather
+from tqdm import tqdm
+
+from gsmap.converters.argoverse2.convert import select_logs
+from gsmap.converters.argoverse2.log import RING_CAMERAS, Argoverse2Log, find_split
+from gsmap.converters.argoverse2.map import find_map
+from gsmap.converters.argoverse2.samples import thin_out
+from gsmap.converters.argoverse2.scene import make_scene
+from gsmap.converters.command_line import add_log_options, add_workers_option
+from gsmap.utils.parallel import ordered_map
+from minicity.camera import Camera
+from minicity.lighting import random_lighting
+from minicity.renderer import SceneRenderer
+
+VIEW_M = 50.0
+GROUND_PIXELS_PER_IMAGE_PIXEL = 0.0625 * 800  # metres times image width, as MiniCity has it
+JPEG_QUALITY = 90
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How logs are rendered.
+
+    Args:
+        rate_hz: Pictures per second and camera; None takes every row of the pose table.
+        scale: Size of the pictures relative to the real cameras'.
+        calibration: Log whose calibration stands in for a missing one; None leaves such logs out.
+        max_frames: Render only so many moments per log, evenly spread; None renders all.
+
+    Raises:
+        ValueError: If a value is out of its domain.
+    """
+
+    rate_hz: float | None = 2.0
+    scale: float = 0.25
+    calibration: Path | None = None
+    max_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale <= 1:
+            raise ValueError(f"scale must be in (0, 1], got {self.scale}.")
+        if self.rate_hz is not None and not self.rate_hz > 0:
+            raise ValueError(f"rate_hz must be > 0, got {self.rate_hz}.")
+        if self.max_frames is not None and self.max_frames < 1:
+            raise ValueError(f"max_frames must be >= 1, got {self.max_frames}.")
+
+
+def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int, int]:
+    """Return a camera's intrinsics (3, 3), width and height when its pictures are scaled.
+
+    Integer pixel coordinates lie at pixel centres, so the picture's corner (-0.5, -0.5) stays put.
+
+    Args:
+        camera: The camera.
+        scale: Factor of the picture's size, which is rounded.
+    """
+    width, height = (max(1, round(n * scale)) for n in (camera.width_px, camera.height_px))
+    ratio = np.array([width / camera.width_px, height / camera.height_px])
+    intrinsics = camera.intrinsics.K.copy()
+    intrinsics[:2] *= ratio[:, None]
+    intrinsics[:2, 2] += 0.5 * (ratio - 1)
+    return intrinsics, width, height
+
+
+class LogRenderer:
+    """Renders the ring cameras of one log.
+
+    Args:
+        log: The log.
+        calibration: Its cameras by name, or another log's.
+        times_ns: When pictures will be taken: the ground is laid out around these places. (n,)
+        scale: Size of the pictures relative to the real cameras'.
+
+    Raises:
+        FileNotFoundError: If the map is missing.
+        ValueError: If the map's ground height is missing.
+    """
+
+    def __init__(
+        self,
+        log: Argoverse2Log,
+        calibration: dict[str, PinholeCamera],
+        times_ns: np.ndarray,
+        scale: float,
+    ) -> None:
+        self._log, self._scale = log, scale
+        self._calibration = calibration
+        track = np.array([log.poses.at(t)[:2, 3] for t in times_ns.tolist()])  # type: ignore[index]
+        low, high = track.min(0) - VIEW_M, track.max(0) + VIEW_M
+        bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        static_map = ArgoverseStaticMap.from_json(find_map(log.log_dir))
+        try:
+            heights = GroundHeightLayer.from_file(log.log_dir / "map")
+        except RuntimeError as error:
+            raise ValueError(f"{error} in {log.log_dir / 'map'}") from error
+        widths = [scaled_camera(camera, scale)[1] for camera in calibration.values()]
+        seed = zlib.crc32(log.log_id.encode())
+        self._rng = np.random.default_rng(seed)
+        self._renderer = SceneRenderer(
+            make_scene(static_map, heights, bounds),
+            bounds,
+            random_lighting(self._rng),
+            float(np.clip(GROUND_PIXELS_PER_IMAGE_PIXEL / max(widths), 0.05, 0.12)),
+            self._rng,
+        )
+
+    def render(self, name: str, timestamp_ns: int) -> np.ndarray:
+        """Take the picture of a camera at a row of the pose table. (H, W, 3), BGR
+
+        Args:
+            name: Camera.
+            timestamp_ns: Time of a row of the pose table.
+
+        Raises:
+            ValueError: If the pose table has no such row.
+        """
+        pose = self._log.poses.at(timestamp_ns)
+        if pose is None:
+            raise ValueError(f"log {self._log.log_id} has no pose at {timestamp_ns}.")
+        camera = self._calibration[name]
+        intrinsics, width, height = scaled_camera(camera, self._scale)
+        cam_from_city = np.linalg.inv(pose @ camera.ego_SE3_cam.transform_matrix)
+        return self._renderer.render_camera(
+            Camera(intrinsics, width, height, cam_from_city), [], self._rng
+        )
+
+
+def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
+    """Render a log into a folder of the official layout, which appears when it is whole.
+
+    The map, the poses and the calibration (for the scaled pictures) are written along.
+
+    Args:
+        log_dir: The real log's folder.
+        out_dir: Folder to make for the rendered log.
+        options: How.
+
+    Returns:
+        Number of pictures.
+
+    Raises:
+        FileExistsError: If ``out_dir`` exists.
+        FileNotFoundError: If map or poses are missing.
+        ValueError: If there is no calibration or ground height.
+        OSError: If a file cannot be written, for example on a full disk; nothing is left behind.
+    """
+    if out_dir.exists():
+        raise FileExistsError(f"{out_dir} is there already and kept: delete it to render it again")
+    log = Argoverse2Log(log_dir)
+    source = log if log.calibration else None
+    if source is None and options.calibration is not None:
+        source = Argoverse2Log(options.calibration)
+    if source is None or len(source.calibration) < len(RING_CAMERAS):
+        raise ValueError(
+            "no calibration of the ring cameras (--calibration-from names another log)"
+        )
+    times = log.poses.timestamps_ns
+    if options.rate_hz is not None:
+        times = thin_out(times, options.rate_hz)
+    if options.max_frames is not None and len(times) > options.max_frames:
+        times = times[np.linspace(0, len(times) - 1, options.max_frames).round().astype(int)]
+    renderer = LogRenderer(log, source.calibration, times, options.scale)
+    partial_dir = out_dir.with_name(f".{out_dir.name}.{os.getpid()}.partial")
+    try:
+        _copy_log(log_dir, source, partial_dir, options.scale)
+        for timestamp_ns in times.tolist():
+            for name in RING_CAMERAS:
+                path = partial_dir / "sensors" / "cameras" / name / f"{timestamp_ns}.jpg"
+                _write_jpeg(path, renderer.render(name, timestamp_ns))
+        os.rename(partial_dir, out_dir)
+    finally:
+        shutil.rmtree(partial_dir, ignore_errors=True)
+    return len(times) * len(RING_CAMERAS)
+
+
+def _copy_log(log_dir: Path, source: Argoverse2Log, target: Path, scale: float) -> None:
+    """Copy map and poses, write the calibration of the scaled cameras, make the image folders."""
+    target.mkdir(parents=True)
+    shutil.copytree(log_dir / "map", target / "map", copy_function=shutil.copyfile)
+    poses = "city_SE3_egovehicle.feather"
+    shutil.copyfile(log_dir / poses, target / poses)
+    (target / "calibration").mkdir()
+    extrinsics = "calibration/egovehicle_SE3_sensor.feather"
+    shutil.copyfile(source.log_dir / extrinsics, target / extrinsics)
+    table = read_feather(source.log_dir / "calibration" / "intrinsics.feather")
+    table = table[table["sensor_name"].isin(RING_CAMERAS)].reset_index(drop=True)
+    for row, name in enumerate(table["sensor_name"]):
+        intrinsics, width, height = scaled_camera(source.calibration[name], scale)
+        table.loc[row, ["fx_px", "fy_px"]] = intrinsics[0, 0], intrinsics[1, 1]
+        table.loc[row, ["cx_px", "cy_px"]] = intrinsics[0, 2], intrinsics[1, 2]
+        table.loc[row, ["width_px", "height_px"]] = width, height
+    table[["k1", "k2", "k3"]] = 0.0  # the renderer's lens is perfect
+    feather.write_feather(table, target / "calibration" / "intrinsics.feather")
+    for name in RING_CAMERAS:
+        (target / "sensors" / "cameras" / name).mkdir(parents=True)
+
+
+def _write_jpeg(path: Path, image: np.ndarray) -> None:
+    encoded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not encoded:
+        raise ValueError(f"could not encode an image of shape {image.shape} for {path}.")
+    path.write_bytes(data.tobytes())
+
+
+def _try_log(log_dir: Path, out: Path, options: RenderOptions) -> int | str:
+    """Render a log; return the reason where it cannot be rendered. A full disk stops everything."""
+    try:
+        return render_log(log_dir, out / log_dir.name, options)
+    except (FileExistsError, FileNotFoundError, ValueError, shapely.errors.ShapelyError) as error:
+        return str(error)
+
+
+def render_logs(
+    log_dirs: Sequence[Path],
+    out: Path,
+    options: RenderOptions,
+    workers: int = 1,
+    advance: Callable[[], None] | None = None,
+) -> str:
+    """Render logs; one that cannot be rendered does not stop the others.
+
+    Args:
+        log_dirs: Folders of the real logs.
+        out: Folder of the split that the rendered logs go to.
+        options: How.
+        workers: Number of processes.
+        advance: Called after each log.
+
+    Returns:
+        What was rendered and what was left out, for people.
+    """
+    lines, pictures, rendered = [], 0, 0
+    render = partial(_try_log, out=out, options=options)
+    results = ordered_map(render, log_dirs, min(workers, max(len(log_dirs), 1)), timeout_s=3600.0)
+    for log_dir, result in zip(log_dirs, results, strict=True):
+        if isinstance(result, str):
+            lines.append(f"log {log_dir.name} left out: {result}")
+        else:
+            rendered, pictures = rendered + 1, pictures + result
+        if advance is not None:
+            advance()
+    return "\n".join([f"{pictures} pictures of {rendered} logs in {out}", *lines])
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the renderer's options to a parser."""
+    add_log_options(parser)
+    parser.add_argument("--out", type=Path, required=True, help="data root to make")
+    parser.add_argument(
+        "--out-split", choices=("train", "val", "test"), help="split there (default: the same)"
+    )
+    parser.add_argument("--scale", type=float, default=0.25, help="of the real image size")
+    parser.add_argument(
+        "--calibration-from", metavar="LOG", help="log whose calibration fills in for a missing one"
+    )
+    parser.add_argument("--max-frames", type=int, help="moments per log, evenly spread")
+    add_workers_option(parser)
+
+
+def run(arguments: argparse.Namespace, command: str) -> str:
+    """Render as the command line asks.
+
+    Args:
+        arguments: Parsed options.
+        command: The command line as typed.
+
+    Returns:
+        The summary as text.
+    """
+    del command
+    split_dir = find_split(arguments.root, arguments.split)
+    calibration = None
+    if arguments.calibration_from:
+        calibration = select_logs(split_dir, [arguments.calibration_from])[0]
+    options = RenderOptions(arguments.rate, arguments.scale, calibration, arguments.max_frames)
+    log_dirs = select_logs(split_dir, arguments.logs)
+    with tqdm(desc="av2-render", unit="log", total=len(log_dirs)) as bar:
+        out = arguments.out / (arguments.out_split or arguments.split)
+        return render_logs(log_dirs, out, options, arguments.workers, lambda: bar.update() and None)

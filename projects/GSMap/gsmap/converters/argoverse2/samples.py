@@ -1,0 +1,263 @@
+"""The samples of one Argoverse 2 log: when they are, what the sensors saw, what the map holds."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.converters.argoverse2.log import (
+    MAX_CAMERA_OFFSET_NS,
+    MAX_LIDAR_OFFSET_NS,
+    RING_CAMERAS,
+    Argoverse2Log,
+    closest_ns,
+)
+from gsmap.converters.argoverse2.map import COMPAT_MODES, MAP_CLASSES, Argoverse2Map
+from gsmap.datasets.annotations.file import (
+    CLASSES,
+    CameraRecord,
+    LidarRecord,
+    MapInstance,
+    MapSample,
+    SweepRecord,
+)
+
+
+@dataclass(frozen=True)
+class SampleOptions:
+    """Which samples to make of a log, and how.
+
+    Args:
+        at: ``lidar``: at the sweeps; ``cameras``: at the front centre camera's images; ``auto``: at
+            the sweeps where the log has some, else at the images; ``poses:N``: at every N-th row of
+            the pose table, whether or not there are sensor data.
+        rate_hz: Samples per second, thinned out from the times of ``at``; None takes them all.
+        compat: Whose rules the ground truth follows: ``maptrv2`` or ``maptr``.
+        classes: Classes in label order.
+        dim: Coordinates per point: 2 or 3.
+        x_range: Smallest and largest x (forward) in metres.
+        y_range: Smallest and largest y (left) in metres.
+        num_sweeps: How many earlier LiDAR sweeps to name.
+
+    Raises:
+        ValueError: If a value is out of its domain.
+    """
+
+    at: str = "auto"
+    rate_hz: float | None = 2.0
+    compat: str = "maptrv2"
+    classes: tuple[str, ...] = CLASSES
+    dim: int = 2
+    x_range: tuple[float, float] = (-30.0, 30.0)
+    y_range: tuple[float, float] = (-15.0, 15.0)
+    num_sweeps: int = 0
+
+    def __post_init__(self) -> None:
+        if self.at not in ("auto", "lidar", "cameras") and self.pose_stride is None:
+            raise ValueError(f"at must be auto, lidar, cameras or poses:N, got {self.at!r}.")
+        if self.rate_hz is not None and not self.rate_hz > 0:
+            raise ValueError(f"rate_hz must be > 0, got {self.rate_hz}.")
+        if self.compat not in COMPAT_MODES:
+            raise ValueError(f"compat must be one of {COMPAT_MODES}, got {self.compat!r}.")
+        if not set(self.classes) <= set(MAP_CLASSES):
+            raise ValueError(f"classes must be among {MAP_CLASSES}, got {self.classes}.")
+        if self.dim not in (2, 3):
+            raise ValueError(f"dim must be 2 or 3, got {self.dim}.")
+
+    @property
+    def pose_stride(self) -> int | None:
+        """N of ``poses:N``; None for the other choices."""
+        match = re.fullmatch(r"poses:([1-9]\d*)", self.at)
+        return int(match[1]) if match else None
+
+
+@dataclass
+class LogSamples:
+    """What one log gave.
+
+    Args:
+        samples: The samples, in the order of time.
+        left_out: How many samples were left out, by reason.
+        invalid: How many invalid polygons the map holds, by kind; they take no part.
+        sweep_offsets_ns: How far in time the LiDAR sweep of each sample that names one lies.
+    """
+
+    samples: list[MapSample] = field(default_factory=list)
+    left_out: Counter[str] = field(default_factory=Counter)
+    invalid: Counter[str] = field(default_factory=Counter)
+    sweep_offsets_ns: list[int] = field(default_factory=list)
+
+
+def read_log(log_dir: Path, root: Path, options: SampleOptions) -> LogSamples:
+    """Make the samples of one log.
+
+    Args:
+        log_dir: The log's folder.
+        root: Data root, to which paths are relative.
+        options: Which samples, and how.
+
+    Returns:
+        The samples, and what was left out.
+
+    Raises:
+        FileNotFoundError: If the map or the poses are missing.
+        ValueError: If a file is damaged, or sensor data that ``options.at`` needs are missing.
+    """
+    log = Argoverse2Log(log_dir)
+    times = sample_times(log, options)
+    log_map = Argoverse2Map.from_log(log_dir)
+    result = LogSamples(invalid=Counter({k: n for k, n in log_map.invalid_counts.items() if n}))
+    builder = _SampleBuilder(log, log_map, log_dir.relative_to(root).as_posix(), options)
+    for timestamp_ns in times.tolist():
+        try:
+            sample = builder.build(timestamp_ns)
+        except _LeftOut as reason:
+            result.left_out[str(reason)] += 1
+            continue
+        result.samples.append(sample)
+        if sample.lidar is not None:
+            sweep_ns = int(Path(sample.lidar.path).stem)
+            result.sweep_offsets_ns.append(abs(sweep_ns - timestamp_ns))
+    return result
+
+
+def sample_times(log: Argoverse2Log, options: SampleOptions) -> np.ndarray:
+    """Return when the samples of a log are.
+
+    Args:
+        log: The log.
+        options: ``at`` and ``rate_hz`` count.
+
+    Returns:
+        Times in nanoseconds, ascending. (n,)
+
+    Raises:
+        ValueError: If the log lacks the sensor data that ``options.at`` asks for.
+    """
+    if options.pose_stride is not None:
+        return log.poses.timestamps_ns[:: options.pose_stride]
+    missing = [name for name in RING_CAMERAS if name not in log.calibration]
+    if missing:
+        which = ", ".join(missing) if log.calibration else "the ring cameras"
+        raise ValueError(f"no calibration of {which} (--at poses:10 needs none)")
+    sweeps = log.lidar_timestamps_ns
+    images = log.image_timestamps_ns[RING_CAMERAS[0]]
+    at = options.at if options.at != "auto" else "lidar" if len(sweeps) else "cameras"
+    times = sweeps if at == "lidar" else images
+    if len(times) == 0:
+        found = "LiDAR sweeps" if at == "lidar" else f"images of {RING_CAMERAS[0]}"
+        raise ValueError(f"no {found} (--at poses:10 needs neither sweeps nor images)")
+    return times if options.rate_hz is None else thin_out(times, options.rate_hz)
+
+
+def thin_out(times_ns: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Keep the first time, then each time that follows the latest kept one after a period.
+
+    Half the sensor's own period is tolerated, so that 10 Hz with jitter thins out to every fifth
+    at 2 Hz, and what is already slower stays whole.
+
+    Args:
+        times_ns: Ascending, in nanoseconds. (n,)
+        rate_hz: Times to keep per second.
+
+    Returns:
+        The kept times. (m,)
+    """
+    if len(times_ns) < 2:
+        return times_ns
+    least_gap = 1e9 / rate_hz - np.median(np.diff(times_ns)) / 2
+    kept = [int(times_ns[0])]
+    for time in times_ns[1:].tolist():
+        if time - kept[-1] >= least_gap:
+            kept.append(time)
+    return np.array(kept, dtype=np.int64)
+
+
+class _LeftOut(Exception):
+    """A sample that cannot be made; the message is the reason, the same for all of its kind."""
+
+
+class _SampleBuilder:
+    """Makes the samples of one log."""
+
+    def __init__(
+        self, log: Argoverse2Log, log_map: Argoverse2Map, folder: str, options: SampleOptions
+    ) -> None:
+        self._log = log
+        self._map = log_map
+        self._folder = folder
+        self._options = options
+        self._cam_from_ego = {
+            name: camera.ego_SE3_cam.inverse().transform_matrix
+            for name, camera in log.calibration.items()
+        }
+
+    def build(self, timestamp_ns: int) -> MapSample:
+        """Make the sample at a time, or raise ``_LeftOut``."""
+        city_from_ego = self._log.poses.at(timestamp_ns)
+        if city_from_ego is None:
+            raise _LeftOut("no pose at the sample's time")
+        ego_from_city = np.linalg.inv(city_from_ego)
+        return MapSample(
+            token=f"{self._log.log_id}_{timestamp_ns}",
+            scene=self._log.log_id,
+            map_name=self._log.city,
+            timestamp_ns=timestamp_ns,
+            cameras=list(self._cameras(timestamp_ns, city_from_ego)),
+            global_from_frame=city_from_ego,
+            lidar=self._lidar(timestamp_ns, ego_from_city),
+            instances=self._instances(city_from_ego),
+        )
+
+    def _instances(self, city_from_ego: np.ndarray) -> list[MapInstance]:
+        options = self._options
+        elements = self._map.extract(
+            city_from_ego, options.classes, options.compat, options.x_range, options.y_range
+        )
+        return [
+            MapInstance(label, points[:, : options.dim])
+            for label, name in enumerate(options.classes)
+            for points in elements[name]
+        ]
+
+    def _cameras(self, timestamp_ns: int, city_from_ego: np.ndarray) -> Iterator[CameraRecord]:
+        """Yield the image of each calibrated camera closest in time."""
+        for name, camera in self._log.calibration.items():
+            image_ns = closest_ns(
+                self._log.image_timestamps_ns[name], timestamp_ns, MAX_CAMERA_OFFSET_NS
+            )
+            city_from_ego_then = None if image_ns is None else self._log.poses.at(image_ns)
+            if city_from_ego_then is None:
+                if self._options.pose_stride is None:
+                    limit = MAX_CAMERA_OFFSET_NS / 1e6
+                    raise _LeftOut(f"no image of {name} with a pose within {limit:.0f} ms")
+                continue
+            motion = np.linalg.inv(city_from_ego_then) @ city_from_ego
+            yield CameraRecord(
+                name=name,
+                path=f"{self._folder}/sensors/cameras/{name}/{image_ns}.jpg",
+                width=camera.width_px,
+                height=camera.height_px,
+                intrinsics=camera.intrinsics.K,
+                cam_from_frame=self._cam_from_ego[name] @ motion,
+            )
+
+    def _lidar(self, timestamp_ns: int, ego_from_city: np.ndarray) -> LidarRecord | None:
+        """Return the closest sweep and the ones before it; sweeps are stored in the ego frame."""
+        times = self._log.lidar_timestamps_ns
+        sweep_ns = closest_ns(times, timestamp_ns, MAX_LIDAR_OFFSET_NS)
+        if sweep_ns is None:
+            return None
+        last = int(np.searchsorted(times, sweep_ns))
+        sweeps = []
+        for time in times[max(last - self._options.num_sweeps, 0) : last + 1][::-1].tolist():
+            city_from_ego_then = self._log.poses.at(time)
+            if city_from_ego_then is not None:
+                path = f"{self._folder}/sensors/lidar/{time}.feather"
+                sweeps.append(SweepRecord(path, time, ego_from_city @ city_from_ego_then))
+        if not sweeps or sweeps[0].timestamp_ns != sweep_ns:
+            return None
+        return LidarRecord(sweeps[0].path, sweeps[0].frame_from_lidar, sweeps[1:])

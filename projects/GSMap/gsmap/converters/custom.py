@@ -1,0 +1,183 @@
+"""Annotation files of your own data, from plain records: any cameras, ground truth or not."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from PIL import Image, UnidentifiedImageError
+
+from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.record import (
+    AnnotationMeta,
+    CameraRecord,
+    LidarRecord,
+    MapInstance,
+    MapSample,
+    SweepRecord,
+)
+from gsmap.structures.polylines import Points, clip_to_box, is_closed
+
+_RECORD_KEYS = {
+    "token", "cameras", "instances", "global_from_frame", "ego_from_frame", "timestamp_ns", "scene",
+    "map_name", "lidar", "can_bus",
+}  # fmt: skip
+_POLYGON = 3  # shapely type id
+
+
+def from_records(
+    path: str | Path,
+    records: Iterable[Mapping[str, Any]],
+    meta: AnnotationMeta,
+    data_root: str | Path,
+) -> int:
+    """Write an annotation file from plain records.
+
+    A record is a mapping with
+
+    - ``token``: unique name (str);
+    - ``cameras``: list of mappings with ``name``, ``path`` (relative to ``data_root``),
+    ``intrinsics`` (3, 3) in
+      pixels, ``cam_from_frame`` (4, 4); ``width`` and ``height`` are read from the image if left
+      out;
+    - ``instances`` (optional; without it no ground truth is known): list of mappings with ``label``
+    (name or index)
+      and ``points`` (n, 2) or (n, 3) in metres, a ring's last equal to its first. What lies outside
+      the range of ``meta`` is cut off; rings stay rings;
+    - ``lidar`` (optional): mapping with ``path``, ``frame_from_lidar`` (4, 4), and optionally
+    ``sweeps``, a list of
+      mappings with ``path``, ``timestamp_ns``, ``frame_from_lidar``;
+    - ``scene``, ``map_name``, ``timestamp_ns``, ``global_from_frame``, ``ego_from_frame``,
+    ``can_bus``: optional.
+
+    Args:
+        path: Annotation file to write.
+        records: The records.
+        meta: Frame, classes and range of the data.
+        data_root: Folder that image and LiDAR paths are relative to.
+
+    Returns:
+        How many samples were written.
+
+    Raises:
+        FileNotFoundError: If an image is missing whose size is not given.
+        ValueError: If a record is malformed; the message names its token. Nothing is left behind
+            then.
+    """
+    return write_annotations(path, meta, _samples(records, meta, Path(data_root)))
+
+
+def _samples(
+    records: Iterable[Mapping[str, Any]], meta: AnnotationMeta, root: Path
+) -> Iterator[MapSample]:
+    for number, record in enumerate(records):
+        unknown = set(record) - _RECORD_KEYS
+        if unknown:
+            raise ValueError(
+                f"record {number} has unknown keys {sorted(unknown)}; known are "
+                f"{sorted(_RECORD_KEYS)}."
+            )
+        try:
+            yield _sample(record, meta, root)
+        except KeyError as error:
+            name = record.get("token", number)
+            raise ValueError(f"record {name!r} has no {error}.") from error
+
+
+def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
+    token = record["token"]
+    can_bus, instances = record.get("can_bus"), record.get("instances")
+    return MapSample(
+        token=token,
+        scene=record.get("scene", ""),
+        map_name=record.get("map_name", ""),
+        timestamp_ns=int(record.get("timestamp_ns", 0)),
+        cameras=[_camera(camera, token, root) for camera in record["cameras"]],
+        global_from_frame=_matrix(record.get("global_from_frame")),
+        ego_from_frame=_matrix(record.get("ego_from_frame")),
+        lidar=None if record.get("lidar") is None else _lidar(record["lidar"]),
+        can_bus=None if can_bus is None else np.asarray(can_bus, np.float64),
+        instances=None if instances is None else _instances(instances, meta, token),
+    )
+
+
+def _matrix(values: Any) -> np.ndarray:
+    """Return a transform; the identity if none is given. (4, 4)."""
+    return np.eye(4) if values is None else np.asarray(values, np.float64)
+
+
+def _camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
+    width, height = camera.get("width"), camera.get("height")
+    if width is None or height is None:
+        file = root / camera["path"]
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"sample {token!r}, camera {camera['name']!r}: no image at {file}; paths are "
+                "relative to data_root."
+            )
+        try:
+            with Image.open(file) as image:
+                width, height = image.size
+        except UnidentifiedImageError as error:
+            raise ValueError(
+                f"sample {token!r}: {file} is not an image; fetch it again."
+            ) from error
+    return CameraRecord(
+        camera["name"],
+        camera["path"],
+        int(width),
+        int(height),
+        np.asarray(camera["intrinsics"], np.float64),
+        np.asarray(camera["cam_from_frame"], np.float64),
+    )
+
+
+def _lidar(lidar: Mapping[str, Any]) -> LidarRecord:
+    sweeps = [
+        SweepRecord(sweep["path"], int(sweep["timestamp_ns"]), _matrix(sweep["frame_from_lidar"]))
+        for sweep in lidar.get("sweeps", [])
+    ]
+    return LidarRecord(lidar["path"], _matrix(lidar.get("frame_from_lidar")), sweeps)
+
+
+def _instances(
+    instances: Sequence[Mapping[str, Any]], meta: AnnotationMeta, token: str
+) -> list[MapInstance]:
+    found = []
+    for instance in instances:
+        label, points = instance["label"], np.asarray(instance["points"], np.float64)
+        if isinstance(label, str):
+            if label not in meta.classes:
+                raise ValueError(f"sample {token!r}: label {label!r} is not among {meta.classes}.")
+            label = meta.classes.index(label)
+        if points.ndim != 2 or len(points) < 2 or points.shape[1] != meta.dim:
+            raise ValueError(
+                f"sample {token!r}: points must be (n >= 2, {meta.dim}), got {points.shape}."
+            )
+        if not np.isfinite(points).all():
+            raise ValueError(f"sample {token!r}: points hold NaN or infinity.")
+        found += [MapInstance(int(label), piece) for piece in _clipped(points, meta, token)]
+    return found
+
+
+def _clipped(points: Points, meta: AnnotationMeta, token: str) -> list[Points]:
+    """Return what of an element lies in the range; rings stay rings. each (n, dim)."""
+    (x0, x1), (y0, y1) = meta.x_range, meta.y_range
+    low, high = points[:, :2].min(0), points[:, :2].max(0)
+    if (low >= (x0, y0)).all() and (high <= (x1, y1)).all():
+        return [points]
+    if not is_closed(points):
+        return list(clip_to_box(points, meta.x_range, meta.y_range))
+    polygon = shapely.Polygon(points)
+    if not polygon.is_valid:
+        raise ValueError(
+            f"sample {token!r}: a ring that leaves the range crosses itself, so it cannot be cut: "
+            "mend it."
+        )
+    parts = shapely.get_parts(shapely.intersection(polygon, shapely.box(x0, y0, x1, y1)))
+    return [
+        shapely.get_coordinates(part.exterior, include_z=meta.dim == 3)
+        for part in parts
+        if shapely.get_type_id(part) == _POLYGON
+    ]

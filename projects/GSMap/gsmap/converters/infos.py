@@ -1,0 +1,339 @@
+"""Info pickles of MapTR and MapTRv2 as annotation files.
+
+MapTR's ``nuscenes_infos_temporal_*.pkl`` hold sensors and poses; their ground truth is made from
+the map expansion. MapTRv2's ``nuscenes_map_infos_temporal_*.pkl`` and ``av2_map_infos_*.pkl`` hold
+the ground truth too. The pickles are read without running code from them.
+"""
+
+import argparse
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from pyquaternion import Quaternion
+from tqdm import tqdm
+
+from gsmap.converters.nuscenes.map import NuScenesLocalMap, read_layers
+from gsmap.converters.summary import ConversionSummary
+from gsmap.datasets.annotations.file import AnnotationWriter
+from gsmap.datasets.annotations.record import (
+    CAN_BUS_SIZE,
+    CLASSES,
+    AnnotationMeta,
+    CameraRecord,
+    LidarRecord,
+    MapInstance,
+    MapSample,
+    SweepRecord,
+)
+from gsmap.datasets.plain_pickle import load_plain_pickle
+
+NUSCENES_IMAGE_SIZE = (1600, 900)
+_RANGES = {"lidar": ((-15.0, 15.0), (-30.0, 30.0)), "ego": ((-30.0, 30.0), (-15.0, 15.0))}
+
+
+@dataclass(frozen=True)
+class InfoOptions:
+    """How to convert an info file.
+
+    Args:
+        infos: The pickle.
+        target: Annotation file to write.
+        data_root: Folder that image and LiDAR paths shall be relative to; maps are read from it.
+        split: Name of the split.
+        classes: Class names in label order.
+        command: The command line, for messages of readers.
+    """
+
+    infos: Path
+    target: Path
+    data_root: Path
+    split: str
+    classes: tuple[str, ...] = CLASSES
+    command: str = ""
+
+
+def _transform(translation: Any, rotation: Any) -> np.ndarray:
+    """Return a transform from a translation and a quaternion (w, x, y, z) or matrix. (4, 4)."""
+    matrix = np.eye(4)
+    turned = np.asarray(rotation, np.float64)
+    matrix[:3, :3] = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
+    matrix[:3, 3] = np.asarray(translation, np.float64).reshape(3)
+    return matrix
+
+
+def _relative(path: str, root: Path) -> str:
+    """Return a path of an info file relative to the data root, wherever it was made.
+
+    Raises:
+        ValueError: If no part of it leads to the data root.
+    """
+    parts = Path(path.replace("\\", "/")).parts
+    for start in range(len(parts)):
+        if (root / Path(*parts[start:])).is_file() and parts[start] != "/":
+            return Path(*parts[start:]).as_posix()
+    for anchor in ("samples", "sweeps", "train", "val", "test"):
+        if anchor in parts:
+            first = len(parts) - 1 - parts[::-1].index(anchor)
+            return Path(*parts[first:]).as_posix()
+    if not Path(path).is_absolute():
+        return Path(*(part for part in parts if part != ".")).as_posix()
+    raise ValueError(f"path {path!r} does not lie under {root}: give the right --data-root.")
+
+
+def _instances(
+    annotation: Mapping[str, Any], classes: Sequence[str], dim: int
+) -> list[MapInstance]:
+    """Return the elements of the given classes; lines of one point are left out."""
+    return [
+        MapInstance(label, np.asarray(points, np.float64)[:, :dim])
+        for label, name in enumerate(classes)
+        for points in annotation[name]
+        if len(points) >= 2
+    ]
+
+
+def _nuscenes_sample(info: Mapping[str, Any], options: InfoOptions) -> MapSample:
+    """Read one entry of a nuScenes info file, in the LIDAR_TOP frame."""
+    ego_from_frame = _transform(info["lidar2ego_translation"], info["lidar2ego_rotation"])
+    pose = _transform(info["ego2global_translation"], info["ego2global_rotation"]) @ ego_from_frame
+
+    def frame_from(sensor: Mapping[str, Any]) -> np.ndarray:
+        return _transform(sensor["sensor2lidar_translation"], sensor["sensor2lidar_rotation"])
+
+    cameras = [
+        CameraRecord(
+            name,
+            _relative(camera["data_path"], options.data_root),
+            *NUSCENES_IMAGE_SIZE,
+            np.asarray(camera["cam_intrinsic"], np.float64)[:3, :3],
+            np.linalg.inv(frame_from(camera)),
+        )
+        for name, camera in info["cams"].items()
+    ]
+    sweeps = [
+        SweepRecord(
+            _relative(sweep["data_path"], options.data_root),
+            int(sweep["timestamp"]) * 1000,
+            frame_from(sweep),
+        )
+        for sweep in info.get("sweeps", [])
+    ]
+    can_bus = info.get("can_bus")
+    annotation = info.get("annotation")
+    return MapSample(
+        token=info["token"],
+        scene=info.get("scene_token", ""),
+        map_name=info.get("map_location", ""),
+        timestamp_ns=int(info["timestamp"]) * 1000,
+        cameras=cameras,
+        global_from_frame=pose,
+        ego_from_frame=ego_from_frame,
+        lidar=LidarRecord(_relative(info["lidar_path"], options.data_root), np.eye(4), sweeps),
+        can_bus=None if can_bus is None else _complete_can_bus(can_bus, info, pose),
+        instances=None if annotation is None else _instances(annotation, options.classes, 2),
+    )
+
+
+def _complete_can_bus(can_bus: Any, info: Mapping[str, Any], pose: np.ndarray) -> np.ndarray:
+    """Put the vehicle's pose into the signals, as MapTR does when it loads them. (18,)."""
+    signals = np.zeros(CAN_BUS_SIZE)
+    signals[: len(can_bus)] = can_bus
+    signals[:3] = info["ego2global_translation"]
+    signals[3:7] = np.asarray(info["ego2global_rotation"])
+    global_from_ego = pose @ np.linalg.inv(
+        _transform(info["lidar2ego_translation"], info["lidar2ego_rotation"])
+    )
+    yaw_deg = np.degrees(np.arctan2(global_from_ego[1, 0], global_from_ego[0, 0])) % 360.0
+    signals[16:] = np.radians(yaw_deg), yaw_deg
+    return signals
+
+
+def _argoverse_sample(info: Mapping[str, Any], options: InfoOptions, dim: int) -> MapSample:
+    """Read one entry of an Argoverse 2 info file, in the vehicle's frame."""
+    pose = _transform(info["e2g_translation"], info["e2g_rotation"])
+    cameras = []
+    for name, camera in info["cams"].items():
+        then = pose
+        if "e2g_translation" in camera:
+            then = _transform(camera["e2g_translation"], camera["e2g_rotation"])
+        path = _relative(camera["img_fpath"], options.data_root)
+        width, height = _argoverse_size(name, options.data_root / path)
+        cameras.append(
+            CameraRecord(
+                name,
+                path,
+                width,
+                height,
+                np.asarray(camera["intrinsics"], np.float64)[:3, :3],
+                np.asarray(camera["extrinsics"], np.float64) @ np.linalg.inv(then) @ pose,
+            )
+        )
+    annotation = info.get("annotation")
+    return MapSample(
+        token=str(info["token"]),
+        scene=info["log_id"],
+        map_name=info["log_id"],
+        timestamp_ns=int(info["timestamp"]),
+        cameras=cameras,
+        global_from_frame=pose,
+        lidar=LidarRecord(_relative(info["lidar_path"], options.data_root), np.eye(4)),
+        instances=None if annotation is None else _instances(annotation, options.classes, dim),
+    )
+
+
+def _argoverse_size(name: str, path: Path) -> tuple[int, int]:
+    """Return an image's width and height, from its file or else from the camera's name."""
+    if path.is_file():
+        with Image.open(path) as image:
+            return image.size
+    return (1550, 2048) if name == "ring_front_center" else (2048, 1550)
+
+
+def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
+    """Return the samples of an info file and the frame of its data set.
+
+    Raises:
+        ValueError: If it is of no known form.
+    """
+    if isinstance(content, Mapping) and isinstance(content.get("infos"), list):
+        entries, frame = content["infos"], "lidar"
+    elif isinstance(content, Mapping) and isinstance(content.get("samples"), list):
+        entries, frame = content["samples"], "ego"
+    else:
+        raise ValueError(
+            f"{path} is no info file of MapTR or MapTRv2: it holds neither a list `infos` "
+            f"(nuScenes) nor a list `samples` (Argoverse 2)."
+        )
+    if not entries:
+        raise ValueError(f"{path} holds no sample.")
+    return entries, frame
+
+
+class _GroundTruth:
+    """Ground truth from the map expansion, for info files without it."""
+
+    def __init__(self, options: InfoOptions, summary: ConversionSummary) -> None:
+        self._options = options
+        self._summary = summary
+        self._maps: dict[str, NuScenesLocalMap | None] = {}
+
+    def _map(self, name: str) -> NuScenesLocalMap | None:
+        if name not in self._maps:
+            path = self._options.data_root / f"maps/expansion/{name}.json"
+            self._maps[name] = None
+            if name and path.is_file():
+                from nuscenes.map_expansion.map_api import NuScenesMap
+
+                layers = read_layers(
+                    NuScenesMap(str(self._options.data_root), name), self._options.classes
+                )
+                self._maps[name] = NuScenesLocalMap(
+                    layers, self._options.classes, *_RANGES["lidar"]
+                )
+        return self._maps[name]
+
+    def add(self, sample: MapSample) -> None:
+        """Add the instances of a sample, if its map is there."""
+        local_map = self._map(sample.map_name)
+        if local_map is None:
+            reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
+            self._summary.add_problem(f"{reason} (sample kept without)", sample.token)
+        else:
+            sample.instances = local_map.instances(sample.global_from_frame)
+
+
+def _samples(
+    entries: Sequence[Mapping[str, Any]],
+    frame: str,
+    options: InfoOptions,
+    dim: int,
+    summary: ConversionSummary,
+) -> Iterator[MapSample]:
+    truth = _GroundTruth(options, summary)
+    for number, info in enumerate(entries):
+        try:
+            if frame == "lidar":
+                sample = _nuscenes_sample(info, options)
+                if sample.instances is None:
+                    truth.add(sample)
+            else:
+                sample = _argoverse_sample(info, options, dim)
+        except KeyError as error:
+            raise ValueError(f"{options.infos}: sample {number} has no {error}.") from error
+        summary.add_sample(options.split, sample)
+        yield sample
+
+
+def _dim(entries: Sequence[Mapping[str, Any]], frame: str, classes: Sequence[str]) -> int:
+    """Return how many coordinates the points of the first element have; nuScenes has 2."""
+    if frame == "lidar":
+        return 2
+    for info in entries:
+        for name in classes:
+            for points in info.get("annotation", {}).get(name, []):
+                return min(np.asarray(points).shape[-1], 3)
+    return 2
+
+
+def convert_infos(options: InfoOptions) -> ConversionSummary:
+    """Convert one info file.
+
+    Args:
+        options: What to convert and how.
+
+    Returns:
+        What was written and what is missing.
+
+    Raises:
+        FileNotFoundError: If the pickle does not exist.
+        ValueError: If it holds more than plain data, or is of no known form.
+    """
+    entries, frame = _entries(load_plain_pickle(options.infos), options.infos)
+    dim = _dim(entries, frame, options.classes)
+    meta = AnnotationMeta(
+        dataset="nuscenes" if frame == "lidar" else "av2",
+        frame=frame,
+        split=options.split,
+        classes=options.classes,
+        x_range=_RANGES[frame][0],
+        y_range=_RANGES[frame][1],
+        dim=dim,
+        source_fingerprint=hashlib.sha256(options.infos.read_bytes()).hexdigest()[:16],
+        options={"infos": options.infos.name},
+        command=options.command,
+    )
+    summary = ConversionSummary(options.classes)
+    with AnnotationWriter(options.target, meta) as writer:
+        for sample in _samples(tqdm(entries, unit="sample"), frame, options, dim, summary):
+            writer.write(sample)
+    return summary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``tools/convert_infos.py``."""
+    parser.add_argument("infos", type=Path, help="info file of MapTR or MapTRv2 (.pkl)")
+    parser.add_argument("target", type=Path, help="annotation file to write (.arrow)")
+    parser.add_argument(
+        "--data-root", type=Path, required=True, help="what paths shall be relative to"
+    )
+    parser.add_argument("--split", help="name of the split (default: what the file's name ends in)")
+    parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="CLASS")
+
+
+def run(arguments: argparse.Namespace, command: str) -> str:
+    """Convert as the command line asks and return the summary."""
+    split = arguments.split or arguments.infos.stem.rsplit("_", 1)[-1]
+    options = InfoOptions(
+        arguments.infos,
+        arguments.target,
+        arguments.data_root,
+        split,
+        tuple(arguments.classes),
+        command,
+    )
+    return convert_infos(options).text()

@@ -1,0 +1,1 @@
+"""nuScenes format: tables and map expansion to annotation files."""

@@ -1,0 +1,65 @@
+"""Vehicle signals of the nuScenes CAN bus expansion, in MapTR's layout of 18 numbers."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyquaternion import Quaternion
+
+from gsmap.datasets.annotations.record import CAN_BUS_SIZE
+
+
+class CanBusReader:
+    """Read the ``pose`` messages of scenes; without the expansion the signals are zero.
+
+    So are those of the scenes that the devkit itself refuses (161 to 176, 309 to 314).
+
+    Args:
+        dataroot: Data root; the expansion lies in its folder ``can_bus``.
+    """
+
+    def __init__(self, dataroot: Path) -> None:
+        self.available = (dataroot / "can_bus").is_dir()
+        self._dataroot = dataroot
+        self._scene = ""
+        self._messages: list[dict[str, Any]] = []
+        self._times: np.ndarray = np.empty(0)
+
+    def _open(self, scene: str) -> None:
+        from nuscenes.can_bus.can_bus_api import NuScenesCanBus
+
+        self._scene, self._messages = scene, []
+        if (self._dataroot / "can_bus" / f"{scene}_pose.json").is_file():
+            api = NuScenesCanBus(dataroot=str(self._dataroot))
+            if int(scene[-4:]) not in api.can_blacklist:  # scenes whose signals are unreliable
+                self._messages = api.get_messages(scene, "pose", print_warnings=False)
+        self._times = np.array([message["utime"] for message in self._messages])
+
+    def signals(self, scene: str, timestamp_ns: int, global_from_ego: np.ndarray) -> np.ndarray:
+        """Return the signals at a time.
+
+        Entries: position (3), orientation (w, x, y, z), acceleration (3), rotation rate (3),
+            velocity (3), yaw in
+        radians, yaw in degrees in [0, 360). Position, orientation and yaw are the vehicle's pose;
+        the others come from the latest message, and are zero where there is none.
+
+        Args:
+            scene: Scene name.
+            timestamp_ns: Time in nanoseconds.
+            global_from_ego: Pose of the vehicle. (4, 4)
+
+        Returns:
+            The signals. (18,)
+        """
+        values = np.zeros(CAN_BUS_SIZE)
+        values[:3] = global_from_ego[:3, 3]
+        values[3:7] = Quaternion(matrix=global_from_ego, atol=1e-6, rtol=1e-6).elements
+        yaw_deg = np.degrees(np.arctan2(global_from_ego[1, 0], global_from_ego[0, 0])) % 360.0
+        values[16:] = np.radians(yaw_deg), yaw_deg
+        if self.available and scene != self._scene:
+            self._open(scene)
+        latest = int(np.searchsorted(self._times, timestamp_ns // 1000, side="right")) - 1
+        if self.available and latest >= 0:
+            message = self._messages[latest]
+            values[7:16] = [*message["accel"], *message["rotation_rate"], *message["vel"]]
+        return values

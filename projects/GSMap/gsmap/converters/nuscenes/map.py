@@ -1,0 +1,218 @@
+"""Local vector maps from a nuScenes map expansion, by the rules of MapTR.
+
+Whatever does not depend on the pose is done once per map: geometries, spatial indices, the union of
+all road surface and its outline. A frame then takes a few vectorised geometry calls on what lies
+near.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+
+from gsmap.converters.argoverse2.lane_graph import LaneLinks, LanePaths
+from gsmap.converters.local_map import LocalPatch, OutlineIndex, rings_of
+from gsmap.datasets.annotations.record import MapInstance
+from gsmap.structures.polylines import Points
+
+if TYPE_CHECKING:
+    from nuscenes.map_expansion.map_api import NuScenesMap
+
+LINE_LAYERS = ("road_divider", "lane_divider")
+SURFACE_LAYERS = ("road_segment", "lane")
+AREA_CLASSES = ("ped_crossing", "stop_line", "intersection", "carpark_area")
+MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:], "centerline")
+OUTLINE_MARGIN_M = 0.2
+CENTERLINE_STEP_M = 0.5
+_POLYGON, _LINE = 3, 1  # shapely type ids
+
+
+@dataclass
+class MapLayers:
+    """The geometries of one map in its global frame; plain enough to hand to another process.
+
+    Args:
+        name: Location.
+        lines: Lines by layer. each (n,) of LineString
+        polygons: Valid polygons by layer or class. each (n,) of Polygon
+        skipped: How many elements were left out, by reason.
+        centerlines: Centre line of each lane and lane connector. each (n, 3)
+        links: Which of these lead into which.
+    """
+
+    name: str
+    lines: dict[str, np.ndarray]
+    polygons: dict[str, np.ndarray]
+    skipped: Counter[str]
+    centerlines: list[np.ndarray] = field(default_factory=list)
+    links: LaneLinks = field(default_factory=lambda: LaneLinks([], []))
+
+
+def _read_lines(nusc_map: "NuScenesMap", layer: str, skipped: Counter[str]) -> np.ndarray:
+    """Return the lines of a layer; those without two nodes are counted. (n,) of LineString."""
+    found = []
+    for record in getattr(nusc_map, layer):
+        tokens = nusc_map.get("line", record["line_token"])["node_tokens"]
+        if len(tokens) < 2:
+            skipped[f"{layer} without two nodes"] += 1
+        else:
+            found.append(nusc_map.extract_line(record["line_token"]))
+    return np.array(found, dtype=object)
+
+
+def _read_polygons(nusc_map: "NuScenesMap", name: str, skipped: Counter[str]) -> np.ndarray:
+    """Return the polygons of a layer or class; invalid ones are counted. (n,) of Polygon."""
+    records: list[dict[str, Any]] = getattr(
+        nusc_map, "road_segment" if name == "intersection" else name
+    )
+    if name == "intersection":
+        records = [record for record in records if record.get("is_intersection", False)]
+    polygons = [nusc_map.extract_polygon(record["polygon_token"]) for record in records]
+    valid = [polygon for polygon in polygons if polygon.is_valid and not polygon.is_empty]
+    if len(valid) < len(polygons):
+        skipped[f"invalid {name} polygon"] += len(polygons) - len(valid)
+    return np.array(valid, dtype=object)
+
+
+def read_layers(nusc_map: "NuScenesMap", classes: Collection[str]) -> MapLayers:
+    """Collect the geometries that the classes need from a map of the official devkit.
+
+    Args:
+        nusc_map: The opened map.
+        classes: Names out of ``MAP_CLASSES``.
+
+    Returns:
+        The layers; lines without two nodes and invalid polygons are left out and counted.
+    """
+    skipped: Counter[str] = Counter()
+    names = set(AREA_CLASSES) & set(classes)
+    if "boundary" in classes:
+        names |= set(SURFACE_LAYERS)
+    areas = {name: _read_polygons(nusc_map, name, skipped) for name in sorted(names)}
+    marks = {}
+    if "divider" in classes:
+        marks = {layer: _read_lines(nusc_map, layer, skipped) for layer in LINE_LAYERS}
+    layers = MapLayers(nusc_map.map_name, marks, areas, skipped)
+    if "centerline" in classes:
+        _read_centerlines(nusc_map, layers)
+    return layers
+
+
+def _read_centerlines(nusc_map: "NuScenesMap", layers: MapLayers) -> None:
+    """Add the centre lines of lanes and lane connectors, and how they follow one another."""
+    tokens = []
+    for record in (*nusc_map.lane, *nusc_map.lane_connector):
+        poses = nusc_map.discretize_lanes([record["token"]], CENTERLINE_STEP_M)[record["token"]]
+        if len(poses) < 2:
+            layers.skipped["lane without a centre line"] += 1
+            continue
+        line = np.zeros((len(poses), 3))
+        line[:, :2] = np.array(poses)[:, :2]
+        layers.centerlines.append(line)
+        tokens.append(record["token"])
+    neighbours = [nusc_map.connectivity.get(token, {}) for token in tokens]
+    layers.links = LaneLinks.from_ids(
+        tokens,
+        [links.get("incoming", []) for links in neighbours],
+        [links.get("outgoing", []) for links in neighbours],
+    )
+
+
+class NuScenesLocalMap:
+    """One map, prepared for cutting out what the vehicle sees at many poses.
+
+    Dividers are the lines of ``road_divider`` and ``lane_divider``, cut with the patch. Crossings
+    (and the extended classes) are areas cut with the patch and united where they overlap: closed
+    rings. Boundaries are the outlines of the union of ``road_segment`` and ``lane``, cut 0.2 m
+    inside the patch.
+
+    Args:
+        layers: The map's geometries.
+        classes: Names out of ``MAP_CLASSES``, in label order.
+        x_range: Smallest and largest x of the patch in metres.
+        y_range: Smallest and largest y of the patch in metres.
+
+    Raises:
+        ValueError: If a class is unknown.
+    """
+
+    def __init__(
+        self,
+        layers: MapLayers,
+        classes: Sequence[str],
+        x_range: tuple[float, float] = (-15.0, 15.0),
+        y_range: tuple[float, float] = (-30.0, 30.0),
+    ) -> None:
+        unknown = [name for name in classes if name not in MAP_CLASSES]
+        if unknown:
+            raise ValueError(f"classes must be among {MAP_CLASSES}, got {unknown}.")
+        self.classes = tuple(classes)
+        self.x_range, self.y_range = x_range, y_range
+        marks = [layers.lines[layer] for layer in LINE_LAYERS if layer in layers.lines]
+        self._lines = np.concatenate(marks) if marks else np.empty(0, object)
+        self._line_tree = shapely.STRtree(self._lines)
+        self._areas = {name: layers.polygons[name] for name in AREA_CLASSES if name in self.classes}
+        self._area_trees = {name: shapely.STRtree(areas) for name, areas in self._areas.items()}
+        surface = [layers.polygons[name] for name in SURFACE_LAYERS if name in layers.polygons]
+        outlines = shapely.get_parts(shapely.union_all([shapely.union_all(p) for p in surface]))
+        self._outlines = OutlineIndex(rings_of(outlines, exterior_ccw=False))
+        self._lane_paths = LanePaths(layers.centerlines, layers.links)
+        lanes = [shapely.LineString(line[:, :2]) for line in layers.centerlines]
+        self._lane_tree = shapely.STRtree(lanes)
+
+    def instances(self, global_from_frame: np.ndarray) -> list[MapInstance]:
+        """Return the map elements around a pose.
+
+        Args:
+            global_from_frame: Pose of the annotation frame in the map. (4, 4)
+
+        Returns:
+            Elements in the frame, class by class in label order; points are (n, 2) in metres.
+        """
+        patch = LocalPatch.from_pose(global_from_frame, self.x_range, self.y_range)
+        found = []
+        for label, name in enumerate(self.classes):
+            found += [MapInstance(label, points) for points in self._polylines(name, patch)]
+        return found
+
+    def _polylines(self, name: str, patch: LocalPatch) -> list[Points]:
+        if name == "divider":
+            return self._dividers(patch)
+        if name == "boundary":
+            return self._outlines.cut(patch, OUTLINE_MARGIN_M)
+        if name == "centerline":
+            return self._centerlines(patch)
+        return self._area_outlines(name, patch)
+
+    def _centerlines(self, patch: LocalPatch) -> list[Points]:
+        near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
+        paths = shapely.force_2d(self._lane_paths.simplified(near.tolist()))
+        return self._cut(paths, patch)
+
+    def _dividers(self, patch: LocalPatch) -> list[Points]:
+        near = np.sort(self._line_tree.query(patch.polygon, predicate="intersects"))
+        return self._cut(self._lines[near], patch)
+
+    def _cut(self, lines: np.ndarray, patch: LocalPatch) -> list[Points]:
+        """Return the parts of lines inside the patch, in the frame. each (n, 2)."""
+        pieces = shapely.get_parts(shapely.intersection(lines, patch.polygon))
+        pieces = pieces[(shapely.get_type_id(pieces) == _LINE) & (shapely.length(pieces) > 0)]
+        return _vertices(patch.to_local(pieces))
+
+    def _area_outlines(self, name: str, patch: LocalPatch) -> list[Points]:
+        near = self._area_trees[name].query(patch.polygon, predicate="intersects")
+        if not len(near):
+            return []
+        pieces = shapely.intersection(self._areas[name][np.sort(near)], patch.polygon)
+        merged = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
+        polygons = merged[shapely.get_type_id(merged) == _POLYGON]
+        return _vertices(rings_of(polygons, exterior_ccw=False))
+
+
+def _vertices(lines: np.ndarray) -> list[Points]:
+    """Return the vertices of each line. each (n, 2)."""
+    points, owner = shapely.get_coordinates(lines, return_index=True)
+    return np.split(points, np.flatnonzero(np.diff(owner)) + 1) if len(points) else []

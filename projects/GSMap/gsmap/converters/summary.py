@@ -1,0 +1,47 @@
+"""What a conversion wrote, and what it left out."""
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+
+from gsmap.datasets.annotations.record import MapSample
+
+_EXAMPLES = 3
+
+
+@dataclass
+class ConversionSummary:
+    """Counts of one conversion, printed at its end.
+
+    Args:
+        classes: Class names in label order.
+    """
+
+    classes: tuple[str, ...]
+    samples: Counter[str] = field(default_factory=Counter)
+    instances: Counter[str] = field(default_factory=Counter)
+    problems: Counter[str] = field(default_factory=Counter)
+    examples: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    notes: list[str] = field(default_factory=list)
+
+    def add_sample(self, split: str, sample: MapSample) -> None:
+        """Count a sample that was written."""
+        self.samples[split] += 1
+        for instance in sample.instances or []:
+            self.instances[self.classes[instance.label]] += 1
+        if sample.instances is not None and not sample.instances:
+            self.add_problem("sample without any map element in range (kept)", sample.token)
+
+    def add_problem(self, reason: str, where: str, count: int = 1) -> None:
+        """Count something that was left out or is missing; the first few places are remembered."""
+        self.problems[reason] += count
+        if len(self.examples[reason]) < _EXAMPLES:
+            self.examples[reason].append(where)
+
+    def text(self) -> str:
+        """Return the summary as lines for a terminal."""
+        samples = ", ".join(f"{split} {count}" for split, count in self.samples.items()) or "none"
+        elements = ", ".join(f"{name} {self.instances[name]}" for name in self.classes)
+        lines = [f"samples: {samples}", f"map elements: {elements}"]
+        for reason, count in self.problems.most_common():
+            lines.append(f"{count:>7} x {reason}, for example {', '.join(self.examples[reason])}")
+        return "\n".join(lines + self.notes)

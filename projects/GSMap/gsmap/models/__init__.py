@@ -1,0 +1,1 @@
+"""Network parts: detectors, BEV encoders, decoders, heads, losses, matching."""

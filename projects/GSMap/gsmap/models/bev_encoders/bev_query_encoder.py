@@ -1,0 +1,239 @@
+"""BEV encoder with one learned query per cell that attends to the BEV and to the cameras."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from mmcv.cnn.bricks.transformer import FFN
+from mmdet.models.layers import LearnedPositionalEncoding
+from mmdet3d.registry import MODELS
+from mmengine.model import BaseModule
+from torch import Tensor, nn
+
+from gsmap.models.bev_encoders.img_metas import stack_matrices
+from gsmap.models.bev_encoders.projection import PillarProjection, pillar_points, project_pillars
+from gsmap.models.layers.deformable_attention import (
+    DeformableAttention,
+    directional_offsets,
+    init_matrices,
+)
+from gsmap.structures.grid import BEVGrid
+
+_NUM_CAN_BUS = 18
+
+
+class BEVSelfAttention(DeformableAttention):
+    """BEVFormer's temporal self-attention for a model without history.
+
+    Both entries of the queue are then the current queries, so the values coincide and averaging the
+    two outputs equals one attention over the samples of both with half the weight.
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of heads.
+        num_points: Samples per head and queue entry.
+        dropout: Dropout on the output.
+    """
+
+    num_queue = 2
+
+    def __init__(
+        self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 4, dropout: float = 0.1
+    ) -> None:
+        super().__init__(
+            embed_dims, num_heads, self.num_queue * num_points, 2 * embed_dims, dropout
+        )
+
+    def initial_offsets(self) -> Tensor:
+        """Return the offsets, in cells, the same for each queue entry. (heads, S, 2)"""
+        one = directional_offsets(self.num_heads, self.num_points // self.num_queue)
+        return one.repeat(1, self.num_queue, 1)
+
+    def weights(self, query: Tensor) -> Tensor:
+        """Return a softmax per queue entry, averaged over the queue. (B, Q, heads, S)"""
+        logits = self.attention_weights(query).float()
+        logits = logits.unflatten(-1, (self.num_heads, self.num_queue, -1))
+        return logits.softmax(-1).flatten(-2) / self.num_queue
+
+
+class BEVEncoderLayer(BaseModule):
+    """Self-attention, camera cross-attention and feed-forward, each followed by its LayerNorm.
+
+    Args:
+        cross_attn: Config of the camera cross-attention.
+        embed_dims: Channels C.
+        num_heads: Heads of the self-attention.
+        num_points: Samples per head and queue entry of the self-attention.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Dropout of every sublayer.
+    """
+
+    def __init__(
+        self,
+        cross_attn: dict,
+        embed_dims: int = 256,
+        num_heads: int = 8,
+        num_points: int = 4,
+        ffn_dims: int = 512,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.self_attn = BEVSelfAttention(embed_dims, num_heads, num_points, dropout)
+        self.cross_attn = MODELS.build({"embed_dims": embed_dims, **cross_attn})
+        self.dropout = nn.Dropout(dropout)
+        self.ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
+
+    def forward(
+        self,
+        query: Tensor,
+        query_pos: Tensor,
+        centres: Tensor,
+        bev_shape: tuple[int, int],
+        img_feats: Tensor,
+        projection: PillarProjection,
+    ) -> Tensor:
+        """Update the BEV queries.
+
+        Args:
+            query: BEV queries. (B, Q, C)
+            query_pos: Their positional encoding. (B, Q, C)
+            centres: Cell centres, [0, 1] over the grid. (B, Q, 2)
+            bev_shape: Rows and columns of the grid.
+            img_feats: Image features with their embeddings. (B, V, C, h, w)
+            projection: Where pillars fall in the cameras.
+
+        Returns:
+            Updated queries. (B, Q, C)
+        """
+        # Differs from upstream for batches: it pairs the query of sample floor(b / 2) with sample b
+        # here.
+        pair = torch.cat([query, query + query_pos], -1)  # (B, Q, 2 C)
+        bev = query.transpose(1, 2).unflatten(-1, bev_shape)  # (B, C, H, W)
+        query = self.norms[0](query + self.self_attn(pair, centres, bev))
+        query = self.norms[1](query + self.dropout(self.cross_attn(query, img_feats, projection)))
+        return self.norms[2](self.ffn(query))
+
+
+@MODELS.register_module()
+class BEVQueryEncoder(BaseModule):
+    """Lift camera features to BEV with a learned query per cell.
+
+    BEVFormer without history, or GKT, according to the camera cross-attention.
+
+    Args:
+        cross_attn: Config of the camera cross-attention of every layer.
+        pc_range: x, y, z minima, then maxima, in metres; z bounds the pillars.
+        bev_size: Rows and columns of the grid.
+        embed_dims: Channels C.
+        num_layers: Number of layers.
+        layer_cfg: Further arguments of :class:`BEVEncoderLayer`.
+        num_cams: Number of cameras V.
+        num_feature_levels: Rows of the level embedding; only the first is used, as there is one
+            level.
+        init_cfg: As in mmengine.
+    """
+
+    def __init__(
+        self,
+        cross_attn: dict,
+        pc_range: Sequence[float],
+        bev_size: tuple[int, int] = (200, 100),
+        embed_dims: int = 256,
+        num_layers: int = 1,
+        layer_cfg: dict | None = None,
+        num_cams: int = 6,
+        num_feature_levels: int = 4,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(init_cfg)
+        self.grid = BEVGrid.from_pc_range(pc_range, *bev_size)
+        self.z_range = (float(pc_range[2]), float(pc_range[5]))
+        self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)
+        self.positional_encoding = LearnedPositionalEncoding(
+            embed_dims // 2, self.grid.height, self.grid.width
+        )
+        self.level_embeds = nn.Parameter(torch.empty(num_feature_levels, embed_dims))
+        self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
+        self.can_bus_mlp = nn.Sequential(
+            nn.Linear(_NUM_CAN_BUS, embed_dims // 2),
+            nn.ReLU(inplace=True),
+            nn.Linear(embed_dims // 2, embed_dims),
+            nn.ReLU(inplace=True),
+        )
+        self.can_bus_mlp.add_module("norm", nn.LayerNorm(embed_dims))
+        layer = {"cross_attn": cross_attn, "embed_dims": embed_dims, **(layer_cfg or {})}
+        layers = [BEVEncoderLayer(**layer) for _ in range(num_layers)]
+        self.num_heights: int = layers[0].cross_attn.num_heights
+        self.layers = nn.ModuleList(layers)
+        nn.init.normal_(self.level_embeds)
+        nn.init.normal_(self.cams_embeds)
+
+    def init_weights(self) -> None:
+        """Initialise the matrices of the layers (Xavier)."""
+        super().init_weights()
+        init_matrices(self.layers)
+        init_matrices(self.can_bus_mlp)
+
+    def forward(
+        self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]
+    ) -> dict[str, Tensor]:
+        """Encode camera features into BEV features.
+
+        Args:
+            mlvl_feats: Image features; the first level is used. List of (B, V, C, h, w)
+            img_metas: Per sample ``lidar2img`` (V, 4, 4), ``batch_input_shape``, optionally
+                ``can_bus`` (18,).
+
+        Returns:
+            ``bev_feats`` (B, C, H, W), row 0 at the smallest y.
+
+        Raises:
+            ValueError: If the number of cameras is not the configured one, or a sample lacks its
+                matrices.
+        """
+        feats = mlvl_feats[0]
+        if feats.shape[1] != len(self.cams_embeds):
+            raise ValueError(
+                f"the encoder is built for {len(self.cams_embeds)} cameras, got {feats.shape[1]}."
+            )
+        feats = feats + (self.cams_embeds + self.level_embeds[0])[:, :, None, None].to(feats.dtype)
+        query, query_pos = self.initial_queries(img_metas, feats)
+        projection = self.project(img_metas, feats.device)
+        centres = self.grid.norm_from_metres(self.grid.pixel_centres(feats.device)).view(1, -1, 2)
+        bev_shape = (self.grid.height, self.grid.width)
+        for layer in self.layers:
+            query = layer(
+                query, query_pos, centres.expand(len(query), -1, -1), bev_shape, feats, projection
+            )
+        return {"bev_feats": query.transpose(1, 2).unflatten(-1, bev_shape)}
+
+    def initial_queries(
+        self, img_metas: Sequence[dict[str, Any]], feats: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the cells' queries, the vehicle's motion added, and positions. 2 x (B, Q, C)"""
+        zeros = np.zeros(_NUM_CAN_BUS)
+        can_bus = [
+            zeros if meta.get("can_bus") is None else np.asarray(meta["can_bus"])
+            for meta in img_metas
+        ]
+        motion = self.can_bus_mlp(
+            torch.as_tensor(np.stack(can_bus), dtype=torch.float32, device=feats.device)
+        )
+        query = self.bev_embedding.weight[None] + motion[:, None]
+        mask = feats.new_zeros(1, self.grid.height, self.grid.width)
+        query_pos = self.positional_encoding(mask).flatten(2).transpose(1, 2)  # (1, Q, C)
+        return query, query_pos
+
+    def project(
+        self, img_metas: Sequence[dict[str, Any]], device: torch.device
+    ) -> PillarProjection:
+        """Project every cell's pillar into every camera."""
+        # Differs from upstream for batches: it takes the set of seen cells from the first sample
+        # for all.
+        points = pillar_points(self.grid, self.z_range, self.num_heights, device)
+        matrices = torch.as_tensor(
+            stack_matrices(img_metas, "lidar2img"), dtype=torch.float32, device=device
+        )
+        return project_pillars(points, matrices, img_metas[0]["batch_input_shape"])

@@ -1,0 +1,76 @@
+"""BEVFormer's spatial cross-attention: deformable sampling around projected BEV pillars."""
+
+import torch
+from mmdet3d.registry import MODELS
+from torch import Tensor
+
+from gsmap.models.bev_encoders.projection import PillarProjection
+from gsmap.models.layers.deformable_attention import SamplingAttention, deformable_sample
+
+
+@MODELS.register_module()
+class SpatialCrossAttention(SamplingAttention):
+    """Attention from BEV cells to the cameras that see them, around their projected pillars.
+
+    Sample s belongs to pillar height ``s % num_heights``. Sums over cameras are divided by the
+    number of cameras that see the cell.
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of heads.
+        num_points: Samples per head, S; a multiple of ``num_heights``.
+        num_heights: Points per pillar, Z.
+        init_cfg: As in mmengine.
+
+    Raises:
+        ValueError: If ``num_points`` is not a multiple of ``num_heights``.
+    """
+
+    def __init__(
+        self,
+        embed_dims: int = 256,
+        num_heads: int = 8,
+        num_points: int = 8,
+        num_heights: int = 4,
+        init_cfg: dict | None = None,
+    ) -> None:
+        if num_points % num_heights:
+            raise ValueError(
+                f"num_points must be a multiple of num_heights, got {num_points} and {num_heights}."
+            )
+        super().__init__(embed_dims, num_heads, num_points, dropout=0.0, init_cfg=init_cfg)
+        self.num_heights = num_heights
+
+    def forward(self, query: Tensor, img_feats: Tensor, projection: PillarProjection) -> Tensor:
+        """Collect camera features for every BEV cell.
+
+        Args:
+            query: BEV queries. (B, Q, C)
+            img_feats: Image features, camera embedding added. (B, V, C, h, w)
+            projection: Where pillars fall in the cameras; ``num_heights`` points per pillar.
+
+        Returns:
+            Attended features, without the residual. (B, Q, C)
+        """
+        height, width = img_feats.shape[-2:]
+        offsets = self.offsets_in_cells(query) / query.new_tensor([width, height])
+        weights = self.weights(query)
+        value = self.value_proj(img_feats.flatten(3).transpose(2, 3)).float()
+        value = value.unflatten(-1, (self.num_heads, -1))  # (B, V, h * w, heads, C)
+        repeats = self.num_points // self.num_heights
+        summed = query.new_zeros(query.shape, dtype=torch.float32)
+        for sample, view in torch.cartesian_prod(
+            *(torch.arange(n) for n in img_feats.shape[:2])
+        ).tolist():
+            cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
+            centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
+            locations = centres[:, None] + offsets[sample, cell]  # (T, heads, S, 2)
+            seen = deformable_sample(
+                value[sample, view][None],
+                (height, width),
+                locations[None],
+                weights[sample, cell][None],
+            )
+            summed[sample] = summed[sample].index_add(0, cell, seen[0])
+        count = projection.visible.sum(1).clamp(min=1)
+        return self.output_proj(summed / count[..., None])

@@ -1,0 +1,160 @@
+"""BEV encoder that lifts image features along predicted depth (Lift, Splat, Shoot; MapTRv2)."""
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+import torch
+from mmdet3d.registry import MODELS
+from mmdet3d.structures import Det3DDataSample
+from mmengine.model import BaseModule
+from torch import Tensor, nn
+
+from gsmap.models.bev_encoders.depth_net import CameraAwareDepthNet, PlainDepthNet
+from gsmap.models.bev_encoders.frustum import camera_vector, frustum_points
+from gsmap.models.bev_encoders.img_metas import stack_matrices
+from gsmap.models.losses.auxiliary import depth_bins, depth_loss, num_depth_bins
+from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
+from gsmap.structures.grid import BEVGrid
+
+
+@MODELS.register_module()
+class LSSEncoder(BaseModule):
+    """Lift image features by predicted depth, sum them in BEV cells, refine by convolutions.
+
+    The cells are half as large as those of the output; the second convolution halves the
+    resolution.
+
+    Args:
+        pc_range: x, y, z minima, then maxima, in metres; points outside are dropped, and z is one
+            layer.
+        bev_size: Rows and columns of the output.
+        embed_dims: Channels C of image and BEV features.
+        depth_range: ``(low, high, step)`` of the depth bins in metres.
+        camera_aware: Whether the depth net reads the cameras' parameters (MapTRv2) or is one
+            convolution (the BEVPool variant of MapTR).
+        aspp_channels: Channels of each branch of the camera-aware depth head's pyramid.
+        loss_depth_weight: Weight of the depth loss; 0 trains without LiDAR.
+        init_cfg: As in mmengine.
+
+    Raises:
+        ValueError: If ``depth_range`` holds no bin.
+    """
+
+    def __init__(
+        self,
+        pc_range: Sequence[float],
+        bev_size: tuple[int, int] = (200, 100),
+        embed_dims: int = 256,
+        depth_range: tuple[float, float, float] = (1.0, 35.0, 0.5),
+        camera_aware: bool = True,
+        aspp_channels: int = 96,
+        loss_depth_weight: float = 3.0,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(init_cfg)
+        self.grid = BEVGrid.from_pc_range(tuple(pc_range), *bev_size)
+        self.cells = self.grid.resized(2 * self.grid.height, 2 * self.grid.width)
+        self.z_range = (float(pc_range[2]), float(pc_range[5]))
+        low, high, step = (float(x) for x in depth_range)
+        self.depth_range = (low, high, step)
+        self.num_bins = num_depth_bins(self.depth_range)
+        self.loss_depth_weight = loss_depth_weight
+        self.camera_aware = camera_aware
+        sizes = (embed_dims, embed_dims, self.num_bins)
+        self.depth_net = (
+            CameraAwareDepthNet(*sizes, aspp_channels) if camera_aware else PlainDepthNet(*sizes)
+        )
+        blocks = []
+        for stride in (1, 2, 1):
+            conv = nn.Conv2d(embed_dims, embed_dims, 3, stride=stride, padding=1, bias=False)
+            blocks += [conv, nn.BatchNorm2d(embed_dims), nn.ReLU(inplace=True)]
+        self.downsample = nn.Sequential(*blocks)
+
+    def init_weights(self) -> None:
+        """Initialise matrices and kernels as upstream's transformer does: Xavier, uniform."""
+        super().init_weights()
+        for parameter in self.parameters():
+            if parameter.dim() > 1:
+                nn.init.xavier_uniform_(parameter)
+
+    def forward(
+        self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]
+    ) -> dict[str, Tensor]:
+        """Encode camera features into BEV features.
+
+        Args:
+            mlvl_feats: Image features; the first level is used. List of (B, V, C, h, w)
+            img_metas: Per sample ``lidar2img`` (V, 4, 4) and ``batch_input_shape``; camera-aware
+                also ``cam2img``, ``img_aug_matrix``, ``lidar2cam`` (V, 4, 4) and ``lidar2ego`` (4,
+                4).
+
+        Returns:
+            ``bev_feats`` (B, C, H, W), row 0 at the smallest y; ``depth``, the probability of each
+            depth bin (B, V, D, h, w); ``img_feats``, the image features used (B, V, C, h, w).
+
+        Raises:
+            ValueError: If a sample lacks a matrix.
+        """
+        feats = mlvl_feats[0]
+        vectors = self.camera_vectors(img_metas, feats) if self.camera_aware else None
+        logits, context = self.depth_net(feats.flatten(0, 1), vectors)
+        depth = logits.float().softmax(1).unflatten(0, feats.shape[:2])  # (B, V, D, h, w)
+        context = context.float().unflatten(0, feats.shape[:2])  # (B, V, C, h, w)
+        points = self.points(img_metas, feats)
+        indices = cell_indices(points, self.cells, self.z_range)  # (B, V, D, h, w)
+        with torch.autocast(feats.device.type, enabled=False):
+            kernel = cast(Tensor, self.downsample[0].weight)
+            bev = bev_pool_conv3x3(depth, context, indices, self.cells, kernel.float())
+        return {"bev_feats": self.downsample[1:](bev), "depth": depth, "img_feats": feats}
+
+    def points(self, img_metas: Sequence[dict[str, Any]], feats: Tensor) -> Tensor:
+        """Return every feature pixel at every depth, in metres. (B, V, D, h, w, 3)"""
+        # inverted in float64, so that the points are as exact as float32 can hold them
+        inverse = np.linalg.inv(stack_matrices(img_metas, "lidar2img"))
+        frame_from_img = torch.as_tensor(inverse, dtype=torch.float32, device=feats.device)
+        depths = torch.arange(*self.depth_range, device=feats.device)
+        rows, cols = img_metas[0]["batch_input_shape"]
+        height, width = feats.shape[-2:]
+        return frustum_points(frame_from_img, (rows, cols), (height, width), depths)
+
+    def camera_vectors(self, img_metas: Sequence[dict[str, Any]], feats: Tensor) -> Tensor:
+        """Return each camera's parameters as a vector. (B * V, 22)"""
+        ego_from_frame = stack_matrices(img_metas, "lidar2ego")[:, None]  # (B, 1, 4, 4)
+        ego_from_cam = ego_from_frame @ np.linalg.inv(stack_matrices(img_metas, "lidar2cam"))
+        matrices = (
+            stack_matrices(img_metas, "cam2img"),
+            stack_matrices(img_metas, "img_aug_matrix"),
+            ego_from_cam,
+        )
+        vectors = camera_vector(*(torch.as_tensor(m, dtype=torch.float32) for m in matrices))
+        return vectors.flatten(0, 1).to(feats.device)
+
+    def loss(
+        self, outputs: dict[str, Tensor], data_samples: Sequence[Det3DDataSample]
+    ) -> dict[str, Tensor]:
+        """Compute the depth loss from ``data_sample.gt_depth``.
+
+        Args:
+            outputs: What `forward` returned.
+            data_samples: Each with ``gt_depth``, metres, 0 where there is no return. (V, H_img,
+                W_img)
+
+        Returns:
+            ``loss_depth``, or nothing if its weight is 0.
+
+        Raises:
+            ValueError: If a sample has no ``gt_depth``.
+        """
+        if self.loss_depth_weight == 0:
+            return {}
+        probs = outputs["depth"]
+        for sample in data_samples:
+            if "gt_depth" not in sample:
+                raise ValueError(
+                    f"sample {sample.metainfo.get('token')!r} has no gt_depth: add the depth "
+                    "transform to the training pipeline, or set loss_depth_weight=0."
+                )
+        target = torch.stack([torch.as_tensor(s.gt_depth) for s in data_samples]).to(probs.device)
+        bins = depth_bins(target, target.shape[-1] // probs.shape[-1], self.depth_range)
+        return {"loss_depth": self.loss_depth_weight * depth_loss(probs, bins)}

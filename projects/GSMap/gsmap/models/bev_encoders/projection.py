@@ -1,0 +1,74 @@
+"""Projection of BEV pillars into the cameras."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsmap.structures.grid import BEVGrid
+
+_MIN_DEPTH_M = 1e-5
+
+
+class PillarProjection(NamedTuple):
+    """Where the pillar points of every BEV cell fall in every camera.
+
+    Attributes:
+        uv: Projected points, [0, 1] over the (padded) image; meaningless behind the camera. (B, V,
+            Q, Z, 2)
+        visible: Whether the camera sees any point of the cell's pillar. (B, V, Q)
+    """
+
+    uv: Tensor
+    visible: Tensor
+
+
+def pillar_points(
+    grid: BEVGrid, z_range: tuple[float, float], num_heights: int, device: torch.device
+) -> Tensor:
+    """Return points at the middle of ``num_heights`` equal slices over every cell centre.
+
+    Args:
+        grid: The BEV grid, H x W = Q cells.
+        z_range: Lowest and highest z in metres.
+        num_heights: Number of points per pillar, Z.
+        device: Device of the result.
+
+    Returns:
+        Homogeneous points (x, y, z, 1) in metres, cells row-major. (Q, Z, 4)
+    """
+    # Fractions first, then metres, in float32: kernel positions round, so the order of operations
+    # matters.
+    cols = torch.linspace(0.5, grid.width - 0.5, grid.width, device=device) / grid.width
+    rows = torch.linspace(0.5, grid.height - 0.5, grid.height, device=device) / grid.height
+    depth_m = z_range[1] - z_range[0]
+    heights = torch.linspace(0.5 / num_heights, 1 - 0.5 / num_heights, num_heights, device=device)
+    x = cols * grid.extent_m[0] + grid.x_range[0]
+    y = rows * grid.extent_m[1] + grid.y_range[0]
+    z = heights * depth_m + z_range[0]
+    y, x, z = torch.meshgrid(y, x, z, indexing="ij")
+    return torch.stack([x, y, z, torch.ones_like(x)], -1).flatten(0, 1)
+
+
+def project_pillars(
+    points: Tensor, img_from_frame: Tensor, img_shape: tuple[int, int]
+) -> PillarProjection:
+    """Project pillar points into every camera.
+
+    Args:
+        points: Homogeneous points in metres. (Q, Z, 4)
+        img_from_frame: Projection matrices to pixels of the padded image. (B, V, 4, 4)
+        img_shape: Rows and columns of the padded image.
+
+    Returns:
+        The projections and which cells each camera sees.
+    """
+    with torch.autocast(points.device.type, enabled=False):
+        projected = torch.matmul(
+            img_from_frame[:, :, None, None].float(), points[..., None].float()
+        )[..., 0]
+    depth = projected[..., 2]
+    uv = projected[..., :2] / depth.clamp(min=_MIN_DEPTH_M)[..., None]
+    uv = uv / uv.new_tensor([img_shape[1], img_shape[0]])
+    inside = (depth > _MIN_DEPTH_M) & ((uv > 0) & (uv < 1)).all(-1)
+    return PillarProjection(uv, inside.any(-1))

@@ -1,0 +1,159 @@
+"""The detector: cameras (and LiDAR) to BEV features to map elements."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from mmdet3d.models.detectors import Base3DDetector
+from mmdet3d.registry import MODELS
+from mmdet3d.structures import Det3DDataSample
+from torch import Tensor
+
+from gsmap.checkpoints.strict import adapt_state, neutral_keys
+from gsmap.models.layers.folded_backbone import FoldedBackbone
+
+
+@MODELS.register_module()
+class MapDetector(Base3DDetector):
+    """Image backbone and neck, BEV encoder, map head; with LiDAR, its encoder and their fusion.
+
+    Args:
+        map_head: Config of the head.
+        bev_encoder: Config of the cameras' BEV encoder; None for a model without cameras.
+        img_backbone: Config of the image backbone; None for a model without cameras.
+        img_neck: Config of the image neck, or None.
+        img_augment: Config of an augmentation of the normalised images in training (GridMask), or
+            None.
+        lidar_encoder: Config of the LiDAR's BEV encoder; None for a model without LiDAR.
+        bev_fuser: Config of the fusion of both, with cameras and LiDAR.
+        data_preprocessor: As in mmdet3d.
+        init_cfg: As in mmengine.
+
+    Raises:
+        ValueError: If there is neither camera nor LiDAR, or both but no fusion.
+    """
+
+    def __init__(
+        self,
+        map_head: dict,
+        bev_encoder: dict | None = None,
+        img_backbone: dict | None = None,
+        img_neck: dict | None = None,
+        img_augment: dict | None = None,
+        lidar_encoder: dict | None = None,
+        bev_fuser: dict | None = None,
+        data_preprocessor: dict | None = None,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(data_preprocessor=data_preprocessor, init_cfg=init_cfg)
+        self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
+        self.folded_backbone = FoldedBackbone()
+        self.img_neck = MODELS.build(img_neck) if img_neck else None
+        self.img_augment = MODELS.build(img_augment) if img_augment else None
+        if not (bev_encoder or lidar_encoder):
+            raise ValueError("a model needs a bev_encoder (cameras), a lidar_encoder or both.")
+        if bool(bev_fuser) != bool(bev_encoder and lidar_encoder):
+            raise ValueError("bev_fuser belongs to a model of cameras and LiDAR, and to no other.")
+        self.bev_encoder = MODELS.build(bev_encoder) if bev_encoder else None
+        self.lidar_encoder = MODELS.build(lidar_encoder) if lidar_encoder else None
+        self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
+        self.map_head = MODELS.build(map_head)
+
+    def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
+        """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
+        if self.img_backbone is None:
+            raise ValueError("the model has no img_backbone, so it takes no images.")
+        batch = len(imgs)
+        images = imgs.flatten(0, 1)
+        if self.training and self.img_augment is not None:
+            images = self.img_augment(images)
+        # channels last is what CPU and tensor-core convolutions are fastest with
+        images = images.contiguous(memory_format=torch.channels_last)
+        feats = self.folded_backbone(self.img_backbone, images)
+        if self.img_neck is not None:
+            feats = self.img_neck(feats)
+        return [feat.unflatten(0, (batch, -1)) for feat in feats]
+
+    def extract_feat(
+        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> dict[str, Tensor]:
+        """Return the BEV encoder's outputs: ``bev_feats`` (B, C, H, W) and what its losses need."""
+        outputs: dict[str, Tensor] = {}
+        if self.bev_encoder is not None:
+            imgs = batch_inputs["imgs"]
+            shape = {"batch_input_shape": tuple(imgs.shape[-2:])}
+            img_metas = [{**sample.metainfo, **shape} for sample in batch_data_samples]
+            outputs = self.bev_encoder(self.extract_img_feats(imgs), img_metas)
+        if self.lidar_encoder is not None:
+            feats = self.lidar_encoder(batch_inputs["voxels"], len(batch_data_samples))
+            if self.bev_fuser is not None:
+                feats = self.bev_fuser(outputs["bev_feats"], feats)
+            outputs = {**outputs, "bev_feats": feats}
+        return outputs
+
+    def loss(
+        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> dict[str, Tensor]:
+        """Return all losses of a batch.
+
+        Raises:
+            FloatingPointError: If a cost or a loss is not finite; the message names the samples.
+        """
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        losses = self.map_head.loss(outputs, batch_data_samples)
+        if self.bev_encoder is not None and hasattr(self.bev_encoder, "loss"):
+            losses.update(self.bev_encoder.loss(outputs, batch_data_samples))
+        self._check_finite(losses, batch_data_samples)
+        return losses
+
+    def predict(
+        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> list[Det3DDataSample]:
+        """Add ``pred_instances_3d``, as the head's ``predict`` returns them, to the samples."""
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        results = self.map_head.predict(outputs, batch_data_samples)
+        return self.add_pred_to_datasample(batch_data_samples, results)
+
+    def _forward(
+        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> dict[str, Tensor]:
+        """Return the head's raw outputs."""
+        return self.map_head(self.extract_feat(batch_inputs, batch_data_samples))
+
+    @staticmethod
+    def _check_finite(
+        losses: dict[str, Tensor], batch_data_samples: Sequence[Det3DDataSample]
+    ) -> None:
+        """Stop at a loss that is not finite (mmengine reads each loss anyway: no new sync)."""
+        finite = torch.isfinite(
+            torch.stack([loss.detach().float().mean() for loss in losses.values()])
+        ).tolist()
+        bad = [name for name, good in zip(losses, finite, strict=True) if not good]
+        if bad:
+            tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
+            raise FloatingPointError(
+                f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
+                "truth, then at the learning rate and at the loss scale of mixed precision."
+            )
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        """Accept upstream's names, then require every key to match.
+
+        Raises:
+            ValueError: If a key is missing, left over or of another shape.
+        """
+        adapt_state(
+            state_dict,
+            self.state_dict(prefix=prefix),
+            prefix,
+            neutral_keys(self, prefix),
+            lambda state: self._fit_state(state, prefix),
+        )
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def _fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Let the head fit a checkpoint's training-only parts to its own size."""
+        if hasattr(self.map_head, "fit_state"):
+            self.map_head.fit_state(state, f"{prefix}map_head.")

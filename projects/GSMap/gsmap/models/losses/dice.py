@@ -1,0 +1,146 @@
+"""MapVR's dice loss between softly rendered elements, and the same as a matching cost."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gsmap.ops.polyline_raster import soft_rasters
+
+
+@dataclass(frozen=True)
+class ElementRenderer:
+    """Renders map elements as MapVR does: lines or filled polygons, by their class.
+
+    Args:
+        size: Rows H and columns W of the masks.
+        line_softness: Softness of lines in square pixels.
+        polygon_softness: Softness of polygons in square pixels.
+        polygon_classes: Classes that are rendered as filled polygons.
+
+    Raises:
+        ValueError: If a softness is not > 0.
+    """
+
+    size: tuple[int, int]
+    line_softness: float = 2.0
+    polygon_softness: float = 4.0
+    polygon_classes: tuple[int, ...] = (1,)
+
+    def __post_init__(self) -> None:
+        softness = self.line_softness, self.polygon_softness
+        if min(softness) <= 0:
+            raise ValueError(f"softness must be > 0, got {softness[0]} and {softness[1]}.")
+
+    def is_polygon(self, labels: Tensor) -> Tensor:
+        """Return which elements are rendered as polygons. (n,) -> (n,)"""
+        return torch.isin(labels, labels.new_tensor(self.polygon_classes))
+
+    def render(self, points: Tensor, is_polygon: Tensor) -> Tensor:
+        """Render elements.
+
+        Args:
+            points: Vertices (x, y), normalised to [0, 1] over the raster. (n, P, 2)
+            is_polygon: Which elements are polygons. (n,)
+
+        Returns:
+            Masks in [0, 1]. (n, H, W)
+        """
+        height, width = self.size
+        pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
+        return soft_rasters(
+            pixels, height, width, is_polygon, self.line_softness, self.polygon_softness
+        )
+
+
+def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
+    """Dice loss of each pair of masks, 1 - (2 sum(p t) + 1) / (sum p + sum t + 1).
+
+    Args:
+        preds: Masks in [0, 1]. (n, H, W)
+        targets: Masks in [0, 1]. (n, H, W)
+
+    Returns:
+        Losses in [0, 1). (n,)
+    """
+    overlap = (preds * targets).sum((1, 2))
+    return 1 - (2 * overlap + 1) / (preds.sum((1, 2)) + targets.sum((1, 2)) + 1)
+
+
+def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
+    """Dice loss of every prediction with every target. (N, H, W), (K, H, W) -> (N, K)"""
+    preds, targets = preds.flatten(1), targets.flatten(1)
+    overlap = preds @ targets.T
+    return 1 - (2 * overlap + 1) / (preds.sum(-1)[:, None] + targets.sum(-1) + 1)
+
+
+def rendered_dice_cost(
+    pred_points: Tensor, gt_points: Tensor, gt_labels: Tensor, renderer: ElementRenderer
+) -> Tensor:
+    """Dice loss of every prediction with every ground truth, each rendered as the latter's class.
+
+    Args:
+        pred_points: Normalised points. (N, P, 2)
+        gt_points: Normalised points. (K, P, 2)
+        gt_labels: Class of each ground truth. (K,)
+        renderer: How elements become masks.
+
+    Returns:
+        Costs, without gradient. (N, K)
+    """
+    is_polygon = renderer.is_polygon(gt_labels)
+    with torch.no_grad(), torch.autocast(pred_points.device.type, enabled=False):
+        preds, gts = pred_points.float(), gt_points.float()
+        targets = renderer.render(gts, is_polygon)
+        lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
+        as_lines = pairwise_dice_loss(renderer.render(preds, lines), targets)
+        as_polygons = pairwise_dice_loss(renderer.render(preds, ~lines), targets)
+        return torch.where(is_polygon, as_polygons, as_lines)
+
+
+class RenderedDiceLoss(nn.Module):
+    """Dice loss between softly rendered predictions and ground truths (MapVR, section 4.3).
+
+    Args:
+        loss_weight: Weight of the loss.
+        size: Rows and columns of the rasters.
+        rendering: Further settings of `ElementRenderer`.
+    """
+
+    def __init__(
+        self, loss_weight: float = 15.0, size: tuple[int, int] = (256, 128), **rendering: Any
+    ) -> None:
+        super().__init__()
+        self.loss_weight = loss_weight
+        self.renderer = ElementRenderer(size, **rendering)
+
+    def forward(
+        self,
+        pred_points: Tensor,
+        gt_points: Tensor,
+        gt_labels: Tensor,
+        avg_factor: float | Tensor | None = None,
+    ) -> Tensor:
+        """Return the weighted loss of matched pairs.
+
+        Args:
+            pred_points: Normalised points. (n, P, 2)
+            gt_points: Normalised points, in their first order. (n, P, 2)
+            gt_labels: Class of each ground truth, which decides how both are rendered. (n,)
+            avg_factor: What the sum over pairs is divided by; n without it.
+
+        Returns:
+            The loss; 0 with a gradient of 0 if nothing is matched. ()
+        """
+        if not len(pred_points):
+            return pred_points.float().sum() * 0
+        with torch.autocast(pred_points.device.type, enabled=False):
+            dtype = torch.promote_types(pred_points.dtype, torch.float32)
+            is_polygon = self.renderer.is_polygon(gt_labels)
+            preds = self.renderer.render(pred_points.to(dtype), is_polygon)
+            with torch.no_grad():
+                targets = self.renderer.render(gt_points.to(dtype), is_polygon)
+            losses = dice_loss(preds, targets)
+        count = len(pred_points) if avg_factor is None else avg_factor
+        return self.loss_weight * losses.sum() / count

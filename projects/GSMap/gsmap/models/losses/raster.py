@@ -1,0 +1,72 @@
+"""GSMap's raster loss as a module (Eq. 12)."""
+
+from torch import Tensor, nn
+
+from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
+
+
+class RasterLoss(nn.Module):
+    """Raster loss of matched instances, averaged over them (GSMap Eq. 12).
+
+    Args:
+        loss_weight: Weight of the loss: the paper's lambda_r.
+        alpha: Share of the weighted L1 term: the paper's lambda_alpha. 0 and 1 switch a term off.
+        foreground_weight: Weight of a ground-truth pixel in the L1 term; 1 is plain L1.
+        normalize: What the sums over pixels are divided by: ``"both"``, ``"foreground"`` or
+            ``"pixels"`` (see `gsmap.ops.raster_loss.raster_loss`).
+        window_size: Side of SSIM's window in pixels, odd.
+        window_sigma: Standard deviation of SSIM's window in pixels.
+
+    Raises:
+        ValueError: If an argument is outside its range.
+    """
+
+    def __init__(
+        self,
+        loss_weight: float = 10.0,
+        alpha: float = 0.8,
+        foreground_weight: float = 1.0,
+        normalize: str = "both",
+        window_size: int = 11,
+        window_sigma: float = 1.5,
+    ) -> None:
+        super().__init__()
+        if not 0 <= alpha <= 1:
+            raise ValueError(f"alpha must lie in [0, 1], got {alpha}.")
+        if foreground_weight <= 0:
+            raise ValueError(f"foreground_weight must be > 0, got {foreground_weight}.")
+        if normalize not in NORMALIZATIONS:
+            raise ValueError(f"normalize must be one of {NORMALIZATIONS}, got {normalize!r}.")
+        if window_size < 1 or window_size % 2 == 0:
+            raise ValueError(f"window_size must be odd and >= 1, got {window_size}.")
+        if window_sigma <= 0:
+            raise ValueError(f"window_sigma must be > 0, got {window_sigma}.")
+        self.loss_weight, self.alpha = loss_weight, alpha
+        self.foreground_weight, self.normalize = foreground_weight, normalize
+        self.window_size, self.window_sigma = window_size, window_sigma
+
+    def forward(
+        self, preds: Tensor, targets: Tensor, avg_factor: float | Tensor | None = None
+    ) -> Tensor:
+        """Return the weighted loss.
+
+        Args:
+            preds: Rendered masks of the matched instances. (n, H, W)
+            targets: Masks of their ground truths. (n, H, W)
+            avg_factor: What the sum over instances is divided by; n without it.
+
+        Returns:
+            The loss; 0 with a gradient of 0 if nothing is matched. ()
+        """
+        if not len(preds):
+            return preds.float().sum() * 0
+        losses = raster_loss(
+            preds,
+            targets,
+            self.alpha,
+            self.foreground_weight,
+            self.normalize,
+            self.window_size,
+            self.window_sigma,
+        )
+        return self.loss_weight * losses.sum() / (len(preds) if avg_factor is None else avg_factor)

@@ -1,0 +1,120 @@
+"""Rasters of polylines and polygons: MapVR's soft ones, and the masks of ground truth."""
+
+import torch
+from torch import Tensor
+
+from gsmap.ops.backends import choose_backend
+from gsmap.ops.polyline_raster.cpu import draw_cpu, soft_rasters_cpu
+from gsmap.ops.polyline_raster.reference import draw_reference, soft_rasters_reference
+from gsmap.structures.grid import BEVGrid
+
+LANE_GAP_PX = 0.01  # how far MapVR moves a line's way back: both form a polygon
+
+
+def draw_polylines(
+    polylines: Tensor,
+    grid: BEVGrid,
+    width_m: float = 0.6,
+    filled: Tensor | None = None,
+    antialias: bool = True,
+    backend: str = "auto",
+) -> Tensor:
+    """Draw the masks of ground-truth polylines, all at once and on their own device.
+
+    Args:
+        polylines: Vertices in metres, in the frame of ``grid``. (K, P, 2)
+        grid: The raster.
+        width_m: Width of a line in metres. The default is close to what AP_raster draws (5 pixels
+            of 0.125 m).
+        filled: Which polylines are filled as polygons (to their vertices, without the line's
+            width), bool; all are drawn as lines without it. (K,)
+        antialias: Give a pixel the share that the shape covers of it, taken across the nearest
+            edge; otherwise 1 if its centre is covered and 0 if not.
+        backend: ``"reference"``, ``"cpu"`` (fused), or ``"auto"``.
+
+    Returns:
+        Masks in [0, 1], without gradient, at least float32. (K, H, W)
+
+    Raises:
+        ValueError: If a shape is wrong, ``width_m`` is not positive or ``backend`` does not serve.
+    """
+    if polylines.ndim != 3 or polylines.shape[-1] != 2 or polylines.shape[1] < 2:
+        raise ValueError(
+            f"polylines must have shape (K, P, 2) with P >= 2, got {tuple(polylines.shape)}."
+        )
+    if not width_m > 0:
+        raise ValueError(f"width_m must be > 0, got {width_m}.")
+    flags = _flags(filled, "filled", polylines)
+    polylines = polylines.detach().to(torch.promote_types(polylines.dtype, torch.float32))
+    dx, dy = grid.pixel_size_m
+    half_width_m, pixel_m = width_m / 2, (dx * dy) ** 0.5
+    with torch.autocast(polylines.device.type, enabled=False):
+        if choose_backend(backend, polylines, ("cpu",)) == "cpu":
+            origin = grid.x_range[0], grid.y_range[0]
+            size = grid.height, grid.width
+            return draw_cpu(
+                polylines, flags, *origin, dx, dy, *size, half_width_m, pixel_m, antialias
+            )
+        pixels = grid.pixel_centres(polylines.device, polylines.dtype)
+        return draw_reference(polylines, flags, pixels, half_width_m, pixel_m, antialias)
+
+
+def soft_rasters(
+    vertices: Tensor,
+    height: int,
+    width: int,
+    is_polygon: Tensor | None = None,
+    line_softness: float = 2.0,
+    polygon_softness: float = 4.0,
+    backend: str = "auto",
+) -> Tensor:
+    r"""Render lines as :math:`\exp(-d^2 / \tau)`, polygons as :math:`\sigma(\pm d^2 / \tau)`.
+
+    d is a pixel's distance to the nearest edge; the sign is + inside (MapVR Eqs. 2-3). A line is
+    rendered as the thin closed polygon of itself and its way back, a polygon is closed implicitly.
+
+    Args:
+        vertices: In pixels (x = column, y = row); pixel (row, col) is sampled at (col, row).
+            (n, V, 2)
+        height: Rows H.
+        width: Columns W.
+        is_polygon: Which are filled polygons, bool; all are lines without it. (n,)
+        line_softness: :math:`\tau` of lines in square pixels.
+        polygon_softness: :math:`\tau` of polygons in square pixels.
+        backend: ``"reference"``, ``"cpu"`` (fused), or ``"auto"``.
+
+    Returns:
+        Masks in [0, 1], differentiable in ``vertices``. (n, H, W)
+
+    Raises:
+        ValueError: If a shape is wrong, a softness is not positive or ``backend`` does not serve.
+    """
+    if vertices.ndim != 3 or vertices.shape[-1] != 2 or not vertices.shape[1]:
+        raise ValueError(
+            f"vertices must have shape (n, V, 2) with V >= 1, got {tuple(vertices.shape)}."
+        )
+    if not (line_softness > 0 and polygon_softness > 0):
+        raise ValueError(f"softness must be > 0, got {line_softness} and {polygon_softness}.")
+    flags = _flags(is_polygon, "is_polygon", vertices)
+    with torch.autocast(vertices.device.type, enabled=False):
+        vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
+        # Differs from MapVR Eqs. (2-3): d is squared, as in MapVR's released rasterizer.
+        back = vertices.flip(1) + LANE_GAP_PX
+        stay = vertices[:, -1:].expand_as(vertices)  # a polygon's ring is padded by its last corner
+        rings = torch.cat([vertices, torch.where(flags[:, None, None], stay, back)], 1)
+        if choose_backend(backend, rings, ("cpu",)) == "cpu":
+            return soft_rasters_cpu(rings, flags, height, width, line_softness, polygon_softness)
+        softness = line_softness, polygon_softness
+        return soft_rasters_reference(rings, flags, height, width, softness)
+
+
+def _flags(flags: Tensor | None, name: str, elements: Tensor) -> Tensor:
+    """Check a flag per element, or make them all false. (n,)"""
+    if flags is None:
+        return torch.zeros(len(elements), dtype=torch.bool, device=elements.device)
+    if flags.shape != elements.shape[:1] or flags.dtype != torch.bool:
+        raise ValueError(
+            f"{name} must be bool of shape {(len(elements),)}, one flag per element, "
+            f"got {flags.dtype} of shape {tuple(flags.shape)}."
+        )
+    return flags

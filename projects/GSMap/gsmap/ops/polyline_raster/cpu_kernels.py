@@ -1,0 +1,224 @@
+# numba infers the types of its kernels:
+# mypy: disable-error-code="no-untyped-def"
+r"""Fused CPU kernels (numba): distances to polylines, soft rasters and ground-truth masks.
+
+One thread works on one element at a time. Edge by edge and row by row, only the pixels within a
+reach of the edge are visited: beyond it a soft raster differs from 0 or 1 by less than 1e-8, and a
+line's mask is empty. Two buffers of one mask per thread hold the smallest squared distance and the
+edge it belongs to; no tensor per edge exists. The backward pass rebuilds both and scatters each
+pixel's gradient to the two ends of its nearest edge, in float64 and in a fixed order, so two runs
+give the same bits.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from gsmap.ops._numba import FASTMATH
+
+FAR = np.float32(np.inf)
+
+
+@njit(inline="always")
+def _columns(low, high, origin, step, width):
+    """Return the first and one past the last of the columns whose centres lie in [low, high]."""
+    first, last = (low - origin) / step - 0.5, (high - origin) / step - 0.5
+    return math.ceil(min(max(first, 0.0), width)), math.floor(max(min(last, width - 1.0), -1.0)) + 1
+
+
+@njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
+def _visit_edge(start, end, index, frame, reach, eps, steps, distances, owners):
+    """Lower the distances (H, W) by one edge's, and note whose they are."""
+    x_min, y_min, step_x, step_y = frame
+    height, width = distances.shape
+    x0, y0 = float(start[0]), float(start[1])
+    edge_x, edge_y = float(end[0]) - x0, float(end[1]) - y0
+    length = math.sqrt(edge_x * edge_x + edge_y * edge_y)
+    length2 = max(edge_x * edge_x + edge_y * edge_y + eps, 1e-38)
+    along_x, along_y = np.float32(edge_x / length2), np.float32(edge_y / length2)
+    ex, ey, step = np.float32(edge_x), np.float32(edge_y), np.float32(step_x)
+    low_y, high_y = min(y0, y0 + edge_y) - reach, max(y0, y0 + edge_y) + reach
+    low_x, high_x = min(x0, x0 + edge_x) - reach, max(x0, x0 + edge_x) + reach
+    top, bottom = _columns(low_y, high_y, y_min, step_y, height)
+    for row in range(top, bottom):
+        offset_y = y_min + (row + 0.5) * step_y - y0
+        left_x, right_x = low_x, high_x
+        if abs(edge_y) > 1e-6 * length:  # the strip along the edge, where it crosses this row
+            crossing = x0 + offset_y * edge_x / edge_y
+            half = reach * length / abs(edge_y)
+            left_x, right_x = max(left_x, crossing - half), min(right_x, crossing + half)
+        left, right = _columns(left_x, right_x, x_min, step_x, width)
+        nearest, owner = distances[row, left : max(left, right)], owners[row, left:right]
+        first, fy = np.float32(x_min + (left + 0.5) * step_x - x0), np.float32(offset_y)
+        for k in range(len(nearest)):
+            fx = first + steps[k] * step
+            t = min(max(fx * along_x + fy * along_y, np.float32(0)), np.float32(1))
+            dx, dy = fx - t * ex, fy - t * ey
+            squared = dx * dx + dy * dy
+            closer = squared < nearest[k]
+            nearest[k] = squared if closer else nearest[k]
+            owner[k] = index if closer else owner[k]
+
+
+@njit(nogil=True, cache=True)
+def _nearest_edges(ring, edges, frame, reach, eps, steps, distances, owners):
+    """Fill the squared distances (H, W), infinite beyond the reach, and the nearest edges."""
+    distances[:] = FAR
+    owners[:] = -1
+    for i in range(edges):
+        j = i + 1 if i + 1 < len(ring) else 0
+        _visit_edge(ring[i], ring[j], np.int32(i), frame, reach, eps, steps, distances, owners)
+
+
+@njit(nogil=True, cache=True)
+def _fill_inside(ring, frame, inside):
+    """Set pixels (H, W) to 1 inside the closed ring by the even-odd rule, and to 0 outside."""
+    x_min, y_min, step_x, step_y = frame
+    inside[:] = 0
+    for i in range(len(ring)):
+        j = i + 1 if i + 1 < len(ring) else 0
+        x0, y0, x1, y1 = float(ring[i, 0]), float(ring[i, 1]), float(ring[j, 0]), float(ring[j, 1])
+        if y0 == y1:
+            continue
+        top, bottom = _columns(min(y0, y1), max(y0, y1), y_min, step_y, len(inside))
+        for row in range(top, bottom):
+            y = y_min + (row + 0.5) * step_y
+            if (y0 > y) == (y1 > y):
+                continue
+            crossing = (x1 - x0) * (y - y0) / (y1 - y0) + x0
+            position = (crossing - x_min) / step_x - 0.5
+            for col in range(math.ceil(min(max(position, 0.0), inside.shape[1]))):
+                inside[row, col] ^= 1
+
+
+@njit(nogil=True, cache=True)
+def _buffers(shape):
+    """Return a thread's scratch: column numbers, distances, owners, inside."""
+    steps = np.arange(shape[1]).astype(np.float32)
+    return steps, np.empty(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.uint8)
+
+
+@njit(nogil=True, cache=True)
+def soft_forward(rings, polygons, frame, reach, eps, softness, masks, first, last):
+    """Render exp(-d^2 / s), or a sigmoid of +-d^2 / s for polygons; NaN for a vertex not finite.
+
+    Args:
+        rings: Closed rings in the unit of ``frame``, float32. (N, V, 2)
+        polygons: Which are filled polygons. (N,)
+        frame: Smallest x and y of the raster and the pixel's size along x and y.
+        reach: Distance beyond which a mask is 0 or 1, for lines and polygons.
+        eps: Added to an edge's squared length.
+        softness: s for lines and polygons.
+        masks: Written to, float32. (N, H, W)
+        first: First element.
+        last: One past the last element.
+    """
+    steps, distances, owners, inside = _buffers(masks.shape[1:])
+    for n in range(first, last):
+        ring, kind = rings[n], int(polygons[n])
+        if not np.isfinite(ring).all():
+            masks[n] = np.nan
+            continue
+        _nearest_edges(ring, len(ring), frame, reach[kind], eps, steps, distances, owners)
+        if kind:
+            _fill_inside(ring, frame, inside)
+        for row in range(masks.shape[1]):
+            for col in range(masks.shape[2]):
+                fade = 0.0
+                if owners[row, col] >= 0:
+                    fade = math.exp(-distances[row, col] / softness[kind])
+                if kind:
+                    fade = (1.0 if inside[row, col] else fade) / (1 + fade)
+                masks[n, row, col] = fade
+
+
+@njit(nogil=True, cache=True)
+def _scatter(ring, owner, x, y, eps, weight, out):
+    """Add weight * d(d^2) to the gradient of the two ends of a pixel's nearest edge."""
+    following = owner + 1 if owner + 1 < len(ring) else 0
+    x0, y0 = float(ring[owner, 0]), float(ring[owner, 1])
+    ex, ey = float(ring[following, 0]) - x0, float(ring[following, 1]) - y0
+    fx, fy = x - x0, y - y0
+    length2 = ex * ex + ey * ey + eps
+    along = (fx * ex + fy * ey) / length2
+    t = min(max(along, 0.0), 1.0)
+    dx, dy = fx - t * ex, fy - t * ey
+    # eps moves t off the nearest point of an edge, so t has a gradient of its own between the ends
+    slip = 2 * t * eps / length2 if 0.0 <= along <= 1.0 else 0.0
+    end_x, end_y = -2 * t * dx - slip * (fx - 2 * t * ex), -2 * t * dy - slip * (fy - 2 * t * ey)
+    out[following, 0] += weight * end_x
+    out[following, 1] += weight * end_y
+    out[owner, 0] += weight * (slip * ex - 2 * dx - end_x)
+    out[owner, 1] += weight * (slip * ey - 2 * dy - end_y)
+
+
+@njit(nogil=True, cache=True)
+def soft_backward(rings, polygons, frame, reach, eps, softness, grads, out, first, last):
+    """Write to ``out`` (N, V, 2), float64, the gradient in the rings of ``grads`` (N, H, W).
+
+    The other arguments are those of :func:`soft_forward`.
+    """
+    steps, distances, owners, inside = _buffers(grads.shape[1:])
+    x_min, y_min, step_x, step_y = frame
+    for n in range(first, last):
+        ring, kind = rings[n], int(polygons[n])
+        out[n] = 0
+        if not np.isfinite(ring).all():
+            out[n] = np.nan
+            continue
+        _nearest_edges(ring, len(ring), frame, reach[kind], eps, steps, distances, owners)
+        if kind:
+            _fill_inside(ring, frame, inside)
+        for row in range(grads.shape[1]):
+            for col in range(grads.shape[2]):
+                if owners[row, col] < 0 or grads[n, row, col] == 0:
+                    continue
+                fade = math.exp(-distances[row, col] / softness[kind])
+                slope = -fade
+                if kind:
+                    slope = (1.0 if inside[row, col] else -1.0) * fade / (1 + fade) ** 2
+                weight = grads[n, row, col] * slope / softness[kind]
+                x, y = x_min + (col + 0.5) * step_x, y_min + (row + 0.5) * step_y
+                _scatter(ring, owners[row, col], x, y, eps, weight, out[n])
+
+
+@njit(nogil=True, cache=True)
+def draw(polylines, filled, frame, half_width, pixel, antialias, masks, first, last):
+    """Draw ground-truth masks: lines of a width, or filled polygons.
+
+    Args:
+        polylines: Vertices in the unit of ``frame``, float32. (K, P, 2)
+        filled: Which are filled as polygons. (K,)
+        frame: As in :func:`soft_forward`.
+        half_width: Half a line's width.
+        pixel: Side of the square that is as large as a pixel.
+        antialias: Whether a pixel takes the share that is covered, or 0 or 1.
+        masks: Written to, float32. (K, H, W)
+        first: First element.
+        last: One past the last element.
+    """
+    steps, distances, owners, inside = _buffers(masks.shape[1:])
+    for n in range(first, last):
+        ring, kind = polylines[n], filled[n]
+        if not np.isfinite(ring).all():
+            masks[n] = np.nan
+            continue
+        reach = pixel if kind else half_width + pixel
+        edges = len(ring) if kind else len(ring) - 1
+        _nearest_edges(ring, edges, frame, reach, 0.0, steps, distances, owners)
+        if kind:
+            _fill_inside(ring, frame, inside)
+        for row in range(masks.shape[1]):
+            for col in range(masks.shape[2]):
+                distance = math.sqrt(distances[row, col])
+                if kind:
+                    signed = distance if inside[row, col] else -distance
+                    share = min(max(0.5 + signed / pixel, 0.0), 1.0)
+                    share = share if antialias else float(inside[row, col])
+                elif antialias:
+                    near = min((distance + half_width) / pixel, 0.5)
+                    share = max(near - max((distance - half_width) / pixel, -0.5), 0.0)
+                else:
+                    share = 1.0 if distance <= half_width else 0.0
+                masks[n, row, col] = share

@@ -1,0 +1,81 @@
+"""The sums behind the raster loss in plain torch: the definition of right."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # the usual constants for values in [0, 1]
+SEEN = 1e-3  # a window whose weighted mean is below sees a mask as empty
+
+
+def gaussian_window(size: int, sigma: float, like: Tensor) -> Tensor:
+    """Return a 1D Gaussian window that sums to one. (size,)"""
+    offsets = torch.arange(size, device=like.device, dtype=like.dtype) - (size - 1) / 2
+    window = torch.exp(-0.5 * (offsets / sigma).square())
+    return window / window.sum()
+
+
+def _blur(images: Tensor, window: Tensor) -> Tensor:
+    """Filter with a separable window, zeros outside the image. (n, H, W)"""
+    pad = len(window) // 2
+    columns = F.conv2d(images[:, None], window.view(1, 1, 1, -1), padding=(0, pad))
+    return F.conv2d(columns, window.view(1, 1, -1, 1), padding=(pad, 0))[:, 0]
+
+
+def dssim_map(preds: Tensor, targets: Tensor, size: int = 11, sigma: float = 1.5) -> Tensor:
+    """Structural dissimilarity 1 - SSIM at every pixel.
+
+    Args:
+        preds: Masks in [0, 1]. (n, H, W)
+        targets: Masks in [0, 1]. (n, H, W)
+        size: Side of the Gaussian window in pixels, odd.
+        sigma: Standard deviation of the window in pixels.
+
+    Returns:
+        Dissimilarity in [0, 2]; 0 where both windows are empty. (n, H, W)
+    """
+    return _dssim(preds, targets, gaussian_window(size, sigma, preds))[0]
+
+
+def _dssim(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return 1 - SSIM, and the means of both masks that the window sees. 3 x (n, H, W)"""
+    mean_p, mean_t = _blur(preds, window), _blur(targets, window)
+    var_p = _blur(preds.square(), window) - mean_p.square()
+    var_t = _blur(targets.square(), window) - mean_t.square()
+    covariance = _blur(preds * targets, window) - mean_p * mean_t
+    numerator = (2 * mean_p * mean_t + SSIM_C1) * (2 * covariance + SSIM_C2)
+    denominator = (mean_p.square() + mean_t.square() + SSIM_C1) * (var_p + var_t + SSIM_C2)
+    return 1 - numerator / denominator, mean_p, mean_t
+
+
+def raster_loss_sums_reference(
+    preds: Tensor, targets: Tensor, window_size: int, window_sigma: float, weight: float
+) -> Tensor:
+    """Sum what Eq. 12 is made of over each instance's pixels.
+
+    Args:
+        preds: Masks in [0, 1]. (n, H, W)
+        targets: Masks in [0, 1]. (n, H, W)
+        window_size: Side of SSIM's window in pixels, odd.
+        window_sigma: Standard deviation of SSIM's window in pixels.
+        weight: Weight of a pixel of the ground truth; w = 1 + (weight - 1) t.
+
+    Returns:
+        sum w |p - t|, sum w p, sum (1 - SSIM), sum w t, sum (w - 1), and the number of pixels whose
+        window sees the target, and either mask. (n, 7)
+    """
+    excess = (weight - 1) * targets
+    weights = 1 + excess
+    window = gaussian_window(window_size, window_sigma, preds)
+    dissimilarity, mean_p, mean_t = _dssim(preds, targets, window)
+    reach = F.max_pool2d(targets[:, None], window_size, 1, window_size // 2)[:, 0]
+    sums = (
+        weights * (preds - targets).abs(),
+        weights * preds,
+        dissimilarity,
+        weights * targets,
+        excess,
+        (reach > 0).to(preds.dtype),
+        (torch.maximum(mean_p, mean_t) > SEEN).to(preds.dtype),
+    )
+    return torch.stack([values.sum((1, 2)) for values in sums], -1)

@@ -1,0 +1,318 @@
+"""Generates a MiniCity data set in the nuScenes format, whole or not at all."""
+
+import fcntl
+import json
+import logging
+import os
+import pickle
+import shutil
+import signal
+import threading
+from collections import defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+from tqdm import tqdm
+
+from gsmap.utils.parallel import spared_from_signals
+from minicity.config import (
+    TRAIN_LOCATIONS,
+    VAL_LOCATIONS,
+    VERSION,
+    MiniCityConfig,
+    make_token,
+)
+from minicity.map_expansion import write_map
+from minicity.rig import CAMERAS, ego_from_lidar, quaternion
+from minicity.scene import Records, SceneMaker, SceneTask
+from minicity.town import Town, make_town
+
+MARKER = "minicity.json"
+TABLES = [
+    "category",
+    "attribute",
+    "visibility",
+    "instance",
+    "sensor",
+    "calibrated_sensor",
+    "ego_pose",
+    "log",
+    "scene",
+    "sample",
+    "sample_data",
+    "sample_annotation",
+    "map",
+]
+CATEGORIES = ("vehicle.car", "vehicle.truck", "vehicle.bus.rigid", "human.pedestrian.adult")
+ATTRIBUTES = ("vehicle.moving", "vehicle.parked", "pedestrian.standing")
+LOGGER = logging.getLogger(__name__)
+
+
+def plan_scenes(config: MiniCityConfig) -> list[SceneTask]:
+    """Name the scenes as the official split does and share them out among the towns."""
+    from nuscenes.utils import splits
+
+    tasks: list[SceneTask] = []
+    for names, count, locations in (
+        (splits.train, config.num_train, TRAIN_LOCATIONS),
+        (splits.val, config.num_val, VAL_LOCATIONS),
+    ):
+        for i, name in enumerate(names[:count]):
+            location = locations[i % len(locations)]
+            tasks.append(SceneTask(name, len(tasks), location, i // len(locations)))
+    return tasks
+
+
+def generate(
+    root: str | Path,
+    scenes: int,
+    seed: int = 0,
+    image_size: tuple[int, int] = (800, 450),
+    samples_per_scene: int = 10,
+    sweeps_per_sample: int = 2,
+    val_scenes: int | None = None,
+    workers: int | None = None,
+    progress: bool = True,
+) -> bool:
+    """Generate a MiniCity data set.
+
+    The same arguments give the same bytes whatever the number of workers. Files are written beside
+    ``root`` and moved there when all are complete.
+
+    Args:
+        root: Folder to make. If it holds the same data set already, nothing is done.
+        scenes: Number of scenes, training and validation together.
+        seed: Seed of every random choice.
+        image_size: Width and height of the pictures in pixels.
+        samples_per_scene: Key frames per scene.
+        sweeps_per_sample: LiDAR sweeps between two key frames.
+        val_scenes: Validation scenes among ``scenes``; None takes a fifth.
+        workers: Processes; None takes one per core, 0 works in this process.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Whether anything was generated: False if it was there already.
+
+    Raises:
+        ValueError: If an argument is out of range or ``root`` holds anything else.
+        RuntimeError: If another process is generating into ``root``.
+    """
+    config = MiniCityConfig(
+        scenes, seed, *image_size, samples_per_scene, sweeps_per_sample, val_scenes
+    )
+    if workers is not None and workers < 0:
+        raise ValueError(f"workers must be >= 0, got {workers}.")
+    root = Path(os.path.abspath(root))
+    if is_complete(root, config):
+        LOGGER.info("%s is complete already: nothing to do.", root)
+        return False
+    with _partial_folder(root) as partial:
+        _fill(partial, config, workers, progress)
+        (partial / MARKER).write_text(json.dumps(config.as_dict(), indent=2) + "\n")
+        os.replace(partial, root)
+    return True
+
+
+def is_complete(root: Path, config: MiniCityConfig) -> bool:
+    """Whether ``root`` holds exactly this data set.
+
+    Raises:
+        ValueError: If it holds something else.
+    """
+    marker = root / MARKER
+    if marker.is_file():
+        found = json.loads(marker.read_text())
+        wanted = config.as_dict()
+        if found == wanted:
+            return True
+        keys = sorted(k for k in {*found, *wanted} if found.get(k) != wanted.get(k))
+        differences = ", ".join(f"{k} is {found.get(k)}, asked for {wanted.get(k)}" for k in keys)
+        raise ValueError(
+            f"{root} holds another MiniCity data set ({differences}): "
+            "choose another --root or remove that folder."
+        )
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise ValueError(
+            f"{root} exists and is not a complete MiniCity data set: "
+            "choose another --root or remove it."
+        )
+    return False
+
+
+@contextmanager
+def _partial_folder(root: Path) -> Iterator[Path]:
+    """A locked folder beside ``root`` to write into, gone afterwards unless it was renamed."""
+    root.parent.mkdir(parents=True, exist_ok=True)
+    partial = root.with_name(f"{root.name}.partial")
+    partial.mkdir(exist_ok=True)
+    handle = os.open(partial, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RuntimeError(
+                f"another process is generating into {partial}: wait for it to end."
+            ) from error
+        try:
+            for leftover in partial.iterdir():
+                shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+            yield partial
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    finally:
+        os.close(handle)
+
+
+def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: bool) -> None:
+    """Write every file of a data set but its marker."""
+    for channel in (*(m.channel for m in CAMERAS), "LIDAR_TOP"):
+        (root / "samples" / channel).mkdir(parents=True)
+    (root / "sweeps" / "LIDAR_TOP").mkdir(parents=True)
+    (root / "can_bus").mkdir()
+    tasks = plan_scenes(config)
+    towns = {
+        name: make_town(name, config.seed, sum(t.location == name for t in tasks))
+        for name in (*TRAIN_LOCATIONS, *VAL_LOCATIONS)
+    }
+    masks = {name: write_map(root, town, config.seed) for name, town in towns.items()}
+    by_scene = _run_scenes(root, config, tasks, towns, workers, progress)
+    tables: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for task in tasks:
+        for table, rows in by_scene[task.name].items():
+            tables[table] += rows
+    _add_fixed_tables(tables, config)
+    places = {log["token"]: log["location"] for log in tables["log"]}
+    for name, filename in masks.items():
+        tables["map"].append(
+            {
+                "token": make_token(config.seed, "map", name),
+                "category": "semantic_prior",
+                "filename": filename,
+                "log_tokens": [token for token, place in places.items() if place == name],
+            }
+        )
+    folder = root / VERSION
+    folder.mkdir()
+    for table in TABLES:
+        (folder / f"{table}.json").write_text(json.dumps(tables[table]))
+
+
+def _add_fixed_tables(tables: dict[str, list[dict[str, Any]]], config: MiniCityConfig) -> None:
+    """The tables that are the same for all scenes."""
+    for name in CATEGORIES:
+        tables["category"].append(
+            {"token": make_token("category", name), "name": name, "description": ""}
+        )
+    for name in ATTRIBUTES:
+        tables["attribute"].append(
+            {"token": make_token("attribute", name), "name": name, "description": ""}
+        )
+    for level, share in enumerate(("0-40", "40-60", "60-80", "80-100"), start=1):
+        tables["visibility"].append({"token": str(level), "level": f"v{share}", "description": ""})
+    lidar_pose = ego_from_lidar()
+    sensors: list[tuple[str, str, Any, list]] = [("LIDAR_TOP", "lidar", lidar_pose, [])]
+    for mount in CAMERAS:
+        intrinsics = mount.intrinsics(config.image_width, config.image_height).tolist()
+        sensors.append((mount.channel, "camera", mount.ego_from_cam, intrinsics))
+    for channel, modality, pose, intrinsics in sensors:
+        sensor = make_token("sensor", channel)
+        tables["sensor"].append({"token": sensor, "channel": channel, "modality": modality})
+        tables["calibrated_sensor"].append(
+            {
+                "token": make_token(config.seed, "calibration", channel),
+                "sensor_token": sensor,
+                "translation": pose[:3, 3].tolist(),
+                "rotation": quaternion(pose),
+                "camera_intrinsic": intrinsics,
+            }
+        )
+
+
+_WORKER: dict[str, Any] = {}
+
+
+def _start_worker(root: Path, config: MiniCityConfig, towns: Path, lifeline: Connection) -> None:
+    """Prepare a worker, which ends as soon as its parent lets go of the lifeline, even by dying."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and ends the pool
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    cv2.setNumThreads(1)
+    _WORKER.update(root=root, config=config, towns=pickle.loads(towns.read_bytes()))
+
+    def end_with_parent() -> None:
+        lifeline.poll(None)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def _make_scene(task: SceneTask) -> Records:
+    return SceneMaker(
+        _WORKER["config"], task, _WORKER["towns"][task.location], _WORKER["root"]
+    ).make()
+
+
+def _run_scenes(
+    root: Path,
+    config: MiniCityConfig,
+    tasks: list[SceneTask],
+    towns: dict[str, Town],
+    workers: int | None,
+    progress: bool,
+) -> dict[str, Records]:
+    """Make all scenes, each in one process, and return their records by scene name."""
+    workers = min(len(os.sched_getaffinity(0)) if workers is None else workers, len(tasks))
+    per_scene = len(CAMERAS) * config.samples_per_scene
+    done: dict[str, Records] = {}
+    with tqdm(
+        total=per_scene * len(tasks), unit="img", desc="MiniCity", disable=not progress
+    ) as bar:
+        if workers == 0:
+            for task in tasks:
+                maker = SceneMaker(config, task, towns[task.location], root)
+                done[task.name] = maker.make()
+                bar.update(per_scene)
+            return done
+        with TemporaryDirectory() as folder:
+            # Through a file: what is handed to a new process goes through a pipe, and if it is long
+            # and the process dies before it reads it, this one would wait for ever.
+            saved = Path(folder, "towns.pickle")
+            saved.write_bytes(pickle.dumps(towns))
+            for name, records in _make_in_workers(root, config, tasks, saved, workers):
+                done[name] = records
+                bar.update(per_scene)
+    return done
+
+
+def _make_in_workers(
+    root: Path, config: MiniCityConfig, tasks: list[SceneTask], towns: Path, workers: int
+) -> Iterator[tuple[str, Records]]:
+    """Make all scenes in worker processes; yield their names and records as they are done."""
+    context = get_context("spawn")
+    lifeline, held = context.Pipe(duplex=False)
+    arguments = (root, config, towns, lifeline)
+    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=arguments)
+    try:
+        with spared_from_signals():
+            futures = {pool.submit(_make_scene, task): task.name for task in tasks}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BrokenProcessPool as error:
+        raise RuntimeError(
+            "a worker process died: for want of memory (use fewer workers), or because the program "
+            "that called generate() cannot be imported anew (put the call under "
+            "if __name__ == '__main__')."
+        ) from error
+    except BaseException:
+        held.close()  # workers stop in the middle of their scenes
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        held.close()

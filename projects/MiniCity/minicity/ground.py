@@ -1,0 +1,183 @@
+"""The ground in a camera's image, filtered so that thin paint survives at a distance.
+
+Far away a pixel covers much more ground along the line of sight than across it. A plain mip-map
+would blur a lane line of 15 cm away, so image rows are grouped into bands, each sampled several
+times per row from the level that fits its width.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from minicity.camera import Camera
+from minicity.curves import Array
+from minicity.scene_map import HeightGrid
+from minicity.terrain import Footprints, see_terrain, terrain_footprints
+from minicity.texture import GroundTexture, Image
+
+MAX_SAMPLES = 8
+HORIZON_EPS = 1e-4
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Band:
+    """Image rows that share a filter.
+
+    Attributes:
+        start: First row.
+        stop: Row after the last.
+        level: Texture level to read.
+        samples: Samples per row.
+    """
+
+    start: int
+    stop: int
+    level: int
+    samples: int
+
+    def sample_rows(self) -> Array:
+        """Image rows at which the band is sampled. ((stop - start) * samples,)"""
+        count = (self.stop - self.start) * self.samples
+        return self.start - 0.5 + (np.arange(count) + 0.5) / self.samples
+
+
+def ground_from_pixel(camera: Camera, ground_z_m: float) -> Array:
+    """Homography from pixels to world x, y on the plane z = ``ground_z_m``. (3, 3)
+
+    Its third row gives the vertical part of the viewing direction: negative below the horizon.
+    """
+    ray, center = camera.world_from_pixel, camera.center
+    height = center[2] - ground_z_m
+    return np.stack(
+        [center[0] * ray[2] - height * ray[0], center[1] * ray[2] - height * ray[1], ray[2]]
+    )
+
+
+def plane_footprints(camera: Camera, homography: Array) -> Footprints:
+    """Footprints on flat ground, at the picture's middle column."""
+    rows = np.arange(camera.height + 1)
+    column = np.full(rows.shape, (camera.width - 1) / 2)
+    center = homography @ np.stack([column, rows - 0.5, np.ones(rows.shape)])
+    beside = homography @ np.stack([column + 1, rows - 0.5, np.ones(rows.shape)])
+    hit = center[:2] / np.minimum(center[2], -4 * HORIZON_EPS)
+    along = np.linalg.norm(np.diff(hit, axis=1), axis=0)
+    across = np.linalg.norm(hit - beside[:2] / np.minimum(beside[2], -4 * HORIZON_EPS), axis=0)
+    distance = np.linalg.norm(hit - camera.center[:2, None], axis=0)
+    # A tilted camera sees the horizon at another row on each side: one end below it is enough.
+    ends = homography[2, 0] * np.array([0, camera.width - 1]) + homography[2, 2]
+    visible = (ends + homography[2, 1] * rows[:-1, None]).min(1) < -HORIZON_EPS
+    return Footprints(along, across[:-1], distance[:-1], visible)
+
+
+def make_bands(footprints: Footprints, resolution_m: float, num_levels: int) -> list[Band]:
+    """Group rows that need the same texture level and the same number of samples.
+
+    Args:
+        footprints: What the picture's rows see.
+        resolution_m: Pixel edge of texture level 0.
+        num_levels: Number of texture levels.
+
+    Returns:
+        Bands from the top of the picture to its bottom.
+    """
+    wanted = np.maximum(footprints.across, footprints.along / MAX_SAMPLES)
+    fit = np.floor(np.log2(np.maximum(wanted / resolution_m, 1.0) * 1.2))
+    levels = np.clip(fit, 0, num_levels - 1).astype(int)
+    needed = np.clip(np.ceil(footprints.along / (resolution_m * 2.0**levels)), 1, MAX_SAMPLES)
+    samples = (2 ** np.ceil(np.log2(needed))).astype(int)
+    bands: list[Band] = []
+    for row in np.flatnonzero(footprints.visible).tolist():
+        level, count = int(levels[row]), int(samples[row])
+        last = bands[-1] if bands else None
+        if last and last.stop == row and (last.level, last.samples) == (level, count):
+            bands[-1] = Band(last.start, row + 1, level, count)
+        else:
+            bands.append(Band(row, row + 1, level, count))
+    return bands
+
+
+def _texture_from_world(texture: GroundTexture, level: int) -> Array:
+    scale = 1.0 / (texture.resolution_m * 2**level)
+    x, y = -texture.origin * scale - 0.5
+    return np.array([[scale, 0, x], [0, scale, y], [0, 0, 1.0]])
+
+
+def render_flat_ground(
+    camera: Camera, texture: GroundTexture, background: Image, border: Color, ground_z_m: float
+) -> tuple[Image, Array]:
+    """Draw flat ground into a picture of the sky.
+
+    Args:
+        camera: Viewing camera, above the ground.
+        texture: The ground from above.
+        background: What is seen where no ground is. (H, W, 3)
+        border: Colour of ground outside the texture, BGR.
+        ground_z_m: Height of the ground.
+
+    Returns:
+        The picture (H, W, 3) and the distance of the ground in each row, metres, inf where none is
+        seen (H,).
+    """
+    image = background.copy()
+    homography = ground_from_pixel(camera, ground_z_m)
+    skyline = _plane_skyline(camera, homography[2])
+    footprints = plane_footprints(camera, homography)
+    for band in make_bands(footprints, texture.resolution_m, len(texture.levels)):
+        first_row = band.start - 0.5 + 0.5 / band.samples
+        pixel_from_sample = np.array([[1.0, 0, 0], [0, 1.0 / band.samples, first_row], [0, 0, 1.0]])
+        warp = _texture_from_world(texture, band.level) @ homography @ pixel_from_sample
+        drawn = cv2.warpPerspective(
+            texture.levels[band.level],
+            warp,
+            (camera.width, (band.stop - band.start) * band.samples),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=border,
+        )
+        _put(image, drawn, band, skyline)
+    return image, np.where(footprints.visible, footprints.distance, np.inf)
+
+
+def render_uneven_ground(
+    camera: Camera, texture: GroundTexture, background: Image, border: Color, height: HeightGrid
+) -> tuple[Image, Array]:
+    """Draw uneven ground into a picture of the sky, as ``render_flat_ground`` does flat ground."""
+    image = background.copy()
+    terrain = see_terrain(camera, height)
+    skyline = terrain.horizon()
+    footprints = terrain_footprints(terrain)
+    for band in make_bands(footprints, texture.resolution_m, len(texture.levels)):
+        to_texture = _texture_from_world(texture, band.level)
+        world = terrain.points(band.sample_rows())
+        at = [(world[..., i] * to_texture[i, i] + to_texture[i, 2]) for i in (0, 1)]
+        drawn = cv2.remap(
+            texture.levels[band.level],
+            at[0].astype(np.float32),
+            at[1].astype(np.float32),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=border,
+        )
+        _put(image, drawn, band, skyline)
+    return image, np.where(footprints.visible, footprints.distance, np.inf)
+
+
+def _plane_skyline(camera: Camera, horizon: Array) -> Array:
+    """Image row of a plane's horizon in every column; ``horizon`` is the third row. (W,)"""
+    slope = min(horizon[1], -1e-9)
+    return -(horizon[0] * np.arange(camera.width) + horizon[2] + HORIZON_EPS) / slope
+
+
+def _put(image: Image, drawn: Image, band: Band, skyline: Array) -> None:
+    """Average a band's samples and copy it into place, leaving out pixels above the skyline."""
+    if band.samples > 1:
+        size = (image.shape[1], band.stop - band.start)
+        drawn = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
+    target = image[band.start : band.stop]
+    if skyline.max() < band.start:
+        target[:] = drawn
+        return
+    below = np.arange(band.start, band.stop)[:, None] > skyline
+    np.copyto(target, drawn, where=below[..., None])

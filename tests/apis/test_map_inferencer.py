@@ -1,0 +1,197 @@
+"""A small MapTR with random weights on generated samples."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from mmengine.config import Config
+
+from gsmap.apis.map_inferencer import MapInferencer
+from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
+from gsmap.visualization.figure import figure_to_rgb
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "_base_"
+NAMES = ("CAM_FRONT", "CAM_BACK")
+
+
+def make_config():
+    cfg = Config.fromfile(CONFIGS / "models" / "maptr_r18_minicity.py")
+    cfg.merge_from_dict(Config.fromfile(CONFIGS / "default_runtime.py").to_dict())
+    cfg.merge_from_dict(
+        {
+            "model.bev_encoder.num_cams": 2,
+            "model.bev_encoder.bev_size": (10, 6),
+            "model.img_backbone.base_channels": 8,
+            "model.img_neck.in_channels": [16, 32, 64],
+            "model.map_head.num_instances": 6,
+            "model.map_head.coder.max_num": 6,
+            "visualizer.width_px": 400,
+            "test_dataloader": {
+                "dataset": {
+                    "type": "VectorizedMapDataset",
+                    "ann_file": "none.arrow",
+                    "split": "val",
+                    "cameras": list(NAMES),
+                    "pipeline": [
+                        {"type": "LoadCameraImages"},
+                        {"type": "ScaleImages", "scale": 0.5},
+                        {"type": "PackMapInputs"},
+                    ],
+                }
+            },
+        }
+    )
+    return cfg
+
+
+def camera(folder, name, token, seed):
+    path = folder / f"{token}_{name}.jpg"
+    pixels = np.random.default_rng(seed).integers(0, 255, (12, 20, 3), dtype=np.uint8)
+    image = cv2.resize(pixels, (320, 180), interpolation=cv2.INTER_CUBIC)
+    cv2.imwrite(str(path), image)
+    sign = 1 if name == "CAM_FRONT" else -1
+    cam_from_frame = np.eye(4)
+    cam_from_frame[:3, :3] = [[sign, 0, 0], [0, 0, -1], [0, sign, 0]]
+    intrinsics = np.array([[250.0, 0, 160], [0, 250, 90], [0, 0, 1]])
+    return CameraRecord(name, path.name, 320, 180, intrinsics, cam_from_frame)
+
+
+def make_samples(folder, count=3):
+    points = np.array([[1, 2, -1.8, 0, 0], [3, 4, -1.8, 0, 0]], np.float32)
+    points.tofile(folder / "sweep.bin")
+    shifted = np.eye(4)
+    shifted[0, 3] = 10
+    return [
+        MapSample(
+            token=f"t{i}",
+            scene="scene",
+            map_name="",
+            timestamp_ns=i,
+            cameras=[camera(folder, name, f"t{i}", 10 * i + j) for j, name in enumerate(NAMES)],
+            global_from_frame=np.eye(4),
+            lidar=LidarRecord("sweep.bin", shifted),
+        )
+        for i in range(count)
+    ]
+
+
+@pytest.fixture(scope="module")
+def inferencer():
+    torch.manual_seed(0)
+    return MapInferencer(make_config(), None, device="cpu")
+
+
+def test_annotation_file_and_samples_give_the_same(inferencer, tmp_path):
+    samples = make_samples(tmp_path)
+    from_samples = inferencer(samples, tmp_path)
+    path = tmp_path / "own.arrow"
+    meta = AnnotationMeta("own", "lidar", "anything")
+    write_annotations(path, meta, samples)
+    dataset = inferencer.dataset(path, tmp_path)
+    from_file = list(inferencer.predict(dataset, batch_size=3))
+    assert [s.metainfo["token"] for s in from_file] == ["t0", "t1", "t2"]
+    for a, b in zip(from_samples, from_file, strict=True):
+        # float32 sums in another order: a batch of 3 instead of 1
+        torch.testing.assert_close(
+            a.pred_instances_3d.pts, b.pred_instances_3d.pts, atol=1e-3, rtol=0
+        )
+    pts = [s.pred_instances_3d.pts for s in from_file]
+    assert (pts[0] - pts[1]).abs().max() > 1e-3  # the images matter
+
+
+def test_chosen_samples_come_in_their_order(inferencer, tmp_path):
+    dataset = inferencer.dataset(make_samples(tmp_path), tmp_path)
+    assert [s.metainfo["token"] for s in inferencer.predict(dataset, [2, 0])] == ["t2", "t0"]
+
+
+def test_predictions_are_written_and_drawn(inferencer, tmp_path):
+    found = inferencer(make_samples(tmp_path, 1), tmp_path)
+    inferencer.write(tmp_path / "map.json", found)
+    (record,) = json.loads((tmp_path / "map.json").read_text())["results"]
+    assert record["sample_token"] == "t0"
+    assert len(record["vectors"][0]["pts"]) == 20
+    assert figure_to_rgb(inferencer.draw(found[0], score_thr=0.0)).shape[1] == 400
+
+
+def test_checkpoint_is_loaded(inferencer, tmp_path):
+    path = tmp_path / "weights.pth"
+    state = {k: torch.full_like(v, 0.01) for k, v in inferencer.model.state_dict().items()}
+    torch.save({"state_dict": state}, path)
+    loaded = MapInferencer(make_config(), path, device="cpu")
+    assert all(
+        (value == 0.01).all()
+        for key, value in loaded.model.state_dict().items()
+        if value.is_floating_point()
+    )
+    other = make_config()
+    other.merge_from_dict({"model.map_head.num_instances": 7})
+    with pytest.raises(
+        ValueError, match=r"weights.pth does not belong to this config: .*instance_embedding"
+    ):
+        MapInferencer(other, path, device="cpu")
+
+
+def test_lidar_points_are_in_the_annotation_frame(inferencer, tmp_path):
+    dataset = inferencer.dataset(make_samples(tmp_path, 1), tmp_path)
+    np.testing.assert_allclose(
+        inferencer.lidar_points(dataset, 0), [[11, 2, -1.8], [13, 4, -1.8]], rtol=1e-6
+    )
+    (tmp_path / "sweep.bin").write_bytes(b"\x00" * 12)
+    with pytest.raises(ValueError, match="five float32 values"):
+        inferencer.lidar_points(dataset, 0)
+    (tmp_path / "sweep.bin").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no LiDAR sweep .*sweep.bin"):
+        inferencer.lidar_points(dataset, 0)
+
+
+def test_absent_camera_is_an_error_or_sees_nothing(inferencer, tmp_path):
+    samples = make_samples(tmp_path, 1)
+    samples[0].cameras = samples[0].cameras[1:]
+    dataset = inferencer.dataset(samples, tmp_path)
+    with pytest.raises(
+        ValueError, match=r"'t0' lacks the cameras \['CAM_FRONT'\].*--allow-missing"
+    ):
+        list(inferencer.predict(dataset))
+    (found,) = inferencer.predict(dataset, allow_missing_cameras=True)
+    assert found.metainfo["cam_names"] == list(NAMES)
+    assert found.metainfo["img_path"][0] is None
+    assert found.metainfo["lidar2img"].shape == (2, 4, 4)
+    corners = np.array([[x, y, -1.8, 1.0] for x in (-15, 15) for y in (-30, 30)])
+    assert (
+        (found.metainfo["lidar2img"][0] @ corners.T)[2] < 0
+    ).all()  # all behind the blank camera
+    assert len(inferencer.visualizer.cameras(found.metainfo)) == 1
+
+
+def test_truncated_and_missing_images_are_named(inferencer, tmp_path):
+    samples = make_samples(tmp_path, 1)
+    dataset = inferencer.dataset(samples, tmp_path)
+    image = tmp_path / samples[0].cameras[0].path
+    image.write_bytes(image.read_bytes()[:500])
+    with pytest.raises(
+        ValueError, match=r"'t0', camera CAM_FRONT: .*t0_CAM_FRONT.jpg is truncated"
+    ):
+        list(inferencer.predict(dataset))
+    image.unlink()
+    with pytest.raises(ValueError, match=r"'t0', camera CAM_FRONT: no image at"):
+        list(inferencer.predict(dataset))
+
+
+def test_file_of_another_range_is_refused(inferencer, tmp_path):
+    cfg = make_config()
+    cfg.test_dataloader.dataset.pc_range = [-30.0, -15.0, -2.0, 30.0, 15.0, 2.0]
+    other = MapInferencer(cfg, None, device="cpu")
+    write_annotations(
+        tmp_path / "a.arrow", AnnotationMeta("x", "lidar", "val"), make_samples(tmp_path, 1)
+    )
+    with pytest.raises(ValueError, match=r"a.arrow was made with x_range"):
+        other.dataset(tmp_path, tmp_path)
+
+
+def test_missing_config_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no config .*gone.py"):
+        MapInferencer(tmp_path / "gone.py", None)

@@ -1,0 +1,160 @@
+"""Parts of converters: worker pool, splits, table reading, CAN bus."""
+
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsmap.converters.splits import overlap_share, read_split_file, resolve_scenes
+from gsmap.utils.parallel import ordered_map
+
+_offset = 0
+
+
+def set_offset(value: int) -> None:
+    global _offset
+    _offset = value
+
+
+def add_offset(value: int) -> int:
+    time.sleep(0.01 * (value % 3))
+    return value + _offset
+
+
+def die(value: int) -> int:
+    os._exit(value)
+
+
+def hang(value: int) -> int:
+    time.sleep(30 * value)
+    return value
+
+
+def write_and_wait(path: Path) -> None:
+    """Stand for a task that writes for long, and cleans up after itself."""
+    try:
+        path.write_text("half")
+        time.sleep(60)
+    finally:
+        path.unlink()
+
+
+def fail_once_others_write(path: Path) -> None:
+    if path.name == "1":
+        while not path.with_name("0").exists():
+            time.sleep(0.02)
+        raise ValueError("bad")
+    write_and_wait(path)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_order_with_the_initializer_applied(workers: int):
+    results = list(ordered_map(add_offset, range(20), workers, set_offset, (100,)))
+    assert results == list(range(100, 120))
+
+
+def test_tasks_are_drawn_as_needed():
+    drawn = []
+
+    def tasks():
+        for i in range(100):
+            drawn.append(i)
+            yield i
+
+    results = ordered_map(add_offset, tasks(), 2)
+    next(results)
+    assert len(drawn) <= 7
+    results.close()
+
+
+def test_a_dead_worker_and_a_hung_one_end_with_words():
+    with pytest.raises(RuntimeError, match=r"died.*fewer --workers"):
+        list(ordered_map(die, [1], 2))
+    start = time.monotonic()
+    with pytest.raises(RuntimeError, match=r"more than 2 s"):
+        list(ordered_map(hang, [1], 2, timeout_s=2))
+    assert time.monotonic() - start < 15
+    with pytest.raises(ValueError, match="workers"):
+        list(ordered_map(hang, [1], 0))
+
+
+def test_what_ends_early_stops_the_tasks_under_way_through_their_clean_up(tmp_path):
+    started = time.monotonic()
+    tasks = [tmp_path / str(number) for number in range(8)]
+    results = ordered_map(fail_once_others_write, reversed(tasks[:2]), 2)
+    with pytest.raises(ValueError, match="bad"):
+        next(results)
+    assert list(tmp_path.iterdir()) == []
+    assert time.monotonic() - started < 50
+
+
+def test_split_files_are_checked(tmp_path: Path):
+    path = tmp_path / "s.json"
+    with pytest.raises(FileNotFoundError, match="no split file"):
+        read_split_file(path)
+    for text, message in [
+        ("[", "not JSON"),
+        ('["a"]', "must look like"),
+        ('{"train": "a"}', "must look like"),
+        ('{"train": ["a"], "val": ["a"]}', "scene a is in both train and val"),
+    ]:
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            read_split_file(path)
+    path.write_text('{"train": ["a"], "val": []}')
+    assert read_split_file(path) == {"train": ["a"], "val": []}
+
+
+def test_scenes_resolve_by_name_or_token_in_the_data_set_s_order():
+    names = {"t1": "one", "t2": "two", "t3": "three"}
+    resolved, missing = resolve_scenes({"train": ["two", "t1"], "val": ["three", "x"]}, names)
+    assert resolved == {"train": ["one", "two"], "val": ["three"]}
+    assert missing == ["x"]
+
+
+def test_overlap_counts_validation_positions_near_training_on_the_same_map():
+    train = {"a": np.array([[0.0, 0]]), "b": np.array([[100.0, 0]])}
+    val = {"a": np.array([[5.0, 0], [5.1, 0], [100, 0]]), "c": np.array([[0.0, 0]])}
+    assert overlap_share(train, val) == pytest.approx(1 / 4)
+    assert overlap_share(train, {}) == 0
+
+
+def test_tables_are_read_across_chunk_borders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from gsmap.converters.nuscenes import tables as nuscenes_tables
+
+    records = [{"token": str(i), "values": [i, {"deep": "ü" * i}]} for i in range(40)]
+    path = tmp_path / "table.json"
+    path.write_text(json.dumps(records, indent=1, ensure_ascii=False))
+    for chunk in (1, 7, 64, 1 << 20):
+        monkeypatch.setattr(nuscenes_tables, "_CHUNK_CHARACTERS", chunk)
+        assert list(nuscenes_tables.iterate_records(path)) == records
+    path.write_text(path.read_text()[:-30])
+    with pytest.raises(ValueError, match="damaged or incomplete"):
+        list(nuscenes_tables.iterate_records(path))
+
+
+def test_can_bus_takes_the_latest_message(tmp_path: Path):
+    from gsmap.converters.nuscenes.can_bus import CanBusReader
+
+    quarter_turn = np.eye(4)
+    quarter_turn[:2, :2] = [[0, -1], [1, 0]]
+    quarter_turn[:3, 3] = 7, 8, 9
+    without = CanBusReader(tmp_path).signals("scene-0001", 5_000, quarter_turn)
+    np.testing.assert_allclose(without[:3], [7, 8, 9])
+    np.testing.assert_allclose(without[3:7], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-9)
+    assert (without[7:16] == 0).all()
+    np.testing.assert_allclose(without[16:], [np.pi / 2, 90])
+    messages = [
+        {"utime": t, "accel": [t] * 3, "rotation_rate": [0, 0, t], "vel": [1, 2, 3]} for t in (4, 6)
+    ]
+    (tmp_path / "can_bus").mkdir()
+    (tmp_path / "can_bus/scene-0001_pose.json").write_text(json.dumps(messages))
+    reader = CanBusReader(tmp_path)
+    np.testing.assert_allclose(
+        reader.signals("scene-0001", 5_999, quarter_turn)[7:16], [4, 4, 4, 0, 0, 4, 1, 2, 3]
+    )
+    assert (reader.signals("scene-0001", 3_000, quarter_turn)[7:16] == 0).all()
+    assert (reader.signals("scene-0002", 5_000, quarter_turn)[7:16] == 0).all()

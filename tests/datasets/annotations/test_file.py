@@ -1,0 +1,212 @@
+"""Annotation files: what is written comes back, and a wrong or half file is refused."""
+
+import pickle
+import resource
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from gsmap.datasets.annotations.file import (
+    AnnotationFile,
+    AnnotationMeta,
+    AnnotationWriter,
+    CameraRecord,
+    LidarRecord,
+    MapInstance,
+    MapSample,
+    SweepRecord,
+    write_annotations,
+)
+
+META = AnnotationMeta("nuscenes", "lidar", "val", options={"centreline": False}, command="make it")
+
+
+def pose(seed: int) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3] = np.random.default_rng(seed).normal(size=(3, 4))
+    return matrix
+
+
+def sample(number: int = 0, **changes) -> MapSample:
+    cameras = [
+        CameraRecord(
+            name, f"samples/{name}/{number}.jpg", 1600, 900, pose(number)[:3, :3], pose(number + i)
+        )
+        for i, name in enumerate(("CAM_FRONT", "CAM_BACK"))
+    ]
+    lidar = LidarRecord("lidar/0.bin", pose(1), [SweepRecord("lidar/-1.bin", 5, pose(2))])
+    points = np.array([[0, 0], [1.5, 2], [3, 4]], np.float32) + number
+    known = MapSample(
+        f"token{number}", "scene", "town", 10 + number, cameras, pose(3), lidar, np.arange(18.0),
+        [MapInstance(2, points), MapInstance(0, points[:2])], pose(4),
+    )  # fmt: skip
+    return replace(known, **changes)
+
+
+def assert_same(found: MapSample, wanted: MapSample) -> None:
+    for name in ("token", "scene", "map_name", "timestamp_ns"):
+        assert getattr(found, name) == getattr(wanted, name)
+    np.testing.assert_array_equal(found.global_from_frame, wanted.global_from_frame)
+    np.testing.assert_array_equal(found.ego_from_frame, wanted.ego_from_frame)
+    for camera, other in zip(found.cameras, wanted.cameras, strict=True):
+        assert (camera.name, camera.path, camera.width, camera.height) == (
+            other.name, other.path, other.width, other.height,
+        )  # fmt: skip
+        np.testing.assert_array_equal(camera.intrinsics, other.intrinsics)
+        np.testing.assert_array_equal(camera.cam_from_frame, other.cam_from_frame)
+
+
+def test_every_field_survives_across_batches_and_with_absent_parts(tmp_path: Path):
+    samples = [sample(i) for i in range(300)]
+    samples[1] = sample(1, lidar=None, can_bus=None, instances=None)
+    samples[2] = sample(2, cameras=[], instances=[])
+    path = tmp_path / "deep" / "val.arrow"
+    assert write_annotations(path, META, samples) == 300
+    file = AnnotationFile(path)
+    assert len(file) == 300
+    for found, wanted in zip(file, samples, strict=True):
+        assert_same(found, wanted)
+    assert file[1].lidar is None
+    assert file[1].can_bus is None
+    assert file[1].instances is None
+    assert file[2].instances == []
+    last = file[-1]
+    assert last.token == "token299"
+    np.testing.assert_array_equal(last.can_bus, np.arange(18.0))
+    assert [i.label for i in last.instances] == [2, 0]
+    np.testing.assert_array_equal(last.instances[0].points, samples[299].instances[0].points)
+    assert last.instances[1].points.shape == (2, 2)
+    assert last.lidar.path == "lidar/0.bin"
+    assert (last.lidar.sweeps[0].path, last.lidar.sweeps[0].timestamp_ns) == ("lidar/-1.bin", 5)
+    np.testing.assert_array_equal(last.lidar.sweeps[0].frame_from_lidar, pose(2))
+    np.testing.assert_array_equal(last.lidar.frame_from_lidar, pose(1))
+    assert file.column("token")[257] == "token257"
+    assert file.meta == META
+
+
+def test_a_file_without_samples_or_cameras_or_truth_opens(tmp_path: Path):
+    assert write_annotations(tmp_path / "none.arrow", META, []) == 0
+    assert len(AnnotationFile(tmp_path / "none.arrow")) == 0
+    write_annotations(
+        tmp_path / "bare.arrow",
+        META,
+        [sample(0, cameras=[], lidar=None, can_bus=None, instances=None)],
+    )
+    assert AnnotationFile(tmp_path / "bare.arrow")[0].can_bus is None
+
+
+def test_three_dimensional_points(tmp_path: Path):
+    meta = replace(META, dim=3)
+    points = np.array([[0, 0, 1], [1, 1, 2]], np.float32)
+    write_annotations(tmp_path / "a.arrow", meta, [sample(instances=[MapInstance(0, points)])])
+    np.testing.assert_array_equal(
+        AnnotationFile(tmp_path / "a.arrow")[0].instances[0].points, points
+    )
+
+
+def test_pickle_hands_on_the_path_alone(tmp_path: Path):
+    write_annotations(tmp_path / "a.arrow", META, [sample(i) for i in range(100)])
+    data = pickle.dumps(AnnotationFile(tmp_path / "a.arrow"))
+    assert len(data) < 500
+    assert_same(pickle.loads(data)[42], sample(42))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"instances": [MapInstance(3, np.zeros((2, 2)))]}, "label 3"),
+        ({"instances": [MapInstance(0, np.zeros((1, 2)))]}, r"n >= 2, 2"),
+        ({"instances": [MapInstance(0, np.full((2, 2), np.nan))]}, "NaN"),
+        ({"global_from_frame": np.eye(3)}, r"global_from_frame .*\(4, 4\)"),
+        ({"can_bus": np.zeros(16)}, r"can_bus .*\(18,\)"),
+        (
+            {"cameras": [CameraRecord("A", "/etc/x.jpg", 1, 1, np.eye(3), np.eye(4))]},
+            "relative to the data root",
+        ),
+        (
+            {"cameras": [CameraRecord("A", "x.jpg", 1, 1, np.eye(3), np.eye(4))] * 2},
+            "appears twice",
+        ),
+        ({"token": ""}, "token"),
+    ],
+)
+def test_a_malformed_sample_is_refused_and_leaves_nothing(
+    tmp_path: Path, changes: dict, message: str
+):
+    with pytest.raises(ValueError, match=message):
+        write_annotations(tmp_path / "a.arrow", META, [sample(7), sample(**changes)])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_rewrite_keeps_the_old_file(tmp_path: Path):
+    write_annotations(tmp_path / "a.arrow", META, [sample(1)])
+    with pytest.raises(ValueError, match="already written"):
+        write_annotations(tmp_path / "a.arrow", META, [sample(2), sample(2)])
+    assert AnnotationFile(tmp_path / "a.arrow")[0].token == "token1"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.arrow"]
+
+
+def test_leftovers_of_a_killed_writer_are_removed(tmp_path: Path):
+    (tmp_path / "a.arrow.999999999.partial").write_bytes(b"half")
+    with AnnotationWriter(tmp_path / "a.arrow", META) as writer:
+        writer.write(sample())
+    assert [p.name for p in tmp_path.iterdir()] == ["a.arrow"]
+
+
+def test_mismatch_names_the_field_and_what_to_run(tmp_path: Path):
+    write_annotations(tmp_path / "a.arrow", META, [sample()])
+    file = AnnotationFile(tmp_path / "a.arrow")
+    file.require(
+        classes=["divider", "ped_crossing", "boundary"], split="val", x_range=[-15, 15], frame=None
+    )
+    with pytest.raises(
+        ValueError, match=r"classes .*boundary.*config asks for \('divider',\).*`make it`"
+    ):
+        file.require(classes=("divider",))
+    with pytest.raises(ValueError, match="split val, the config asks for train"):
+        file.require(split="train")
+    with pytest.raises(ValueError, match=r"y_range \(-30.0, 30.0\)"):
+        file.require(y_range=(-50, 50))
+
+
+def test_half_foreign_and_outdated_files_are_refused(tmp_path: Path):
+    path = tmp_path / "a.arrow"
+    with pytest.raises(FileNotFoundError, match="create_data"):
+        AnnotationFile(path)
+    write_annotations(path, META, [sample()])
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(ValueError, match="not a whole annotation file"):
+        AnnotationFile(path)
+    table = pa.table({"a": [1]})
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        writer.write_table(table)
+    with pytest.raises(ValueError, match="not an annotation file"):
+        AnnotationFile(path)
+    write_annotations(path, replace(META, format_version=99), [sample()])
+    with pytest.raises(ValueError, match=r"format version 99.*`make it`"):
+        AnnotationFile(path)
+
+
+def test_meta_refuses_bad_values():
+    with pytest.raises(ValueError, match="frame"):
+        AnnotationMeta("x", "camera", "val")
+    with pytest.raises(ValueError, match="x_range"):
+        AnnotationMeta("x", "ego", "val", x_range=(1, 1))
+    with pytest.raises(ValueError, match="classes"):
+        AnnotationMeta("x", "ego", "val", classes=("a", "a"))
+
+
+def test_a_full_disk_leaves_the_old_file_alone(tmp_path: Path):
+    write_annotations(tmp_path / "a.arrow", META, [sample(1)])
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # writing more fails
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_annotations(tmp_path / "a.arrow", META, [sample(i) for i in range(300)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert AnnotationFile(tmp_path / "a.arrow")[0].token == "token1"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.arrow"]

@@ -1,0 +1,64 @@
+import math
+
+import pytest
+import torch
+
+from gsmap.models.losses.direction import direction_loss
+from gsmap.models.losses.point import points_l1_loss
+
+
+def test_points_loss_by_hand():
+    pred = torch.tensor([[[0.0, 0.0], [1.0, 2.0]]])
+    target = torch.tensor([[[0.5, 0.0], [1.0, 0.0]]])
+    torch.testing.assert_close(points_l1_loss(pred, target, 2.0), torch.tensor(1.25))
+
+
+def test_direction_loss_by_hand():
+    # one right angle (1 - 0), one turned by 45 degrees, one reversed (1 - -1)
+    pred = torch.tensor(
+        [
+            [[0.0, 0.0], [0.0, 3.0]],
+            [[0.0, 0.0], [2.0, 2.0]],
+            [[0.0, 0.0], [-1.0, 0.0]],
+        ]
+    )
+    target = torch.tensor([[[0.0, 0.0], [5.0, 0.0]]]).expand(3, -1, -1)
+    expected = (1 + (1 - math.sqrt(0.5)) + 2) / 3
+    torch.testing.assert_close(direction_loss(pred, target, 3.0), torch.tensor(expected))
+
+
+def test_direction_over_a_longer_interval_ignores_the_points_between():
+    pred = torch.tensor([[[0.0, 0.0], [0.5, 7.0], [1.0, 0.0]]])
+    target = torch.tensor([[[0.0, 0.0], [0.5, -7.0], [1.0, 0.0]]])
+    torch.testing.assert_close(direction_loss(pred, target, 1.0, interval=2), torch.tensor(0.0))
+
+
+@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss])
+def test_no_match_gives_a_zero_with_a_gradient(loss):
+    pred = torch.zeros(0, 20, 2, requires_grad=True)
+    value = loss(pred, torch.zeros(0, 20, 2), 1.0)
+    assert value.item() == 0.0
+    value.backward()
+    assert pred.grad.shape == (0, 20, 2)
+
+
+@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss])
+def test_gradients(loss):
+    torch.manual_seed(0)
+    pred = torch.randn(2, 4, 2, dtype=torch.float64, requires_grad=True)
+    target = torch.randn(2, 4, 2, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda p: loss(p, target, 3.0), [pred])
+
+
+def test_equal_neighbours_do_not_break_the_direction():
+    pred = torch.zeros(1, 3, 2, requires_grad=True)
+    direction_loss(pred, torch.rand(1, 3, 2), 1.0).backward()
+    assert torch.isfinite(pred.grad).all()
+
+
+@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss])
+def test_other_shapes_are_refused(loss):
+    with pytest.raises(ValueError, match=r"target must have shape \(2, 4, 2\) of pred"):
+        loss(torch.rand(2, 4, 2), torch.rand(1, 4, 2), 1.0)
+    with pytest.raises(ValueError, match=r"interval must be in \[1, 4\), got 4"):
+        direction_loss(torch.rand(2, 4, 2), torch.rand(2, 4, 2), 1.0, interval=4)

@@ -1,0 +1,286 @@
+"""MapTR: state, forward pass, targets, assignment, losses and gradients."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from mmengine.structures import InstanceData
+from scipy.optimize import linear_sum_assignment
+
+from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
+from gsmap.checkpoints.key_map import find_key_map
+from gsmap.models.bev_encoders.gkt import border_pixels, kernel_offsets
+from gsmap.models.heads.map_head import MapHead
+from gsmap.models.layers.deformable_attention import sum_rows
+from reference.golden import Golden
+from reference.registry import check
+from reference.report import Row, largest_difference, largest_relative, relative_norm
+from reference.targets import gt_instances
+
+CONFIG = "maptr/maptr_r50_24e.py"
+STATE = "maptr_r50_state.json"
+_OTHER_CLASS_M = 1e3  # keeps detections of different classes from being paired
+_MEAN_SHARE = 0.1  # a cell's mean over its channels moves less than its channels do
+SAMPLES = {
+    "empty": [("reduced", "empty")],
+    "closed": [("reduced", "closed")],
+    "many": [("reduced", "many")],
+    "batch3": [("reduced", "empty"), ("full", "closed"), ("reduced", "many")],
+}
+
+
+def state_rows(golden: Golden, name: str, config: str) -> Iterator[Row]:
+    """Compare keys, shapes, counts and the round trip of an upstream state list with a model."""
+    listed = golden.read_json(name)
+    model = golden.model(config, name)
+    shapes = golden.state_shapes(name)
+    renamed = ours_from_upstream({key: torch.empty(shape) for key, shape in shapes.items()})
+    own = {key: tuple(value.shape) for key, value in model.state_dict().items()}
+    wrong = set(own.items()) ^ {(key, tuple(value.shape)) for key, value in renamed.items()}
+    yield Row(name, "keys or shapes that differ", len(wrong), 0)
+    unused = find_key_map(shapes).unused
+    trainable = sum(p.numel() for p in model.parameters() if p.requires_grad)
+    for key in unused:  # upstream trains them too, without effect
+        if listed["state"][key].get("requires_grad"):
+            trainable += math.prod(shapes[key])
+    yield Row(name, "trainable parameters", abs(trainable - listed["trainable_params"]), 0)
+    back = upstream_from_ours(model.state_dict())
+    lost = set(shapes.items()) ^ {(key, tuple(value.shape)) for key, value in back.items()}
+    yield Row(name, "keys lost on the way back", len(lost), 0)
+    original = {k: v for k, v in golden.upstream_state(name).items() if k not in unused}
+    changed = max(largest_difference(back[key], value) for key, value in original.items())
+    yield Row(name, "weights on the way back", changed, 0)
+
+
+@check(STATE, "mapvr_r50_state.json")
+def check_state(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the state of MapTR, which is also MapVR's, with ours."""
+    yield from state_rows(golden, name, CONFIG)
+
+
+@check("ops_gka_{variant}.npz")
+def check_kernel_attention(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the geometry kernel attention alone."""
+    data = golden.read_arrays(name)
+    value = torch.from_numpy(data["value"])  # (B, h * w, heads, C)
+    batch, num_pixels, heads, _ = value.shape
+    height, width = data["spatial_shapes"][0].tolist()
+    place = torch.from_numpy(data["loc_xy"])[:, :, :, 0]  # (B, Q, heads, S, 2)
+    pixels = border_pixels(place, (height, width))
+    sample = torch.arange(batch).view(-1, 1, 1, 1)
+    rows = (sample * num_pixels + pixels) * heads + torch.arange(heads).view(-1, 1)
+    weights = torch.from_numpy(data["weights"])[:, :, :, 0]
+    out = sum_rows(value.flatten(0, 2), rows, weights)
+    reference = data["out"].reshape(out.shape)
+    yield Row(name, "out", largest_difference(out, reference), 1e-5)
+    offsets = kernel_offsets((3, 5))
+    wanted = data["kernel_offsets_xy_in_weight_order"]
+    yield Row(name, "kernel offsets", largest_difference(offsets, wanted), 0)
+
+
+def head_rows(
+    name: str,
+    data: dict[str, np.ndarray],
+    outputs: dict[str, Any],
+    cls_atol: float,
+    pts_atol: float,
+) -> Iterator[Row]:
+    """Compare class scores, points and their boxes of all layers."""
+    scores, pts = outputs["all_cls_scores"], outputs["all_pts_preds"]
+    low, high = pts.amin(-2), pts.amax(-2)
+    boxes = torch.cat([(low + high) / 2, high - low], -1)
+    yield Row(name, "all_cls_scores", largest_difference(scores, data["all_cls_scores"]), cls_atol)
+    yield Row(name, "all_pts_preds", largest_difference(pts, data["all_pts_preds"]), pts_atol)
+    yield Row(name, "all_bbox_preds", largest_difference(boxes, data["all_bbox_preds"]), pts_atol)
+
+
+def decoded_rows(
+    name: str, data: dict[str, np.ndarray], result: InstanceData, score_atol: float = 5e-4
+) -> Iterator[Row]:
+    """Compare decoded detections, paired by class and points, as scores may tie."""
+    labels, pts = result.labels_3d.numpy(), result.pts.numpy()
+    if pts.shape != data["dec_pts"].shape:
+        yield Row(name, "number of detections", abs(len(pts) - len(data["dec_pts"])), 0)
+        return
+    distance = np.abs(pts[:, None] - data["dec_pts"]).max((-1, -2))
+    other_class = labels[:, None] != data["dec_labels"]
+    ours, theirs = linear_sum_assignment(distance + _OTHER_CLASS_M * other_class)
+    yield Row(name, "dec_labels", float(other_class[ours, theirs].sum()), 0)
+    yield Row(name, "dec_pts (m)", float(distance[ours, theirs].max(initial=0.0)), 0.01)
+    if "dec_boxes" in data:
+        boxes = np.concatenate([pts.min(1), pts.max(1)], -1)[ours]
+        off = largest_difference(boxes, data["dec_boxes"][theirs])
+        yield Row(name, "dec_boxes (m)", off, 0.01)
+    scores = result.scores_3d.numpy()[ours]
+    off = largest_difference(scores, data["dec_scores"][theirs])
+    yield Row(name, "dec_scores", off, score_atol)
+
+
+def bev_rows(
+    name: str, data: dict[str, np.ndarray], bev: torch.Tensor, atol: float, fraction: float
+) -> Iterator[Row]:
+    """Compare BEV features: the mean of every cell, and all channels of a subset.
+
+    A tie in rounding a position can change a whole cell. The means tell which cells those are;
+    there may be few, and the subset is compared at the others.
+    """
+    off = np.abs(bev.mean(0).numpy() - data["bev_embed_channel_mean"]) > atol * _MEAN_SHARE
+    yield Row(name, "fraction of BEV cells that differ", float(off.mean()), fraction)
+    rows, cols = data["bev_rows"], data["bev_cols"]
+    subset = bev.numpy()[:, rows][:, :, cols].reshape(len(bev), -1).T  # (cells, C)
+    same = ~off[rows][:, cols].ravel()
+    deviation = largest_difference(subset[same], data["bev_embed_sub"][same])
+    yield Row(name, "channels of the other cells", deviation, atol)
+
+
+@check("maptr_r50_forward_*_{variant}.npz")
+@torch.no_grad()
+def check_forward(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the way from the images to the detections."""
+    data = golden.read_arrays(name)
+    size = name.split("_")[3]
+    model, meta = golden.model(CONFIG, STATE), golden.meta(size)
+    feats = model.extract_img_feats(golden.images(size))
+    yield Row(name, "FPN", largest_difference(feats[0][0, :, ::16], data["fpn_feat_sub"]), 1e-4)
+    projection = model.bev_encoder.project([meta], feats[0].device)
+    seen = np.packbits(projection.visible[0].numpy(), axis=-1)
+    differing = np.unpackbits(seen ^ data["cam_hit"]).mean()
+    yield Row(name, "cells seen by each camera", float(differing), 1e-4)
+
+    bev_outputs = model.bev_encoder(feats, [meta])
+    yield from bev_rows(name, data, bev_outputs["bev_feats"][0], 1e-4, 1e-3)
+    head = model.map_head
+    reference = head.initial_reference(head.queries()[0])
+    yield Row(
+        name, "init_reference", largest_difference(reference[None], data["init_reference"]), 1e-5
+    )
+    outputs = head(bev_outputs)
+    states = outputs["states"][:, 0, ::25, ::8]
+    yield Row(name, "decoder states", largest_difference(states, data["hs_sub"]), 1e-3)
+    yield from head_rows(name, data, outputs, 5e-4, 1e-4)
+    yield from decoded_rows(name, data, head.predict_by_feat(outputs, [meta])[0])
+
+
+def loss_rows(
+    golden: Golden,
+    name: str,
+    data: dict[str, np.ndarray],
+    head: MapHead,
+    samples: Sequence[tuple[str, str]],
+    forward_file: str = "maptr_r50_forward_{size}_{variant}.npz",
+    names: Sequence[str] = ("loss_cls", "loss_pts", "loss_dir"),
+) -> Iterator[Row]:
+    """Compare assignment, losses and gradients on saved predictions.
+
+    Args:
+        golden: The reference data.
+        name: The file.
+        data: Its arrays.
+        head: A head with the losses.
+        samples: Input size and set of ground truth of every sample of the batch.
+        forward_file: Pattern of the file of saved predictions.
+        names: The losses to compare.
+
+    Yields:
+        The compared quantities.
+    """
+    saved = [
+        golden.read_arrays(forward_file.format(size=size, variant=golden.variant))
+        for size, _ in samples
+    ]
+    scores, pts = (
+        torch.from_numpy(np.concatenate([arrays[key] for arrays in saved], 1)).requires_grad_()
+        for key in ("all_cls_scores", "all_pts_preds")
+    )
+    outputs = {"all_cls_scores": scores, "all_pts_preds": pts, "all_references": pts}
+    batch_gt = [gt_instances(golden.gt_sets[gt_set]) for _, gt_set in samples]
+    metas = [golden.meta(size) for size, _ in samples]
+    yield from match_rows(name, data, head, outputs, batch_gt, metas)
+    losses = head.loss_by_feat(outputs, batch_gt, metas)
+    layers = [*(f"d{layer}." for layer in range(len(scores) - 1)), ""]
+    for key in names:
+        ours = [losses[layer + key].item() for layer in layers]
+        yield Row(name, f"{key} (relative)", largest_relative(ours, data[key]), 1e-4)
+    # without ground truth nothing reaches the points
+    torch.stack(list(losses.values())).sum().backward()
+    for key, tensor in (("grad_cls", scores), ("grad_pts", pts)):
+        grad = torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
+        yield Row(name, f"{key} (relative)", relative_norm(grad, data[key]), 1e-3)
+
+
+def match_rows(
+    name: str,
+    data: dict[str, np.ndarray],
+    head: MapHead,
+    outputs: dict[str, torch.Tensor],
+    batch_gt: Sequence[InstanceData],
+    metas: Sequence[dict[str, Any]],
+) -> Iterator[Row]:
+    """Compare the pairs of query, ground truth and order of every layer."""
+    gts = [head.prepare_gt(gt) for gt in batch_gt]
+    wrong = 0.0
+    for layer in range(len(outputs["all_cls_scores"])):
+        predictions = head.layer_predictions(outputs, layer)
+        targets = head.get_targets(predictions, gts, metas)
+        for image, match in enumerate(targets.matches):
+            ours = torch.stack([match.query_inds, match.gt_inds, match.order_inds], -1)
+            wrong = max(wrong, largest_difference(ours, data[f"match_l{layer}_b{image}"]))
+    yield Row(name, "query, ground truth and order of matches", wrong, 0)
+
+
+@check("maptr_loss_*_{variant}.npz")
+def check_loss(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare targets, matching costs, assignment, losses and gradients."""
+    data = golden.read_arrays(name)
+    case = name.split("_")[2]
+    head = golden.model(CONFIG, STATE).map_head
+    yield from loss_rows(golden, name, data, head, SAMPLES[case])
+    if "gt_fixed_pts" in data:
+        yield from target_rows(name, data, gt_instances(golden.gt_sets[case]))
+    if "cost_pts_lastlayer" in data:
+        saved = golden.read_arrays(f"maptr_r50_forward_reduced_{golden.variant}.npz")
+        prediction = InstanceData(
+            scores=torch.from_numpy(saved["all_cls_scores"][-1, 0]),
+            pts=torch.from_numpy(saved["all_pts_preds"][-1, 0]),
+        )
+        gt = head.prepare_gt(gt_instances(golden.gt_sets[case]))
+        keys = ("cost_cls_lastlayer", "cost_pts_lastlayer")
+        for key, cost in zip(keys, head.assigner.match_costs, strict=True):
+            ours = cost(prediction, gt, {})
+            yield Row(name, f"{key} (relative)", largest_relative(ours, data[key]), 1e-4)
+
+
+def target_rows(name: str, data: dict[str, np.ndarray], gt: InstanceData) -> Iterator[Row]:
+    """Compare resampled points and their equivalent orders."""
+    yield Row(name, "gt_fixed_pts (m)", largest_difference(gt.pts, data["gt_fixed_pts"]), 1e-4)
+    yield Row(
+        name, "gt_shift_pts (m)", largest_difference(gt.pts_shifts, data["gt_shift_pts"]), 1e-4
+    )
+    yield Row(name, "gt_bbox (m)", largest_difference(gt.boxes, data["gt_bbox"]), 1e-4)
+
+
+@check("maptr_gt_shift_patterns_{variant}.npz")
+def check_orders(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the equivalent orders of pattern v2."""
+    ours = gt_instances(golden.gt_sets["closed"]).pts_shifts
+    reference = golden.read_arrays(name)["v2"]
+    yield Row(name, "v2 (m)", largest_difference(ours, reference), 1e-4)
+
+
+@check("maptr_gt_bigring_{variant}.npz")
+def check_many_orders(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare a ring of more orders than are kept: the reference's random ones are among ours."""
+    data = golden.read_arrays(name)
+    ring = np.array(golden.gt_sets["bigring"][0]["pts"])
+    gt = gt_instances(golden.gt_sets["bigring"])
+    yield Row(name, "gt_fixed_pts (m)", largest_difference(gt.pts, data["gt_fixed_pts"]), 1e-4)
+    yield Row(name, "bbox (m)", largest_difference(gt.boxes, data["bbox"]), 1e-4)
+    rolled = [np.roll(ring[:-1], k, 0) for k in range(len(ring) - 1)]
+    rings = [{"label": 2, "pts": np.concatenate([points, points[:1]])} for points in rolled]
+    every = gt_instances(rings).pts.numpy()
+    distance = np.abs(data["gt_shift_pts_seed0"][0][:, None] - every).max((-1, -2))
+    yield Row(name, "drawn orders are orders of the ring (m)", float(distance.min(1).max()), 1e-4)
+    missing = gt.pts_shifts.shape[1] - len(set(distance.argmin(1).tolist()))
+    yield Row(name, "orders missing among the drawn ones", missing, 0)

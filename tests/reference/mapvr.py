@@ -1,0 +1,54 @@
+"""MapVR: soft rasters, the dice loss between them with its gradient, and the matching cost."""
+
+from collections.abc import Iterator
+
+import torch
+
+from gsmap.models.losses.dice import ElementRenderer, RenderedDiceLoss, rendered_dice_cost
+from gsmap.ops.polyline_raster import soft_rasters
+from reference.golden import Golden
+from reference.registry import check
+from reference.report import Row, largest_difference, largest_relative, relative_norm
+
+COST_WEIGHT, COST_RENDERER = 10.0, ElementRenderer((128, 64))
+# How the suffix of a raster's name says it was rendered: whether as a polygon. Boundaries of
+# polygons and hard masks serve nothing in MapVR's training and have no counterpart here.
+KINDS = {"lane_boundary_s2": False, "as_lane_s2": False, "mask_s4": True}
+
+
+@check("mapvr_rasters_{variant}.npz")
+def check_rasters(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare soft rasters of lines and polygons."""
+    data = golden.read_arrays(name)
+    elements = sorted(key.removesuffix("_vertices") for key in data if key.endswith("_vertices"))
+    for element in elements:
+        vertices = torch.from_numpy(data[f"{element}_vertices"])[None]
+        for kind, is_polygon in KINDS.items():
+            key = f"{element}_{kind}"
+            if key not in data:
+                continue
+            height, width = data[key].shape
+            raster = soft_rasters(vertices, height, width, torch.tensor([is_polygon]))[0]
+            yield Row(name, key, largest_difference(raster, data[key]), 1e-5)
+
+
+@check("mapvr_dice_{variant}.npz")
+def check_dice(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare dice loss, its true gradient, and the cost.
+
+    The original's gradient of lines is not the derivative of its loss; the file holds both.
+    """
+    data = {key: torch.from_numpy(value) for key, value in golden.read_arrays(name).items()}
+    for case in sorted(key.removesuffix("_labels") for key in data if key.endswith("_labels")):
+        labels, gt = data[f"{case}_labels"], data[f"{case}_gt"]
+        pred = data[f"{case}_pred"].clone().requires_grad_()
+        loss = RenderedDiceLoss()(pred, gt, labels)
+        loss.backward()
+        assert pred.grad is not None
+        off = largest_relative(loss.detach(), data[f"{case}_loss_w15"])
+        yield Row(name, f"{case}: loss (relative)", off, 1e-4)
+        off = relative_norm(pred.grad, data[f"{case}_grad_analytic"])
+        yield Row(name, f"{case}: true gradient (relative)", off, 1e-3)
+        cost = rendered_dice_cost(data[f"{case}_cost_pred"], gt, labels, COST_RENDERER)
+        off = largest_difference(COST_WEIGHT * cost, data[f"{case}_cost_w10"])
+        yield Row(name, f"{case}: cost", off, 1e-4)

@@ -1,0 +1,136 @@
+"""Polylines: values worked by hand, and MapTR's training targets."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsmap.structures.polylines import (
+    PADDING,
+    arc_lengths,
+    bounding_boxes,
+    clamp,
+    clip_to_box,
+    equivalent_orders,
+    is_closed,
+    points_at,
+    resample,
+)
+
+SQUARE = np.array([[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]], float)
+
+
+def test_resampling_keeps_both_ends_and_spaces_by_arc_length():
+    corner = np.array([[0, 0], [3, 0], [3, 1]], float)
+    np.testing.assert_allclose(arc_lengths(corner), [0, 3, 4])
+    np.testing.assert_allclose(resample(corner, 5), [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]])
+    np.testing.assert_allclose(
+        points_at(corner, np.array([-1, 3.5, 9])), [[0, 0], [3, 0.5], [3, 1]]
+    )
+
+
+def test_resampling_interpolates_height_and_survives_repeated_points():
+    line = np.array([[0, 0, 0], [0, 0, 0], [4, 0, 8]], float)
+    resampled = resample(line, 3)
+    assert resampled[1, 2] == pytest.approx(4)
+    assert resampled[0].tolist() == [0, 0, 0]
+    np.testing.assert_array_equal(resample(np.zeros((2, 2)), 3), np.zeros((3, 2)))
+
+
+def test_an_open_line_has_two_orders():
+    line = np.array([[0, 0], [3, 0]], float)
+    orders = equivalent_orders(line, 4)
+    assert orders.shape == (3, 4, 2)
+    np.testing.assert_allclose(orders[0, :, 0], [0, 1, 2, 3])
+    np.testing.assert_allclose(orders[1, :, 0], [3, 2, 1, 0])
+    assert (orders[2] == PADDING).all()
+
+
+def test_a_ring_has_one_order_per_vertex_and_order_k_starts_at_vertex_minus_k():
+    orders = equivalent_orders(SQUARE, 9)
+    assert (orders[4:] == PADDING).all()
+    np.testing.assert_allclose(orders[:4, 0], [[0, 0], [0, 4], [4, 4], [4, 0]])
+    np.testing.assert_allclose(orders[:4, 0], orders[:4, -1])
+    np.testing.assert_allclose(orders[1, :3], [[0, 4], [0, 2], [0, 0]])
+
+
+def test_of_many_vertices_as_many_as_there_is_room_are_taken():
+    angles = np.linspace(0, 2 * np.pi, 31)[:-1]
+    ring = np.stack([np.cos(angles), np.sin(angles)], -1)
+    ring = np.concatenate([ring, ring[:1]])
+    starts = equivalent_orders(ring, 20)[:, 0]
+    assert len(np.unique(starts.round(6), axis=0)) == 19
+    first = equivalent_orders(ring, 20, np.random.default_rng(1))[:, 0]
+    second = equivalent_orders(ring, 20, np.random.default_rng(2))[:, 0]
+    assert len(np.unique(first.round(6), axis=0)) == 19
+    assert not np.allclose(first, second)
+
+
+def test_boxes_clamping_and_closure():
+    assert bounding_boxes(SQUARE - 1).tolist() == [-1, -1, 3, 3]
+    assert clamp(np.array([[9.0, -9, 7]]), (-1, 1), (-2, 2)).tolist() == [[1, -2, 7]]
+    assert is_closed(SQUARE)
+    assert not is_closed(SQUARE[:-1])
+    assert not is_closed(np.zeros((2, 2)))
+
+
+def test_clipping_splits_a_line_that_leaves_and_comes_back():
+    """The line dips below the box between x = 1 and x = 3.
+
+    ::
+
+        0---.       .---4      y = 1
+             `.   .'
+        ------`.-.'------      y = 0, lower edge
+    """
+    line = np.array([[0, 1], [1, 0], [2, -1], [3, 0], [4, 1]], float)
+    left, right = clip_to_box(line, (0, 4), (0, 2))
+    np.testing.assert_allclose(left, [[0, 1], [1, 0]])
+    np.testing.assert_allclose(right, [[3, 0], [4, 1]])
+
+
+def test_clipping_cuts_at_the_edge_and_interpolates_height():
+    (piece,) = clip_to_box(np.array([[-2, 0, 0], [2, 0, 4]], float), (-1, 1), (-1, 1))
+    np.testing.assert_allclose(piece, [[-1, 0, 1], [1, 0, 3]])
+
+
+def test_a_cut_ring_is_one_piece_across_its_start():
+    (piece,) = clip_to_box(SQUARE, (-1, 3), (-1, 3))
+    np.testing.assert_allclose(piece, [[0, 3], [0, 0], [3, 0]])
+
+
+def test_a_ring_inside_stays_closed_and_a_touching_line_is_left_out():
+    (piece,) = clip_to_box(SQUARE, (-1, 5), (-1, 5))
+    np.testing.assert_allclose(piece, SQUARE)
+    assert clip_to_box(np.array([[-1.0, 1], [0, 0], [-1, -1]]), (0, 1), (-1, 1)) == []
+    assert clip_to_box(SQUARE, (5, 6), (5, 6)) == []
+
+
+@pytest.mark.parametrize("points", [np.zeros((1, 2)), np.zeros(4), np.zeros((3, 1))])
+def test_what_is_no_polyline_is_refused(points: np.ndarray):
+    for function in (lambda p: resample(p, 5), lambda p: equivalent_orders(p, 5)):
+        with pytest.raises(ValueError, match="points must have shape"):
+            function(points)
+    with pytest.raises(ValueError, match="num_points"):
+        resample(SQUARE, 1)
+
+
+def test_orders_equal_the_reference_targets(golden_dir: Path):
+    frames = json.loads((golden_dir / "data/E6_A.json").read_text())["frames"]
+    targets = np.load(golden_dir / "data/E6_A_targets.npz")
+    seen = 0
+    for i, frame in enumerate(frames):
+        if f"f{i}_vec_index" not in targets:
+            continue
+        for j, index in enumerate(targets[f"f{i}_vec_index"]):
+            points = np.array(frame["vectors"][index]["pts"])
+            fixed = clamp(resample(points, 20), (-15, 15), (-30, 30))
+            orders = equivalent_orders(points, 20)
+            orders = np.where(orders == PADDING, PADDING, clamp(orders, (-15, 15), (-30, 30)))
+            # the reference is rounded to 1e-6 m before and stored as float32 after
+            np.testing.assert_allclose(fixed, targets[f"f{i}_fixed"][j], atol=3e-6)
+            np.testing.assert_allclose(orders, targets[f"f{i}_shift_v2"][j], atol=3e-6)
+            np.testing.assert_allclose(bounding_boxes(points), targets[f"f{i}_bbox"][j], atol=3e-6)
+            seen += 1
+    assert seen == 185
