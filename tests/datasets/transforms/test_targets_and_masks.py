@@ -34,8 +34,18 @@ def test_no_element_gives_empty_targets_of_the_right_shape():
     assert targets.pts.shape == (0, 20, 2)
     assert targets.pts_shifts.shape == (0, 19, 20, 2)
     assert targets.boxes.shape == (0, 4)
+    assert targets.polylines.shape == (0, 2, 2)
+    assert targets.polylines.dtype == torch.float32
     assert targets.labels_3d.dtype == torch.int64
     assert targets.closed.dtype == torch.bool
+
+
+def test_polylines_keep_every_vertex_clamped_and_padded_by_their_last():
+    short = MapInstance(0, np.array([[0.0, 0, 7], [20, 40, 7]]))
+    longer = MapInstance(2, np.array([[0.0, 0, 7], [1, 0, 7], [1, 2, 7]]))
+    polylines = map_targets([short, longer], 20, **RANGES, dim=3).polylines
+    assert polylines.dtype == torch.float32
+    assert polylines.tolist() == [[[0, 0], [15, 30], [15, 30]], [[0, 0], [1, 0], [1, 2]]]
 
 
 def test_three_coordinates_are_kept_or_refused():

@@ -40,7 +40,8 @@ def map_targets(
 
     Returns:
         ``labels_3d`` (K,) int64, ``pts`` (K, P, dim), ``pts_shifts`` (K, S, P, dim), ``boxes`` (K,
-        4) float32 in metres, ``closed`` (K,) bool; unused orders hold -10000.
+        4), ``polylines`` (K, M, 2) float32 in metres, ``closed`` (K,) bool. Unused orders hold
+        -10000; polylines are at full resolution, the last vertex repeated up to the longest.
 
     Raises:
         ValueError: If the elements have fewer coordinates than ``dim``.
@@ -49,6 +50,8 @@ def map_targets(
     points = np.empty((len(instances), num_points, dim))
     orders = np.empty((len(instances), slots, num_points, dim))
     boxes = np.empty((len(instances), 4))
+    longest = max((len(instance.points) for instance in instances), default=2)
+    polylines = np.empty((len(instances), longest, 2))
     for i, instance in enumerate(instances):
         if instance.points.shape[1] < dim:
             raise ValueError(
@@ -59,6 +62,8 @@ def map_targets(
         orders[i] = equivalent_orders(line, num_points, rng)
         points[i] = resample(line, num_points)
         boxes[i] = bounding_boxes(line)
+        polylines[i, : len(line)] = line[:, :2]
+        polylines[i, len(line) :] = line[-1, :2]
     points = clamp(points, x_range, y_range)
     unused = orders == PADDING
     orders = clamp(orders, x_range, y_range)
@@ -69,6 +74,7 @@ def map_targets(
         pts=torch.from_numpy(points.astype(np.float32)),
         pts_shifts=torch.from_numpy(orders.astype(np.float32)),
         boxes=torch.from_numpy(corners.reshape(-1, 4).astype(np.float32)),
+        polylines=torch.from_numpy(clamp(polylines, x_range, y_range).astype(np.float32)),
         closed=torch.tensor(
             [is_closed(instance.points) for instance in instances], dtype=torch.bool
         ),
