@@ -1,0 +1,60 @@
+"""Files that are whole or absent, whatever stops their writer."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, Literal
+
+SUFFIX = ".partial"
+
+
+@contextmanager
+def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
+    """Open a file that takes its name only when the block ends well.
+
+    Until then it is ``PATH.<pid>.partial``, which any exception removes. One that a killed writer
+    left behind goes when the same file is written again. A reader sees the old file or the new one.
+
+    Args:
+        path: File to write; parent folders are made.
+        mode: ``w`` for text in UTF-8, ``wb`` for bytes.
+
+    Yields:
+        The open file.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_stale(path)
+    partial = path.with_name(f"{path.name}.{os.getpid()}{SUFFIX}")
+    try:
+        with partial.open(mode, encoding=None if "b" in mode else "utf-8") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in one step, in UTF-8."""
+    with atomic_write(path) as file:
+        file.write(text)
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file in one step."""
+    with atomic_write(path, "wb") as file:
+        file.write(content)
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove what killed writers of the same file left behind."""
+    if not Path("/proc/self").exists():
+        return  # no way to tell whether a writer lives
+    start = f"{path.name}."
+    for name in os.listdir(path.parent):
+        pid = name[len(start) : -len(SUFFIX)]
+        if name == f"{start}{pid}{SUFFIX}" and pid.isdigit() and not Path("/proc", pid).exists():
+            (path.parent / name).unlink(missing_ok=True)
