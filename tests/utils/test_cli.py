@@ -1,0 +1,162 @@
+"""How a command ends: with a report, an error in words, interrupted, or a traceback."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import pytest
+
+from gsmap.utils.cli import run_command
+from gsmap.utils.files import atomic_write
+
+
+class DamagedError(ValueError):
+    """An error of a kind of its own."""
+
+
+def test_a_report_is_printed(capsys):
+    run_command(lambda: "3 samples")
+    run_command(lambda: None)
+    assert capsys.readouterr().out == "3 samples\n"
+
+
+def fail(error: Exception) -> None:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (ValueError("no such split"), "no such split"),
+        (TypeError("grid must be a BEVGrid"), "grid must be a BEVGrid"),
+        (KeyError("Foo is not in the registry"), "Foo is not in the registry"),
+        (RuntimeError("a worker\n  died"), "a worker died"),
+        (DamagedError("sample 'a': damaged"), "sample 'a': damaged"),
+        (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
+        (PermissionError(13, "Permission denied", "a"), "[Errno 13] Permission denied: 'a'"),
+    ],
+)
+def test_what_a_check_says_is_one_line_and_2(error, line, capsys):
+    with pytest.raises(SystemExit) as left:
+        run_command(lambda: fail(error))
+    assert left.value.code == 2
+    assert capsys.readouterr().err == f"error: {line}\n"
+
+
+def test_files_of_the_user_end_in_words(tmp_path, capsys):
+    (tmp_path / "a.json").write_text("{")
+    (tmp_path / "b.txt").write_bytes(b"\xff")
+    for read in (
+        lambda: json.loads((tmp_path / "a.json").read_text()),
+        lambda: (tmp_path / "b.txt").read_text(encoding="utf-8"),
+        lambda: (tmp_path / "c.txt").read_text(),
+    ):
+        with pytest.raises(SystemExit):
+            run_command(read)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["error"] * 3
+    assert "Expecting property name" in lines[0]
+    assert "can't decode byte" in lines[1]
+    assert "c.txt" in lines[2]
+
+
+def full_disk() -> None:
+    with open("/dev/full", "w") as file:
+        file.write("x")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_one_line(capsys):
+    with pytest.raises(SystemExit):
+        run_command(full_disk)
+    assert capsys.readouterr().err == "error: [Errno 28] No space left on device\n"
+
+
+def bad_check(text: str) -> None:
+    raise ValueError(
+        f"text must be a number, got {text}."
+    )  # fmt: skip
+
+
+def in_a_block(path: Path) -> None:
+    with atomic_write(path) as file:
+        file.write("half")
+        raise ValueError("not whole")
+
+
+def test_the_raise_statement_may_span_lines_or_stand_in_a_block(tmp_path, capsys):
+    for command in (lambda: bad_check("x"), lambda: in_a_block(tmp_path / "a")):
+        with pytest.raises(SystemExit):
+            run_command(command)
+    assert capsys.readouterr().err == "error: text must be a number, got x.\nerror: not whole\n"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("slip", "kind"),
+    [
+        (lambda: {}["key"], KeyError),
+        (lambda: len(1), TypeError),
+        (lambda: float("x"), ValueError),
+        (lambda: [][1], IndexError),
+        (lambda: fail(AssertionError()), AssertionError),
+        (lambda: None.nothing, AttributeError),
+    ],
+)
+def test_a_slip_in_the_code_keeps_its_traceback(slip, kind):
+    with pytest.raises(kind):
+        run_command(slip)
+
+
+def look_up(key: str) -> None:
+    {}[key]
+
+
+def in_worker(function, argument) -> None:
+    with ProcessPoolExecutor(1, get_context("fork")) as pool:
+        pool.submit(function, argument).result()
+
+
+def test_errors_of_workers_are_told_apart_too(capsys):
+    with pytest.raises(SystemExit):
+        run_command(lambda: in_worker(bad_check, "x"))
+    assert capsys.readouterr().err == "error: text must be a number, got x.\n"
+    with pytest.raises(KeyError):
+        run_command(lambda: in_worker(look_up, "x"))
+
+
+def test_ctrl_c_is_one_line_and_130(capsys):
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as left:
+        run_command(interrupted)
+    assert left.value.code == 130
+    assert capsys.readouterr().err == "interrupted: nothing half-written is left\n"
+
+
+@pytest.mark.parametrize(("heed_kill", "code", "left"), [(True, 143, 0), (False, -15, 1)])
+def test_kill_runs_the_clean_up_where_that_is_wanted(heed_kill, code, left, tmp_path):
+    program = f"""
+import time
+from gsmap.utils.cli import run_command
+from gsmap.utils.files import atomic_write
+def command():
+    with atomic_write({str(tmp_path / "a")!r}):
+        print("ready", flush=True)
+        time.sleep(60)
+run_command(command, heed_kill={heed_kill})
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout.readline() == b"ready\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait() == code
+        assert process.stderr.read() == b""
+    assert len(os.listdir(tmp_path)) == left
