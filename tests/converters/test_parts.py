@@ -1,94 +1,12 @@
-"""Parts of converters: worker pool, splits, table reading, CAN bus."""
+"""Parts of converters: splits, table reading, CAN bus."""
 
 import json
-import os
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gsmap.converters.splits import overlap_share, read_split_file, resolve_scenes
-from gsmap.utils.parallel import ordered_map
-
-_offset = 0
-
-
-def set_offset(value: int) -> None:
-    global _offset
-    _offset = value
-
-
-def add_offset(value: int) -> int:
-    time.sleep(0.01 * (value % 3))
-    return value + _offset
-
-
-def die(value: int) -> int:
-    os._exit(value)
-
-
-def hang(value: int) -> int:
-    time.sleep(30 * value)
-    return value
-
-
-def write_and_wait(path: Path) -> None:
-    """Stand for a task that writes for long, and cleans up after itself."""
-    try:
-        path.write_text("half")
-        time.sleep(60)
-    finally:
-        path.unlink()
-
-
-def fail_once_others_write(path: Path) -> None:
-    if path.name == "1":
-        while not path.with_name("0").exists():
-            time.sleep(0.02)
-        raise ValueError("bad")
-    write_and_wait(path)
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_results_come_in_order_with_the_initializer_applied(workers: int):
-    results = list(ordered_map(add_offset, range(20), workers, set_offset, (100,)))
-    assert results == list(range(100, 120))
-
-
-def test_tasks_are_drawn_as_needed():
-    drawn = []
-
-    def tasks():
-        for i in range(100):
-            drawn.append(i)
-            yield i
-
-    results = ordered_map(add_offset, tasks(), 2)
-    next(results)
-    assert len(drawn) <= 7
-    results.close()
-
-
-def test_a_dead_worker_and_a_hung_one_end_with_words():
-    with pytest.raises(RuntimeError, match=r"died.*fewer --workers"):
-        list(ordered_map(die, [1], 2))
-    start = time.monotonic()
-    with pytest.raises(RuntimeError, match=r"more than 2 s"):
-        list(ordered_map(hang, [1], 2, timeout_s=2))
-    assert time.monotonic() - start < 15
-    with pytest.raises(ValueError, match="workers"):
-        list(ordered_map(hang, [1], 0))
-
-
-def test_what_ends_early_stops_the_tasks_under_way_through_their_clean_up(tmp_path):
-    started = time.monotonic()
-    tasks = [tmp_path / str(number) for number in range(8)]
-    results = ordered_map(fail_once_others_write, reversed(tasks[:2]), 2)
-    with pytest.raises(ValueError, match="bad"):
-        next(results)
-    assert list(tmp_path.iterdir()) == []
-    assert time.monotonic() - started < 50
 
 
 def test_split_files_are_checked(tmp_path: Path):

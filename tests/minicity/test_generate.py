@@ -159,7 +159,7 @@ def test_a_failing_scene_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monk
 def test_an_error_in_a_worker_reaches_the_caller(tmp_path: Path) -> None:
     config = MiniCityConfig(2, 0, 128, 72, 1, 0)
     with pytest.raises(KeyError, match="singapore-onenorth"):
-        generate_module._run_scenes(tmp_path, config, plan_scenes(config), {}, 1, False)
+        generate_module._run_scenes(tmp_path, config, plan_scenes(config), {}, 2, False)
 
 
 def test_workers_that_cannot_start_end_the_run(tmp_path: Path) -> None:
@@ -199,7 +199,7 @@ def test_a_killed_run_leaves_no_root_and_the_next_one_completes(tmp_path: Path) 
     root, partial = tmp_path / "root", tmp_path / "root.partial"
     script = (
         "from minicity.generate import generate\n"
-        f"generate({str(root)!r}, 2, 4, (128, 72), samples_per_scene=40, workers=1)\n"
+        f"generate({str(root)!r}, 2, 4, (128, 72), samples_per_scene=40, workers=2)\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen(

@@ -118,7 +118,7 @@ def look_up(key: str) -> None:
 
 
 def in_worker(function, argument) -> None:
-    with ProcessPoolExecutor(1, get_context("fork")) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         pool.submit(function, argument).result()
 
 

@@ -4,25 +4,18 @@ import fcntl
 import json
 import logging
 import os
-import pickle
 import shutil
-import signal
-import threading
 from collections import defaultdict
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
 from tqdm import tqdm
 
-from gsmap.utils.parallel import spared_from_signals
+from gsmap.utils.parallel import default_workers, ordered_map
 from minicity.config import (
     TRAIN_LOCATIONS,
     VAL_LOCATIONS,
@@ -95,7 +88,7 @@ def generate(
         samples_per_scene: Key frames per scene.
         sweeps_per_sample: LiDAR sweeps between two key frames.
         val_scenes: Validation scenes among ``scenes``; None takes a fifth.
-        workers: Processes; None takes one per core, 0 works in this process.
+        workers: Processes; None takes one per core, 0 or 1 works in this process.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -114,10 +107,10 @@ def generate(
     if is_complete(root, config):
         LOGGER.info("%s is complete already: nothing to do.", root)
         return False
-    with _partial_folder(root) as partial:
-        _fill(partial, config, workers, progress)
-        (partial / MARKER).write_text(json.dumps(config.as_dict(), indent=2) + "\n")
-        os.replace(partial, root)
+    with _partial_folder(root) as folder:
+        _fill(folder, config, workers, progress)
+        (folder / MARKER).write_text(json.dumps(config.as_dict(), indent=2) + "\n")
+        os.replace(folder, root)
     return True
 
 
@@ -236,27 +229,11 @@ def _add_fixed_tables(tables: dict[str, list[dict[str, Any]]], config: MiniCityC
         )
 
 
-_WORKER: dict[str, Any] = {}
-
-
-def _start_worker(root: Path, config: MiniCityConfig, towns: Path, lifeline: Connection) -> None:
-    """Prepare a worker, which ends as soon as its parent lets go of the lifeline, even by dying."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and ends the pool
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-    cv2.setNumThreads(1)
-    _WORKER.update(root=root, config=config, towns=pickle.loads(towns.read_bytes()))
-
-    def end_with_parent() -> None:
-        lifeline.poll(None)
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-def _make_scene(task: SceneTask) -> Records:
-    return SceneMaker(
-        _WORKER["config"], task, _WORKER["towns"][task.location], _WORKER["root"]
-    ).make()
+def _make_scene(
+    root: Path, config: MiniCityConfig, towns: dict[str, Town], task: SceneTask
+) -> Records:
+    """Make a scene in one process."""
+    return SceneMaker(config, task, towns[task.location], root).make()
 
 
 def _run_scenes(
@@ -268,51 +245,17 @@ def _run_scenes(
     progress: bool,
 ) -> dict[str, Records]:
     """Make all scenes, each in one process, and return their records by scene name."""
-    workers = min(len(os.sched_getaffinity(0)) if workers is None else workers, len(tasks))
+    workers = min(default_workers() if workers is None else max(workers, 1), len(tasks))
+    make = partial(_make_scene, root, config, towns)
+    # many processes of one thread; this one, if it is to do the work, stays as it is
+    prepare = cv2.setNumThreads if workers > 1 else None
+    results = ordered_map(make, tasks, workers, prepare, (1,), timeout_s=7200.0)
     per_scene = len(CAMERAS) * config.samples_per_scene
     done: dict[str, Records] = {}
     with tqdm(
         total=per_scene * len(tasks), unit="img", desc="MiniCity", disable=not progress
     ) as bar:
-        if workers == 0:
-            for task in tasks:
-                maker = SceneMaker(config, task, towns[task.location], root)
-                done[task.name] = maker.make()
-                bar.update(per_scene)
-            return done
-        with TemporaryDirectory() as folder:
-            # Through a file: what is handed to a new process goes through a pipe, and if it is long
-            # and the process dies before it reads it, this one would wait for ever.
-            saved = Path(folder, "towns.pickle")
-            saved.write_bytes(pickle.dumps(towns))
-            for name, records in _make_in_workers(root, config, tasks, saved, workers):
-                done[name] = records
-                bar.update(per_scene)
+        for task, records in zip(tasks, results, strict=True):
+            done[task.name] = records
+            bar.update(per_scene)
     return done
-
-
-def _make_in_workers(
-    root: Path, config: MiniCityConfig, tasks: list[SceneTask], towns: Path, workers: int
-) -> Iterator[tuple[str, Records]]:
-    """Make all scenes in worker processes; yield their names and records as they are done."""
-    context = get_context("spawn")
-    lifeline, held = context.Pipe(duplex=False)
-    arguments = (root, config, towns, lifeline)
-    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=arguments)
-    try:
-        with spared_from_signals():
-            futures = {pool.submit(_make_scene, task): task.name for task in tasks}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    except BrokenProcessPool as error:
-        raise RuntimeError(
-            "a worker process died: for want of memory (use fewer workers), or because the program "
-            "that called generate() cannot be imported anew (put the call under "
-            "if __name__ == '__main__')."
-        ) from error
-    except BaseException:
-        held.close()  # workers stop in the middle of their scenes
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        held.close()

@@ -2,12 +2,16 @@
 
 import multiprocessing
 import os
+import pickle
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, TimeoutError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 Task = TypeVar("Task")
@@ -34,18 +38,29 @@ def spared_from_signals() -> Iterator[None]:
 
 
 class _Worker:
-    """State of a worker process: whether it is to stop, and whether it is at a task."""
+    """State of a worker process."""
 
+    function: Callable[[Any], Any]
     stopping = False
     busy = False
 
 
-def _start_worker(initializer: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
+def _start_worker(setup: Path) -> None:
+    """Prepare a worker process, which ends with its parent, however that ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C for all
     signal.signal(signal.SIGTERM, _stop_worker)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _Worker.function, initializer, arguments = pickle.loads(setup.read_bytes())
     if initializer is not None:
         initializer(*arguments)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _stop_worker(number: int, _frame: object) -> None:
@@ -55,13 +70,13 @@ def _stop_worker(number: int, _frame: object) -> None:
         raise SystemExit(128 + number)
 
 
-def _work(function: Callable[[Task], Result], task: Task) -> Result:
+def _work(task: Any) -> Any:
     """Do a task in a worker unless it is to stop."""
     _Worker.busy = True
     try:
         if _Worker.stopping:
             raise SystemExit(128 + signal.SIGTERM)
-        return function(task)
+        return _Worker.function(task)
     finally:
         _Worker.busy = False
 
@@ -81,10 +96,10 @@ def ordered_map(
     stops the tasks under way, through their own clean-up.
 
     Args:
-        function: A module-level function.
-        tasks: Its arguments; drawn as they are needed.
+        function: A picklable function; it reaches each process once, not with every task.
+        tasks: Its arguments, picklable; drawn as they are needed.
         workers: Number of processes, >= 1.
-        initializer: Called once in each process before any task.
+        initializer: Called once in each process before any task; a module-level function.
         arguments: Its arguments.
         timeout_s: Longest time that one result may take, in seconds.
 
@@ -102,15 +117,30 @@ def ordered_map(
             initializer(*arguments)
         yield from map(function, tasks)
         return
-    context = multiprocessing.get_context("spawn")  # no copies of this process's tables
-    pool = ProcessPoolExecutor(workers, context, _start_worker, (initializer, arguments))
+    with TemporaryDirectory() as folder:
+        # Through a file: what a new process is handed goes through a pipe, and if it is long and
+        # the process dies before it reads it, this one would wait for ever.
+        setup = Path(folder, "setup.pickle")
+        setup.write_bytes(pickle.dumps((function, initializer, arguments)))
+        context = multiprocessing.get_context("spawn")  # no copies of this process's tables
+        with _ending(
+            ProcessPoolExecutor(workers, context, _start_worker, (setup,)), timeout_s
+        ) as pool:
+            yield from _in_order(pool, tasks, 3 * workers, timeout_s)
+
+
+@contextmanager
+def _ending(pool: ProcessPoolExecutor, timeout_s: float) -> Iterator[ProcessPoolExecutor]:
+    """End a pool with the block: at leisure if it ends well, and otherwise at once, in words."""
     done = False
     try:
-        yield from _in_order(pool, function, tasks, 3 * workers, timeout_s)
+        yield pool
         done = True
     except BrokenProcessPool as error:
         raise RuntimeError(
-            "a worker process died, most likely for want of memory: run again with fewer --workers."
+            "a worker process died: most likely for want of memory (run again with fewer "
+            "--workers), or because the program that called this cannot be imported anew (put the "
+            "call under if __name__ == '__main__')."
         ) from error
     except TimeoutError as error:
         for process in list(pool._processes.values()):
@@ -127,17 +157,13 @@ def ordered_map(
 
 
 def _in_order(
-    pool: ProcessPoolExecutor,
-    function: Callable[[Task], Result],
-    tasks: Iterable[Task],
-    limit: int,
-    timeout_s: float,
-) -> Iterator[Result]:
+    pool: ProcessPoolExecutor, tasks: Iterable[Any], limit: int, timeout_s: float
+) -> Iterator[Any]:
     """Keep at most ``limit`` tasks in the pool and yield the oldest one's result."""
-    pending: deque[Future[Result]] = deque()
+    pending: deque[Future[Any]] = deque()
     for task in tasks:
         with spared_from_signals():
-            pending.append(pool.submit(_work, function, task))
+            pending.append(pool.submit(_work, task))
         if len(pending) == limit:
             yield pending.popleft().result(timeout_s)
     while pending:

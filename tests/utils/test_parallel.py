@@ -1,0 +1,139 @@
+"""The pool of worker processes: order, memory, and how it ends."""
+
+import operator
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from gsmap.utils.parallel import ordered_map
+
+_offset = 0
+
+
+def set_offset(value: int) -> None:
+    global _offset
+    _offset = value
+
+
+def add_offset(value: int) -> int:
+    time.sleep(0.01 * (value % 3))
+    return value + _offset
+
+
+def die(value: int) -> int:
+    os._exit(value)
+
+
+def hang(value: int) -> int:
+    time.sleep(30 * value)
+    return value
+
+
+def write_and_wait(path: Path) -> None:
+    """Stand for a task that writes for long, and cleans up after itself."""
+    try:
+        path.write_text("half")
+        time.sleep(60)
+    finally:
+        path.unlink()
+
+
+def fail_once_others_write(path: Path) -> None:
+    if path.name == "1":
+        while not path.with_name("0").exists():
+            time.sleep(0.02)
+        raise ValueError("bad")
+    write_and_wait(path)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_order_with_the_initializer_applied(workers: int):
+    results = list(ordered_map(add_offset, range(20), workers, set_offset, (100,)))
+    assert results == list(range(100, 120))
+
+
+def test_tasks_are_drawn_as_needed():
+    drawn = []
+
+    def tasks():
+        for i in range(100):
+            drawn.append(i)
+            yield i
+
+    results = ordered_map(add_offset, tasks(), 2)
+    next(results)
+    assert len(drawn) <= 7
+    results.close()
+
+
+def test_a_dead_worker_and_a_hung_one_end_with_words():
+    with pytest.raises(RuntimeError, match=r"died.*fewer --workers"):
+        list(ordered_map(die, [1], 2))
+    start = time.monotonic()
+    with pytest.raises(RuntimeError, match=r"more than 2 s"):
+        list(ordered_map(hang, [1], 2, timeout_s=2))
+    assert time.monotonic() - start < 15
+    with pytest.raises(ValueError, match="workers"):
+        list(ordered_map(hang, [1], 0))
+
+
+def test_what_ends_early_stops_the_tasks_under_way_through_their_clean_up(tmp_path):
+    started = time.monotonic()
+    tasks = [tmp_path / str(number) for number in range(8)]
+    results = ordered_map(fail_once_others_write, reversed(tasks[:2]), 2)
+    with pytest.raises(ValueError, match="bad"):
+        next(results)
+    assert list(tmp_path.iterdir()) == []
+    assert time.monotonic() - started < 50
+
+
+def test_the_function_may_carry_more_than_a_pipe_takes():
+    holds = partial(operator.contains, bytes(range(200)) * 10**4)
+    assert list(ordered_map(holds, [1, 250], 2)) == [True, False]
+
+
+def test_a_program_that_cannot_be_imported_anew_ends_in_words():
+    """Read from standard input; what its workers were to be sent is longer than a pipe takes."""
+    program = (
+        "import functools, operator\n"
+        "from gsmap.utils.parallel import ordered_map\n"
+        "print(list(ordered_map(functools.partial(operator.contains, bytes(10**6)), [1, 2], 2)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-"],
+        input=program,
+        text=True,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "RuntimeError: a worker process died" in done.stderr
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    """They hold its output open, so it ends when the last of them has."""
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import time\n"
+        "from gsmap.utils.parallel import ordered_map\n"
+        "if __name__ == '__main__':\n"
+        "    results = ordered_map(print, ['ready', 'ready'], 2)\n"
+        "    next(results)\n"
+        "    time.sleep(60)\n"
+    )
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        [sys.executable, str(program)], stdout=subprocess.PIPE, env=environment
+    ) as parent:
+        assert parent.stdout.readline() == b"ready\n"
+        parent.send_signal(signal.SIGKILL)
+        started = time.monotonic()
+        parent.stdout.read()
+    assert time.monotonic() - started < 30
