@@ -7,4 +7,7 @@ _base_ = [
     '../_base_/default_runtime.py',
 ]
 
-model = dict(map_head=dict(type='SegmentationHead', bev_seg=dict(weight=2.0, pos_weight=4.0)))
+model = dict(
+    grid=_base_.grid,
+    classes=_base_.classes,
+    map_head=dict(aux_heads=[dict(type='BEVMaskHead', loss_weight=2.0, pos_weight=4.0)]))

@@ -6,3 +6,4 @@ _base_ = [
     '../_base_/default_runtime.py',
 ]
 auto_scale_lr = dict(base_batch_size=48)
+model = dict(grid=_base_.grid, classes=_base_.classes)

@@ -5,5 +5,4 @@ _base_ = [
     '../_base_/schedules/cosine_24e.py',
     '../_base_/default_runtime.py',
 ]
-
-model = dict(map_head=dict(num_classes=6))
+model = dict(grid=_base_.grid, classes=_base_.classes)

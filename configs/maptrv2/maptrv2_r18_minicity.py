@@ -5,3 +5,4 @@ _base_ = [
     '../_base_/schedules/minicity.py',
     '../_base_/default_runtime.py',
 ]
+model = dict(grid=_base_.grid, classes=_base_.classes)

@@ -6,3 +6,7 @@ _base_ = [
     '../_base_/default_runtime.py',
 ]
 train_dataloader = dict(batch_size=4)
+model = dict(
+    grid=_base_.grid,
+    classes=_base_.classes,
+    map_head=dict(aux_heads=_base_.model.map_head.aux_heads[:2]))  # no depth

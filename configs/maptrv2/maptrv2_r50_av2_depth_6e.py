@@ -6,4 +6,4 @@ _base_ = [
     '../_base_/default_runtime.py',
 ]
 train_dataloader = dict(batch_size=4)
-model = dict(bev_encoder=dict(loss_depth_weight=3.0))
+model = dict(grid=_base_.grid, classes=_base_.classes)

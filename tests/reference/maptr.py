@@ -152,7 +152,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     bev_outputs = model.bev_encoder(feats, [meta])
     yield from bev_rows(name, data, bev_outputs["bev_feats"][0], 1e-4, 1e-3)
     head = model.map_head
-    reference = head.initial_reference(head.queries()[0])
+    reference = head.reference.start(head.queries()[0])
     yield Row(
         name, "init_reference", largest_difference(reference[None], data["init_reference"]), 1e-5
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakeBEVMask, MakePVMask
-from gsmap.models.heads.maptrv2_head import MapTRv2Head
+from gsmap.models.heads.map_head import MapHead
 from gsmap.models.losses.auxiliary import depth_bins
 from gsmap.ops.bev_pool import cell_indices
 from reference.golden import NUM_CAMS, Golden
@@ -38,7 +38,7 @@ def check_state(golden: Golden, name: str) -> Iterator[Row]:
 
 
 @contextmanager
-def all_queries(head: MapTRv2Head) -> Iterator[None]:
+def all_queries(head: MapHead) -> Iterator[None]:
     """Let the head run its training queries, while its layers stay in eval mode (no dropout)."""
     head.training = True
     try:
@@ -68,11 +68,13 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     yield from head_rows(name, data, outputs, CLS_ATOL, PTS_ATOL)
     result = head.predict_by_feat(outputs, [golden.meta(size)])[0]
     yield from decoded_rows(name, data, result, CLS_ATOL)
-    seg = fraction_beyond(outputs["seg"], data["seg"], 1e-3)
+    masks = head.aux_heads
+    seg = fraction_beyond(masks["seg"](bev_outputs["bev_feats"]), data["seg"], 1e-3)
     yield Row(name, "cells with seg off by > 1e-3", seg, FLIPPED)
-    yield Row(name, "pv_seg", largest_difference(outputs["pv_seg"], data["pv_seg"]), 1e-4)
+    pv_seg = masks["pv_seg"](bev_outputs["img_feats"].flatten(0, 1))[None]
+    yield Row(name, "pv_seg", largest_difference(pv_seg, data["pv_seg"]), 1e-4)
     with all_queries(head):
-        groups = head.split_groups(head(bev_outputs))
+        groups = [part for _, part in head.split_groups(head(bev_outputs))]
     yield from group_rows(name, data, *groups)
 
 
@@ -136,12 +138,13 @@ def check_loss(golden: Golden, name: str) -> Iterator[Row]:
     yield from target_rows(name, data, gt, sample)
     with all_queries(head):
         outputs = head(bev_outputs)
-    first, further = head.split_groups(outputs)
-    for group, part, repeats in (("one2one", first, 1), ("one2many", further, head.num_repeats)):
-        yield from match_rows(name, data, group, head, part, gt, meta, repeats)
+    for group, part in head.split_groups(outputs):
+        label = group.name or "one2one"
+        yield from match_rows(name, data, label, head, part, gt, meta, group.repeats)
     losses = head.loss_by_feat(outputs, [gt], [meta])
-    losses.update(head.segmentation_losses(outputs, [sample]))
-    losses.update(model.bev_encoder.loss(bev_outputs, [sample]))
+    losses.update(
+        {f"loss_{k}": aux.loss(bev_outputs, [sample]) for k, aux in head.aux_heads.items()}
+    )
     for group, chosen in (("", "one2one and auxiliary"), ("_one2many", "one2many")):
         keys = [key for key in losses if key.endswith("_one2many") == bool(group)]
         ours = [losses[key].item() for key in keys]
@@ -187,7 +190,7 @@ def match_rows(
     name: str,
     data: dict[str, np.ndarray],
     group: str,
-    head: MapTRv2Head,
+    head: MapHead,
     outputs: dict[str, Tensor],
     gt: InstanceData,
     meta: dict[str, Any],

@@ -68,7 +68,7 @@ def missed(golden, files):
 
 def test_a_wrong_weight_is_noticed(golden):
     head = golden.model("maptr/maptr_r50_24e.py", "maptr_r50_state.json").map_head
-    with shifted(head.reg_branches[2][-1].bias, 0.1):
+    with shifted(head.reference.branches[2][-1].bias, 0.1):
         found = missed(golden, "maptr_r50_forward_reduced_*.npz")
     assert {"all_pts_preds", "all_cls_scores", "dec_pts (m)"} <= found
 

@@ -2,6 +2,9 @@
 # 60 x 30 m in the ego frame. `python tools/create_data.py av2 --root data/av2 --split train --rate 2.5hz`, and
 # the same for val, make the annotation files: every fourth sweep, as in MapTR's evaluation.
 data_root = 'data/av2/'
+# the one place of range and classes: leaves hand them to the model
+grid = dict(x_range=[-30.0, 30.0], y_range=[-15.0, 15.0])  # metres; travel is along the longer side
+classes = ['divider', 'ped_crossing', 'boundary']
 
 _cameras = [
     'ring_front_center', 'ring_front_right', 'ring_front_left', 'ring_rear_right', 'ring_rear_left',
@@ -27,8 +30,8 @@ _test_pipeline = [
 _dataset = dict(
     type='VectorizedMapDataset',
     data_root=data_root,
-    classes=['divider', 'ped_crossing', 'boundary'],
-    pc_range=[-30.0, -15.0, -2.0, 30.0, 15.0, 2.0],
+    classes=classes,
+    grid=grid,
     frame='ego',
     cameras=_cameras)
 

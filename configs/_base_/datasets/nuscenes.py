@@ -1,6 +1,9 @@
 # nuScenes, six cameras at half size, ground truth of 60 x 30 m in the LIDAR_TOP frame.
 # `python tools/create_data.py nuscenes --root data/nuscenes` makes the annotation files.
 data_root = 'data/nuscenes/'
+# the one place of range and classes: leaves hand them to the model
+grid = dict(x_range=[-15.0, 15.0], y_range=[-30.0, 30.0])  # metres; travel is along the longer side
+classes = ['divider', 'ped_crossing', 'boundary']
 
 _cameras = [
     'CAM_FRONT', 'CAM_FRONT_RIGHT', 'CAM_FRONT_LEFT', 'CAM_BACK', 'CAM_BACK_LEFT', 'CAM_BACK_RIGHT'
@@ -22,8 +25,8 @@ _test_pipeline = [*_load, dict(type='ScaleImages', scale=0.5), dict(type='PackMa
 _dataset = dict(
     type='VectorizedMapDataset',
     data_root=data_root,
-    classes=['divider', 'ped_crossing', 'boundary'],
-    pc_range=[-15.0, -30.0, -2.0, 15.0, 30.0, 2.0],
+    classes=classes,
+    grid=grid,
     frame='lidar',
     cameras=_cameras)
 

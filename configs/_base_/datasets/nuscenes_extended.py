@@ -3,12 +3,12 @@
 # stop_line intersection carpark_area` makes the annotation files.
 _base_ = './nuscenes.py'
 
-_classes = [
+classes = [
     'divider', 'ped_crossing', 'boundary', 'stop_line', 'intersection', 'carpark_area'
 ]
 
 train_dataloader = dict(
-    dataset=dict(classes=_classes, ann_file='gsmap_nuscenes_train_extended.arrow'))
+    dataset=dict(classes=classes, ann_file='gsmap_nuscenes_train_extended.arrow'))
 val_dataloader = dict(
-    dataset=dict(classes=_classes, ann_file='gsmap_nuscenes_val_extended.arrow'))
+    dataset=dict(classes=classes, ann_file='gsmap_nuscenes_val_extended.arrow'))
 test_dataloader = val_dataloader

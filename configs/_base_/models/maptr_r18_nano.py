@@ -5,5 +5,7 @@ _base_ = './maptr_r18.py'
 model = dict(
     img_backbone=dict(
         frozen_stages=-1, norm_eval=False, norm_cfg=dict(type='BN', requires_grad=True)),
-    bev_encoder=dict(bev_size=(80, 40)),
-    map_head=dict(num_instances=100, decoder=dict(num_layers=2, layer=dict(num_heads=4))))
+    bev_encoder=dict(bev_pixel_m=0.75),
+    map_head=dict(
+        query_groups=[dict(num=100)],
+        decoder=dict(num_layers=2, layer=dict(num_heads=4))))

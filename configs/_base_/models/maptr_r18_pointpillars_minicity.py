@@ -26,6 +26,6 @@ model = dict(
         backbone=dict(
             type='SECOND', in_channels=32, layer_nums=[3], layer_strides=[2], out_channels=[64]),
         neck=dict(type='SECONDFPN', in_channels=[64], upsample_strides=[1], out_channels=[128]),
-        bev_size=(50, 25)),
+        bev_pixel_m=1.2),
     bev_fuser=dict(
         type='ConvFuser', camera_channels=128, lidar_channels=128, out_channels=128))

@@ -30,31 +30,26 @@ model = dict(
     bev_encoder=dict(
         type='BEVQueryEncoder',
         cross_attn=dict(type='GeometryKernelAttention', num_heads=4, kernel_size=(3, 5)),
-        pc_range=[-15.0, -30.0, -2.0, 15.0, 30.0, 2.0],
-        bev_size=(200, 100),
+        z_range=(-2.0, 2.0),
+        bev_pixel_m=0.3,
         embed_dims=256,
         num_layers=1,
         layer_cfg=dict(num_heads=8, ffn_dims=512, dropout=0.1),
         num_cams=6),
     map_head=dict(
         type='MapHead',
-        num_classes=3,
-        pc_range=[-15.0, -30.0, -2.0, 15.0, 30.0, 2.0],
-        num_instances=50,
+        query_groups=[dict(num=50)],
         num_points=20,
         embed_dims=256,
-        decoder=dict(
-            type='MapDecoder',
-            num_layers=6,
-            layer=dict(
-                type='MapDecoderLayer', embed_dims=256, num_heads=8, ffn_dims=512, dropout=0.1)),
-        assigner=dict(
-            type='MapAssigner',
-            match_costs=[
-                dict(type='mmdet.FocalLossCost', weight=2.0),
-                dict(type='OrderedPointsCost', weight=5.0),
-            ]),
-        coder=dict(type='MapCoder', max_num=50, post_center_range=[-20.0, -35.0, 20.0, 35.0]),
+        decoder=dict(num_layers=6, layer=dict(num_heads=8, ffn_dims=512, dropout=0.1)),
+        match_costs=[
+            dict(type='mmdet.FocalLossCost', weight=2.0),
+            dict(type='OrderedPointsCost', weight=5.0),
+        ],
         loss_cls=dict(
             type='mmdet.FocalLoss', use_sigmoid=True, gamma=2.0, alpha=0.25, loss_weight=2.0),
-        loss_weights=dict(pts=5.0, dir=0.005)))
+        losses=[
+            dict(type='PointsLoss', loss_weight=5.0),
+            dict(type='DirectionLoss', loss_weight=0.005),
+        ],
+        coder=dict(max_num=50)))

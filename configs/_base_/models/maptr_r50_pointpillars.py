@@ -34,6 +34,6 @@ model = dict(
             in_channels=[64, 128, 256],
             upsample_strides=[1, 2, 4],
             out_channels=[128, 128, 128]),
-        bev_size=(200, 100)),
+        bev_pixel_m=0.3),
     bev_fuser=dict(
         type='ConvFuser', camera_channels=256, lidar_channels=384, out_channels=256))

@@ -22,6 +22,6 @@ model = dict(
             encoder_channels=((16, 16, 32), (32, 32, 64), (64, 64, 128), (128, 128)),
             encoder_paddings=([0, 0, 1], [0, 0, 1], [0, 0, [1, 1, 0]], [0, 0]),
             block_type='basicblock'),
-        bev_size=(200, 100)),
+        bev_pixel_m=0.3),
     bev_fuser=dict(
         type='ConvFuser', camera_channels=256, lidar_channels=256, out_channels=256))

@@ -3,25 +3,23 @@
 # of which 40.23 M are in use).
 _base_ = './maptr_r50.py'
 
-_pc_range = [-15.0, -30.0, -10.0, 15.0, 30.0, 10.0]
-
 model = dict(
     bev_encoder=dict(
         _delete_=True,
         type='LSSEncoder',
-        pc_range=_pc_range,
-        bev_size=(200, 100),
+        z_range=(-10.0, 10.0),
+        bev_pixel_m=0.3,
         embed_dims=256,
         depth_range=(1.0, 35.0, 0.5),
-        aspp_channels=96,
-        loss_depth_weight=3.0),
+        aspp_channels=96),
     map_head=dict(
-        type='MapTRv2Head',
-        pc_range=_pc_range,
-        num_instances=50,
-        num_one2many=300,
-        num_repeats=6,
-        one2many_weight=1.0,
-        decoder=dict(layer=dict(type='DecoupledDecoderLayer', num_points=20)),
-        bev_seg=dict(weight=1.0, pos_weight=4.0),
-        pv_seg=dict(weight=2.0, pos_weight=1.0)))
+        query_groups=[
+            dict(num=50),
+            dict(name='one2many', num=300, repeats=6, weight=1.0),
+        ],
+        decoder=dict(layer=dict(self_attn=dict(type='DecoupledSelfAttention'))),
+        aux_heads=[
+            dict(type='BEVMaskHead', loss_weight=1.0, pos_weight=4.0),
+            dict(type='PVMaskHead', loss_weight=2.0, pos_weight=1.0),
+            dict(type='DepthSupervision', loss_weight=3.0),
+        ]))

@@ -16,25 +16,23 @@ import gsmap.models.bev_encoders.bevformer
 import gsmap.models.bev_encoders.gkt
 import gsmap.models.bev_encoders.lidar
 import gsmap.models.bev_encoders.lss
-import gsmap.models.decoders.decoupled_layer
-import gsmap.models.decoders.gaussian_decoupled_layer
-import gsmap.models.decoders.gaussian_layer
 import gsmap.models.decoders.map_decoder
 import gsmap.models.detectors.map_detector
+import gsmap.models.heads.aux_heads
 import gsmap.models.heads.gsmap_head
-import gsmap.models.heads.gsmap_maptrv2_head
 import gsmap.models.heads.map_head
-import gsmap.models.heads.maptrv2_head
+import gsmap.models.heads.references
 import gsmap.models.layers.grid_mask
-import gsmap.models.task_modules.map_assigner
-import gsmap.models.task_modules.map_coder
+import gsmap.models.layers.self_attention
 import gsmap.models.task_modules.match_costs
 import gsmap.models.task_modules.raster_costs
 import gsmap.visualization.map_visualization_hook
 import gsmap.visualization.map_visualizer  # noqa: F401
 from gsmap.models.losses.dice import RenderedDiceLoss
-from gsmap.models.losses.raster import RasterLoss
+from gsmap.models.losses.direction import DirectionLoss
+from gsmap.models.losses.point import PointsLoss
+from gsmap.models.losses.raster import MaskOverlapLoss, RasterLoss
 
 # The losses are plain torch modules, usable without OpenMMLab; they enter the registry here.
-MODELS.register_module(module=RasterLoss)
-MODELS.register_module(module=RenderedDiceLoss)
+for loss in (DirectionLoss, MaskOverlapLoss, PointsLoss, RasterLoss, RenderedDiceLoss):
+    MODELS.register_module(module=loss)

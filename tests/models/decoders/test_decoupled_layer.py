@@ -1,7 +1,6 @@
 """MapTRv2's decoder layer against attention computed group by group."""
 
 import torch
-
 from gsmap.models.decoders.decoupled_layer import DecoupledDecoderLayer
 
 N, P, C = 4, 3, 8

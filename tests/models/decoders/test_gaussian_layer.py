@@ -1,6 +1,6 @@
 import torch
-
 from gsmap.models.decoders.gaussian_layer import GaussianDecoderLayer
+
 from gsmap.models.decoders.map_decoder import refine_reference
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid

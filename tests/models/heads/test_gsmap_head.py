@@ -1,9 +1,9 @@
 import pytest
 import torch
+from gsmap.models.decoders.gaussian_layer import GaussianDecoderLayer
 from head_cases import GAUSSIANS, HEAD, along_y, bev, build_head, elements, with_layer
 from mmengine.structures import InstanceData
 
-from gsmap.models.decoders.gaussian_layer import GaussianDecoderLayer
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.grid import BEVGrid
 

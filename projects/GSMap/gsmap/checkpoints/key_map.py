@@ -77,8 +77,8 @@ HEAD_RULES = (
     (_HEAD + "instance_embedding.", "map_head.instance_embedding."),
     (_HEAD + "pts_embedding.", "map_head.pts_embedding."),
     (_HEAD + "cls_branches.", "map_head.cls_branches."),
-    (_HEAD + "reg_branches.", "map_head.reg_branches."),
-    (_TRANSFORMER + "reference_points.", "map_head.reference_points."),
+    (_HEAD + "reg_branches.", "map_head.reference.branches."),
+    (_TRANSFORMER + "reference_points.", "map_head.reference.initial."),
 )
 DECODER_RULES = (
     (_DECODER_LAYER + "attentions.0.attn.", "map_head.decoder.layers.{i}.self_attn."),
@@ -136,6 +136,7 @@ MAPTR_BEVFORMER = KeyMap(
     ),
 )
 
+_LAYER = "map_head.decoder.layers.{i}."
 _V2_ENCODER = _TRANSFORMER + "encoder."
 _BY_QUERIES = "part of the encoder with learned BEV queries, which depth lifting does not run"
 
@@ -155,15 +156,18 @@ MAPTRV2 = KeyMap(
     rules=(
         *IMAGE_RULES,
         *HEAD_RULES,
-        (_HEAD + "seg_head.", "map_head.seg_head."),
-        (_HEAD + "pv_seg_head.", "map_head.pv_seg_head."),
+        (_HEAD + "seg_head.", "map_head.aux_heads.seg."),
+        (_HEAD + "pv_seg_head.", "map_head.aux_heads.pv_seg."),
         (_V2_ENCODER + "depth_net.", "bev_encoder.depth_net."),
         (_V2_ENCODER + "downsample.", "bev_encoder.downsample."),
-        (_DECODER_LAYER + "attentions.0.attn.", "map_head.decoder.layers.{i}.self_attn."),
-        (_DECODER_LAYER + "attentions.1.attn.", "map_head.decoder.layers.{i}.point_attn."),
-        (_DECODER_LAYER + "attentions.2.", "map_head.decoder.layers.{i}.cross_attn."),
-        (_DECODER_LAYER + "ffns.0.", "map_head.decoder.layers.{i}.ffn."),
-        (_DECODER_LAYER + "norms.", "map_head.decoder.layers.{i}.norms."),
+        (_DECODER_LAYER + "attentions.0.attn.", _LAYER + "self_attn.instance_attn."),
+        (_DECODER_LAYER + "attentions.1.attn.", _LAYER + "self_attn.point_attn."),
+        (_DECODER_LAYER + "attentions.2.", _LAYER + "cross_attn."),
+        (_DECODER_LAYER + "ffns.0.", _LAYER + "ffn."),
+        (_DECODER_LAYER + "norms.0.", _LAYER + "self_attn.norm."),
+        (_DECODER_LAYER + "norms.1.", _LAYER + "norms.0."),
+        (_DECODER_LAYER + "norms.2.", _LAYER + "norms.1."),
+        (_DECODER_LAYER + "norms.3.", _LAYER + "norms.2."),
     ),
     unused={
         **CODE_WEIGHTS,

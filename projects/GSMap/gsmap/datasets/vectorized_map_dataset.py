@@ -12,6 +12,7 @@ from mmengine.logging import MMLogger, print_log
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CAN_BUS_SIZE, LidarRecord, MapSample
 from gsmap.datasets.errors import BrokenSampleError
+from gsmap.structures.grid import BEVGrid
 
 _BROKEN = ("raise", "skip")
 
@@ -40,8 +41,8 @@ class VectorizedMapDataset(BaseDataset):
         data_root: Folder that image and LiDAR paths are relative to.
         pipeline: Transforms.
         classes: Class names that the file must have, in label order; None takes the file's.
-        pc_range: (x_min, y_min, z_min, x_max, y_max, z_max) in metres, whose x and y the file must
-            have; None takes the file's.
+        grid: ``x_range`` and ``y_range`` in metres, which the file must have (further keys are the
+            model's affair); None takes the file's.
         split: Split that the file must hold; None takes any.
         frame: ``lidar`` or ``ego``, which the file must have; None takes any.
         cameras: Names of the cameras to use, in order; None takes all of each sample.
@@ -66,7 +67,7 @@ class VectorizedMapDataset(BaseDataset):
         data_root: str = "",
         pipeline: Sequence[dict | Callable[..., Any]] = (),
         classes: Sequence[str] | None = None,
-        pc_range: Sequence[float] | None = None,
+        grid: dict[str, Any] | None = None,
         split: str | None = None,
         frame: str | None = None,
         cameras: Sequence[str] | None = None,
@@ -82,8 +83,7 @@ class VectorizedMapDataset(BaseDataset):
             raise ValueError(f"broken_samples must be one of {_BROKEN}, got {broken_samples!r}.")
         if broken_samples == "skip" and test_mode:
             raise ValueError("broken_samples='skip' is for training: a test must see every sample.")
-        if pc_range is not None and len(pc_range) != 6:
-            raise ValueError(f"pc_range must hold 6 values, got {len(pc_range)}.")
+        extent = None if grid is None else BEVGrid(**grid)
         self.ann_file = str(Path(data_root, ann_file))
         self.data_root = str(data_root)
         self.cameras = None if cameras is None else tuple(cameras)
@@ -93,8 +93,8 @@ class VectorizedMapDataset(BaseDataset):
         self.broken_tokens: dict[str, str] = {}
         self._expected = {
             "classes": None if classes is None else tuple(classes),
-            "x_range": None if pc_range is None else (float(pc_range[0]), float(pc_range[3])),
-            "y_range": None if pc_range is None else (float(pc_range[1]), float(pc_range[4])),
+            "x_range": None if extent is None else extent.x_range,
+            "y_range": None if extent is None else extent.y_range,
             "split": split,
             "frame": frame,
         }

@@ -15,6 +15,7 @@ KNOWN_KEYS = frozenset(
     [
         "auto_scale_lr",
         "backend_args",
+        "classes",
         "custom_hooks",
         "custom_imports",
         "data_preprocessor",
@@ -24,6 +25,7 @@ KNOWN_KEYS = frozenset(
         "env_cfg",
         "experiment_name",
         "find_unused_parameters",
+        "grid",
         "launcher",
         "load_from",
         "log_level",

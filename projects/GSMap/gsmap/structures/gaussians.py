@@ -4,9 +4,12 @@ import math
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
+
+ACTIVATIONS = ("sigmoid", "softplus", "exp")
 
 
 @dataclass(frozen=True)
@@ -26,29 +29,35 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class GaussianSpace:
-    r"""How a decoder's reference of five numbers stands for a Gaussian.
+    r"""How a decoder's reference stands for a Gaussian.
 
-    The first two are the centre, [0, 1] over the map; two stand for sigma and one for theta, all
-    three zero for the Gaussian that a query starts with:
-    :math:`\sigma = \sigma_{min} + (\sigma_{max} - \sigma_{min})\,\mathrm{sigmoid}(s + s_0)`, theta
-    as it is. The first Gaussian is longer along y than along x (or the other way round), because a
-    round one has no direction, and so no gradient in theta.
+    Its first entries are the centre, [0, 1] over the map; the last three stand for sigma (2) and
+    theta (1), all three zero for the Gaussian that a query starts with. That one lies along the
+    direction of travel: a round one has no direction, and so no gradient in theta.
 
     Args:
-        grid: The map's extent; its raster is not used.
+        grid: The map's extent and direction of travel; its raster is not used.
         min_scale_m: Smallest sigma in metres. Half a pixel of the training raster: a smaller
             Gaussian falls between pixels and gets no gradient.
         max_scale_m: Largest sigma in metres.
-        init_scales_m: Sigma of the Gaussian that a query starts with, along x and y, in metres.
+        init_scales_m: Sigma of the Gaussian that a query starts with, along and across the
+            direction of travel, in metres.
+        activation: How a number s becomes sigma, with s_0 so that zero gives the first one:
+            ``"sigmoid"``: min + (max - min) sigmoid(s + s_0); ``"softplus"``: min + softplus(s +
+            s_0); ``"exp"``: min + exp(s + s_0), the last two cut off at the largest.
+        literal_covariance: Take S = diag(sigma^2) as GSMap's Eq. 3 prints it, so that the standard
+            deviations are the squares of sigma.
 
     Raises:
-        ValueError: If not min < init < max for both axes.
+        ValueError: If not min < init < max for both axes, or ``activation`` is unknown.
     """
 
     grid: BEVGrid
     min_scale_m: float = 0.15
     max_scale_m: float = 5.0
-    init_scales_m: tuple[float, float] = (0.4, 1.0)
+    init_scales_m: tuple[float, float] = (1.0, 0.4)
+    activation: str = "sigmoid"
+    literal_covariance: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "init_scales_m", tuple(float(s) for s in self.init_scales_m))
@@ -57,50 +66,72 @@ class GaussianSpace:
                 "0 < min_scale_m < init_scales_m < max_scale_m must hold, got "
                 f"{self.min_scale_m}, {self.init_scales_m}, {self.max_scale_m}."
             )
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f"activation must be one of {ACTIVATIONS}, got {self.activation!r}.")
+
+    @property
+    def heading_rad(self) -> float:
+        """Angle of the direction of travel from +x in radians."""
+        return 0.0 if self.grid.forward == "x" else math.pi / 2
 
     def decode(self, reference: Tensor) -> Gaussians:
         """Return the Gaussians that a reference stands for, in float32 at least.
 
         Args:
-            reference: Centre in [0, 1], sigma and theta before their activation. (..., 5)
+            reference: Centre in [0, 1] (and perhaps a height), then sigma and theta before their
+                activation. (..., 5 or more)
 
         Returns:
             The Gaussians, differentiable in ``reference``. (...)
 
         Raises:
-            ValueError: If the last axis does not hold five numbers.
+            ValueError: If the last axis holds fewer than five numbers.
         """
-        if reference.shape[-1] != 5:
-            raise ValueError(f"reference must have shape (..., 5), got {tuple(reference.shape)}.")
+        if reference.shape[-1] < 5:
+            raise ValueError(
+                f"reference must have shape (..., 5) or more, got {tuple(reference.shape)}."
+            )
         reference = reference.to(torch.promote_types(reference.dtype, torch.float32))
         means = self.grid.metres_from_norm(reference[..., :2])
-        return Gaussians(means, self.scales(reference[..., 2:4]), reference[..., 4])
+        scales = self.scales(reference[..., -3:-1])
+        if self.literal_covariance:
+            scales = scales.square()  # GSMap Eq. 3 as printed
+        return Gaussians(means, scales, reference[..., -1] + self.heading_rad)
 
     def scales(self, raw: Tensor) -> Tensor:
         """Activate sigma: zero gives ``init_scales_m``. (..., 2) -> (..., 2) metres"""
-        span = self.max_scale_m - self.min_scale_m
-        start = [
-            math.log((s - self.min_scale_m) / (self.max_scale_m - s)) for s in self.init_scales_m
-        ]
-        return self.min_scale_m + span * (raw + raw.new_tensor(start)).sigmoid()
+        low, high = self.min_scale_m, self.max_scale_m
+        if self.activation == "sigmoid":
+            start = [math.log((s - low) / (high - s)) for s in self.init_scales_m]
+            return low + (high - low) * (raw + raw.new_tensor(start)).sigmoid()
+        if self.activation == "softplus":
+            start = [math.log(math.expm1(s - low)) for s in self.init_scales_m]
+            return (low + F.softplus(raw + raw.new_tensor(start))).clamp(max=high)
+        start = [math.log(s - low) for s in self.init_scales_m]
+        return (low + (raw + raw.new_tensor(start)).exp()).clamp(max=high)
 
-    def frames(self, reference: Tensor) -> Tensor:
+    def frames(self, reference: Tensor, invariant: bool = False) -> Tensor:
         r"""Return what turns an offset into the Gaussian's own frame, the identity at the start.
 
-        The matrix is :math:`R(\theta)\,\mathrm{diag}(\sigma / \sigma_{init})`: a Gaussian that is
-        twice as long as the one that every query starts with looks twice as far along that axis.
+        A Gaussian that is twice as long as the one that every query starts with looks twice as far
+        along that axis. With the stretch :math:`D = \mathrm{diag}(\sigma / \sigma_{init})` and the
+        direction of travel :math:`\theta_0`, the matrix is :math:`R(\theta) D R(\theta_0)^T`. The
+        invariant one, :math:`R(\theta) D R(\theta)^T`, is the same for theta and theta + pi, which
+        are the same Gaussian.
 
         Args:
-            reference: As in :meth:`decode`. (..., 5)
+            reference: As in :meth:`decode`. (..., 5 or more)
+            invariant: Which of the two.
 
         Returns:
             Matrices that multiply (x, y) in metres from the left. (..., 2, 2)
         """
         gaussians = self.decode(reference)
-        stretch = gaussians.scales / self.scales(gaussians.scales.new_zeros(2))
-        cos, sin = gaussians.rotations.cos(), gaussians.rotations.sin()
-        rotation = torch.stack([cos, -sin, sin, cos], -1).unflatten(-1, (2, 2))  # GSMap Eq. 4
-        return rotation * stretch[..., None, :]
+        start = self.scales(gaussians.scales.new_zeros(2))
+        stretch = gaussians.scales / (start.square() if self.literal_covariance else start)
+        turned = _rotations(gaussians.rotations)
+        back = turned if invariant else _rotations(stretch.new_tensor(self.heading_rad))
+        return (turned * stretch[..., None, :]) @ back.transpose(-1, -2)
 
     def describe(self, reference: Tensor) -> Tensor:
         """Return numbers of unit size that describe the Gaussians, for an embedding.
@@ -109,10 +140,37 @@ class GaussianSpace:
         same.
 
         Args:
-            reference: As in :meth:`decode`. (..., 5)
+            reference: As in :meth:`decode`. (..., 5 or more)
 
         Returns:
             mu in [-1, 1], sigma before its activation, cos and sin of 2 theta. (..., 6)
         """
-        centre, raw_scales, theta = reference.split([2, 2, 1], -1)
-        return torch.cat([2 * centre - 1, raw_scales, (2 * theta).cos(), (2 * theta).sin()], -1)
+        centre, raw_scales, theta = reference[..., :2], reference[..., -3:-1], reference[..., -1:]
+        angle = 2 * (theta + self.heading_rad)
+        return torch.cat([2 * centre - 1, raw_scales, angle.cos(), angle.sin()], -1)
+
+
+def _rotations(angles: Tensor) -> Tensor:
+    """Return rotation matrices (GSMap Eq. 4). (...) -> (..., 2, 2)"""
+    cos, sin = angles.cos(), angles.sin()
+    return torch.stack([cos, -sin, sin, cos], -1).unflatten(-1, (2, 2))
+
+
+def extents_along_line(gaussians: Gaussians) -> Tensor:
+    r"""Return each Gaussian's standard deviation along and across the line of its centres.
+
+    The line's direction at a centre joins its neighbours, or at an end the end and its neighbour.
+
+    Args:
+        gaussians: Ordered Gaussians of each element, at least two. (..., P)
+
+    Returns:
+        :math:`\sqrt{d^T \Sigma d}` for d along and across the line, in metres. (..., P, 2)
+    """
+    means = gaussians.means
+    padded = torch.cat([means[..., :1, :], means, means[..., -1:, :]], -2)
+    along = padded[..., 2:, :] - padded[..., :-2, :]
+    angles = torch.atan2(along[..., 1], along[..., 0]) - gaussians.rotations
+    cos, sin = angles.cos().square(), angles.sin().square()
+    first, second = gaussians.scales.square().unbind(-1)
+    return torch.stack([first * cos + second * sin, first * sin + second * cos], -1).sqrt()

@@ -1,7 +1,7 @@
 """The extent of the map in metres and its raster: every metres <-> [0, 1] <-> pixel conversion."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,15 +24,17 @@ class BEVGrid:
         y_range: Smallest and largest y in metres.
         height: Number of rows H (along y).
         width: Number of columns W (along x).
+        forward: Axis of the direction of travel, ``"x"`` or ``"y"``; by default the longer side.
 
     Raises:
-        ValueError: If a range is empty or a size is not positive.
+        ValueError: If a range is empty, a size is not positive or ``forward`` is unknown.
     """
 
     x_range: tuple[float, float]
     y_range: tuple[float, float]
-    height: int
-    width: int
+    height: int = 1
+    width: int = 1
+    forward: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("x_range", "y_range"):
@@ -44,6 +46,11 @@ class BEVGrid:
             )  # lists from a config become a hashable value
         if self.height < 1 or self.width < 1:
             raise ValueError(f"height and width must be >= 1, got {self.height} x {self.width}.")
+        if self.forward is None:
+            wide = self.extent_m[0] > self.extent_m[1]
+            object.__setattr__(self, "forward", "x" if wide else "y")
+        elif self.forward not in ("x", "y"):
+            raise ValueError(f"forward must be 'x' or 'y', got {self.forward!r}.")
 
     @classmethod
     def from_pc_range(cls, pc_range: Sequence[float], height: int, width: int) -> "BEVGrid":
@@ -64,7 +71,26 @@ class BEVGrid:
 
     def resized(self, height: int, width: int) -> "BEVGrid":
         """Return the same extent with another raster size."""
-        return BEVGrid(self.x_range, self.y_range, height, width)
+        return replace(self, height=height, width=width)
+
+    def rasterized(self, pixel_m: float | Sequence[float]) -> "BEVGrid":
+        """Return the same extent divided into pixels of a size.
+
+        Args:
+            pixel_m: Side of a square pixel in metres, or its sizes along x and y.
+
+        Raises:
+            ValueError: If the pixels do not divide the extent.
+        """
+        sizes = (pixel_m, pixel_m) if isinstance(pixel_m, (int, float)) else tuple(pixel_m)
+        counts = [extent / size for extent, size in zip(self.extent_m, sizes, strict=True)]
+        width, height = (round(count) for count in counts)
+        if min(width, height) < 1 or max(abs(counts[0] - width), abs(counts[1] - height)) > 1e-3:
+            raise ValueError(
+                f"pixels of {sizes[0]:g} x {sizes[1]:g} m do not divide the map of "
+                f"{self.extent_m[0]:g} x {self.extent_m[1]:g} m."
+            )
+        return self.resized(height, width)
 
     def _affine(
         self, points: Array, scale: tuple[float, float], shift: tuple[float, float]

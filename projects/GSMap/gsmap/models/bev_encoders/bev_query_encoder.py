@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from gsmap.models.bev_encoders.img_metas import stack_matrices
 from gsmap.models.bev_encoders.projection import PillarProjection, pillar_points, project_pillars
 from gsmap.models.layers.deformable_attention import (
-    DeformableAttention,
+    BEVDeformableAttention,
     directional_offsets,
     init_matrices,
 )
@@ -23,7 +23,7 @@ from gsmap.structures.grid import BEVGrid
 _NUM_CAN_BUS = 18
 
 
-class BEVSelfAttention(DeformableAttention):
+class BEVSelfAttention(BEVDeformableAttention):
     """BEVFormer's temporal self-attention for a model without history.
 
     Both entries of the queue are then the current queries, so the values coincide and averaging the
@@ -124,8 +124,9 @@ class BEVQueryEncoder(BaseModule):
 
     Args:
         cross_attn: Config of the camera cross-attention of every layer.
-        pc_range: x, y, z minima, then maxima, in metres; z bounds the pillars.
-        bev_size: Rows and columns of the grid.
+        grid: The map's extent.
+        z_range: Lowest and highest z of the pillars in metres.
+        bev_pixel_m: Side of a cell in metres, or its sizes along x and y.
         embed_dims: Channels C.
         num_layers: Number of layers.
         layer_cfg: Further arguments of :class:`BEVEncoderLayer`.
@@ -138,8 +139,9 @@ class BEVQueryEncoder(BaseModule):
     def __init__(
         self,
         cross_attn: dict,
-        pc_range: Sequence[float],
-        bev_size: tuple[int, int] = (200, 100),
+        grid: BEVGrid,
+        z_range: Sequence[float] = (-2.0, 2.0),
+        bev_pixel_m: float | Sequence[float] = 0.3,
         embed_dims: int = 256,
         num_layers: int = 1,
         layer_cfg: dict | None = None,
@@ -148,8 +150,8 @@ class BEVQueryEncoder(BaseModule):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.grid = BEVGrid.from_pc_range(pc_range, *bev_size)
-        self.z_range = (float(pc_range[2]), float(pc_range[5]))
+        self.grid = grid.rasterized(bev_pixel_m)
+        self.z_range = (float(z_range[0]), float(z_range[1]))
         self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)
         self.positional_encoding = LearnedPositionalEncoding(
             embed_dims // 2, self.grid.height, self.grid.width

@@ -1,5 +1,6 @@
 """BEV features from LiDAR with mmdet3d's own modules, and their fusion with the cameras'."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,6 +12,8 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from torch import Tensor
 
+from gsmap.structures.grid import BEVGrid
+
 
 @MODELS.register_module()
 class LidarEncoder(BaseModule):
@@ -19,21 +22,24 @@ class LidarEncoder(BaseModule):
     The data preprocessor voxelises (``voxel=True``), with the extent of the map as its range.
 
     Args:
+        grid: The map's extent.
         voxel_encoder: Config of the encoder of each voxel's points.
         middle_encoder: Config of what spreads the voxels over the plane.
         backbone: Config of the 2D backbone, or None.
         neck: Config of the neck, or None; its first output is used.
-        bev_size: Rows and columns of the output, to which the features are interpolated.
+        bev_pixel_m: Side of a cell of the output in metres, or its sizes along x and y; the
+            features are interpolated to it.
         init_cfg: As in mmengine.
     """
 
     def __init__(
         self,
+        grid: BEVGrid,
         voxel_encoder: dict,
         middle_encoder: dict,
         backbone: dict | None = None,
         neck: dict | None = None,
-        bev_size: tuple[int, int] = (200, 100),
+        bev_pixel_m: float | Sequence[float] = 0.3,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
@@ -41,7 +47,8 @@ class LidarEncoder(BaseModule):
         self.middle_encoder = MODELS.build(middle_encoder)
         self.backbone = MODELS.build(backbone) if backbone else None
         self.neck = MODELS.build(neck) if neck else None
-        self.bev_size = tuple(bev_size)
+        cells = grid.rasterized(bev_pixel_m)
+        self.bev_size = (cells.height, cells.width)
 
     def forward(self, voxels: dict[str, Tensor], batch_size: int) -> Tensor:
         """Encode the voxels of a batch.

@@ -6,14 +6,13 @@ from typing import Any, cast
 import numpy as np
 import torch
 from mmdet3d.registry import MODELS
-from mmdet3d.structures import Det3DDataSample
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
 from gsmap.models.bev_encoders.depth_net import CameraAwareDepthNet, PlainDepthNet
 from gsmap.models.bev_encoders.frustum import camera_vector, frustum_points
 from gsmap.models.bev_encoders.img_metas import stack_matrices
-from gsmap.models.losses.auxiliary import depth_bins, depth_loss, num_depth_bins
+from gsmap.models.losses.auxiliary import num_depth_bins
 from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
 from gsmap.structures.grid import BEVGrid
 
@@ -26,15 +25,14 @@ class LSSEncoder(BaseModule):
     resolution.
 
     Args:
-        pc_range: x, y, z minima, then maxima, in metres; points outside are dropped, and z is one
-            layer.
-        bev_size: Rows and columns of the output.
+        grid: The map's extent; points outside are dropped.
+        z_range: Lowest and highest z in metres; it is one layer.
+        bev_pixel_m: Side of a cell of the output in metres, or its sizes along x and y.
         embed_dims: Channels C of image and BEV features.
         depth_range: ``(low, high, step)`` of the depth bins in metres.
         camera_aware: Whether the depth net reads the cameras' parameters (MapTRv2) or is one
             convolution (the BEVPool variant of MapTR).
         aspp_channels: Channels of each branch of the camera-aware depth head's pyramid.
-        loss_depth_weight: Weight of the depth loss; 0 trains without LiDAR.
         init_cfg: As in mmengine.
 
     Raises:
@@ -43,23 +41,22 @@ class LSSEncoder(BaseModule):
 
     def __init__(
         self,
-        pc_range: Sequence[float],
-        bev_size: tuple[int, int] = (200, 100),
+        grid: BEVGrid,
+        z_range: Sequence[float] = (-10.0, 10.0),
+        bev_pixel_m: float | Sequence[float] = 0.3,
         embed_dims: int = 256,
         depth_range: tuple[float, float, float] = (1.0, 35.0, 0.5),
         camera_aware: bool = True,
         aspp_channels: int = 96,
-        loss_depth_weight: float = 3.0,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.grid = BEVGrid.from_pc_range(tuple(pc_range), *bev_size)
+        self.grid = grid.rasterized(bev_pixel_m)
         self.cells = self.grid.resized(2 * self.grid.height, 2 * self.grid.width)
-        self.z_range = (float(pc_range[2]), float(pc_range[5]))
+        self.z_range = (float(z_range[0]), float(z_range[1]))
         low, high, step = (float(x) for x in depth_range)
         self.depth_range = (low, high, step)
         self.num_bins = num_depth_bins(self.depth_range)
-        self.loss_depth_weight = loss_depth_weight
         self.camera_aware = camera_aware
         sizes = (embed_dims, embed_dims, self.num_bins)
         self.depth_net = (
@@ -80,7 +77,7 @@ class LSSEncoder(BaseModule):
 
     def forward(
         self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]
-    ) -> dict[str, Tensor]:
+    ) -> dict[str, Any]:
         """Encode camera features into BEV features.
 
         Args:
@@ -91,7 +88,8 @@ class LSSEncoder(BaseModule):
 
         Returns:
             ``bev_feats`` (B, C, H, W), row 0 at the smallest y; ``depth``, the probability of each
-            depth bin (B, V, D, h, w); ``img_feats``, the image features used (B, V, C, h, w).
+            depth bin (B, V, D, h, w), and their ``depth_range``; ``img_feats``, the image features
+            used (B, V, C, h, w).
 
         Raises:
             ValueError: If a sample lacks a matrix.
@@ -106,7 +104,12 @@ class LSSEncoder(BaseModule):
         with torch.autocast(feats.device.type, enabled=False):
             kernel = cast(Tensor, self.downsample[0].weight)
             bev = bev_pool_conv3x3(depth, context, indices, self.cells, kernel.float())
-        return {"bev_feats": self.downsample[1:](bev), "depth": depth, "img_feats": feats}
+        return {
+            "bev_feats": self.downsample[1:](bev),
+            "depth": depth,
+            "depth_range": self.depth_range,
+            "img_feats": feats,
+        }
 
     def points(self, img_metas: Sequence[dict[str, Any]], feats: Tensor) -> Tensor:
         """Return every feature pixel at every depth, in metres. (B, V, D, h, w, 3)"""
@@ -129,32 +132,3 @@ class LSSEncoder(BaseModule):
         )
         vectors = camera_vector(*(torch.as_tensor(m, dtype=torch.float32) for m in matrices))
         return vectors.flatten(0, 1).to(feats.device)
-
-    def loss(
-        self, outputs: dict[str, Tensor], data_samples: Sequence[Det3DDataSample]
-    ) -> dict[str, Tensor]:
-        """Compute the depth loss from ``data_sample.gt_depth``.
-
-        Args:
-            outputs: What `forward` returned.
-            data_samples: Each with ``gt_depth``, metres, 0 where there is no return. (V, H_img,
-                W_img)
-
-        Returns:
-            ``loss_depth``, or nothing if its weight is 0.
-
-        Raises:
-            ValueError: If a sample has no ``gt_depth``.
-        """
-        if self.loss_depth_weight == 0:
-            return {}
-        probs = outputs["depth"]
-        for sample in data_samples:
-            if "gt_depth" not in sample:
-                raise ValueError(
-                    f"sample {sample.metainfo.get('token')!r} has no gt_depth: add the depth "
-                    "transform to the training pipeline, or set loss_depth_weight=0."
-                )
-        target = torch.stack([torch.as_tensor(s.gt_depth) for s in data_samples]).to(probs.device)
-        bins = depth_bins(target, target.shape[-1] // probs.shape[-1], self.depth_range)
-        return {"loss_depth": self.loss_depth_weight * depth_loss(probs, bins)}

@@ -5,97 +5,62 @@ from typing import Any
 
 import torch
 from mmcv.cnn.bricks.transformer import FFN
-from mmdet.models.layers import inverse_sigmoid
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule
+from mmengine.model import BaseModule, ModuleList
 from torch import Tensor, nn
 
-from gsmap.models.layers.deformable_attention import DeformableAttention, at_least_float32
-
-
-def refine_reference(reference: Tensor, offsets: Tensor) -> Tensor:
-    """Move a reference by predicted offsets.
-
-    The centre moves before its sigmoid; further entries (GSMap Eq. 1: sigma, theta before their
-    activation) add up.
-
-    Args:
-        reference: Reference; the first two entries are the centre in (0, 1). (..., D)
-        offsets: Predicted offsets. (..., D)
-
-    Returns:
-        The refined reference, at least float32. (..., D)
-
-    Raises:
-        ValueError: If the shapes disagree.
-    """
-    if reference.shape != offsets.shape:
-        raise ValueError(
-            f"offsets must have shape {tuple(reference.shape)} of reference, got "
-            f"{tuple(offsets.shape)}."
-        )
-    reference, offsets = at_least_float32(reference), at_least_float32(offsets)
-    centres = (inverse_sigmoid(reference[..., :2], eps=1e-5) + offsets[..., :2]).sigmoid()
-    return torch.cat([centres, reference[..., 2:] + offsets[..., 2:]], -1)
+from gsmap.models.layers.gaussian_guidance import GaussianGuidance
+from gsmap.structures.gaussians import GaussianSpace
 
 
 @MODELS.register_module()
 class MapDecoderLayer(BaseModule):
-    """Self-attention, deformable attention on the BEV and feed-forward, each with its LayerNorm.
-
-    Subclasses override one of :meth:`embed_position`, :meth:`interact` and :meth:`sample_bev`, or
-    build another cross-attention in :meth:`build_cross_attention`.
+    """Self-attention, cross-attention to the BEV and feed-forward, each with its LayerNorm.
 
     Args:
         embed_dims: Channels C.
         num_heads: Heads of both attentions.
-        num_sampling_points: Samples per head of the deformable attention.
+        num_points: Points per instance P.
         ffn_dims: Hidden channels of the feed-forward network.
         dropout: Dropout of every sublayer.
+        self_attn: Config of the self-attention (`PointSelfAttention`).
+        cross_attn: Config of the cross-attention (`BEVDeformableAttention`).
+        guidance: Settings of `GaussianGuidance`, or None for a layer that is not guided.
+        space: How the reference stands for a Gaussian, for the guidance.
         init_cfg: As in mmengine.
-    """
 
-    num_norms = 3
+    Raises:
+        ValueError: If there is guidance but the reference holds no Gaussians.
+    """
 
     def __init__(
         self,
         embed_dims: int = 256,
         num_heads: int = 8,
-        num_sampling_points: int = 4,
+        num_points: int = 20,
         ffn_dims: int = 512,
         dropout: float = 0.1,
+        self_attn: dict[str, Any] | None = None,
+        cross_attn: dict[str, Any] | None = None,
+        guidance: dict[str, Any] | None = None,
+        space: GaussianSpace | None = None,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.self_attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
-        self.cross_attn = self.build_cross_attention(
-            embed_dims, num_heads, num_sampling_points, dropout
+        shared = {"embed_dims": embed_dims, "num_heads": num_heads, "dropout": dropout}
+        self.self_attn = MODELS.build(
+            {"type": "PointSelfAttention", "num_points": num_points, **shared, **(self_attn or {})}
+        )
+        self.cross_attn = MODELS.build(
+            {"type": "BEVDeformableAttention", **shared, **(cross_attn or {})}
         )
         self.ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
-        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(self.num_norms))
-        self.dropout = nn.Dropout(dropout)
-
-    def build_cross_attention(
-        self, embed_dims: int, num_heads: int, num_sampling_points: int, dropout: float
-    ) -> DeformableAttention:
-        """Return the attention that :meth:`sample_bev` uses."""
-        return DeformableAttention(embed_dims, num_heads, num_sampling_points, dropout=dropout)
-
-    def embed_position(self, query_pos: Tensor, reference: Tensor) -> Tensor:
-        """Return the position that both attentions add; MapTR's is learned alone. (B, N * P, C)"""
-        return query_pos
-
-    def interact(self, query: Tensor, query_pos: Tensor, attn_mask: Tensor | None) -> Tensor:
-        """Let all point queries attend to each other, with residual and norm. (B, N * P, C)"""
-        key = query + query_pos
-        attended = self.self_attn(key, key, query, attn_mask=attn_mask, need_weights=False)[0]
-        return self.norms[0](query + self.dropout(attended))
-
-    def sample_bev(
-        self, query: Tensor, query_pos: Tensor, reference: Tensor, bev_feats: Tensor
-    ) -> Tensor:
-        """Look at the BEV around the reference, without residual and norm. (B, N * P, C)"""
-        return self.cross_attn(query + query_pos, reference, bev_feats)
+        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
+        self.guidance: GaussianGuidance | None = None
+        if guidance is not None:
+            if space is None:
+                raise ValueError("a guided decoder layer needs a reference that holds Gaussians.")
+            self.guidance = GaussianGuidance(space, embed_dims, **guidance)
 
     def forward(
         self,
@@ -112,16 +77,49 @@ class MapDecoderLayer(BaseModule):
             query_pos: Their learned position. (B, N * P, C)
             reference: Their reference. (B, N * P, D)
             bev_feats: BEV features. (B, C, H, W)
-            attn_mask: True where a query may not attend to another, or None. Its shape is the
-                subclass's affair.
+            attn_mask: True where an instance may not attend to another, or None. (N, N)
 
         Returns:
             Updated queries. (B, N * P, C)
         """
-        position = self.embed_position(query_pos, reference)
-        query = self.interact(query, position, attn_mask)
-        query = self.norms[-2](query + self.sample_bev(query, position, reference, bev_feats))
-        return self.norms[-1](self.ffn(query))
+        frames = None
+        if self.guidance is not None:
+            query_pos = self.guidance.position(query_pos, reference)
+            shape = (bev_feats.shape[-2], bev_feats.shape[-1])
+            frames = self.guidance.frames(reference, shape)
+        query = self.norms[0](self.self_attn(query, query_pos, attn_mask))
+        sampled = self.cross_attn(query + query_pos, reference, bev_feats, frames)
+        query = self.norms[1](query + sampled)
+        return self.norms[2](self.ffn(query))
+
+
+@MODELS.register_module()
+class GaussianDecoderLayer(MapDecoderLayer):
+    """The layer guided by Gaussians (GSMap section 3.4), whatever its attentions are.
+
+    Args:
+        guide_sampling: Sample the BEV features in each Gaussian's own frame.
+        embed_gaussians: Add an embedding of (mu, sigma, theta) to the query's position.
+        invariant_frame: Take the sampling frame that is the same for theta and theta + pi.
+        embed_hidden_dims: Hidden channels of that embedding.
+        kwargs: Arguments of `MapDecoderLayer`.
+    """
+
+    def __init__(
+        self,
+        guide_sampling: bool = True,
+        embed_gaussians: bool = True,
+        invariant_frame: bool = False,
+        embed_hidden_dims: int = 16,
+        **kwargs: Any,
+    ) -> None:
+        guidance = {
+            "sampling": guide_sampling,
+            "embedding": embed_gaussians,
+            "invariant": invariant_frame,
+            "hidden_dims": embed_hidden_dims,
+        }
+        super().__init__(guidance=guidance, **kwargs)
 
 
 @MODELS.register_module()
@@ -129,17 +127,24 @@ class MapDecoder(BaseModule):
     """A stack of decoder layers that refine one reference.
 
     Args:
-        layer: Config of the layer; it may leave out its ``type`` (:class:`MapDecoderLayer`).
+        layer: Config of the layer; its ``type`` is the head's choice unless it names one.
         num_layers: Number of layers L.
+        detach_reference: Cut the gradient through the reference between layers, as MapTR does.
         init_cfg: As in mmengine.
+        shared: What the head hands on to every layer: ``embed_dims``, ``num_points``, ``space``.
     """
 
     def __init__(
-        self, layer: dict[str, Any] | None = None, num_layers: int = 6, init_cfg: dict | None = None
+        self,
+        layer: dict[str, Any],
+        num_layers: int = 6,
+        detach_reference: bool = True,
+        init_cfg: dict | None = None,
+        **shared: Any,
     ) -> None:
         super().__init__(init_cfg)
-        layer = {"type": "MapDecoderLayer", **(layer or {})}
-        self.layers = nn.ModuleList(MODELS.build(layer) for _ in range(num_layers))
+        self.detach_reference = detach_reference
+        self.layers = ModuleList(MODELS.build({**shared, **layer}) for _ in range(num_layers))
 
     def forward(
         self,
@@ -147,19 +152,19 @@ class MapDecoder(BaseModule):
         query_pos: Tensor,
         reference: Tensor,
         bev_feats: Tensor,
-        predict_offsets: Callable[[int, Tensor], Tensor],
+        refine: Callable[[int, Tensor, Tensor], Tensor],
         attn_mask: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Run all layers, each on the reference that the one before refined, the gradient cut.
+        """Run all layers, each on the reference that the one before refined.
 
         Args:
             query: Content of the point queries. (B, N * P, C)
             query_pos: Their learned position. (B, N * P, C)
             reference: Initial reference. (B, N * P, D)
             bev_feats: BEV features. (B, C, H, W)
-            predict_offsets: Maps a layer's number and its states (B, N * P, C) to offsets (B, N *
-                P, D).
-            attn_mask: Passed on to every layer.
+            refine: Maps a layer's number, its states (B, N * P, C) and a reference (B, N * P, D) to
+                the refined one.
+            attn_mask: True where an instance may not attend to another, or None. (N, N)
 
         Returns:
             The layers' states (L, B, N * P, C) and refined references (L, B, N * P, D), the latter
@@ -168,8 +173,9 @@ class MapDecoder(BaseModule):
         states, references = [], []
         for number, layer in enumerate(self.layers):
             query = layer(query, query_pos, reference, bev_feats, attn_mask)
-            refined = refine_reference(reference, predict_offsets(number, query))
+            reference = refine(number, query, reference)
             states.append(query)
-            references.append(refined)
-            reference = refined.detach()
+            references.append(reference)
+            if self.detach_reference:
+                reference = reference.detach()
         return torch.stack(states), torch.stack(references)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
 from gsmap.models.layers.folded_backbone import FoldedBackbone
+from gsmap.structures.grid import BEVGrid
 
 
 @MODELS.register_module()
@@ -18,6 +19,9 @@ class MapDetector(Base3DDetector):
     """Image backbone and neck, BEV encoder, map head; with LiDAR, its encoder and their fusion.
 
     Args:
+        grid: The map: ``x_range`` and ``y_range`` in metres, optionally ``forward``; it reaches
+            encoders, head, masks and coder from here.
+        classes: Names of the classes.
         map_head: Config of the head.
         bev_encoder: Config of the cameras' BEV encoder; None for a model without cameras.
         img_backbone: Config of the image backbone; None for a model without cameras.
@@ -35,6 +39,8 @@ class MapDetector(Base3DDetector):
 
     def __init__(
         self,
+        grid: dict,
+        classes: Sequence[str],
         map_head: dict,
         bev_encoder: dict | None = None,
         img_backbone: dict | None = None,
@@ -54,10 +60,12 @@ class MapDetector(Base3DDetector):
             raise ValueError("a model needs a bev_encoder (cameras), a lidar_encoder or both.")
         if bool(bev_fuser) != bool(bev_encoder and lidar_encoder):
             raise ValueError("bev_fuser belongs to a model of cameras and LiDAR, and to no other.")
-        self.bev_encoder = MODELS.build(bev_encoder) if bev_encoder else None
-        self.lidar_encoder = MODELS.build(lidar_encoder) if lidar_encoder else None
+        self.grid = BEVGrid(**grid)
+        shared = {"grid": self.grid}
+        self.bev_encoder = MODELS.build({**shared, **bev_encoder}) if bev_encoder else None
+        self.lidar_encoder = MODELS.build({**shared, **lidar_encoder}) if lidar_encoder else None
         self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
-        self.map_head = MODELS.build(map_head)
+        self.map_head = MODELS.build({**shared, "classes": classes, **map_head})
 
     def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
         """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
@@ -101,8 +109,6 @@ class MapDetector(Base3DDetector):
         """
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         losses = self.map_head.loss(outputs, batch_data_samples)
-        if self.bev_encoder is not None and hasattr(self.bev_encoder, "loss"):
-            losses.update(self.bev_encoder.loss(outputs, batch_data_samples))
         self._check_finite(losses, batch_data_samples)
         return losses
 
@@ -155,5 +161,4 @@ class MapDetector(Base3DDetector):
 
     def _fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
         """Let the head fit a checkpoint's training-only parts to its own size."""
-        if hasattr(self.map_head, "fit_state"):
-            self.map_head.fit_state(state, f"{prefix}map_head.")
+        self.map_head.fit_state(state, f"{prefix}map_head.")

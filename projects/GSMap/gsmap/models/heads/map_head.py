@@ -1,147 +1,190 @@
-"""MapTR's head: hierarchical queries, per-layer predictions, matching and losses."""
+"""The map head: hierarchical queries, predictions of every layer, matching, losses; all in parts."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from mmdet.utils import reduce_mean
-from mmdet3d.registry import MODELS, TASK_UTILS
+import torch.nn.functional as F
+from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
-from mmengine.model import BaseModule, bias_init_with_prob, xavier_init
+from mmengine.model import BaseModule, bias_init_with_prob
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
+from gsmap.models.heads.masks import ElementMasks
+from gsmap.models.heads.matched import GT_FIELDS, MapTargets, MatchedPairs, collect_targets
+from gsmap.models.heads.query_groups import QueryGroup, fit_instance_queries, group_mask
 from gsmap.models.layers.deformable_attention import init_matrices
-from gsmap.models.losses.direction import direction_loss
-from gsmap.models.losses.point import points_l1_loss
-from gsmap.models.task_modules.map_assigner import MapMatch
+from gsmap.models.task_modules.map_assigner import MapAssigner
+from gsmap.models.task_modules.map_coder import MapCoder
 from gsmap.structures.grid import BEVGrid
 
 _PRIOR_PROBABILITY = 0.01
-
-
-@dataclass
-class MapTargets:
-    """What the predictions of one decoder layer should be.
-
-    Attributes:
-        matches: Matched pairs of every sample.
-        labels: Class of every query, ``num_classes`` for background. (B * N,)
-        pts: Normalised points of the matched ground truth, in the matched order, samples
-            concatenated. (M, P, 2)
-        avg_factor: Matched elements in the batch, averaged over ranks, at least 1. ()
-    """
-
-    matches: list[MapMatch]
-    labels: Tensor
-    pts: Tensor
-    avg_factor: Tensor
+PARTS = dict[str, Any]
 
 
 @MODELS.register_module()
 class MapHead(BaseModule):
-    """Predict N map elements of P ordered points from BEV features (MapTR).
+    """Predict N map elements of P ordered points from BEV features, as its parts say.
 
-    A query is the sum of its instance's and its point's embedding; half of its channels are
-    position, half content. Subclasses override :meth:`predict_offsets` (what the reference holds),
-    :meth:`layer_predictions` and :meth:`prepare_gt` (what costs and losses read), and
-    :meth:`matched_losses` (which losses there
-    are).
+    A query is the sum of its instance's and its point's embedding (MapTR); half of its channels are
+    position, half content. Methods are combined by their parts: a reference that the decoder
+    refines, the decoder's layers, query groups, matching costs, losses of matched pairs, auxiliary
+    heads. A loss or a cost names the fields that it reads (``reads``); what nobody offers is an
+    error when the head is built.
 
     Args:
-        num_classes: Number of classes.
-        pc_range: x, y, z minima, then maxima, in metres.
+        grid: The map's extent.
+        classes: Names of the classes.
         decoder: Config of the decoder.
-        assigner: Config of the assigner.
-        coder: Config of the coder that selects detections.
-        loss_cls: Config of the classification loss.
-        loss_weights: Weights of the further losses: ``pts``, ``dir``.
-        num_instances: Number of instance queries N.
+        losses: Configs of the losses of matched pairs.
+        match_costs: Configs of the matching costs.
+        loss_cls: Config of the classification loss, on logits and one-hot targets.
+        query_groups: Settings of each `QueryGroup`; the first one predicts.
+        reference: Config of the reference; its type is ``default_reference`` unless it names one.
+        masks: Settings of `ElementMasks`, for losses and costs that read masks.
+        aux_heads: Configs of heads that only help training.
+        coder: Settings of `MapCoder`.
         num_points: Points per instance P.
         embed_dims: Channels C.
         num_reg_layers: Hidden layers of each branch.
         init_cfg: As in mmengine.
+
+    Raises:
+        ValueError: If a loss or a cost reads a field that nothing here offers, or two parts have
+            one name.
     """
+
+    default_reference = "PointReference"
+    default_layer = "MapDecoderLayer"
 
     def __init__(
         self,
-        num_classes: int,
-        pc_range: Sequence[float],
-        decoder: dict,
-        assigner: dict,
-        coder: dict,
-        loss_cls: dict,
-        loss_weights: dict[str, float],
-        num_instances: int = 50,
+        grid: BEVGrid,
+        classes: Sequence[str],
+        decoder: PARTS,
+        losses: Sequence[PARTS],
+        match_costs: Sequence[PARTS],
+        loss_cls: PARTS,
+        query_groups: Sequence[PARTS] = ({"num": 50},),
+        reference: PARTS | None = None,
+        masks: PARTS | None = None,
+        aux_heads: Sequence[PARTS] = (),
+        coder: PARTS | None = None,
         num_points: int = 20,
         embed_dims: int = 256,
         num_reg_layers: int = 2,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.num_classes = num_classes
-        self.num_instances = num_instances
+        self.grid = grid
+        self.classes = tuple(classes)
         self.num_points = num_points
         self.embed_dims = embed_dims
-        self.num_reg_layers = num_reg_layers
-        self.grid = BEVGrid.from_pc_range(pc_range, 1, 1)  # only its extent is used
-        self.loss_weights = dict(loss_weights)
-        self.loss_cls = MODELS.build(loss_cls)
-        self.assigner = TASK_UTILS.build(assigner)
-        self.coder = TASK_UTILS.build(coder)
-        self.decoder = MODELS.build(decoder)
+        self.masks = ElementMasks(grid, **(masks or {}))
+        self.query_groups = [QueryGroup(**group) for group in query_groups]
+        num_instances = sum(group.num for group in self.query_groups)
+        num_layers = decoder["num_layers"]
+        self.reference = MODELS.build(
+            {
+                "type": self.default_reference,
+                "grid": grid,
+                "embed_dims": embed_dims,
+                "num_layers": num_layers,
+                "num_reg_layers": num_reg_layers,
+                **self.reference_settings(reference or {}),
+            }
+        )
+        self.decoder = MODELS.build(
+            {
+                "type": "MapDecoder",
+                "embed_dims": embed_dims,
+                "num_points": num_points,
+                "space": getattr(self.reference, "space", None),
+                **decoder,
+                "layer": {"type": self.default_layer, **decoder.get("layer", {})},
+            }
+        )
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
         self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
-        self.reference_points = nn.Linear(embed_dims, 2)
-        num_layers = len(self.decoder.layers)
-        self.cls_branches = nn.ModuleList(self.build_cls_branch() for _ in range(num_layers))
-        self.reg_branches = nn.ModuleList(self.build_reg_branch(2) for _ in range(num_layers))
+        self.cls_branches = nn.ModuleList(
+            self.build_cls_branch(num_reg_layers) for _ in range(num_layers)
+        )
+        self.loss_cls = MODELS.build(loss_cls)
+        self.losses = nn.ModuleDict(_by_name([MODELS.build(loss) for loss in losses]))
+        self.aux_heads = nn.ModuleDict(
+            _by_name([MODELS.build({"embed_dims": embed_dims, **head}) for head in aux_heads])
+        )
+        self.assigner = MapAssigner(match_costs)
+        self.coder = MapCoder(grid=grid, **(coder or {}))
+        self._check_parts()
 
-    def build_cls_branch(self) -> nn.Sequential:
+    def reference_settings(self, reference: PARTS) -> PARTS:
+        """Return the reference's settings, with what this head knows better than the defaults."""
+        return reference
+
+    def build_cls_branch(self, num_hidden: int) -> nn.Sequential:
         """Return one layer's classifier: hidden layers with LayerNorm, then logits."""
         layers: list[nn.Module] = []
-        for _ in range(self.num_reg_layers):
+        for _ in range(num_hidden):
             layers += [
                 nn.Linear(self.embed_dims, self.embed_dims),
                 nn.LayerNorm(self.embed_dims),
                 nn.ReLU(True),
             ]
-        return nn.Sequential(*layers, nn.Linear(self.embed_dims, self.num_classes))
+        return nn.Sequential(*layers, nn.Linear(self.embed_dims, len(self.classes)))
 
-    def build_reg_branch(self, out_dims: int) -> nn.Sequential:
-        """Return one layer's regressor of ``out_dims`` numbers per point."""
-        layers: list[nn.Module] = []
-        for _ in range(self.num_reg_layers):
-            layers += [nn.Linear(self.embed_dims, self.embed_dims), nn.ReLU(True)]
-        return nn.Sequential(*layers, nn.Linear(self.embed_dims, out_dims))
+    def _check_parts(self) -> None:
+        """Refuse a part that reads what nothing offers, and a group's loss that does not exist."""
+        pred = {"scores", *self.reference.fields, *getattr(self.decoder, "fields", ())}
+        offered = {f"pred.{name}" for name in pred} | {f"gt.{name}" for name in GT_FIELDS}
+        parts = [*self.losses.values(), *self.assigner.match_costs]
+        for part in parts:
+            missing = sorted(set(getattr(part, "reads", ())) - offered)
+            if missing:
+                raise ValueError(
+                    f"{type(part).__name__} reads {missing}, which neither "
+                    f"{type(self.reference).__name__} nor the decoder nor the ground truth offers."
+                )
+        self._reads = {field for part in parts for field in getattr(part, "reads", ())}
+        for group in self.query_groups:
+            unknown = sorted(set(group.losses or ()) - {"cls", *self.losses})
+            if unknown:
+                raise ValueError(
+                    f"query group {group.name!r} names losses {unknown}; there are "
+                    f"{['cls', *self.losses]}."
+                )
 
     def init_weights(self) -> None:
         """Initialise the decoder's matrices (Xavier) and let every class start improbable."""
-        super().init_weights()
         init_matrices(self.decoder)
-        xavier_init(self.reference_points, distribution="uniform", bias=0.0)
         for branch in self.cls_branches:
             *_, bias = branch.parameters()  # of the logits
             nn.init.constant_(bias, bias_init_with_prob(_PRIOR_PROBABILITY))
+        super().init_weights()  # parts that start neutral have the last word
 
     def queries(self) -> tuple[Tensor, Tensor]:
-        """Return position and content of every point query, instance by instance. 2 x (N * P, C)"""
-        both = self.instance_embedding.weight[:, None] + self.pts_embedding.weight
+        """Return position and content of the point queries. 2 x (N * P, C)
+
+        All groups in training; else the one that predicts.
+        """
+        instances = self.instance_embedding.weight
+        if not self.training:
+            instances = instances[: self.query_groups[0].num]
+        both = instances[:, None] + self.pts_embedding.weight
         position, content = both.flatten(0, 1).split(self.embed_dims, -1)
         return position, content
 
-    def initial_reference(self, query_pos: Tensor) -> Tensor:
-        """Return the reference that the first layer starts from. (..., C) -> (..., D)"""
-        return self.reference_points(query_pos).float().sigmoid()
-
-    def predict_offsets(self, layer: int, states: Tensor) -> Tensor:
-        """Return a layer's change of the reference, float32. (B, N * P, C) -> (B, N * P, D)"""
-        return self.reg_branches[layer](states).float()
-
     def attention_mask(self) -> Tensor | None:
-        """Return which queries may not attend to which others; MapTR has no such limit."""
-        return None
+        """Return which instances may not attend to each other: those of two groups. (N, N)"""
+        if not self.training or len(self.query_groups) == 1:
+            return None
+        return group_mask(self.query_groups, self.instance_embedding.weight.device)
+
+    def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Fit the instance queries of a checkpoint with another number of further queries."""
+        key = f"{prefix}instance_embedding.weight"
+        fit_instance_queries(state, key, self.instance_embedding.weight, self.query_groups[0].num)
 
     def forward(self, bev_outputs: dict[str, Tensor]) -> dict[str, Tensor]:
         """Predict the elements after every decoder layer.
@@ -151,17 +194,16 @@ class MapHead(BaseModule):
 
         Returns:
             ``all_cls_scores`` logits (L, B, N, classes), ``all_pts_preds`` normalised (L, B, N, P,
-            2) and ``all_references`` (L, B, N, P, D), float32; ``states`` (L, B, N * P, C).
+            2 or 3) and ``all_references`` (L, B, N, P, D), float32; ``states`` (L, B, N * P, C).
         """
         bev_feats = bev_outputs["bev_feats"]
-        batch = len(bev_feats)
-        query_pos, query = (part.expand(batch, -1, -1) for part in self.queries())
+        query_pos, query = (part.expand(len(bev_feats), -1, -1) for part in self.queries())
         states, references = self.decoder(
             query,
             query_pos,
-            self.initial_reference(query_pos),
+            self.reference.start(query_pos),
             bev_feats,
-            self.predict_offsets,
+            self.reference.refine,
             self.attention_mask(),
         )
         instances = states.unflatten(2, (-1, self.num_points)).mean(3)  # (L, B, N, C)
@@ -169,7 +211,7 @@ class MapHead(BaseModule):
         references = references.unflatten(2, (-1, self.num_points))  # (L, B, N, P, D)
         return {
             "all_cls_scores": torch.stack(scores).float(),
-            "all_pts_preds": references[..., :2],
+            "all_pts_preds": references[..., : self.reference.coords],
             "all_references": references,
             "states": states,
         }
@@ -177,12 +219,15 @@ class MapHead(BaseModule):
     def loss(
         self, bev_outputs: dict[str, Tensor], batch_data_samples: Sequence[Det3DDataSample]
     ) -> dict[str, Tensor]:
-        """Run the head and return its losses."""
-        return self.loss_by_feat(
+        """Run the head and return its losses, those of the auxiliary heads included."""
+        losses = self.loss_by_feat(
             self(bev_outputs),
             [sample.gt_instances_3d for sample in batch_data_samples],
             [sample.metainfo for sample in batch_data_samples],
         )
+        for name, head in self.aux_heads.items():
+            losses[f"loss_{name}"] = head.loss(bev_outputs, batch_data_samples)
+        return losses
 
     def loss_by_feat(
         self,
@@ -190,66 +235,99 @@ class MapHead(BaseModule):
         batch_gt_instances: Sequence[InstanceData],
         batch_img_metas: Sequence[dict[str, Any]],
     ) -> dict[str, Tensor]:
-        """Prepare the ground truth and return the losses of every decoder layer.
+        """Prepare the ground truth and return the losses of every decoder layer and query group.
 
         Args:
             outputs: What :meth:`forward` returned.
-            batch_gt_instances: Per sample ``labels_3d`` (K,) and ``pts_shifts`` in metres (K, S, P,
-                2).
+            batch_gt_instances: Per sample ``labels_3d`` (K,), ``pts`` (K, P, 2), ``pts_shifts`` (K,
+                S, P, 2) in metres, and for masks ``polylines`` (K, M, 2).
             batch_img_metas: Meta dicts.
 
         Returns:
-            The last layer's losses under their names, the others' with the prefix ``d<layer>.``.
+            The last layer's losses under their names, the others' with the prefix ``d<layer>.``;
+            those of a further query group end in its name.
 
         Raises:
             FloatingPointError: If a matching cost is not finite.
         """
+        losses: dict[str, Tensor] = {}
         with torch.autocast(outputs["all_pts_preds"].device.type, enabled=False):
             gts = [self.prepare_gt(gt) for gt in batch_gt_instances]
-            return self.losses_by_layer(outputs, gts, batch_img_metas)
+            for group, own in self.split_groups(outputs):
+                losses.update(self.group_losses(group, own, gts, batch_img_metas))
+        return losses
 
-    def losses_by_layer(
+    def split_groups(
+        self, outputs: dict[str, Tensor]
+    ) -> Iterator[tuple[QueryGroup, dict[str, Tensor]]]:
+        """Yield each query group with its predictions, ``all_*`` (L, B, N of the group, ...)."""
+        start = 0
+        for group in self.query_groups:
+            chosen = slice(start, start + group.num)
+            yield (
+                group,
+                {k: v[:, :, chosen] for k, v in outputs.items() if k.startswith("all_")},
+            )
+            start += group.num
+
+    def group_losses(
         self,
+        group: QueryGroup,
         outputs: dict[str, Tensor],
         gts: Sequence[InstanceData],
         batch_img_metas: Sequence[dict[str, Any]],
-        repeats: int = 1,
     ) -> dict[str, Tensor]:
-        """Return every layer's losses; each ground truth is matched to ``repeats`` queries."""
-        losses = {}
-        num_layers = len(outputs["all_cls_scores"])
-        for layer in range(num_layers):
+        """Return every layer's losses of one query group."""
+        losses: dict[str, Tensor] = {}
+        last = len(outputs["all_cls_scores"]) - 1
+        suffix = f"_{group.name}" if group.name else ""
+        for layer in range(last + 1):
             predictions = self.layer_predictions(outputs, layer)
-            layer_losses = self.loss_by_feat_single(predictions, gts, batch_img_metas, repeats)
-            prefix = "" if layer == num_layers - 1 else f"d{layer}."
-            losses.update({f"{prefix}{name}": value for name, value in layer_losses.items()})
+            targets = self.get_targets(predictions, gts, batch_img_metas, group.repeats)
+            values = self.layer_losses(group, predictions, gts, targets, layer == last)
+            prefix = "" if layer == last else f"d{layer}."
+            for name, value in values.items():
+                weight = group.weight if name.startswith("loss_") else 1.0
+                losses[f"{prefix}{name}{suffix}"] = weight * value
         return losses
 
     def prepare_gt(self, gt_instances: InstanceData) -> InstanceData:
-        """Return one sample's ``labels`` (K,) and normalised ``pts_shifts`` (K, S, P, 2)."""
-        shifts = self.grid.norm_from_metres(gt_instances.pts_shifts.float())
-        return InstanceData(labels=gt_instances.labels_3d, pts_shifts=shifts)
+        """Return one sample's ground truth as costs and losses read it.
+
+        Returns:
+            ``labels`` (K,), normalised ``pts_shifts`` (K, S, P, 2) and ``first_pts`` (K, P, 2) in
+            the annotated order; where something reads them, ``rasters`` (K, h, w) for matching and
+            ``masks`` (K, H, W) at full resolution.
+        """
+        gt = InstanceData(
+            labels=gt_instances.labels_3d,
+            pts_shifts=self.reference.norm(gt_instances.pts_shifts.float()),
+            first_pts=self.reference.norm(gt_instances.pts.float()),
+        )
+        if "gt.rasters" in self._reads:
+            gt.rasters = self.masks.draw_sample(gt_instances, self.masks.cost_grid)
+        if "gt.masks" in self._reads and self.masks.source == "full":
+            gt.masks = self.masks.draw_sample(gt_instances, self.masks.grid)
+        return gt
 
     def layer_predictions(self, outputs: dict[str, Tensor], layer: int) -> list[InstanceData]:
-        """Return a layer's ``scores`` (N, classes) and normalised ``pts`` (N, P, 2), per sample."""
-        scores, pts = outputs["all_cls_scores"][layer], outputs["all_pts_preds"][layer]
-        return [
-            InstanceData(scores=s.float(), pts=p.float()) for s, p in zip(scores, pts, strict=True)
-        ]
+        """Return a layer's predictions as costs and losses read them.
 
-    def loss_by_feat_single(
-        self,
-        predictions: Sequence[InstanceData],
-        gts: Sequence[InstanceData],
-        batch_img_metas: Sequence[dict[str, Any]],
-        repeats: int = 1,
-    ) -> dict[str, Tensor]:
-        """Match one layer's predictions and return its losses."""
-        targets = self.get_targets(predictions, gts, batch_img_metas, repeats)
-        scores = torch.cat([prediction.scores for prediction in predictions])
-        losses = {"loss_cls": self.loss_cls(scores, targets.labels, avg_factor=targets.avg_factor)}
-        losses.update(self.matched_losses(predictions, gts, targets))
-        return losses
+        Returns:
+            Per sample ``scores`` (N, classes), normalised ``pts`` (N, P, 2), ``references`` (N, P,
+            D), whatever else the decoder gives (``all_<name>``), and ``rasters`` (N, h, w), without
+            gradient, where a cost reads them.
+        """
+        names = {"all_cls_scores": "scores", "all_pts_preds": "pts", "all_references": "references"}
+        fields = {
+            names.get(name, name.removeprefix("all_")): value[layer].float()
+            for name, value in outputs.items()
+        }
+        if "pred.rasters" in self._reads:
+            gaussians = self.reference.gaussians(fields["references"].detach())
+            fields["rasters"] = self.masks.render(gaussians, self.masks.cost_grid)
+        batch = len(fields["scores"])
+        return [InstanceData(**{k: v[i] for k, v in fields.items()}) for i in range(batch)]
 
     def get_targets(
         self,
@@ -259,30 +337,39 @@ class MapHead(BaseModule):
         repeats: int = 1,
     ) -> MapTargets:
         """Match every sample's predictions with its ground truth and collect the targets."""
-        matches, labels, pts = [], [], []
-        for prediction, gt, meta in zip(predictions, gts, batch_img_metas, strict=True):
-            match = self.assigner.assign(prediction, gt, meta, repeats)
-            sample_labels = gt.labels.new_full((len(prediction.scores),), self.num_classes)
-            sample_labels[match.query_inds] = gt.labels[match.gt_inds]
-            matches.append(match)
-            labels.append(sample_labels)
-            pts.append(gt.pts_shifts[match.gt_inds, match.order_inds])
-        matched = torch.cat(pts)
-        count = reduce_mean(matched.new_tensor(float(len(matched))))
-        return MapTargets(matches, torch.cat(labels), matched, count.clamp(min=1.0))
+        matches = [
+            self.assigner.assign(prediction, gt, meta, repeats)
+            for prediction, gt, meta in zip(predictions, gts, batch_img_metas, strict=True)
+        ]
+        return collect_targets(predictions, gts, matches, len(self.classes))
 
-    def matched_losses(
-        self, predictions: Sequence[InstanceData], gts: Sequence[InstanceData], targets: MapTargets
+    def layer_losses(
+        self,
+        group: QueryGroup,
+        predictions: Sequence[InstanceData],
+        gts: Sequence[InstanceData],
+        targets: MapTargets,
+        is_last: bool,
     ) -> dict[str, Tensor]:
-        """Return the losses of the matched predictions of one layer."""
-        pred = gather_matched(predictions, targets.matches, "pts")
-        pred_m, target_m = self.grid.metres_from_norm(pred), self.grid.metres_from_norm(targets.pts)
-        loss_pts = points_l1_loss(pred, targets.pts, targets.avg_factor)
-        loss_dir = direction_loss(pred_m, target_m, targets.avg_factor)
-        return {
-            "loss_pts": self.loss_weights["pts"] * loss_pts,
-            "loss_dir": self.loss_weights["dir"] * loss_dir,
-        }
+        """Return the losses of one layer's predictions."""
+        losses: dict[str, Tensor] = {}
+        if group.has("cls"):
+            scores = torch.cat([prediction.scores for prediction in predictions])
+            # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
+            one_hot = F.one_hot(targets.labels, len(self.classes) + 1)[:, :-1]
+            losses["loss_cls"] = self.loss_cls(scores, one_hot, avg_factor=targets.avg_factor)
+        pairs = MatchedPairs(predictions, gts, targets, self.reference, self.masks)
+        for name, loss in self.losses.items():
+            if group.has(name) and (is_last or not getattr(loss, "last_layer_only", False)):
+                values = [pairs[field] for field in loss.reads]
+                losses[f"loss_{name}"] = loss(*values, avg_factor=targets.avg_factor)
+        if is_last and group is self.query_groups[0]:
+            losses.update(self.statistics(pairs))
+        return losses
+
+    def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:
+        """Return figures to log beside the losses; their names do not start with ``loss``."""
+        return {}
 
     def predict(
         self, bev_outputs: dict[str, Tensor], batch_data_samples: Sequence[Det3DDataSample]
@@ -303,24 +390,25 @@ class MapHead(BaseModule):
 
         Returns:
             Per sample ``scores_3d`` (M,), ``labels_3d`` (M,) and ``pts`` (M, P, 2) in metres, best
-            first.
+            first, and what else the reference decodes.
         """
         results = []
         last = zip(outputs["all_cls_scores"][-1], outputs["all_references"][-1], strict=True)
         for scores, references in last:
-            fields = self.decode_reference(references)
+            fields = self.reference.decode(references)
             best = self.coder.decode(scores, fields["pts"])
             chosen = {name: value[best.query_inds] for name, value in fields.items()}
             results.append(InstanceData(scores_3d=best.scores, labels_3d=best.labels, **chosen))
         return results
 
-    def decode_reference(self, references: Tensor) -> dict[str, Tensor]:
-        """Return what a reference (N, P, D) says in metres: ``pts`` (N, P, 2)."""
-        return {"pts": self.grid.metres_from_norm(references[..., :2])}
 
+def _by_name(modules: Sequence[nn.Module]) -> dict[str, nn.Module]:
+    """Return modules by their ``name``.
 
-def gather_matched(
-    predictions: Sequence[InstanceData], matches: Sequence[MapMatch], field: str
-) -> Tensor:
-    """Return a field of the matched predictions of all samples, concatenated. (M, ...)"""
-    return torch.cat([p[field][m.query_inds] for p, m in zip(predictions, matches, strict=True)])
+    Raises:
+        ValueError: If two have the same.
+    """
+    named = {str(module.name): module for module in modules}
+    if len(named) < len(modules):
+        raise ValueError(f"two parts have one name: {[module.name for module in modules]}.")
+    return named

@@ -1,4 +1,4 @@
-"""Deformable attention over one feature map, with overridable sampling locations."""
+"""Deformable attention over one feature map."""
 
 import math
 
@@ -6,8 +6,11 @@ import torch
 import torch.nn.functional as F
 from mmcv.ops import get_compiling_cuda_version
 from mmcv.ops.multi_scale_deform_attn import MultiScaleDeformableAttnFunction
+from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule, constant_init, xavier_init
 from torch import Tensor, nn
+
+from gsmap.models.layers.gaussian_guidance import turn_offsets
 
 _SAMPLING_WEIGHTS = ("sampling_offsets.weight", "attention_weights.weight")
 _IM2COL_STEP = 64
@@ -173,15 +176,19 @@ class SamplingAttention(BaseModule):
         return logits.unflatten(-1, (self.num_heads, self.num_points)).softmax(-1)
 
 
-class DeformableAttention(SamplingAttention):
+@MODELS.register_module()
+class BEVDeformableAttention(SamplingAttention):
     """Multi-head deformable attention on one map; the residual is left to the caller.
 
-    Subclasses change where it looks by overriding :meth:`sampling_locations`. Its arguments are
-    those of :class:`SamplingAttention`.
+    Its arguments are those of :class:`SamplingAttention`.
     """
 
     def sampling_locations(
-        self, query: Tensor, reference: Tensor, shape: tuple[int, int]
+        self,
+        query: Tensor,
+        reference: Tensor,
+        shape: tuple[int, int],
+        frames: Tensor | None = None,
     ) -> Tensor:
         """Place the samples around the reference points; learned offsets are in cells.
 
@@ -190,15 +197,18 @@ class DeformableAttention(SamplingAttention):
             reference: Reference; the first two entries are the point, [0, 1] over the map. (B, Q,
                 D)
             shape: Rows and columns of the map.
+            frames: What turns each query's offsets, or None. (B, Q, 2, 2)
 
         Returns:
             Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
         """
-        offsets = self.offsets_in_cells(query)
+        offsets = turn_offsets(self.offsets_in_cells(query), frames)
         size = offsets.new_tensor([shape[1], shape[0]])
         return reference[:, :, None, None, :2] + offsets / size
 
-    def forward(self, query: Tensor, reference: Tensor, feats: Tensor) -> Tensor:
+    def forward(
+        self, query: Tensor, reference: Tensor, feats: Tensor, frames: Tensor | None = None
+    ) -> Tensor:
         """Sample the map for each query.
 
         Args:
@@ -206,13 +216,15 @@ class DeformableAttention(SamplingAttention):
             reference: Reference; the first two entries are the point, [0, 1] over the map. (B, Q,
                 D)
             feats: The map. (B, C, H, W)
+            frames: What turns each query's sampling offsets, or None. (B, Q, 2, 2)
 
         Returns:
             Attended features, without the residual. (B, Q, C)
         """
         shape = (feats.shape[-2], feats.shape[-1])
         tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)
-        locations, weights = self.sampling_locations(query, reference, shape), self.weights(query)
+        locations = self.sampling_locations(query, reference, shape, frames)
+        weights = self.weights(query)
         # Projection and sampling commute: projecting after it pays when few cells are looked at.
         if weights.numel() * _CORNERS < tokens[..., 0].numel() * self.num_heads and not (
             has_compiled_op(tokens)

@@ -108,6 +108,9 @@ class RenderedDiceLoss(nn.Module):
         rendering: Further settings of `ElementRenderer`.
     """
 
+    name = "dice"
+    reads = ("pred.pts", "gt.first_pts", "gt.labels")
+
     def __init__(
         self, loss_weight: float = 15.0, size: tuple[int, int] = (256, 128), **rendering: Any
     ) -> None:

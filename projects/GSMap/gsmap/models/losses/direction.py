@@ -1,7 +1,7 @@
 """Edge direction loss."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 _EPS = 1e-12
 
@@ -35,3 +35,22 @@ def direction_loss(
     target_edges = target[:, interval:] - target[:, :-interval]
     lengths = ((pred_edges.square().sum(-1) + _EPS) * (target_edges.square().sum(-1) + _EPS)).sqrt()
     return torch.sum(1 - (pred_edges * target_edges).sum(-1) / lengths) / avg_factor
+
+
+class DirectionLoss(nn.Module):
+    """Direction of the edges of matched pairs against the ground truth's (MapTR Eq. 7).
+
+    Args:
+        loss_weight: Weight of the loss.
+    """
+
+    name = "dir"
+    reads = ("pred.pts_m", "gt.pts_m")
+
+    def __init__(self, loss_weight: float = 0.005) -> None:
+        super().__init__()
+        self.loss_weight = loss_weight
+
+    def forward(self, preds: Tensor, targets: Tensor, avg_factor: float | Tensor) -> Tensor:
+        """Return the weighted loss of points in metres. 2 x (M, P, 2) -> ()"""
+        return self.loss_weight * direction_loss(preds, targets, avg_factor)

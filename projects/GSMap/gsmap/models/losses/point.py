@@ -1,6 +1,6 @@
 """Point regression loss."""
 
-from torch import Tensor
+from torch import Tensor, nn
 
 
 def points_l1_loss(pred: Tensor, target: Tensor, avg_factor: float | Tensor) -> Tensor:
@@ -22,3 +22,22 @@ def points_l1_loss(pred: Tensor, target: Tensor, avg_factor: float | Tensor) -> 
             f"target must have shape {tuple(pred.shape)} of pred, got {tuple(target.shape)}."
         )
     return (pred - target).abs().sum() / avg_factor
+
+
+class PointsLoss(nn.Module):
+    """L1 loss of the points of matched pairs (MapTR Eq. 6, GSMap Eq. 11).
+
+    Args:
+        loss_weight: Weight of the loss: GSMap's lambda_v.
+    """
+
+    name = "pts"
+    reads = ("pred.pts", "gt.pts")
+
+    def __init__(self, loss_weight: float = 5.0) -> None:
+        super().__init__()
+        self.loss_weight = loss_weight
+
+    def forward(self, preds: Tensor, targets: Tensor, avg_factor: float | Tensor) -> Tensor:
+        """Return the weighted loss of normalised points. 2 x (M, P, 2) -> ()"""
+        return self.loss_weight * points_l1_loss(preds, targets, avg_factor)

@@ -1,8 +1,12 @@
-"""GSMap's raster loss as a module (Eq. 12)."""
+"""Losses of rendered masks: GSMap's raster loss (Eq. 12), and overlap in its place."""
 
+import torch
 from torch import Tensor, nn
 
+from gsmap.models.losses.dice import dice_loss
 from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
+
+_EPS = 1e-6
 
 
 class RasterLoss(nn.Module):
@@ -16,10 +20,14 @@ class RasterLoss(nn.Module):
             ``"pixels"`` (see `gsmap.ops.raster_loss.raster_loss`).
         window_size: Side of SSIM's window in pixels, odd.
         window_sigma: Standard deviation of SSIM's window in pixels.
+        last_layer_only: Leave it out of all decoder layers but the last.
 
     Raises:
         ValueError: If an argument is outside its range.
     """
+
+    name = "raster"
+    reads = ("pred.masks", "gt.masks")
 
     def __init__(
         self,
@@ -29,6 +37,7 @@ class RasterLoss(nn.Module):
         normalize: str = "both",
         window_size: int = 11,
         window_sigma: float = 1.5,
+        last_layer_only: bool = False,
     ) -> None:
         super().__init__()
         if not 0 <= alpha <= 1:
@@ -44,6 +53,7 @@ class RasterLoss(nn.Module):
         self.loss_weight, self.alpha = loss_weight, alpha
         self.foreground_weight, self.normalize = foreground_weight, normalize
         self.window_size, self.window_sigma = window_size, window_sigma
+        self.last_layer_only = last_layer_only
 
     def forward(
         self, preds: Tensor, targets: Tensor, avg_factor: float | Tensor | None = None
@@ -69,4 +79,41 @@ class RasterLoss(nn.Module):
             self.window_size,
             self.window_sigma,
         )
+        return self.loss_weight * losses.sum() / (len(preds) if avg_factor is None else avg_factor)
+
+
+class MaskOverlapLoss(nn.Module):
+    """Dice or IoU loss of the rendered masks of matched instances, in place of Eq. 12.
+
+    Args:
+        loss_weight: Weight of the loss.
+        kind: ``"dice"``: 1 - (2 sum(p t) + 1) / (sum p + sum t + 1), as MapVR; ``"iou"``: 1 - sum
+            min / sum max.
+        last_layer_only: Leave it out of all decoder layers but the last.
+
+    Raises:
+        ValueError: If ``kind`` is unknown.
+    """
+
+    name = "raster"
+    reads = ("pred.masks", "gt.masks")
+
+    def __init__(
+        self, loss_weight: float = 10.0, kind: str = "dice", last_layer_only: bool = False
+    ) -> None:
+        super().__init__()
+        if kind not in ("dice", "iou"):
+            raise ValueError(f"kind must be 'dice' or 'iou', got {kind!r}.")
+        self.loss_weight, self.kind, self.last_layer_only = loss_weight, kind, last_layer_only
+
+    def forward(
+        self, preds: Tensor, targets: Tensor, avg_factor: float | Tensor | None = None
+    ) -> Tensor:
+        """Return the weighted loss. 2 x (n, H, W) -> ()"""
+        if self.kind == "dice":
+            losses = dice_loss(preds, targets)
+        else:
+            overlap = torch.minimum(preds, targets).sum((1, 2))
+            union = torch.maximum(preds, targets).sum((1, 2))
+            losses = 1 - overlap / union.clamp(min=_EPS)
         return self.loss_weight * losses.sum() / (len(preds) if avg_factor is None else avg_factor)

@@ -27,7 +27,6 @@ class MapMatch:
     order_inds: Tensor
 
 
-@TASK_UTILS.register_module()
 class MapAssigner:
     """Hungarian assignment under summed costs, then each pair's point order (MapTR Eqs. 3-5).
 

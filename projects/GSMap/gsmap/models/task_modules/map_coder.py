@@ -1,11 +1,11 @@
 """From class scores and points of all queries to the best detections."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from mmdet3d.registry import TASK_UTILS
 from torch import Tensor
+
+from gsmap.structures.grid import BEVGrid
 
 
 class Detections(NamedTuple):
@@ -22,32 +22,33 @@ class Detections(NamedTuple):
     query_inds: Tensor
 
 
-@TASK_UTILS.register_module()
 class MapCoder:
-    """Keep the best pairs of query and class whose box lies inside a range.
+    """Keep the best pairs of query and class whose points lie on the map or close to it.
 
     Args:
+        grid: The map's extent.
         max_num: Largest number of detections per sample.
-        post_center_range: x, y minima, then maxima, in metres, that the points must keep to; None
-            keeps all.
+        margin_m: How far beyond the map a point may lie, in metres; None keeps all.
         score_threshold: Smallest score to keep; None keeps all.
 
     Raises:
-        ValueError: If ``max_num`` is not positive or the range does not have four values.
+        ValueError: If ``max_num`` or ``margin_m`` is not positive.
     """
 
     def __init__(
         self,
+        grid: BEVGrid,
         max_num: int = 50,
-        post_center_range: Sequence[float] | None = None,
+        margin_m: float | None = 5.0,
         score_threshold: float | None = None,
     ) -> None:
         if max_num < 1:
             raise ValueError(f"max_num must be >= 1, got {max_num}.")
-        if post_center_range is not None and len(post_center_range) != 4:
-            raise ValueError(f"post_center_range must hold 4 values, got {len(post_center_range)}.")
+        if margin_m is not None and margin_m <= 0:
+            raise ValueError(f"margin_m must be > 0, got {margin_m}.")
+        self.grid = grid
         self.max_num = max_num
-        self.post_center_range = post_center_range
+        self.margin_m = margin_m
         self.score_threshold = score_threshold
 
     def decode(self, scores: Tensor, pts: Tensor) -> Detections:
@@ -55,7 +56,7 @@ class MapCoder:
 
         Args:
             scores: Class logits. (N, classes)
-            pts: Points in metres. (N, P, 2)
+            pts: Points in metres. (N, P, 2 or 3)
 
         Returns:
             At most ``max_num`` detections; index ``pts`` with their ``query_inds``.
@@ -65,10 +66,11 @@ class MapCoder:
         best, index = flat.topk(min(self.max_num, len(flat)))
         query = torch.div(index, num_classes, rounding_mode="floor")
         keep = torch.ones_like(best, dtype=torch.bool)
-        if self.post_center_range is not None:
-            limits = pts.new_tensor(self.post_center_range)
-            low, high = pts[query].amin(1), pts[query].amax(1)
-            keep = (low >= limits[:2]).all(-1) & (high <= limits[2:]).all(-1)
+        if self.margin_m is not None:
+            low, high = pts.new_tensor([self.grid.x_range, self.grid.y_range]).T
+            chosen = pts[query][..., :2]
+            keep = (chosen.amin(1) >= low - self.margin_m).all(-1)
+            keep &= (chosen.amax(1) <= high + self.margin_m).all(-1)
         if self.score_threshold is not None:
             keep &= best > self.score_threshold
         return Detections(best[keep], (index % num_classes)[keep], query[keep])

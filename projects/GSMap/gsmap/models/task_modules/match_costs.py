@@ -40,6 +40,8 @@ class OrderedPointsCost:
         weight: Factor of the cost.
     """
 
+    reads = ("pred.pts", "gt.pts_shifts")
+
     def __init__(self, weight: float = 5.0) -> None:
         self.weight = weight
 

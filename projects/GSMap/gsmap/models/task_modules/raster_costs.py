@@ -7,35 +7,35 @@ from mmdet3d.registry import TASK_UTILS
 from mmengine.structures import InstanceData
 from torch import Tensor
 
-from gsmap.models.losses.dice import ElementRenderer, rendered_dice_cost
+from gsmap.models.losses.dice import (
+    ElementRenderer,
+    pairwise_dice_loss,
+    rendered_dice_cost,
+)
 from gsmap.ops.soft_iou import pairwise_soft_iou
-
-
-def raster_iou_cost(preds: Tensor, targets: Tensor) -> Tensor:
-    """Return 1 - soft IoU of every prediction and ground truth.
-
-    Args:
-        preds: Masks in [0, 1]. (N, h, w)
-        targets: Masks in [0, 1]. (K, h, w)
-
-    Returns:
-        Costs in [0, 1], without gradient. (N, K)
-    """
-    with torch.no_grad():
-        return 1 - pairwise_soft_iou(preds, targets)
 
 
 @TASK_UTILS.register_module()
 class IoUCost:
-    """Cost 1 - soft IoU of the rasters that the head has rendered.
+    """Cost of the overlap of the rasters that the head has rendered (GSMap Eq. 9).
 
     Args:
         weight: Weight of the cost.
+        kind: ``"iou"``: 1 - sum min / sum max; ``"dice"``: MapVR's dice loss.
+
+    Raises:
+        ValueError: If ``kind`` is unknown.
     """
 
-    def __init__(self, weight: float = 1.0) -> None:
-        self.weight = weight
+    reads = ("pred.rasters", "gt.rasters")
 
+    def __init__(self, weight: float = 1.0, kind: str = "iou") -> None:
+        if kind not in ("iou", "dice"):
+            raise ValueError(f"kind must be 'iou' or 'dice', got {kind!r}.")
+        self.weight = weight
+        self.kind = kind
+
+    @torch.no_grad()
     def __call__(
         self,
         pred_instances: InstanceData,
@@ -52,7 +52,7 @@ class IoUCost:
             kwargs: Not used.
 
         Returns:
-            Costs. (N, K)
+            Costs, without gradient. (N, K)
 
         Raises:
             ValueError: If either has no ``rasters``.
@@ -62,7 +62,10 @@ class IoUCost:
                 raise ValueError(
                     f"IoUCost needs {name}.rasters: use a head that renders masks for matching."
                 )
-        return self.weight * raster_iou_cost(pred_instances.rasters, gt_instances.rasters)
+        preds, targets = pred_instances.rasters, gt_instances.rasters
+        if self.kind == "dice":
+            return self.weight * pairwise_dice_loss(preds, targets)
+        return self.weight * (1 - pairwise_soft_iou(preds, targets))
 
 
 @TASK_UTILS.register_module()
@@ -74,6 +77,8 @@ class RenderedDiceCost:
         size: Rows and columns of the rasters.
         rendering: Further settings of `ElementRenderer`.
     """
+
+    reads = ("pred.pts", "gt.first_pts", "gt.labels")
 
     def __init__(
         self, weight: float = 10.0, size: tuple[int, int] = (128, 64), **rendering: Any
@@ -92,8 +97,7 @@ class RenderedDiceCost:
 
         Args:
             pred_instances: With normalised ``pts`` (N, P, 2).
-            gt_instances: With ``labels`` (K,) and normalised ``pts_shifts`` (K, S, P, 2), the first
-                of which is the annotated order.
+            gt_instances: With ``labels`` (K,) and normalised ``first_pts`` (K, P, 2).
             img_meta: Not used.
             kwargs: Not used.
 
@@ -102,7 +106,7 @@ class RenderedDiceCost:
         """
         cost = rendered_dice_cost(
             pred_instances.pts,
-            gt_instances.pts_shifts[:, 0],
+            gt_instances.first_pts,
             gt_instances.labels,
             self.renderer,
         )

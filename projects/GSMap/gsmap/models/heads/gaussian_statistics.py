@@ -1,0 +1,52 @@
+"""Figures that say whether the Gaussians of matched predictions live."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsmap.structures.gaussians import Gaussians, extents_along_line
+
+AT_FLOOR = 1.1  # a Gaussian is at its floor if both sigmas are below this multiple of it
+
+
+@torch.no_grad()
+def gaussian_statistics(
+    gaussians: Gaussians,
+    rendered: Tensor,
+    masks: Tensor,
+    labels: Tensor,
+    class_names: Sequence[str],
+    min_scale_m: float,
+) -> dict[str, Tensor]:
+    """Summarise matched elements by class; a class without one is left out.
+
+    Args:
+        gaussians: Gaussians of the matched predictions. (M, P)
+        rendered: Their masks. (M, H, W)
+        masks: Masks of their ground truths. (M, H, W)
+        labels: Classes of their ground truths. (M,)
+        class_names: Names of the classes.
+        min_scale_m: Smallest sigma in metres.
+
+    Returns:
+        Per class ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>``
+        (medians in metres); of all ``at_floor``, the share of Gaussians whose sigmas both lie within
+        10 % of the smallest. Scalars.
+    """
+    if not len(labels):
+        return {}
+    overlap = torch.minimum(rendered, masks).sum((1, 2))
+    union = rendered.sum((1, 2)) + masks.sum((1, 2)) - overlap
+    iou = overlap / union.clamp(min=1e-6)
+    extents = extents_along_line(gaussians)  # (M, P, 2)
+    figures = {}
+    for label, name in enumerate(class_names):
+        chosen = labels == label
+        if chosen.any():
+            along, across = extents[chosen].flatten(0, 1).median(0).values
+            figures[f"soft_iou/{name}"] = iou[chosen].mean()
+            figures[f"sigma_along/{name}"], figures[f"sigma_across/{name}"] = along, across
+    floor = (gaussians.scales < AT_FLOOR * min_scale_m).all(-1)
+    figures["at_floor"] = floor.float().mean()
+    return figures

@@ -1,0 +1,75 @@
+"""Masks of map elements: drawn from the ground truth, rendered from Gaussians."""
+
+from collections.abc import Sequence
+
+import torch
+from mmengine.structures import InstanceData
+from torch import Tensor
+
+from gsmap.ops.gaussian_raster import render_gaussians
+from gsmap.ops.polyline_raster import draw_polylines
+from gsmap.structures.gaussians import Gaussians
+from gsmap.structures.grid import BEVGrid
+
+SOURCES = ("full", "points")
+
+
+class ElementMasks:
+    """The rasters on which predictions and ground truth are compared, and how both get there.
+
+    Args:
+        grid: The map's extent.
+        pixel_m: Side of a pixel of the losses' masks in metres, or its sizes along x and y.
+        cost_pixel_m: The same for matching.
+        line_width_m: Width of a line in the ground-truth mask, in metres.
+        filled_classes: Classes whose ground-truth mask is filled; the others are bands.
+        source: ``"full"``: the ground truth is drawn at full resolution; ``"points"``: by its P
+            points in the matched order (in matching, in the annotated one).
+
+    Raises:
+        ValueError: If ``source`` is unknown, or the pixels do not divide the map.
+    """
+
+    def __init__(
+        self,
+        grid: BEVGrid,
+        pixel_m: float | Sequence[float] = 0.3,
+        cost_pixel_m: float | Sequence[float] = 0.46875,
+        line_width_m: float = 0.75,
+        filled_classes: Sequence[int] = (),
+        source: str = "full",
+    ) -> None:
+        if source not in SOURCES:
+            raise ValueError(f"source must be one of {SOURCES}, got {source!r}.")
+        self.grid = grid.rasterized(pixel_m)
+        self.cost_grid = grid.rasterized(cost_pixel_m)
+        self.line_width_m = line_width_m
+        self.filled_classes = tuple(filled_classes)
+        self.source = source
+
+    @property
+    def half_pixel_m(self) -> float:
+        """Half the longer side of a pixel of the losses' masks, in metres."""
+        return max(self.grid.pixel_size_m) / 2
+
+    def draw(self, polylines: Tensor, labels: Tensor, grid: BEVGrid) -> Tensor:
+        """Draw ground truths as bands, or filled, by their class. (K, M, 2) -> (K, H, W)"""
+        filled = None
+        if self.filled_classes:
+            filled = torch.isin(labels, labels.new_tensor(self.filled_classes))
+        return draw_polylines(polylines[..., :2].float(), grid, self.line_width_m, filled)
+
+    def draw_sample(self, gt_instances: InstanceData, grid: BEVGrid) -> Tensor:
+        """Draw a sample's ground truth, before its matching is known. (K, H, W)"""
+        name = "polylines" if self.source == "full" else "pts"
+        if name not in gt_instances:
+            raise ValueError(
+                f"masks of source {self.source!r} need gt_instances_3d.{name}: make the targets "
+                "with FormatMapTargets."
+            )
+        return self.draw(gt_instances[name], gt_instances.labels_3d, grid)
+
+    @staticmethod
+    def render(gaussians: Gaussians, grid: BEVGrid) -> Tensor:
+        """Render each instance's Gaussians to its mask (GSMap Eq. 6). (..., P) -> (..., H, W)"""
+        return render_gaussians(gaussians.means, gaussians.scales, gaussians.rotations, grid)

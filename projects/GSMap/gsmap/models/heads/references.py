@@ -1,0 +1,210 @@
+"""References: what decoder layers refine, from its first value to points or Gaussians in metres."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from mmdet.models.layers import inverse_sigmoid
+from mmdet3d.registry import MODELS
+from mmengine.model import BaseModule, constant_init, xavier_init
+from torch import Tensor, nn
+
+from gsmap.models.layers.deformable_attention import at_least_float32
+from gsmap.structures.gaussians import Gaussians, GaussianSpace
+from gsmap.structures.grid import BEVGrid
+
+
+def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Tensor:
+    """Move a reference by predicted offsets.
+
+    The point moves before its sigmoid; further entries (GSMap Eq. 1: sigma, theta before their
+    activation) add up.
+
+    Args:
+        reference: Reference; the first entries are the point in (0, 1). (..., D)
+        offsets: Predicted offsets. (..., D)
+        coords: Coordinates of the point.
+
+    Returns:
+        The refined reference, at least float32. (..., D)
+
+    Raises:
+        ValueError: If the shapes disagree.
+    """
+    if reference.shape != offsets.shape:
+        raise ValueError(
+            f"offsets must have shape {tuple(reference.shape)} of reference, got "
+            f"{tuple(offsets.shape)}."
+        )
+    reference, offsets = at_least_float32(reference), at_least_float32(offsets)
+    points = inverse_sigmoid(reference[..., :coords], eps=1e-5) + offsets[..., :coords]
+    return torch.cat([points.sigmoid(), reference[..., coords:] + offsets[..., coords:]], -1)
+
+
+def regression_branch(embed_dims: int, num_layers: int, out_dims: int) -> nn.Sequential:
+    """Return a regressor of ``out_dims`` numbers with ``num_layers`` hidden layers."""
+    layers: list[nn.Module] = []
+    for _ in range(num_layers):
+        layers += [nn.Linear(embed_dims, embed_dims), nn.ReLU(True)]
+    return nn.Sequential(*layers, nn.Linear(embed_dims, out_dims))
+
+
+@MODELS.register_module()
+class PointReference(BaseModule):
+    """A point per query, [0, 1] over the map, refined by each decoder layer (MapTR).
+
+    Args:
+        grid: The map's extent.
+        embed_dims: Channels C of the states.
+        num_layers: Decoder layers.
+        num_reg_layers: Hidden layers of each layer's branch.
+        coords: 2, or 3 for points with height.
+        z_range: Lowest and highest z in metres, for points with height.
+        init_cfg: As in mmengine.
+
+    Raises:
+        ValueError: If ``coords`` is not 2 or 3, or a height lacks its range.
+    """
+
+    def __init__(
+        self,
+        grid: BEVGrid,
+        embed_dims: int = 256,
+        num_layers: int = 6,
+        num_reg_layers: int = 2,
+        coords: int = 2,
+        z_range: Sequence[float] | None = None,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(init_cfg)
+        if coords not in (2, 3) or (coords == 3) != (z_range is not None):
+            raise ValueError(
+                f"coords must be 2, or 3 with a z_range, got coords={coords}, z_range={z_range}."
+            )
+        self.grid = grid
+        self.coords = coords
+        self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
+        self.initial = nn.Linear(embed_dims, coords)
+        self.branches = nn.ModuleList(
+            regression_branch(embed_dims, num_reg_layers, coords) for _ in range(num_layers)
+        )
+
+    @property
+    def fields(self) -> frozenset[str]:
+        """Names of what a loss or a cost may read of a prediction."""
+        return frozenset({"pts", "pts_m"})
+
+    def init_weights(self) -> None:
+        """Spread the first points over the map."""
+        super().init_weights()
+        xavier_init(self.initial, distribution="uniform", bias=0.0)
+
+    def start(self, query_pos: Tensor) -> Tensor:
+        """Return the reference that the first layer starts from. (..., C) -> (..., D)"""
+        return self.initial(query_pos).float().sigmoid()
+
+    def offsets(self, layer: int, states: Tensor) -> Tensor:
+        """Return a layer's change of the reference, float32. (..., C) -> (..., D)"""
+        return self.branches[layer](states).float()
+
+    def refine(self, layer: int, states: Tensor, reference: Tensor) -> Tensor:
+        """Return the reference after a layer. (..., C), (..., D) -> (..., D)"""
+        return refine_reference(reference, self.offsets(layer, states), self.coords)
+
+    def metres(self, points: Tensor) -> Tensor:
+        """Bring normalised points to metres. (..., coords) -> (..., coords)"""
+        points = self.grid.metres_from_norm(points)
+        if self.z_range is None:
+            return points
+        low, high = self.z_range
+        return torch.cat([points[..., :2], low + (high - low) * points[..., 2:]], -1)
+
+    def norm(self, points_m: Tensor) -> Tensor:
+        """Bring points in metres to [0, 1]; the inverse of :meth:`metres`."""
+        points = self.grid.norm_from_metres(points_m[..., : self.coords])
+        if self.z_range is None:
+            return points
+        low, high = self.z_range
+        return torch.cat([points[..., :2], (points[..., 2:] - low) / (high - low)], -1)
+
+    def decode(self, references: Tensor) -> dict[str, Tensor]:
+        """Return what references (N, P, D) say in metres: ``pts`` (N, P, coords)."""
+        return {"pts": self.metres(references[..., : self.coords])}
+
+
+@MODELS.register_module()
+class GaussianReference(PointReference):
+    """A Gaussian per query: its centre is the point, sigma and theta follow it (GSMap Eq. 1).
+
+    What it adds to points starts neutral: every query has the same Gaussian, every layer leaves it.
+
+    Args:
+        grid: The map's extent.
+        embed_dims: Channels C of the states.
+        num_layers: Decoder layers.
+        mlp: Predict sigma and theta by branches like the points' (GSMap Eq. 8) in place of one
+            linear layer each.
+        num_reg_layers: Hidden layers of each layer's branch.
+        coords: 2, or 3 for centres with height; the Gaussians lie in the plane.
+        z_range: Lowest and highest z in metres, for centres with height.
+        space: Settings of `GaussianSpace`: ``min_scale_m`` and so on.
+        init_cfg: As in mmengine.
+    """
+
+    neutral_keys = ("gaussian_init.", "gaussian_branches.")
+
+    def __init__(
+        self,
+        grid: BEVGrid,
+        embed_dims: int = 256,
+        num_layers: int = 6,
+        mlp: bool = False,
+        num_reg_layers: int = 2,
+        coords: int = 2,
+        z_range: Sequence[float] | None = None,
+        init_cfg: dict | None = None,
+        **space: Any,
+    ) -> None:
+        super().__init__(grid, embed_dims, num_layers, num_reg_layers, coords, z_range, init_cfg)
+        self.space = GaussianSpace(grid, **space)
+        self.gaussian_init = nn.Linear(embed_dims, 3)
+        hidden = num_reg_layers if mlp else 0
+        self.gaussian_branches = nn.ModuleList(
+            regression_branch(embed_dims, hidden, 3) for _ in range(num_layers)
+        )
+        self.reset_gaussian_parts()
+
+    @property
+    def fields(self) -> frozenset[str]:
+        """Names of what a loss or a cost may read of a prediction."""
+        return super().fields | {"gaussians", "masks", "rasters"}
+
+    def init_weights(self) -> None:
+        """Initialise as for points; what the Gaussians add starts neutral."""
+        super().init_weights()
+        self.reset_gaussian_parts()
+
+    def reset_gaussian_parts(self) -> None:
+        """Let every query start with the same Gaussian, and every layer leave it as it is."""
+        constant_init(self.gaussian_init, 0.0)
+        for branch in self.gaussian_branches:
+            constant_init(branch[-1], 0.0)
+
+    def start(self, query_pos: Tensor) -> Tensor:
+        """Return the Gaussians that the first layer starts from. (..., C) -> (..., D)"""
+        return torch.cat([super().start(query_pos), self.gaussian_init(query_pos).float()], -1)
+
+    def offsets(self, layer: int, states: Tensor) -> Tensor:
+        """Return a layer's change of the Gaussians (Eq. 8). (..., C) -> (..., D)"""
+        centres = super().offsets(layer, states)
+        return torch.cat([centres, self.gaussian_branches[layer](states).float()], -1)
+
+    def gaussians(self, references: Tensor) -> Gaussians:
+        """Return the Gaussians that references (..., D) stand for, centres in the plane."""
+        return self.space.decode(references)
+
+    def decode(self, references: Tensor) -> dict[str, Tensor]:
+        """Add the Gaussians' ``scales`` (N, P, 2) in metres and ``rotations`` (N, P) in radians."""
+        gaussians = self.gaussians(references)
+        fields = super().decode(references)
+        return {**fields, "scales": gaussians.scales, "rotations": gaussians.rotations}

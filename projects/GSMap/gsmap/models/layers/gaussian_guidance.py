@@ -1,0 +1,86 @@
+"""How one layer's Gaussians guide where the next looks (GSMap section 3.4)."""
+
+import torch
+from mmengine.model import BaseModule, constant_init
+from torch import Tensor, nn
+
+from gsmap.structures.gaussians import GaussianSpace
+
+
+class GaussianGuidance(BaseModule):
+    """What a decoder layer takes from the Gaussians, for whichever attentions it has.
+
+    Both parts start neutral: the sampling frame is the identity and the embedding zero, so a layer
+    with the weights of a MapTR layer computes what that layer computes.
+
+    Args:
+        space: How the reference stands for a Gaussian.
+        embed_dims: Channels C.
+        sampling: Place the samples of the BEV features in each Gaussian's own frame.
+        embedding: Add an embedding of (mu, sigma, theta) to the query's position.
+        invariant: Take the sampling frame that is the same for theta and theta + pi.
+        hidden_dims: Hidden channels of the embedding.
+    """
+
+    neutral_keys = ("embedding.",)
+
+    def __init__(
+        self,
+        space: GaussianSpace,
+        embed_dims: int,
+        sampling: bool = True,
+        embedding: bool = True,
+        invariant: bool = False,
+        hidden_dims: int = 16,
+    ) -> None:
+        super().__init__()
+        self.space = space
+        self.sampling = sampling
+        self.invariant = invariant
+        self.embedding: nn.Sequential | None = None
+        if embedding:
+            self.embedding = nn.Sequential(
+                nn.Linear(6, hidden_dims), nn.ReLU(True), nn.Linear(hidden_dims, embed_dims)
+            )
+        self.reset()
+
+    def init_weights(self) -> None:
+        """Start neutral."""
+        super().init_weights()
+        self.reset()
+
+    def reset(self) -> None:
+        """Make what GSMap adds neutral."""
+        if self.embedding is not None:
+            constant_init(self.embedding[-1], 0.0)
+
+    def position(self, query_pos: Tensor, reference: Tensor) -> Tensor:
+        """Add the embedded Gaussians to the queries' position. (B, Q, C), (B, Q, D) -> (B, Q, C)"""
+        if self.embedding is None:
+            return query_pos
+        return query_pos + self.embedding(self.space.describe(reference))
+
+    def frames(self, reference: Tensor, shape: tuple[int, int]) -> Tensor | None:
+        """Return what turns sampling offsets in cells into each Gaussian's frame, or None.
+
+        Args:
+            reference: The Gaussians. (B, Q, D)
+            shape: Rows and columns of the map that is sampled.
+
+        Returns:
+            Matrices that multiply offsets (x, y) in cells from the left. (B, Q, 2, 2)
+        """
+        if not self.sampling:
+            return None
+        cell_m = reference.new_tensor(self.space.grid.resized(*shape).pixel_size_m)
+        # The frames act on metres; brought to cells, the identity stays the identity bit by bit.
+        return self.space.frames(reference, self.invariant) * (cell_m / cell_m[:, None])
+
+
+def turn_offsets(offsets: Tensor, frames: Tensor | None) -> Tensor:
+    """Turn sampling offsets of each query; None leaves them. (B, Q, ..., 2), (B, Q, 2, 2)"""
+    if frames is None:
+        return offsets
+    extra = offsets.dim() - frames.dim() + 1
+    frames = frames.reshape(*frames.shape[:2], *(1,) * extra, 2, 2)
+    return torch.sum(frames * offsets[..., None, :], -1)

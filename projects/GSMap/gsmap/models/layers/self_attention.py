@@ -1,0 +1,88 @@
+"""Self-attentions of a decoder layer: how the point queries of all instances interact.
+
+Each takes point queries (B, N * P, C), their position, and a mask of instances that may not attend
+to each other (N, N); it returns the queries with its residual, and the layer normalises them.
+"""
+
+from mmdet3d.registry import MODELS
+from torch import Tensor, nn
+
+
+@MODELS.register_module()
+class PointSelfAttention(nn.MultiheadAttention):
+    """One attention over all points of all instances (MapTR).
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of heads.
+        num_points: Points per instance P.
+        dropout: Dropout of the attention weights and of the output.
+    """
+
+    def __init__(
+        self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 20, dropout: float = 0.1
+    ) -> None:
+        super().__init__(embed_dims, num_heads, dropout, batch_first=True)
+        self.num_points = num_points
+        self.output_dropout = nn.Dropout(dropout)
+
+    def forward(  # type: ignore[override]
+        self, query: Tensor, query_pos: Tensor, attn_mask: Tensor | None = None
+    ) -> Tensor:
+        """Let all points attend to each other. (B, N * P, C) -> (B, N * P, C)"""
+        if attn_mask is not None:
+            attn_mask = attn_mask.repeat_interleave(self.num_points, 0)
+            attn_mask = attn_mask.repeat_interleave(self.num_points, 1)
+        key = query + query_pos
+        attended = super().forward(key, key, query, attn_mask=attn_mask, need_weights=False)[0]
+        return query + self.output_dropout(attended)
+
+
+@MODELS.register_module()
+class DecoupledSelfAttention(nn.Module):
+    """Two small attentions: among instances, then among the points of each (MapTRv2).
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of heads.
+        num_points: Points per instance P.
+        dropout: Dropout of the attention weights and of the outputs.
+    """
+
+    def __init__(
+        self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 20, dropout: float = 0.1
+    ) -> None:
+        super().__init__()
+        self.num_points = num_points
+        self.instance_attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+        self.norm = nn.LayerNorm(embed_dims)
+        self.point_attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, query: Tensor, query_pos: Tensor, attn_mask: Tensor | None = None) -> Tensor:
+        """Let point p of all instances attend to each other, then the points of each instance.
+
+        Args:
+            query: Content of the point queries. (B, N * P, C)
+            query_pos: Their position. (B, N * P, C)
+            attn_mask: True where an instance may not attend to another, or None. (N, N)
+
+        Returns:
+            Updated queries. (B, N * P, C)
+        """
+        batch = len(query)
+        per_instance = [x.unflatten(1, (-1, self.num_points)) for x in (query, query_pos)]
+        query, query_pos = (x.transpose(1, 2).flatten(0, 1) for x in per_instance)  # (B * P, N, C)
+        query = self.norm(self._attend(self.instance_attn, query, query_pos, attn_mask))
+        query = query.unflatten(0, (batch, -1)).transpose(1, 2).flatten(0, 1)  # (B * N, P, C)
+        query_pos = per_instance[1].flatten(0, 1)
+        query = self._attend(self.point_attn, query, query_pos, None)
+        return query.unflatten(0, (batch, -1)).flatten(1, 2)
+
+    def _attend(
+        self, attention: nn.MultiheadAttention, query: Tensor, pos: Tensor, mask: Tensor | None
+    ) -> Tensor:
+        """Apply one attention with its residual."""
+        key = query + pos
+        attended = attention(key, key, query, attn_mask=mask, need_weights=False)[0]
+        return query + self.dropout(attended)
