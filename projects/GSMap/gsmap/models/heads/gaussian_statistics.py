@@ -31,8 +31,8 @@ def gaussian_statistics(
 
     Returns:
         Per class ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>``
-        (medians in metres); of all ``at_floor``, the share of Gaussians whose sigmas both lie within
-        10 % of the smallest. Scalars.
+        (medians in metres); of all ``at_floor``, the share of Gaussians whose sigmas both lie
+        within 10 % of the smallest. Scalars.
     """
     if not len(labels):
         return {}

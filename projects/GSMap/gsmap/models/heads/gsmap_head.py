@@ -55,7 +55,7 @@ class GSMapHead(MapHead):
         )
 
     def reference_settings(self, reference: PARTS) -> PARTS:
-        """Let the smallest Gaussian follow from the masks' pixels: a smaller one gets no gradient."""
+        """Let the smallest Gaussian be half a pixel of the masks: a smaller one gets no gradient."""
         return {"min_scale_m": self._min_scale_m, **reference}
 
     def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""The map head: hierarchical queries, predictions of every layer, matching, losses; all in parts."""
+"""The map head, composed of parts: queries, predictions of every layer, matching, losses."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
