@@ -23,7 +23,7 @@ ALLOWED = {
     "checkpoints": {"utils"},
     "datasets": {"structures", "utils"},
     "converters": {"datasets", "structures", "utils", "minicity"},
-    "evaluation": {"datasets", "structures", "utils"},
+    "evaluation": {"datasets", "ops", "structures", "utils"},
     "visualization": {"datasets", "ops", "structures", "utils"},
     "engine": {"utils"},
     "apis": {

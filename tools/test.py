@@ -48,6 +48,7 @@ def apply_options(cfg: Config, args: argparse.Namespace) -> None:
         "eval": args.eval,
         "out_file": args.out,
     }
+    cfg.test_evaluator = [cfg.test_evaluator, {"type": "GaussianMetric"}]
     if args.show_dir:
         cfg.default_hooks.visualization.update(
             draw=True,

@@ -12,6 +12,7 @@ default_hooks = dict(
     checkpoint=dict(type='CheckpointHook', interval=1, max_keep_ckpts=3),
     sampler_seed=dict(type='DistSamplerSeedHook'),
     visualization=dict(type='MapVisualizationHook', draw=False))
+custom_hooks = [dict(type='GaussianHealthHook')]
 val_evaluator = dict(type='MapMetric', eval=['chamfer'])
 test_evaluator = dict(type='MapMetric', eval=['chamfer', 'raster'])
 vis_backends = [dict(type='LocalVisBackend'), dict(type='TensorboardVisBackend')]

@@ -10,6 +10,7 @@ from torch import Tensor
 from gsmap.structures.grid import BEVGrid
 
 ACTIVATIONS = ("sigmoid", "softplus", "exp")
+AT_FLOOR = 1.1  # a Gaussian is at its floor if both sigmas are below this multiple of it
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,11 @@ class GaussianSpace:
             )
         if self.activation not in ACTIVATIONS:
             raise ValueError(f"activation must be one of {ACTIVATIONS}, got {self.activation!r}.")
+
+    @property
+    def floor_m(self) -> float:
+        """Smallest standard deviation in metres."""
+        return self.min_scale_m**2 if self.literal_covariance else self.min_scale_m
 
     @property
     def heading_rad(self) -> float:

@@ -5,9 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsmap.structures.gaussians import Gaussians, extents_along_line
-
-AT_FLOOR = 1.1  # a Gaussian is at its floor if both sigmas are below this multiple of it
+from gsmap.structures.gaussians import AT_FLOOR, Gaussians, extents_along_line
 
 
 @torch.no_grad()

@@ -55,7 +55,7 @@ class GSMapHead(MapHead):
         )
 
     def reference_settings(self, reference: PARTS) -> PARTS:
-        """Let the smallest Gaussian be half a pixel of the masks: a smaller one gets no gradient."""
+        """Let the smallest Gaussian be half a pixel of the masks: smaller ones get no gradient."""
         return {"min_scale_m": self._min_scale_m, **reference}
 
     def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:
@@ -68,5 +68,5 @@ class GSMapHead(MapHead):
             pairs["gt.masks"],
             pairs["gt.labels"],
             self.classes,
-            self.reference.space.min_scale_m,
+            self.reference.space.floor_m,
         )

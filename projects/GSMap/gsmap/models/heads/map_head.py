@@ -398,7 +398,8 @@ class MapHead(BaseModule):
             fields = self.reference.decode(references)
             best = self.coder.decode(scores, fields["pts"])
             chosen = {name: value[best.query_inds] for name, value in fields.items()}
-            results.append(InstanceData(scores_3d=best.scores, labels_3d=best.labels, **chosen))
+            chosen.update(scores_3d=best.scores, labels_3d=best.labels)
+            results.append(InstanceData(metainfo=self.reference.metainfo, **chosen))
         return results
 
 

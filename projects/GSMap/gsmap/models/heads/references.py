@@ -94,6 +94,11 @@ class PointReference(BaseModule):
         """Names of what a loss or a cost may read of a prediction."""
         return frozenset({"pts", "pts_m"})
 
+    @property
+    def metainfo(self) -> dict[str, float]:
+        """What the predictions' metainfo says of all of them."""
+        return {}
+
     def init_weights(self) -> None:
         """Spread the first points over the map."""
         super().init_weights()
@@ -178,6 +183,11 @@ class GaussianReference(PointReference):
     def fields(self) -> frozenset[str]:
         """Names of what a loss or a cost may read of a prediction."""
         return super().fields | {"gaussians", "masks", "rasters"}
+
+    @property
+    def metainfo(self) -> dict[str, float]:
+        """What the predictions' metainfo says of all of them: the smallest Gaussian."""
+        return {"min_scale_m": self.space.floor_m}
 
     def init_weights(self) -> None:
         """Initialise as for points; what the Gaussians add starts neutral."""

@@ -1,0 +1,39 @@
+"""A warning when the Gaussians of a run die."""
+
+from mmdet3d.registry import HOOKS
+from mmengine.hooks import Hook
+from mmengine.runner import Runner
+
+_FIGURE = "train/at_floor"
+
+
+@HOOKS.register_module()
+class GaussianHealthHook(Hook):
+    """Warn after an epoch in which most Gaussians of matched predictions are at their smallest.
+
+    GSMap's head logs ``at_floor``, the share of Gaussians whose sigmas both lie within 10 % of the
+    smallest; a model without Gaussians logs none, and the hook is silent.
+
+    Args:
+        threshold: Share from which it warns.
+        window: Iterations that the share is averaged over.
+    """
+
+    def __init__(self, threshold: float = 0.5, window: int = 50) -> None:
+        self.threshold = threshold
+        self.window = window
+
+    def after_train_epoch(self, runner: Runner) -> None:
+        """Look at the latest iterations."""
+        history = runner.message_hub.log_scalars.get(_FIGURE)
+        if history is None:
+            return
+        share = history.mean(self.window)
+        if share >= self.threshold:
+            runner.logger.warning(
+                f"{100 * share:.0f} % of the Gaussians of matched predictions are at their "
+                "smallest size: their masks are dots, which teach nothing. Use "
+                "RasterLoss(normalize='both'), lower loss_raster.loss_weight until the points are "
+                "right to a metre or so, or give the masks larger pixels (map_head.masks.pixel_m): "
+                "docs/benchmarks/gaussians.md."
+            )
