@@ -24,17 +24,28 @@ import gsmap.models.heads.aux_heads
 import gsmap.models.heads.gsmap_head
 import gsmap.models.heads.map_head
 import gsmap.models.heads.references
+import gsmap.models.layers.geometry_attention
 import gsmap.models.layers.grid_mask
 import gsmap.models.layers.self_attention
+import gsmap.models.layers.vovnet
 import gsmap.models.task_modules.match_costs
 import gsmap.models.task_modules.raster_costs
 import gsmap.visualization.map_visualization_hook
 import gsmap.visualization.map_visualizer  # noqa: F401
 from gsmap.models.losses.dice import RenderedDiceLoss
 from gsmap.models.losses.direction import DirectionLoss
+from gsmap.models.losses.geometry import EuclideanLoss
 from gsmap.models.losses.point import PointsLoss
 from gsmap.models.losses.raster import MaskOverlapLoss, RasterLoss
 
+LOSSES = (
+    DirectionLoss,
+    EuclideanLoss,
+    MaskOverlapLoss,
+    PointsLoss,
+    RasterLoss,
+    RenderedDiceLoss,
+)
 # The losses are plain torch modules, usable without OpenMMLab; they enter the registry here.
-for loss in (DirectionLoss, MaskOverlapLoss, PointsLoss, RasterLoss, RenderedDiceLoss):
+for loss in LOSSES:
     MODELS.register_module(module=loss)

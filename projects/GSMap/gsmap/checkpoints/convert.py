@@ -61,7 +61,8 @@ def upstream_from_ours(
             f"keys that upstream's {key_map.name} does not have: {', '.join(unknown)}."
         )
     renamed = {name: state[key] for key, name in names.items() if name is not None}
-    return {**renamed, **{key: unused.value() for key, unused in key_map.unused.items()}}
+    extra = {key: unused.value() for key, unused in key_map.unused.items() if unused.value}
+    return {**renamed, **extra}
 
 
 def read_state(path: str | Path) -> dict[str, Tensor]:

@@ -17,11 +17,12 @@ class UnusedKey(NamedTuple):
 
     Attributes:
         reason: Why nothing is lost without it.
-        value: Makes the tensor that upstream expects there, for conversion back.
+        value: Makes the tensor that upstream expects there, for conversion back; None where only
+            some of upstream's models hold the key.
     """
 
     reason: str
-    value: Callable[[], Tensor]
+    value: Callable[[], Tensor] | None
 
 
 @dataclass(frozen=True)
@@ -33,14 +34,14 @@ class KeyMap:
         rules: Pairs of key prefixes (upstream's, ours); ``{i}`` stands for a number, the same on
             both sides, in order. The first that fits wins.
         unused: Upstream keys without a counterpart.
-        marker: A pair of key prefixes (upstream's, ours) that tells this architecture from those
-            after it in ``KEY_MAPS``.
+        markers: Pairs of key prefixes (upstream's, ours) that, all present, tell this architecture
+            from those after it in ``KEY_MAPS``.
     """
 
     name: str
     rules: tuple[tuple[str, str], ...]
     unused: Mapping[str, UnusedKey] = field(default_factory=dict)
-    marker: tuple[str, str] = ("", "")
+    markers: tuple[tuple[str, str], ...] = (("", ""),)
 
     def to_ours(self, key: str) -> str | None:
         """Return our name of an upstream key, or None if there is none."""
@@ -130,9 +131,11 @@ MAPTR_BEVFORMER = KeyMap(
         ),
     ),
     unused=CODE_WEIGHTS,
-    marker=(
-        _ENCODER_LAYER + "attentions.1.deformable_attention.",
-        "bev_encoder.layers.{i}.cross_attn.sampling_offsets.",
+    markers=(
+        (
+            _ENCODER_LAYER + "attentions.1.deformable_attention.",
+            "bev_encoder.layers.{i}.cross_attn.sampling_offsets.",
+        ),
     ),
 )
 
@@ -151,15 +154,53 @@ def _constants(reason: str, values: Mapping[str, tuple[float, ...]]) -> dict[str
     return {key: UnusedKey(reason, partial(torch.tensor, value)) for key, value in values.items()}
 
 
+LIFTED_RULES = (
+    *IMAGE_RULES,
+    *HEAD_RULES,
+    (_HEAD + "seg_head.", "map_head.aux_heads.seg."),
+    (_HEAD + "pv_seg_head.", "map_head.aux_heads.pv_seg."),
+    (_V2_ENCODER + "depth_net.", "bev_encoder.depth_net."),
+    (_V2_ENCODER + "downsample.", "bev_encoder.downsample."),
+)
+LIFTED_UNUSED = {
+    **CODE_WEIGHTS,
+    **_unused_zeros(
+        _BY_QUERIES,
+        {
+            _HEAD + "positional_encoding.row_embed.weight": (200, 128),
+            _HEAD + "positional_encoding.col_embed.weight": (100, 128),
+            _TRANSFORMER + "level_embeds": (4, 256),
+            _TRANSFORMER + "cams_embeds": (6, 256),
+            _TRANSFORMER + "can_bus_mlp.0.weight": (128, 18),
+            _TRANSFORMER + "can_bus_mlp.0.bias": (128,),
+            _TRANSFORMER + "can_bus_mlp.2.weight": (256, 128),
+            _TRANSFORMER + "can_bus_mlp.2.bias": (256,),
+            _TRANSFORMER + "can_bus_mlp.norm.weight": (256,),
+            _TRANSFORMER + "can_bus_mlp.norm.bias": (256,),
+        },
+    ),
+    **_constants(
+        "the grid of voxels, which the config says: size, first centre and number (x, y, z)",
+        {
+            _V2_ENCODER + "dx": (0.15, 0.15, 20.0),
+            _V2_ENCODER + "bx": (-14.925, -29.925, 0.0),
+            _V2_ENCODER + "nx": (200.0, 400.0, 1.0),
+        },
+    ),
+    **_constants(
+        "weight of the foreground in a mask loss, which the config says",
+        {
+            _HEAD + "loss_seg.loss_fn.pos_weight": (4.0,),
+            _HEAD + "loss_pv_seg.loss_fn.pos_weight": (1.0,),
+        },
+    ),
+}
+LIFTED_MARKER = (_V2_ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv.")
+
 MAPTRV2 = KeyMap(
     name="maptrv2",
     rules=(
-        *IMAGE_RULES,
-        *HEAD_RULES,
-        (_HEAD + "seg_head.", "map_head.aux_heads.seg."),
-        (_HEAD + "pv_seg_head.", "map_head.aux_heads.pv_seg."),
-        (_V2_ENCODER + "depth_net.", "bev_encoder.depth_net."),
-        (_V2_ENCODER + "downsample.", "bev_encoder.downsample."),
+        *LIFTED_RULES,
         (_DECODER_LAYER + "attentions.0.attn.", _LAYER + "self_attn.instance_attn."),
         (_DECODER_LAYER + "attentions.1.attn.", _LAYER + "self_attn.point_attn."),
         (_DECODER_LAYER + "attentions.2.", _LAYER + "cross_attn."),
@@ -169,43 +210,45 @@ MAPTRV2 = KeyMap(
         (_DECODER_LAYER + "norms.2.", _LAYER + "norms.1."),
         (_DECODER_LAYER + "norms.3.", _LAYER + "norms.2."),
     ),
-    unused={
-        **CODE_WEIGHTS,
-        **_unused_zeros(
-            _BY_QUERIES,
-            {
-                _HEAD + "positional_encoding.row_embed.weight": (200, 128),
-                _HEAD + "positional_encoding.col_embed.weight": (100, 128),
-                _TRANSFORMER + "level_embeds": (4, 256),
-                _TRANSFORMER + "cams_embeds": (6, 256),
-                _TRANSFORMER + "can_bus_mlp.0.weight": (128, 18),
-                _TRANSFORMER + "can_bus_mlp.0.bias": (128,),
-                _TRANSFORMER + "can_bus_mlp.2.weight": (256, 128),
-                _TRANSFORMER + "can_bus_mlp.2.bias": (256,),
-                _TRANSFORMER + "can_bus_mlp.norm.weight": (256,),
-                _TRANSFORMER + "can_bus_mlp.norm.bias": (256,),
-            },
-        ),
-        **_constants(
-            "the grid of voxels, which the config says: size, first centre and number (x, y, z)",
-            {
-                _V2_ENCODER + "dx": (0.15, 0.15, 20.0),
-                _V2_ENCODER + "bx": (-14.925, -29.925, 0.0),
-                _V2_ENCODER + "nx": (200.0, 400.0, 1.0),
-            },
-        ),
-        **_constants(
-            "weight of the foreground in a mask loss, which the config says",
-            {
-                _HEAD + "loss_seg.loss_fn.pos_weight": (4.0,),
-                _HEAD + "loss_pv_seg.loss_fn.pos_weight": (1.0,),
-            },
-        ),
-    },
-    marker=(_V2_ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv."),
+    unused=LIFTED_UNUSED,
+    markers=(LIFTED_MARKER,),
 )
 
-KEY_MAPS: list[KeyMap] = [MAPTRV2, MAPTR_BEVFORMER, MAPTR]
+# The names are those of upstream since 2023-12-12. Before, upstream called the attention among
+# instances "intra" and the one within each "inter", and no key tells the two apart.
+GEOMETRY_MARKER = (
+    _DECODER_LAYER + "attentions.0.inter_",
+    "map_head.decoder.layers.{i}.self_attn.inter.",
+)
+GEOMETRY_RULES = (
+    GEOMETRY_MARKER,
+    (_DECODER_LAYER + "attentions.0.intra_", "map_head.decoder.layers.{i}.self_attn.intra."),
+)
+GEMAP = KeyMap(
+    name="gemap",
+    rules=(*GEOMETRY_RULES, *MAPTR.rules),
+    unused={
+        **CODE_WEIGHTS,
+        # On Argoverse 2, the simple objective is the full one's head with its parts switched off.
+        _HEAD + "tau": UnusedKey("a number that no computation reads", None),
+        _HEAD + "loss_seg.loss_fn.pos_weight": UnusedKey("weight in a loss that is off", None),
+        _HEAD + "loss_pv_seg.loss_fn.pos_weight": UnusedKey("weight in a loss that is off", None),
+    },
+    markers=(GEOMETRY_MARKER,),
+)
+GEMAP_FULL = KeyMap(
+    name="gemap-full",
+    rules=(*GEOMETRY_RULES, *LIFTED_RULES, *DECODER_RULES),
+    unused={
+        **LIFTED_UNUSED,
+        _HEAD + "tau": UnusedKey(
+            "a number that no computation reads", lambda: torch.full((1,), 0.1)
+        ),
+    },
+    markers=(GEOMETRY_MARKER, LIFTED_MARKER),
+)
+
+KEY_MAPS: list[KeyMap] = [GEMAP_FULL, GEMAP, MAPTRV2, MAPTR_BEVFORMER, MAPTR]
 """Known architectures, the most special first; the last needs no marker."""
 
 
@@ -219,7 +262,7 @@ def find_key_map(keys: Iterable[str]) -> KeyMap:
     keys = list(keys)
     side = 0 if is_upstream(keys) else 1
     for key_map in KEY_MAPS:
-        pattern = _pattern(key_map.marker[side])
-        if any(pattern.match(key) for key in keys):
+        patterns = [_pattern(pair[side]) for pair in key_map.markers]
+        if all(any(pattern.match(key) for key in keys) for pattern in patterns):
             return key_map
     raise ValueError("the checkpoint holds no weights.")

@@ -1,0 +1,149 @@
+"""GeMap's Euclidean loss (arXiv 2312.03341): shapes of map elements and the relations between them.
+
+Angles count by their cosine and sine, so that no angle wraps around. The released code is the
+specification: it compares coordinates normalised to [0, 1], so x and y weigh differently; every
+element has an edge from its last point to its first, open lines too.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+NORM_EPS = 1e-6  # added to the product of two lengths: an edge may be a single point
+
+
+def shape_features(points: Tensor) -> Tensor:
+    """Describe each element's edges: their length, cosine and sine to the edge before.
+
+    Args:
+        points: Points of elements. (M, P, 2)
+
+    Returns:
+        Length, cosine and sine per edge. (3, M, P)
+    """
+    edges = _edges(points)
+    return torch.cat([edges.norm(dim=-1)[None], _turns(edges.roll(1, 1), edges)])
+
+
+def relation_features(points: Tensor, pairs: Tensor) -> Tensor:
+    """Describe pairs of elements: distances of all their points, angles between all their edges.
+
+    Args:
+        points: Points of elements. (M, P, 2)
+        pairs: Indices of the first and the second element of each pair. (2, R)
+
+    Returns:
+        Distance, cosine and sine per point (or edge) of the first and of the second. (3, R, P, P)
+    """
+    first, second = points[pairs[0], :, None], points[pairs[1], None]  # (R, P, 1, 2), (R, 1, P, 2)
+    edges = _edges(points)
+    turns = _turns(edges[pairs[0], :, None], edges[pairs[1], None])  # (2, R, P, P)
+    return torch.cat([(first - second).norm(dim=-1)[None], turns])
+
+
+def euclidean_shape_loss(pred: Tensor, target: Tensor) -> Tensor:
+    """Return the mean L1 distance of shapes: of lengths, of cosines and of sines, added up.
+
+    Args:
+        pred: Points of matched predictions, normalised to [0, 1]. (M, P, 2)
+        target: Points of their ground truth, in the same order. (M, P, 2)
+
+    Returns:
+        The loss; zero without matches. ()
+
+    Raises:
+        ValueError: If the shapes disagree.
+    """
+    _check_shapes(pred, target)
+    if not len(pred):
+        return pred.sum() * 0
+    return (shape_features(pred) - shape_features(target)).abs().sum(0).mean()
+
+
+def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int]) -> Tensor:
+    """Return the L1 distance of the relations between the elements of each sample.
+
+    A sample with n matches adds the sum over its pairs of elements, each taken once, divided by
+    (n * P)^2: by all pairs of points, also those of an element with itself. Samples add up.
+
+    Args:
+        pred: Points of matched predictions, normalised to [0, 1], sample after sample. (M, P, 2)
+        target: Points of their ground truth, in the same order. (M, P, 2)
+        counts: Number of matches of each sample; they add up to M.
+
+    Returns:
+        The loss; zero where no sample has two matches. ()
+
+    Raises:
+        ValueError: If the shapes disagree or ``counts`` do not add up.
+    """
+    _check_shapes(pred, target)
+    if sum(counts) != len(pred):
+        raise ValueError(f"counts must add up to {len(pred)} matches, got {list(counts)}.")
+    pairs, shares, first = [], [], 0
+    for count in counts:
+        pairs.append(torch.triu_indices(count, count, 1, device=pred.device) + first)
+        shares.append(pred.new_full((pairs[-1].shape[1],), 1 / max(count, 1) ** 2))
+        first += count
+    if not pairs:
+        return pred.sum() * 0
+    both = torch.cat(pairs, 1)
+    off = (relation_features(pred, both) - relation_features(target, both)).abs()
+    return off.sum(0).mean((1, 2)) @ torch.cat(shares)
+
+
+class EuclideanLoss(nn.Module):
+    """GeMap's Euclidean loss of matched elements: their shapes and their relations.
+
+    Args:
+        loss_weight: Weight of the loss (lambda in the supplement's Table A1).
+        shape_weight: Weight of the shapes in it.
+        relation_weight: Weight of the relations in it.
+    """
+
+    def __init__(
+        self, loss_weight: float = 0.005, shape_weight: float = 1.0, relation_weight: float = 1.0
+    ) -> None:
+        super().__init__()
+        self.loss_weight = loss_weight
+        self.shape_weight, self.relation_weight = shape_weight, relation_weight
+
+    def forward(self, pred: Tensor, target: Tensor, counts: Sequence[int]) -> Tensor:
+        """Return the weighted loss. Its parts are means: no number of matches divides them.
+
+        Args:
+            pred: Points of matched predictions, normalised to [0, 1], sample after sample.
+                (M, P, 2)
+            target: Points of their ground truth, in the order that was matched. (M, P, 2)
+            counts: Number of matches of each sample.
+
+        Returns:
+            The loss; 0 with a gradient of 0 if nothing is matched. ()
+        """
+        with torch.autocast(pred.device.type, enabled=False):
+            dtype = torch.promote_types(pred.dtype, torch.float32)
+            pred, target = pred.to(dtype), target.to(dtype)
+            shape = euclidean_shape_loss(pred, target)
+            relation = euclidean_relation_loss(pred, target, counts)
+        return self.loss_weight * (self.shape_weight * shape + self.relation_weight * relation)
+
+
+def _edges(points: Tensor) -> Tensor:
+    """Return the edge that ends in each point; the first one closes the ring. (M, P, 2)"""
+    return points - points.roll(1, 1)
+
+
+def _turns(first: Tensor, second: Tensor) -> Tensor:
+    """Return cosine and sine from edges to others; 0 for points. (..., 2) each -> (2, ...)"""
+    lengths = first.norm(dim=-1) * second.norm(dim=-1) + NORM_EPS
+    cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    return torch.stack([(first * second).sum(-1), cross]) / lengths
+
+
+def _check_shapes(pred: Tensor, target: Tensor) -> None:
+    """Raise if points are not those of the same elements."""
+    if pred.shape != target.shape:
+        raise ValueError(
+            f"target must have shape {tuple(pred.shape)} of pred, got {tuple(target.shape)}."
+        )

@@ -1,0 +1,80 @@
+"""The table between GeMap's upstream keys and ours."""
+
+import json
+
+import pytest
+import torch
+
+from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
+from gsmap.checkpoints.key_map import GEMAP, GEMAP_FULL, MAPTR, MAPTRV2, find_key_map
+from gsmap.models.layers.geometry_attention import GeometryDecoupledAttention
+
+LAYER = "pts_bbox_head.transformer.decoder.layers.3."
+OURS = "map_head.decoder.layers.3."
+PAIRS = {
+    LAYER + "attentions.0.inter_attention.in_proj_bias": (
+        OURS + "self_attn.inter.attention.in_proj_bias"
+    ),
+    LAYER + "attentions.0.inter_norm1.weight": OURS + "self_attn.inter.norm1.weight",
+    LAYER + "attentions.0.intra_ffn.2.weight": OURS + "self_attn.intra.ffn.2.weight",
+    LAYER + "attentions.1.value_proj.weight": OURS + "cross_attn.value_proj.weight",
+    LAYER + "ffns.0.layers.1.bias": OURS + "ffn.layers.1.bias",
+    LAYER + "norms.2.weight": OURS + "norms.2.weight",
+}
+DEPTH = "pts_bbox_head.transformer.encoder.depth_net.depth_conv.4.bias"
+
+
+def read_keys(golden_dir, name):
+    return json.loads((golden_dir / f"models/{name}_state.json").read_text())["state"]
+
+
+@pytest.mark.parametrize("key_map", [GEMAP, GEMAP_FULL])
+@pytest.mark.parametrize(("upstream", "ours"), PAIRS.items())
+def test_names_by_hand_in_both_directions(key_map, upstream, ours):
+    assert key_map.to_ours(upstream) == ours
+    assert key_map.to_upstream(ours) == upstream
+
+
+def test_the_architecture_is_found_by_its_attention_and_its_depth_net():
+    attention = next(iter(PAIRS))
+    assert find_key_map([attention, "img_neck.x"]) is GEMAP
+    assert find_key_map([PAIRS[attention], "img_neck.x"]) is GEMAP
+    assert find_key_map([attention, DEPTH]) is GEMAP_FULL
+    assert find_key_map([PAIRS[attention], GEMAP_FULL.to_ours(DEPTH)]) is GEMAP_FULL
+    assert find_key_map([DEPTH]) is MAPTRV2
+    assert find_key_map(["img_neck.x"]) is MAPTR
+
+
+def test_every_key_of_the_simple_model_has_its_place(golden_dir):
+    """All but the self-attention's keys go where MapTR's go, and those to its parameters."""
+    state = {key: torch.ones(()) for key in read_keys(golden_dir, "gemap_simple_r50")}
+    ours = ours_from_upstream(state)
+    assert len(ours) == len(state) - 1 == 709
+    others = {key for key in ours if ".self_attn.int" not in key}
+    maptr = {MAPTR.to_ours(key) for key in read_keys(golden_dir, "maptr_r50")} - {None}
+    assert others == {key for key in maptr if "decoder" not in key or "self_attn" not in key}
+    prefix = "map_head.decoder.layers.5.self_attn."
+    parameters = {prefix + key for key in GeometryDecoupledAttention().state_dict()}
+    assert {key for key in ours if key.startswith(prefix)} == parameters
+    assert upstream_from_ours(ours).keys() == state.keys()
+
+
+def test_every_key_of_the_full_model_has_its_place(golden_dir):
+    """The full objective's model is MapTRv2's with the decoder of the simple one, and ``tau``."""
+    decoder = "pts_bbox_head.transformer.decoder."
+    simple = read_keys(golden_dir, "gemap_simple_r50")
+    lifted = read_keys(golden_dir, "maptrv2_r50")
+    keys = {key for key in simple if key.startswith(decoder)}
+    keys |= {key for key in lifted if not key.startswith(decoder)} | {"pts_bbox_head.tau"}
+    state = {key: torch.ones(()) for key in keys}
+    ours = ours_from_upstream(state)
+    assert upstream_from_ours(ours).keys() == keys
+    assert "map_head.seg_head.2.bias" in ours
+
+
+def test_argoverse_2s_simple_model_holds_keys_of_losses_that_are_off():
+    losses = [f"pts_bbox_head.{name}.loss_fn.pos_weight" for name in ("loss_seg", "loss_pv_seg")]
+    state = {key: torch.ones(1) for key in [*PAIRS, "pts_bbox_head.tau", *losses]}
+    ours = ours_from_upstream(state)
+    assert ours.keys() == set(PAIRS.values())
+    assert upstream_from_ours(ours).keys() == {*PAIRS, "pts_bbox_head.code_weights"}
