@@ -1,9 +1,10 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from gsmap.models.losses.direction import direction_loss
+from gsmap.models.losses.direction import direction_loss, self_direction_loss
 from gsmap.models.losses.point import points_l1_loss
 
 
@@ -33,7 +34,33 @@ def test_direction_over_a_longer_interval_ignores_the_points_between():
     torch.testing.assert_close(direction_loss(pred, target, 1.0, interval=2), torch.tensor(0.0))
 
 
-@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss])
+def test_self_direction_by_hand():
+    """A straight step (0), a right angle (1), a fold back (2); a ring's two ends are no pair."""
+    pred = torch.tensor(
+        [[[0.0, 0], [1, 0], [3, 0], [3, 5], [3, 0]], [[0, 0], [1, 0], [2, 0], [3, 0], [4, 0]]]
+    )
+    torch.testing.assert_close(self_direction_loss(pred, 2.0), torch.tensor(1.5))
+    assert self_direction_loss(pred[:, :2], 2.0).item() == 0
+
+
+@pytest.mark.parametrize("case", ["closed", "many"])
+def test_self_direction_equals_the_golden_one(golden_dir, case):
+    models = golden_dir / "models"
+    golden = np.load(models / f"mapvr_headloss_{case}_A.npz")
+    preds = np.load(models / "maptr_r50_forward_reduced_A.npz")["all_pts_preds"][:, 0]
+    for layer, pred in enumerate(torch.from_numpy(preds)):
+        query = golden[f"match_l{layer}"][:, 0]
+        points_m = pred[query] * torch.tensor([30.0, 60.0]) - torch.tensor([15.0, 30.0])
+        value = 0.002 * self_direction_loss(points_m, len(query))
+        name = f"loss/d{layer}.loss_dir" if layer < 5 else "loss/loss_dir"
+        assert value.item() == pytest.approx(float(golden[name]), rel=1e-4)
+
+
+def self_loss(pred, _, avg_factor):
+    return self_direction_loss(pred, avg_factor)
+
+
+@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss, self_loss])
 def test_no_match_gives_a_zero_with_a_gradient(loss):
     pred = torch.zeros(0, 20, 2, requires_grad=True)
     value = loss(pred, torch.zeros(0, 20, 2), 1.0)
@@ -42,7 +69,7 @@ def test_no_match_gives_a_zero_with_a_gradient(loss):
     assert pred.grad.shape == (0, 20, 2)
 
 
-@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss])
+@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss, self_loss])
 def test_gradients(loss):
     torch.manual_seed(0)
     pred = torch.randn(2, 4, 2, dtype=torch.float64, requires_grad=True)
@@ -50,9 +77,10 @@ def test_gradients(loss):
     assert torch.autograd.gradcheck(lambda p: loss(p, target, 3.0), [pred])
 
 
-def test_equal_neighbours_do_not_break_the_direction():
+@pytest.mark.parametrize("loss", [direction_loss, self_loss])
+def test_equal_neighbours_do_not_break_the_direction(loss):
     pred = torch.zeros(1, 3, 2, requires_grad=True)
-    direction_loss(pred, torch.rand(1, 3, 2), 1.0).backward()
+    loss(pred, torch.rand(1, 3, 2), 1.0).backward()
     assert torch.isfinite(pred.grad).all()
 
 
