@@ -98,6 +98,27 @@ def test_soft_polygon_is_a_sigmoid_of_the_signed_squared_distance(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_plain_distance_falls_as_the_paper_writes(backend):
+    """MapVR Eqs. 2-3: exp(-D / tau) of a line, sigmoid(+-D / tau) of a polygon."""
+    line = torch.tensor([[[1.0, 2.0], [4.0, 2.0]]])
+    mask = soft_rasters(line, 6, 9, line_softness=2.0, distance="plain", backend=backend)[0]
+    torch.testing.assert_close(mask[2, 1:5], torch.ones(4))
+    torch.testing.assert_close(mask[0, 3], torch.tensor(math.exp(-2 / 2)))
+    torch.testing.assert_close(mask[4, 3], torch.tensor(math.exp(-1.99 / 2)))
+    square = torch.tensor([[[0.5, 0.5], [6.5, 0.5], [6.5, 6.5], [0.5, 6.5]]])
+    mask = soft_rasters(square, 8, 9, yes(True), distance="plain", backend=backend)[0]
+    torch.testing.assert_close(mask[2, 3], torch.sigmoid(torch.tensor(1.5 / 4)))
+    torch.testing.assert_close(mask[3, 8], torch.sigmoid(torch.tensor(-1.5 / 4)))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_pixels_on_a_line_have_a_finite_gradient_in_the_plain_distance(backend):
+    line = torch.tensor([[[1.0, 2.0], [4.0, 2.0]]], requires_grad=True)
+    soft_rasters(line, 6, 9, distance="plain", backend=backend).sum().backward()
+    assert torch.isfinite(line.grad).all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_soft_rasters_equal_the_golden_ones(golden_dir, backend):
     golden = np.load(golden_dir / "models/mapvr_rasters_A.npz")
     kinds = {f"line{i}_lane_boundary_s2": False for i in range(4)}
@@ -109,24 +130,47 @@ def test_soft_rasters_equal_the_golden_ones(golden_dir, backend):
         torch.testing.assert_close(mask, torch.from_numpy(golden[name]), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_plain_distance_equals_the_golden_rasters_roots(golden_dir, backend):
+    """A golden mask holds its squared distance wherever float32 does not round it away."""
+    golden = np.load(golden_dir / "models/mapvr_rasters_A.npz")
+    kinds = {f"line{i}_lane_boundary_s2": False for i in range(4)}
+    kinds |= {f"poly{i}_mask_s4": True for i in range(4)}
+    for name, is_polygon in kinds.items():
+        vertices = torch.from_numpy(golden[f"{name.split('_')[0]}_vertices"])[None]
+        squared = torch.from_numpy(golden[name]).double()
+        squared = 4 * torch.logit(squared) if is_polygon else -2 * squared.log()
+        clear = (squared.abs() > 1e-2) & (squared.abs() < 25)
+        distance = squared.abs().sqrt()
+        expected = (
+            torch.sigmoid(squared.sign() * distance / 4) if is_polygon else (-distance / 2).exp()
+        )
+        mask = soft_rasters(vertices, 64, 32, yes(is_polygon), distance="plain", backend=backend)
+        assert clear.sum() > 100
+        torch.testing.assert_close(mask[0][clear], expected[clear].float(), atol=1e-5, rtol=0)
+
+
 @pytest.mark.usefixtures("poisoned_empty")
+@pytest.mark.parametrize("distance", ["squared", "plain"])
 @pytest.mark.parametrize("count", [1, 2, 9])
-def test_fused_soft_rasters_equal_the_float64_reference(count):
+def test_fused_soft_rasters_equal_the_float64_reference(count, distance):
     vertices, kinds = random_vertices(count), yes(True, False, True, False, False, True)
     upstream = torch.randn(6, 21, 33, generator=torch.Generator().manual_seed(1))
     leaf, exact = vertices.clone().requires_grad_(), vertices.double().requires_grad_()
-    mask = soft_rasters(leaf, 21, 33, kinds, backend="cpu")
-    true = soft_rasters(exact, 21, 33, kinds, backend="reference")
+    mask = soft_rasters(leaf, 21, 33, kinds, distance=distance, backend="cpu")
+    true = soft_rasters(exact, 21, 33, kinds, distance=distance, backend="reference")
     mask.backward(upstream)
     true.backward(upstream.double())
     torch.testing.assert_close(mask, true.float(), atol=1e-5, rtol=0)
     assert (leaf.grad - exact.grad).norm() < 1e-4 * exact.grad.norm()
 
 
-def test_gradcheck_of_soft_rasters():
+@pytest.mark.parametrize("distance", ["squared", "plain"])
+def test_gradcheck_of_soft_rasters(distance):
     vertices = (random_vertices(4, seed=3)[:2] / 5).double().requires_grad_()
+    settings = {"distance": distance, "backend": "reference"}
     assert torch.autograd.gradcheck(
-        lambda v: soft_rasters(v, 5, 6, yes(True, False), backend="reference"), vertices
+        lambda v: soft_rasters(v, 5, 6, yes(True, False), **settings), vertices
     )
 
 
@@ -169,5 +213,7 @@ def test_drawing_names_bad_arguments(change, match):
 def test_soft_rasters_name_bad_arguments():
     with pytest.raises(ValueError, match="softness must be > 0"):
         soft_rasters(torch.zeros(1, 3, 2), 4, 4, line_softness=0.0)
+    with pytest.raises(ValueError, match=r"distance must be one of .* got 'cubed'"):
+        soft_rasters(torch.zeros(1, 3, 2), 4, 4, distance="cubed")
     with pytest.raises(ValueError, match=r"vertices must have shape \(n, V, 2\)"):
         soft_rasters(torch.zeros(3, 2), 4, 4)

@@ -1,3 +1,6 @@
+import json
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -53,6 +56,48 @@ def test_cost_equals_the_golden_one(golden):
     torch.testing.assert_close(cost, golden["cost_w10"], rtol=1e-4, atol=1e-5)
 
 
+def test_without_polygon_classes_all_are_lines():
+    points, labels = torch.rand(2, 5, 2), torch.tensor([0, 1])
+    renderer = ElementRenderer((16, 8), polygon_classes=())
+    assert not renderer.is_polygon(labels).any()
+    lines = ElementRenderer((16, 8)).render(points, torch.zeros(2, dtype=torch.bool))
+    torch.testing.assert_close(renderer.render(points, renderer.is_polygon(labels)), lines)
+
+
+@pytest.mark.parametrize("distance", ["squared", "plain"])
+def test_softness_is_in_the_unit_of_the_distance(distance):
+    """A line on row 2 of 8, seen from row 5: 3 pixels, or 9 square pixels."""
+    line = torch.tensor([[[0.0, 0.25], [1.0, 0.25]]])
+    renderer = ElementRenderer((8, 8), line_softness=3.0, distance=distance)
+    mask = renderer.render(line, torch.tensor([False]))[0]
+    expected = math.exp(-3 if distance == "squared" else -1)
+    assert mask[5, 4].item() == pytest.approx(expected, rel=0.03)  # the way back is 0.01 nearer
+
+
+def test_gradient_of_the_plain_distances_loss():
+    generator = torch.Generator().manual_seed(1)
+    pred, gt = torch.rand(2, 2, 4, 2, dtype=torch.float64, generator=generator)
+    loss = RenderedDiceLoss(size=(9, 7), distance="plain")
+    labels = torch.tensor([0, 1])
+    assert torch.autograd.gradcheck(lambda p: loss(p, gt, labels), [pred.requires_grad_()])
+
+
+@pytest.mark.parametrize("case", ["closed", "many"])
+def test_loss_on_a_models_predictions_equals_the_golden_one(golden_dir, case):
+    models = golden_dir / "models"
+    golden = np.load(models / f"mapvr_headloss_{case}_A.npz")
+    preds = np.load(models / "maptr_r50_forward_reduced_A.npz")["all_pts_preds"][:, 0]
+    gts_m = np.load(models / f"maptr_loss_{case}_A.npz")["gt_fixed_pts"]
+    gts = (torch.from_numpy(gts_m) + torch.tensor([15.0, 30.0])) / torch.tensor([30.0, 60.0])
+    annotated = json.loads((models / "gt_A.json").read_text())["sets"][case]
+    labels = torch.tensor([element["label"] for element in annotated])
+    for layer, pred in enumerate(torch.from_numpy(preds)):
+        query, gt, _ = golden[f"match_l{layer}"].T
+        value = RenderedDiceLoss()(pred[query], gts[gt], labels[gt])
+        name = f"loss/d{layer}.loss_rendered_mask" if layer < 5 else "loss/loss_rendered_mask"
+        assert value.item() == pytest.approx(float(golden[name]), rel=1e-4)
+
+
 def test_nothing_matched_gives_zero_with_a_gradient():
     pred = torch.zeros(0, 20, 2, requires_grad=True)
     loss = RenderedDiceLoss()(pred, torch.zeros(0, 20, 2), torch.zeros(0, dtype=torch.long))
@@ -61,6 +106,15 @@ def test_nothing_matched_gives_zero_with_a_gradient():
     assert pred.grad.shape == pred.shape
 
 
-def test_bad_softness_is_named():
-    with pytest.raises(ValueError, match="softness must be > 0"):
-        RenderedDiceLoss(line_softness=0)
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"line_softness": 0}, "softness must be > 0, got 0 and 4.0"),
+        ({"size": (0, 4)}, r"size must be rows and columns, both >= 1, got \(0, 4\)"),
+        ({"polygon_classes": (-1,)}, r"polygon_classes must be >= 0, got \(-1,\)"),
+        ({"distance": "cubed"}, "distance must be one of .* got 'cubed'"),
+    ],
+)
+def test_bad_settings_are_named(change, match):
+    with pytest.raises(ValueError, match=match):
+        RenderedDiceLoss(**change)

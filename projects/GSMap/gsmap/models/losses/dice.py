@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gsmap.ops.polyline_raster import soft_rasters
+from gsmap.ops.polyline_raster import DISTANCES, soft_rasters
 
 
 @dataclass(frozen=True)
@@ -15,20 +15,28 @@ class ElementRenderer:
 
     Args:
         size: Rows H and columns W of the masks.
-        line_softness: Softness of lines in square pixels.
-        polygon_softness: Softness of polygons in square pixels.
-        polygon_classes: Classes that are rendered as filled polygons.
+        line_softness: Softness of lines (tau), in pixels, squared if ``distance`` is.
+        polygon_softness: Softness of polygons.
+        polygon_classes: Classes that are rendered as filled polygons; none: all are lines.
+        distance: ``"squared"`` or ``"plain"`` (see `gsmap.ops.polyline_raster.soft_rasters`).
 
     Raises:
-        ValueError: If a softness is not > 0.
+        ValueError: If a setting is outside its range.
     """
 
     size: tuple[int, int]
     line_softness: float = 2.0
     polygon_softness: float = 4.0
     polygon_classes: tuple[int, ...] = (1,)
+    distance: str = "squared"
 
     def __post_init__(self) -> None:
+        if len(self.size) != 2 or min(self.size) < 1:
+            raise ValueError(f"size must be rows and columns, both >= 1, got {self.size}.")
+        if any(label < 0 for label in self.polygon_classes):
+            raise ValueError(f"polygon_classes must be >= 0, got {self.polygon_classes}.")
+        if self.distance not in DISTANCES:
+            raise ValueError(f"distance must be one of {DISTANCES}, got {self.distance!r}.")
         softness = self.line_softness, self.polygon_softness
         if min(softness) <= 0:
             raise ValueError(f"softness must be > 0, got {softness[0]} and {softness[1]}.")
@@ -49,9 +57,8 @@ class ElementRenderer:
         """
         height, width = self.size
         pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
-        return soft_rasters(
-            pixels, height, width, is_polygon, self.line_softness, self.polygon_softness
-        )
+        softness = self.line_softness, self.polygon_softness
+        return soft_rasters(pixels, height, width, is_polygon, *softness, self.distance)
 
 
 def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from gsmap.ops.polyline_raster.reference import draw_reference, soft_rasters_ref
 from gsmap.structures.grid import BEVGrid
 
 LANE_GAP_PX = 0.01  # how far MapVR moves a line's way back: both form a polygon
+DISTANCES = ("squared", "plain")
 
 
 def draw_polylines(
@@ -66,12 +67,14 @@ def soft_rasters(
     is_polygon: Tensor | None = None,
     line_softness: float = 2.0,
     polygon_softness: float = 4.0,
+    distance: str = "squared",
     backend: str = "auto",
 ) -> Tensor:
-    r"""Render lines as :math:`\exp(-d^2 / \tau)`, polygons as :math:`\sigma(\pm d^2 / \tau)`.
+    r"""Render lines as :math:`\exp(-D / \tau)`, polygons as :math:`\sigma(\pm D / \tau)`.
 
-    d is a pixel's distance to the nearest edge; the sign is + inside (MapVR Eqs. 2-3). A line is
-    rendered as the thin closed polygon of itself and its way back, a polygon is closed implicitly.
+    D is a pixel's distance to the nearest edge, or its square; the sign is + inside (MapVR
+    Eqs. 2-3). A line is rendered as the thin closed polygon of itself and its way back, a polygon
+    is closed implicitly.
 
     Args:
         vertices: In pixels (x = column, y = row); pixel (row, col) is sampled at (col, row).
@@ -79,15 +82,18 @@ def soft_rasters(
         height: Rows H.
         width: Columns W.
         is_polygon: Which are filled polygons, bool; all are lines without it. (n,)
-        line_softness: :math:`\tau` of lines in square pixels.
-        polygon_softness: :math:`\tau` of polygons in square pixels.
+        line_softness: :math:`\tau` of lines, in the unit of D.
+        polygon_softness: :math:`\tau` of polygons, in the unit of D.
+        distance: ``"squared"``: D in square pixels, as in MapVR's released rasterizer; ``"plain"``:
+            D in pixels, as in its equations.
         backend: ``"reference"``, ``"cpu"`` (fused), or ``"auto"``.
 
     Returns:
         Masks in [0, 1], differentiable in ``vertices``. (n, H, W)
 
     Raises:
-        ValueError: If a shape is wrong, a softness is not positive or ``backend`` does not serve.
+        ValueError: If a shape is wrong, a softness is not positive, ``distance`` is unknown or
+            ``backend`` does not serve.
     """
     if vertices.ndim != 3 or vertices.shape[-1] != 2 or not vertices.shape[1]:
         raise ValueError(
@@ -95,17 +101,19 @@ def soft_rasters(
         )
     if not (line_softness > 0 and polygon_softness > 0):
         raise ValueError(f"softness must be > 0, got {line_softness} and {polygon_softness}.")
-    flags = _flags(is_polygon, "is_polygon", vertices)
+    if distance not in DISTANCES:
+        raise ValueError(f"distance must be one of {DISTANCES}, got {distance!r}.")
+    flags, plain = _flags(is_polygon, "is_polygon", vertices), distance == "plain"
     with torch.autocast(vertices.device.type, enabled=False):
         vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
-        # Differs from MapVR Eqs. (2-3): d is squared, as in MapVR's released rasterizer.
+        # Differs from MapVR Eqs. (2-3) by default: D is squared, as in its released rasterizer.
         back = vertices.flip(1) + LANE_GAP_PX
         stay = vertices[:, -1:].expand_as(vertices)  # a polygon's ring is padded by its last corner
         rings = torch.cat([vertices, torch.where(flags[:, None, None], stay, back)], 1)
-        if choose_backend(backend, rings, ("cpu",)) == "cpu":
-            return soft_rasters_cpu(rings, flags, height, width, line_softness, polygon_softness)
         softness = line_softness, polygon_softness
-        return soft_rasters_reference(rings, flags, height, width, softness)
+        if choose_backend(backend, rings, ("cpu",)) == "cpu":
+            return soft_rasters_cpu(rings, flags, height, width, *softness, plain)
+        return soft_rasters_reference(rings, flags, height, width, softness, plain)
 
 
 def _flags(flags: Tensor | None, name: str, elements: Tensor) -> Tensor:

@@ -7,20 +7,23 @@ import torch
 from torch import Tensor
 
 from gsmap.ops._numba import run_in_threads
-from gsmap.ops.polyline_raster.reference import LENGTH_EPS
+from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
 Pair = tuple[float, float]
 Frame = tuple[float, float, float, float]
 
-REACH = math.sqrt(-math.log(1e-8))  # in units of sqrt(softness): beyond it masks are 0 or 1
+REACH = -math.log(1e-8)  # in units of softness: beyond it masks are 0 or 1
 INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)  # MapVR samples pixel (row, col) at (col, row)
 
 
-def _settings(line_softness: float, polygon_softness: float) -> tuple[Frame, Pair, float, Pair]:
-    """Return the kernels' frame, reach, eps and softness."""
+def _settings(
+    line_softness: float, polygon_softness: float, plain: bool
+) -> tuple[Frame, Pair, float, Pair, float]:
+    """Return the kernels' frame, reach, eps, softness and smallest distance."""
+    lines, polygons = REACH * line_softness, REACH * polygon_softness
+    reach = (lines, polygons) if plain else (math.sqrt(lines), math.sqrt(polygons))
     softness = (line_softness, polygon_softness)
-    reach = (REACH * math.sqrt(line_softness), REACH * math.sqrt(polygon_softness))
-    return INTEGER_FRAME, reach, LENGTH_EPS, softness
+    return INTEGER_FRAME, reach, LENGTH_EPS, softness, DISTANCE_EPS if plain else 0.0
 
 
 @torch.library.custom_op("gsmap::soft_rasters", mutates_args=(), device_types="cpu")
@@ -31,12 +34,13 @@ def soft_rasters_cpu(
     width: int,
     line_softness: float,
     polygon_softness: float,
+    plain: bool,
 ) -> Tensor:
     """Render closed float32 rings softly; see ``soft_rasters_reference``. (n, H, W)"""
     from gsmap.ops.polyline_raster.cpu_kernels import soft_forward
 
     masks = torch.empty(len(rings), height, width, dtype=torch.float32)
-    settings = _settings(line_softness, polygon_softness)
+    settings = _settings(line_softness, polygon_softness, plain)
     arguments = (
         rings.contiguous().numpy(),
         is_polygon.contiguous().numpy(),
@@ -58,12 +62,13 @@ def _soft_rasters_backward(
     is_polygon: Tensor,
     line_softness: float,
     polygon_softness: float,
+    plain: bool,
 ) -> Tensor:
     """Return the gradient in the rings. (n, V, 2)"""
     from gsmap.ops.polyline_raster.cpu_kernels import soft_backward
 
     gradients = torch.empty(rings.shape, dtype=torch.float64)
-    settings = _settings(line_softness, polygon_softness)
+    settings = _settings(line_softness, polygon_softness, plain)
     arrays = grads.contiguous().numpy(), gradients.numpy()
     arguments = (rings.contiguous().numpy(), is_polygon.contiguous().numpy(), *settings, *arrays)
     run_in_threads(
@@ -75,23 +80,25 @@ def _soft_rasters_backward(
 
 
 @soft_rasters_cpu.register_fake
-def _(rings, is_polygon, height, width, line_softness, polygon_softness):  # type: ignore[no-untyped-def]
+def _(  # type: ignore[no-untyped-def]
+    rings, is_polygon, height, width, line_softness, polygon_softness, plain
+):
     return rings.new_empty(rings.shape[0], height, width)
 
 
 @_soft_rasters_backward.register_fake
-def _(grads, rings, is_polygon, line_softness, polygon_softness):  # type: ignore[no-untyped-def]
+def _(grads, rings, is_polygon, line_softness, polygon_softness, plain):  # type: ignore[no-untyped-def]
     return rings.new_empty(rings.shape)
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     ctx.save_for_backward(*inputs[:2])
-    ctx.softness = inputs[4:]
+    ctx.settings = inputs[4:]
 
 
 def _differentiate(ctx: Any, grads: Tensor) -> tuple[Any, ...]:
-    gradient = _soft_rasters_backward(grads, *ctx.saved_tensors, *ctx.softness)
-    return gradient, None, None, None, None, None
+    gradient = _soft_rasters_backward(grads, *ctx.saved_tensors, *ctx.settings)
+    return gradient, None, None, None, None, None, None
 
 
 soft_rasters_cpu.register_autograd(_differentiate, setup_context=_setup_context)

@@ -99,9 +99,15 @@ def _buffers(shape):
     return steps, np.empty(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.uint8)
 
 
+@njit(inline="always")
+def _measure(squared, nearest):
+    """Return D: a squared distance as it is, or, if ``nearest`` > 0, the distance."""
+    return max(math.sqrt(squared), nearest) if nearest > 0 else float(squared)
+
+
 @njit(nogil=True, cache=True)
-def soft_forward(rings, polygons, frame, reach, eps, softness, masks, first, last):
-    """Render exp(-d^2 / s), or a sigmoid of +-d^2 / s for polygons; NaN for a vertex not finite.
+def soft_forward(rings, polygons, frame, reach, eps, softness, nearest, masks, first, last):
+    """Render exp(-D / s), or a sigmoid of +-D / s for polygons; NaN for a vertex not finite.
 
     Args:
         rings: Closed rings in the unit of ``frame``, float32. (N, V, 2)
@@ -109,7 +115,9 @@ def soft_forward(rings, polygons, frame, reach, eps, softness, masks, first, las
         frame: Smallest x and y of the raster and the pixel's size along x and y.
         reach: Distance beyond which a mask is 0 or 1, for lines and polygons.
         eps: Added to an edge's squared length.
-        softness: s for lines and polygons.
+        softness: s for lines and polygons, in the unit of D.
+        nearest: 0: D is the squared distance to the nearest edge. > 0: D is the distance, or this
+            where it is smaller; there it has no gradient.
         masks: Written to, float32. (N, H, W)
         first: First element.
         last: One past the last element.
@@ -127,7 +135,7 @@ def soft_forward(rings, polygons, frame, reach, eps, softness, masks, first, las
             for col in range(masks.shape[2]):
                 fade = 0.0
                 if owners[row, col] >= 0:
-                    fade = math.exp(-distances[row, col] / softness[kind])
+                    fade = math.exp(-_measure(distances[row, col], nearest) / softness[kind])
                 if kind:
                     fade = (1.0 if inside[row, col] else fade) / (1 + fade)
                 masks[n, row, col] = fade
@@ -154,7 +162,7 @@ def _scatter(ring, owner, x, y, eps, weight, out):
 
 
 @njit(nogil=True, cache=True)
-def soft_backward(rings, polygons, frame, reach, eps, softness, grads, out, first, last):
+def soft_backward(rings, polygons, frame, reach, eps, softness, nearest, grads, out, first, last):
     """Write to ``out`` (N, V, 2), float64, the gradient in the rings of ``grads`` (N, H, W).
 
     The other arguments are those of :func:`soft_forward`.
@@ -174,11 +182,14 @@ def soft_backward(rings, polygons, frame, reach, eps, softness, grads, out, firs
             for col in range(grads.shape[2]):
                 if owners[row, col] < 0 or grads[n, row, col] == 0:
                     continue
-                fade = math.exp(-distances[row, col] / softness[kind])
+                distance = _measure(distances[row, col], nearest)
+                fade = math.exp(-distance / softness[kind])
                 slope = -fade
                 if kind:
                     slope = (1.0 if inside[row, col] else -1.0) * fade / (1 + fade) ** 2
                 weight = grads[n, row, col] * slope / softness[kind]
+                if nearest > 0:
+                    weight *= 0.5 / distance if distance > nearest else 0.0
                 x, y = x_min + (col + 0.5) * step_x, y_min + (row + 0.5) * step_y
                 _scatter(ring, owners[row, col], x, y, eps, weight, out[n])
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 BLOCK_VALUES = 1 << 22  # how many distances are held at a time
+DISTANCE_EPS = 1e-6  # pixels that are nearer to an edge count as this near
 LENGTH_EPS = 1e-5  # added to an edge's squared length, as in MapVR: an edge may be a single point
 
 
@@ -79,9 +80,14 @@ def inside_polygon(pixels: Tensor, vertices: Tensor) -> Tensor:
 
 
 def soft_rasters_reference(
-    rings: Tensor, is_polygon: Tensor, height: int, width: int, softness: tuple[float, float]
+    rings: Tensor,
+    is_polygon: Tensor,
+    height: int,
+    width: int,
+    softness: tuple[float, float],
+    plain: bool = False,
 ) -> Tensor:
-    r"""Render closed rings: :math:`\exp(-d^2 / s)`, or :math:`\sigma(\pm d^2 / s)` for polygons.
+    r"""Render closed rings: :math:`\exp(-D / s)`, or :math:`\sigma(\pm D / s)` for polygons.
 
     Args:
         rings: Vertices in pixels, sampled at integer positions. (n, V, 2)
@@ -89,6 +95,7 @@ def soft_rasters_reference(
         height: Rows H.
         width: Columns W.
         softness: s for lines and for polygons.
+        plain: D is the distance to the nearest edge; otherwise its square.
 
     Returns:
         Masks. (n, H, W)
@@ -97,6 +104,8 @@ def soft_rasters_reference(
     y = torch.arange(height, device=rings.device, dtype=rings.dtype)
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
     distances = edge_distances(pixels, rings, rings.roll(-1, 1), LENGTH_EPS)
+    if plain:  # no gradient at an edge, where the distance has a kink
+        distances = distances.clamp(min=DISTANCE_EPS**2).sqrt()
     signed = torch.where(inside_polygon(pixels, rings.detach()), distances, -distances)
     lines, polygons = torch.exp(-distances / softness[0]), torch.sigmoid(signed / softness[1])
     return torch.where(is_polygon[:, None, None], polygons, lines)
