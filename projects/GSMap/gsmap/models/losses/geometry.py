@@ -22,8 +22,10 @@ def shape_features(points: Tensor) -> Tensor:
     Returns:
         Length, cosine and sine per edge. (3, M, P)
     """
-    edges = _edges(points)
-    return torch.cat([edges.norm(dim=-1)[None], _turns(edges.roll(1, 1), edges)])
+    edges = _edges(points.movedim(-1, 0))
+    lengths = edges.norm(dim=0)
+    before = edges.roll(1, -1)
+    return torch.stack([lengths, *_turns(before, edges, lengths.roll(1, -1) * lengths)])
 
 
 def relation_features(points: Tensor, pairs: Tensor) -> Tensor:
@@ -36,10 +38,13 @@ def relation_features(points: Tensor, pairs: Tensor) -> Tensor:
     Returns:
         Distance, cosine and sine per point (or edge) of the first and of the second. (3, R, P, P)
     """
-    first, second = points[pairs[0], :, None], points[pairs[1], None]  # (R, P, 1, 2), (R, 1, P, 2)
+    points = points.movedim(-1, 0)  # sums over a last axis of two would be slow
     edges = _edges(points)
-    turns = _turns(edges[pairs[0], :, None], edges[pairs[1], None])  # (2, R, P, P)
-    return torch.cat([(first - second).norm(dim=-1)[None], turns])
+    lengths = edges.norm(dim=0)
+    distances = (points[:, pairs[0], :, None] - points[:, pairs[1], None]).norm(dim=0)
+    products = lengths[pairs[0], :, None] * lengths[pairs[1], None]
+    turns = _turns(edges[:, pairs[0], :, None], edges[:, pairs[1], None], products)
+    return torch.stack([distances, *turns])
 
 
 def euclidean_shape_loss(pred: Tensor, target: Tensor) -> Tensor:
@@ -130,15 +135,16 @@ class EuclideanLoss(nn.Module):
 
 
 def _edges(points: Tensor) -> Tensor:
-    """Return the edge that ends in each point; the first one closes the ring. (M, P, 2)"""
-    return points - points.roll(1, 1)
+    """Return the edge that ends in each point; the first one closes the ring. (2, M, P)"""
+    return points - points.roll(1, -1)
 
 
-def _turns(first: Tensor, second: Tensor) -> Tensor:
-    """Return cosine and sine from edges to others; 0 for points. (..., 2) each -> (2, ...)"""
-    lengths = first.norm(dim=-1) * second.norm(dim=-1) + NORM_EPS
-    cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-    return torch.stack([(first * second).sum(-1), cross]) / lengths
+def _turns(first: Tensor, second: Tensor, products: Tensor) -> tuple[Tensor, Tensor]:
+    """Return cosine and sine from edges (2, ...) to others, given their lengths' products."""
+    dot = first[0] * second[0] + first[1] * second[1]
+    cross = first[0] * second[1] - first[1] * second[0]
+    scale = 1 / (products + NORM_EPS)
+    return dot * scale, cross * scale
 
 
 def _check_shapes(pred: Tensor, target: Tensor) -> None:
