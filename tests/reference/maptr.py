@@ -43,7 +43,7 @@ def state_rows(golden: Golden, name: str, config: str) -> Iterator[Row]:
     unused = find_key_map(shapes).unused
     trainable = sum(p.numel() for p in model.parameters() if p.requires_grad)
     for key in unused:  # upstream trains them too, without effect
-        if listed["state"][key].get("requires_grad"):
+        if listed["state"].get(key, {}).get("requires_grad"):
             trainable += math.prod(shapes[key])
     yield Row(name, "trainable parameters", abs(trainable - listed["trainable_params"]), 0)
     back = upstream_from_ours(model.state_dict())

@@ -31,6 +31,8 @@ FILES = [
     "maptr_loss_closed_*.npz",
     "maptr_loss_many_*.npz",
     "maptr_loss_batch3_*.npz",
+    "gemap_gda_*.npz",
+    "gemap_geoloss_*.npz",
     "maptrv2_r50_state.json",
     "maptrv2_r50_forward_reduced_*.npz",
     "maptrv2_r50_forward_full_*.npz",
