@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 from mmdet3d.registry import MODELS
+from model_cases import build_small
 from torch import nn
 
 from gsmap.models.layers.folded_backbone import FoldedBackbone, can_be_folded
@@ -92,3 +93,8 @@ def test_is_the_backbone_itself_when_it_trains_or_is_watched(backbone: nn.Module
     folded = FoldedBackbone()
     folded(backbone, IMAGES)[0].sum().backward()
     assert backbone.conv1.weight.grad is not None
+
+
+def test_a_config_can_leave_the_backbone_as_it_is():
+    model = build_small(fold_batch_norms=False)
+    assert model.folded_backbone is None

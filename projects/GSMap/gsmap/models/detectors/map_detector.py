@@ -30,6 +30,10 @@ class MapDetector(Base3DDetector):
             None.
         lidar_encoder: Config of the LiDAR's BEV encoder; None for a model without LiDAR.
         bev_fuser: Config of the fusion of both, with cameras and LiDAR.
+        fold_batch_norms: Whether the image backbone runs without gradients as a copy whose batch
+            norms are folded into its convolutions (faster, for a second copy of its weights).
+        strict_loading: Whether a checkpoint must hold every weight, by our names or upstream's, and
+            nothing else; otherwise it is loaded as torch does, by our names.
         data_preprocessor: As in mmdet3d.
         init_cfg: As in mmengine.
 
@@ -48,12 +52,15 @@ class MapDetector(Base3DDetector):
         img_augment: dict | None = None,
         lidar_encoder: dict | None = None,
         bev_fuser: dict | None = None,
+        fold_batch_norms: bool = True,
+        strict_loading: bool = True,
         data_preprocessor: dict | None = None,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(data_preprocessor=data_preprocessor, init_cfg=init_cfg)
         self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
-        self.folded_backbone = FoldedBackbone()
+        self.folded_backbone = FoldedBackbone() if fold_batch_norms else None
+        self.strict_loading = strict_loading
         self.img_neck = MODELS.build(img_neck) if img_neck else None
         self.img_augment = MODELS.build(img_augment) if img_augment else None
         if not (bev_encoder or lidar_encoder):
@@ -77,7 +84,10 @@ class MapDetector(Base3DDetector):
             images = self.img_augment(images)
         # channels last is what CPU and tensor-core convolutions are fastest with
         images = images.contiguous(memory_format=torch.channels_last)
-        feats = self.folded_backbone(self.img_backbone, images)
+        if self.folded_backbone is None:
+            feats = self.img_backbone(images)
+        else:
+            feats = self.folded_backbone(self.img_backbone, images)
         if self.img_neck is not None:
             feats = self.img_neck(feats)
         return [feat.unflatten(0, (batch, -1)) for feat in feats]
@@ -145,20 +155,17 @@ class MapDetector(Base3DDetector):
     def _load_from_state_dict(
         self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        """Accept upstream's names, then require every key to match.
+        """Accept upstream's names, then require every key to match, with ``strict_loading``.
 
         Raises:
             ValueError: If a key is missing, left over or of another shape.
         """
-        adapt_state(
-            state_dict,
-            self.state_dict(prefix=prefix),
-            prefix,
-            neutral_keys(self, prefix),
-            lambda state: self._fit_state(state, prefix),
-        )
+        if self.strict_loading:
+            adapt_state(
+                state_dict,
+                self.state_dict(prefix=prefix),
+                prefix,
+                neutral_keys(self, prefix),
+                lambda state: self.map_head.fit_state(state, f"{prefix}map_head."),
+            )
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-    def _fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
-        """Let the head fit a checkpoint's training-only parts to its own size."""
-        self.map_head.fit_state(state, f"{prefix}map_head.")
