@@ -31,32 +31,18 @@ def stack_targets(
     return torch.stack([torch.as_tensor(s.get(name)) for s in batch_data_samples]).to(device)
 
 
-class _MaskHead(nn.Sequential):
-    """A 3x3 and a 1x1 convolution to the logits of a mask, and its loss."""
-
-    def __init__(self, embed_dims: int, loss_weight: float, pos_weight: float, name: str) -> None:
-        super().__init__(
-            nn.Conv2d(embed_dims, embed_dims, 3, padding=1, bias=False),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(embed_dims, 1, 1),
-        )
-        self.loss_weight, self.pos_weight, self.name = loss_weight, pos_weight, name
-
-    def _loss(self, feats: Tensor, target: Tensor) -> Tensor:
-        """Return the weighted loss of the features' mask."""
-        return self.loss_weight * mask_loss(self(feats), target, self.pos_weight)
-
-
 @MODELS.register_module()
-class BEVMaskHead(_MaskHead):
-    """All elements drawn in one mask in bird's-eye view, from ``gt_seg`` (1, H, W).
+class BEVMaskHead(nn.Sequential):
+    """All elements drawn in one mask in bird's-eye view: two convolutions and a cross-entropy.
 
     Args:
-        embed_dims: Channels C of the BEV features.
+        embed_dims: Channels C of the features.
         loss_weight: Weight of the loss.
-        pos_weight: Weight of the drawn cells.
+        pos_weight: Weight of the drawn cells in it.
         name: Name of its weights and of its loss.
     """
+
+    feats, target = "bev_feats", "gt_seg"  # (B, C, H, W) and (B, 1, H, W)
 
     def __init__(
         self,
@@ -65,26 +51,29 @@ class BEVMaskHead(_MaskHead):
         pos_weight: float = 4.0,
         name: str = "seg",
     ) -> None:
-        super().__init__(embed_dims, loss_weight, pos_weight, name)
+        super().__init__(
+            nn.Conv2d(embed_dims, embed_dims, 3, padding=1, bias=False),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(embed_dims, 1, 1),
+        )
+        self.loss_weight, self.pos_weight, self.name = loss_weight, pos_weight, name
 
     def loss(
         self, bev_outputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
     ) -> Tensor:
-        """Return the loss on ``bev_feats`` (B, C, H, W)."""
-        feats = bev_outputs["bev_feats"]
-        return self._loss(feats, stack_targets(batch_data_samples, "gt_seg", feats.device))
+        """Return the weighted loss on the encoder's features."""
+        feats = bev_outputs[self.feats]
+        target = stack_targets(batch_data_samples, self.target, feats.device)
+        logits = self(feats.reshape(-1, *feats.shape[-3:]))
+        target = target.reshape(logits.shape)
+        return self.loss_weight * mask_loss(logits, target, self.pos_weight)
 
 
 @MODELS.register_module()
-class PVMaskHead(_MaskHead):
-    """All elements drawn in one mask per camera, from ``gt_pv_seg`` (V, 1, h, w).
+class PVMaskHead(BEVMaskHead):
+    """The same in the view of each camera, on the encoder's image features."""
 
-    Args:
-        embed_dims: Channels C of the image features.
-        loss_weight: Weight of the loss.
-        pos_weight: Weight of the drawn pixels.
-        name: Name of its weights and of its loss.
-    """
+    feats, target = "img_feats", "gt_pv_seg"  # (B, V, C, h, w) and (B, V, 1, h, w)
 
     def __init__(
         self,
@@ -94,14 +83,6 @@ class PVMaskHead(_MaskHead):
         name: str = "pv_seg",
     ) -> None:
         super().__init__(embed_dims, loss_weight, pos_weight, name)
-
-    def loss(
-        self, bev_outputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> Tensor:
-        """Return the loss on ``img_feats`` (B, V, C, h, w)."""
-        feats = bev_outputs["img_feats"]
-        target = stack_targets(batch_data_samples, "gt_pv_seg", feats.device)
-        return self._loss(feats.flatten(0, 1), target.flatten(0, 1))
 
 
 @MODELS.register_module()
