@@ -1,7 +1,8 @@
 #!/usr/bin/env python
 """Draw the loss and metric curves of training runs and print a table of them.
 
-Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out curves.png``.
+Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out curves.png``; with ``--keys
+soft_iou/divider at_floor`` it draws these figures of training, a panel each.
 """
 
 import argparse
@@ -9,7 +10,7 @@ import sys
 from pathlib import Path
 
 from gsmap.visualization.figure import save_figure
-from gsmap.visualization.run_curves import plot_runs, read_run, summary_table
+from gsmap.visualization.run_curves import plot_runs, plot_series, read_run, summary_table
 
 
 def parse_args() -> argparse.Namespace:
@@ -19,6 +20,7 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("--names", nargs="+", help="a name for each run, for the legend")
     parser.add_argument("--out", type=Path, help="picture to write: .png, .jpg, .pdf or .svg")
+    parser.add_argument("--keys", nargs="+", help="logged figures to draw in place of the losses")
     parser.add_argument("--table", type=Path, help="also write the Markdown table to this file")
     return parser.parse_args()
 
@@ -35,7 +37,8 @@ def main() -> None:
         if args.table:
             args.table.write_text(table + "\n")
         if args.out:
-            print(f"curves: {save_figure(plot_runs(runs), args.out)}")
+            figure = plot_series(runs, args.keys) if args.keys else plot_runs(runs)
+            print(f"curves: {save_figure(figure, args.out)}")
     except (FileNotFoundError, ValueError) as error:
         sys.exit(str(error))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsmap.visualization.figure import figure_to_rgb
-from gsmap.visualization.run_curves import plot_runs, read_run, smoothed, summary_table
+from gsmap.visualization.run_curves import plot_runs, plot_series, read_run, smoothed, summary_table
 
 
 def write_log(folder, start, records):
@@ -60,6 +60,16 @@ def test_plot_shows_total_parts_and_metrics(run):
     np.testing.assert_allclose(metrics.lines[0].get_ydata(), [0.25, 0.75, 0.5])
     assert total.lines[1].get_label() == "demo"
     assert figure_to_rgb(figure).std() > 10
+
+
+def test_chosen_figures_have_a_panel_each(tmp_path):
+    log = [{"loss": 1.0, "at_floor": share, "step": i} for i, share in enumerate((0.5, 0.25), 1)]
+    first, second = (read_run(write_log(tmp_path, name, log), name) for name in "ab")
+    (panel,) = plot_series([first, second], ["at_floor"]).axes
+    assert [line.get_label() for line in panel.lines[1::2]] == ["a", "b"]
+    np.testing.assert_allclose(panel.lines[0].get_ydata(), [0.5, 0.25])
+    with pytest.raises(ValueError, match=r"no run logged \['floor'\]"):
+        plot_series([first], ["floor"])
 
 
 def test_values_that_are_not_finite_are_left_out(tmp_path):

@@ -176,6 +176,35 @@ def plot_runs(runs: Sequence[RunLog]) -> Figure:
     return figure
 
 
+def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
+    """Draw logged figures of training, a panel a figure, one colour per run.
+
+    Args:
+        runs: At least one.
+        keys: Names of the figures, such as ``soft_iou/divider``.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: If a figure is in no run's log.
+    """
+    logged = {key for run in runs for record in run.train for key in record}
+    unknown = [key for key in keys if key not in logged]
+    if unknown:
+        raise ValueError(f"no run logged {unknown}; there are {sorted(logged - set(_TIMING))}.")
+    figure = Figure(figsize=(3.6 * len(keys), 3.2), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(keys), squeeze=False)[0]
+    for panel, key in zip(panels, keys, strict=True):
+        for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
+            steps, values = run.series(key)
+            panel.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
+            panel.plot(steps, smoothed(values, 5), color=colour, linewidth=1.6, label=run.name)
+        _finish(panel, key, "iteration")
+    return figure
+
+
 def summary_table(runs: Sequence[RunLog]) -> str:
     """Return a Markdown table: per run its length, loss, speed, and last and best metrics."""
     names = list(dict.fromkeys(name for run in runs for name in run.metrics))
