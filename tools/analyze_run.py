@@ -1,9 +1,8 @@
 #!/usr/bin/env python
 """Draw the loss and metric curves of training runs and print a table of them.
 
-Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out curves.png``; with
-``--keys
-soft_iou/divider at_floor`` it draws these figures of training, a panel each.
+Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out curves.png``.
+``--keys soft_iou/divider at_floor`` draws these figures of training, a panel each.
 """
 
 import argparse
