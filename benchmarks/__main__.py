@@ -2,10 +2,15 @@
 
 import argparse
 
-from benchmarks import evaluation, model_commands, raster
+from benchmarks import evaluation, masks, model_commands, raster
 
 # each adds its own parser, with ``run`` as a default
-SUBCOMMANDS = (evaluation.add_parser, model_commands.add_parser, raster.add_parser)
+SUBCOMMANDS = (
+    evaluation.add_parser,
+    masks.add_parser,
+    model_commands.add_parser,
+    raster.add_parser,
+)
 
 
 def main() -> None:

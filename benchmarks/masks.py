@@ -1,0 +1,118 @@
+"""What the raster loss asks of Gaussians that lie off their line, by its reduction."""
+
+import argparse
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.measure import markdown_table
+from gsmap.ops.gaussian_raster import render_gaussians
+from gsmap.ops.polyline_raster import draw_polylines
+from gsmap.ops.raster_loss import raster_loss
+from gsmap.structures.grid import BEVGrid
+
+GRID = BEVGrid((-15, 15), (-30, 30), 128, 64)
+POINTS = 20
+BANDS_M = (0.75, 4.0)
+ERRORS_M = (0.1, 0.5, 1.0, 2.0, 3.0)
+SCALES_M = (0.15, 0.25, 0.5, 1.0, 1.5)
+LENGTHS_M = (4.0, 10.0, 60.0)
+MISS_SIZES = ((128, 64), (200, 100), (256, 128))
+# name in the tables -> normalize and foreground_weight of `raster_loss`
+REDUCTIONS = {
+    "both": ("both", 1.0),
+    "foreground, weight 5": ("foreground", 5.0),
+    "pixels": ("pixels", 1.0),
+}
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the subcommand ``masks``."""
+    parser = subparsers.add_parser("masks", help=__doc__)
+    parser.add_argument("--seeds", type=int, default=64, help="random errors that are averaged")
+    parser.add_argument("--out", type=Path, help="write the tables to this file, too")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure, print and write the tables."""
+    parts = [
+        "-dL / d log sigma in thousandths, along / across the line; + grows, - shrinks. "
+        f"A line of 60 m, {POINTS} round Gaussians, raster {GRID.height} x {GRID.width}, "
+        f"mean over {args.seeds} seeds. Rows: error of the centres, columns: sigma.\n"
+    ]
+    for reduction in REDUCTIONS:
+        for band_m in BANDS_M:
+            parts += [f"{reduction}, band of {band_m:g} m:\n", push_table(reduction, band_m, args)]
+    parts += ["Loss of a miss, by the length of the element:\n", miss_table()]
+    report = "\n".join(parts)
+    print(report)
+    if args.out:
+        args.out.write_text(report)
+
+
+def straight_line(length_m: float) -> Tensor:
+    """Return a line along y through the raster's middle, in metres. (POINTS, 2)"""
+    y = torch.linspace(-length_m / 2, length_m / 2, POINTS)
+    return torch.stack([torch.zeros(POINTS), y], -1)
+
+
+def push(
+    reduction: str, band_m: float, error_m: float, scale_m: float, seeds: int = 64
+) -> tuple[float, float]:
+    """Measure what the loss asks of the scales of round Gaussians along a line of 60 m.
+
+    Args:
+        reduction: One of ``REDUCTIONS``.
+        band_m: Width of the ground-truth mask in metres.
+        error_m: Standard deviation of the centres' error along x and y, in metres.
+        scale_m: Standard deviation of the Gaussians in metres.
+        seeds: Number of random errors.
+
+    Returns:
+        -dL / d log sigma along and across the line, of all Gaussians together, mean over the seeds.
+    """
+    line = straight_line(60.0)
+    errors = torch.randn(seeds, POINTS, 2, generator=torch.Generator().manual_seed(0))
+    scales = torch.full((seeds, POINTS, 2), scale_m, requires_grad=True)
+    rotations = torch.full((seeds, POINTS), math.pi / 2)
+    preds = render_gaussians(line + error_m * errors, scales, rotations, GRID)
+    targets = draw_polylines(line[None], GRID, band_m).expand_as(preds)
+    normalize, weight = REDUCTIONS[reduction]
+    loss = raster_loss(preds, targets, foreground_weight=weight, normalize=normalize).sum()
+    (gradient,) = torch.autograd.grad(loss, scales)
+    along, across = (-scale_m * gradient.sum((0, 1)) / seeds).tolist()
+    return along, across
+
+
+def push_table(reduction: str, band_m: float, args: argparse.Namespace) -> str:
+    """Measure one reduction and band at every error and scale."""
+    rows = []
+    for error_m in ERRORS_M:
+        pushes = (push(reduction, band_m, error_m, scale_m, args.seeds) for scale_m in SCALES_M)
+        cells = (f"{1e3 * along:+.2f} / {1e3 * across:+.2f}" for along, across in pushes)
+        rows.append([f"{error_m:g} m", *cells])
+    return markdown_table(["error", *(f"{scale_m:g} m" for scale_m in SCALES_M)], rows)
+
+
+def miss(reduction: str, band_m: float, length_m: float, size: tuple[int, int]) -> float:
+    """Return the loss of an empty prediction for a line of a length."""
+    target = draw_polylines(straight_line(length_m)[None], GRID.resized(*size), band_m)
+    normalize, weight = REDUCTIONS[reduction]
+    empty = torch.zeros_like(target)
+    return raster_loss(empty, target, foreground_weight=weight, normalize=normalize).item()
+
+
+def miss_table() -> str:
+    """Measure the loss of a miss."""
+    rows = [
+        [reduction, f"{band_m:g} m", f"{height} x {width}"]
+        + [f"{miss(reduction, band_m, length_m, (height, width)):.3f}" for length_m in LENGTHS_M]
+        for reduction in REDUCTIONS
+        for band_m in BANDS_M
+        for height, width in MISS_SIZES
+    ]
+    header = ["reduction", "band", "raster", *(f"{length_m:g} m" for length_m in LENGTHS_M)]
+    return markdown_table(header, rows)
