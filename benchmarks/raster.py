@@ -5,14 +5,15 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from benchmarks.measure import MIB, Cost, markdown_table, measure
-from gsmap.models.losses.raster import raster_loss
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.gaussian_raster.reference import gaussian_densities
 from gsmap.ops.polyline_raster import draw_polylines, soft_rasters
+from gsmap.ops.raster_loss import raster_loss
 from gsmap.ops.soft_iou import pairwise_soft_iou
 from gsmap.structures.grid import BEVGrid
 
@@ -102,7 +103,18 @@ def exponential_seconds(device: torch.device) -> float:
     """Measure the time of one of the CPU kernels' exponentials; a GPU's hide behind its memory."""
     if device.type != "cpu":
         return 0.0
-    from gsmap.ops.gaussian_raster.cpu_kernels import fill_exponentials
+    import numba
+
+    from gsmap.ops._numba import FASTMATH
+    from gsmap.ops.gaussian_raster.numba import exp2_float32
+
+    @numba.njit(fastmath=FASTMATH)
+    def fill_exponentials(values, repeats):  # type: ignore[no-untyped-def]
+        out = np.empty_like(values)
+        for _ in range(repeats):
+            for k in range(len(values)):
+                out[k] = exp2_float32(values[k])
+        return out
 
     array = -torch.rand(1 << 12).numpy()
     cost = measure(lambda: fill_exponentials(array, 256), device, RATE_REPEATS)

@@ -16,10 +16,10 @@ from gaussian_cases import (
 )
 
 from benchmarks.measure import measure
-from gsmap.models.losses.raster import raster_loss
 from gsmap.ops import backends, gaussian_raster
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.polyline_raster import draw_polylines
+from gsmap.ops.raster_loss import raster_loss
 from gsmap.ops.soft_iou import pairwise_soft_iou
 from gsmap.structures.grid import BEVGrid
 
@@ -188,9 +188,10 @@ def test_compiled_model_keeps_values_and_gradients():
 
 def test_operator_is_well_formed():
     leaves = [value.requires_grad_() for value in random_gaussians(2, 3, 0.5, 3)]
+    render_gaussians(*leaves, ODD_GRID, "cpu")  # registers the operator
     torch.library.opcheck(
         torch.ops.gsmap.render_gaussians_cpu.default,
-        (*leaves, -15.0, -30.0, 1.0, 2.0, 21, 33),
+        (*leaves, [-15.0, -30.0, 1.0, 2.0], 21, 33),
         test_utils=("test_schema", "test_faketensor", "test_autograd_registration"),
     )
 
@@ -274,8 +275,8 @@ def test_triton_kernels_compile_for_a_gpu():
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource, compile
 
-    from gsmap.ops import soft_iou_triton
-    from gsmap.ops.gaussian_raster import triton_kernels
+    from gsmap.ops.gaussian_raster import triton as gaussian_raster
+    from gsmap.ops.soft_iou import triton as soft_iou
 
     def check_compiles(source):
         compiled = compile(source, target=GPUTarget("cuda", 80, 32), options={"num_warps": 4})
@@ -285,18 +286,20 @@ def test_triton_kernels_compile_for_a_gpu():
     sizes = {"count": "i32", "height": "i32", "width": "i32", "TILE": "constexpr"}
     frame = dict.fromkeys(("x_min", "y_min", "step_x", "step_y"), "fp32")
     for kernel, pointers in (
-        (triton_kernels.forward_kernel, ("gaussians", "masks")),
-        (triton_kernels.backward_kernel, ("gaussians", "grads", "moments")),
+        (gaussian_raster.forward_kernel, ("gaussians", "masks")),
+        (gaussian_raster.backward_kernel, ("gaussians", "grads", "moments")),
     ):
         signature = dict.fromkeys(pointers, "*fp32") | sizes | frame
-        source = ASTSource(fn=kernel, signature=signature, constexprs={"TILE": triton_kernels.TILE})
+        source = ASTSource(
+            fn=kernel, signature=signature, constexprs={"TILE": gaussian_raster.TILE}
+        )
         check_compiles(source)
     signature = dict.fromkeys(("preds", "targets", "minima"), "*fp32")
     check_compiles(
         ASTSource(
-            fn=soft_iou_triton.minima_kernel,
+            fn=soft_iou.minima_kernel,
             signature=signature | {"pixels": "i32", "BLOCK": "constexpr"},
-            constexprs={"BLOCK": soft_iou_triton.BLOCK},
+            constexprs={"BLOCK": soft_iou.BLOCK},
         )
     )
 

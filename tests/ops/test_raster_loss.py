@@ -185,5 +185,5 @@ def test_shapes_that_disagree_are_named():
 
 
 def test_an_unknown_reduction_is_named():
-    with pytest.raises(ValueError, match="normalize must be one of .*got 'mean'"):
+    with pytest.raises(ValueError, match=r"normalize must be one of .*got 'mean'"):
         raster_loss(torch.zeros(1, 4, 5), torch.zeros(1, 4, 5), normalize="mean")

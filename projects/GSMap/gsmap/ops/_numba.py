@@ -6,9 +6,11 @@ Numba's cache watches the file of a kernel alone: delete ``__pycache__`` after a
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filling so many
 
@@ -17,8 +19,8 @@ SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filli
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
 
-def run_in_threads(kernel: Callable[[int, int], None], count: int, pixels: int) -> None:
-    """Call ``kernel(first, last)`` on slices of ``range(count)``, one per torch thread.
+def run_in_threads(kernel: Callable[..., None], count: int, pixels: int, *arguments: Any) -> None:
+    """Call ``kernel(*arguments, first, last)`` on slices of ``range(count)``, one a torch thread.
 
     Each instance is worked on by one thread from start to end, so the result does not depend on
     the number of threads. Threads live for one call: nothing survives into a forked process, and
@@ -28,16 +30,19 @@ def run_in_threads(kernel: Callable[[int, int], None], count: int, pixels: int) 
         kernel: Releases the GIL; works on instances ``first`` to ``last - 1``.
         count: Number of instances.
         pixels: Number of pixels per instance.
+        arguments: Of the kernel; a tensor becomes an array, one that is written to must be
+            contiguous.
     """
+    arrays = [a.contiguous().numpy() if isinstance(a, Tensor) else a for a in arguments]
     workers = min(torch.get_num_threads(), count)
     if workers <= 1 or count * pixels < SERIAL_BELOW:
         if count:
-            kernel(0, count)
+            kernel(*arrays, 0, count)
         return
     bounds = [round(i * count / workers) for i in range(workers + 1)]
     with ThreadPoolExecutor(workers - 1) as pool:
-        jobs = [pool.submit(kernel, *pair) for pair in pairwise(bounds[1:])]
-        kernel(bounds[0], bounds[1])
+        jobs = [pool.submit(kernel, *arrays, *pair) for pair in pairwise(bounds[1:])]
+        kernel(*arrays, bounds[0], bounds[1])
         for job in jobs:
             job.result()
 

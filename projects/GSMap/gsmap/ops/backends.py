@@ -1,12 +1,14 @@
-"""The choice between plain torch and the fused kernels."""
+"""The choice between plain torch and the fused kernels, and the gradient of a fused operator."""
 
 import os
 import warnings
 from collections.abc import Collection
 from importlib.util import find_spec
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.library import CustomOpDef
 
 HAS_NUMBA = find_spec("numba") is not None
 HAS_TRITON = find_spec("triton") is not None
@@ -69,3 +71,38 @@ def _check_serves(backend: str, tensor: Tensor) -> None:
         raise ValueError(f"backend {backend!r} needs {package}, which is not installed.")
     if not serves:
         raise ValueError(f"backend {backend!r} does not serve tensors on {tensor.device}.")
+
+
+def register_gradient(
+    forward: CustomOpDef, backward: CustomOpDef, tensors: int, differentiable: int = 1
+) -> None:
+    """Make an operator the gradient of another.
+
+    Registered operators work under torch.compile, autocast, DistributedDataParallel and gradient
+    checkpointing. Only inputs are kept, so the backward pass can run twice (``retain_graph``).
+
+    Args:
+        forward: ``(*tensors, *settings) -> tensor``.
+        backward: ``(grads, *tensors, *settings) -> gradients``, contiguous.
+        tensors: How many of the inputs are tensors.
+        differentiable: In how many of them, the first ones, there are gradients.
+    """
+
+    @backward.register_fake
+    def fake(grads: Tensor, *inputs: Any) -> Any:
+        gradients = tuple(
+            torch.empty_like(value, memory_format=torch.contiguous_format)
+            for value in inputs[:differentiable]
+        )
+        return gradients if differentiable > 1 else gradients[0]
+
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[:tensors])
+        ctx.settings = inputs[tensors:]
+
+    def differentiate(ctx: Any, grads: Tensor) -> tuple[Any, ...]:
+        gradients = backward(grads, *ctx.saved_tensors, *ctx.settings)
+        gradients = gradients if differentiable > 1 else (gradients,)
+        return *gradients, *(None,) * (tensors + len(ctx.settings) - differentiable)
+
+    forward.register_autograd(differentiate, setup_context=setup_context)

@@ -5,7 +5,7 @@ from mmdet3d.registry import MODELS
 from torch import Tensor
 
 from gsmap.models.bev_encoders.projection import PillarProjection
-from gsmap.models.layers.deformable_attention import SamplingAttention, deformable_sample
+from gsmap.models.layers.deformable_attention import SamplingAttention, sample_map
 
 
 @MODELS.register_module()
@@ -65,7 +65,7 @@ class SpatialCrossAttention(SamplingAttention):
             cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
             centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
             locations = centres[:, None] + offsets[sample, cell]  # (T, heads, S, 2)
-            seen = deformable_sample(
+            seen = sample_map(
                 value[sample, view][None],
                 (height, width),
                 locations[None],

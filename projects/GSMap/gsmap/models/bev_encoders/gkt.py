@@ -6,7 +6,7 @@ from mmengine.model import BaseModule, constant_init, xavier_init
 from torch import Tensor, nn
 
 from gsmap.models.bev_encoders.projection import PillarProjection
-from gsmap.models.layers.deformable_attention import sum_rows
+from gsmap.ops.deformable_sampling import sum_rows
 
 
 def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:

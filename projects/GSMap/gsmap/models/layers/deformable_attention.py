@@ -3,7 +3,6 @@
 import math
 
 import torch
-import torch.nn.functional as F
 from mmcv.ops import get_compiling_cuda_version
 from mmcv.ops.multi_scale_deform_attn import MultiScaleDeformableAttnFunction
 from mmdet3d.registry import MODELS
@@ -11,40 +10,11 @@ from mmengine.model import BaseModule, constant_init, xavier_init
 from torch import Tensor, nn
 
 from gsmap.models.layers.gaussian_guidance import turn_offsets
+from gsmap.ops.deformable_sampling import bilinear_cells, deformable_sample, sum_rows
 
 _SAMPLING_WEIGHTS = ("sampling_offsets.weight", "attention_weights.weight")
 _IM2COL_STEP = 64
 _CORNERS = 4
-
-
-def bilinear_cells(
-    locations: Tensor, weights: Tensor, shape: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
-    """Turn weighted sampling locations into the cells around them and their weights.
-
-    The value of a cell lies at its centre; outside the map everything is zero
-    (``align_corners=False`` and zero padding, as in ``grid_sample``).
-
-    Args:
-        locations: Points (x, y), [0, 1] over the map. (..., S, 2)
-        weights: Their weights. (..., S)
-        shape: Rows and columns of the map.
-
-    Returns:
-        Row-major cell indices and weights, both zero outside the map; a location that is not a
-        number has a valid index and its weight is not a number. 2 x (..., 4 S)
-    """
-    height, width = shape
-    x, y = locations[..., 0] * width - 0.5, locations[..., 1] * height - 0.5
-    x0, y0 = x.detach().floor(), y.detach().floor()
-    right, lower = x - x0, y - y0
-    cells, cell_weights = [], []
-    for col, wx in ((x0, 1 - right), (x0 + 1, right)):
-        for row, wy in ((y0, 1 - lower), (y0 + 1, lower)):
-            inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
-            cells.append(torch.where(inside, row * width + col, 0))
-            cell_weights.append(wx * wy * weights * inside)
-    return torch.cat(cells, -1).long(), torch.cat(cell_weights, -1)
 
 
 def at_least_float32(values: Tensor) -> Tensor:
@@ -52,64 +22,24 @@ def at_least_float32(values: Tensor) -> Tensor:
     return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
-def deformable_sample(
-    value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor
-) -> Tensor:
-    """Sum bilinear samples of a map, each head with its own places (Deformable DETR Eq. 2).
-
-    mmcv's compiled op runs on a GPU where it was built; elsewhere each output row is one weighted
-    bag of table rows, which needs no intermediate tensor of samples.
-
-    Args:
-        value: Flattened map, row-major. (B, H * W, heads, C)
-        shape: Rows and columns of the map.
-        locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
-        weights: Attention weights. (B, Q, heads, S)
-
-    Returns:
-        Weighted sums, heads concatenated. (B, Q, heads * C)
-    """
-    batch, num_cells, heads, channels = value.shape
-    if has_compiled_op(value):
-        shapes = torch.tensor([shape], device=value.device)
-        return MultiScaleDeformableAttnFunction.apply(
-            value.contiguous(),
-            shapes,
-            shapes.new_zeros(1),
-            locations[:, :, :, None].contiguous(),
-            weights[:, :, :, None].contiguous(),
-            _IM2COL_STEP,
-        )
-    cells, cell_weights = bilinear_cells(locations, weights, shape)  # (B, Q, heads, 4 S)
-    sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1)
-    head = torch.arange(heads, device=value.device).view(1, 1, -1, 1)
-    rows = (sample * num_cells + cells) * heads + head
-    return sum_rows(value.reshape(-1, channels), rows, cell_weights).flatten(2)
+def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor) -> Tensor:
+    """Do what `deformable_sample` does, by mmcv's compiled op on a GPU where it was built."""
+    if not has_compiled_op(value):
+        return deformable_sample(value, shape, locations, weights)
+    shapes = torch.tensor([shape], device=value.device)
+    return MultiScaleDeformableAttnFunction.apply(
+        value.contiguous(),
+        shapes,
+        shapes.new_zeros(1),
+        locations[:, :, :, None].contiguous(),
+        weights[:, :, :, None].contiguous(),
+        _IM2COL_STEP,
+    )
 
 
 def has_compiled_op(value: Tensor) -> bool:
     """Return whether mmcv's compiled deformable attention can run on a tensor."""
     return value.is_cuda and get_compiling_cuda_version() != "not available"
-
-
-def sum_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
-    """Sum weighted rows of a table.
-
-    Args:
-        table: The table. (R, C)
-        rows: Row indices. (..., S)
-        weights: Their weights. (..., S)
-
-    Returns:
-        The sums, without a tensor of all the rows in between. (..., C)
-    """
-    out = F.embedding_bag(
-        rows.reshape(-1, rows.shape[-1]),
-        table,
-        per_sample_weights=weights.reshape(-1, rows.shape[-1]).to(table.dtype),
-        mode="sum",
-    )
-    return out.view(*rows.shape[:-1], table.shape[-1])
 
 
 class SamplingAttention(BaseModule):
@@ -233,7 +163,7 @@ class BEVDeformableAttention(SamplingAttention):
         else:
             value = at_least_float32(self.value_proj(tokens))
             value = value.unflatten(-1, (self.num_heads, -1))
-            sampled = deformable_sample(value, shape, locations, weights)
+            sampled = sample_map(value, shape, locations, weights)
         return self.dropout(self.output_proj(sampled))
 
     def sample_then_project(

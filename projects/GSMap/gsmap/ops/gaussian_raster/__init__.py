@@ -1,5 +1,87 @@
-"""Rendering of 2D Gaussians to soft masks (GSMap Eq. 6): one function, several backends."""
+"""Rendering of 2D Gaussians to soft masks (GSMap Eq. 6)."""
 
-from gsmap.ops.gaussian_raster.api import render_gaussians
+import math
+from collections.abc import Callable
 
-__all__ = ["render_gaussians"]
+import torch
+from torch import Tensor
+
+from gsmap.ops.backends import choose_backend
+from gsmap.ops.gaussian_raster.reference import render_gaussians_reference
+from gsmap.structures.grid import BEVGrid
+
+
+def render_gaussians(
+    means: Tensor, scales: Tensor, rotations: Tensor, grid: BEVGrid, backend: str = "auto"
+) -> Tensor:
+    r"""Render each map element's 2D Gaussians to a soft occupancy raster.
+
+    A pixel :math:`p` takes :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6), with :math:`G_i` from
+    Eq. 2. Inputs of several types are computed in the widest, and at least in float32, also under
+    autocast.
+
+    Args:
+        means: Centres (x, y) in metres, in the frame of ``grid``. (..., P, 2)
+        scales: Standard deviations along each Gaussian's own axes, in metres, > 0. (..., P, 2)
+        rotations: Angle of the first axis from +x, in radians, anticlockwise. (..., P)
+        grid: The raster: its extent in metres and its size in pixels.
+        backend: ``"reference"`` (plain torch), ``"cpu"`` or ``"triton"`` (fused kernels), or
+            ``"auto"``: the fastest one that serves the inputs' device and type.
+
+    Returns:
+        Occupancy in [0, 1], differentiable in the first three inputs. (..., H, W)
+
+    Raises:
+        TypeError: If an input is not floating point.
+        ValueError: If the shapes or devices disagree, or ``backend`` does not serve.
+    """
+    _check(means, scales, rotations)
+    dtype = torch.float32
+    for tensor in (means, scales, rotations):
+        dtype = torch.promote_types(dtype, tensor.dtype)
+    means, scales, rotations = means.to(dtype), scales.to(dtype), rotations.to(dtype)
+    with torch.autocast(means.device.type, enabled=False):
+        backend = choose_backend(backend, means)
+        if backend == "reference":
+            return render_gaussians_reference(means, scales, rotations, grid)
+        batch, count = means.shape[:-2], means.shape[-2]
+        instances = math.prod(batch)
+        masks = _operator(backend)(
+            means.reshape(instances, count, 2),
+            scales.reshape(instances, count, 2),
+            rotations.reshape(instances, count),
+            [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m],
+            grid.height,
+            grid.width,
+        )
+        return masks.reshape(*batch, grid.height, grid.width)
+
+
+def _operator(backend: str) -> Callable[..., Tensor]:
+    """Import a fused backend when it is first used."""
+    if backend == "triton":
+        from gsmap.ops.gaussian_raster import triton
+
+        return triton.render
+    from gsmap.ops.gaussian_raster import numba
+
+    return numba.render
+
+
+def _check(means: Tensor, scales: Tensor, rotations: Tensor) -> None:
+    """Raise for inputs that do not belong together."""
+    if means.ndim < 2 or means.shape[-1] != 2:
+        raise ValueError(f"means must have shape (..., P, 2), got {tuple(means.shape)}.")
+    for name, tensor, shape in (
+        ("scales", scales, means.shape),
+        ("rotations", rotations, means.shape[:-1]),
+    ):
+        if tensor.shape != shape:
+            raise ValueError(
+                f"{name} must have shape {tuple(shape)} to match means, got {tuple(tensor.shape)}."
+            )
+        if tensor.device != means.device:
+            raise ValueError(f"{name} must be on {means.device} like means, got {tensor.device}.")
+    for name, tensor in (("means", means), ("scales", scales), ("rotations", rotations)):
+        if not tensor.dtype.is_floating_point:
+            raise TypeError(f"{name} must be floating point, got {tensor.dtype}.")

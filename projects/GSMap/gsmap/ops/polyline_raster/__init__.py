@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from gsmap.ops.backends import choose_backend
-from gsmap.ops.polyline_raster.cpu import draw_cpu, soft_rasters_cpu
 from gsmap.ops.polyline_raster.reference import draw_reference, soft_rasters_reference
 from gsmap.structures.grid import BEVGrid
 
@@ -51,11 +50,10 @@ def draw_polylines(
     half_width_m, pixel_m = width_m / 2, (dx * dy) ** 0.5
     with torch.autocast(polylines.device.type, enabled=False):
         if choose_backend(backend, polylines, ("cpu",)) == "cpu":
-            origin = grid.x_range[0], grid.y_range[0]
-            size = grid.height, grid.width
-            return draw_cpu(
-                polylines, flags, *origin, dx, dy, *size, half_width_m, pixel_m, antialias
-            )
+            from gsmap.ops.polyline_raster.numba import draw_cpu
+
+            size, frame = (grid.height, grid.width), [grid.x_range[0], grid.y_range[0], dx, dy]
+            return draw_cpu(polylines, flags, *size, frame, half_width_m, pixel_m, antialias)
         pixels = grid.pixel_centres(polylines.device, polylines.dtype)
         return draw_reference(polylines, flags, pixels, half_width_m, pixel_m, antialias)
 
@@ -110,9 +108,11 @@ def soft_rasters(
         back = vertices.flip(1) + LANE_GAP_PX
         stay = vertices[:, -1:].expand_as(vertices)  # a polygon's ring is padded by its last corner
         rings = torch.cat([vertices, torch.where(flags[:, None, None], stay, back)], 1)
-        softness = line_softness, polygon_softness
+        softness = [line_softness, polygon_softness]
         if choose_backend(backend, rings, ("cpu",)) == "cpu":
-            return soft_rasters_cpu(rings, flags, height, width, *softness, plain)
+            from gsmap.ops.polyline_raster.numba import soft_rasters_cpu
+
+            return soft_rasters_cpu(rings, flags, height, width, softness, plain)
         return soft_rasters_reference(rings, flags, height, width, softness, plain)
 
 

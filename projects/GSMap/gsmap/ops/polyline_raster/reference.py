@@ -1,7 +1,7 @@
 """Plain torch rasters of polylines and polygons: the definition of right, in any float type."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -84,7 +84,7 @@ def soft_rasters_reference(
     is_polygon: Tensor,
     height: int,
     width: int,
-    softness: tuple[float, float],
+    softness: Sequence[float],
     plain: bool = False,
 ) -> Tensor:
     r"""Render closed rings: :math:`\exp(-D / s)`, or :math:`\sigma(\pm D / s)` for polygons.

@@ -7,7 +7,6 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from gsmap.ops.backends import choose_backend
-from gsmap.ops.raster_loss.numba import raster_loss_sums
 from gsmap.ops.raster_loss.reference import gaussian_window, raster_loss_sums_reference
 
 NORMALIZATIONS = ("both", "foreground", "pixels")
@@ -86,6 +85,8 @@ def _sums(
 ) -> Tensor:
     """Return the sums of `raster_loss_sums_reference` by the backend that serves. (n, 7)"""
     if choose_backend(backend, preds, ("cpu",)) == "cpu":
+        from gsmap.ops.raster_loss.numba import raster_loss_sums
+
         return raster_loss_sums(preds, targets, gaussian_window(size, sigma, preds), weight)
     return checkpoint(
         raster_loss_sums_reference,

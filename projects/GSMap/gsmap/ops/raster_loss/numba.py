@@ -1,23 +1,253 @@
-"""Torch operators around the numba kernels of the raster loss."""
+# numba infers the types of its kernels:
+# mypy: disable-error-code="no-untyped-def"
+r"""Fused CPU kernels (numba) and their operators: the raster loss on the pixels that matter.
 
-import math
+One thread works on one instance at a time. Where neither mask has anything within SSIM's window,
+SSIM is exactly 1 and the L1 term exactly 0, so every step runs, row by row, from the first to the
+last column that can differ: from the masks' own columns, grown by the window's radius for each
+blur. The window is separable: 2 x 11 taps in place of 121, and the row pass takes symmetric taps
+together.
+
+Nothing is kept for the backward pass but the two masks, which the caller holds anyway: the five
+blurred maps (p, t, p^2, t^2, p t) are built again, turned into the derivatives of SSIM by the
+blurred p, p^2 and p t, and blurred once more (the window is symmetric, so the blur is its own
+transpose). Scratch: 15 buffers of one mask per thread, however many instances there are.
+
+Sums run in a fixed order in one thread, so two runs give the same bits.
+"""
+
 from typing import Any
 
 import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
-from gsmap.ops._numba import run_in_threads
+from gsmap.ops._numba import FASTMATH, run_in_threads
+from gsmap.ops.backends import register_gradient
 from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
 
-_DIFFERENTIABLE = 3  # the first sums
-_SUMS = 7
+ONE, TWO, ZERO = np.float32(1), np.float32(2), np.float32(0)
+SUMS, DIFFERENTIABLE_SUMS = 7, 3
+
+
+@njit(nogil=True, cache=True)
+def _find_spans(preds, targets, spans):
+    """Write each row's first and one past the last column where a mask is not 0. (H, 2)"""
+    height, width = preds.shape
+    for row in range(height):
+        left, right = 0, width
+        while left < width and preds[row, left] == 0 and targets[row, left] == 0:
+            left += 1
+        while right > left and preds[row, right - 1] == 0 and targets[row, right - 1] == 0:
+            right -= 1
+        spans[row, 0], spans[row, 1] = left, right
+
+
+@njit(nogil=True, cache=True)
+def _grow_spans(spans, radius, width, grown):
+    """Write the columns that a window of a radius carries each row's span to. (H, 2)"""
+    for row in range(len(spans)):
+        left, right = width, 0
+        for other in range(max(row - radius, 0), min(row + radius + 1, len(spans))):
+            if spans[other, 0] < spans[other, 1]:
+                left, right = min(left, spans[other, 0]), max(right, spans[other, 1])
+        grown[row, 0] = max(left - radius, 0)
+        grown[row, 1] = max(min(right + radius, width), grown[row, 0])
+
+
+@njit(nogil=True, cache=True, fastmath=FASTMATH)
+def _add_scaled(out, source, factor):
+    """Add ``factor * source`` to ``out``."""
+    for k in range(len(out)):
+        out[k] += factor * source[k]
+
+
+@njit(nogil=True, cache=True, fastmath=FASTMATH)
+def _add_scaled_pair(out, first, second, factor):
+    """Add ``factor * (first + second)`` to ``out``."""
+    for k in range(len(out)):
+        out[k] += factor * (first[k] + second[k])
+
+
+@njit(nogil=True, cache=True)
+def _blur(images, spans, window, padded, rows, out, out_spans):
+    """Filter images (C, H, W) that are 0 outside ``spans``; fill ``out`` inside ``out_spans``."""
+    radius = len(window) // 2
+    height, width = images.shape[1:]
+    for row in range(height):
+        left, right = spans[row]
+        if left >= right:
+            continue
+        low, high = max(left - radius, 0), min(right + radius, width)
+        size = high - low
+        for c in range(len(images)):
+            padded[: right - left + 4 * radius] = 0  # starts at column left - 2 radius
+            padded[2 * radius : 2 * radius + right - left] = images[c, row, left:right]
+            start = low - left + radius  # of the window's first tap at column low
+            line = rows[c, row, low:high]
+            line[:] = 0
+            for k in range(radius):
+                far = start + 2 * radius - k
+                first, second = padded[start + k : start + k + size], padded[far : far + size]
+                _add_scaled_pair(line, first, second, window[k])
+            _add_scaled(line, padded[start + radius : start + radius + size], window[radius])
+    for row in range(height):
+        out[:, row, out_spans[row, 0] : out_spans[row, 1]] = 0
+        for k in range(len(window)):
+            other = row + k - radius
+            if other < 0 or other >= height or spans[other, 0] >= spans[other, 1]:
+                continue
+            low, high = max(spans[other, 0] - radius, 0), min(spans[other, 1] + radius, width)
+            for c in range(len(images)):
+                _add_scaled(out[c, row, low:high], rows[c, other, low:high], window[k])
+
+
+@njit(nogil=True, cache=True)
+def _multiply(preds, targets, spans, images):
+    """Fill p, t, p^2, t^2 and p t inside the spans. (5, H, W)"""
+    for row in range(len(spans)):
+        for col in range(spans[row, 0], spans[row, 1]):
+            p, t = preds[row, col], targets[row, col]
+            images[0, row, col], images[1, row, col] = p, t
+            images[2, row, col], images[3, row, col], images[4, row, col] = p * p, t * t, p * t
+
+
+@njit(inline="always")
+def _ssim_terms(maps, row, col, c1, c2):
+    """Return the blurred p and t and SSIM's two numerators and two denominators at a pixel."""
+    p, t = maps[0, row, col], maps[1, row, col]
+    top_mean = TWO * p * t + c1
+    top_cov = TWO * (maps[4, row, col] - p * t) + c2
+    low_mean = p * p + t * t + c1
+    low_var = (maps[2, row, col] - p * p) + (maps[3, row, col] - t * t) + c2
+    return p, t, top_mean, top_cov, low_mean, low_var
+
+
+@njit(nogil=True, cache=True)
+def _dissimilarity(maps, spans, constants):
+    """Return the sum of 1 - SSIM, and on how many pixels the window sees the target, or either."""
+    c1, c2, threshold = constants
+    total, target, either = 0.0, 0.0, 0.0
+    for row in range(len(spans)):
+        for col in range(spans[row, 0], spans[row, 1]):
+            p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(maps, row, col, c1, c2)
+            total += ONE - (top_mean * top_cov) / (low_mean * low_var)
+            target += 1.0 if t > 0 else 0.0
+            either += 1.0 if max(p, t) > threshold else 0.0
+    return total, target, either
+
+
+@njit(nogil=True, cache=True)
+def _derivatives(maps, spans, constants, out):
+    """Fill SSIM's derivatives by the blurred p, p^2 and p t inside the spans. (3, H, W)"""
+    c1, c2, _ = constants
+    for row in range(len(spans)):
+        for col in range(spans[row, 0], spans[row, 1]):
+            p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(maps, row, col, c1, c2)
+            scale = ONE / (low_mean * low_var)
+            ssim = top_mean * top_cov * scale
+            out[0, row, col] = TWO * t * (top_cov - top_mean) * scale + TWO * p * ssim * (
+                ONE / low_var - ONE / low_mean
+            )
+            out[1, row, col] = -ssim / low_var
+            out[2, row, col] = TWO * top_mean * scale
+
+
+@njit(nogil=True, cache=True)
+def _weighted_masses(preds, targets, spans, weight):
+    """Return sum w |p - t|, sum w p, sum w t and sum (w - 1) over an instance."""
+    l1, predicted, foreground, excess = 0.0, 0.0, 0.0, 0.0
+    for row in range(len(spans)):
+        for col in range(spans[row, 0], spans[row, 1]):
+            p, t = preds[row, col], targets[row, col]
+            extra = (weight - ONE) * t
+            l1 += (ONE + extra) * abs(p - t)
+            predicted += (ONE + extra) * p
+            foreground += (ONE + extra) * t
+            excess += extra
+    return l1, predicted, foreground, excess
+
+
+@njit(nogil=True, cache=True)
+def _buffers(shape, radius):
+    """Return a thread's scratch: products, row pass, blurred maps, padded row, three spans."""
+    height, width = shape
+    return (
+        np.empty((5, height, width), np.float32),
+        np.empty((5, height, width), np.float32),
+        np.empty((5, height, width), np.float32),
+        np.empty(width + 4 * radius, np.float32),
+        np.empty((3, height, 2), np.int64),
+    )
+
+
+@njit(nogil=True, cache=True)
+def loss_forward(preds, targets, window, constants, weight, results, first, last):
+    """Write each instance's sums.
+
+    Args:
+        preds: Masks, float32. (n, H, W)
+        targets: Masks, float32. (n, H, W)
+        window: SSIM's window along one axis, float32, odd. (size,)
+        constants: SSIM's C1 and C2, and from what mean on a window sees a mask, float32.
+        weight: Weight of a pixel of the ground truth, float32.
+        results: Written to, float64: the sums of `raster_loss_sums_reference`. (n, 7)
+        first: First instance.
+        last: One past the last instance.
+    """
+    radius = len(window) // 2
+    products, rows, maps, padded, spans = _buffers(preds.shape[1:], radius)
+    for n in range(first, last):
+        _find_spans(preds[n], targets[n], spans[0])
+        _grow_spans(spans[0], radius, preds.shape[2], spans[1])
+        _multiply(preds[n], targets[n], spans[0], products)
+        _blur(products, spans[0], window, padded, rows, maps, spans[1])
+        masses = _weighted_masses(preds[n], targets[n], spans[0], weight)
+        results[n, 0], results[n, 1], results[n, 3], results[n, 4] = masses
+        dissimilarity = _dissimilarity(maps, spans[1], constants)
+        results[n, 2], results[n, 5], results[n, 6] = dissimilarity
+
+
+@njit(nogil=True, cache=True)
+def loss_backward(preds, targets, window, constants, weight, factors, grads, first, last):
+    """Write the gradient of the first three sums of `raster_loss_sums_reference`, each times one.
+
+    Args:
+        preds: As in :func:`loss_forward`. (n, H, W)
+        targets: As in :func:`loss_forward`. (n, H, W)
+        window: As in :func:`loss_forward`. (size,)
+        constants: As in :func:`loss_forward`.
+        weight: As in :func:`loss_forward`.
+        factors: Of the three sums, float32. (n, 3)
+        grads: Gradient in ``preds``, written to, float32. (n, H, W)
+        first: First instance.
+        last: One past the last instance.
+    """
+    radius, width = len(window) // 2, preds.shape[2]
+    products, rows, maps, padded, spans = _buffers(preds.shape[1:], radius)
+    for n in range(first, last):
+        grads[n] = factors[n, 1]  # outside the spans w is 1, and nothing else depends on p
+        _find_spans(preds[n], targets[n], spans[0])
+        _grow_spans(spans[0], radius, width, spans[1])
+        _grow_spans(spans[1], radius, width, spans[2])
+        _multiply(preds[n], targets[n], spans[0], products)
+        _blur(products, spans[0], window, padded, rows, maps, spans[1])
+        _derivatives(maps, spans[1], constants, products[:3])
+        _blur(products[:3], spans[1], window, padded, rows, maps[:3], spans[2])
+        for row in range(preds.shape[1]):
+            for col in range(spans[2, row, 0], spans[2, row, 1]):
+                p, t = preds[n, row, col], targets[n, row, col]
+                slope = factors[n, 0] * np.sign(p - t) + factors[n, 1]
+                ssim = maps[0, row, col] + TWO * p * maps[1, row, col] + t * maps[2, row, col]
+                extra = (weight - ONE) * t
+                grads[n, row, col] = (ONE + extra) * slope - factors[n, 2] * ssim
 
 
 def _settings(window: Tensor, weight: float) -> tuple[Any, Any, Any]:
     """Return the kernels' window, constants and weight in float32."""
     constants = np.float32(SSIM_C1), np.float32(SSIM_C2), np.float32(SEEN)
-    return window.float().contiguous().numpy(), constants, np.float32(weight)
+    return window.float(), constants, np.float32(weight)
 
 
 @torch.library.custom_op("gsmap::raster_loss_sums", mutates_args=(), device_types="cpu")
@@ -33,57 +263,27 @@ def raster_loss_sums(preds: Tensor, targets: Tensor, window: Tensor, weight: flo
     Returns:
         The sums. (n, 7)
     """
-    from gsmap.ops.raster_loss.numba_kernels import loss_forward
-
-    sums = torch.empty(len(preds), _SUMS, dtype=torch.float64)
-    settings = _settings(window, weight)
-    arrays = preds.contiguous().numpy(), targets.contiguous().numpy()
-    results = sums.numpy()
-    run_in_threads(
-        lambda first, last: loss_forward(*arrays, *settings, results, first, last),
-        len(preds),
-        math.prod(preds.shape[1:]),
-    )
+    sums = torch.empty(len(preds), SUMS, dtype=torch.float64)
+    arguments = preds, targets, *_settings(window, weight), sums
+    run_in_threads(loss_forward, len(preds), preds.shape[1:].numel(), *arguments)
     return sums.float()
 
 
 @torch.library.custom_op("gsmap::raster_loss_backward", mutates_args=(), device_types="cpu")
-def _raster_loss_backward(
+def _backward(
     grads: Tensor, preds: Tensor, targets: Tensor, window: Tensor, weight: float
 ) -> Tensor:
     """Return the gradient in the predictions. (n, H, W)"""
-    from gsmap.ops.raster_loss.numba_kernels import loss_backward
-
     gradient = torch.empty(preds.shape, dtype=torch.float32)
-    settings = _settings(window, weight)
-    arrays = preds.contiguous().numpy(), targets.contiguous().numpy()
-    factors = grads[:, :_DIFFERENTIABLE].contiguous().numpy(), gradient.numpy()
-    run_in_threads(
-        lambda first, last: loss_backward(*arrays, *settings, *factors, first, last),
-        len(preds),
-        math.prod(preds.shape[1:]),
-    )
+    factors = grads[:, :DIFFERENTIABLE_SUMS]
+    arguments = preds, targets, *_settings(window, weight), factors, gradient
+    run_in_threads(loss_backward, len(preds), preds.shape[1:].numel(), *arguments)
     return gradient
 
 
 @raster_loss_sums.register_fake
-def _(preds, targets, window, weight):  # type: ignore[no-untyped-def]
-    return preds.new_empty(preds.shape[0], _SUMS)
+def _(preds, targets, window, weight):
+    return preds.new_empty(preds.shape[0], SUMS)
 
 
-@_raster_loss_backward.register_fake
-def _(grads, preds, targets, window, weight):  # type: ignore[no-untyped-def]
-    return preds.new_empty(preds.shape)
-
-
-def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.save_for_backward(*inputs[:3])
-    ctx.weight = inputs[3]
-
-
-def _differentiate(ctx: Any, grads: Tensor) -> tuple[Any, ...]:
-    gradient = _raster_loss_backward(grads, *ctx.saved_tensors, ctx.weight)
-    return gradient, None, None, None
-
-
-raster_loss_sums.register_autograd(_differentiate, setup_context=_setup_context)
+register_gradient(raster_loss_sums, _backward, tensors=3)

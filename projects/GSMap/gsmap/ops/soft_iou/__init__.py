@@ -1,12 +1,10 @@
 """Soft intersection over union of masks: sum(min) / sum(max)."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
-from gsmap.ops._numba import run_in_threads
 from gsmap.ops.backends import choose_backend
+from gsmap.ops.soft_iou.reference import pairwise_minima_reference
 
 
 def pairwise_soft_iou(
@@ -43,54 +41,19 @@ def pairwise_soft_iou(
     backend = choose_backend(backend, preds)
     if backend != "reference":
         preds, targets = preds.detach(), targets.detach()
-    minima = MINIMA[backend](preds, targets)
+    minima = _minima(backend, preds, targets)
     union = preds.sum(-1)[:, None] + targets.sum(-1) - minima
     return minima / (union + eps)
 
 
-def _minima_reference(preds: Tensor, targets: Tensor) -> Tensor:
-    """Sum the minimum of every pair, one target at a time. (N, HW), (K, HW) -> (N, K)"""
-    if not len(targets):
-        return preds.new_zeros(len(preds), 0)
-    return torch.stack([torch.minimum(preds, target).sum(-1) for target in targets], -1)
+def _minima(backend: str, preds: Tensor, targets: Tensor) -> Tensor:
+    """Sum the minimum of every pair by a backend, imported when it is first used. (N, K)"""
+    if backend == "reference":
+        return pairwise_minima_reference(preds, targets)
+    if backend == "triton":
+        from gsmap.ops.soft_iou import triton
 
+        return triton.pairwise_minima(preds, targets)
+    from gsmap.ops.soft_iou import numba
 
-@torch.library.custom_op("gsmap::pairwise_minima_cpu", mutates_args=())
-def _minima_cpu(preds: Tensor, targets: Tensor) -> Tensor:
-    """Sum the minimum of every pair of flat float32 masks. (N, HW), (K, HW) -> (N, K)"""
-    from gsmap.ops.soft_iou.cpu_kernels import list_pixels, sum_minima
-
-    minima = torch.empty(len(preds), len(targets), dtype=torch.float32)
-    starts, pixels, values = list_pixels(targets.contiguous().numpy())
-    array, out = preds.contiguous().numpy(), minima.numpy()
-    run_in_threads(
-        lambda first, last: sum_minima(array, starts, pixels, values, out, first, last),
-        len(preds),
-        len(pixels),
-    )
-    return minima
-
-
-@_minima_cpu.register_fake
-def _(preds, targets):  # type: ignore[no-untyped-def]
-    return preds.new_empty(preds.shape[0], targets.shape[0])
-
-
-@torch.library.custom_op("gsmap::pairwise_minima_triton", mutates_args=())
-def _minima_triton(preds: Tensor, targets: Tensor) -> Tensor:
-    """Sum the minimum of every pair of flat float32 masks. (N, HW), (K, HW) -> (N, K)"""
-    from gsmap.ops.soft_iou.triton import pairwise_minima
-
-    return pairwise_minima(preds, targets)
-
-
-@_minima_triton.register_fake
-def _(preds, targets):  # type: ignore[no-untyped-def]
-    return preds.new_empty(preds.shape[0], targets.shape[0])
-
-
-MINIMA: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "reference": _minima_reference,
-    "cpu": _minima_cpu,
-    "triton": _minima_triton,
-}
+    return numba.pairwise_minima(preds, targets)

@@ -1,6 +1,6 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-r"""Fused CPU kernels (numba): masks of 2D Gaussians without a tensor per Gaussian.
+r"""Fused CPU kernels (numba) and their operators: masks of 2D Gaussians, no tensor per Gaussian.
 
 How the work is laid out
     One thread renders one instance at a time, straight into the instance's (H, W) mask, which
@@ -42,10 +42,12 @@ Two runs give the same bits, whatever the number of threads.
 import math
 
 import numpy as np
+import torch
 from numba import njit
-from numpy.typing import NDArray
+from torch import Tensor
 
-from gsmap.ops._numba import FASTMATH, exp2_coefficients
+from gsmap.ops._numba import FASTMATH, exp2_coefficients, run_in_threads
+from gsmap.ops.backends import register_gradient
 from gsmap.ops.gaussian_raster.reference import SQUARED_REACH
 
 C0, C1, C2, C3, C4, C5 = exp2_coefficients()
@@ -53,8 +55,6 @@ HALF, ONE, LOWEST = np.float32(0.5), np.float32(1), np.float32(-126)
 BIAS, MANTISSA_BITS = np.int32(127), np.int32(23)
 MAX_DENSITY = np.float32(1 - 1e-6)
 HALF_LOG2E = 0.5 / math.log(2)
-
-Array = NDArray[np.float32]
 
 
 @njit(inline="always")
@@ -230,11 +230,46 @@ def render_backward(gaussians, frame, grads, out, first, last):
             _gaussian_gradient(gaussians[n, p], frame, steps, grads[n], trans, out[n, p])
 
 
-@njit(nogil=True, cache=True, fastmath=FASTMATH)
-def fill_exponentials(values, repeats):
-    """Take 2^x of every value (<= 0), again and again: what the floor is counted in."""
-    out = np.empty_like(values)
-    for _ in range(repeats):
-        for k in range(len(values)):
-            out[k] = exp2_float32(values[k])
-    return out
+def _pack(means: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:
+    """Put an instance's parameters together in float64. (N, P, 5)"""
+    return torch.cat([means, scales, rotations[..., None]], -1).double()
+
+
+@torch.library.custom_op("gsmap::render_gaussians_cpu", mutates_args=(), device_types="cpu")
+def render(
+    means: Tensor, scales: Tensor, rotations: Tensor, frame: list[float], height: int, width: int
+) -> Tensor:
+    """Render float32 Gaussians; ``frame`` as in :func:`render_forward`. (N, H, W)"""
+    masks = torch.empty(len(means), height, width, dtype=torch.float32)
+    gaussians = _pack(means, scales, rotations)
+    run_in_threads(render_forward, len(means), height * width, gaussians, tuple(frame), masks)
+    return masks
+
+
+@torch.library.custom_op(
+    "gsmap::render_gaussians_cpu_backward", mutates_args=(), device_types="cpu"
+)
+def _backward(
+    grads: Tensor,
+    means: Tensor,
+    scales: Tensor,
+    rotations: Tensor,
+    frame: list[float],
+    height: int,
+    width: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the gradients in means, scales and rotations."""
+    gaussians = _pack(means, scales, rotations)
+    out = torch.empty_like(gaussians)
+    arguments = gaussians, tuple(frame), grads, out
+    run_in_threads(render_backward, len(means), height * width, *arguments)
+    out = out.float()
+    return out[..., :2].clone(), out[..., 2:4].clone(), out[..., 4].clone()
+
+
+@render.register_fake
+def _(means, scales, rotations, frame, height, width):
+    return means.new_empty(means.shape[0], height, width)
+
+
+register_gradient(render, _backward, tensors=3, differentiable=3)

@@ -1,6 +1,6 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-r"""Fused CPU kernels (numba): distances to polylines, soft rasters and ground-truth masks.
+r"""Fused CPU kernels (numba) and their operators: soft rasters and ground-truth masks.
 
 One thread works on one element at a time. Edge by edge and row by row, only the pixels within a
 reach of the edge are visited: beyond it a soft raster differs from 0 or 1 by less than 1e-8, and a
@@ -13,11 +13,18 @@ give the same bits.
 import math
 
 import numpy as np
+import torch
 from numba import njit
+from torch import Tensor
 
-from gsmap.ops._numba import FASTMATH
+from gsmap.ops._numba import FASTMATH, run_in_threads
+from gsmap.ops.backends import register_gradient
+from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
 FAR = np.float32(np.inf)
+REACH = -math.log(1e-8)  # in units of softness: beyond it masks are 0 or 1
+INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)  # MapVR samples pixel (row, col) at (col, row)
+Pair = tuple[float, float]
 
 
 @njit(inline="always")
@@ -233,3 +240,68 @@ def draw(polylines, filled, frame, half_width, pixel, antialias, masks, first, l
                 else:
                     share = 1.0 if distance <= half_width else 0.0
                 masks[n, row, col] = share
+
+
+def _settings(
+    softness: list[float], plain: bool
+) -> tuple[tuple[float, ...], Pair, float, Pair, float]:
+    """Return the kernels' frame, reach, eps, softness and smallest distance."""
+    line, polygon = softness
+    reach = REACH * line, REACH * polygon
+    reach = reach if plain else (math.sqrt(reach[0]), math.sqrt(reach[1]))
+    return INTEGER_FRAME, reach, LENGTH_EPS, (line, polygon), DISTANCE_EPS if plain else 0.0
+
+
+@torch.library.custom_op("gsmap::soft_rasters", mutates_args=(), device_types="cpu")
+def soft_rasters_cpu(
+    rings: Tensor, is_polygon: Tensor, height: int, width: int, softness: list[float], plain: bool
+) -> Tensor:
+    """Render closed float32 rings softly; see ``soft_rasters_reference``. (n, H, W)"""
+    masks = torch.empty(len(rings), height, width, dtype=torch.float32)
+    arguments = rings, is_polygon, *_settings(softness, plain), masks
+    run_in_threads(soft_forward, len(rings), height * width, *arguments)
+    return masks
+
+
+@torch.library.custom_op("gsmap::soft_rasters_backward", mutates_args=(), device_types="cpu")
+def _soft_rasters_backward(
+    grads: Tensor,
+    rings: Tensor,
+    is_polygon: Tensor,
+    height: int,
+    width: int,
+    softness: list[float],
+    plain: bool,
+) -> Tensor:
+    """Return the gradient in the rings. (n, V, 2)"""
+    gradients = torch.empty(rings.shape, dtype=torch.float64)
+    arguments = rings, is_polygon, *_settings(softness, plain), grads, gradients
+    run_in_threads(soft_backward, len(rings), height * width, *arguments)
+    return gradients.float()
+
+
+@torch.library.custom_op("gsmap::draw_polylines", mutates_args=(), device_types="cpu")
+def draw_cpu(
+    polylines: Tensor,
+    filled: Tensor,
+    height: int,
+    width: int,
+    frame: list[float],
+    half_width: float,
+    pixel: float,
+    antialias: bool,
+) -> Tensor:
+    """Draw float32 polylines; see ``draw_reference``. (K, H, W)"""
+    masks = torch.empty(len(polylines), height, width, dtype=torch.float32)
+    arguments = polylines, filled, tuple(frame), half_width, pixel, antialias, masks
+    run_in_threads(draw, len(polylines), height * width, *arguments)
+    return masks
+
+
+@soft_rasters_cpu.register_fake
+@draw_cpu.register_fake
+def _(elements, flags, height, width, *settings):
+    return elements.new_empty(elements.shape[0], height, width)
+
+
+register_gradient(soft_rasters_cpu, _soft_rasters_backward, tensors=2)

@@ -1,0 +1,79 @@
+"""Sampling of a map at weighted places, in plain torch: one weighted bag of rows per output."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def deformable_sample(
+    value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor
+) -> Tensor:
+    """Sum bilinear samples of a map, each head with its own places (Deformable DETR Eq. 2).
+
+    Each output row is one weighted bag of table rows: no tensor of samples in between.
+
+    Args:
+        value: Flattened map, row-major. (B, H * W, heads, C)
+        shape: Rows and columns of the map.
+        locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
+        weights: Attention weights. (B, Q, heads, S)
+
+    Returns:
+        Weighted sums, heads concatenated. (B, Q, heads * C)
+    """
+    batch, num_cells, heads, channels = value.shape
+    cells, cell_weights = bilinear_cells(locations, weights, shape)  # (B, Q, heads, 4 S)
+    sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1)
+    head = torch.arange(heads, device=value.device).view(1, 1, -1, 1)
+    rows = (sample * num_cells + cells) * heads + head
+    return sum_rows(value.reshape(-1, channels), rows, cell_weights).flatten(2)
+
+
+def bilinear_cells(
+    locations: Tensor, weights: Tensor, shape: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Turn weighted sampling locations into the cells around them and their weights.
+
+    The value of a cell lies at its centre; outside the map everything is zero
+    (``align_corners=False`` and zero padding, as in ``grid_sample``).
+
+    Args:
+        locations: Points (x, y), [0, 1] over the map. (..., S, 2)
+        weights: Their weights. (..., S)
+        shape: Rows and columns of the map.
+
+    Returns:
+        Row-major cell indices and weights, both zero outside the map; a location that is not a
+        number has a valid index and its weight is not a number. 2 x (..., 4 S)
+    """
+    height, width = shape
+    x, y = locations[..., 0] * width - 0.5, locations[..., 1] * height - 0.5
+    x0, y0 = x.detach().floor(), y.detach().floor()
+    right, lower = x - x0, y - y0
+    cells, cell_weights = [], []
+    for col, wx in ((x0, 1 - right), (x0 + 1, right)):
+        for row, wy in ((y0, 1 - lower), (y0 + 1, lower)):
+            inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+            cells.append(torch.where(inside, row * width + col, 0))
+            cell_weights.append(wx * wy * weights * inside)
+    return torch.cat(cells, -1).long(), torch.cat(cell_weights, -1)
+
+
+def sum_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """Sum weighted rows of a table.
+
+    Args:
+        table: The table. (R, C)
+        rows: Row indices. (..., S)
+        weights: Their weights. (..., S)
+
+    Returns:
+        The sums, without a tensor of all the rows in between. (..., C)
+    """
+    out = F.embedding_bag(
+        rows.reshape(-1, rows.shape[-1]),
+        table,
+        per_sample_weights=weights.reshape(-1, rows.shape[-1]).to(table.dtype),
+        mode="sum",
+    )
+    return out.view(*rows.shape[:-1], table.shape[-1])
