@@ -119,6 +119,26 @@ def test_runs_and_thread_counts_give_the_same_bits():
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+CACHE_SCRIPT = """
+import torch
+from gaussian_cases import ODD_GRID, random_gaussians, render_with_gradients
+
+torch.set_num_threads(1)
+upstream = torch.randn(20, 21, 33, generator=torch.Generator().manual_seed(0))
+_, grads = render_with_gradients(random_gaussians(20, 20, 0.3, 3), ODD_GRID, "cpu", upstream)
+print([grad.double().abs().sum().item() for grad in grads])
+"""
+
+
+@pytest.mark.slow
+def test_a_process_that_compiles_and_one_that_reads_the_cache_give_the_same_bits(tmp_path):
+    paths = [str(Path(__file__).parent), str(Path(gaussian_raster.__file__).parents[3])]
+    changes = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(paths)}
+    command = [sys.executable, "-c", CACHE_SCRIPT]
+    runs = [subprocess.check_output(command, env={**os.environ, **changes}) for _ in range(2)]
+    assert runs[0] == runs[1]
+
+
 @pytest.mark.skipif(platform.system() != "Linux", reason="peak memory is read from /proc")
 @pytest.mark.parametrize("count", [1, 64])
 def test_memory_is_that_of_the_masks_whatever_the_number_of_gaussians(count):

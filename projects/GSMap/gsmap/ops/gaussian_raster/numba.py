@@ -36,7 +36,7 @@ The floor
     sigma_u x sigma_v pixels visits pi * 2 ln(1 / cut) * sigma_u * sigma_v of them: 510 for
     1.0 x 0.4 m at 0.3 m per pixel, against 20,000 in the reference.
 
-Two runs give the same bits, whatever the number of threads.
+Two runs give the same bits, whatever the number of threads, compiled now or before.
 """
 
 import math
@@ -136,7 +136,8 @@ def _row_sums(grad, trans, curve, base, start, step, steps):
     return sum_0, sum_1, sum_2
 
 
-@njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
+# inlined, or the process that compiles it runs another copy (in the last bit) than the cached one
+@njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy", forceinline=True)
 def _gaussian_gradient(gaussian, frame, steps, grad, trans, out):
     """Write the gradient in one Gaussian's (mean, scales, rotation)."""
     x_min, y_min, step_x, step_y = frame

@@ -31,10 +31,10 @@ def raster_loss(
 
     * ``"both"``: :math:`D_w = \sum w |R - R^*| / \sum w (R + R^*)`; D-SSIM is the mean over the
       pixels whose window sees either mask. A miss costs about 1 whatever the size of the element
-      or of the raster. Gaussians that lie off the line by metres are pushed to grow until they
-      find it, not to vanish.
+      or of the raster. Small Gaussians that lie off their line by metres are pushed to grow until
+      they find it, not to vanish (`python -m benchmarks masks`).
     * ``"foreground"``: D_w by :math:`\sum w R^*`, D-SSIM by the pixels whose window sees R*, each
-      at least 0.5 % of the raster. Gaussians that lie off by 1 m or more shrink to nothing.
+      at least 0.5 % of the raster. Gaussians that lie off by 2 m are pushed to shrink.
     * ``"pixels"``: plain means over the raster, weighted by w.
 
     Nothing but the masks is kept for the backward pass; the rest is computed again.

@@ -5,7 +5,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # the usual constants for values in [0, 1]
-SEEN = 1e-3  # a window whose weighted mean is below sees a mask as empty
+# A window whose weighted mean is below sees a mask as empty. So D-SSIM of a miss is 0.94 to 1.03
+# for elements of 4 to 60 m and rasters of 128 x 64 to 256 x 128. At 0 it is 0.59 to 0.93, as
+# windows that see next to nothing of the mask count, too; at 1e-2 it is 1.09 to 1.38.
+SEEN = 1e-3
 
 
 def gaussian_window(size: int, sigma: float, like: Tensor) -> Tensor:
@@ -22,23 +25,8 @@ def _blur(images: Tensor, window: Tensor) -> Tensor:
     return F.conv2d(columns, window.view(1, 1, -1, 1), padding=(pad, 0))[:, 0]
 
 
-def dssim_map(preds: Tensor, targets: Tensor, size: int = 11, sigma: float = 1.5) -> Tensor:
-    """Structural dissimilarity 1 - SSIM at every pixel.
-
-    Args:
-        preds: Masks in [0, 1]. (n, H, W)
-        targets: Masks in [0, 1]. (n, H, W)
-        size: Side of the Gaussian window in pixels, odd.
-        sigma: Standard deviation of the window in pixels.
-
-    Returns:
-        Dissimilarity in [0, 2]; 0 where both windows are empty. (n, H, W)
-    """
-    return _dssim(preds, targets, gaussian_window(size, sigma, preds))[0]
-
-
-def _dssim(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return 1 - SSIM, and the means of both masks that the window sees. 3 x (n, H, W)"""
+def dssim_map(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return 1 - SSIM in [0, 2], and the means of both masks in the window. 3 x (n, H, W)"""
     mean_p, mean_t = _blur(preds, window), _blur(targets, window)
     var_p = _blur(preds.square(), window) - mean_p.square()
     var_t = _blur(targets.square(), window) - mean_t.square()
@@ -67,7 +55,7 @@ def raster_loss_sums_reference(
     excess = (weight - 1) * targets
     weights = 1 + excess
     window = gaussian_window(window_size, window_sigma, preds)
-    dissimilarity, mean_p, mean_t = _dssim(preds, targets, window)
+    dissimilarity, mean_p, mean_t = dssim_map(preds, targets, window)
     reach = F.max_pool2d(targets[:, None], window_size, 1, window_size // 2)[:, 0]
     sums = (
         weights * (preds - targets).abs(),
