@@ -3,7 +3,7 @@ import torch
 from mmcv.ops.multi_scale_deform_attn import multi_scale_deformable_attn_pytorch
 
 from gsmap.models.layers.deformable_attention import (
-    DeformableAttention,
+    BEVDeformableAttention,
     directional_offsets,
 )
 
@@ -20,7 +20,7 @@ def test_directional_offsets_lie_on_squares():
 @pytest.mark.parametrize("late", [False, True])
 def test_attention_equals_its_formula_whether_it_projects_before_or_after_sampling(late):
     torch.manual_seed(0)
-    attention = DeformableAttention(embed_dims=8, num_heads=2, num_points=3).eval()
+    attention = BEVDeformableAttention(embed_dims=8, num_heads=2, num_points=3).eval()
     for parameter in attention.parameters():
         torch.nn.init.normal_(parameter, std=0.5)
     feats = torch.randn(2, 8, *((20, 30) if late else SHAPE))
@@ -40,7 +40,7 @@ def test_attention_equals_its_formula_whether_it_projects_before_or_after_sampli
 
 
 def test_a_new_attention_looks_in_every_direction_with_equal_weights():
-    attention = DeformableAttention(embed_dims=8, num_heads=4, num_points=2)
+    attention = BEVDeformableAttention(embed_dims=8, num_heads=4, num_points=2)
     reference = torch.full((1, 1, 2), 0.5)
     locations = attention.sampling_locations(torch.randn(1, 1, 8), reference, (10, 20))
     # head 0 looks along +x: one and two cells of 1 / 20
@@ -50,4 +50,4 @@ def test_a_new_attention_looks_in_every_direction_with_equal_weights():
 
 def test_channels_must_divide_among_the_heads():
     with pytest.raises(ValueError, match="divisible by num_heads, got 9 and 4"):
-        DeformableAttention(embed_dims=9, num_heads=4)
+        BEVDeformableAttention(embed_dims=9, num_heads=4)

@@ -1,0 +1,20 @@
+import argparse
+
+from benchmarks import masks
+
+
+def test_the_command_writes_a_table_per_reduction_and_band_and_one_of_misses(tmp_path, monkeypatch):
+    monkeypatch.setattr(masks, "ERRORS_M", (1.0,))
+    monkeypatch.setattr(masks, "SCALES_M", (0.25,))
+    monkeypatch.setattr(masks, "LENGTHS_M", (10.0,))
+    parser = argparse.ArgumentParser()
+    masks.add_parser(parser.add_subparsers())
+    args = parser.parse_args(f"masks --seeds 2 --out {tmp_path / 'out.md'}".split())
+    args.run(args)
+    report = (tmp_path / "out.md").read_text()
+    along, across = masks.push("both", 0.75, 1.0, 0.25, seeds=2)
+    assert f"| 1 m | {1e3 * along:+.2f} / {1e3 * across:+.2f} |" in report
+    assert report.count("\n| --- |") == len(masks.REDUCTIONS) * len(masks.BANDS_M) + 1
+    assert (
+        f"| both | 0.75 m | 128 x 64 | {masks.miss('both', 0.75, 10.0, (128, 64)):.3f} |" in report
+    )
