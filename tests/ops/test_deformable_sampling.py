@@ -1,3 +1,4 @@
+import pytest
 import torch
 from mmcv.ops.multi_scale_deform_attn import multi_scale_deformable_attn_pytorch
 
@@ -61,3 +62,39 @@ def test_sum_rows_equals_the_plain_sum():
     table, rows, weights = torch.randn(8, 3), torch.randint(8, (2, 4, 5)), torch.rand(2, 4, 5)
     expected = (table[rows] * weights[..., None]).sum(-2)
     torch.testing.assert_close(sum_rows(table, rows, weights), expected)
+
+
+@pytest.mark.usefixtures("poisoned_empty")
+@pytest.mark.parametrize("shape", [(50, 3, 7), (1, 1, 1), (0, 4, 3)])
+def test_the_fused_gradient_equals_torchs(shape):
+    bags, samples, channels = shape
+    torch.manual_seed(0)
+    rows = torch.randint(0, 20, (bags, 2, samples))
+    results = []
+    for backend, dtype in (("cpu", torch.float32), ("reference", torch.float64)):
+        torch.manual_seed(1)
+        table = torch.randn(20, channels, dtype=torch.float64).to(dtype).requires_grad_()
+        weights = torch.randn(bags, 2, samples, dtype=torch.float64).to(dtype).requires_grad_()
+        out = sum_rows(table, rows, weights, backend)
+        (
+            out
+            * torch.linspace(-1, 1, max(out.numel(), 1), dtype=dtype)[: out.numel()].view(out.shape)
+        ).sum().backward()
+        results.append((out, table.grad, weights.grad))
+    for fused, exact in zip(*results, strict=True):
+        # sums of up to 100 float32 products of size 1
+        torch.testing.assert_close(fused, exact.float(), atol=1e-5, rtol=1e-5)
+
+
+def test_the_fused_gradient_works_under_compile_and_twice():
+    table = torch.randn(20, 4, requires_grad=True)
+    rows, weights = torch.randint(0, 20, (6, 3)), torch.rand(6, 3, requires_grad=True)
+    out = sum_rows(table, rows, weights).square().sum()
+    first = torch.autograd.grad(out, (table, weights), retain_graph=True)
+    again = torch.autograd.grad(out, (table, weights))
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    compiled = torch.compile(lambda t, w: sum_rows(t, rows, w).square().sum(), backend="aot_eager")
+    for a, b in zip(
+        first, torch.autograd.grad(compiled(table, weights), (table, weights)), strict=True
+    ):
+        torch.testing.assert_close(a, b)

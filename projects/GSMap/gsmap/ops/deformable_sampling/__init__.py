@@ -1,8 +1,10 @@
-"""Sampling of a map at weighted places, in plain torch: one weighted bag of rows per output."""
+"""Sampling of a map at weighted places: one weighted bag of table rows per output."""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from gsmap.ops.backends import choose_backend
 
 
 def deformable_sample(
@@ -59,21 +61,27 @@ def bilinear_cells(
     return torch.cat(cells, -1).long(), torch.cat(cell_weights, -1)
 
 
-def sum_rows(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+def sum_rows(table: Tensor, rows: Tensor, weights: Tensor, backend: str = "auto") -> Tensor:
     """Sum weighted rows of a table.
 
     Args:
         table: The table. (R, C)
         rows: Row indices. (..., S)
         weights: Their weights. (..., S)
+        backend: ``"reference"`` (torch's embedding bags), ``"cpu"`` (the same forward pass with a
+            fused backward pass), or ``"auto"``.
 
     Returns:
-        The sums, without a tensor of all the rows in between. (..., C)
+        The sums, without a tensor of all the rows in between; differentiable in ``table`` and
+        ``weights``. (..., C)
     """
-    out = F.embedding_bag(
-        rows.reshape(-1, rows.shape[-1]),
-        table,
-        per_sample_weights=weights.reshape(-1, rows.shape[-1]).to(table.dtype),
-        mode="sum",
-    )
+    bags = rows.reshape(-1, rows.shape[-1])
+    factors = weights.reshape(-1, rows.shape[-1]).to(table.dtype)
+    wants_gradient = torch.is_grad_enabled() and (table.requires_grad or factors.requires_grad)
+    if not wants_gradient or choose_backend(backend, table, ("cpu",)) == "reference":
+        out = F.embedding_bag(bags, table, per_sample_weights=factors, mode="sum")
+    else:
+        from gsmap.ops.deformable_sampling.numba import sum_rows_cpu
+
+        out = sum_rows_cpu(table, factors, bags)
     return out.view(*rows.shape[:-1], table.shape[-1])
