@@ -67,6 +67,11 @@ class Golden:
         return self._module("inputs_recipe")
 
     @cached_property
+    def mgmapnet(self) -> ModuleType:
+        """The recipe of MGMapNet's weights and inputs: ``tensor``, ``normal``, ``uniform``."""
+        return self._module("mgmapnet_recipe")
+
+    @cached_property
     def cameras(self) -> dict[str, Any]:
         """Cameras of the variant."""
         return self.read_json(f"cameras_{self.variant}.json")

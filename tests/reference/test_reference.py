@@ -38,6 +38,12 @@ FILES = [
     "maptrv2_r50_forward_full_*.npz",
     "maptrv2_loss_reduced_closed_*.npz",
     "maptrv2_loss_reduced_many_*.npz",
+    "mgmapnet_state.json",
+    "mgmapnet_patchmerge_*.npz",
+    "mgmapnet_attention_*.npz",
+    "mgmapnet_layer_*.npz",
+    "mgmapnet_decoder_*.npz",
+    "mgmapnet_losses_*.npz",
 ]
 
 

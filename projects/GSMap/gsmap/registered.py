@@ -19,6 +19,7 @@ import gsmap.models.bev_encoders.gkt
 import gsmap.models.bev_encoders.lidar
 import gsmap.models.bev_encoders.lss
 import gsmap.models.decoders.map_decoder
+import gsmap.models.decoders.mgmapnet_decoder
 import gsmap.models.detectors.map_detector
 import gsmap.models.heads.aux_heads
 import gsmap.models.heads.gsmap_head
@@ -26,6 +27,7 @@ import gsmap.models.heads.map_head
 import gsmap.models.heads.references
 import gsmap.models.layers.geometry_attention
 import gsmap.models.layers.grid_mask
+import gsmap.models.layers.multi_granularity
 import gsmap.models.layers.self_attention
 import gsmap.models.layers.vovnet
 import gsmap.models.task_modules.match_costs

@@ -33,7 +33,7 @@ class KeyMap:
         name: Name of the architecture.
         rules: Pairs of key prefixes (upstream's, ours); ``{i}`` stands for a number, the same on
             both sides, in order. The first that fits wins.
-        unused: Upstream keys without a counterpart.
+        unused: Upstream keys without a counterpart, whatever the rules say.
         markers: Pairs of key prefixes (upstream's, ours) that, all present, tell this architecture
             from those after it in ``KEY_MAPS``.
     """
@@ -45,7 +45,7 @@ class KeyMap:
 
     def to_ours(self, key: str) -> str | None:
         """Return our name of an upstream key, or None if there is none."""
-        return _rename(key, self.rules)
+        return None if key in self.unused else _rename(key, self.rules)
 
     def to_upstream(self, key: str) -> str | None:
         """Return upstream's name of one of our keys, or None if there is none."""
@@ -248,7 +248,82 @@ GEMAP_FULL = KeyMap(
     markers=(GEOMETRY_MARKER, LIFTED_MARKER),
 )
 
-KEY_MAPS: list[KeyMap] = [GEMAP_FULL, GEMAP, MAPTRV2, MAPTR_BEVFORMER, MAPTR]
+_MG_ATTENTION = _DECODER_LAYER + "attentions.1."
+_INTERACTION_RULES = tuple(
+    (f"{_MG_ATTENTION}{kind}_attention.{upstream}.", f"{_LAYER}cross_attn.{kind}.{ours}.")
+    for kind in ("p2p", "p2i")
+    for upstream, ours in (
+        ("cross_attn", "attn"),
+        ("linear1", "ffn.layers.0.0"),
+        ("linear2", "ffn.layers.1"),
+        ("norm1", "norms.0"),
+        ("norm3", "norms.1"),
+    )
+)
+_SECOND_PV = _HEAD + "bev_pv_seg_head."
+_DOWN_SAMPLING = (
+    _TRANSFORMER + "bev_downsample.",
+    "map_head.decoder.bev_pyramid.merges.0.",
+)
+MGMAPNET = KeyMap(
+    name="mgmapnet",
+    rules=(
+        *LIFTED_RULES,
+        (_HEAD + "ins_seg_head.", "map_head.aux_heads.ins_seg."),
+        _DOWN_SAMPLING,
+        *_INTERACTION_RULES,
+        (_MG_ATTENTION + "point_pos.", _LAYER + "cross_attn.point_code."),
+        (_MG_ATTENTION + "instance_pos.", _LAYER + "cross_attn.instance_code."),
+        (_MG_ATTENTION + "output_proj_point.", _LAYER + "cross_attn.output_proj."),
+        (_MG_ATTENTION + "point2ins_proj.", _LAYER + "cross_attn.instance_mlp."),
+        *DECODER_RULES,
+        (_TRANSFORMER + "decoder.point_ffn.{i}.", _LAYER + "point_ffn."),
+        (_TRANSFORMER + "decoder.point_norm.{i}.", _LAYER + "point_norm."),
+        (_TRANSFORMER + "decoder.gen_pos_embed.{i}.", _LAYER + "reference_code."),
+    ),
+    unused={
+        **LIFTED_UNUSED,
+        _HEAD + "loss_seg.loss_fn.pos_weight": UnusedKey("a loss that MGMapNet has not", None),
+        **_unused_zeros(
+            "embedding of the points, which MGMapNet's queries do not use",
+            {_HEAD + "pts_embedding.weight": (20, 512)},
+        ),
+        **_unused_zeros(
+            "code of the first layer's reference, which adds the learned position instead",
+            {
+                _TRANSFORMER + "decoder.gen_pos_embed.0.0.weight": (256, 40),
+                _TRANSFORMER + "decoder.gen_pos_embed.0.0.bias": (256,),
+                _TRANSFORMER + "decoder.gen_pos_embed.0.2.weight": (256, 256),
+                _TRANSFORMER + "decoder.gen_pos_embed.0.2.bias": (256,),
+            },
+        ),
+        **_unused_zeros(
+            "projection of the aggregated instance query, which is never called",
+            {
+                f"{_MG_ATTENTION}output_proj_instance.{leaf}".replace(_NUMBER, str(layer)): shape
+                for layer in range(6)
+                for leaf, shape in (("weight", (256, 256)), ("bias", (256,)))
+            },
+        ),
+        **_unused_zeros(
+            "second mask head of the camera view, which is never called",
+            {
+                **{f"{_SECOND_PV}{i}.weight": (256, 256, 3, 3) for i in (0, 3)},
+                **{
+                    f"{_SECOND_PV}{i}.{leaf}": (256,)
+                    for i in (1, 4)
+                    for leaf in ("weight", "bias", "running_mean", "running_var")
+                },
+                **{f"{_SECOND_PV}{i}.num_batches_tracked": () for i in (1, 4)},
+                _SECOND_PV + "6.weight": (3, 256, 1, 1),
+                _SECOND_PV + "6.bias": (3,),
+            },
+        ),
+    },
+    markers=(_DOWN_SAMPLING,),
+)
+
+KEY_MAPS: list[KeyMap] = [MGMAPNET, GEMAP_FULL, GEMAP, MAPTRV2, MAPTR_BEVFORMER, MAPTR]
 """Known architectures, the most special first; the last needs no marker."""
 
 

@@ -42,6 +42,24 @@ def has_compiled_op(value: Tensor) -> bool:
     return value.is_cuda and get_compiling_cuda_version() != "not available"
 
 
+def place_samples(
+    offsets: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None = None
+) -> Tensor:
+    """Place samples around reference points.
+
+    Args:
+        offsets: Offsets (x, y) in cells. (B, Q, heads, S, 2)
+        reference: Reference; the first two entries are the point, [0, 1] over the map. (B, Q, D)
+        shape: Rows and columns of the map.
+        frames: What turns each query's offsets, or None. (B, Q, 2, 2)
+
+    Returns:
+        Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
+    """
+    size = offsets.new_tensor([shape[1], shape[0]])
+    return reference[:, :, None, None, :2] + turn_offsets(offsets, frames) / size
+
+
 class SamplingAttention(BaseModule):
     """The learned parts of deformable attention on one map.
 
@@ -132,9 +150,7 @@ class BEVDeformableAttention(SamplingAttention):
         Returns:
             Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
         """
-        offsets = turn_offsets(self.offsets_in_cells(query), frames)
-        size = offsets.new_tensor([shape[1], shape[0]])
-        return reference[:, :, None, None, :2] + offsets / size
+        return place_samples(self.offsets_in_cells(query), reference, shape, frames)
 
     def forward(
         self, query: Tensor, reference: Tensor, feats: Tensor, frames: Tensor | None = None

@@ -1,0 +1,343 @@
+"""MGMapNet's attention: one sampling of the BEV serves an instance query and its point queries."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from mmcv.cnn.bricks.transformer import FFN
+from mmdet3d.registry import MODELS
+from mmengine.model import BaseModule
+from torch import Tensor, nn
+
+from gsmap.models.layers.deformable_attention import (
+    SamplingAttention,
+    at_least_float32,
+    deformable_sample,
+    directional_offsets,
+)
+
+
+class Granularities(NamedTuple):
+    """The queries of all map elements at both granularities, as one layer hands them to the next.
+
+    Attributes:
+        instances: Instance queries. (B, N, C)
+        points: Point queries; None before the first layer. (B, N, P, C)
+        point_code: Position code of the points; None without codes. (B, N, P, C)
+        mean_locations: Mean of each point's sampling locations (x, y), [0, 1] over the map; not
+            clipped. (B, N, P, 2)
+    """
+
+    instances: Tensor
+    points: Tensor | None = None
+    point_code: Tensor | None = None
+    mean_locations: Tensor | None = None
+
+
+class Samples(NamedTuple):
+    """Where an attention looks, and how it weighs what it sees.
+
+    Attributes:
+        locations: Sampling points (x, y), [0, 1] over the map. (B, N, P, levels, heads, K, 2)
+        point_weights: Weights of sum one over K. (B, N, P, levels, heads, K)
+        weights: Weights of sum one over P, levels and K. (B, N, P, levels, heads, K)
+    """
+
+    locations: Tensor
+    point_weights: Tensor
+    weights: Tensor
+
+
+class PerPointSampling(SamplingAttention):
+    """The sampling that both attentions of this module share: K offsets around every point.
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of heads.
+        num_points: Points per instance P.
+        num_samples: Samples per head, level and point K.
+        num_levels: Levels of BEV features.
+        dropout: Dropout on every output.
+        init_cfg: As in mmengine.
+
+    Raises:
+        ValueError: If ``embed_dims`` is not divisible by ``num_heads``.
+    """
+
+    def __init__(
+        self,
+        embed_dims: int = 256,
+        num_heads: int = 8,
+        num_points: int = 20,
+        num_samples: int = 8,
+        num_levels: int = 2,
+        dropout: float = 0.1,
+        init_cfg: dict | None = None,
+    ) -> None:
+        self.layout = (num_levels, num_points, num_samples)
+        total = num_levels * num_points * num_samples
+        super().__init__(embed_dims, num_heads, total, dropout=dropout, init_cfg=init_cfg)
+
+    def initial_offsets(self) -> Tensor:
+        """Return the same offsets for every level and point. (heads, levels * P * K, 2)"""
+        levels, points, samples = self.layout
+        return directional_offsets(self.num_heads, samples).repeat(1, levels * points, 1)
+
+    def look(self, query: Tensor, reference: Tensor, feats: Sequence[Tensor]) -> Samples:
+        """Place and weigh the samples.
+
+        Args:
+            query: Instance queries with their position added. (B, N, C)
+            reference: References of the points; the first two entries are the point, [0, 1] over
+                the map. (B, N, P, D)
+            feats: BEV features, finest level first. levels x (B, C, H, W)
+
+        Returns:
+            Locations and weights of all samples.
+
+        Raises:
+            ValueError: If the numbers of levels or points are not the module's.
+        """
+        levels, points, _ = self.layout
+        if len(feats) != levels or reference.shape[2] != points:
+            raise ValueError(
+                f"expected {levels} levels of BEV features and {points} points per instance, got "
+                f"{len(feats)} and {reference.shape[2]}."
+            )
+        offsets = self.offsets_in_cells(query).unflatten(-2, self.layout)
+        offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6).flatten(2, 3)  # (levels, B, N P, heads, K,2)
+        locations = [
+            self.place(by_level, reference.flatten(1, 2), map_size(feat))
+            for by_level, feat in zip(offsets, feats, strict=True)
+        ]
+        logits = at_least_float32(self.attention_weights(query))
+        logits = logits.unflatten(-1, (self.num_heads, *self.layout))
+        joint = logits.flatten(-3).softmax(-1).unflatten(-1, self.layout)
+        order = (0, 1, 4, 3, 2, 5)  # (B, N, heads, levels, P, K) -> (B, N, P, levels, heads, K)
+        return Samples(
+            torch.stack(locations, 2).unflatten(1, (-1, points)),
+            logits.softmax(-1).permute(order),
+            joint.permute(order),
+        )
+
+    def values(self, feats: Tensor) -> Tensor:
+        """Return the projected cells of a level, by head. (B, C, H, W) -> (B, H W, heads, C')"""
+        value = at_least_float32(self.value_proj(feats.flatten(2).transpose(1, 2)))
+        return value.unflatten(-1, (self.num_heads, -1))
+
+
+@MODELS.register_module()
+class MultiPointAttention(PerPointSampling):
+    """Instance queries alone look around all of their points (StreamMapNet).
+
+    The point queries follow from the instance query by one matrix, as StreamMapNet's points do.
+    This is the baseline of MGMapNet's tables. Arguments as in :class:`PerPointSampling`.
+    """
+
+    def __init__(self, embed_dims: int = 256, **kwargs: Any) -> None:
+        super().__init__(embed_dims, **kwargs)
+        self.point_proj = nn.Linear(embed_dims, self.layout[1] * embed_dims)
+
+    def forward(
+        self, state: Granularities, position: Tensor, reference: Tensor, feats: Sequence[Tensor]
+    ) -> Granularities:
+        """Update the queries from the BEV.
+
+        Args:
+            state: The queries; only the instances are read.
+            position: Position of the instance queries. (B, N, C)
+            reference: References of the points; the first two entries are the point, [0, 1] over
+                the map. (B, N, P, D)
+            feats: BEV features, finest level first. levels x (B, C, H, W)
+
+        Returns:
+            Updated queries, the instances' residual included.
+        """
+        samples = self.look(state.instances + position, reference, feats)
+        seen = [
+            deformable_sample(
+                self.values(level_feats),
+                map_size(level_feats),
+                samples.locations[:, :, :, level].transpose(2, 3).flatten(3, 4),
+                samples.weights[:, :, :, level].transpose(2, 3).flatten(3, 4),
+            )
+            for level, level_feats in enumerate(feats)
+        ]
+        instances = state.instances + self.dropout(self.output_proj(torch.stack(seen).sum(0)))
+        points = self.point_proj(instances).unflatten(-1, (self.layout[1], -1))
+        return Granularities(instances, points, None, samples.locations.mean((3, 4, 5)))
+
+
+@MODELS.register_module()
+class MultiGranularityAttention(PerPointSampling):
+    """An aggregated instance query and its P point queries, which then interact (MGMapNet).
+
+    Each part has its switch, for the ablation tables of the paper.
+
+    Args:
+        embed_dims: Channels C.
+        ffn_dims: Hidden channels of the interactions.
+        add_instance: Add the aggregated instance query to its points, before P2I.
+        p2p: Let an instance's points attend to each other and to those of the layer before.
+        p2i: Let the points attend to all aggregated instance queries of the sample.
+        position_codes: Add codes of the sampling locations to queries and keys of both.
+        **kwargs: Arguments of :class:`PerPointSampling`.
+
+    Raises:
+        ValueError: If ``embed_dims`` is not divisible by ``num_heads``.
+    """
+
+    def __init__(
+        self,
+        embed_dims: int = 256,
+        ffn_dims: int = 1024,
+        add_instance: bool = True,
+        p2p: bool = True,
+        p2i: bool = True,
+        position_codes: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(embed_dims, **kwargs)
+        _, points, samples = self.layout
+        settings = (embed_dims, self.num_heads, ffn_dims, self.dropout.p)
+        self.add_instance = add_instance
+        self.p2p = Interaction(*settings) if p2p else None
+        self.p2i = Interaction(*settings) if p2i else None
+        coded = position_codes and (p2p or p2i)
+        self.point_code = mlp(2 * samples, embed_dims) if coded else None
+        self.instance_code = mlp(2 * points * samples, embed_dims) if coded and p2i else None
+        self.instance_mlp = mlp(points * embed_dims, embed_dims)
+
+    def forward(
+        self, state: Granularities, position: Tensor, reference: Tensor, feats: Sequence[Tensor]
+    ) -> Granularities:
+        """Update the queries from the BEV.
+
+        Args:
+            state: The queries; points and their code are those of the layer before.
+            position: Position of the instance queries. (B, N, C)
+            reference: References of the points; the first two entries are the point, [0, 1] over
+                the map. (B, N, P, D)
+            feats: BEV features, finest level first. levels x (B, C, H, W)
+
+        Returns:
+            Updated queries, residuals included.
+        """
+        samples = self.look(state.instances + position, reference, feats)
+        instances, points = self.aggregate(feats, samples)
+        point_code, instance_code = self.codes(samples)
+        points = self.interact_points(points, point_code, state)
+        if self.add_instance:
+            points = points + instances[:, :, None]
+        points = self.interact_instances(points, point_code, instances, instance_code)
+        # Differs from the poster, which sums the points: the released model concatenates them.
+        instances = state.instances + self.dropout(self.instance_mlp(points.flatten(2)))
+        points = self.dropout(self.output_proj(points))
+        if state.points is not None:
+            points = points + state.points
+        return Granularities(instances, points, point_code, samples.locations.mean((3, 4, 5)))
+
+    def aggregate(self, feats: Sequence[Tensor], samples: Samples) -> tuple[Tensor, Tensor]:
+        """Sum the samples for both granularities.
+
+        The joint weights are the points' weights times the share that each point and level has in
+        the instance, so the instance query is a weighted sum of what its points saw.
+
+        Args:
+            feats: BEV features, finest level first. levels x (B, C, H, W)
+            samples: Locations and weights of the samples.
+
+        Returns:
+            Instance queries (B, N, C) and point queries (B, N, P, C), the mean over levels.
+        """
+        seen = [
+            deformable_sample(
+                self.values(level_feats),
+                map_size(level_feats),
+                samples.locations[:, :, :, level].flatten(1, 2),
+                samples.point_weights[:, :, :, level].flatten(1, 2),
+            )
+            for level, level_feats in enumerate(feats)
+        ]
+        # (B, N, P, levels, heads, C')
+        by_head = torch.stack(seen, 2).unflatten(1, (-1, self.layout[1]))
+        by_head = by_head.unflatten(-1, (self.num_heads, -1))
+        shares = samples.weights.sum(-1)  # (B, N, P, levels, heads)
+        instances = torch.einsum("bnplh,bnplhc->bnhc", shares, by_head)
+        return instances.flatten(2), by_head.mean(3).flatten(3)
+
+    def codes(self, samples: Samples) -> tuple[Tensor | None, Tensor | None]:
+        """Return the position codes of points (B, N, P, C) and instances (B, N, C)."""
+        locations = samples.locations.mean((3, 4))  # (B, N, P, K, 2)
+        point_code = instance_code = None
+        # Differs from the poster's MLP(S, W): the released model codes their product.
+        if self.point_code is not None:
+            weighted = locations * samples.point_weights.mean((3, 4))[..., None]
+            point_code = self.point_code(weighted.flatten(3))
+        if self.instance_code is not None:
+            weighted = locations * samples.weights.mean((3, 4))[..., None]
+            instance_code = self.instance_code(weighted.flatten(2))
+        return point_code, instance_code
+
+    def interact_points(self, points: Tensor, code: Tensor | None, before: Granularities) -> Tensor:
+        """Let points attend to their instance's, now and in the layer before. (B, N, P, C)"""
+        if self.p2p is None:
+            return points
+        value, query = points, add_code(points, code)
+        key = query
+        # Differs from the poster, whose later layers attend to the points of the layer before only.
+        if before.points is not None:
+            value = torch.cat([before.points, value], 2)  # (B, N, 2 P, C)
+            key = torch.cat([add_code(before.points, before.point_code), key], 2)
+        flat = [x.flatten(0, 1) for x in (points, query, key, value)]
+        return self.p2p(*flat).unflatten(0, points.shape[:2])
+
+    def interact_instances(
+        self, points: Tensor, code: Tensor | None, instances: Tensor, instance_code: Tensor | None
+    ) -> Tensor:
+        """Let all points of a sample attend to its aggregated instance queries. (B, N, P, C)"""
+        if self.p2i is None:
+            return points
+        query, key = add_code(points, code), add_code(instances, instance_code)
+        attended = self.p2i(points.flatten(1, 2), query.flatten(1, 2), key, instances)
+        return attended.unflatten(1, points.shape[1:3])
+
+
+class Interaction(BaseModule):
+    """Attention and feed-forward network, each with residual and LayerNorm after it.
+
+    Args:
+        embed_dims: Channels C.
+        num_heads: Number of heads.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Dropout of the attention and of every sublayer.
+    """
+
+    def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float) -> None:
+        super().__init__()
+        self.attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+        self.ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(2))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, content: Tensor, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        """Update the content (B, Q, C) from keys and values (B, S, C). -> (B, Q, C)"""
+        attended = self.attn(query, key, value, need_weights=False)[0]
+        return self.norms[1](self.ffn(self.norms[0](content + self.dropout(attended))))
+
+
+def mlp(in_dims: int, embed_dims: int) -> nn.Sequential:
+    """Return two matrices with a ReLU in between."""
+    return nn.Sequential(
+        nn.Linear(in_dims, embed_dims), nn.ReLU(True), nn.Linear(embed_dims, embed_dims)
+    )
+
+
+def add_code(query: Tensor, code: Tensor | None) -> Tensor:
+    """Return the queries with their position code, if there is one."""
+    return query if code is None else query + code
+
+
+def map_size(feats: Tensor) -> tuple[int, int]:
+    """Return rows and columns of a map. (B, C, H, W)"""
+    return feats.shape[-2], feats.shape[-1]
