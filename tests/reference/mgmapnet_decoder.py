@@ -8,11 +8,13 @@ from torch import Tensor, nn
 
 from gsmap.checkpoints.key_map import MGMAPNET
 from gsmap.models.decoders.mgmapnet_decoder import MGMapNetDecoder
+from gsmap.models.heads.references import PointReference, refine_reference
 from gsmap.models.layers.mask_heads import (
     bev_mask_head,
     instance_mask_embedding,
     instance_mask_logits,
 )
+from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
 from reference.mgmapnet import GRAD_L2, B, C, GoldenParts, N, P, gradients_of
 from reference.registry import check
@@ -28,45 +30,41 @@ class Head(nn.Module):
         super().__init__()
         self.decoder = MGMapNetDecoder()
         self.instance_embedding = nn.Embedding(N + FURTHER, 2 * C)
-        self.reference_points = nn.Linear(C, 2)
-        self.cls_branches = nn.ModuleList(self.branch(3, nn.LayerNorm) for _ in range(6))
-        self.reg_branches = nn.ModuleList(self.branch(2) for _ in range(6))
-        self.seg_head = bev_mask_head(C, 3)
-        self.ins_seg_head = instance_mask_embedding(C)
+        self.reference = PointReference(BEVGrid((-15, 15), (-30, 30), 1, 1))
+        self.cls_branches = nn.ModuleList(self.cls_branch() for _ in range(6))
+        masks = {"seg": bev_mask_head(C, 3), "ins_seg": instance_mask_embedding(C)}
+        self.aux_heads = nn.ModuleDict(masks)
 
     @staticmethod
-    def branch(out_dims: int, norm: type[nn.LayerNorm] | None = None) -> nn.Sequential:
-        """Return two hidden layers and an output."""
+    def cls_branch() -> nn.Sequential:
+        """Return one layer's classifier."""
         layers: list[nn.Module] = []
         for _ in range(2):
-            layers += [nn.Linear(C, C), *([norm(C)] if norm else []), nn.ReLU()]
-        return nn.Sequential(*layers, nn.Linear(C, out_dims))
+            layers += [nn.Linear(C, C), nn.LayerNorm(C), nn.ReLU()]
+        return nn.Sequential(*layers, nn.Linear(C, 3))
 
     def forward(self, bev_feats: Tensor, attn_mask: Tensor | None = None) -> dict[str, Tensor]:
         """Return all predictions by the golden names; with a mask, of the further queries too."""
         chosen = self.instance_embedding.weight[: N if attn_mask is None else None]
         position, content = chosen.expand(B, -1, -1).split(C, 2)
-        start = self.reference_points(position).sigmoid()[:, :, None].expand(-1, -1, P, -1)
-        states = self.decoder(
-            content,
-            position,
-            start.flatten(1, 2),
-            bev_feats,
-            lambda number, points: self.reg_branches[number](points),
-            attn_mask,
-        )
+        start = self.reference.initial(position).sigmoid()
+        states = self.decoder(content, position, start, bev_feats, self.refine, attn_mask)
         scores = [b(s) for b, s in zip(self.cls_branches, states.instance_states, strict=True)]
-        embeddings = self.ins_seg_head(states.instance_states[-1])
+        embeddings = self.aux_heads["ins_seg"](states.instance_states[-1])
         return {
-            "init_reference": start,
+            "init_reference": start[:, :, None].expand(-1, -1, P, -1),
             "instance_states": states.instance_states.transpose(1, 2),
             "point_states": states.point_states.unflatten(2, (-1, P)),
             "references": states.references.unflatten(2, (-1, P)),
             "mean_loc": states.mean_locations,
             "all_cls_scores": torch.stack(scores),
-            "seg": self.seg_head(bev_feats),
+            "seg": self.aux_heads["seg"](bev_feats),
             "ins_seg": instance_mask_logits(embeddings, bev_feats),
         }
+
+    def refine(self, layer: int, states: Tensor, reference: Tensor) -> Tensor:
+        """Refine as `PointReference` does, in any precision."""
+        return refine_reference(reference, self.reference.branches[layer](states))
 
 
 DECODER_ROWS = {  # what the file holds of each output, and the tolerance

@@ -6,22 +6,26 @@ from mmdet3d.registry import MODELS
 from mmengine.registry import init_default_scope
 
 import gsmap.registered  # noqa: F401
+from gsmap.models.heads.references import refine_reference
+from gsmap.structures.gaussians import GaussianSpace
+from gsmap.structures.grid import BEVGrid
 
 B, N, P, C = 2, 4, 3, 8
 BASELINE = {"type": "MultiPointAttention"}
 
 
-def build(num_levels=2, cross_attn=None, **layer):
+def build(num_levels=2, cross_attn=None, space=None, **layer):
     init_default_scope("mmdet3d")
     torch.manual_seed(0)
     config = {
         "type": "MGMapNetDecoder",
         "num_layers": 3,
         "embed_dims": C,
+        "num_points": P,
+        "space": space,
         "num_levels": num_levels,
         "layer": {
             "num_heads": 2,
-            "num_points": P,
             "ffn_dims": 16,
             "cross_attn": {"num_samples": 2, **(cross_attn or {})},
             **layer,
@@ -38,13 +42,17 @@ def inputs(dims=2):
     generator = torch.Generator().manual_seed(1)
     shapes = [(B, N, C), (B, N, C), (B, C, 8, 6)]
     normal = [torch.randn(*s, generator=generator, dtype=torch.float64) for s in shapes]
-    return *normal, torch.rand(B, N * P, dims, generator=generator, dtype=torch.float64)
+    return *normal, torch.rand(B, N, dims, generator=generator, dtype=torch.float64)
 
 
 def run(decoder, mask=None, num=N, dims=2, step=0.3):
     position, content, bev, reference = inputs(dims)
-    position, content, reference = position[:, :num], content[:, :num], reference[:, : num * P]
-    return decoder(content, position, reference, bev, lambda _, x: step * x[..., :dims], mask)
+    position, content, reference = (x[:, :num] for x in (position, content, reference))
+
+    def refine(_, states, reference):
+        return refine_reference(reference, step * states[..., :dims])
+
+    return decoder(content, position, reference, bev, refine, mask)
 
 
 @pytest.mark.parametrize("dims", [2, 3, 5])
@@ -60,7 +68,9 @@ def test_the_gradient_is_cut_between_layers():
     decoder = build()
     moves = torch.zeros(3, requires_grad=True)
     position, query, bev, reference = inputs()
-    out = decoder(query, position, reference, bev, lambda n, x: moves[n] + 0 * x[..., :2])
+    out = decoder(
+        query, position, reference, bev, lambda n, _, r: refine_reference(r, moves[n].expand_as(r))
+    )
     (gradient,) = torch.autograd.grad(out.references[2].sum(), moves, retain_graph=True)
     assert gradient.ne(0).tolist() == [False, False, True]
     (gradient,) = torch.autograd.grad(out.mean_locations.sum(), moves, allow_unused=True)
@@ -101,11 +111,29 @@ ROWS = {  # the poster's tables
 @pytest.mark.parametrize("row", ROWS)
 def test_every_row_of_the_tables_trains_with_all_of_its_parameters(row):
     decoder = build(**ROWS[row]).train()
-    decoder.init_weights()
     out = run(decoder)
     loss = out.instance_states.square().sum() + out.references.sum() + out.mean_locations.sum()
     loss.backward()
     assert [name for name, p in decoder.named_parameters() if p.grad is None] == []
+
+
+def test_gaussians_guide_positions_and_samples_once_they_are_not_neutral():
+    grid = BEVGrid((-15, 15), (-30, 30), 8, 6)
+    settings = {"space": GaussianSpace(grid), "reference_dims": 2}
+    guided, plain = build(**settings, guidance={}), build(reference_dims=2)
+    plain.load_state_dict({k: guided.state_dict()[k] for k in plain.state_dict()})
+    assert not torch.allclose(
+        run(guided, dims=5).mean_locations[0], run(plain, dims=5).mean_locations[0]
+    )
+    for layer in guided.layers:
+        layer.guidance.reset()
+    layer = guided.layers[0]
+    neutral = torch.rand(B, N * P, 5, dtype=torch.float64)
+    neutral[..., 2:] = 0
+    frames = layer.guidance.frames(neutral, (8, 6))
+    torch.testing.assert_close(frames, torch.eye(2, dtype=frames.dtype).expand_as(frames))
+    position = torch.randn(B, N, C, dtype=torch.float64)
+    torch.testing.assert_close(layer.guided(position, neutral), position)
 
 
 def test_without_a_position_code_every_layer_adds_the_learned_position():

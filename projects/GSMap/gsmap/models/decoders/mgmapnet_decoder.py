@@ -6,10 +6,9 @@ from typing import Any, NamedTuple
 import torch
 from mmcv.cnn.bricks.transformer import FFN
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.models.decoders.map_decoder import refine_reference
+from gsmap.models.decoders.map_decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.layers.bev_pyramid import BEVPyramid
 from gsmap.models.layers.multi_granularity import Granularities, mlp
 
@@ -32,60 +31,56 @@ class DecodedGranularities(NamedTuple):
 
 
 @MODELS.register_module()
-class MGMapNetDecoderLayer(BaseModule):
+class MGMapNetDecoderLayer(MapDecoderLayer):
     """Self-attention of the instances, attention on the BEV, and a network for each granularity.
 
     Args:
         embed_dims: Channels C.
-        num_heads: Heads of both attentions.
         num_points: Points per instance P.
         num_levels: Levels of BEV features.
-        cross_attn: Config of the attention on the BEV; it may leave out its ``type``
-            (:class:`MultiGranularityAttention`).
         ffn_dims: Hidden channels of both feed-forward networks.
         dropout: Dropout of every sublayer.
+        self_attn: Config of the instances' self-attention (`PointSelfAttention`).
+        cross_attn: Config of the attention on the BEV (`MultiGranularityAttention`).
         reference_dims: Entries of the reference that its position code reads; None for the learned
             position instead.
-        init_cfg: As in mmengine.
+        **kwargs: Further arguments of `MapDecoderLayer`.
     """
 
     def __init__(
         self,
         embed_dims: int = 256,
-        num_heads: int = 8,
         num_points: int = 20,
         num_levels: int = 2,
-        cross_attn: dict[str, Any] | None = None,
         ffn_dims: int = 512,
         dropout: float = 0.1,
+        self_attn: dict[str, Any] | None = None,
+        cross_attn: dict[str, Any] | None = None,
         reference_dims: int | None = 2,
-        init_cfg: dict | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(init_cfg)
+        sampling = {
+            "type": "MultiGranularityAttention",
+            "num_points": num_points,
+            "num_levels": num_levels,
+        }
+        super().__init__(
+            embed_dims,
+            ffn_dims=ffn_dims,
+            dropout=dropout,
+            self_attn={"num_points": 1, **(self_attn or {})},
+            cross_attn={**sampling, **(cross_attn or {})},
+            **kwargs,
+        )
         self.num_points = num_points
         self.reference_dims = reference_dims
-        self.self_attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
-        self.cross_attn = MODELS.build(
-            {
-                "type": "MultiGranularityAttention",
-                "embed_dims": embed_dims,
-                "num_heads": num_heads,
-                "num_points": num_points,
-                "num_levels": num_levels,
-                "dropout": dropout,
-                **(cross_attn or {}),
-            }
-        )
-        self.ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
-        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
-        self.dropout = nn.Dropout(dropout)
         self.point_ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
         self.point_norm = nn.LayerNorm(embed_dims)
         self.reference_code: nn.Sequential | None = None
         if reference_dims is not None:
             self.reference_code = mlp(num_points * reference_dims, embed_dims)
 
-    def forward(
+    def forward(  # type: ignore[override]
         self,
         state: Granularities,
         query_pos: Tensor,
@@ -117,72 +112,79 @@ class MGMapNetDecoderLayer(BaseModule):
         attn_mask: Tensor | None,
     ) -> Granularities:
         """Run both attentions and the instances' network; the points' own network is to come."""
-        query, key = state.instances, state.instances + query_pos
-        attended = self.self_attn(key, key, query, attn_mask=attn_mask, need_weights=False)[0]
-        query = self.norms[0](query + self.dropout(attended))
-        reference = reference.unflatten(1, (-1, self.num_points))  # (B, N, P, D)
+        attended = self.self_attn(state.instances, self.guided(query_pos, reference), attn_mask)
+        state = state._replace(instances=self.norms[0](attended))
+        by_instance = reference.unflatten(1, (-1, self.num_points))  # (B, N, P, D)
         position = query_pos
         if self.reference_code is not None:
-            position = self.reference_code(reference[..., : self.reference_dims].flatten(2))
-        state = self.cross_attn(state._replace(instances=query), position, reference, feats)
-        instances = self.norms[2](self.ffn(self.norms[1](state.instances)))
-        return state._replace(instances=instances)
+            position = self.reference_code(by_instance[..., : self.reference_dims].flatten(2))
+        frames = None
+        if self.guidance is not None:  # levels halve both sides, so one frame serves all
+            frames = self.guidance.frames(reference, (feats[0].shape[-2], feats[0].shape[-1]))
+        position = self.guided(position, reference)
+        state = self.cross_attn(state, position, by_instance, feats, frames)
+        return state._replace(instances=self.norms[2](self.ffn(self.norms[1](state.instances))))
+
+    def guided(self, position: Tensor, reference: Tensor) -> Tensor:
+        """Add the mean of what the guidance adds to the position of each point. (B, N, C)"""
+        if self.guidance is None:
+            return position
+        by_point = position.repeat_interleave(self.num_points, 1)  # (B, N * P, C)
+        by_point = self.guidance.position(by_point, reference)
+        return by_point.unflatten(1, (-1, self.num_points)).mean(2)
 
 
 @MODELS.register_module()
-class MGMapNetDecoder(BaseModule):
+class MGMapNetDecoder(MapDecoder):
     """A stack of layers with instance and point queries that refine one reference (MGMapNet).
 
     Args:
-        layer: Config of the layer; it may leave out its ``type`` (:class:`MGMapNetDecoderLayer`).
-            Its ``reference_dims`` holds from the second layer on: the first has no reference that
-            the points made.
+        layer: Config of the layer (`MGMapNetDecoderLayer`). Its ``reference_dims`` holds from the
+            second layer on: before that no point has moved.
         num_layers: Number of layers L.
         embed_dims: Channels C.
+        num_points: Points per instance P.
         num_levels: Levels of BEV features.
-        init_cfg: As in mmengine.
+        **kwargs: Further arguments of `MapDecoder`.
     """
+
+    fields = ("mean_locations",)
 
     def __init__(
         self,
         layer: dict[str, Any] | None = None,
         num_layers: int = 6,
         embed_dims: int = 256,
+        num_points: int = 20,
         num_levels: int = 2,
-        init_cfg: dict | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(init_cfg)
-        layer = {
-            "type": "MGMapNetDecoderLayer",
-            "embed_dims": embed_dims,
-            "num_levels": num_levels,
-            **(layer or {}),
-        }
+        shared = {"embed_dims": embed_dims, "num_points": num_points, "num_levels": num_levels}
+        layer = {"type": "MGMapNetDecoderLayer", **(layer or {})}
+        super().__init__(layer, num_layers, **shared, **kwargs)
+        self.num_points = num_points
         # Differs from the poster: the released model's first layer adds the learned position.
-        first = {**layer, "reference_dims": None}
+        self.layers[0].reference_code = None
         self.bev_pyramid = BEVPyramid(embed_dims, num_levels)
-        self.layers = nn.ModuleList(
-            MODELS.build(layer if number else first) for number in range(num_layers)
-        )
 
-    def forward(
+    def forward(  # type: ignore[override]
         self,
         query: Tensor,
         query_pos: Tensor,
         reference: Tensor,
         bev_feats: Tensor,
-        predict_offsets: Callable[[int, Tensor], Tensor],
+        refine: Callable[[int, Tensor, Tensor], Tensor],
         attn_mask: Tensor | None = None,
     ) -> DecodedGranularities:
-        """Run all layers, each on the reference that the one before refined, the gradient cut.
+        """Run all layers, each on the reference that the one before refined.
 
         Args:
             query: Content of the instance queries. (B, N, C)
             query_pos: Their learned position. (B, N, C)
-            reference: Initial references of the points. (B, N * P, D)
+            reference: Initial reference of each instance, which its points share. (B, N, D)
             bev_feats: BEV features. (B, C, H, W)
-            predict_offsets: Maps a layer's number and its point states (B, N * P, C) to offsets
-                (B, N * P, D).
+            refine: Maps a layer's number, its point states (B, N * P, C) and a reference (B, N * P,
+                D) to the refined one.
             attn_mask: True where an instance may not attend to another, or None. (N, N)
 
         Returns:
@@ -190,11 +192,13 @@ class MGMapNetDecoder(BaseModule):
         """
         feats = self.bev_pyramid(bev_feats)
         state = Granularities(query)
+        reference = reference.repeat_interleave(self.num_points, 1)  # (B, N * P, D)
         outputs = []
         for number, layer in enumerate(self.layers):
             state = layer(state, query_pos, reference, feats, attn_mask)
             points = state.points.flatten(1, 2)  # (B, N * P, C)
-            refined = refine_reference(reference, predict_offsets(number, points))
-            outputs.append((state.instances, points, refined, state.mean_locations))
-            reference = refined.detach()
+            reference = refine(number, points, reference)
+            outputs.append((state.instances, points, reference, state.mean_locations))
+            if self.detach_reference:
+                reference = reference.detach()
         return DecodedGranularities(*(torch.stack(part) for part in zip(*outputs, strict=True)))

@@ -14,6 +14,7 @@ from gsmap.models.layers.deformable_attention import (
     at_least_float32,
     deformable_sample,
     directional_offsets,
+    place_samples,
 )
 
 
@@ -83,7 +84,13 @@ class PerPointSampling(SamplingAttention):
         levels, points, samples = self.layout
         return directional_offsets(self.num_heads, samples).repeat(1, levels * points, 1)
 
-    def look(self, query: Tensor, reference: Tensor, feats: Sequence[Tensor]) -> Samples:
+    def look(
+        self,
+        query: Tensor,
+        reference: Tensor,
+        feats: Sequence[Tensor],
+        frames: Tensor | None = None,
+    ) -> Samples:
         """Place and weigh the samples.
 
         Args:
@@ -91,6 +98,7 @@ class PerPointSampling(SamplingAttention):
             reference: References of the points; the first two entries are the point, [0, 1] over
                 the map. (B, N, P, D)
             feats: BEV features, finest level first. levels x (B, C, H, W)
+            frames: What turns the sampling offsets of each point, or None. (B, N * P, 2, 2)
 
         Returns:
             Locations and weights of all samples.
@@ -107,7 +115,7 @@ class PerPointSampling(SamplingAttention):
         offsets = self.offsets_in_cells(query).unflatten(-2, self.layout)
         offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6).flatten(2, 3)  # (levels, B, N P, heads, K,2)
         locations = [
-            self.place(by_level, reference.flatten(1, 2), map_size(feat))
+            place_samples(by_level, reference.flatten(1, 2), map_size(feat), frames)
             for by_level, feat in zip(offsets, feats, strict=True)
         ]
         logits = at_least_float32(self.attention_weights(query))
@@ -139,7 +147,12 @@ class MultiPointAttention(PerPointSampling):
         self.point_proj = nn.Linear(embed_dims, self.layout[1] * embed_dims)
 
     def forward(
-        self, state: Granularities, position: Tensor, reference: Tensor, feats: Sequence[Tensor]
+        self,
+        state: Granularities,
+        position: Tensor,
+        reference: Tensor,
+        feats: Sequence[Tensor],
+        frames: Tensor | None = None,
     ) -> Granularities:
         """Update the queries from the BEV.
 
@@ -149,11 +162,12 @@ class MultiPointAttention(PerPointSampling):
             reference: References of the points; the first two entries are the point, [0, 1] over
                 the map. (B, N, P, D)
             feats: BEV features, finest level first. levels x (B, C, H, W)
+            frames: What turns the sampling offsets of each point, or None. (B, N * P, 2, 2)
 
         Returns:
             Updated queries, the instances' residual included.
         """
-        samples = self.look(state.instances + position, reference, feats)
+        samples = self.look(state.instances + position, reference, feats, frames)
         seen = [
             deformable_sample(
                 self.values(level_feats),
@@ -209,7 +223,12 @@ class MultiGranularityAttention(PerPointSampling):
         self.instance_mlp = mlp(points * embed_dims, embed_dims)
 
     def forward(
-        self, state: Granularities, position: Tensor, reference: Tensor, feats: Sequence[Tensor]
+        self,
+        state: Granularities,
+        position: Tensor,
+        reference: Tensor,
+        feats: Sequence[Tensor],
+        frames: Tensor | None = None,
     ) -> Granularities:
         """Update the queries from the BEV.
 
@@ -219,11 +238,12 @@ class MultiGranularityAttention(PerPointSampling):
             reference: References of the points; the first two entries are the point, [0, 1] over
                 the map. (B, N, P, D)
             feats: BEV features, finest level first. levels x (B, C, H, W)
+            frames: What turns the sampling offsets of each point, or None. (B, N * P, 2, 2)
 
         Returns:
             Updated queries, residuals included.
         """
-        samples = self.look(state.instances + position, reference, feats)
+        samples = self.look(state.instances + position, reference, feats, frames)
         instances, points = self.aggregate(feats, samples)
         point_code, instance_code = self.codes(samples)
         points = self.interact_points(points, point_code, state)
