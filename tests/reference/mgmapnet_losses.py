@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import torch
 
-from gsmap.models.losses.point import points_l1_loss
+from gsmap.models.losses.point import SamplingLocationLoss
 from gsmap.models.losses.segmentation import class_mask_losses, instance_mask_losses, pair_masks
 from reference.golden import Golden
 from reference.mgmapnet import BEV, B, GoldenParts
@@ -13,7 +13,7 @@ from reference.registry import check
 from reference.report import Row, largest_relative, relative_norm
 
 LOW_M, SIZE_M = torch.tensor([-15.0, -30.0]), torch.tensor([30.0, 60.0])
-POINT_WEIGHT, MASK_WEIGHT = 5.0, 3.0
+MASK_WEIGHT = 3.0
 LOSS, LOSS_GRAD = 1e-4, 1e-3
 
 
@@ -40,8 +40,7 @@ def mean_location_rows(name: str, data: Mapping[str, np.ndarray], group: str) ->
             pred.append(by_layer[sample, query])
             target.append((shifts[gt, order] - LOW_M) / SIZE_M)
         matched = torch.cat(pred)
-        loss = points_l1_loss(matched, torch.cat(target), len(matched))
-        losses.append(POINT_WEIGHT * loss)
+        losses.append(SamplingLocationLoss()(matched, torch.cat(target), len(matched)))
     torch.stack(losses).sum().backward()
     off = largest_relative([loss.item() for loss in losses], data[f"{group}_loss_MGA_ref"])
     yield Row(name, f"{group}: mean locations (relative)", off, LOSS)

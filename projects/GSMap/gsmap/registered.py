@@ -37,7 +37,7 @@ import gsmap.visualization.map_visualizer  # noqa: F401
 from gsmap.models.losses.dice import RenderedDiceLoss
 from gsmap.models.losses.direction import DirectionLoss
 from gsmap.models.losses.geometry import EuclideanLoss
-from gsmap.models.losses.point import PointsLoss
+from gsmap.models.losses.point import PointsLoss, SamplingLocationLoss
 from gsmap.models.losses.raster import MaskOverlapLoss, RasterLoss
 
 LOSSES = (
@@ -47,6 +47,7 @@ LOSSES = (
     PointsLoss,
     RasterLoss,
     RenderedDiceLoss,
+    SamplingLocationLoss,
 )
 # The losses are plain torch modules, usable without OpenMMLab; they enter the registry here.
 for loss in LOSSES:

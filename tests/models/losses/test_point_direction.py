@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsmap.models.losses.direction import direction_loss, self_direction_loss
-from gsmap.models.losses.point import points_l1_loss
+from gsmap.models.losses.point import SamplingLocationLoss, points_l1_loss
 
 
 def test_points_loss_by_hand():
@@ -90,3 +90,10 @@ def test_other_shapes_are_refused(loss):
         loss(torch.rand(2, 4, 2), torch.rand(1, 4, 2), 1.0)
     with pytest.raises(ValueError, match=r"interval must be in \[1, 4\), got 4"):
         direction_loss(torch.rand(2, 4, 2), torch.rand(2, 4, 2), 1.0, interval=4)
+
+
+def test_mean_sampling_locations_are_compared_in_the_plane():
+    locations = torch.tensor([[[0.5, 0.25], [1.5, 0.0]]])
+    points = torch.tensor([[[0.0, 0.25, 9.0], [1.0, 1.0, 9.0]]])
+    loss = SamplingLocationLoss(loss_weight=2.0)(locations, points, avg_factor=4.0)
+    assert loss.item() == pytest.approx(2 * (0.5 + 0.5 + 1.0) / 4)

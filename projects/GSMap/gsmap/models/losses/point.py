@@ -41,3 +41,18 @@ class PointsLoss(nn.Module):
     def forward(self, preds: Tensor, targets: Tensor, avg_factor: float | Tensor) -> Tensor:
         """Return the weighted loss of normalised points. 2 x (M, P, 2) -> ()"""
         return self.loss_weight * points_l1_loss(preds, targets, avg_factor)
+
+
+class SamplingLocationLoss(PointsLoss):
+    """L1 loss of each point's mean sampling location, against the point itself (MGMapNet).
+
+    Args:
+        loss_weight: Weight of the loss.
+    """
+
+    name = "mean_loc"
+    reads = ("pred.mean_locations", "gt.pts")
+
+    def forward(self, preds: Tensor, targets: Tensor, avg_factor: float | Tensor) -> Tensor:
+        """Return the weighted loss in the plane. (M, P, 2), (M, P, 2 or 3) -> ()"""
+        return super().forward(preds, targets[..., :2], avg_factor)
