@@ -159,9 +159,14 @@ class MGMapNetDecoder(MapDecoder):
         num_levels: int = 2,
         **kwargs: Any,
     ) -> None:
-        shared = {"embed_dims": embed_dims, "num_points": num_points, "num_levels": num_levels}
-        layer = {"type": "MGMapNetDecoderLayer", **(layer or {})}
-        super().__init__(layer, num_layers, **shared, **kwargs)
+        super().__init__(
+            {"type": "MGMapNetDecoderLayer", **(layer or {})},
+            num_layers,
+            embed_dims=embed_dims,
+            num_points=num_points,
+            num_levels=num_levels,
+            **kwargs,
+        )
         self.num_points = num_points
         # Differs from the poster: the released model's first layer adds the learned position.
         self.layers[0].reference_code = None
