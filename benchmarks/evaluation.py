@@ -160,19 +160,22 @@ def _reference_table(frames: list[Record], count: int) -> str:
     """Compare the reference's way with ours on a few samples, in this process, loading apart."""
     from benchmarks import reference_evaluation as reference
     from gsmap.evaluation.chamfer_ap import ChamferConfig
-    from gsmap.evaluation.elements import map_elements
     from gsmap.evaluation.evaluator import EvaluationConfig, MapEvaluator, flat_metrics
     from gsmap.evaluation.raster_ap import RasterConfig
+    from gsmap.structures.elements import MapElements
 
     samples = []
     for k in range(count):
         frame = frames[k % len(frames)]
         pred, gt = frame["pred"], frame["gt"]
-        predictions = map_elements(
+        predictions = MapElements.from_polylines(
             [e["pts"] for e in pred], [e["label"] for e in pred], [e["score"] for e in pred]
         )
         samples.append(
-            (predictions, map_elements([e["pts"] for e in gt], [e["label"] for e in gt]))
+            (
+                predictions,
+                MapElements.from_polylines([e["pts"] for e in gt], [e["label"] for e in gt]),
+            )
         )
     chamfer, raster = ChamferConfig(CLASSES), RasterConfig(CLASSES)
     rows = []

@@ -16,8 +16,8 @@ from scipy.ndimage import grey_dilation
 from scipy.spatial.distance import cdist
 
 from gsmap.evaluation.average_precision import area_ap, interpolated_ap
-from gsmap.evaluation.elements import MapElements
 from gsmap.evaluation.raster_ap import RasterConfig, pixels_from_metres
+from gsmap.structures.elements import MapElements
 
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth
 
@@ -55,8 +55,8 @@ def _chamfer_hits(pred: list[np.ndarray], gt: list[np.ndarray], threshold: float
 
 
 def _ranked(elements: MapElements, label: int, minimum: float = 0.0) -> np.ndarray:
-    rows = np.flatnonzero((elements.labels == label) & (elements.scores >= minimum))
-    ranked: np.ndarray = rows[np.argsort(-elements.scores[rows], kind="stable")]
+    rows = np.flatnonzero((elements.labels == label) & (elements.confidence >= minimum))
+    ranked: np.ndarray = rows[np.argsort(-elements.confidence[rows], kind="stable")]
     return ranked
 
 
@@ -75,14 +75,16 @@ def chamfer_map(
         rows = [_ranked(pred, label) for pred, _ in frames]
         truths = [np.flatnonzero(gt.labels == label) for _, gt in frames]
         preds = [
-            [_resampled(pred.polyline(i)) for i in r]
+            [_resampled(pred.polylines[i]) for i in r]
             for (pred, _), r in zip(frames, rows, strict=True)
         ]
         gts = [
-            [_resampled(gt.polyline(k)) for k in t]
+            [_resampled(gt.polylines[k]) for k in t]
             for (_, gt), t in zip(frames, truths, strict=True)
         ]
-        scores = np.concatenate([pred.scores[r] for (pred, _), r in zip(frames, rows, strict=True)])
+        scores = np.concatenate(
+            [pred.confidence[r] for (pred, _), r in zip(frames, rows, strict=True)]
+        )
         order = np.argsort(-scores, kind="stable")
         for threshold in thresholds:
             found = [_chamfer_hits(p, g, threshold) for p, g in zip(preds, gts, strict=True)]
@@ -95,7 +97,7 @@ def _codes(elements: MapElements, rows: np.ndarray, polygon: bool, config: Raste
     codes = []
     for i in rows:
         canvas = np.zeros((config.height, config.width), np.uint8)
-        points = pixels_from_metres(elements.polyline(i), config).astype(np.int32)
+        points = pixels_from_metres(elements.polylines[i], config).astype(np.int32)
         if polygon:
             cv2.fillPoly(canvas, [points], (1,))
         else:
@@ -135,7 +137,7 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig) -> float:
             num_gts += len(truths)
             codes = _codes(pred, rows, polygon, config), _codes(gt, truths, polygon, config)
             found = run_length.iou(*codes, [0] * len(truths))
-            scores.append(pred.scores[rows])
+            scores.append(pred.confidence[rows])
             ious.append(np.asarray(found).reshape(len(rows), len(truths)))
         order = np.argsort(-np.concatenate(scores), kind="stable")
         for threshold in config.thresholds_of(label):

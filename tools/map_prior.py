@@ -12,7 +12,6 @@ from pathlib import Path
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.elements import MapElements
 from gsmap.evaluation.evaluator import (
     METRIC_NAMES,
     EvaluationConfig,
@@ -23,6 +22,7 @@ from gsmap.evaluation.file_evaluation import ArrowElements
 from gsmap.evaluation.prior import PriorConfig, fit_prior
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import MetricReport, format_table
+from gsmap.structures.elements import MapElements
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -83,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.out:
         elements = [
             {
-                "pts": prior.polyline(i).tolist(),
+                "pts": prior.polylines[i].tolist(),
                 "cls_name": meta.classes[prior.labels[i]],
                 "confidence_level": float(prior.scores[i]),
             }

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.elements import MapElements, map_elements
 from gsmap.evaluation.evaluator import EvaluationConfig
 from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing", "boundary")
 CONFIG = EvaluationConfig(ChamferConfig(CLASSES), RasterConfig(CLASSES))
@@ -20,13 +20,13 @@ def read(path: Path) -> Any:
 
 def frame_of(record: dict[str, Any]) -> Frame:
     pred, gt = record["pred"], record["gt"]
-    predictions = map_elements(
+    predictions = MapElements.from_polylines(
         [p["pts"] for p in pred], [p["label"] for p in pred], [p["score"] for p in pred]
     )
     return (
         record["token"],
         predictions,
-        map_elements([g["pts"] for g in gt], [g["label"] for g in gt]),
+        MapElements.from_polylines([g["pts"] for g in gt], [g["label"] for g in gt]),
     )
 
 

@@ -9,7 +9,7 @@ from gsmap.evaluation.chamfer_ap import (
     nearest_by_chamfer,
     resample_polylines,
 )
-from gsmap.evaluation.elements import map_elements
+from gsmap.structures.elements import MapElements
 
 CONFIG = ChamferConfig(("divider", "boundary"))
 
@@ -29,13 +29,15 @@ def test_resampling_walks_equal_arc_lengths_round_a_corner():
         o          (0,1)
         o          (0,0)
     """
-    elements = map_elements([[[0, 0], [0, 3], [2, 3]]], [0])
+    elements = MapElements.from_polylines([[[0, 0], [0, 3], [2, 3]]], [0])
     want = [[0, 0], [0, 1], [0, 2], [0, 3], [1, 3], [2, 3]]
     np.testing.assert_allclose(resample_polylines(elements, 6)[0], want, atol=1e-12)
 
 
 def test_resampling_of_repeated_points_zero_length_and_no_points():
-    elements = map_elements([[[0, 0], [0, 0], [4, 0], [4, 0]], [[1, 2], [1, 2]], []], [0, 0, 0])
+    elements = MapElements.from_polylines(
+        [[[0, 0], [0, 0], [4, 0], [4, 0]], [[1, 2], [1, 2]], []], [0, 0, 0]
+    )
     points = resample_polylines(elements, 3)
     assert points.tolist() == [[[0, 0], [2, 0], [4, 0]], [[1, 2]] * 3, [[0, 0]] * 3]
 
@@ -63,8 +65,10 @@ def test_hand_worked_ap():
                    AP = 1
         boundary has no ground truth and counts as 0 in the mean over classes.
     """
-    gt = map_elements([upright(0.0), upright(8.0)], [0, 0])
-    pred = map_elements([upright(14.0), upright(0.3), upright(8.7)], [0] * 3, [0.7, 0.9, 0.8])
+    gt = MapElements.from_polylines([upright(0.0), upright(8.0)], [0, 0])
+    pred = MapElements.from_polylines(
+        [upright(14.0), upright(0.3), upright(8.7)], [0] * 3, [0.7, 0.9, 0.8]
+    )
     matches = match_chamfer(pred, gt, CONFIG, "a")
     assert matches.pred_index.tolist() == [1, 2, 0]
     assert matches.matched_gt.tolist() == [[0, 0, 0], [-1, 1, 1], [-1, -1, -1]]
@@ -84,29 +88,31 @@ def test_precision_envelope_lifts_an_early_miss():
 
     AP = 1/2 * 2/3 + 1/2 * 2/3.
     """
-    gt = map_elements([upright(0.0), upright(8.0)], [0, 0])
-    pred = map_elements([upright(4.0), upright(0.0), upright(8.0)], [0] * 3, [0.9, 0.8, 0.7])
+    gt = MapElements.from_polylines([upright(0.0), upright(8.0)], [0, 0])
+    pred = MapElements.from_polylines(
+        [upright(4.0), upright(0.0), upright(8.0)], [0] * 3, [0.9, 0.8, 0.7]
+    )
     metrics = chamfer_report([match_chamfer(pred, gt, CONFIG)], CONFIG).metrics
     assert metrics["chamfer/divider/AP@0.5"] == pytest.approx(2 / 3)
 
 
 def test_no_second_choice():
     """Both predictions are nearest to the left line; the second does not get the right one."""
-    gt = map_elements([upright(0.0), upright(1.0)], [0, 0])
-    pred = map_elements([upright(0.1), upright(0.2)], [0, 0], [0.9, 0.8])
+    gt = MapElements.from_polylines([upright(0.0), upright(1.0)], [0, 0])
+    pred = MapElements.from_polylines([upright(0.1), upright(0.2)], [0, 0], [0.9, 0.8])
     assert match_chamfer(pred, gt, CONFIG).matched_gt[:, 2].tolist() == [0, -1]
 
 
 def test_threshold_is_inclusive_and_classes_do_not_mix():
-    gt = map_elements([upright(0.0), upright(0.5)], [0, 1])
-    pred = map_elements([upright(0.5)], [0], [0.9])
+    gt = MapElements.from_polylines([upright(0.0), upright(0.5)], [0, 1])
+    pred = MapElements.from_polylines([upright(0.5)], [0], [0.9])
     assert match_chamfer(pred, gt, CONFIG).matched_gt.tolist() == [[0, 0, 0]]
 
 
 def test_error_of_a_match_that_exists_at_the_tight_threshold_only():
     """At 1.5 m the first prediction, 1.2 m away, has the line; at 0.5 m the second, 0.1 m away."""
-    gt = map_elements([upright(0.0)], [0])
-    pred = map_elements([upright(1.2), upright(0.1)], [0, 0], [0.9, 0.8])
+    gt = MapElements.from_polylines([upright(0.0)], [0])
+    pred = MapElements.from_polylines([upright(1.2), upright(0.1)], [0, 0], [0.9, 0.8])
     matches = match_chamfer(pred, gt, CONFIG)
     assert matches.matched_gt.tolist() == [[-1, -1, 0], [0, 0, -1]]
     metrics = chamfer_report([matches], CONFIG).metrics
@@ -116,8 +122,10 @@ def test_error_of_a_match_that_exists_at_the_tight_threshold_only():
 
 def test_unknown_classes_and_short_lines():
     """Label 7 is nobody's; a prediction of one point is dropped, such a ground truth counts."""
-    gt = map_elements([upright(0.0), [[1, 1]], upright(3.0)], [0, 0, 7])
-    pred = map_elements([[[0, 0]], upright(0.0), upright(3.0)], [0, 0, 7], [0.9, 0.8, 0.7])
+    gt = MapElements.from_polylines([upright(0.0), [[1, 1]], upright(3.0)], [0, 0, 7])
+    pred = MapElements.from_polylines(
+        [[[0, 0]], upright(0.0), upright(3.0)], [0, 0, 7], [0.9, 0.8, 0.7]
+    )
     matches = match_chamfer(pred, gt, CONFIG)
     assert matches.pred_index.tolist() == [1]
     assert matches.num_gts.tolist() == [2, 0]
@@ -125,8 +133,8 @@ def test_unknown_classes_and_short_lines():
 
 def test_equal_scores_keep_their_order():
     """At 0.5 m the first of two equal scores misses: precision 0, 1/2."""
-    gt = map_elements([upright(0.0)], [0])
-    pred = map_elements([upright(0.9), upright(0.1)], [0, 0], [0.5, 0.5])
+    gt = MapElements.from_polylines([upright(0.0)], [0])
+    pred = MapElements.from_polylines([upright(0.9), upright(0.1)], [0, 0], [0.5, 0.5])
     metrics = chamfer_report([match_chamfer(pred, gt, CONFIG)], CONFIG).metrics
     assert metrics["chamfer/divider/AP@0.5"] == 0.5
     assert metrics["chamfer/divider/AP@1.0"] == 1.0  # the first takes the line, the second misses
@@ -135,7 +143,10 @@ def test_equal_scores_keep_their_order():
 def test_branch_and_bound_finds_what_brute_force_finds():
     rng = np.random.default_rng(3)
     walks = np.cumsum(rng.normal(size=(40, 12, 2)), axis=1) + rng.uniform(-15, 15, (40, 1, 2))
-    pred, gt = map_elements(list(walks[:20]), [0] * 20), map_elements(list(walks[20:]), [0] * 20)
+    pred, gt = (
+        MapElements.from_polylines(list(walks[:20]), [0] * 20),
+        MapElements.from_polylines(list(walks[20:]), [0] * 20),
+    )
     best, distance = nearest_by_chamfer(pred, gt, CONFIG, max_distance=6.0)
     p, g = resample_polylines(pred, 100), resample_polylines(gt, 100)
     for i in range(20):

@@ -19,16 +19,15 @@ from gsmap.datasets.annotations.file import (
     MapSample,
     write_annotations,
 )
-from gsmap.evaluation.elements import map_elements
 from gsmap.evaluation.file_evaluation import ArrowElements, JsonElements, evaluate_files
 from gsmap.evaluation.json_index import JsonSamples
 from gsmap.evaluation.results_json import (
     elements_from_vectors,
-    gaussian_extras,
     vectors_of,
     write_results,
 )
 from gsmap.evaluation.worker_pool import map_unordered, run_apart
+from gsmap.structures.elements import MapElements
 
 REPO = Path(__file__).resolve().parents[2]
 LABELS = {name: i for i, name in enumerate(CLASSES)}
@@ -242,14 +241,14 @@ def test_fast_and_plain_parsers_agree(files):
 
 
 def test_written_predictions_read_back(tmp_path):
-    elements = map_elements([LINE, RING], [0, 1], [0.25, 0.1 + 0.2])
-    extras = gaussian_extras(np.ones((2, 3, 2)), np.zeros((2, 3)))
-    vectors = vectors_of(elements, CLASSES, extras)
+    gaussians = [np.ones((n, 2)) for n in (2, 4)], [np.zeros(n) for n in (2, 4)]
+    elements = MapElements.from_polylines([LINE, RING], [0, 1], [0.25, 0.1 + 0.2], *gaussians)
+    vectors = vectors_of(elements, CLASSES)
     path = tmp_path / "new" / "out.json"
     write_results(path, [("a", vectors)])
     back = JsonSamples(path, "results").vectors(0)
     assert back[1]["confidence_level"] == 0.1 + 0.2
-    assert back[1]["gaussian_scales"] == [[1.0, 1.0]] * 3
+    assert back[1]["gaussian_scales"] == [[1.0, 1.0]] * 4
     assert back[0]["pts"] == LINE
     assert list(path.parent.iterdir()) == [path]
 

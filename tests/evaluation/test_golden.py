@@ -12,10 +12,10 @@ from gsmap.evaluation.chamfer_ap import (
     match_chamfer,
     nearest_by_chamfer,
 )
-from gsmap.evaluation.elements import map_elements
 from gsmap.evaluation.evaluator import MapEvaluator, flat_metrics
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, rasterize
 from gsmap.evaluation.raster_kernels import mask_ious
+from gsmap.structures.elements import MapElements
 
 AP_TOLERANCE = 1e-6  # the reference computes precision and recall of AP_chamfer in float32
 STORED = 1e-9  # distances and IoUs are stored with nine decimals
@@ -188,8 +188,8 @@ def test_order_of_samples_and_repetition_change_no_digit(frames, metrics) -> Non
 
 def test_a_line_that_touches_no_strip_is_never_matched() -> None:
     """Two short collinear pieces end to end: 1 m apart on average, but their strips only abut."""
-    pred = map_elements([[[0.0, 1.2], [0.0, 2.0]]], [0], [0.9])
-    gt = map_elements([[[0.0, 0.0], [0.0, 1.0]]], [0])
+    pred = MapElements.from_polylines([[[0.0, 1.2], [0.0, 2.0]]], [0], [0.9])
+    gt = MapElements.from_polylines([[[0.0, 0.0], [0.0, 1.0]]], [0])
     best, distance = nearest_by_chamfer(pred, gt, ChamferConfig(CLASSES))
     assert best.tolist() == [-1]
     assert np.isinf(distance[0])

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
-from gsmap.evaluation.elements import map_elements
 from gsmap.evaluation.prior import PriorConfig, fit_prior
+from gsmap.structures.elements import MapElements
 
 CHAMFER = ChamferConfig(("divider", "ped_crossing"))
 RING = np.array([[3.0, 3], [7, 3], [7, 6], [3, 6], [3, 3]])
@@ -20,7 +20,7 @@ def score(prior, truth) -> dict[str, float]:
 
 
 def test_the_same_map_everywhere_is_found_exactly():
-    truth = [map_elements([line(0.0), line(5.0), RING], [0, 0, 1])] * 6
+    truth = [MapElements.from_polylines([line(0.0), line(5.0), RING], [0, 0, 1])] * 6
     prior = fit_prior(truth, CHAMFER)
     assert len(prior) == 3
     assert score(prior, truth)["chamfer/mAP"] == 1.0
@@ -29,10 +29,11 @@ def test_the_same_map_everywhere_is_found_exactly():
 def test_scores_order_elements_by_how_often_they_are_right():
     """The line at 0 is there always, the one at 6 in two of four samples."""
     truth = [
-        map_elements([line(0.0), line(6.0)][: 1 + i % 2], [0, 0][: 1 + i % 2]) for i in range(4)
+        MapElements.from_polylines([line(0.0), line(6.0)][: 1 + i % 2], [0, 0][: 1 + i % 2])
+        for i in range(4)
     ]
     prior = fit_prior(truth, CHAMFER)
-    x = [round(float(prior.polyline(i)[0, 0]), 6) for i in range(len(prior))]
+    x = [round(float(prior.polylines[i][0, 0]), 6) for i in range(len(prior))]
     assert x == [0.0, 6.0]
     assert prior.scores[0] == pytest.approx(1.0)
     assert prior.scores[1] == pytest.approx(0.05 + 0.95 * 0.5)
@@ -44,11 +45,11 @@ def test_scores_order_elements_by_how_often_they_are_right():
 def test_refinement_moves_an_element_to_the_middle_of_what_it_matches():
     """Lines within +-0.9 m, every second one turned: only the middle is within 1.0 m of all."""
     truth = [
-        map_elements([line(x)[::-1] if i % 2 else line(x)], [0])
+        MapElements.from_polylines([line(x)[::-1] if i % 2 else line(x)], [0])
         for i, x in enumerate(np.linspace(-0.9, 0.9, 7))
     ]
     prior = fit_prior(truth, CHAMFER, PriorConfig(max_elements=1, max_candidates=1, seed=1))
-    assert abs(prior.polyline(0)[:, 0]).max() < 0.4
+    assert abs(prior.polylines[0][:, 0]).max() < 0.4
     assert score(prior, truth)["chamfer/divider/AP@1.0"] == 1.0
 
 
@@ -57,14 +58,17 @@ def test_rings_that_start_elsewhere_are_averaged_as_rings():
         np.concatenate([np.roll(RING[:-1], k, axis=0), np.roll(RING[:-1], k, axis=0)[:1]])
         for k in range(4)
     ]
-    truth = [map_elements([ring + 0.1 * i], [1]) for i, ring in enumerate(rings)]
+    truth = [MapElements.from_polylines([ring + 0.1 * i], [1]) for i, ring in enumerate(rings)]
     prior = fit_prior(truth, CHAMFER, PriorConfig(max_elements=1))
     assert score(prior, truth)["chamfer/ped_crossing/AP"] == 1.0
 
 
 def test_the_number_of_elements_is_limited_and_fitting_is_deterministic():
     rng = np.random.default_rng(0)
-    truth = [map_elements([line(x) for x in rng.uniform(-15, 15, 6)], [0] * 6) for _ in range(20)]
+    truth = [
+        MapElements.from_polylines([line(x) for x in rng.uniform(-15, 15, 6)], [0] * 6)
+        for _ in range(20)
+    ]
     config = PriorConfig(max_elements=5, max_candidates=30)
     first, second = fit_prior(truth, CHAMFER, config), fit_prior(truth, CHAMFER, config)
     assert len(first) == 5
@@ -77,4 +81,4 @@ def test_the_number_of_elements_is_limited_and_fitting_is_deterministic():
 
 def test_no_ground_truth_is_an_error():
     with pytest.raises(ValueError, match="no ground truth"):
-        fit_prior([map_elements([], [])], CHAMFER)
+        fit_prior([MapElements.from_polylines([], [])], CHAMFER)

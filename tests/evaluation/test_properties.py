@@ -5,9 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.elements import MapElements, map_elements
 from gsmap.evaluation.evaluator import EvaluationConfig, MapEvaluator, flat_metrics
 from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing")
 CONFIG = EvaluationConfig(ChamferConfig(CLASSES), RasterConfig(CLASSES))
@@ -39,11 +39,11 @@ def maps(draw: st.DrawFn) -> MapElements:
             x = np.sort(rng.uniform(-14, 14, 6))
             lines.append(np.stack([x + np.arange(6), y + rng.uniform(0, 6, 6)], axis=1))
         labels.append(label)
-    return map_elements(lines, labels, np.round(rng.permutation(count) / 10 + 0.3, 3))
+    return MapElements.from_polylines(lines, labels, np.round(rng.permutation(count) / 10 + 0.3, 3))
 
 
 def lines_of(elements: MapElements) -> list[np.ndarray]:
-    return [elements.polyline(i) for i in range(len(elements))]
+    return [elements.polylines[i] for i in range(len(elements))]
 
 
 @given(gt=maps())
@@ -58,7 +58,9 @@ def test_ground_truth_as_prediction_gives_one(gt):
 @given(gt=maps())
 @settings(max_examples=20, deadline=None)
 def test_moved_by_a_hundred_metres_gives_zero(gt):
-    moved = map_elements([p + np.array([100.0, 0.0]) for p in lines_of(gt)], gt.labels, gt.scores)
+    moved = MapElements.from_polylines(
+        [p + np.array([100.0, 0.0]) for p in lines_of(gt)], gt.labels, gt.scores
+    )
     metrics = score([(moved, gt)])
     assert all(metrics[key] in (0.0, -1.0) for key in AP_KEYS)
     assert metrics["chamfer/mAP"] == 0.0
@@ -70,7 +72,7 @@ def test_reversing_lines_and_rings_changes_nothing(pred, gt, turn):
     flip = np.random.default_rng(turn).integers(2, size=len(pred)).astype(bool)
     lines = [p[::-1] if f else p for p, f in zip(lines_of(pred), flip, strict=True)]
     before = score([(pred, gt)])
-    after = score([(map_elements(lines, pred.labels, pred.scores), gt)])
+    after = score([(MapElements.from_polylines(lines, pred.labels, pred.scores), gt)])
     for key, value in before.items():
         assert abs(after[key] - value) < 1e-9, key
 
@@ -80,7 +82,9 @@ def test_reversing_lines_and_rings_changes_nothing(pred, gt, turn):
 def test_a_miss_below_all_scores_never_raises_ap(pred, gt, label):
     far = [[90.0, 0.0], [95.0, 5.0], [90.0, 5.0]]
     scores = np.append(pred.scores, 0.1)
-    more = map_elements([*lines_of(pred), np.array(far)], np.append(pred.labels, label), scores)
+    more = MapElements.from_polylines(
+        [*lines_of(pred), np.array(far)], np.append(pred.labels, label), scores
+    )
     before, after = score([(pred, gt)]), score([(more, gt)])
     assert all(after[key] <= before[key] + 1e-12 for key in AP_KEYS)
 

@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gsmap.evaluation.elements import map_elements
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report, rasterize
+from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing")
 CONFIG = RasterConfig(CLASSES)
@@ -19,7 +19,9 @@ def rows(mask: np.ndarray) -> list[str]:
 
 def test_line_and_polygon_by_hand():
     """A line is one pixel thick, a polygon includes its outline; row 0 is the smallest y."""
-    elements = map_elements([[[1, 0], [4, 3]], [[6, 1], [9, 1], [9, 3], [6, 3]]], [0, 1])
+    elements = MapElements.from_polylines(
+        [[[1, 0], [4, 3]], [[6, 1], [9, 1], [9, 3], [6, 3]]], [0, 1]
+    )
     masks = rasterize(elements, TINY)
     assert rows(masks.full(0, 8, 12))[:4] == [
         ".#..........",
@@ -38,7 +40,7 @@ def test_line_and_polygon_by_hand():
 
 def test_dilation_is_a_square_and_ends_at_the_canvas():
     masks = rasterize(
-        map_elements([[[0, 0], [0, 0]]], [0]),
+        MapElements.from_polylines([[[0, 0], [0, 0]]], [0]),
         RasterConfig(CLASSES, x_range=(0, 12), y_range=(0, 8), px_per_m=1),
     )
     assert rows(masks.full(0, 8, 12))[:4] == [
@@ -65,7 +67,7 @@ def opencv_pixels(line: np.ndarray) -> np.ndarray:
 
 def test_lines_are_opencv_lines_on_and_off_the_canvas():
     lines = random_lines(300)
-    masks = rasterize(map_elements(lines, [0] * len(lines)), CONFIG)
+    masks = rasterize(MapElements.from_polylines(lines, [0] * len(lines)), CONFIG)
     for i, line in enumerate(lines):
         want = np.zeros((480, 240), np.uint8)
         cv2.polylines(want, [opencv_pixels(line)], False, 1)
@@ -76,7 +78,7 @@ def test_lines_are_opencv_lines_on_and_off_the_canvas():
 def test_polygons_contain_opencv_outlines_and_little_else():
     """OpenCV's versions differ along the outline of a filled polygon, never by more than it."""
     lines = [line for line in random_lines(200) if len(line) > 2]
-    masks = rasterize(map_elements(lines, [1] * len(lines)), RAW)
+    masks = rasterize(MapElements.from_polylines(lines, [1] * len(lines)), RAW)
     for i, line in enumerate(lines):
         outline, filled = np.zeros((2, 480, 240), np.uint8)
         cv2.polylines(outline, [opencv_pixels(line)], True, 1)
@@ -90,7 +92,7 @@ def test_polygons_contain_opencv_outlines_and_little_else():
 
 def test_self_intersection_is_even_odd():
     """The two wings of a bow tie are filled, what lies beside its waist is not."""
-    elements = map_elements([[[1, 1], [9, 7], [9, 1], [1, 7]]], [1])
+    elements = MapElements.from_polylines([[[1, 1], [9, 7], [9, 1], [1, 7]]], [1])
     mask = rasterize(elements, TINY).full(0, 8, 12)
     assert mask[4, 2]
     assert mask[4, 8]
@@ -109,8 +111,8 @@ def test_hand_worked_ap_raster():
         A (0.9) hits at 0.50, 0.55, 0.60, misses above; B (0.8) misses.
         AP = 1 at three thresholds, 0 at three: 0.5
     """
-    gt = map_elements([[[0, 0], [3, 0], [3, 1], [0, 1]]], [1])
-    pred = map_elements(
+    gt = MapElements.from_polylines([[[0, 0], [3, 0], [3, 1], [0, 1]]], [1])
+    pred = MapElements.from_polylines(
         [[[8, 5], [10, 5], [10, 7]], [[1, 0], [4, 0], [4, 1], [1, 1]]], [1, 1], [0.8, 0.9]
     )
     matches = match_raster(pred, gt, TINY, "a")
@@ -130,24 +132,35 @@ def test_hand_worked_ap_raster():
 
 def test_half_recall_is_51_of_101():
     line = [[0, -20], [0, 20]]
-    gt = map_elements([line, [[8, -20], [8, 20]]], [0, 0])
-    metrics = raster_report([match_raster(map_elements([line], [0]), gt, CONFIG)], CONFIG).metrics
+    gt = MapElements.from_polylines([line, [[8, -20], [8, 20]]], [0, 0])
+    metrics = raster_report(
+        [match_raster(MapElements.from_polylines([line], [0]), gt, CONFIG)], CONFIG
+    ).metrics
     assert metrics["raster/divider/AP"] == pytest.approx(51 / 101)
 
 
 def test_second_choice_is_allowed_and_the_later_of_equals_wins():
     line = [[0, -20], [0, 20]]
-    gt, pred = map_elements([line, line], [0, 0]), map_elements([line, line], [0, 0], [0.9, 0.8])
+    gt, pred = (
+        MapElements.from_polylines([line, line], [0, 0]),
+        MapElements.from_polylines([line, line], [0, 0], [0.9, 0.8]),
+    )
     assert match_raster(pred, gt, CONFIG).matched_gt[:, 0].tolist() == [1, 0]
 
 
 def test_low_scores_and_more_than_the_limit_are_dropped():
     lines = [[[x, -20.0], [x, 20.0]] for x in np.linspace(-14, 14, 120)]
     scores = np.linspace(0.9, 0.04, 120)
-    matches = match_raster(map_elements(lines, [0] * 120, scores), map_elements([], []), CONFIG)
+    matches = match_raster(
+        MapElements.from_polylines(lines, [0] * 120, scores),
+        MapElements.from_polylines([], []),
+        CONFIG,
+    )
     assert matches.pred_index.tolist() == list(range(100))
     few = match_raster(
-        map_elements(lines[:3], [0] * 3, [0.05, 0.0499, 0.9]), map_elements([], []), CONFIG
+        MapElements.from_polylines(lines[:3], [0] * 3, [0.05, 0.0499, 0.9]),
+        MapElements.from_polylines([], []),
+        CONFIG,
     )
     assert few.pred_index.tolist() == [2, 0]
 
@@ -155,7 +168,9 @@ def test_low_scores_and_more_than_the_limit_are_dropped():
 def test_argoverse_range_turns_the_canvas():
     config = RasterConfig(CLASSES, x_range=(-30, 30), y_range=(-15, 15))
     assert (config.width, config.height) == (480, 240)
-    mask = rasterize(map_elements([[[-30, 0], [29.9, 0]]], [0]), config).full(0, 240, 480)
+    mask = rasterize(MapElements.from_polylines([[[-30, 0], [29.9, 0]]], [0]), config).full(
+        0, 240, 480
+    )
     assert mask[118:123].all()
     assert not mask[117].any()
 
@@ -164,13 +179,14 @@ def test_extended_classes_are_polygons():
     config = RasterConfig(("divider", "stop_line", "intersection", "carpark"))
     assert config.is_polygon == (False, True, True, True)
     square = [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]]
-    mask = rasterize(map_elements([square], [2]), config).full(0, 480, 240)
+    mask = rasterize(MapElements.from_polylines([square], [2]), config).full(0, 480, 240)
     assert mask[256, 136]  # the middle of the square: (2 + 15) * 8, (2 + 30) * 8
 
 
 def test_far_points_do_not_overflow():
     masks = rasterize(
-        map_elements([[[0.0, 0.0], [1e30, 1e30]], [[1e12, 0], [1e12, 5]]], [0, 1]), CONFIG
+        MapElements.from_polylines([[[0.0, 0.0], [1e30, 1e30]], [[1e12, 0], [1e12, 5]]], [0, 1]),
+        CONFIG,
     )
     assert masks.full(0, 480, 240)[240, 120]
     assert not masks.full(1, 480, 240).any()

@@ -5,11 +5,11 @@ import pytest
 from matplotlib import colors as mcolors
 
 from gsmap.structures import BEVGrid
+from gsmap.structures.elements import MapElements
 from gsmap.visualization import (
     FRAME_VIEWS,
     BEVPanel,
     CameraView,
-    MapElements,
     MapStyle,
     compose_figure,
     figure_to_rgb,
@@ -52,7 +52,7 @@ RIG = [
 def elements(**extra):
     ring = np.array([[-8.0, 5], [8, 5], [8, 9], [-8, 9], [-8, 5]])
     lines = (np.array([[0.0, 3], [0, 28]]), ring)
-    return MapElements(lines, np.array([0, 1]), **extra)
+    return MapElements.from_polylines(lines, np.array([0, 1]), **extra)
 
 
 def colour_share(picture, colour):
@@ -91,7 +91,7 @@ def test_missing_cameras_leave_no_empty_row():
 
 
 def test_line_ahead_appears_in_the_front_camera_only():
-    line = MapElements((np.array([[0.0, 3], [0, 28]]),), np.array([0]))
+    line = MapElements.from_polylines((np.array([[0.0, 3], [0, 28]]),), np.array([0]))
     for view, expected in ((RIG[0], True), (RIG[3], False)):
         picture = figure_to_rgb(compose_figure([view], [], GRID, VIEW, STYLE, line))
         body = picture[80:]  # below the legend
@@ -99,7 +99,9 @@ def test_line_ahead_appears_in_the_front_camera_only():
 
 
 def test_elements_appear_in_bev_where_they_are():
-    panel = BEVPanel("", MapElements((np.array([[-14.0, 29], [-1, 29]]),), np.array([2])))
+    panel = BEVPanel(
+        "", MapElements.from_polylines((np.array([[-14.0, 29], [-1, 29]]),), np.array([2]))
+    )
     figure = compose_figure([], [panel], GRID, VIEW, STYLE)
     picture = figure_to_rgb(figure)
     box = figure.axes[0].get_window_extent()
@@ -114,7 +116,7 @@ def test_elements_appear_in_bev_where_they_are():
 
 def test_every_kind_of_panel_is_drawn():
     scales, rotations = np.full((1, 5, 2), 0.5), np.zeros((1, 5))
-    found = MapElements(
+    found = MapElements.from_polylines(
         (np.stack([np.zeros(5), np.linspace(0, 20, 5)], 1),),
         np.array([0]),
         np.array([0.9]),
@@ -123,7 +125,7 @@ def test_every_kind_of_panel_is_drawn():
     )
     panels = [
         BEVPanel("none", None),
-        BEVPanel("empty", MapElements((), np.empty(0, int))),
+        BEVPanel("empty", MapElements.from_polylines((), np.empty(0, int))),
         BEVPanel("all", found, vertices=True, order=True, gaussians=True, scores=True),
         BEVPanel("raster", found, lines=False, rasters=np.ones((1, 60, 30))),
     ]
@@ -136,7 +138,7 @@ def test_every_kind_of_panel_is_drawn():
 
 def test_gaussian_ellipse_has_its_one_sigma_size():
     # 4 m along x and 2 m along y, turned by 90 degrees: at 1 sigma it is 4 m wide and 8 m high.
-    single = MapElements(
+    single = MapElements.from_polylines(
         (np.array([[0.0, 15.0]]),),
         np.array([2]),
         scales=np.array([[[4.0, 2.0]]]),
@@ -173,7 +175,7 @@ def test_raster_lies_where_its_lines_lie_in_both_frames():
     ):
         raster = np.zeros((1, grid.height, grid.width))
         raster[0, rows, columns] = 1
-        single = MapElements((np.zeros((2, 2)),), np.array([0]))
+        single = MapElements.from_polylines((np.zeros((2, 2)),), np.array([0]))
         panel = BEVPanel("", single, lines=False, rasters=raster)
         figure = compose_figure([], [panel], grid, FRAME_VIEWS[frame], STYLE)
         picture = figure_to_rgb(figure)

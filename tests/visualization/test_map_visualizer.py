@@ -74,7 +74,7 @@ def test_predictions_are_chosen_by_score_and_drawn_in_its_order(tmp_path):
     found = predicted_elements(sample, score_thr=0.5)
     assert found.labels.tolist() == [2, 0]
     np.testing.assert_allclose(found.polylines[1], sample.pred_instances_3d.pts[0])
-    np.testing.assert_allclose(found.scales[0], sample.pred_instances_3d.scales[2])
+    np.testing.assert_allclose(found.scales[:4], sample.pred_instances_3d.scales[2])
     assert predicted_elements(sample, max_num=1).labels.tolist() == [0]
 
 

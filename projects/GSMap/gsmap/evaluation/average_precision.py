@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsmap.evaluation.elements import BoolArray, FloatArray
+from gsmap.structures.elements import BoolArray, FloatArray
 
 _RECALL_POINTS = np.linspace(0.0, 1.0, 101)
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from gsmap.evaluation import chamfer_kernels as kernels
 from gsmap.evaluation.average_precision import area_ap, calibration_error
-from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.evaluation.matches import (
     ClassDetections,
     FrameMatches,
@@ -22,6 +21,7 @@ from gsmap.evaluation.matches import (
     unique_by_token,
 )
 from gsmap.evaluation.report import Curve, MetricReport, threshold_key
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
 CHAMFER_THRESHOLDS = (0.5, 1.0, 1.5)
 HARD_CHAMFER_THRESHOLDS = (0.2, 0.5, 1.0)
@@ -90,6 +90,7 @@ def resample_polylines(elements: MapElements, num_points: int) -> FloatArray:
     Returns:
         The new points in metres. (N, P, 2)
     """
+    elements = elements.planar()
     lengths = kernels.line_lengths(elements.points, elements.offsets)
     x, y = kernels.resample(elements.points, elements.offsets, lengths, num_points)
     return np.stack([x, y], axis=1).reshape(len(elements), num_points, 2)
@@ -97,6 +98,7 @@ def resample_polylines(elements: MapElements, num_points: int) -> FloatArray:
 
 def _prepare(elements: MapElements, num_points: int, resample: bool) -> _Lines:
     """Resample, or keep, the lines of one sample."""
+    elements = elements.planar()
     lengths = kernels.line_lengths(elements.points, elements.offsets)
     valid = (lengths > 0.0) & (elements.num_points >= 2)
     if resample:
@@ -204,7 +206,7 @@ def match_chamfer(
     kept = (predictions.num_points >= 2) & _known(predictions.labels, num_classes)
     best, distance = nearest_by_chamfer(predictions, ground_truth, config, config.thresholds[-1])
     rows = np.flatnonzero(kept)
-    rows = rows[np.argsort(-predictions.scores[rows], kind="stable")]
+    rows = rows[np.argsort(-predictions.confidence[rows], kind="stable")]
     best, distance = best[rows], distance[rows]
     thresholds = np.asarray(config.thresholds)
     matched = kernels.assign(best, distance, len(ground_truth), thresholds)
@@ -213,7 +215,7 @@ def match_chamfer(
         token=token,
         pred_index=rows,
         labels=predictions.labels[rows],
-        scores=predictions.scores[rows],
+        scores=predictions.confidence[rows],
         matched_gt=matched,
         quality=np.where((matched >= 0).any(axis=1), distance, np.nan),
         num_gts=np.bincount(known_gts, minlength=num_classes),

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
 _NO_NAN = {"nnan", "nsz"}  # minima vectorise; the order of additions stays as it is written
 _BOUND_SLACK = 1.0 - 1e-12  # a lower bound may be too large by the rounding of its sum

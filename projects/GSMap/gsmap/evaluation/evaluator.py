@@ -9,10 +9,10 @@ from gsmap.evaluation.chamfer_ap import (
     match_chamfer,
     resample_polylines,
 )
-from gsmap.evaluation.elements import MapElements, map_elements
 from gsmap.evaluation.matches import FrameMatches, MatchTable, as_table
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
 from gsmap.evaluation.report import MetricReport
+from gsmap.structures.elements import MapElements
 
 METRIC_NAMES = ("chamfer", "raster")
 
@@ -76,10 +76,10 @@ def with_points(elements: MapElements, num_points: int) -> MapElements:
     """
     points = resample_polylines(elements, num_points)
     polylines = [
-        points[i] if count >= 2 else elements.polyline(i)
+        points[i] if count >= 2 else elements.polylines[i]
         for i, count in enumerate(elements.num_points)
     ]
-    return map_elements(polylines, elements.labels, elements.scores)
+    return MapElements.from_polylines(polylines, elements.labels, elements.scores)
 
 
 def match_sample(
@@ -146,7 +146,7 @@ def load_kernels(config: EvaluationConfig) -> None:
     Args:
         config: Metrics and their rules.
     """
-    line = map_elements([[[0.0, 0.0], [1.0, 1.0]]], [0])
+    line = MapElements.from_polylines([[[0.0, 0.0], [1.0, 1.0]]], [0])
     match_sample("", line, line, config)
 
 

@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from gsmap.evaluation.elements import MapElements, empty_elements, map_elements
 from gsmap.evaluation.evaluator import (
     METRIC_NAMES,
     EvaluationConfig,
@@ -22,6 +21,7 @@ from gsmap.evaluation.matches import MatchTable, join_tables
 from gsmap.evaluation.report import MetricReport
 from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, elements_from_vectors
 from gsmap.evaluation.worker_pool import map_unordered, run_apart
+from gsmap.structures.elements import MapElements
 
 if TYPE_CHECKING:
     from gsmap.datasets.annotations.file import AnnotationFile
@@ -182,7 +182,7 @@ class ArrowElements:
                 self._names[i.label] for i in sample.instances if self._labels[i.label] < 0
             )
             notes["3D"] += len(labels) if self._dim == 3 else 0
-            found.append(map_elements([i.points for i in sample.instances], labels))
+            found.append(MapElements.from_polylines([i.points for i in sample.instances], labels))
         return found, notes
 
 
@@ -215,7 +215,7 @@ class _ChunkJob:
         found, pred_notes = self.results.elements(with_result)
         predictions = dict(zip(with_result, found, strict=True))
         truth, gt_notes = self.truth.elements([pair[1] for pair in pairs])
-        predictions[-1] = empty_elements()
+        predictions[-1] = MapElements.from_polylines()
         matches = []
         for (result_index, truth_index), ground_truth in zip(pairs, truth, strict=True):
             gt_notes["degenerate"] += int((ground_truth.num_points < 2).sum())

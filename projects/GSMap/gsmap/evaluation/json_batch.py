@@ -13,7 +13,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.json
 
-from gsmap.evaluation.elements import MapElements
+from gsmap.structures.elements import MapElements
 
 _VECTOR = {"pts": pa.list_(pa.list_(pa.float64())), "cls_name": pa.string()}
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from gsmap.evaluation.elements import IntArray
+from gsmap.structures.elements import IntArray
 
 _FIRST = re.compile(rb'\{\s*"sample_token"\s*:')
 _NEXT = re.compile(rb'\}\s*,\s*(\{)\s*"sample_token"\s*:')

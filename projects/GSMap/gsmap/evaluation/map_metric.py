@@ -4,14 +4,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 from mmdet3d.registry import METRICS
 from mmengine.evaluator import BaseMetric
 from mmengine.logging import MMLogger, print_log
 
+from gsmap.datasets.elements import elements_of_predictions, elements_of_truth
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.elements import MapElements, map_elements
 from gsmap.evaluation.evaluator import (
     METRIC_NAMES,
     EvaluationConfig,
@@ -22,7 +20,8 @@ from gsmap.evaluation.evaluator import (
 )
 from gsmap.evaluation.raster_ap import POLYGON_CLASSES, RasterConfig
 from gsmap.evaluation.report import format_table
-from gsmap.evaluation.results_json import gaussian_extras, vectors_of, write_results
+from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.structures.elements import MapElements
 
 
 @METRICS.register_module()
@@ -115,16 +114,12 @@ class MapMetric(BaseMetric):
         config = self.config
         for sample in data_samples:
             token = str(sample["token"])
-            instances = sample["pred_instances_3d"]
-            predictions = _predictions(instances, token)
+            predictions = _predictions(sample["pred_instances_3d"], token)
             record: dict[str, Any] = {"token": token}
             if config is not None:
                 record["matches"] = match_sample(token, predictions, _truth(sample), config)
             if self.out_file is not None:
-                gaussians = [_array(instances.get(key)) for key in ("scales", "rotations")]
-                record["vectors"] = vectors_of(
-                    predictions, self.classes, gaussian_extras(*gaussians)
-                )
+                record["vectors"] = vectors_of(predictions, self.classes)
             self.results.append(record)
 
     def evaluate(self, size: int) -> dict[str, float]:
@@ -168,20 +163,10 @@ class MapMetric(BaseMetric):
         return flat_metrics(found)
 
 
-def _array(value: Any) -> npt.NDArray[Any] | None:
-    """Convert a tensor on any device to an array."""
-    if value is None:
-        return None
-    return value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)
-
-
 def _predictions(instances: Mapping[str, Any], token: str) -> MapElements:
     """Read the predictions of one sample."""
-    points, labels, scores = (_array(instances[k]) for k in ("pts", "labels_3d", "scores_3d"))
-    assert points is not None
-    assert labels is not None
     try:
-        return map_elements(list(points.astype(np.float64)), labels, scores)
+        return elements_of_predictions(instances)
     except ValueError as error:
         raise ValueError(f"predictions of sample {token}: {error}") from error
 
@@ -194,4 +179,4 @@ def _truth(sample: Mapping[str, Any]) -> MapElements:
             f"sample {sample['token']} has no ground truth (eval_ann_info): it cannot be scored. "
             "Use an annotation file with instances, or eval=[] with an out_file."
         )
-    return map_elements(list(info["polylines"]), info["labels"])
+    return elements_of_truth(info)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)

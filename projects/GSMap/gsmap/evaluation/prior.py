@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig, nearest_by_chamfer, resample_polylines
-from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray, MapElements, map_elements
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
 _LOWEST_SCORE = 0.05  # AP_raster drops lower ones; the order, which is all that counts, stays
 _MIN_PRECISION = 1e-3  # an element that is right once in a thousand samples adds nothing
@@ -75,7 +75,7 @@ def _matches(
     Returns:
         Flat index of the nearest ground truth or -1 (N, F), and its distance in metres (N, F).
     """
-    elements = map_elements(list(candidates), np.full(len(candidates), label))
+    elements = MapElements.from_polylines(list(candidates), np.full(len(candidates), label))
     nearest = np.full((len(candidates), len(truth.frames)), -1, dtype=np.int64)
     distance = np.full(nearest.shape, np.inf)
     for i, frame in enumerate(truth.frames):
@@ -231,4 +231,4 @@ def fit_prior(
         scores.append(score)
     say(f"{len(lines)} elements chosen")
     lifted = _LOWEST_SCORE + (1.0 - _LOWEST_SCORE) * np.clip(scores, 0.0, 1.0)
-    return map_elements(lines, labels, lifted)
+    return MapElements.from_polylines(lines, labels, lifted)

@@ -13,7 +13,6 @@ import numpy as np
 from gsmap.evaluation import raster_drawing as drawing
 from gsmap.evaluation import raster_kernels as kernels
 from gsmap.evaluation.average_precision import calibration_error, interpolated_ap
-from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.evaluation.matches import (
     ClassDetections,
     FrameMatches,
@@ -23,6 +22,7 @@ from gsmap.evaluation.matches import (
     unique_by_token,
 )
 from gsmap.evaluation.report import UNDEFINED, Curve, MetricReport, threshold_key
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
 LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 POLYGON_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
@@ -161,7 +161,7 @@ def rasterize(elements: MapElements, config: RasterConfig) -> Masks:
         elements: N elements with labels below the number of classes.
         config: Rules.
     """
-    pixels = pixels_from_metres(elements.points, config)
+    pixels = pixels_from_metres(elements.planar().points, config)
     radius = config.dilation_px // 2
     boxes, starts = drawing.crops(pixels, elements.offsets, config.height, config.width, radius)
     filled = np.array(config.is_polygon)[elements.labels]
@@ -173,8 +173,8 @@ def _ranked_predictions(predictions: MapElements, config: RasterConfig) -> IntAr
     """Return the predictions that count, in descending order of score."""
     labels = predictions.labels
     kept = (labels >= 0) & (labels < len(config.classes)) & (predictions.num_points >= 2)
-    rows = np.flatnonzero(kept & (predictions.scores >= config.min_score))
-    rows = rows[np.argsort(-predictions.scores[rows], kind="stable")]
+    rows = np.flatnonzero(kept & (predictions.confidence >= config.min_score))
+    rows = rows[np.argsort(-predictions.confidence[rows], kind="stable")]
     if len(rows) > config.max_predictions:
         labels = labels[rows]
         rank = np.zeros(len(rows), dtype=np.int64)
@@ -212,7 +212,7 @@ def match_raster(
         token=token,
         pred_index=rows,
         labels=pred.labels,
-        scores=predictions.scores[rows],
+        scores=predictions.confidence[rows],
         matched_gt=np.where(matched >= 0, gt_index[matched] if len(gt_index) else -1, -1),
         quality=quality,
         num_gts=np.bincount(gt.labels, minlength=num_classes),

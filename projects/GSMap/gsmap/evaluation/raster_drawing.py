@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from gsmap.evaluation.elements import BoolArray, IntArray
+from gsmap.structures.elements import BoolArray, IntArray
 
 WordArray = npt.NDArray[np.uint64]
 

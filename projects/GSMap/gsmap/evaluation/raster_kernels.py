@@ -6,8 +6,8 @@ Masks are crops of packed pixels, as ``raster_drawing`` makes them.
 import numpy as np
 from numba import njit
 
-from gsmap.evaluation.elements import BoolArray, FloatArray, IntArray
 from gsmap.evaluation.raster_drawing import WordArray
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
 _COCO_SLACK = 1.0 - 1e-10  # COCO lowers a threshold of 1, so that equal masks match
 

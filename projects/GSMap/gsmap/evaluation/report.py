@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.evaluation.elements import BoolArray, FloatArray
+from gsmap.structures.elements import BoolArray, FloatArray
 
 UNDEFINED = -1.0  # as in COCO: the figure does not exist (a class without ground truth, no match)
 

@@ -10,10 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from gsmap.evaluation.elements import MapElements, map_elements
+from gsmap.structures.elements import MapElements
 
 RESULTS_KEY, GROUND_TRUTH_KEY = "results", "GTs"
 
@@ -45,48 +42,35 @@ def elements_from_vectors(
         ) from error
     except TypeError as error:
         raise ValueError(f"vectors must be a list of objects, got {vectors!r:.80}.") from error
-    return map_elements(points, labels, scores)
+    return MapElements.from_polylines(points, labels, scores)
 
 
-def vectors_of(
-    elements: MapElements,
-    classes: Sequence[str],
-    extra: Sequence[Mapping[str, Any]] | None = None,
-) -> list[dict[str, Any]]:
-    """Convert predictions to the ``vectors`` of one sample.
+def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, Any]]:
+    """Convert predictions to the ``vectors`` of one sample, with their Gaussians if they have any.
 
     Args:
         elements: Predictions. (N,)
         classes: Names of the classes.
-        extra: Further entries of each vector, such as its Gaussians. (N,)
     """
-    vectors = []
-    for i in range(len(elements)):
-        points, label = elements.polyline(i), int(elements.labels[i])
-        vector: dict[str, Any] = {
+    vectors: list[dict[str, Any]] = [
+        {
             "pts": points.tolist(),
             "pts_num": len(points),
             "cls_name": classes[label],
             "type": label,
-            "confidence_level": float(elements.scores[i]),
+            "confidence_level": score,
         }
-        vectors.append({**vector, **extra[i]} if extra else vector)
+        for points, label, score in zip(
+            elements.polylines, elements.labels.tolist(), elements.confidence.tolist(), strict=True
+        )
+    ]
+    for name in ("scales", "rotations"):
+        values = getattr(elements, name)
+        if values is not None:
+            for i, vector in enumerate(vectors):
+                part = slice(elements.offsets[i], elements.offsets[i + 1])
+                vector[f"gaussian_{name}"] = values[part].tolist()
     return vectors
-
-
-def gaussian_extras(
-    scales: npt.ArrayLike | None, rotations: npt.ArrayLike | None
-) -> list[dict[str, Any]] | None:
-    """Return the Gaussians of each prediction as further entries of its vector.
-
-    Args:
-        scales: Standard deviations in metres, or None. (N, P, 2)
-        rotations: Angles in radians, or None. (N, P)
-    """
-    if scales is None or rotations is None:
-        return None
-    pairs = zip(np.asarray(scales).tolist(), np.asarray(rotations).tolist(), strict=True)
-    return [{"gaussian_scales": s, "gaussian_rotations": r} for s, r in pairs]
 
 
 def write_results(

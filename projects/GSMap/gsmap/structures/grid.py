@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
-Array = TypeVar("Array", npt.NDArray[Any], Tensor)
+if TYPE_CHECKING:  # what scores files and knows no tensors starts without torch
+    import torch
+    from torch import Tensor
+
+Array = TypeVar("Array", npt.NDArray[Any], "Tensor")
 
 
 @dataclass(frozen=True)
@@ -98,11 +100,13 @@ class BEVGrid:
         """Return ``points * scale + shift`` on (x, y); further entries (z) are kept. (..., >= 2)"""
         if points.shape[-1] < 2:
             raise ValueError(f"points must end in (x, y), got shape {tuple(points.shape)}.")
-        if isinstance(points, Tensor):
-            x, y = points[..., 0] * scale[0] + shift[0], points[..., 1] * scale[1] + shift[1]
-            return torch.cat([torch.stack([x, y], -1), points[..., 2:]], -1)
-        xy = points[..., :2] * np.asarray(scale) + np.asarray(shift)
-        return np.concatenate([xy, points[..., 2:]], -1).astype(points.dtype, copy=False)
+        if isinstance(points, np.ndarray):
+            xy = points[..., :2] * np.asarray(scale) + np.asarray(shift)
+            return np.concatenate([xy, points[..., 2:]], -1).astype(points.dtype, copy=False)
+        import torch
+
+        x, y = points[..., 0] * scale[0] + shift[0], points[..., 1] * scale[1] + shift[1]
+        return torch.cat([torch.stack([x, y], -1), points[..., 2:]], -1)
 
     def norm_from_metres(self, points: Array) -> Array:
         """Map metres to [0, 1] over the extent. (..., 2)"""
@@ -123,9 +127,12 @@ class BEVGrid:
         return self._affine(points, self.pixel_size_m, (self.x_range[0], self.y_range[0]))
 
     def pixel_centres(
-        self, device: torch.device | str | None = None, dtype: torch.dtype = torch.float32
-    ) -> Tensor:
-        """Return the centre (x, y) of every pixel in metres. (H, W, 2)"""
+        self, device: "torch.device | str | None" = None, dtype: "torch.dtype | None" = None
+    ) -> "Tensor":
+        """Return the centre (x, y) of every pixel in metres, float32 by default. (H, W, 2)"""
+        import torch
+
+        dtype = dtype or torch.float32
         (dx, dy), x0, y0 = self.pixel_size_m, self.x_range[0], self.y_range[0]
         x = x0 + dx * (torch.arange(self.width, device=device, dtype=dtype) + 0.5)
         y = y0 + dy * (torch.arange(self.height, device=device, dtype=dtype) + 0.5)

@@ -8,7 +8,7 @@ from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
 from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure
 from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView, resolve_frame_view
-from gsmap.visualization.map_elements import MapElements, ground_truth_elements, predicted_elements
+from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
 from gsmap.visualization.style import MapStyle
 
 __all__ = [
@@ -16,7 +16,6 @@ __all__ = [
     "BEVPanel",
     "CameraView",
     "FrameView",
-    "MapElements",
     "MapStyle",
     "compose_figure",
     "figure_to_rgb",

@@ -10,8 +10,8 @@ from matplotlib.patches import FancyBboxPatch, Polygon
 from matplotlib.patheffects import withStroke
 
 from gsmap.structures import BEVGrid
+from gsmap.structures.elements import MapElements
 from gsmap.visualization.frame_view import FrameView
-from gsmap.visualization.map_elements import MapElements
 from gsmap.visualization.style import MapStyle
 
 
@@ -165,17 +165,15 @@ def _draw_order(ax: Axes, lines: list[np.ndarray], labels: np.ndarray, style: Ma
 
 def _draw_gaussians(ax: Axes, elements: MapElements, view: FrameView, style: MapStyle) -> None:
     """Draw each Gaussian as the ellipse at one standard deviation."""
-    centres = view.display_from_frame(np.concatenate([line[:, :2] for line in elements.polylines]))
-    scales = np.asarray(elements.scales, dtype=float).reshape(-1, 2)
-    turned = np.asarray(elements.rotations, dtype=float).reshape(-1) + view.display_turn_rad
-    per_element = [len(line) for line in elements.polylines]
-    colours = np.repeat([style.colour(label) for label in elements.labels], per_element)
+    assert elements.scales is not None
+    assert elements.rotations is not None
+    colours = np.repeat([style.colour(label) for label in elements.labels], elements.num_points)
     ellipses = EllipseCollection(
-        widths=2 * scales[:, 0],
-        heights=2 * scales[:, 1],
-        angles=np.degrees(turned),
+        widths=2 * elements.scales[:, 0],
+        heights=2 * elements.scales[:, 1],
+        angles=np.degrees(elements.rotations + view.display_turn_rad),
         units="xy",
-        offsets=centres,
+        offsets=view.display_from_frame(elements.points),
         transOffset=ax.transData,
         facecolors=[mcolors.to_rgba(c, 0.22) for c in colours],
         edgecolors=colours,
@@ -196,7 +194,7 @@ def _draw_scores(ax: Axes, lines: list[np.ndarray], elements: MapElements, style
     halo = [withStroke(linewidth=1.8, foreground="white")]
     left, right = sorted(ax.get_xlim())
     bottom, top = sorted(ax.get_ylim())
-    for line, label, score in zip(lines, elements.labels, elements.scores, strict=True):  # type: ignore[arg-type]
+    for line, label, score in zip(lines, elements.labels, elements.confidence, strict=True):
         x, y = line[len(line) // 2]
         ax.text(
             np.clip(x, left + 1.2, right - 1.2),
@@ -275,7 +273,7 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
         return
     if panel.rasters is not None:
         _draw_rasters(ax, panel, grid, view, style)
-    lines = [view.display_from_frame(np.asarray(line, dtype=float)) for line in elements.polylines]
+    lines = [view.display_from_frame(line) for line in elements.polylines]
     if panel.gaussians and elements.has_gaussians:
         _draw_gaussians(ax, elements, view, style)
     if panel.lines:

@@ -9,9 +9,9 @@ from matplotlib import colors as mcolors
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
+from gsmap.structures.elements import MapElements
 from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
 from gsmap.visualization.frame_view import FrameView
-from gsmap.visualization.map_elements import MapElements
 from gsmap.visualization.style import MapStyle
 
 _STEP_M = 1.0  # a line's width follows its depth in steps of this length
@@ -122,10 +122,7 @@ def _draw_polylines(
 ) -> None:
     """Draw the polylines, thinner with distance, on a dark edge."""
     height, width = camera.image.shape[:2]
-    dense = [
-        subdivided(view.lifted(np.asarray(line, dtype=float)), _STEP_M)
-        for line in elements.polylines
-    ]
+    dense = [subdivided(view.lifted(line), _STEP_M) for line in elements.polylines]
     starts, ends = (
         np.concatenate([line[s] for line in dense]) for s in (slice(None, -1), slice(1, None))
     )

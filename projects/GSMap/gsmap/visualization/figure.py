@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from gsmap.structures import BEVGrid
+from gsmap.structures.elements import MapElements
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
 from gsmap.visualization.frame_view import FrameView
-from gsmap.visualization.map_elements import MapElements
 from gsmap.visualization.style import MapStyle
 
 DPI = 150

@@ -1,54 +1,15 @@
 """Map elements to draw, read off a data sample."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
-
-def _array(values: Any) -> np.ndarray:
-    """Return a tensor or array-like as a numpy array."""
-    return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
-
-
-@dataclass(frozen=True)
-class MapElements:
-    """Polylines with their classes, in metres of the annotation frame.
-
-    Args:
-        polylines: One array per element. N x (n, 2 or 3)
-        labels: Class index of each. (N,)
-        scores: Confidence in [0, 1], or None for ground truth. (N,)
-        scales: Standard deviations of each vertex's Gaussian in metres, if it has one. (N, P, 2)
-        rotations: Angle of its first axis from +x in radians, anticlockwise. (N, P)
-
-    Raises:
-        ValueError: If the lengths disagree.
-    """
-
-    polylines: tuple[np.ndarray, ...]
-    labels: np.ndarray
-    scores: np.ndarray | None = None
-    scales: np.ndarray | None = None
-    rotations: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("labels", "scores", "scales", "rotations"):
-            values = getattr(self, name)
-            if values is not None and len(values) != len(self.polylines):
-                raise ValueError(
-                    f"{name} must have one entry for each of the {len(self.polylines)} polylines, "
-                    f"got {len(values)}."
-                )
-
-    def __len__(self) -> int:
-        return len(self.polylines)
-
-    @property
-    def has_gaussians(self) -> bool:
-        """Whether every vertex carries a Gaussian."""
-        return self.scales is not None and self.rotations is not None
+from gsmap.datasets.elements import (
+    elements_of_predictions,
+    elements_of_targets,
+    elements_of_truth,
+)
+from gsmap.structures.elements import MapElements
 
 
 def ground_truth_elements(data_sample: Any) -> MapElements | None:
@@ -63,12 +24,11 @@ def ground_truth_elements(data_sample: Any) -> MapElements | None:
     """
     info = data_sample.metainfo.get("eval_ann_info")
     if info is not None:
-        polylines = tuple(_array(line) for line in info["polylines"])
-        return MapElements(polylines, _array(info["labels"]).astype(int))
+        return elements_of_truth(info)
     instances = getattr(data_sample, "gt_instances_3d", None)
     if instances is None or "pts" not in instances:
         return None
-    return MapElements(tuple(_array(instances.pts)), _array(instances.labels_3d).astype(int))
+    return elements_of_targets(instances)
 
 
 def predicted_elements(
@@ -87,19 +47,9 @@ def predicted_elements(
     instances = getattr(data_sample, "pred_instances_3d", None)
     if instances is None or "pts" not in instances:
         return None
-    scores = _array(instances.scores_3d).astype(float)
-    order = np.argsort(scores, kind="stable")
-    order = order[scores[order] >= score_thr]
+    found = elements_of_predictions(instances)
+    order = np.argsort(found.confidence, kind="stable")
+    order = order[found.confidence[order] >= score_thr]
     if max_num is not None:
         order = order[max(len(order) - max_num, 0) :]
-    gaussians = {
-        name: _array(instances[name])[order]
-        for name in ("scales", "rotations")
-        if name in instances
-    }
-    return MapElements(
-        polylines=tuple(_array(instances.pts)[order]),
-        labels=_array(instances.labels_3d)[order].astype(int),
-        scores=scores[order],
-        **gaussians,
-    )
+    return found.select(order)

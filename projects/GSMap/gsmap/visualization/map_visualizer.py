@@ -14,11 +14,12 @@ from mmengine.visualization import Visualizer
 
 from gsmap.datasets.transforms.images import read_image
 from gsmap.structures import BEVGrid
+from gsmap.structures.elements import MapElements
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
 from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure
 from gsmap.visualization.frame_view import FrameView, resolve_frame_view
-from gsmap.visualization.map_elements import MapElements, ground_truth_elements, predicted_elements
+from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
 from gsmap.visualization.style import MapStyle
 
 PANELS = ("ground_truth", "prediction", "gaussians", "rasters")
@@ -46,9 +47,10 @@ def render_masks(elements: MapElements, grid: BEVGrid) -> np.ndarray:
     """Render every element's Gaussians to occupancy in [0, 1] (GSMap Eq. 6). (N, H, W)"""
     from gsmap.ops.gaussian_raster import render_gaussians
 
-    means = torch.as_tensor(np.stack(elements.polylines), dtype=torch.float32)[..., :2]
-    scales = torch.as_tensor(np.asarray(elements.scales), dtype=torch.float32)
-    rotations = torch.as_tensor(np.asarray(elements.rotations), dtype=torch.float32)
+    means, scales, rotations = (
+        torch.as_tensor(values, dtype=torch.float32).unflatten(0, (len(elements), -1))
+        for values in (elements.points[:, :2], elements.scales, elements.rotations)
+    )
     with torch.no_grad():
         return render_gaussians(means, scales, rotations, grid).numpy()
 
@@ -63,9 +65,9 @@ def _title(scene: str | None, token: str | None) -> str:
 def _note(data_sample: Any, score_thr: float) -> str:
     """Say why there is no prediction to draw."""
     everything = predicted_elements(data_sample)
-    if everything is None or not len(everything) or everything.scores is None:
+    if everything is None or not len(everything):
         return "no elements"
-    return f"no score reaches {score_thr:g} (highest {everything.scores.max():.2g})"
+    return f"no score reaches {score_thr:g} (highest {everything.confidence.max():.2g})"
 
 
 @VISUALIZERS.register_module()

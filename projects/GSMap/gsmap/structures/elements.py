@@ -1,0 +1,175 @@
+"""The map of one sample, predicted or annotated: all its polylines and rings in flat arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+PerElement = Sequence[Any] | npt.NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class MapElements:
+    """Polylines and rings of one sample, one after another in one array.
+
+    ``from_polylines`` builds and checks them.
+
+    Args:
+        points: Vertices of all elements, (x, y) or (x, y, z) in metres in the frame of the
+            annotations. (M, D)
+        offsets: Element i owns the vertices ``offsets[i]:offsets[i + 1]``. (N + 1,)
+        labels: Class index of each element. (N,)
+        scores: Confidence of each element in [0, 1], or None for ground truth. (N,)
+        scales: Standard deviations of each vertex's Gaussian in metres, if it has one. (M, 2)
+        rotations: Angle of its first axis from +x in radians, anticlockwise. (M,)
+    """
+
+    points: FloatArray
+    offsets: IntArray
+    labels: IntArray
+    scores: FloatArray | None = None
+    scales: FloatArray | None = None
+    rotations: FloatArray | None = None
+
+    @classmethod
+    def from_polylines(
+        cls,
+        polylines: PerElement = (),
+        labels: npt.ArrayLike = (),
+        scores: npt.ArrayLike | None = None,
+        scales: PerElement | None = None,
+        rotations: PerElement | None = None,
+    ) -> "MapElements":
+        """Build the elements of a sample from separate polylines.
+
+        Args:
+            polylines: Vertices of each element in metres, arrays or nested lists; z is dropped
+                unless all have it. N x (P, 2 or 3)
+            labels: Class index of each. (N,)
+            scores: Confidence of each. (N,)
+            scales: Standard deviations of each vertex's Gaussian in metres. N x (P, 2)
+            rotations: Angle of its first axis in radians. N x (P,)
+
+        Raises:
+            ValueError: If the lengths disagree, the points are not (x, y[, z]), or a point or a
+                score is not finite.
+        """
+        label_array = np.asarray(labels, dtype=np.int64).reshape(-1)
+        score_array = None if scores is None else np.asarray(scores, np.float64).reshape(-1)
+        values = {"labels": label_array, "scores": score_array}
+        for name, given in (values | {"scales": scales, "rotations": rotations}).items():
+            if given is not None and len(given) != len(polylines):
+                raise ValueError(
+                    f"{name} must have one entry for each of the {len(polylines)} polylines, "
+                    f"got {len(given)}."
+                )
+        try:
+            points = _joined(polylines)
+        except (TypeError, IndexError, ValueError) as error:
+            raise ValueError(f"polylines must be lists of (x, y) or (x, y, z): {error}") from error
+        offsets = np.zeros(len(polylines) + 1, dtype=np.int64)
+        np.cumsum([len(p) for p in polylines], out=offsets[1:])
+        _require_finite(points, offsets, score_array)
+        return cls(
+            points,
+            offsets,
+            label_array,
+            score_array,
+            _per_vertex(scales, "scales", (len(points), 2)),
+            _per_vertex(rotations, "rotations", (len(points),)),
+        )
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @property
+    def num_points(self) -> IntArray:
+        """Number of vertices of each element. (N,)"""
+        return np.diff(self.offsets)
+
+    @property
+    def polylines(self) -> list[FloatArray]:
+        """The vertices of each element, as views. N x (P, D)"""
+        return [self.points[a:b] for a, b in pairwise(self.offsets.tolist())]
+
+    @property
+    def confidence(self) -> FloatArray:
+        """The scores; ones if there are none. (N,)"""
+        return np.ones(len(self)) if self.scores is None else self.scores
+
+    @property
+    def has_gaussians(self) -> bool:
+        """Whether every vertex carries a Gaussian."""
+        return self.scales is not None and self.rotations is not None
+
+    def planar(self) -> "MapElements":
+        """Return the elements without z."""
+        if self.points.shape[1] == 2:
+            return self
+        return replace(self, points=np.ascontiguousarray(self.points[:, :2]))
+
+    def select(self, index: IntArray | BoolArray) -> "MapElements":
+        """Return some of the elements, in the order that is asked for.
+
+        Args:
+            index: Positions, or a mask. (K,) or (N,)
+        """
+        rows = np.flatnonzero(index) if index.dtype == np.bool_ else np.asarray(index)
+        counts = self.num_points[rows]
+        offsets = np.zeros(len(rows) + 1, dtype=np.int64)
+        np.cumsum(counts, out=offsets[1:])
+        take = np.repeat(self.offsets[rows] - offsets[:-1], counts) + np.arange(offsets[-1])
+        return MapElements(
+            self.points[take],
+            offsets,
+            self.labels[rows],
+            None if self.scores is None else self.scores[rows],
+            None if self.scales is None else self.scales[take],
+            None if self.rotations is None else self.rotations[take],
+        )
+
+
+def _joined(polylines: PerElement) -> FloatArray:
+    """Return the vertices of all polylines. (M, 2 or 3)"""
+    filled = [p for p in polylines if len(p)]
+    if not filled:
+        return np.empty((0, 2))
+    if isinstance(filled[0], np.ndarray):
+        dims = {p.shape[1] for p in filled}
+        rows = np.concatenate([p[:, : min(dims)] for p in filled], dtype=np.float64)
+    else:
+        dims = {len(row) for row in chain.from_iterable(filled)}
+        rows = np.array([row[: min(dims)] for p in filled for row in p], dtype=np.float64)
+    if not dims <= {2, 3}:
+        raise ValueError(f"points have {sorted(dims)} coordinates")
+    return rows
+
+
+def _per_vertex(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray | None:
+    """Join what each polyline's vertices carry, and check that every vertex has it."""
+    if values is None:
+        return None
+    if not len(values):
+        return np.empty(shape)
+    joined = np.concatenate([np.asarray(v, dtype=np.float64) for v in values])
+    if joined.shape != shape:
+        raise ValueError(f"{name} must hold {shape} values in all, got {joined.shape}.")
+    return joined
+
+
+def _require_finite(points: FloatArray, offsets: IntArray, scores: FloatArray | None) -> None:
+    """Raise a ValueError that names the first element with a NaN or infinite value."""
+    bad_points = ~np.isfinite(points)
+    if bad_points.any():
+        first = np.flatnonzero(bad_points.any(axis=1))[0]
+        index = int(np.searchsorted(offsets, first, side="right")) - 1
+        raise ValueError(f"element {index} has a point that is not finite.")
+    if scores is not None and not np.isfinite(scores).all():
+        index = int(np.flatnonzero(~np.isfinite(scores))[0])
+        raise ValueError(f"element {index} has a score that is not finite.")

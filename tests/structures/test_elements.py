@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from gsmap.structures.elements import MapElements
+
+LINE, RING = [[0.0, 1.0], [2.0, 3.0]], [[4.0, 4.0], [5.0, 4.0], [5.0, 5.0], [4.0, 4.0]]
+
+
+def test_vertices_lie_one_after_another():
+    elements = MapElements.from_polylines([LINE, [], np.array(RING)], [2, 0, 1], [0.5, 0.25, 1])
+    assert elements.points.tolist() == LINE + RING
+    assert elements.offsets.tolist() == [0, 2, 2, 6]
+    assert elements.num_points.tolist() == [2, 0, 4]
+    assert [p.tolist() for p in elements.polylines] == [LINE, [], RING]
+    assert elements.confidence.tolist() == [0.5, 0.25, 1.0]
+    assert not elements.has_gaussians
+
+
+def test_selected_elements_take_their_scores_and_gaussians_along():
+    scales, rotations = [np.full((2, 2), 3.0), np.full((4, 2), 7.0)], [np.zeros(2), np.ones(4)]
+    elements = MapElements.from_polylines([LINE, RING], [2, 1], [0.5, 0.25], scales, rotations)
+    turned = elements.select(np.array([1, 0]))
+    assert [p.tolist() for p in turned.polylines] == [RING, LINE]
+    assert turned.scores.tolist() == [0.25, 0.5]
+    assert turned.scales[:, 0].tolist() == [7.0] * 4 + [3.0] * 2
+    assert turned.rotations.tolist() == [1.0] * 4 + [0.0] * 2
+    masked = elements.select(np.array([True, False]))
+    assert masked.labels.tolist() == [2]
+    assert masked.scales.tolist() == [[3.0, 3.0]] * 2
+    none = elements.select(np.array([], dtype=int))
+    assert (len(none), none.points.shape, none.scales.shape) == (0, (0, 2), (0, 2))
+
+
+def test_z_is_kept_if_all_have_it():
+    line_3d = [[0.0, 1.0, 5.0], [2.0, 3.0, 6.0]]
+    elements = MapElements.from_polylines([line_3d], [0])
+    assert elements.points.tolist() == line_3d
+    assert elements.planar().points.tolist() == LINE
+    assert MapElements.from_polylines([line_3d, RING], [0, 1]).points.tolist() == LINE + RING
+    assert elements.planar().planar().points.flags.c_contiguous
+
+
+def test_ground_truth_has_full_confidence_and_a_sample_may_be_empty():
+    truth = MapElements.from_polylines([LINE], [0])
+    assert truth.scores is None
+    assert truth.confidence.tolist() == [1.0]
+    empty = MapElements.from_polylines()
+    assert (len(empty), empty.points.shape, empty.polylines) == (0, (0, 2), [])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (([LINE], [0, 1]), "labels must have one entry for each of the 1 polylines, got 2"),
+        (([LINE], [0], [0.5, 0.5]), "scores must have one entry"),
+        (([LINE], [0], None, [np.ones((3, 2))]), r"scales must hold \(2, 2\) values in all"),
+        (([LINE], [0], None, None, [[0.0]]), r"rotations must hold \(2,\) values"),
+        (([[[0.0, 1.0], [2.0]]], [0]), "coordinates"),
+        (([[0.0, 1.0]], [0]), r"lists of \(x, y\)"),
+        (([LINE, [[0.0, np.nan]]], [0, 0]), "element 1 has a point that is not finite"),
+        (([LINE], [0], [np.inf]), "element 0 has a score that is not finite"),
+    ],
+)
+def test_bad_elements_are_refused(values, message):
+    with pytest.raises(ValueError, match=message):
+        MapElements.from_polylines(*values)
