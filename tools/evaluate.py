@@ -18,13 +18,14 @@ import sys
 import time
 from pathlib import Path
 
+from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.chamfer_ap import (
     CHAMFER_THRESHOLDS,
     HARD_CHAMFER_THRESHOLDS,
     ChamferConfig,
 )
 from gsmap.evaluation.evaluator import METRIC_NAMES, EvaluationConfig, flat_metrics
-from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files, read_arrow_index
+from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files
 from gsmap.evaluation.raster_ap import POLYGON_CLASSES, RasterConfig
 from gsmap.evaluation.report import format_table
 
@@ -91,9 +92,10 @@ def config_from(args: argparse.Namespace) -> EvaluationConfig:
     """Join the arguments with what the annotation file says."""
     classes, extent = args.classes, args.range
     if args.ground_truth.suffix.lower() != ".json":
-        index = read_arrow_index(args.ground_truth, args.workers)
-        classes = classes or index.classes
-        extent = extent or index.extent
+        meta = AnnotationFile(args.ground_truth).meta
+        (x0, x1), (y0, y1) = meta.x_range, meta.y_range
+        classes = classes or meta.classes
+        extent = extent or (x0, y0, x1, y1)
     classes = tuple(classes or DEFAULT_CLASSES)
     x0, y0, x1, y1 = extent or DEFAULT_RANGE
     chamfer = raster = None

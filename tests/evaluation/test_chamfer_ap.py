@@ -7,39 +7,15 @@ from gsmap.evaluation.chamfer_ap import (
     chamfer_report,
     match_chamfer,
     nearest_by_chamfer,
-    resample_polylines,
 )
 from gsmap.structures.elements import MapElements
+from gsmap.structures.polylines import resample_all
 
 CONFIG = ChamferConfig(("divider", "boundary"))
 
 
 def upright(x: float, low: float = -20.0, high: float = 20.0) -> list[list[float]]:
     return [[x, low], [x, high]]
-
-
-def test_resampling_walks_equal_arc_lengths_round_a_corner():
-    """Six points on an L of length 3 + 2: one metre apart.
-
-    .. code-block:: text
-
-        o-o-o      (0,3) (1,3) (2,3)
-        |
-        o          (0,2)
-        o          (0,1)
-        o          (0,0)
-    """
-    elements = MapElements.from_polylines([[[0, 0], [0, 3], [2, 3]]], [0])
-    want = [[0, 0], [0, 1], [0, 2], [0, 3], [1, 3], [2, 3]]
-    np.testing.assert_allclose(resample_polylines(elements, 6)[0], want, atol=1e-12)
-
-
-def test_resampling_of_repeated_points_zero_length_and_no_points():
-    elements = MapElements.from_polylines(
-        [[[0, 0], [0, 0], [4, 0], [4, 0]], [[1, 2], [1, 2]], []], [0, 0, 0]
-    )
-    points = resample_polylines(elements, 3)
-    assert points.tolist() == [[[0, 0], [2, 0], [4, 0]], [[1, 2]] * 3, [[0, 0]] * 3]
 
 
 def test_chamfer_distance_is_the_mean_of_both_directions():
@@ -148,7 +124,7 @@ def test_branch_and_bound_finds_what_brute_force_finds():
         MapElements.from_polylines(list(walks[20:]), [0] * 20),
     )
     best, distance = nearest_by_chamfer(pred, gt, CONFIG, max_distance=6.0)
-    p, g = resample_polylines(pred, 100), resample_polylines(gt, 100)
+    p, g = (resample_all(e.points, e.offsets, 100) for e in (pred, gt))
     for i in range(20):
         nn = np.linalg.norm(p[i][:, None] - g[:, None, :, :], axis=-1)  # (K, 100, 100)
         brute = (nn.min(2).mean(1) + nn.min(1).mean(1)) / 2

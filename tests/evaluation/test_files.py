@@ -2,11 +2,8 @@
 
 import importlib.util
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +16,8 @@ from gsmap.datasets.annotations.file import (
     MapSample,
     write_annotations,
 )
-from gsmap.evaluation.file_evaluation import ArrowElements, JsonElements, evaluate_files
-from gsmap.evaluation.json_index import JsonSamples
-from gsmap.evaluation.results_json import (
-    elements_from_vectors,
-    vectors_of,
-    write_results,
-)
-from gsmap.evaluation.worker_pool import map_unordered, run_apart
+from gsmap.evaluation.file_evaluation import evaluate_files, read_annotations
+from gsmap.evaluation.results_json import read_samples, vectors_of, write_results
 from gsmap.structures.elements import MapElements
 
 REPO = Path(__file__).resolve().parents[2]
@@ -191,53 +182,17 @@ def test_malformed_results_name_the_file_and_the_sample(tmp_path, text, message)
     assert command()([str(results), str(truth)]) == 1
 
 
-def test_index_reads_any_layout_of_the_file(tmp_path):
+def test_samples_are_read_from_any_layout_of_the_file(tmp_path):
     path = tmp_path / "odd.json"
     path.write_text(
         '{"meta": {"results": [1], "text": "a \\" ] } [ {"}, "other": [[{}], "results"],\n'
         ' "results" : [ {"vectors": [], "extra": {"deep": [{}]}, "sample_token": "x\\u0041"},\n'
-        '{"sample_token": "b]", "vectors": [ ]} ], "tail": [{}]}'
+        '{"sample_token": "b]", "was": [{"sample_token": "c"}], "vectors": [ ]} ], "tail": [{}]}'
     )
-    samples = JsonSamples(path, "results")
-    assert samples.tokens == ["xA", "b]"]
-    assert samples.vectors(0) == []
-
-
-def test_quick_index_equals_the_exact_one(files):
-    for path, key in zip(files, ("results", "GTs"), strict=True):
-        quick, exact = (JsonSamples(path, key, exact) for exact in (False, True))
-        assert quick.tokens == exact.tokens
-        assert [quick.piece(i) for i in range(8)] == [exact.piece(i) for i in range(8)]
-
-
-@pytest.mark.parametrize(
-    "samples",
-    [
-        '{"sample_token": "a", "vectors": []}, {"vectors": [], "sample_token": "b"}',
-        '{"sample_token": "a", "was": [{"k": 1}, {"sample_token": "c"}], "vectors": []},'
-        '{"sample_token": "b", "vectors": []}',
-        '{"sample_token": "a", "vectors": []}, {"sample_token": "b", "vectors": []}],'
-        '"more": [{"sample_token": "c"}, {"sample_token": "d"}',
-        '{"sample_token":"a","text":"}, {\\"sample_token\\": 1}","vectors":[]} , \n'
-        '{"sample_token":"b","vectors":[]}',
-    ],
-)
-def test_samples_that_a_quick_index_cuts_wrongly_are_read_well(tmp_path, samples):
-    results, truth = tmp_path / "results.json", tmp_path / "truth.json"
-    results.write_text(f'{{"meta": {{}}, "results": [{samples}]}}')
-    write_results(truth, [("a", []), ("b", [vector(LINE, "divider")])], key="GTs")
-    for workers in (1, 2):
-        metrics = evaluate_files(results, truth, CONFIG, workers).reports[0].metrics
-        assert metrics["chamfer/num_samples"] == 2
-
-
-def test_fast_and_plain_parsers_agree(files):
-    source = JsonElements(JsonSamples(files[0], "results"), LABELS, scored=True)
-    fast, _ = source.elements(range(8))
-    for i, elements in enumerate(fast):
-        plain = elements_from_vectors(source.samples.vectors(i), LABELS, scored=True)
-        for name in ("points", "offsets", "labels", "scores"):
-            np.testing.assert_array_equal(getattr(elements, name), getattr(plain, name))
+    samples, ignored = read_samples(path, "results", CLASSES)
+    assert list(samples) == ["xA", "b]"]
+    assert [len(elements) for elements in samples.values()] == [0, 0]
+    assert not ignored
 
 
 def test_written_predictions_read_back(tmp_path):
@@ -246,10 +201,12 @@ def test_written_predictions_read_back(tmp_path):
     vectors = vectors_of(elements, CLASSES)
     path = tmp_path / "new" / "out.json"
     write_results(path, [("a", vectors)])
-    back = JsonSamples(path, "results").vectors(0)
-    assert back[1]["confidence_level"] == 0.1 + 0.2
-    assert back[1]["gaussian_scales"] == [[1.0, 1.0]] * 4
-    assert back[0]["pts"] == LINE
+    written = json.loads(path.read_text())["results"][0]["vectors"]
+    assert written[1]["gaussian_scales"] == [[1.0, 1.0]] * 4
+    back = read_samples(path, "results", CLASSES)[0]["a"]
+    assert back.scores.tolist() == [0.25, 0.1 + 0.2]
+    assert back.labels.tolist() == [0, 1]
+    assert [p.tolist() for p in back.polylines] == [LINE, RING]
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -268,68 +225,6 @@ def test_annotation_file_without_ground_truth_or_class_is_refused(tmp_path):
     sample = MapSample("t0", "s", "", 0, [], np.eye(4))
     write_annotations(arrow, AnnotationMeta("minicity", "lidar", "val"), [sample])
     with pytest.raises(ValueError, match="'t0' has no ground truth"):
-        ArrowElements(arrow, CLASSES).elements([0])
+        read_annotations(arrow, CLASSES)
     with pytest.raises(ValueError, match="stop_line"):
-        ArrowElements(arrow, ("divider", "stop_line"))
-
-
-def double(value: int) -> int:
-    return 2 * value
-
-
-def die(value: int) -> int:
-    if value == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return value
-
-
-def sleep(value: int) -> int:
-    time.sleep(300 if value == 3 else 0)
-    return value
-
-
-def fail(value: int) -> int:
-    raise ValueError(f"task {value}")
-
-
-def test_pool_returns_every_result():
-    assert sorted(map_unordered(double, range(20), 2)) == list(range(0, 40, 2))
-    assert list(map_unordered(double, [1], 4)) == [2]
-    with pytest.raises(ValueError, match="num_workers"):
-        list(map_unordered(double, [1], 0))
-
-
-@pytest.mark.parametrize(
-    ("function", "error", "message", "patience_s"),
-    [
-        (die, RuntimeError, "worker process died", 60),
-        (sleep, TimeoutError, "within 3 s", 3),
-        (fail, ValueError, "task", 60),
-    ],
-)
-def test_pool_ends_when_a_worker_dies_stalls_or_fails(function, error, message, patience_s):
-    start = time.monotonic()
-    with pytest.raises(error, match=message):
-        list(map_unordered(function, range(8), 2, stall_timeout_s=patience_s))
-    assert time.monotonic() - start < 50  # the stalled task would sleep for 300 s
-
-
-def test_function_apart_returns_its_result_or_its_error():
-    assert run_apart(double, 4) == 8
-    with pytest.raises(ValueError, match="task 5"):
-        run_apart(fail, 5)
-
-
-def test_workers_that_cannot_start_do_not_hang(tmp_path):
-    """A module without a main guard is run again by each new worker, which then dies; what the
-    worker was to be sent is longer than a pipe takes."""
-    script = tmp_path / "unguarded.py"
-    script.write_text(
-        "import functools, operator, threading\n"
-        "from gsmap.evaluation.worker_pool import map_unordered\n"
-        "threading.Thread(target=threading.Event().wait, args=(40,), daemon=True).start()\n"
-        "print(list(map_unordered(functools.partial(operator.contains, bytes(10**6)), [1, 2], 2)))"
-    )
-    found = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
-    assert found.returncode == 1
-    assert "RuntimeError" in found.stderr
+        read_annotations(arrow, ("divider", "stop_line"))

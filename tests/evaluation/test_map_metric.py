@@ -16,7 +16,6 @@ from mmengine.evaluator import Evaluator  # noqa: E402
 from mmengine.structures import InstanceData  # noqa: E402
 
 from gsmap.evaluation import map_metric  # noqa: E402
-from gsmap.evaluation.json_index import JsonSamples  # noqa: E402
 
 RANGES = {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0)}
 
@@ -82,13 +81,13 @@ def test_results_are_written_with_gaussians_and_without_ground_truth(tmp_path):
     evaluator = build(eval=[], out_file=str(path))
     evaluator.process([sample("b", 0.2, truth=False), sample("a", 0.1, truth=False)])
     assert evaluator.evaluate(2) == {}
-    written = JsonSamples(path, "results")
-    assert written.tokens == ["a", "b"]
-    vector = written.vectors(1)[0]
+    written = json.loads(path.read_text())
+    assert [sample["sample_token"] for sample in written["results"]] == ["a", "b"]
+    vector = written["results"][1]["vectors"][0]
     assert vector["cls_name"] == "divider"
     assert vector["pts"][0] == pytest.approx([0.2, -20.0])
     assert len(vector["gaussian_rotations"]) == 20
-    assert json.loads(path.read_text())["meta"]["classes"] == list(CLASSES)
+    assert written["meta"]["classes"] == list(CLASSES)
 
 
 def test_samples_without_ground_truth_and_bad_settings_are_refused():

@@ -16,6 +16,7 @@ from gsmap.structures.polylines import (
     is_closed,
     points_at,
     resample,
+    resample_all,
 )
 
 SQUARE = np.array([[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]], float)
@@ -36,6 +37,30 @@ def test_resampling_interpolates_height_and_survives_repeated_points():
     assert resampled[1, 2] == pytest.approx(4)
     assert resampled[0].tolist() == [0, 0, 0]
     np.testing.assert_array_equal(resample(np.zeros((2, 2)), 3), np.zeros((3, 2)))
+
+
+def test_many_polylines_are_resampled_at_once():
+    """Six points on an L of length 3 + 2, one metre apart; a repeated point; one without points.
+
+    .. code-block:: text
+
+        o-o-o      (0,3) (1,3) (2,3)
+        |
+        o          (0,2)
+        o          (0,1)
+        o          (0,0)
+    """
+    corner, repeated, still = [[0, 0], [0, 3], [2, 3]], [[0, 0], [0, 0], [10, 0]], [[1, 2], [1, 2]]
+    points = np.array([*corner, *repeated, *still], float)
+    found = resample_all(points, np.array([0, 3, 6, 6, 8]), 6)
+    np.testing.assert_allclose(
+        found[0], [[0, 0], [0, 1], [0, 2], [0, 3], [1, 3], [2, 3]], atol=1e-12
+    )
+    np.testing.assert_allclose(found[1, :, 0], [0, 2, 4, 6, 8, 10], atol=1e-12)
+    assert found[0, -1].tolist() == [2, 3]  # the ends are kept to the digit
+    assert found[2].tolist() == [[0, 0]] * 6
+    assert found[3].tolist() == [[1, 2]] * 6
+    assert resample_all(np.zeros((0, 2)), np.array([0, 0]), 3).tolist() == [[[0, 0]] * 3]
 
 
 def test_an_open_line_has_two_orders():

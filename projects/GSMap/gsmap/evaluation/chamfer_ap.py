@@ -11,17 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmap.evaluation import chamfer_kernels as kernels
-from gsmap.evaluation.average_precision import area_ap, calibration_error
-from gsmap.evaluation.matches import (
-    ClassDetections,
-    FrameMatches,
-    MatchTable,
-    as_table,
-    detections_per_class,
-    unique_by_token,
+from gsmap.evaluation.average_precision import area_ap
+from gsmap.evaluation.matches import FrameMatches, detections_per_class, unique_by_token
+from gsmap.evaluation.report import (
+    UNDEFINED,
+    MetricReport,
+    class_figures,
+    curves_of,
+    threshold_key,
 )
-from gsmap.evaluation.report import Curve, MetricReport, threshold_key
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+from gsmap.structures.polylines import resample_all
 
 CHAMFER_THRESHOLDS = (0.5, 1.0, 1.5)
 HARD_CHAMFER_THRESHOLDS = (0.2, 0.5, 1.0)
@@ -61,53 +61,17 @@ class ChamferConfig:
             raise ValueError(f"num_points must be >= 2, got {self.num_points}.")
 
 
-@dataclass(frozen=True)
-class _Lines:
-    """Lines ready for comparison: x and y of all points, offsets, labels, which can match."""
-
-    x: FloatArray
-    y: FloatArray
-    offsets: IntArray
-    labels: IntArray
-    valid: BoolArray
-
-    def astuple(self) -> tuple[FloatArray, FloatArray, IntArray, IntArray, BoolArray]:
-        return self.x, self.y, self.offsets, self.labels, self.valid
-
-    def points(self, index: int) -> FloatArray:
-        part = slice(self.offsets[index], self.offsets[index + 1])
-        return np.stack([self.x[part], self.y[part]], axis=1)
-
-
-def resample_polylines(elements: MapElements, num_points: int) -> FloatArray:
-    """Place points at equal arc lengths on every polyline, both ends included.
-
-    Args:
-        elements: N polylines. An element of zero length gives copies of its first point, one
-            without points gives zeros.
-        num_points: Number of points P.
-
-    Returns:
-        The new points in metres. (N, P, 2)
-    """
-    elements = elements.planar()
-    lengths = kernels.line_lengths(elements.points, elements.offsets)
-    x, y = kernels.resample(elements.points, elements.offsets, lengths, num_points)
-    return np.stack([x, y], axis=1).reshape(len(elements), num_points, 2)
-
-
-def _prepare(elements: MapElements, num_points: int, resample: bool) -> _Lines:
-    """Resample, or keep, the lines of one sample."""
-    elements = elements.planar()
-    lengths = kernels.line_lengths(elements.points, elements.offsets)
-    valid = (lengths > 0.0) & (elements.num_points >= 2)
+def _lines(elements: MapElements, num_points: int, resample: bool) -> kernels.Lines:
+    """Resample, or keep, the lines of one sample; those of no length get the label -1."""
+    points, offsets = elements.planar().points, elements.offsets
+    moved = np.append(0, np.cumsum((points[1:] != points[:-1]).any(axis=1)))
+    long = elements.num_points >= 2
+    long[long] = moved[offsets[1:][long] - 1] > moved[offsets[:-1][long]]
     if resample:
-        x, y = kernels.resample(elements.points, elements.offsets, lengths, num_points)
-        offsets = np.arange(len(elements) + 1, dtype=np.int64) * num_points
-    else:
-        x, y = np.ascontiguousarray(elements.points.T)
-        offsets = elements.offsets
-    return _Lines(x, y, offsets, elements.labels, valid)
+        points = resample_all(points, offsets, num_points).reshape(-1, 2)
+        offsets = np.arange(len(elements) + 1) * num_points
+    x, y = np.ascontiguousarray(points.T)
+    return x, y, offsets, np.where(long, elements.labels, -1)
 
 
 def chamfer_distance(first: FloatArray, second: FloatArray) -> float:
@@ -123,39 +87,44 @@ def chamfer_distance(first: FloatArray, second: FloatArray) -> float:
     for points in (first, second):
         if points.ndim != 2 or points.shape[1] != 2 or not len(points):
             raise ValueError(f"point sets must be (n, 2) with n >= 1, got {points.shape}.")
-    ax, ay = np.ascontiguousarray(first.T, dtype=np.float64)
-    bx, by = np.ascontiguousarray(second.T, dtype=np.float64)
-    return float(kernels.chamfer(ax, ay, bx, by, np.empty(len(ax)), np.empty(len(bx))))
+    columns = (np.ascontiguousarray(points.T, np.float64) for points in (first, second))
+    (ax, ay), (bx, by) = columns
+    return float(kernels.chamfer(ax, ay, bx, by))
 
 
 def _strips_touch(first: FloatArray, second: FloatArray) -> bool:
     """Whether the strips around two lines intersect: flat ends, mitred corners, 4 m wide."""
     import shapely  # only a handful of pairs per thousand frames come here
 
-    lines = (
-        shapely.linestrings([first, second])
-        if first.shape == second.shape
-        else [
-            shapely.LineString(first),
-            shapely.LineString(second),
-        ]
-    )
     a, b = shapely.buffer(
-        lines, STRIP_HALF_WIDTH_M, quad_segs=16, cap_style="flat", join_style="mitre"
+        [shapely.LineString(first), shapely.LineString(second)],
+        STRIP_HALF_WIDTH_M,
+        quad_segs=16,
+        cap_style="flat",
+        join_style="mitre",
     )
     return bool(shapely.intersects(a, b))
 
 
-def _nearest_touching(pred: _Lines, row: int, gt: _Lines) -> tuple[int, float]:
+def _nearest_touching(
+    pred: kernels.Lines, row: int, gt: kernels.Lines, max_distance: float
+) -> tuple[int, float]:
     """Return the nearest ground truth whose strip touches the prediction's, or (-1, inf)."""
     best, distance = -1, np.inf
-    line = pred.points(row)
-    for k in np.flatnonzero(gt.valid & (gt.labels == pred.labels[row])):
-        other = gt.points(int(k))
+    line = _points(pred, row)
+    for k in np.flatnonzero(gt[3] == pred[3][row]).tolist():
+        other = _points(gt, k)
         d = chamfer_distance(line, other)
-        if d < distance and _strips_touch(line, other):
-            best, distance = int(k), d
+        if d < distance and d <= max_distance and _strips_touch(line, other):
+            best, distance = k, d
     return best, distance
+
+
+def _points(lines: kernels.Lines, index: int) -> FloatArray:
+    """Return the points of one line. (P, 2)"""
+    x, y, offsets, _ = lines
+    part = slice(offsets[index], offsets[index + 1])
+    return np.stack([x[part], y[part]], axis=1)
 
 
 def nearest_by_chamfer(
@@ -170,21 +139,19 @@ def nearest_by_chamfer(
         predictions: N predictions.
         ground_truth: K ground truths.
         config: Rules.
-        max_distance: Farther pairs are not searched, in metres.
+        max_distance: Farther pairs are passed over, in metres.
 
     Returns:
         Index of the nearest ground truth, or -1 if none is within ``max_distance`` (N,), and its
         Chamfer distance in metres, or infinity (N,).
     """
-    pred = _prepare(predictions, config.num_points, config.resample_predictions)
-    gt = _prepare(ground_truth, config.num_points, config.resample_ground_truth)
+    pred = _lines(predictions, config.num_points, config.resample_predictions)
+    gt = _lines(ground_truth, config.num_points, config.resample_ground_truth)
     best, distance, touching = kernels.nearest_ground_truth(
-        pred.astuple(), gt.astuple(), max_distance, STRIP_HALF_WIDTH_M
+        pred, gt, max_distance, STRIP_HALF_WIDTH_M
     )
-    for row in np.flatnonzero((distance <= max_distance) & ~touching & (best >= 0)):
-        best[row], distance[row] = _nearest_touching(pred, int(row), gt)
-    beyond = distance > max_distance
-    best[beyond], distance[beyond] = -1, np.inf
+    for row in np.flatnonzero((best >= 0) & ~touching).tolist():
+        best[row], distance[row] = _nearest_touching(pred, row, gt, max_distance)
     return best, distance
 
 
@@ -202,22 +169,21 @@ def match_chamfer(
         config: Rules.
         token: Name of the sample.
     """
-    num_classes = len(config.classes)
-    kept = (predictions.num_points >= 2) & _known(predictions.labels, num_classes)
+    num_classes, scores = len(config.classes), predictions.confidence
     best, distance = nearest_by_chamfer(predictions, ground_truth, config, config.thresholds[-1])
+    kept = (predictions.num_points >= 2) & _known(predictions.labels, num_classes)
     rows = np.flatnonzero(kept)
-    rows = rows[np.argsort(-predictions.confidence[rows], kind="stable")]
-    best, distance = best[rows], distance[rows]
+    rows = rows[np.argsort(-scores[rows], kind="stable")]
     thresholds = np.asarray(config.thresholds)
-    matched = kernels.assign(best, distance, len(ground_truth), thresholds)
+    matched = kernels.assign(best[rows], distance[rows], len(ground_truth), thresholds)
     known_gts = ground_truth.labels[_known(ground_truth.labels, num_classes)]
     return FrameMatches(
         token=token,
         pred_index=rows,
         labels=predictions.labels[rows],
-        scores=predictions.confidence[rows],
+        scores=scores[rows],
         matched_gt=matched,
-        quality=np.where((matched >= 0).any(axis=1), distance, np.nan),
+        quality=np.where((matched >= 0).any(axis=1), distance[rows], np.nan),
         num_gts=np.bincount(known_gts, minlength=num_classes),
     )
 
@@ -226,26 +192,7 @@ def _known(labels: IntArray, num_classes: int) -> BoolArray:
     return (labels >= 0) & (labels < num_classes)
 
 
-def _class_figures(found: ClassDetections, thresholds: tuple[float, ...]) -> dict[str, float]:
-    """Return the figures of one class, by the last part of their key."""
-    figures: dict[str, float] = {}
-    aps = [area_ap(found.hits[:, t], found.num_gts) for t in range(len(thresholds))]
-    for t, threshold in enumerate(thresholds):
-        key, hits = threshold_key(threshold), found.hits[:, t]
-        figures[f"AP@{key}"] = aps[t]
-        figures[f"recall@{key}"] = float(hits.sum()) / max(found.num_gts, 1)
-        figures[f"tp@{key}"] = float(hits.sum())
-        figures[f"error_m@{key}"] = float(found.quality[hits].mean()) if hits.any() else -1.0
-        figures[f"calibration_error@{key}"] = calibration_error(found.scores, hits)
-    figures["AP"] = float(np.mean(aps))
-    figures["num_gts"] = float(found.num_gts)
-    figures["num_preds"] = float(len(found.scores))
-    return figures
-
-
-def chamfer_report(
-    matches: MatchTable | Iterable[FrameMatches], config: ChamferConfig
-) -> MetricReport:
+def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> MetricReport:
     """Compute AP_chamfer from the matches of all samples.
 
     A class without ground truth counts as 0 in ``mAP``, as in MapTR, but not in the mean per
@@ -255,27 +202,30 @@ def chamfer_report(
         matches: All samples, in any order; repeated tokens count once.
         config: Rules.
     """
-    table = unique_by_token(as_table(matches))
-    per_class = detections_per_class(table, len(config.classes), len(config.thresholds))
+    classes, thresholds = config.classes, config.thresholds
+    records = unique_by_token(matches)
+    found = dict(
+        zip(classes, detections_per_class(records, len(classes), len(thresholds)), strict=True)
+    )
     metrics: dict[str, float] = {}
-    curves: list[Curve] = []
-    for name, found in zip(config.classes, per_class, strict=True):
-        figures = _class_figures(found, config.thresholds)
-        metrics.update({f"{name}/{key}": value for key, value in figures.items()})
-        curves += [
-            Curve(name, threshold, found.scores, found.hits[:, t], found.num_gts)
-            for t, threshold in enumerate(config.thresholds)
-        ]
-    present = [n for n, f in zip(config.classes, per_class, strict=True) if f.num_gts]
-    for key in map(threshold_key, config.thresholds):
-        aps = [metrics[f"{name}/AP@{key}"] for name in present]
+    for name, of_class in found.items():
+        figures = class_figures(of_class, thresholds, area_ap, absent=0.0)
+        for t, threshold in enumerate(thresholds):
+            errors = of_class.quality[of_class.hits[:, t]]
+            figures[f"error_m@{threshold_key(threshold)}"] = (
+                float(errors.mean()) if len(errors) else UNDEFINED
+            )
+        metrics |= {f"{name}/{key}": value for key, value in figures.items()}
+    for key in map(threshold_key, thresholds):
+        aps = [metrics[f"{name}/AP@{key}"] for name in classes if found[name].num_gts]
         metrics[f"AP@{key}"] = float(np.mean(aps)) if aps else 0.0
-    metrics["mAP"] = float(np.mean([metrics[f"{name}/AP"] for name in config.classes]))
-    metrics["num_samples"] = float(len(table))
+    metrics["mAP"] = float(np.mean([metrics[f"{name}/AP"] for name in classes]))
+    metrics["num_samples"] = float(len(records))
+    by_class = dict.fromkeys(classes, thresholds)
     return MetricReport(
         "chamfer",
-        {"class": config.classes},
-        dict.fromkeys(config.classes, config.thresholds),
+        {"class": classes},
+        by_class,
         {f"chamfer/{k}": v for k, v in metrics.items()},
-        curves,
+        curves_of(found, by_class),
     )

@@ -1,7 +1,6 @@
 """Compiled inner loops of AP_chamfer; ``chamfer_ap`` is their only user.
 
-Coordinates come as separate x and y arrays, so that the loops vectorise. The order of every sum is
-that of numpy and GEOS, so that distances which equal a threshold exactly do so here as well.
+Coordinates come as separate x and y arrays, so that the loops vectorise.
 """
 
 import math
@@ -11,116 +10,32 @@ from numba import njit
 
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
+Lines = tuple[FloatArray, FloatArray, IntArray, IntArray]  # x, y (M,), offsets (N + 1,), labels
 _NO_NAN = {"nnan", "nsz"}  # minima vectorise; the order of additions stays as it is written
 _BOUND_SLACK = 1.0 - 1e-12  # a lower bound may be too large by the rounding of its sum
 
 
-@njit(cache=True)
-def line_lengths(points: FloatArray, offsets: IntArray) -> FloatArray:
-    """Return the arc length of each polyline, in metres. (N,)"""
-    lengths = np.zeros(len(offsets) - 1)
-    for i in range(len(lengths)):
-        total = 0.0
-        for j in range(offsets[i] + 1, offsets[i + 1]):
-            dx, dy = points[j, 0] - points[j - 1, 0], points[j, 1] - points[j - 1, 1]
-            total += math.sqrt(dx * dx + dy * dy)
-        lengths[i] = total
-    return lengths
-
-
-@njit(cache=True)
-def resample(
-    points: FloatArray, offsets: IntArray, lengths: FloatArray, num_points: int
-) -> tuple[FloatArray, FloatArray]:
-    """Place points at equal arc lengths, both ends included, on each polyline.
-
-    Args:
-        points: Points of all polylines. (M, 2)
-        offsets: Where each polyline starts in ``points``. (N + 1,)
-        lengths: Arc length of each polyline. (N,)
-        num_points: How many points each polyline gets.
-
-    Returns:
-        x and y of the new points; zeros for a polyline without points. 2 x (N * num_points,)
-    """
-    n = len(offsets) - 1
-    xs, ys = np.zeros(n * num_points), np.zeros(n * num_points)
-    for i in range(n):
-        first, last = offsets[i], offsets[i + 1] - 1
-        if last < first:
-            continue
-        step = lengths[i] / (num_points - 1) if num_points > 1 else 0.0
-        j, walked = first, 0.0  # the segment j to j + 1 starts at arc length `walked`
-        seg_x = seg_y = seg = 0.0
-        if j < last:
-            seg_x, seg_y = points[j + 1, 0] - points[j, 0], points[j + 1, 1] - points[j, 1]
-            seg = math.sqrt(seg_x * seg_x + seg_y * seg_y)
-        for k in range(num_points):
-            target = k * step if k + 1 < num_points else lengths[i]
-            while j < last and walked + seg <= target:
-                walked += seg
-                j += 1
-                if j < last:
-                    seg_x, seg_y = points[j + 1, 0] - points[j, 0], points[j + 1, 1] - points[j, 1]
-                    seg = math.sqrt(seg_x * seg_x + seg_y * seg_y)
-            fraction = (target - walked) / seg if j < last else 0.0
-            xs[i * num_points + k] = points[j, 0] + seg_x * fraction
-            ys[i * num_points + k] = points[j, 1] + seg_y * fraction
-    return xs, ys
-
-
 @njit(cache=True, fastmath=_NO_NAN)
-def _mean_of_roots(squared: FloatArray, n: int) -> float:
-    """Return the mean of the square roots of the first n entries, summed as numpy sums."""
-    if n < 8 or n > 128:  # numpy halves longer arrays; no reference uses more than 100 points
-        total = 0.0
-        for i in range(n):
-            total += math.sqrt(squared[i])
-        return total / n
-    r = np.zeros(8)
-    for i in range(8):
-        r[i] = math.sqrt(squared[i])
-    whole = n - n % 8
-    for i in range(8, whole, 8):
-        for j in range(8):
-            r[j] += math.sqrt(squared[i + j])
-    total = ((r[0] + r[1]) + (r[2] + r[3])) + ((r[4] + r[5]) + (r[6] + r[7]))
-    for i in range(whole, n):
-        total += math.sqrt(squared[i])
-    return total / n
-
-
-@njit(cache=True, fastmath=_NO_NAN)
-def chamfer(
-    ax: FloatArray,
-    ay: FloatArray,
-    bx: FloatArray,
-    by: FloatArray,
-    row: FloatArray,
-    col: FloatArray,
-) -> float:
-    """Return the Chamfer distance of two point sets: the mean of both directed mean distances.
+def chamfer(ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray) -> float:
+    """Return the mean of both directed mean nearest-neighbour distances of two point sets.
 
     Args:
         ax: x of the first set. (P,)
         ay: y of the first set. (P,)
         bx: x of the second set. (Q,)
         by: y of the second set. (Q,)
-        row: Scratch. (>= P,)
-        col: Scratch. (>= Q,)
     """
-    na, nb = len(ax), len(bx)
-    for j in range(nb):
-        col[j] = np.inf
-    for i in range(na):
+    back = np.full(len(bx), np.inf)
+    there = 0.0
+    for i in range(len(ax)):
         nearest = np.inf
-        for j in range(nb):
+        for j in range(len(bx)):
             dx, dy = ax[i] - bx[j], ay[i] - by[j]
             squared = dx * dx + dy * dy
-            col[j] = min(col[j], squared)
+            back[j] = min(back[j], squared)
             nearest = min(nearest, squared)
-        row[i] = nearest
-    return (_mean_of_roots(row, na) + _mean_of_roots(col, nb)) / 2.0
+        there += math.sqrt(nearest)
+    return (there / len(ax) + np.sqrt(back).sum() / len(bx)) / 2.0
 
 
 @njit(cache=True, fastmath=_NO_NAN)
@@ -139,10 +54,9 @@ def _boxes(xs: FloatArray, ys: FloatArray, offsets: IntArray) -> FloatArray:
     """Return the bounding box of each point set. (N, 4)"""
     boxes = np.zeros((len(offsets) - 1, 4))
     for i in range(len(boxes)):
-        start, stop = offsets[i], offsets[i + 1]
-        if stop > start:
-            boxes[i, 0], boxes[i, 1] = xs[start:stop].min(), ys[start:stop].min()
-            boxes[i, 2], boxes[i, 3] = xs[start:stop].max(), ys[start:stop].max()
+        x, y = xs[offsets[i] : offsets[i + 1]], ys[offsets[i] : offsets[i + 1]]
+        if len(x):
+            boxes[i] = x.min(), y.min(), x.max(), y.max()
     return boxes
 
 
@@ -164,73 +78,46 @@ def _beside_a_segment(
 
 
 @njit(cache=True)
-def _lower_bounds(
-    x: FloatArray,
-    y: FloatArray,
-    box: FloatArray,
-    label: int,
-    gt: tuple[FloatArray, FloatArray, IntArray, IntArray, BoolArray],
-    g_boxes: FloatArray,
-) -> FloatArray:
-    """Bound the Chamfer distance of one line to each ground truth from below. (K,)
-
-    No point of a set is nearer than the set's bounding box. Infinity where the classes differ.
-    """
-    gx, gy, g_off, g_labels, g_valid = gt
-    bounds = np.full(len(g_labels), np.inf)
-    for k in range(len(bounds)):
-        if g_valid[k] and g_labels[k] == label:
-            there = _mean_distance_to_box(x, y, g_boxes[k])
-            start, stop = g_off[k], g_off[k + 1]
-            back = _mean_distance_to_box(gx[start:stop], gy[start:stop], box)
-            bounds[k] = (there + back) / 2.0 * _BOUND_SLACK
-    return bounds
-
-
-@njit(cache=True)
 def nearest_ground_truth(
-    pred: tuple[FloatArray, FloatArray, IntArray, IntArray, BoolArray],
-    gt: tuple[FloatArray, FloatArray, IntArray, IntArray, BoolArray],
-    max_distance: float,
-    half_width: float,
+    pred: Lines, gt: Lines, max_distance: float, half_width: float
 ) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Find each prediction's nearest ground truth of its class, by branch and bound.
+    """Find each prediction's nearest ground truth of its class.
+
+    No point of a set is nearer than the set's bounding box, which bounds the distance from below;
+    few pairs are left to compute in full.
 
     Args:
-        pred: x, y (M,), offsets (N + 1,), labels (N,), and which elements may match at all (N,).
-        gt: The same of the ground truth, K elements.
-        max_distance: Pairs farther apart need not be found, in metres.
+        pred: N predictions; a label of -1 marks one that cannot match.
+        gt: K ground truths.
+        max_distance: Pairs farther apart are passed over, in metres.
         half_width: Half width of the strips that have to touch, in metres.
 
     Returns:
         Index of the nearest ground truth or -1 (N,); Chamfer distance or infinity (N,); whether
         the pair's strips are known to touch (N,).
     """
-    px, py, p_off, p_labels, p_valid = pred
-    gx, gy, g_off = gt[0], gt[1], gt[2]
-    best, distance = np.full(len(p_labels), -1, dtype=np.int64), np.full(len(p_labels), np.inf)
-    touching = np.zeros(len(p_labels), dtype=np.bool_)
-    row, col = np.empty(max(1, len(px))), np.empty(max(1, len(gx)))
+    px, py, p_off, p_labels = pred
+    gx, gy, g_off, g_labels = gt
+    n = len(p_labels)
+    best, distance, touching = np.full(n, -1), np.full(n, np.inf), np.zeros(n, np.bool_)
     p_boxes, g_boxes = _boxes(px, py, p_off), _boxes(gx, gy, g_off)
     width_sq = half_width * half_width * _BOUND_SLACK
-    for i in range(len(p_labels)):
-        if not p_valid[i]:
+    for i in range(n):
+        if p_labels[i] < 0:
             continue
         ax, ay = px[p_off[i] : p_off[i + 1]], py[p_off[i] : p_off[i + 1]]
-        bounds = _lower_bounds(ax, ay, p_boxes[i], p_labels[i], gt, g_boxes)
-        for k in np.argsort(bounds):
-            if bounds[k] > min(distance[i], max_distance) or bounds[k] == np.inf:
-                break
+        for k in np.flatnonzero(g_labels == p_labels[i]):
             bx, by = gx[g_off[k] : g_off[k + 1]], gy[g_off[k] : g_off[k + 1]]
-            d = chamfer(ax, ay, bx, by, row, col)
-            if d < distance[i] or (d == distance[i] and k < best[i]):
-                distance[i], best[i] = d, k
-        if distance[i] <= max_distance and best[i] >= 0:
+            bound = _mean_distance_to_box(ax, ay, g_boxes[k])
+            bound += _mean_distance_to_box(bx, by, p_boxes[i])
+            if bound / 2.0 * _BOUND_SLACK <= min(distance[i], max_distance):
+                d = chamfer(ax, ay, bx, by)
+                if d < distance[i] and d <= max_distance:
+                    distance[i], best[i] = d, k
+        if best[i] >= 0:
             k = best[i]
             bx, by = gx[g_off[k] : g_off[k + 1]], gy[g_off[k] : g_off[k + 1]]
-            touching[i] = _beside_a_segment(ax, ay, bx, by, width_sq) or _beside_a_segment(
-                bx, by, ax, ay, width_sq
-            )
+            touching[i] = _beside_a_segment(ax, ay, bx, by, width_sq)
     return best, distance, touching
 
 
@@ -247,12 +134,11 @@ def assign(best: IntArray, distance: FloatArray, num_gts: int, thresholds: Float
     Returns:
         The matched ground truth, or -1. (N, T)
     """
-    matched = np.full((len(best), len(thresholds)), -1, dtype=np.int64)
+    matched = np.full((len(best), len(thresholds)), -1)
     for t in range(len(thresholds)):
-        taken = np.zeros(num_gts, dtype=np.bool_)
+        taken = np.zeros(num_gts, np.bool_)
         for i in range(len(best)):
             k = best[i]
             if k >= 0 and distance[i] <= thresholds[t] and not taken[k]:
-                taken[k] = True
-                matched[i, t] = k
+                taken[k], matched[i, t] = True, k
     return matched

@@ -1,20 +1,17 @@
 """Both metrics over a stream of samples: match each sample once, keep only its matches."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from gsmap.evaluation.chamfer_ap import (
-    ChamferConfig,
-    chamfer_report,
-    match_chamfer,
-    resample_polylines,
-)
-from gsmap.evaluation.matches import FrameMatches, MatchTable, as_table
+from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
+from gsmap.evaluation.matches import FrameMatches
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
 from gsmap.evaluation.report import MetricReport
 from gsmap.structures.elements import MapElements
+from gsmap.structures.polylines import resample_all
 
 METRIC_NAMES = ("chamfer", "raster")
+SampleMatches = dict[str, FrameMatches]  # by the name of the metric
 
 
 @dataclass(frozen=True)
@@ -54,32 +51,17 @@ class EvaluationConfig:
         return config.classes
 
 
-@dataclass(frozen=True)
-class SampleMatches:
-    """What is kept of one sample; small, and picklable between processes.
-
-    Args:
-        token: Name of the sample.
-        by_metric: Matches by the name of the metric.
-    """
-
-    token: str
-    by_metric: dict[str, FrameMatches]
-
-
 def with_points(elements: MapElements, num_points: int) -> MapElements:
-    """Return elements with a fixed number of points at equal arc lengths.
+    """Return ground truth with a fixed number of points at equal arc lengths.
 
     Args:
         elements: Polylines and rings; those of fewer than two points are kept as they are.
         num_points: Number of points of each.
     """
-    points = resample_polylines(elements, num_points)
-    polylines = [
-        points[i] if count >= 2 else elements.polylines[i]
-        for i, count in enumerate(elements.num_points)
-    ]
-    return MapElements.from_polylines(polylines, elements.labels, elements.scores)
+    resampled = resample_all(elements.points, elements.offsets, num_points)
+    pairs = zip(elements.polylines, resampled, strict=True)
+    polylines = [new if len(old) >= 2 else old for old, new in pairs]
+    return MapElements.from_polylines(polylines, elements.labels)
 
 
 def match_sample(
@@ -95,12 +77,12 @@ def match_sample(
     """
     if config.ground_truth_points is not None:
         ground_truth = with_points(ground_truth, config.ground_truth_points)
-    found: dict[str, FrameMatches] = {}
+    found: SampleMatches = {}
     if config.chamfer:
         found["chamfer"] = match_chamfer(predictions, ground_truth, config.chamfer, token)
     if config.raster:
         found["raster"] = match_raster(predictions, ground_truth, config.raster, token)
-    return SampleMatches(token, found)
+    return found
 
 
 def reports(samples: Iterable[SampleMatches], config: EvaluationConfig) -> list[MetricReport]:
@@ -110,44 +92,12 @@ def reports(samples: Iterable[SampleMatches], config: EvaluationConfig) -> list[
         samples: Matches in any order; repeated tokens count once.
         config: Metrics and their rules.
     """
-    return table_reports(tables_of(samples, config), config)
-
-
-def tables_of(samples: Iterable[SampleMatches], config: EvaluationConfig) -> dict[str, MatchTable]:
-    """Join the matches of samples to a table of each metric.
-
-    Args:
-        samples: Matches of each sample.
-        config: Metrics and their rules.
-    """
-    records = list(samples)
-    names = [name for name in METRIC_NAMES if getattr(config, name)]
-    return {name: as_table(record.by_metric[name] for record in records) for name in names}
-
-
-def table_reports(tables: Mapping[str, MatchTable], config: EvaluationConfig) -> list[MetricReport]:
-    """Compute the metrics from tables of all samples.
-
-    Args:
-        tables: The table of each metric.
-        config: Metrics and their rules.
-    """
-    found = []
+    records, found = list(samples), []
     if config.chamfer:
-        found.append(chamfer_report(tables["chamfer"], config.chamfer))
+        found.append(chamfer_report((r["chamfer"] for r in records), config.chamfer))
     if config.raster:
-        found.append(raster_report(tables["raster"], config.raster))
+        found.append(raster_report((r["raster"] for r in records), config.raster))
     return found
-
-
-def load_kernels(config: EvaluationConfig) -> None:
-    """Load the compiled code that matching needs, by matching a small sample.
-
-    Args:
-        config: Metrics and their rules.
-    """
-    line = MapElements.from_polylines([[[0.0, 0.0], [1.0, 1.0]]], [0])
-    match_sample("", line, line, config)
 
 
 def flat_metrics(found: Sequence[MetricReport]) -> dict[str, float]:
@@ -163,6 +113,7 @@ class MapEvaluator:
 
     Args:
         config: Metrics and their rules.
+        samples: Matches so far; those of another process may be added.
     """
 
     config: EvaluationConfig
@@ -177,19 +128,6 @@ class MapEvaluator:
             ground_truth: Its ground truth.
         """
         self.samples.append(match_sample(token, predictions, ground_truth, self.config))
-
-    def merge(self, other: "MapEvaluator") -> None:
-        """Add the samples that another evaluator has seen.
-
-        Args:
-            other: An evaluator with the same rules.
-
-        Raises:
-            ValueError: If its rules differ.
-        """
-        if other.config != self.config:
-            raise ValueError(f"evaluators differ: {self.config} and {other.config}.")
-        self.samples.extend(other.samples)
 
     def compute(self) -> list[MetricReport]:
         """Return one report per metric."""

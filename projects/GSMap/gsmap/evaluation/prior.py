@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig, nearest_by_chamfer, resample_polylines
+from gsmap.evaluation.chamfer_ap import ChamferConfig, nearest_by_chamfer
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+from gsmap.structures.polylines import resample_all
 
 _LOWEST_SCORE = 0.05  # AP_raster drops lower ones; the order, which is all that counts, stays
 _MIN_PRECISION = 1e-3  # an element that is right once in a thousand samples adds nothing
@@ -56,7 +57,7 @@ def _class_truth(truth: Sequence[MapElements], label: int, num_points: int) -> _
     frames = [f for f in frames if len(f)]
     first = np.zeros(len(frames) + 1, dtype=np.int64)
     np.cumsum([len(f) for f in frames], out=first[1:])
-    points = [resample_polylines(f, num_points) for f in frames]
+    points = [resample_all(f.points, f.offsets, num_points) for f in frames]
     empty = np.empty((0, num_points, 2))
     return _ClassTruth(frames, first, np.concatenate(points) if points else empty)
 

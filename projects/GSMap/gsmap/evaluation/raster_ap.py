@@ -10,18 +10,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmap.evaluation import raster_drawing as drawing
 from gsmap.evaluation import raster_kernels as kernels
-from gsmap.evaluation.average_precision import calibration_error, interpolated_ap
+from gsmap.evaluation.average_precision import interpolated_ap
 from gsmap.evaluation.matches import (
     ClassDetections,
     FrameMatches,
-    MatchTable,
-    as_table,
     detections_per_class,
     unique_by_token,
 )
-from gsmap.evaluation.report import UNDEFINED, Curve, MetricReport, threshold_key
+from gsmap.evaluation.raster_drawing import Masks, draw
+from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures, curves_of
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
 LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
@@ -104,37 +102,6 @@ class RasterConfig:
         return self.polygon_thresholds if self.is_polygon[label] else self.line_thresholds
 
 
-@dataclass(frozen=True)
-class Masks:
-    """The masks of N elements as crops of the canvas.
-
-    Args:
-        words: Packed pixels of all crops, one crop after another (``raster_drawing``). (M,)
-        boxes: First row, first word, rows and words of each crop. (N, 4)
-        starts: Where each crop starts in ``words``, and the size of it. (N + 1,)
-        labels: Class indices. (N,)
-    """
-
-    words: drawing.WordArray
-    boxes: IntArray
-    starts: IntArray
-    labels: IntArray
-
-    def astuple(self) -> tuple[drawing.WordArray, IntArray, IntArray, IntArray]:
-        """Return the fields in the order in which the kernels take them."""
-        return self.words, self.boxes, self.starts, self.labels
-
-    def full(self, index: int, height: int, width: int) -> BoolArray:
-        """Return one mask on the whole canvas. (H, W)"""
-        top, left, rows, words = self.boxes[index]
-        packed = self.words[self.starts[index] : self.starts[index + 1]].astype("<u8")
-        bits = np.unpackbits(packed.view(np.uint8), bitorder="little").reshape(rows, 64 * words)
-        canvas = np.zeros((height, width), dtype=np.bool_)
-        columns = min(64 * int(words), width - 64 * int(left))
-        canvas[top : top + rows, 64 * left : 64 * left + columns] = bits[:, :columns]
-        return canvas
-
-
 def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
     """Round points to pixels, halves to even, with the arithmetic of the reference evaluator.
 
@@ -162,27 +129,21 @@ def rasterize(elements: MapElements, config: RasterConfig) -> Masks:
         config: Rules.
     """
     pixels = pixels_from_metres(elements.planar().points, config)
-    radius = config.dilation_px // 2
-    boxes, starts = drawing.crops(pixels, elements.offsets, config.height, config.width, radius)
     filled = np.array(config.is_polygon)[elements.labels]
-    masks = drawing.draw(pixels, elements.offsets, boxes, starts, filled, config.width, radius)
-    return Masks(masks, boxes, starts, elements.labels)
+    size, radius = (config.height, config.width), config.dilation_px // 2
+    return draw(pixels, elements.offsets, elements.labels, filled, size, radius)
 
 
 def _ranked_predictions(predictions: MapElements, config: RasterConfig) -> IntArray:
     """Return the predictions that count, in descending order of score."""
-    labels = predictions.labels
-    kept = (labels >= 0) & (labels < len(config.classes)) & (predictions.num_points >= 2)
-    rows = np.flatnonzero(kept & (predictions.confidence >= config.min_score))
-    rows = rows[np.argsort(-predictions.confidence[rows], kind="stable")]
-    if len(rows) > config.max_predictions:
-        labels = labels[rows]
-        rank = np.zeros(len(rows), dtype=np.int64)
-        for c in range(len(config.classes)):
-            mine = labels == c
-            rank[mine] = np.arange(mine.sum())
-        rows = rows[rank < config.max_predictions]
-    return rows
+    scores = predictions.confidence
+    rows = np.flatnonzero((predictions.num_points >= 2) & (scores >= config.min_score))
+    rows = rows[np.argsort(-scores[rows], kind="stable")]
+    counted = [
+        np.flatnonzero(predictions.labels[rows] == c)[: config.max_predictions]
+        for c in range(len(config.classes))
+    ]
+    return rows[np.sort(np.concatenate(counted))]
 
 
 def match_raster(
@@ -198,11 +159,10 @@ def match_raster(
     """
     num_classes = len(config.classes)
     rows = _ranked_predictions(predictions, config)
-    known = (ground_truth.labels >= 0) & (ground_truth.labels < num_classes)
-    gt_index = np.flatnonzero(known)
+    gt_index = np.flatnonzero((ground_truth.labels >= 0) & (ground_truth.labels < num_classes))
     pred = rasterize(predictions.select(rows), config)
     gt = rasterize(ground_truth.select(gt_index), config)
-    ious = kernels.mask_ious(pred.astuple(), gt.astuple())
+    ious = kernels.mask_ious(pred, gt)
     thresholds = np.array([config.thresholds_of(c) for c in range(num_classes)])
     matched = kernels.assign(ious, pred.labels, gt.labels, thresholds)
     loosest = matched[:, 0]
@@ -213,48 +173,28 @@ def match_raster(
         pred_index=rows,
         labels=pred.labels,
         scores=predictions.confidence[rows],
-        matched_gt=np.where(matched >= 0, gt_index[matched] if len(gt_index) else -1, -1),
+        matched_gt=np.append(gt_index, -1)[matched],
         quality=quality,
         num_gts=np.bincount(gt.labels, minlength=num_classes),
-        areas=kernels.union_areas(
-            pred.astuple(), gt.astuple(), num_classes, config.height, config.width
-        ),
+        class_iou=kernels.class_ious(pred, gt, num_classes, config.height, config.width),
     )
-
-
-def _mean_iou(table: MatchTable, label: int) -> float:
-    """Mean over the samples with predictions or ground truth of the class; -1 without any."""
-    if not len(table):
-        return UNDEFINED
-    assert table.areas is not None
-    shared, union = table.areas[:, label].T
-    predicted = np.bincount(table.sample[table.labels == label], minlength=len(table))
-    counts = (union > 0) | (table.num_gts[:, label] > 0) | (predicted > 0)
-    ious = shared[counts] / np.maximum(union[counts], 1)  # nothing is shared where union is 0
-    return float(np.mean(ious)) if len(ious) else UNDEFINED
-
-
-def _class_figures(found: ClassDetections, thresholds: tuple[float, ...]) -> dict[str, float]:
-    """Return the figures of one class, by the last part of their key."""
-    figures: dict[str, float] = {}
-    aps = [interpolated_ap(found.hits[:, t], found.num_gts) for t in range(len(thresholds))]
-    for t, threshold in enumerate(thresholds):
-        key, hits = threshold_key(threshold), found.hits[:, t]
-        figures[f"AP@{key}"] = aps[t]
-        figures[f"recall@{key}"] = _recall(hits, found.num_gts)
-        figures[f"tp@{key}"] = float(hits.sum())
-        figures[f"calibration_error@{key}"] = calibration_error(found.scores, hits)
-    figures["AP"] = float(np.mean(aps))
-    for limit in RECALL_LIMITS:
-        recalls = [_recall(hits, found.num_gts) for hits in found.hits[found.ranks < limit].T]
-        figures[f"AR@{limit}"] = float(np.mean(recalls))
-    figures["num_gts"] = float(found.num_gts)
-    figures["num_preds"] = float(len(found.scores))
-    return figures
 
 
 def _recall(hits: BoolArray, num_gts: int) -> float:
     return float(hits.sum()) / num_gts if num_gts else UNDEFINED
+
+
+def _class_figures(
+    found: ClassDetections, thresholds: tuple[float, ...], ious: FloatArray
+) -> dict[str, float]:
+    """Return the figures of one class, by the last part of their key."""
+    figures = class_figures(found, thresholds, interpolated_ap, absent=UNDEFINED)
+    for limit in RECALL_LIMITS:
+        recalls = [_recall(hits, found.num_gts) for hits in found.hits[found.ranks < limit].T]
+        figures[f"AR@{limit}"] = float(np.mean(recalls))
+    ious = ious[~np.isnan(ious)]
+    figures["mIoU"] = float(np.mean(ious)) if len(ious) else UNDEFINED
+    return figures
 
 
 def _mean_of_defined(values: Iterable[float]) -> float:
@@ -269,9 +209,7 @@ def _group_figures(metrics: dict[str, float], names: Sequence[str]) -> dict[str,
     return {k: _mean_of_defined(metrics[f"{name}/{k}"] for name in names) for k in averaged}
 
 
-def raster_report(
-    matches: MatchTable | Iterable[FrameMatches], config: RasterConfig
-) -> MetricReport:
+def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> MetricReport:
     """Compute AP_raster from the matches of all samples.
 
     A class without ground truth is left out of the means.
@@ -280,29 +218,24 @@ def raster_report(
         matches: All samples, in any order; repeated tokens count once.
         config: Rules.
     """
-    table = unique_by_token(as_table(matches))
-    num_thresholds = len(config.line_thresholds)
-    per_class = detections_per_class(table, len(config.classes), num_thresholds)
+    records, classes = unique_by_token(matches), config.classes
+    per_class = detections_per_class(records, len(classes), len(config.line_thresholds))
+    found = dict(zip(classes, per_class, strict=True))
+    by_class = {name: config.thresholds_of(c) for c, name in enumerate(classes)}
     metrics: dict[str, float] = {}
-    curves: list[Curve] = []
-    for c, (name, found) in enumerate(zip(config.classes, per_class, strict=True)):
-        thresholds = config.thresholds_of(c)
-        figures = {**_class_figures(found, thresholds), "mIoU": _mean_iou(table, c)}
-        metrics.update({f"{name}/{key}": value for key, value in figures.items()})
-        curves += [
-            Curve(name, threshold, found.scores, found.hits[:, t], found.num_gts)
-            for t, threshold in enumerate(thresholds)
-        ]
-    metrics["mAP"] = _mean_of_defined(metrics[f"{name}/AP"] for name in config.classes)
-    metrics["mIoU"] = _mean_of_defined(metrics[f"{name}/mIoU"] for name in config.classes)
+    for c, name in enumerate(classes):
+        ious = np.array([m.class_iou[c] for m in records if m.class_iou is not None])
+        figures = _class_figures(found[name], by_class[name], ious)
+        metrics |= {f"{name}/{key}": value for key, value in figures.items()}
+    for key in ("AP", "mIoU"):
+        mean = _mean_of_defined(metrics[f"{name}/{key}"] for name in classes)
+        metrics["mAP" if key == "AP" else key] = mean
     groups: dict[str, list[str]] = {}
-    for name, polygon in zip(config.classes, config.is_polygon, strict=True):
+    for name, polygon in zip(classes, config.is_polygon, strict=True):
         groups.setdefault("polygon" if polygon else "line", []).append(name)
     for group, names in groups.items():
         means = _group_figures(metrics, names)
-        metrics.update({f"{group}/{key}": value for key, value in means.items()})
-    metrics["num_samples"] = float(len(table))
-    by_class = {name: config.thresholds_of(c) for c, name in enumerate(config.classes)}
-    return MetricReport(
-        "raster", groups, by_class, {f"raster/{k}": v for k, v in metrics.items()}, curves
-    )
+        metrics |= {f"{group}/{key}": value for key, value in means.items()}
+    metrics["num_samples"] = float(len(records))
+    figures = {f"raster/{k}": v for k, v in metrics.items()}
+    return MetricReport("raster", groups, by_class, figures, curves_of(found, by_class))

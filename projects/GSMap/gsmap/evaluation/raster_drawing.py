@@ -7,6 +7,8 @@ of a polygon, enough to move an AP in the third digit; so the rule stands here, 
 A mask is a crop of the canvas, 64 pixels of a row to a word: bit b of word w is column 64 w + b.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit
@@ -19,36 +21,48 @@ _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _ONE = 65536  # crossings are in 1/65536 of a pixel
 
 
-@njit(cache=True)
-def crops(
-    pixels: IntArray, offsets: IntArray, height: int, width: int, radius: int
-) -> tuple[IntArray, IntArray]:
-    """Find the part of the canvas that each element and its dilation need.
+class Masks(NamedTuple):
+    """The masks of N elements as crops of the canvas.
 
     Args:
-        pixels: Column and row of all points. (M, 2)
-        offsets: Element i owns the points ``offsets[i]:offsets[i + 1]``. (N + 1,)
-        height: Rows of the canvas.
-        width: Columns of the canvas.
-        radius: Half the side of the dilating square, less the centre.
-
-    Returns:
-        First row, first word, rows and words of each crop, zero for an element without points or
-        outside the canvas (N, 4); where each crop starts in one flat array of words, and that
-        array's size (N + 1,).
+        words: Pixels of all crops, one crop after another. (M,)
+        boxes: First row, first word, rows and words of each crop, zero for an element without
+            points or outside the canvas. (N, 4)
+        starts: Where each crop starts in ``words``, and the size of it. (N + 1,)
+        labels: Class indices. (N,)
     """
-    boxes = np.zeros((len(offsets) - 1, 4), dtype=np.int64)
-    starts = np.zeros(len(offsets), dtype=np.int64)
+
+    words: WordArray
+    boxes: IntArray
+    starts: IntArray
+    labels: IntArray
+
+    def full(self, index: int, height: int, width: int) -> BoolArray:
+        """Return one mask on the whole canvas. (H, W)"""
+        top, left, rows, words = self.boxes[index]
+        packed = self.words[self.starts[index] : self.starts[index + 1]].astype("<u8")
+        bits = np.unpackbits(packed.view(np.uint8), bitorder="little").reshape(rows, 64 * words)
+        canvas = np.zeros((height, width), dtype=np.bool_)
+        columns = min(64 * int(words), width - 64 * int(left))
+        canvas[top : top + rows, 64 * left : 64 * left + columns] = bits[:, :columns]
+        return canvas
+
+
+@njit(cache=True)
+def _crops(
+    pixels: IntArray, offsets: IntArray, height: int, width: int, radius: int
+) -> tuple[IntArray, IntArray]:
+    """Find the part of the canvas that each element and its dilation need: boxes and starts."""
+    boxes = np.zeros((len(offsets) - 1, 4), np.int64)
+    starts = np.zeros(len(offsets), np.int64)
     for i in range(len(boxes)):
-        start, stop = offsets[i], offsets[i + 1]
-        if stop > start:
-            x_low, x_high = pixels[start:stop, 0].min(), pixels[start:stop, 0].max()
-            y_low, y_high = pixels[start:stop, 1].min(), pixels[start:stop, 1].max()
-            if x_high >= 0 and y_high >= 0 and x_low < width and y_low < height:
-                top, first_word = max(y_low - radius, 0), max(x_low - radius, 0) // 64
-                boxes[i, 0], boxes[i, 1] = top, first_word
-                boxes[i, 2] = min(y_high + radius + 1, height) - top
-                boxes[i, 3] = min(x_high + radius, width - 1) // 64 + 1 - first_word
+        points = pixels[offsets[i] : offsets[i + 1]]
+        x, y = points[:, 0], points[:, 1]
+        if len(x) and x.max() >= 0 and y.max() >= 0 and x.min() < width and y.min() < height:
+            top, first_word = max(y.min() - radius, 0), max(x.min() - radius, 0) // 64
+            boxes[i, 0], boxes[i, 1] = top, first_word
+            boxes[i, 2] = min(y.max() + radius + 1, height) - top
+            boxes[i, 3] = min(x.max() + radius, width - 1) // 64 + 1 - first_word
         starts[i + 1] = starts[i] + boxes[i, 2] * boxes[i, 3]
     return boxes, starts
 
@@ -83,20 +97,10 @@ def _side(value: int, limit: int) -> int:
 
 
 @njit(cache=True)
-def clip_segment(a: IntArray, b: IntArray, height: int, width: int) -> bool:
-    """Move the ends of a segment to where it meets the border, in place.
+def _clip_segment(a: IntArray, b: IntArray, height: int, width: int) -> bool:
+    """Move the ends of a segment to where it meets the border, and say if it has a part inside.
 
     First the rows are brought inside, then the columns; each new coordinate is truncated.
-
-    Args:
-        a: Column and row of the first end. (2,)
-        b: Column and row of the second end. (2,)
-        height: Rows of the mask.
-        width: Columns of the mask.
-
-    Returns:
-        Whether the segment has a part inside; without one the ends are moved as far as needed to
-        tell.
     """
     for axis in (1, 0):
         limit = (width if axis == 0 else height) - 1
@@ -148,16 +152,8 @@ def _fill(
     """Fill the inside of a polygon by the even-odd rule, dilated.
 
     Row y holds the pixels between the crossings of the edges that span [y, y + 1), rounded to the
-    nearest pixel.
-
-    Args:
-        mask: Where to set bits. (rows, words)
-        width: Columns of the mask.
-        corners: Column and row of each corner. (P, 2)
-        edges: Two points of the edge from each corner to the next, that fix its slope: its ends,
-            or where it meets the border of the mask. (P, 2, 2)
-        cut: Which edges leave the mask; their crossings are rounded down. (P,)
-        radius: Half the side of the dilating square, less the centre.
+    nearest pixel; down for edges that leave the mask (``cut``). ``edges`` (P, 2, 2) are two points
+    that fix each edge's slope: its ends, or where it meets the border of the mask.
     """
     num_edges, height = len(corners), mask.shape[0]
     x_start, slope = np.zeros(num_edges, np.int64), np.zeros(num_edges, np.int64)
@@ -189,48 +185,44 @@ def _fill(
 def draw(
     pixels: IntArray,
     offsets: IntArray,
-    boxes: IntArray,
-    starts: IntArray,
+    labels: IntArray,
     filled: BoolArray,
-    canvas_width: int,
+    size: tuple[int, int],
     radius: int,
-) -> WordArray:
+) -> Masks:
     """Draw and dilate all elements, each in its crop.
 
     Args:
         pixels: Column and row of all points. (M, 2)
         offsets: Element i owns the points ``offsets[i]:offsets[i + 1]``. (N + 1,)
-        boxes: Crops, from ``crops``. (N, 4)
-        starts: Where they start, from ``crops``. (N + 1,)
+        labels: Class indices. (N,)
         filled: Which elements are polygons. (N,)
-        canvas_width: Columns of the canvas.
+        size: Rows and columns of the canvas.
         radius: Half the side of the dilating square, less the centre.
-
-    Returns:
-        The crops, one after another. (starts[-1],)
     """
-    masks = np.zeros(starts[-1], dtype=np.uint64)
+    boxes, starts = _crops(pixels, offsets, size[0], size[1], radius)
+    words = np.zeros(starts[-1], np.uint64)
     for i in range(len(boxes)):
         top, left, height = boxes[i, 0], 64 * boxes[i, 1], boxes[i, 2]
         if height == 0:
             continue
-        width = min(64 * boxes[i, 3], canvas_width - left)
-        mask = masks[starts[i] : starts[i + 1]].reshape((height, boxes[i, 3]))
+        width = min(64 * boxes[i, 3], size[1] - left)
+        mask = words[starts[i] : starts[i + 1]].reshape((height, boxes[i, 3]))
         corners = pixels[offsets[i] : offsets[i + 1]] - np.array([left, top])
         num_edges = len(corners) - (0 if filled[i] else 1)
-        edges = np.zeros((num_edges, 2, 2), dtype=np.int64)
-        cut = np.zeros(num_edges, dtype=np.bool_)
+        edges = np.zeros((num_edges, 2, 2), np.int64)
+        cut = np.zeros(num_edges, np.bool_)
         for j in range(num_edges):
             edges[j, 0], edges[j, 1] = corners[j], corners[(j + 1) % len(corners)]
             for end in edges[j]:
                 cut[j] |= _side(end[0], width - 1) != 0 or _side(end[1], height - 1) != 0
             visible = True
             if cut[j]:
-                visible = clip_segment(edges[j, 0], edges[j, 1], height, width)
+                visible = _clip_segment(edges[j, 0], edges[j, 1], height, width)
             if visible:
                 _draw_segment(mask, width, edges[j, 0], edges[j, 1], radius)
             if edges[j, 0, 1] == edges[j, 1, 1]:  # it says nothing about the slope
                 edges[j, 0], edges[j, 1] = corners[j], corners[(j + 1) % len(corners)]
         if filled[i]:
             _fill(mask, width, corners, edges, cut, radius)
-    return masks
+    return Masks(words, boxes, starts, labels)

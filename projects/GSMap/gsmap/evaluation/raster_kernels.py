@@ -1,13 +1,10 @@
-"""Compiled comparison of masks; ``raster_ap`` is its only user.
-
-Masks are crops of packed pixels, as ``raster_drawing`` makes them.
-"""
+"""Compiled comparison of masks; ``raster_ap`` is its only user."""
 
 import numpy as np
 from numba import njit
 
-from gsmap.evaluation.raster_drawing import WordArray
-from gsmap.structures.elements import BoolArray, FloatArray, IntArray
+from gsmap.evaluation.raster_drawing import Masks, WordArray
+from gsmap.structures.elements import FloatArray, IntArray
 
 _COCO_SLACK = 1.0 - 1e-10  # COCO lowers a threshold of 1, so that equal masks match
 
@@ -24,62 +21,39 @@ def _count(word: int) -> int:
 
 
 @njit(cache=True)
-def areas(masks: WordArray, boxes: IntArray, starts: IntArray) -> IntArray:
-    """Count the pixels of each mask. (N,)"""
-    counts = np.zeros(len(boxes), dtype=np.int64)
-    for i in range(len(boxes)):
-        for word in masks[starts[i] : starts[i + 1]]:
-            counts[i] += _count(word)
-    return counts
-
-
-@njit(cache=True)
-def _intersection(
-    masks_a: WordArray,
-    box_a: IntArray,
-    start_a: int,
-    masks_b: WordArray,
-    box_b: IntArray,
-    start_b: int,
-) -> int:
-    """Count the pixels that two masks share."""
-    top, bottom = max(box_a[0], box_b[0]), min(box_a[0] + box_a[2], box_b[0] + box_b[2])
-    left, right = max(box_a[1], box_b[1]), min(box_a[1] + box_a[3], box_b[1] + box_b[3])
+def _intersection(a: Masks, i: int, b: Masks, k: int) -> int:
+    """Count the pixels that a mask shares with another."""
+    a_top, a_left, a_rows, a_words = a.boxes[i]
+    b_top, b_left, b_rows, b_words = b.boxes[k]
     total = 0
-    for row in range(top, bottom):
-        a = start_a + (row - box_a[0]) * box_a[3] - box_a[1]
-        b = start_b + (row - box_b[0]) * box_b[3] - box_b[1]
-        for word in range(left, right):
-            total += _count(masks_a[a + word] & masks_b[b + word])
+    for row in range(max(a_top, b_top), min(a_top + a_rows, b_top + b_rows)):
+        of_a = a.starts[i] + (row - a_top) * a_words - a_left
+        of_b = b.starts[k] + (row - b_top) * b_words - b_left
+        for word in range(max(a_left, b_left), min(a_left + a_words, b_left + b_words)):
+            total += _count(a.words[of_a + word] & b.words[of_b + word])
     return total
 
 
 @njit(cache=True)
-def mask_ious(
-    pred: tuple[WordArray, IntArray, IntArray, IntArray],
-    gt: tuple[WordArray, IntArray, IntArray, IntArray],
-) -> FloatArray:
+def mask_ious(pred: Masks, gt: Masks) -> FloatArray:
     """Return the IoU of each prediction with each ground truth of its class, 0 elsewhere.
 
     Args:
-        pred: Masks, boxes, starts and labels of N predictions.
-        gt: The same of K ground truths.
+        pred: N masks.
+        gt: K masks.
 
     Returns:
         IoU. (N, K)
     """
-    p_masks, p_boxes, p_starts, p_labels = pred
-    g_masks, g_boxes, g_starts, g_labels = gt
-    p_areas, g_areas = areas(p_masks, p_boxes, p_starts), areas(g_masks, g_boxes, g_starts)
-    ious = np.zeros((len(p_labels), len(g_labels)))
-    for i in range(len(p_labels)):
-        for k in range(len(g_labels)):
-            if p_labels[i] == g_labels[k]:
-                shared = _intersection(
-                    p_masks, p_boxes[i], p_starts[i], g_masks, g_boxes[k], g_starts[k]
-                )
+    ious = np.zeros((len(pred.labels), len(gt.labels)))
+    gt_areas = [_intersection(gt, k, gt, k) for k in range(len(gt.labels))]
+    for i in range(len(pred.labels)):
+        area = _intersection(pred, i, pred, i)
+        for k in range(len(gt.labels)):
+            if pred.labels[i] == gt.labels[k]:
+                shared = _intersection(pred, i, gt, k)
                 if shared:
-                    ious[i, k] = shared / (p_areas[i] + g_areas[k] - shared)
+                    ious[i, k] = shared / (area + gt_areas[k] - shared)
     return ious
 
 
@@ -102,10 +76,9 @@ def assign(
         The matched ground truth, or -1. (N, T)
     """
     n, k_total = ious.shape
-    num_thresholds = thresholds.shape[1]
-    matched = np.full((n, num_thresholds), -1, dtype=np.int64)
-    for t in range(num_thresholds):
-        taken = np.zeros(k_total, dtype=np.bool_)
+    matched = np.full((n, thresholds.shape[1]), -1)
+    for t in range(thresholds.shape[1]):
+        taken = np.zeros(k_total, np.bool_)
         for i in range(n):
             best = min(thresholds[pred_labels[i], t], _COCO_SLACK)
             match = -1
@@ -113,53 +86,46 @@ def assign(
                 if pred_labels[i] == gt_labels[k] and not taken[k] and ious[i, k] >= best:
                     best, match = ious[i, k], k
             if match >= 0:
-                taken[match] = True
-                matched[i, t] = match
+                taken[match], matched[i, t] = True, match
     return matched
 
 
 @njit(cache=True)
-def _union(
-    masks: WordArray, boxes: IntArray, starts: IntArray, which: BoolArray, height: int, words: int
-) -> WordArray:
-    """Join some masks on one canvas. (height, words)"""
-    canvas = np.zeros((height, words), dtype=np.uint64)
-    for i in range(len(boxes)):
-        if which[i]:
-            top, left, num_rows, num_words = boxes[i]
-            for row in range(num_rows):
-                for word in range(num_words):
-                    canvas[top + row, left + word] |= masks[starts[i] + row * num_words + word]
+def _union(masks: Masks, label: int, height: int, words: int) -> WordArray:
+    """Join the masks of a class on one canvas. (height, words)"""
+    canvas = np.zeros((height, words), np.uint64)
+    for i in np.flatnonzero(masks.labels == label):
+        top, left, num_rows, num_words = masks.boxes[i]
+        for row in range(num_rows):
+            start = masks.starts[i] + row * num_words
+            for word in range(num_words):
+                canvas[top + row, left + word] |= masks.words[start + word]
     return canvas
 
 
 @njit(cache=True)
-def union_areas(
-    pred: tuple[WordArray, IntArray, IntArray, IntArray],
-    gt: tuple[WordArray, IntArray, IntArray, IntArray],
-    num_classes: int,
-    height: int,
-    width: int,
-) -> IntArray:
-    """Compare all predictions of a class together with all its ground truths.
+def class_ious(pred: Masks, gt: Masks, num_classes: int, height: int, width: int) -> FloatArray:
+    """Return the IoU of all predictions of a class together with all its ground truths.
 
     Args:
-        pred: Masks, boxes, starts and labels of N predictions.
-        gt: The same of K ground truths.
+        pred: N masks.
+        gt: K masks.
         num_classes: Number of classes C.
         height: Rows of the canvas.
         width: Columns of the canvas.
 
     Returns:
-        Pixels in the intersection and in the union. (C, 2)
+        IoU, NaN for a class without predictions and ground truths. (C,)
     """
-    counts = np.zeros((num_classes, 2), dtype=np.int64)
+    ious = np.full(num_classes, np.nan)
     words = (width + 63) // 64
     for c in range(num_classes):
-        predicted = _union(pred[0], pred[1], pred[2], pred[3] == c, height, words)
-        true = _union(gt[0], gt[1], gt[2], gt[3] == c, height, words)
-        for row in range(height):
-            for word in range(words):
-                counts[c, 0] += _count(predicted[row, word] & true[row, word])
-                counts[c, 1] += _count(predicted[row, word] | true[row, word])
-    return counts
+        if (pred.labels == c).any() or (gt.labels == c).any():
+            predicted, true = _union(pred, c, height, words), _union(gt, c, height, words)
+            shared, union = 0, 0
+            for row in range(height):
+                for word in range(words):
+                    shared += _count(predicted[row, word] & true[row, word])
+                    union += _count(predicted[row, word] | true[row, word])
+            ious[c] = shared / max(union, 1)
+    return ious

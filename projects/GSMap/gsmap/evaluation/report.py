@@ -1,10 +1,12 @@
 """The outcome of a metric: flat figures, curves, and one table to read."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from gsmap.evaluation.average_precision import calibration_error
+from gsmap.evaluation.matches import ClassDetections
 from gsmap.structures.elements import BoolArray, FloatArray
 
 UNDEFINED = -1.0  # as in COCO: the figure does not exist (a class without ground truth, no match)
@@ -52,6 +54,44 @@ class MetricReport:
     thresholds: Mapping[str, tuple[float, ...]]
     metrics: dict[str, float]
     curves: list[Curve]
+
+
+def class_figures(
+    found: ClassDetections,
+    thresholds: Sequence[float],
+    average_precision: Callable[[BoolArray, int], float],
+    absent: float,
+) -> dict[str, float]:
+    """Return the figures of one class that both metrics have, by the last part of their key.
+
+    Args:
+        found: The predictions of the class.
+        thresholds: Thresholds of its hits. (T,)
+        average_precision: Turns hits (N,) and the number of ground truths into an AP.
+        absent: Recall of a class without ground truth.
+    """
+    figures: dict[str, float] = {}
+    for t, threshold in enumerate(thresholds):
+        key, hits = threshold_key(threshold), found.hits[:, t]
+        figures[f"AP@{key}"] = average_precision(hits, found.num_gts)
+        figures[f"recall@{key}"] = float(hits.sum()) / found.num_gts if found.num_gts else absent
+        figures[f"tp@{key}"] = float(hits.sum())
+        figures[f"calibration_error@{key}"] = calibration_error(found.scores, hits)
+    figures["AP"] = float(np.mean([figures[f"AP@{threshold_key(t)}"] for t in thresholds]))
+    figures["num_gts"] = float(found.num_gts)
+    figures["num_preds"] = float(len(found.scores))
+    return figures
+
+
+def curves_of(
+    found: Mapping[str, ClassDetections], thresholds: Mapping[str, Sequence[float]]
+) -> list[Curve]:
+    """Return one curve per class and threshold."""
+    return [
+        Curve(name, threshold, of_class.scores, of_class.hits[:, t], of_class.num_gts)
+        for name, of_class in found.items()
+        for t, threshold in enumerate(thresholds[name])
+    ]
 
 
 def _cell(value: float, digits: int = 4) -> str:

@@ -5,25 +5,28 @@ Results: ``{"meta": ..., "results": [{"sample_token", "vectors": [{"pts", "pts_n
 """
 
 import json
-import os
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gsmap.structures.elements import MapElements
+from gsmap.utils.files import atomic_write
 
 RESULTS_KEY, GROUND_TRUTH_KEY = "results", "GTs"
+THREE_D = "3D"
 
 
 def elements_from_vectors(
-    vectors: Sequence[Mapping[str, Any]], classes: Mapping[str, int], scored: bool
+    vectors: Sequence[Mapping[str, Any]], classes: Sequence[str], scored: bool
 ) -> MapElements:
     """Convert the ``vectors`` of one sample.
 
     Args:
         vectors: Entries with ``pts``, ``cls_name`` and, if scored, ``confidence_level``.
-        classes: Label of each class name; vectors of other classes get the label -1, which no
-            metric counts.
+        classes: Names of the classes; vectors of other classes get the label -1, which no metric
+            counts.
         scored: Whether to read the confidence.
 
     Returns:
@@ -32,9 +35,10 @@ def elements_from_vectors(
     Raises:
         ValueError: If a key is missing or a value is not finite.
     """
+    label_of = {name: label for label, name in enumerate(classes)}
     try:
         points = [v["pts"] for v in vectors]
-        labels = [classes.get(v["cls_name"], -1) for v in vectors]
+        labels = [label_of.get(v["cls_name"], -1) for v in vectors]
         scores = [v["confidence_level"] for v in vectors] if scored else None
     except KeyError as error:
         raise ValueError(
@@ -52,6 +56,7 @@ def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, 
         elements: Predictions. (N,)
         classes: Names of the classes.
     """
+    labels, scores = elements.labels.tolist(), elements.confidence.tolist()
     vectors: list[dict[str, Any]] = [
         {
             "pts": points.tolist(),
@@ -60,17 +65,82 @@ def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, 
             "type": label,
             "confidence_level": score,
         }
-        for points, label, score in zip(
-            elements.polylines, elements.labels.tolist(), elements.confidence.tolist(), strict=True
-        )
+        for points, label, score in zip(elements.polylines, labels, scores, strict=True)
     ]
     for name in ("scales", "rotations"):
         values = getattr(elements, name)
         if values is not None:
-            for i, vector in enumerate(vectors):
-                part = slice(elements.offsets[i], elements.offsets[i + 1])
-                vector[f"gaussian_{name}"] = values[part].tolist()
+            for vector, a, b in zip(vectors, elements.offsets, elements.offsets[1:], strict=False):
+                vector[f"gaussian_{name}"] = values[a:b].tolist()
     return vectors
+
+
+def read_samples(
+    path: str | Path, key: str, classes: Sequence[str]
+) -> tuple[dict[str, MapElements], Counter[str]]:
+    """Read a result or ground-truth file.
+
+    Samples become arrays while the file is parsed, so that no more than one is ever held as lists.
+
+    Args:
+        path: The file.
+        key: ``results`` or ``GTs``.
+        classes: Names of the classes.
+
+    Returns:
+        The elements of each sample, by token; how many elements are of which other class, and how
+        many samples have 3D points (``THREE_D``).
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If it has no list under the key, a sample is malformed or has no token, or a
+            token occurs twice; the message names the file and the sample.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no file at {path}.")
+    text, ignored = Path(path).read_bytes(), Counter[str]()
+    convert = partial(_converted, path, classes, key == RESULTS_KEY, ignored)
+    try:
+        items = json.loads(text, object_hook=convert)[key]
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        items = error
+    if not isinstance(items, list):
+        raise ValueError(
+            f"{path} {f'holds no complete list under {key!r}' if text else 'is empty'}: expected "
+            f'{{"{key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}, got {items!r:.80}.'
+        )
+    samples: dict[str, MapElements] = {}
+    for item in items:
+        if not isinstance(item, tuple):
+            token = item.get("sample_token") if isinstance(item, dict) else None
+            what = "a sample has no sample_token" if token is None else f"sample {token!r}"
+            raise ValueError(f"{path}: {what}: expected sample_token and a list of vectors.")
+        if item[0] in samples:
+            raise ValueError(f"{path} holds sample {item[0]!r} more than once.")
+        samples[item[0]] = item[1]
+    return samples, ignored
+
+
+def _converted(
+    path: str | Path,
+    classes: Sequence[str],
+    scored: bool,
+    ignored: Counter[str],
+    item: dict[str, Any],
+) -> Any:
+    """Return a sample as its token and elements, and count what is ignored; others as they are."""
+    token, vectors = item.get("sample_token"), item.get("vectors")
+    if token is None or not isinstance(vectors, list):
+        return item
+    try:
+        elements = elements_from_vectors(vectors, classes, scored)
+    except ValueError as error:
+        raise ValueError(f"{path}, sample {token!r}: {error}") from error
+    if (elements.labels < 0).any():
+        ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in classes)
+    if any(len(point) == 3 for v in vectors for point in v["pts"][:1]):
+        ignored[THREE_D] += 1
+    return str(token), elements
 
 
 def write_results(
@@ -87,17 +157,10 @@ def write_results(
         meta: What to say about the file.
         key: ``results``, or ``GTs`` for ground truth.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("w", encoding="utf-8") as file:
-            file.write(f'{{"meta":{json.dumps(dict(meta or {}))},"{key}":[')
-            for number, (token, vectors) in enumerate(samples):
-                file.write(",\n" if number else "\n")
-                sample = {"sample_token": token, "vectors": vectors}
-                file.write(json.dumps(sample, separators=(",", ":")))
-            file.write("\n]}\n")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with atomic_write(path) as file:
+        file.write(f'{{"meta":{json.dumps(dict(meta or {}))},"{key}":[')
+        for number, (token, vectors) in enumerate(samples):
+            file.write(",\n" if number else "\n")
+            sample = {"sample_token": token, "vectors": vectors}
+            file.write(json.dumps(sample, separators=(",", ":")))
+        file.write("\n]}\n")

@@ -68,8 +68,37 @@ def resample(points: Points, num_points: int) -> NDArray[np.float64]:
     points = _check_polyline(points)
     if num_points < 2:
         raise ValueError(f"num_points must be >= 2, got {num_points}.")
-    length = arc_lengths(points)[-1]
-    return points_at(points, np.linspace(0.0, length, num_points))
+    return resample_all(points, np.array([0, len(points)]), num_points)[0]
+
+
+def resample_all(
+    points: Points, offsets: NDArray[np.integer[Any]], num_points: int
+) -> NDArray[np.float64]:
+    """Resample many polylines at equal arc length, both end points included.
+
+    Args:
+        points: Vertices of all polylines in metres. (M, D)
+        offsets: Polyline i owns the vertices ``offsets[i]:offsets[i + 1]``. (N + 1,)
+        num_points: Number P of points of each, >= 2.
+
+    Returns:
+        Resampled points in metres; zeros for a polyline without vertices. (N, P, D)
+    """
+    counts = np.diff(offsets)
+    resampled = np.zeros((len(counts), num_points, points.shape[1]))
+    if not counts.any():
+        return resampled
+    vertex = np.minimum(np.arange(counts.max()), counts[:, None] - 1) + offsets[:-1, None]
+    padded = points[vertex.clip(0)]  # (N, n, D), the last vertex repeated
+    along = np.zeros(vertex.shape)
+    np.cumsum(np.linalg.norm(np.diff(padded, axis=1), axis=-1), axis=1, out=along[:, 1:])
+    distances = np.arange(num_points) * (along[:, -1:] / (num_points - 1))  # (N, P)
+    distances[:, -1] = along[:, -1]
+    for i in np.flatnonzero(counts):
+        n = counts[i]
+        for axis in range(points.shape[1]):
+            resampled[i, :, axis] = np.interp(distances[i], along[i, :n], padded[i, :n, axis])
+    return resampled
 
 
 def rotations(
