@@ -124,7 +124,7 @@ def data_steps(folder: Path, budget: Budget) -> Iterable[Step]:
     metrics = folder / "prior.json"
     yield Step(
         "score the prior",
-        ["tools/map_prior.py", *map(str, splits), "--out", str(metrics)],
+        ["tools/evaluate.py", str(splits[1]), "--prior", str(splits[0]), "--out", str(metrics)],
         [metrics],
     )
 
@@ -176,7 +176,6 @@ def table(folder: Path, models: Iterable[str]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for name, path in rows.items():
         figures = json.loads(path.read_text())
-        figures = figures.get("metrics", figures)  # the prior's file also holds its elements
         keys = [[f"{metric}/{c}/AP" for c in CLASSES] for metric in ("chamfer", "raster")]
         keys = [*keys[0], "chamfer/mAP", *keys[1], "raster/mAP"]
         cells = [f"{100 * figures[key]:.1f}" if key in figures else "" for key in keys]

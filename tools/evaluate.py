@@ -4,6 +4,7 @@
 Examples:
     python tools/evaluate.py results.json data/nuscenes/annotations_val.arrow --eval chamfer raster
     python tools/evaluate.py results.json nuscenes_map_anns_val.json --eval chamfer --hard
+    python tools/evaluate.py annotations_val.arrow --prior annotations_train.arrow
 """
 
 # ruff: noqa: E402 - numpy reads these variables when it is imported
@@ -26,8 +27,11 @@ from gsmap.evaluation.chamfer_ap import (
 )
 from gsmap.evaluation.evaluator import METRIC_NAMES, EvaluationConfig, flat_metrics
 from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files
+from gsmap.evaluation.prior import PriorConfig, evaluate_prior
 from gsmap.evaluation.raster_ap import POLYGON_CLASSES, RasterConfig
 from gsmap.evaluation.report import format_table
+from gsmap.utils.cli import run_command
+from gsmap.utils.files import write_text
 
 DEFAULT_CLASSES = ("divider", "ped_crossing", "boundary")
 DEFAULT_RANGE = (-15.0, -30.0, 15.0, 30.0)
@@ -37,10 +41,17 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("results", type=Path, help="results in MapTR's JSON form")
+    parser.add_argument("results", type=Path, nargs="?", help="results in MapTR's JSON form")
     parser.add_argument(
         "ground_truth", type=Path, help="annotation file (*.arrow), or JSON with a list of GTs"
     )
+    parser.add_argument(
+        "--prior",
+        type=Path,
+        metavar="TRAIN",
+        help="instead of results: the best fixed set of elements, fitted on this ground truth",
+    )
+    parser.add_argument("--prior-elements", type=int, default=50, help="elements in that set")
     parser.add_argument("--eval", nargs="+", default=list(METRIC_NAMES), choices=METRIC_NAMES)
     parser.add_argument(
         "--thresholds", nargs="+", type=float, help="of AP_chamfer, in metres (0.5 1.0 1.5)"
@@ -83,6 +94,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="write all figures as flat JSON")
     parser.add_argument("--pr-curves", type=Path, help="draw PR curves and calibration")
     args = parser.parse_args(argv)
+    if (args.results is None) == (args.prior is None):
+        parser.error("name either a result file or --prior")
     if args.hard and args.thresholds:
         parser.error("--hard and --thresholds exclude each other")
     return args
@@ -124,10 +137,7 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     for note in outcome.notes:
         print(f"note: {note}")
     if args.out:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        partial = args.out.with_name(f"{args.out.name}.partial")
-        partial.write_text(json.dumps(flat_metrics(outcome.reports), indent=1) + "\n")
-        partial.replace(args.out)
+        write_text(args.out, json.dumps(flat_metrics(outcome.reports), indent=1) + "\n")
         print(f"figures: {args.out}")
     if args.pr_curves:
         from gsmap.evaluation.curves import draw_curves
@@ -136,11 +146,14 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         print(f"curves: {args.pr_curves}")
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(argv: list[str] | None = None) -> str:
     args = parse_args(argv)
     start = time.perf_counter()
-    try:
-        config = config_from(args)
+    config = config_from(args)
+    if args.prior:
+        prior = PriorConfig(max_elements=args.prior_elements)
+        outcome = evaluate_prior(args.prior, args.ground_truth, config, prior)
+    else:
         outcome = evaluate_files(
             args.results,
             args.ground_truth,
@@ -149,17 +162,10 @@ def main(argv: list[str] | None = None) -> int:
             args.allow_mismatch,
             show_progress,
         )
-    except (ValueError, OSError, RuntimeError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
     report(outcome, args)
     number = int(next(iter(outcome.reports)).metrics[f"{outcome.reports[0].name}/num_samples"])
-    print(f"{number} samples in {time.perf_counter() - start:.1f} s")
-    return 0
+    return f"{number} samples in {time.perf_counter() - start:.1f} s"
 
 
 if __name__ == "__main__":
-    code = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)  # without 0.15 s of taking the compiled code down
+    run_command(main)

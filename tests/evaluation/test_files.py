@@ -62,7 +62,7 @@ def command():
 def test_command_writes_flat_figures_of_samples_paired_by_token(files, tmp_path, capsys):
     out, curves = tmp_path / "metrics.json", tmp_path / "curves.png"
     arguments = [*map(str, files), "--out", str(out), "--pr-curves", str(curves)]
-    assert command()([*arguments, "--eval", "chamfer", "raster"]) == 0
+    assert command()([*arguments, "--eval", "chamfer", "raster"]).startswith("8 samples")
     metrics = json.loads(out.read_text())
     assert metrics["chamfer/divider/AP@0.5"] == 1.0
     assert metrics["chamfer/ped_crossing/AP"] == 0.5
@@ -82,8 +82,18 @@ def test_annotation_file_and_json_give_the_same_figures(files, tmp_path):
     write_annotations(arrow, AnnotationMeta("minicity", "lidar", "val"), samples)
     outs = [tmp_path / "json.json", tmp_path / "arrow.json"]
     for truth, out in zip((files[1], arrow), outs, strict=True):
-        assert command()([str(files[0]), str(truth), "--out", str(out)]) == 0
+        command()([str(files[0]), str(truth), "--out", str(out)])
     assert outs[0].read_text() == outs[1].read_text()
+
+
+def test_prior_is_fitted_on_one_file_and_scored_on_another(files, tmp_path, capsys):
+    out = tmp_path / "prior.json"
+    command()([str(files[1]), "--prior", str(files[1]), "--out", str(out), "--eval", "chamfer"])
+    assert json.loads(out.read_text())["chamfer/divider/AP"] == 1.0
+    assert "the same 2 elements in every sample, fitted on 8" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        command()([str(files[1])])
+    assert "either a result file or --prior" in capsys.readouterr().err
 
 
 def test_two_workers_give_the_same_digits(tmp_path):
@@ -179,7 +189,8 @@ def test_malformed_results_name_the_file_and_the_sample(tmp_path, text, message)
     write_results(truth, truth_of(1), key="GTs")
     with pytest.raises(ValueError, match=message):
         evaluate_files(results, truth, CONFIG)
-    assert command()([str(results), str(truth)]) == 1
+    with pytest.raises(ValueError, match=message):
+        command()([str(results), str(truth)])
 
 
 def test_samples_are_read_from_any_layout_of_the_file(tmp_path):

@@ -1,7 +1,7 @@
 """Score a result file against a ground-truth file, in one or more processes."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -155,25 +155,31 @@ def evaluate_files(
     results, ignored["predictions"] = read_samples(results_path, RESULTS_KEY, config.classes)
     truth, ignored["ground truths"] = read_ground_truth(truth_path, config.classes)
     notes = mismatch_notes(results, truth, allow_mismatch) + _content_notes(truth, ignored)
-    return Evaluation(
-        reports(_matches(results, truth, config, num_workers, progress), config), notes
-    )
+    return Evaluation(score(results, truth, config, num_workers, progress), notes)
 
 
-def _matches(
+def score(
     results: Samples,
     truth: Samples,
     config: EvaluationConfig,
-    num_workers: int,
-    progress: Callable[[int, int], None] | None,
-) -> Iterable[SampleMatches]:
-    """Match all samples of the ground truth."""
+    num_workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[MetricReport]:
+    """Match all samples of the ground truth and compute the metrics.
+
+    Args:
+        results: Predictions by token; those of samples without ground truth are left out.
+        truth: Ground truth by token.
+        config: Metrics and their rules.
+        num_workers: Number of processes.
+        progress: Called with the number of samples done and in all.
+    """
     nothing = MapElements.from_polylines()
     pairs = [(token, results.get(token, nothing), of_token) for token, of_token in truth.items()]
     tasks = [pairs[i : i + CHUNK] for i in range(0, len(pairs), CHUNK)]
-    done = 0
+    matches: list[SampleMatches] = []
     for found in ordered_map(partial(_match_all, config), tasks, num_workers):
-        yield from found
-        done += len(found)
+        matches += found
         if progress is not None:
-            progress(done, len(pairs))
+            progress(len(matches), len(pairs))
+    return reports(matches, config)

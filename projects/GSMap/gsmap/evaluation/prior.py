@@ -5,17 +5,21 @@ same score, in every sample; the set is chosen greedily so that AP_chamfer on th
 as high as it gets.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig, nearest_by_chamfer
-from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+from gsmap.evaluation.evaluator import EvaluationConfig, flat_metrics
+from gsmap.evaluation.file_evaluation import Evaluation, read_ground_truth, score
+from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
 
 _LOWEST_SCORE = 0.05  # AP_raster drops lower ones; the order, which is all that counts, stays
 _MIN_PRECISION = 1e-3  # an element that is right once in a thousand samples adds nothing
+_REFINEMENTS = 3  # how often a chosen element is moved to the mean of what it matches
 
 
 @dataclass(frozen=True)
@@ -25,95 +29,22 @@ class PriorConfig:
     Args:
         max_elements: Elements in the set, over all classes; a network of 50 queries predicts 50.
         max_candidates: Ground truths of a class that are tried, evenly drawn from the training set.
+        max_samples: Training samples to use, evenly spread over the file.
         num_points: Points of each element.
-        refinements: How often a chosen element is moved to the mean of what it matches.
         seed: Draws the candidates.
     """
 
     max_elements: int = 50
     max_candidates: int = 400
+    max_samples: int = 2000
     num_points: int = 20
-    refinements: int = 3
     seed: int = 0
 
 
-@dataclass
-class _ClassTruth:
-    """The training ground truth of one class, flat over all samples.
-
-    Args:
-        frames: Ground truth of each sample that has any of the class.
-        first: Where each of these samples starts in the flat list. (F + 1,)
-        points: Resampled elements. (K, P, 2)
-    """
-
-    frames: list[MapElements]
-    first: IntArray
-    points: FloatArray
-
-
-def _class_truth(truth: Sequence[MapElements], label: int, num_points: int) -> _ClassTruth:
-    frames = [t.select(t.labels == label) for t in truth]
-    frames = [f for f in frames if len(f)]
-    first = np.zeros(len(frames) + 1, dtype=np.int64)
-    np.cumsum([len(f) for f in frames], out=first[1:])
-    points = [resample_all(f.points, f.offsets, num_points) for f in frames]
-    empty = np.empty((0, num_points, 2))
-    return _ClassTruth(frames, first, np.concatenate(points) if points else empty)
-
-
-def _matches(
-    candidates: FloatArray, label: int, truth: _ClassTruth, config: ChamferConfig
-) -> tuple[IntArray, FloatArray]:
-    """Find what each candidate would match in each sample.
-
-    Args:
-        candidates: Lines in metres. (N, P, 2)
-        label: Their class.
-        truth: Ground truth of the class.
-        config: Rules of AP_chamfer.
-
-    Returns:
-        Flat index of the nearest ground truth or -1 (N, F), and its distance in metres (N, F).
-    """
-    elements = MapElements.from_polylines(list(candidates), np.full(len(candidates), label))
-    nearest = np.full((len(candidates), len(truth.frames)), -1, dtype=np.int64)
-    distance = np.full(nearest.shape, np.inf)
-    for i, frame in enumerate(truth.frames):
-        best, d = nearest_by_chamfer(elements, frame, config, config.thresholds[-1])
-        nearest[:, i] = np.where(best >= 0, best + truth.first[i], -1)
-        distance[:, i] = d
-    return nearest, distance
-
-
-def _new_hits(
-    nearest: IntArray, distance: FloatArray, taken: BoolArray, thresholds: FloatArray
-) -> FloatArray:
-    """Count the free ground truths that each candidate matches, averaged over the thresholds.
-
-    Args:
-        nearest: Flat index of the nearest ground truth, or -1. (N, F)
-        distance: Its distance in metres. (N, F)
-        taken: Ground truths that are matched already, at each threshold. (T, K)
-        thresholds: Thresholds in metres. (T,)
-
-    Returns:
-        Mean number of new matches. (N,)
-    """
-    hits = np.zeros(len(nearest))
-    for t, threshold in enumerate(thresholds):
-        hits += ((distance <= threshold) & ~taken[t][nearest]).sum(axis=1)
-    return hits / len(thresholds)
-
-
 def _aligned_mean(line: FloatArray, others: FloatArray) -> FloatArray:
-    """Return the mean of lines after bringing each into the point order nearest to the first.
+    """Return the mean of lines (K, P, 2), each in the point order nearest to ``line`` (P, 2).
 
     A closed ring may also start at any of its points.
-
-    Args:
-        line: The line that gives the order. (P, 2)
-        others: Lines to average. (K, P, 2)
     """
     orders = [others, others[:, ::-1]]
     if np.allclose(line[0], line[-1]) and np.allclose(others[:, 0], others[:, -1]):
@@ -134,59 +65,75 @@ class _ClassFit:
     def __init__(
         self,
         label: int,
-        truth: _ClassTruth,
-        num_samples: int,
+        truth: Sequence[MapElements],
         chamfer: ChamferConfig,
         config: PriorConfig,
     ) -> None:
-        self.label, self.truth, self.chamfer, self.config = label, truth, chamfer, config
-        self.num_samples = num_samples
+        self.label, self.chamfer, self.num_samples = label, chamfer, len(truth)
         self.thresholds = np.asarray(chamfer.thresholds)
-        total = len(truth.points)
-        self.taken = np.zeros((len(self.thresholds), total), dtype=np.bool_)
-        rng = np.random.default_rng(config.seed)
-        drawn = rng.permutation(total)[: config.max_candidates]
-        self.candidates = truth.points[np.sort(drawn)]
-        self.nearest, self.distance = _matches(self.candidates, label, truth, chamfer)
+        frames = [elements.select(elements.labels == label) for elements in truth]
+        self.frames = [frame for frame in frames if len(frame)]
+        self.first = np.cumsum([0, *map(len, self.frames)])  # where each frame starts, (F + 1,)
+        points = [resample_all(f.points, f.offsets, config.num_points) for f in self.frames]
+        self.points = np.concatenate([np.empty((0, config.num_points, 2)), *points])  # (K, P, 2)
+        self.taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)
+        drawn = np.random.default_rng(config.seed).permutation(len(self.points))
+        self.candidates = self.points[np.sort(drawn[: config.max_candidates])]
+        self.nearest, self.distance = self._compare(self.candidates)
+
+    def _compare(self, lines: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Find the flat index of the ground truth nearest to each line in each frame, or -1.
+
+        Returns it with its distance in metres. 2 x (N, F)
+        """
+        elements = MapElements.from_polylines(lines, np.full(len(lines), self.label))
+        nearest = np.full((len(lines), len(self.frames)), -1)
+        distance = np.full(nearest.shape, np.inf)
+        for i, frame in enumerate(self.frames):
+            best, d = nearest_by_chamfer(elements, frame, self.chamfer, self.thresholds[-1])
+            nearest[:, i] = np.where(best >= 0, best + self.first[i], -1)
+            distance[:, i] = d
+        return nearest, distance
+
+    def _new_hits(self, nearest: IntArray, distance: FloatArray) -> FloatArray:
+        """Count the free ground truths that each line matches, averaged over thresholds. (N,)"""
+        hits = [
+            ((distance <= threshold) & ~taken[nearest]).sum(axis=-1)
+            for threshold, taken in zip(self.thresholds, self.taken, strict=True)
+        ]
+        mean: FloatArray = np.mean(hits, axis=0)
+        return mean
 
     def propose(self) -> tuple[float, float, int]:
         """Return the gain in AP of the best candidate, its precision and its position."""
         if not len(self.candidates):
             return 0.0, 0.0, -1
-        hits = _new_hits(self.nearest, self.distance, self.taken, self.thresholds)
+        hits = self._new_hits(self.nearest, self.distance)
         best = int(hits.argmax())
         precision = float(hits[best]) / self.num_samples
-        recall = float(hits[best]) / self.taken.shape[1]
-        return precision * recall, precision, best
+        return precision * float(hits[best]) / len(self.points), precision, best
 
     def take(self, index: int) -> tuple[FloatArray, float]:
         """Refine a candidate, mark what it matches as taken; return it and its precision."""
-        line = self.candidates[index]
-        nearest, distance = self.nearest[index], self.distance[index]
-        best = self._hits(nearest, distance)
-        for _ in range(self.config.refinements):
+        line, nearest, distance = self.candidates[index], self.nearest[index], self.distance[index]
+        best = float(self._new_hits(nearest, distance))
+        for _ in range(_REFINEMENTS):
             near = (distance <= self.thresholds[-1]) & ~self.taken[-1][nearest]
             if not near.any():
                 break
-            moved = _aligned_mean(line, self.truth.points[nearest[near]])
-            found = _matches(moved[None], self.label, self.truth, self.chamfer)
-            hits = self._hits(found[0][0], found[1][0])
+            moved = _aligned_mean(line, self.points[nearest[near]])
+            (new_nearest,), (new_distance,) = self._compare(moved[None])
+            hits = float(self._new_hits(new_nearest, new_distance))
             if hits <= best:
                 break
-            line, best, nearest, distance = moved, hits, found[0][0], found[1][0]
+            line, best, nearest, distance = moved, hits, new_nearest, new_distance
         for t, threshold in enumerate(self.thresholds):
             self.taken[t][nearest[distance <= threshold]] = True
         return line, best / self.num_samples
 
-    def _hits(self, nearest: IntArray, distance: FloatArray) -> float:
-        return float(_new_hits(nearest[None], distance[None], self.taken, self.thresholds)[0])
-
 
 def fit_prior(
-    truth: Sequence[MapElements],
-    chamfer: ChamferConfig,
-    config: PriorConfig | None = None,
-    progress: Callable[[str], None] | None = None,
+    truth: Sequence[MapElements], chamfer: ChamferConfig, config: PriorConfig | None = None
 ) -> MapElements:
     """Fit the fixed set of elements that scores best on a training set.
 
@@ -200,7 +147,6 @@ def fit_prior(
         truth: Ground truth of each training sample.
         chamfer: Rules of AP_chamfer.
         config: How the prior is fitted.
-        progress: Called with a line of text at each stage.
 
     Returns:
         The elements, with their scores.
@@ -209,12 +155,7 @@ def fit_prior(
         ValueError: If the training set holds no ground truth.
     """
     config = config or PriorConfig()
-    say = progress or (lambda _: None)
-    fits = []
-    for label, name in enumerate(chamfer.classes):
-        of_class = _class_truth(truth, label, config.num_points)
-        say(f"{name}: comparing candidates with {len(of_class.points)} ground truths")
-        fits.append(_ClassFit(label, of_class, len(truth), chamfer, config))
+    fits = [_ClassFit(label, truth, chamfer, config) for label in range(len(chamfer.classes))]
     if not any(len(fit.candidates) for fit in fits):
         raise ValueError("the training set holds no ground truth of these classes.")
     lines: list[FloatArray] = []
@@ -226,10 +167,43 @@ def fit_prior(
         _, precision, index = proposals[label]
         if precision < _MIN_PRECISION:
             break
-        line, score = fits[label].take(index)
+        line, share = fits[label].take(index)
         lines.append(line)
         labels.append(label)
-        scores.append(score)
-    say(f"{len(lines)} elements chosen")
+        scores.append(share)
     lifted = _LOWEST_SCORE + (1.0 - _LOWEST_SCORE) * np.clip(scores, 0.0, 1.0)
     return MapElements.from_polylines(lines, labels, lifted)
+
+
+def evaluate_prior(
+    train_path: str | Path,
+    truth_path: str | Path,
+    config: EvaluationConfig,
+    prior: PriorConfig | None = None,
+) -> Evaluation:
+    """Fit the prior on one file of ground truth and score it on another.
+
+    Args:
+        train_path: Ground truth to fit on: an annotation file, or MapTR's JSON.
+        truth_path: Ground truth to score on.
+        config: Metrics and their rules.
+        prior: How the prior is fitted.
+    """
+    prior, chamfer = prior or PriorConfig(), config.chamfer or ChamferConfig(config.classes)
+    train, _ = read_ground_truth(train_path, config.classes)
+    tokens = list(train)[:: max(1, -(-len(train) // prior.max_samples))]
+    fitted = fit_prior([train[token] for token in tokens], chamfer, prior)
+    found, on_train = (
+        score(dict.fromkeys(truth, fitted), truth, of)
+        for truth, of in (
+            (read_ground_truth(truth_path, config.classes)[0], config),
+            ({token: train[token] for token in tokens}, EvaluationConfig(chamfer, None)),
+        )
+    )
+    return Evaluation(
+        found,
+        [
+            f"the same {len(fitted)} elements in every sample, fitted on {len(tokens)} training "
+            f"samples; mAP_chamfer there {flat_metrics(on_train)['chamfer/mAP']:.6f}"
+        ],
+    )
