@@ -14,6 +14,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import markdown_table
+from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.evaluator import EvaluationConfig, MapEvaluator, flat_metrics
+from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.results_json import write_results
+from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing", "boundary")
 TOOL = Path(__file__).resolve().parents[1] / "tools" / "evaluate.py"
@@ -27,8 +32,7 @@ class Run:
     Args:
         wall_s: Wall-clock time in seconds.
         cpu_s: Processor time in seconds, workers included.
-        peak_mib: Largest resident memory of all its processes together, in MiB; pages that they
-            share count once for each.
+        peak_mib: Largest resident memory of its largest process, in MiB.
     """
 
     wall_s: float
@@ -108,8 +112,6 @@ def write_race(folder: Path, frames: list[Record], count: int) -> tuple[Path, Pa
     Returns:
         The result file and the ground-truth file.
     """
-    from gsmap.evaluation.results_json import write_results
-
     paths = folder / f"results_{count}.json", folder / f"truth_{count}.json"
     for path, part, key in zip(paths, ("pred", "gt"), ("results", "GTs"), strict=True):
         samples = (
@@ -120,63 +122,35 @@ def write_race(folder: Path, frames: list[Record], count: int) -> tuple[Path, Pa
     return paths
 
 
-def _resident_mib(pid: int) -> float:
-    """Return the resident memory of a process and its children; 0 for one that is gone."""
-    try:
-        status = Path(f"/proc/{pid}/status").read_text()
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    except OSError:
-        return 0.0
-    own = next((line for line in status.splitlines() if line.startswith("VmRSS")), "VmRSS: 0 kB")
-    return int(own.split()[1]) / 1024 + sum(_resident_mib(int(child)) for child in children)
-
-
-def _measure(command: list[str]) -> Run:
-    """Run a command and measure it with everything that it starts.
-
-    Raises:
-        RuntimeError: If it fails.
-    """
+def _evaluate(files: tuple[Path, Path], metrics: list[str], workers: int = 1) -> Run:
+    """Run the command and measure it with everything that it starts."""
+    command = [sys.executable, str(TOOL), *map(str, files), "--eval", *metrics]
     start = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    peak, pid = 0.0, 0
-    while pid == 0:
-        peak = max(peak, _resident_mib(process.pid))
-        time.sleep(0.02)
-        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+    process = subprocess.Popen([*command, "--workers", str(workers)], stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
     wall = time.perf_counter() - start
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}.")
-    return Run(wall, usage.ru_utime + usage.ru_stime, peak)
+    return Run(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
 
 
-def _evaluate(files: tuple[Path, Path], metrics: list[str], workers: int = 1) -> Run:
-    command = [sys.executable, str(TOOL), *map(str, files), "--eval", *metrics]
-    return _measure([*command, "--workers", str(workers)])
+def _frame(record: Record) -> tuple[MapElements, MapElements]:
+    """Return predictions and ground truth of a frame."""
+    pred, truth = record["pred"], record["gt"]
+    return (
+        MapElements.from_polylines(
+            [e["pts"] for e in pred], [e["label"] for e in pred], [e["score"] for e in pred]
+        ),
+        MapElements.from_polylines([e["pts"] for e in truth], [e["label"] for e in truth]),
+    )
 
 
 def _reference_table(frames: list[Record], count: int) -> str:
     """Compare the reference's way with ours on a few samples, in this process, loading apart."""
-    from benchmarks import reference_evaluation as reference
-    from gsmap.evaluation.chamfer_ap import ChamferConfig
-    from gsmap.evaluation.evaluator import EvaluationConfig, MapEvaluator, flat_metrics
-    from gsmap.evaluation.raster_ap import RasterConfig
-    from gsmap.structures.elements import MapElements
+    from benchmarks import reference_evaluation as reference  # needs pycocotools
 
-    samples = []
-    for k in range(count):
-        frame = frames[k % len(frames)]
-        pred, gt = frame["pred"], frame["gt"]
-        predictions = MapElements.from_polylines(
-            [e["pts"] for e in pred], [e["label"] for e in pred], [e["score"] for e in pred]
-        )
-        samples.append(
-            (
-                predictions,
-                MapElements.from_polylines([e["pts"] for e in gt], [e["label"] for e in gt]),
-            )
-        )
+    samples = [_frame(frames[k % len(frames)]) for k in range(count)]
     chamfer, raster = ChamferConfig(CLASSES), RasterConfig(CLASSES)
     rows = []
     for name, config, slow in (
