@@ -32,7 +32,8 @@ class Run:
     Args:
         wall_s: Wall-clock time in seconds.
         cpu_s: Processor time in seconds, workers included.
-        peak_mib: Largest resident memory of its largest process, in MiB.
+        peak_mib: Largest resident memory of all its processes together, in MiB; pages that they
+            share count once for each.
     """
 
     wall_s: float
@@ -122,17 +123,32 @@ def write_race(folder: Path, frames: list[Record], count: int) -> tuple[Path, Pa
     return paths
 
 
+def _resident_mib(pid: int) -> float:
+    """Return the resident memory of a process and its children; 0 for one that is gone."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:
+        return 0.0
+    own = next((line for line in status.splitlines() if line.startswith("VmRSS")), "VmRSS: 0 kB")
+    return int(own.split()[1]) / 1024 + sum(_resident_mib(int(child)) for child in children)
+
+
 def _evaluate(files: tuple[Path, Path], metrics: list[str], workers: int = 1) -> Run:
     """Run the command and measure it with everything that it starts."""
     command = [sys.executable, str(TOOL), *map(str, files), "--eval", *metrics]
     start = time.perf_counter()
     process = subprocess.Popen([*command, "--workers", str(workers)], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
+    peak, pid = 0.0, 0
+    while pid == 0:
+        peak = max(peak, _resident_mib(process.pid))
+        time.sleep(0.02)
+        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
     wall = time.perf_counter() - start
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}.")
-    return Run(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+    return Run(wall, usage.ru_utime + usage.ru_stime, peak)
 
 
 def _frame(record: Record) -> tuple[MapElements, MapElements]:

@@ -96,6 +96,11 @@ def test_prior_is_fitted_on_one_file_and_scored_on_another(files, tmp_path, caps
     assert "either a result file or --prior" in capsys.readouterr().err
 
 
+def test_the_command_starts_without_torch():
+    code = "import sys, gsmap.evaluation.prior; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+
+
 def test_two_workers_give_the_same_digits(tmp_path):
     results, truth = tmp_path / "results.json", tmp_path / "truth.json"
     write_results(results, results_of(150))

@@ -8,15 +8,7 @@ _RECALL_POINTS = np.linspace(0.0, 1.0, 101)
 
 
 def precision_recall(hits: BoolArray, num_gts: int) -> tuple[FloatArray, FloatArray]:
-    """Return recall and precision after each prediction.
-
-    Args:
-        hits: Whether each prediction matches, in descending order of score. (N,)
-        num_gts: Number of ground truths.
-
-    Returns:
-        Recall (N,) and precision (N,).
-    """
+    """Return recall and precision after each prediction, in descending order of score. 2 x (N,)"""
     found = np.cumsum(hits, dtype=np.float64)
     recall = found / max(num_gts, 1)
     return recall, found / np.arange(1, len(found) + 1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,11 +40,8 @@ def draw_curves(reports: Sequence[MetricReport], path: str | Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _draw_calibration(panel: "object", report: MetricReport) -> None:
+def _draw_calibration(panel: Any, report: MetricReport) -> None:
     """Draw the share of matches at the loosest threshold over the score, class by class."""
-    from matplotlib.axes import Axes
-
-    assert isinstance(panel, Axes)
     panel.plot([0, 1], [0, 1], color="0.7", linewidth=1)
     for name, thresholds in report.thresholds.items():
         loosest = thresholds[0] if report.name == "raster" else thresholds[-1]

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.evaluator import EvaluationConfig, SampleMatches, match_sample, reports
 from gsmap.evaluation.report import MetricReport
 from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, read_samples
@@ -47,9 +49,6 @@ def read_annotations(
     Raises:
         ValueError: If the file lacks one of the classes, or a sample has no ground truth.
     """
-    from gsmap.datasets.annotations.file import AnnotationFile  # pyarrow; JSON goes without
-    from gsmap.datasets.elements import elements_of_instances
-
     file = AnnotationFile(path)
     names = file.meta.classes
     missing = [name for name in classes if name not in names]

@@ -94,62 +94,48 @@ def curves_of(
     ]
 
 
-def _cell(value: float, digits: int = 4) -> str:
-    return "-" if value == UNDEFINED or np.isnan(value) else f"{value:.{digits}f}"
-
-
-def align(rows: Sequence[Sequence[str]]) -> str:
-    """Align rows of cells in columns: the first to the left, the others to the right."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = [row[0].ljust(widths[0])]
-        cells += [cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True)]
-        lines.append("  ".join(cells).rstrip())
-    rule = "-" * max(map(len, lines))
-    return "\n".join([lines[0], rule, *lines[1:]])
-
-
-def _class_rows(report: MetricReport, names: Sequence[str]) -> list[list[str]]:
-    """One row per class that shares its thresholds with the others."""
-    figures, rows = report.metrics, []
-    loosest = 0 if report.name == "raster" else -1
-    for name in names:
-        keys = [threshold_key(t) for t in report.thresholds[name]]
-        prefix = f"{report.name}/{name}"
-        row = [name, _cell(figures[f"{prefix}/AP"])]
-        row += [_cell(figures[f"{prefix}/AP@{key}"]) for key in keys]
-        row.append(_cell(figures[f"{prefix}/recall@{keys[loosest]}"]))
-        if report.name == "raster":
-            row.append(_cell(figures[f"{prefix}/mIoU"]))
-        else:
-            row.append(_cell(figures[f"{prefix}/error_m@{keys[loosest]}"], 3))
-        row.append(_cell(figures[f"{prefix}/calibration_error@{keys[loosest]}"], 3))
-        row += [f"{figures[f'{prefix}/num_gts']:.0f}", f"{figures[f'{prefix}/num_preds']:.0f}"]
-        rows.append(row)
-    return rows
-
-
 def format_table(report: MetricReport) -> str:
     """Return the table of a metric: a row per class, a column per threshold, the means below.
 
     Classes with the same thresholds stand together; the recall, the error and the calibration are
     those at the loosest threshold.
     """
-    unit = "m" if report.name == "chamfer" else "IoU"
-    last = "error m" if report.name == "chamfer" else "mIoU"
+    chamfer = report.name == "chamfer"
+    unit, last = ("m", "error m") if chamfer else ("IoU", "mIoU")
     blocks = [f"AP_{report.name}"]
     for group, names in report.groups.items():
         keys = [threshold_key(t) for t in report.thresholds[names[0]]]
-        header = [group, "AP", *[f"@{k} {unit}" for k in keys], "recall", last, "calib. err."]
-        rows = [[*header, "truths", "preds"], *_class_rows(report, names)]
-        prefix = f"raster/{group}" if report.name == "raster" else "chamfer"
-        mean = "chamfer/mAP" if report.name == "chamfer" else f"{prefix}/AP"
-        row = [
-            "mean",
-            *[_cell(report.metrics[k]) for k in [mean, *[f"{prefix}/AP@{k}" for k in keys]]],
-        ]
-        rows.append(row + [""] * (len(rows[0]) - len(row)))
-        blocks.append(align(rows))
+        loosest = keys[-1 if chamfer else 0]
+        aps = ["AP", *(f"AP@{key}" for key in keys)]
+        details = {
+            f"recall@{loosest}": 4,
+            (f"error_m@{loosest}" if chamfer else "mIoU"): 3 if chamfer else 4,
+            f"calibration_error@{loosest}": 3,
+            "num_gts": 0,
+            "num_preds": 0,
+        }
+        header = [group, "AP", *(f"@{key} {unit}" for key in keys), "recall", last]
+        rows = [[*header, "calib. err.", "truths", "preds"]]
+        for name in names:
+            columns = [*((key, 4) for key in aps), *details.items()]
+            figures = [(report.metrics[f"{report.name}/{name}/{key}"], n) for key, n in columns]
+            rows.append([name, *(_cell(value, digits) for value, digits in figures)])
+        means = ["mAP", *aps[1:]] if chamfer else [f"{group}/{key}" for key in aps]
+        row = ["mean", *(_cell(report.metrics[f"{report.name}/{key}"]) for key in means)]
+        blocks.append(_aligned([*rows, row + [""] * (len(rows[0]) - len(row))]))
     blocks.append(f"mAP_{report.name} = {_cell(report.metrics[f'{report.name}/mAP'], 6)}")
     return "\n".join(blocks)
+
+
+def _cell(value: float, digits: int = 4) -> str:
+    return "-" if value == UNDEFINED or np.isnan(value) else f"{value:.{digits}f}"
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Align rows of cells in columns: the first to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [cell.rjust(w) for cell, w in zip(row, widths, strict=True)]
+        lines.append("  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip())
+    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
