@@ -13,13 +13,7 @@ import numpy as np
 from gsmap.evaluation import chamfer_kernels as kernels
 from gsmap.evaluation.average_precision import area_ap
 from gsmap.evaluation.matches import FrameMatches, detections_per_class, unique_by_token
-from gsmap.evaluation.report import (
-    UNDEFINED,
-    MetricReport,
-    class_figures,
-    curves_of,
-    threshold_key,
-)
+from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures, threshold_key
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
 
@@ -204,9 +198,7 @@ def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> Me
     """
     classes, thresholds = config.classes, config.thresholds
     records = unique_by_token(matches)
-    found = dict(
-        zip(classes, detections_per_class(records, len(classes), len(thresholds)), strict=True)
-    )
+    found = detections_per_class(records, classes, len(thresholds))
     metrics: dict[str, float] = {}
     for name, of_class in found.items():
         figures = class_figures(of_class, thresholds, area_ap, absent=0.0)
@@ -222,10 +214,4 @@ def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> Me
     metrics["mAP"] = float(np.mean([metrics[f"{name}/AP"] for name in classes]))
     metrics["num_samples"] = float(len(records))
     by_class = dict.fromkeys(classes, thresholds)
-    return MetricReport(
-        "chamfer",
-        {"class": classes},
-        by_class,
-        {f"chamfer/{k}": v for k, v in metrics.items()},
-        curves_of(found, by_class),
-    )
+    return MetricReport.of("chamfer", {"class": classes}, by_class, metrics, found)

@@ -17,14 +17,7 @@ _BOUND_SLACK = 1.0 - 1e-12  # a lower bound may be too large by the rounding of 
 
 @njit(cache=True, fastmath=_NO_NAN)
 def chamfer(ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray) -> float:
-    """Return the mean of both directed mean nearest-neighbour distances of two point sets.
-
-    Args:
-        ax: x of the first set. (P,)
-        ay: y of the first set. (P,)
-        bx: x of the second set. (Q,)
-        by: y of the second set. (Q,)
-    """
+    """Return the mean of both directed mean nearest-neighbour distances, (P,) points to (Q,)."""
     back = np.full(len(bx), np.inf)
     there = 0.0
     for i in range(len(ax)):

@@ -68,8 +68,8 @@ def unique_by_token(matches: Iterable[FrameMatches]) -> list[FrameMatches]:
 
 
 def detections_per_class(
-    records: Sequence[FrameMatches], num_classes: int, num_thresholds: int
-) -> list[ClassDetections]:
+    records: Sequence[FrameMatches], classes: Sequence[str], num_thresholds: int
+) -> dict[str, ClassDetections]:
     """Gather the predictions of each class over all samples and rank them by score.
 
     Equal scores keep the order of the samples, then the order within the sample: the reference
@@ -78,28 +78,23 @@ def detections_per_class(
 
     Args:
         records: The samples, from ``unique_by_token``.
-        num_classes: Number of classes C.
+        classes: Names of the classes.
         num_thresholds: Number of thresholds T.
-
-    Returns:
-        One entry per class. (C,)
     """
     none = np.zeros(0)
     labels = np.concatenate([none, *(m.labels for m in records)])
     scores = np.concatenate([none, *(m.scores for m in records)])
     quality = np.concatenate([none, *(m.quality for m in records)])
     matched = np.concatenate([np.zeros((0, num_thresholds)), *(m.matched_gt for m in records)])
-    num_gts = sum((m.num_gts for m in records), np.zeros(num_classes, np.int64))
+    num_gts = sum((m.num_gts for m in records), np.zeros(len(classes), np.int64))
     frame = np.repeat(np.arange(len(records)), [len(m.labels) for m in records])
-    detections = []
-    for label in range(num_classes):
+    detections = {}
+    for label, name in enumerate(classes):
         rows = np.flatnonzero(labels == label)
         ranks = np.arange(len(rows)) - np.searchsorted(frame[rows], frame[rows])
         order = np.argsort(-scores[rows], kind="stable")
         rows = rows[order]
-        detections.append(
-            ClassDetections(
-                scores[rows], matched[rows] >= 0, quality[rows], ranks[order], int(num_gts[label])
-            )
+        detections[name] = ClassDetections(
+            scores[rows], matched[rows] >= 0, quality[rows], ranks[order], int(num_gts[label])
         )
     return detections

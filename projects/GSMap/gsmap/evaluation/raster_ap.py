@@ -19,7 +19,7 @@ from gsmap.evaluation.matches import (
     unique_by_token,
 )
 from gsmap.evaluation.raster_drawing import Masks, draw
-from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures, curves_of
+from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
 LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
@@ -219,17 +219,15 @@ def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> Metr
         config: Rules.
     """
     records, classes = unique_by_token(matches), config.classes
-    per_class = detections_per_class(records, len(classes), len(config.line_thresholds))
-    found = dict(zip(classes, per_class, strict=True))
+    found = detections_per_class(records, classes, len(config.line_thresholds))
     by_class = {name: config.thresholds_of(c) for c, name in enumerate(classes)}
     metrics: dict[str, float] = {}
     for c, name in enumerate(classes):
         ious = np.array([m.class_iou[c] for m in records if m.class_iou is not None])
         figures = _class_figures(found[name], by_class[name], ious)
         metrics |= {f"{name}/{key}": value for key, value in figures.items()}
-    for key in ("AP", "mIoU"):
-        mean = _mean_of_defined(metrics[f"{name}/{key}"] for name in classes)
-        metrics["mAP" if key == "AP" else key] = mean
+    metrics["mAP"] = _mean_of_defined(metrics[f"{name}/AP"] for name in classes)
+    metrics["mIoU"] = _mean_of_defined(metrics[f"{name}/mIoU"] for name in classes)
     groups: dict[str, list[str]] = {}
     for name, polygon in zip(classes, config.is_polygon, strict=True):
         groups.setdefault("polygon" if polygon else "line", []).append(name)
@@ -237,5 +235,4 @@ def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> Metr
         means = _group_figures(metrics, names)
         metrics |= {f"{group}/{key}": value for key, value in means.items()}
     metrics["num_samples"] = float(len(records))
-    figures = {f"raster/{k}": v for k, v in metrics.items()}
-    return MetricReport("raster", groups, by_class, figures, curves_of(found, by_class))
+    return MetricReport.of("raster", groups, by_class, metrics, found)

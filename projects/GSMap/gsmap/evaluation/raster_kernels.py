@@ -36,15 +36,7 @@ def _intersection(a: Masks, i: int, b: Masks, k: int) -> int:
 
 @njit(cache=True)
 def mask_ious(pred: Masks, gt: Masks) -> FloatArray:
-    """Return the IoU of each prediction with each ground truth of its class, 0 elsewhere.
-
-    Args:
-        pred: N masks.
-        gt: K masks.
-
-    Returns:
-        IoU. (N, K)
-    """
+    """Return the IoU of each prediction with each ground truth of its class, 0 elsewhere. (N, K)"""
     ious = np.zeros((len(pred.labels), len(gt.labels)))
     gt_areas = [_intersection(gt, k, gt, k) for k in range(len(gt.labels))]
     for i in range(len(pred.labels)):
@@ -59,10 +51,7 @@ def mask_ious(pred: Masks, gt: Masks) -> FloatArray:
 
 @njit(cache=True)
 def assign(
-    ious: FloatArray,
-    pred_labels: IntArray,
-    gt_labels: IntArray,
-    thresholds: FloatArray,
+    ious: FloatArray, pred_labels: IntArray, gt_labels: IntArray, thresholds: FloatArray
 ) -> IntArray:
     """Match greedily as COCO: take the best free ground truth, the later one of equals.
 
@@ -105,17 +94,9 @@ def _union(masks: Masks, label: int, height: int, words: int) -> WordArray:
 
 @njit(cache=True)
 def class_ious(pred: Masks, gt: Masks, num_classes: int, height: int, width: int) -> FloatArray:
-    """Return the IoU of all predictions of a class together with all its ground truths.
+    """Return the IoU of all predictions of a class together with all its ground truths. (C,)
 
-    Args:
-        pred: N masks.
-        gt: K masks.
-        num_classes: Number of classes C.
-        height: Rows of the canvas.
-        width: Columns of the canvas.
-
-    Returns:
-        IoU, NaN for a class without predictions and ground truths. (C,)
+    It is NaN for a class with neither; ``height`` and ``width`` are those of the canvas.
     """
     ious = np.full(num_classes, np.nan)
     words = (width + 63) // 64

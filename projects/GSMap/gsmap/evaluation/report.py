@@ -55,6 +55,24 @@ class MetricReport:
     metrics: dict[str, float]
     curves: list[Curve]
 
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        groups: Mapping[str, Sequence[str]],
+        thresholds: Mapping[str, tuple[float, ...]],
+        metrics: Mapping[str, float],
+        found: Mapping[str, ClassDetections],
+    ) -> "MetricReport":
+        """Put the name of the metric before its keys, and add the curves of all classes."""
+        curves = [
+            Curve(class_name, threshold, of_class.scores, of_class.hits[:, t], of_class.num_gts)
+            for class_name, of_class in found.items()
+            for t, threshold in enumerate(thresholds[class_name])
+        ]
+        prefixed = {f"{name}/{key}": value for key, value in metrics.items()}
+        return cls(name, groups, thresholds, prefixed, curves)
+
 
 def class_figures(
     found: ClassDetections,
@@ -81,17 +99,6 @@ def class_figures(
     figures["num_gts"] = float(found.num_gts)
     figures["num_preds"] = float(len(found.scores))
     return figures
-
-
-def curves_of(
-    found: Mapping[str, ClassDetections], thresholds: Mapping[str, Sequence[float]]
-) -> list[Curve]:
-    """Return one curve per class and threshold."""
-    return [
-        Curve(name, threshold, of_class.scores, of_class.hits[:, t], of_class.num_gts)
-        for name, of_class in found.items()
-        for t, threshold in enumerate(thresholds[name])
-    ]
 
 
 def format_table(report: MetricReport) -> str:
