@@ -140,15 +140,14 @@ def _joined(polylines: PerElement) -> FloatArray:
     filled = [p for p in polylines if len(p)]
     if not filled:
         return np.empty((0, 2))
-    if isinstance(filled[0], np.ndarray):
-        dims = {p.shape[1] for p in filled}
-        rows = np.concatenate([p[:, : min(dims)] for p in filled], dtype=np.float64)
-    else:
-        dims = {len(row) for row in chain.from_iterable(filled)}
-        rows = np.array([row[: min(dims)] for p in filled for row in p], dtype=np.float64)
+    arrays = isinstance(filled[0], np.ndarray)
+    rows = list(chain.from_iterable(filled)) if not arrays else []
+    dims = {p.shape[1] for p in filled} if arrays else set(map(len, rows))
     if not dims <= {2, 3}:
         raise ValueError(f"points have {sorted(dims)} coordinates")
-    return rows
+    if arrays:
+        return np.concatenate([p[:, : min(dims)] for p in filled], dtype=np.float64)
+    return np.array(rows if len(dims) == 1 else [row[:2] for row in rows], dtype=np.float64)
 
 
 def _per_vertex(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray | None:
