@@ -98,15 +98,17 @@ def read_samples(
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"no file at {path}.")
-    text, ignored = Path(path).read_bytes(), Counter[str]()
+    ignored = Counter[str]()
     convert = partial(_converted, path, classes, key == RESULTS_KEY, ignored)
     try:
-        items = json.loads(text, object_hook=convert)[key]
+        items = json.loads(Path(path).read_text(encoding="utf-8"), object_hook=convert)[key]
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         items = error
     if not isinstance(items, list):
+        empty = not Path(path).stat().st_size
+        what = "is empty" if empty else f"holds no complete list under {key!r}"
         raise ValueError(
-            f"{path} {f'holds no complete list under {key!r}' if text else 'is empty'}: expected "
+            f"{path} {what}: expected "
             f'{{"{key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}, got {items!r:.80}.'
         )
     samples: dict[str, MapElements] = {}
