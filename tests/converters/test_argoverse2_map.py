@@ -10,13 +10,12 @@ from av2.geometry.geometry import quat_to_mat
 
 from gsmap.converters.argoverse2.map import Argoverse2Map
 from gsmap.converters.argoverse2.rules import (
-    EgoPatch,
     cut_rings,
     drop_duplicates,
     merge_parallel,
     merge_until_stable,
 )
-from gsmap.converters.local_map import rings_of
+from gsmap.converters.local_map import LocalPatch, rings_of
 
 
 @pytest.fixture
@@ -144,7 +143,7 @@ def test_pieces_of_a_ring_are_joined_across_its_start():
 
 def test_holes_turn_the_other_way_than_the_exterior():
     square = shapely.box(0, 0, 9, 9).difference(shapely.box(3, 3, 6, 6))
-    rings = rings_of(np.array([square]), exterior_ccw=False)
+    rings = rings_of(np.array([square]))
     assert shapely.is_ccw(rings).tolist() == [False, True]
 
 
@@ -164,7 +163,8 @@ def test_equal_points_stay_equal_in_the_vehicles_frame():
     turned = pose(yaw_rad=0.7)
     points = np.random.default_rng(0).normal(scale=50, size=(37, 3)) + turned[:3, 3]
     lines = shapely.linestrings(np.stack([points, points[::-1]]))
-    forward, backward = shapely.get_coordinates(EgoPatch(turned).to_ego(lines)).reshape(2, 37, 2)
+    patch = LocalPatch(turned, (-30.0, 30.0), (-15.0, 15.0))
+    forward, backward = shapely.get_coordinates(patch.to_frame(lines)).reshape(2, 37, 2)
     np.testing.assert_array_equal(forward, backward[::-1])
 
 

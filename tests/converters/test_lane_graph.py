@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import shapely
 
-from gsmap.converters.argoverse2 import lane_graph
-from gsmap.converters.argoverse2.lane_graph import LaneLinks, LanePaths
+from gsmap.converters import lane_graph
+from gsmap.converters.lane_graph import LaneLinks, LanePaths
 
 
 def line(*xy: tuple[float, float]) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import shapely
 
-from gsmap.converters.argoverse2.lane_graph import LaneLinks
+from gsmap.converters.lane_graph import LaneLinks
 from gsmap.converters.export import export_json
 from gsmap.converters.nuscenes import convert as nuscenes
 from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes

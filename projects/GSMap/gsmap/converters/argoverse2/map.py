@@ -13,19 +13,17 @@ import shapely
 from av2.map.lane_segment import LaneMarkType, LaneSegment
 from av2.map.map_api import ArgoverseStaticMap
 
-from gsmap.converters.argoverse2.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths
+from gsmap.converters.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths
 from gsmap.converters.argoverse2.rules import (
     EDGE_MARGIN_M,
-    EgoPatch,
     clip_lines,
     clip_polygons,
     cut_rings,
     drop_duplicates,
     merge_parallel,
     merge_until_stable,
-    points_of,
 )
-from gsmap.converters.local_map import rings_of
+from gsmap.converters.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 
 COMPAT_MODES = ("maptrv2", "maptr")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
@@ -48,29 +46,6 @@ def find_map(log_dir: Path) -> Path:
     if len(found) > 1:
         raise ValueError(f"{len(found)} maps in {log_dir / 'map'}, expected one: {found}.")
     return found[0]
-
-
-class GeometryLayer:
-    """Geometries of one kind of a log's map, with a spatial index.
-
-    Args:
-        geometries: Lines or polygons in the city frame; invalid ones are left out of every answer.
-            (n,)
-    """
-
-    def __init__(self, geometries: Sequence[shapely.Geometry]) -> None:
-        self.geometries = np.array(list(geometries), dtype=object)
-        self._valid = np.flatnonzero(shapely.is_valid(self.geometries))
-        self._tree = shapely.STRtree(self.geometries[self._valid])
-
-    @property
-    def invalid_count(self) -> int:
-        """How many geometries are invalid (self-crossing, for example)."""
-        return len(self.geometries) - len(self._valid)
-
-    def touching(self, patch: EgoPatch) -> np.ndarray:
-        """Return the positions, ascending, of the valid geometries that meet the patch."""
-        return np.sort(self._valid[self._tree.query(patch.polygon, predicate="intersects")])
 
 
 class LaneSide:
@@ -186,7 +161,7 @@ class Argoverse2Map:
         unknown = set(classes) - set(MAP_CLASSES)
         if unknown:
             raise ValueError(f"classes must be among {MAP_CLASSES}, got {sorted(unknown)}.")
-        patch = EgoPatch(np.asarray(city_from_ego, dtype=np.float64), x_range, y_range)
+        patch = LocalPatch(np.asarray(city_from_ego, dtype=np.float64), x_range, y_range)
         lanes = self._lanes.touching(patch)
         maptr = compat == "maptr"
         rules = {
@@ -195,9 +170,9 @@ class Argoverse2Map:
             "boundary": self._boundaries,
             "centerline": self._centerlines,
         }
-        return {name: points_of(rules[name](patch, lanes)) for name in classes}
+        return {name: vertices_of(rules[name](patch, lanes), 3) for name in classes}
 
-    def _dividers(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+    def _dividers(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Lines between neighbouring lanes outside intersections (MapTRv2)."""
         lanes = lanes[~self._is_intersection[lanes]]
         left, right = self._left.dividing(lanes), self._right.dividing(lanes)
@@ -205,25 +180,21 @@ class Argoverse2Map:
         # in view.
         right = right[~np.isin(right, self._left.neighbours[left])]
         left = left[~np.isin(left, self._right.neighbours[right])]
-        paths = [
-            self._left.paths.simplified(left.tolist()),
-            self._right.paths.simplified(right.tolist()),
-        ]
+        sides = ((self._left, left), (self._right, right))
+        paths = [side.paths.simplified(lanes.tolist()) for side, lanes in sides]
         return drop_duplicates(clip_lines(np.concatenate(paths), patch))
 
-    def _centerlines(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+    def _centerlines(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Paths along the middle of the lanes (MapTRv2)."""
         return drop_duplicates(clip_lines(self._centre.simplified(lanes.tolist()), patch))
 
-    def _painted_lines(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+    def _painted_lines(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Every lane boundary that carries paint, joined where the lines meet (MapTR)."""
-        lines = self._marked.geometries[self._marked.touching(patch)]
-        return merge_until_stable(clip_lines(lines, patch))
+        return merge_until_stable(clip_lines(self._marked.near(patch), patch))
 
-    def _merged_crossings(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+    def _merged_crossings(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Crossings, parallel neighbours united, open where the patch cuts them (MapTRv2)."""
-        touching = self._crossings.touching(patch)
-        pieces, owner = clip_polygons(self._crossings.geometries[touching], patch)
+        pieces, owner = clip_polygons(self._crossings.near(patch), patch)
         exteriors = shapely.get_exterior_ring(merge_parallel(pieces, owner))
         turn = ~shapely.is_ccw(exteriors)
         exteriors[turn] = shapely.reverse(exteriors[turn])
@@ -234,18 +205,16 @@ class Argoverse2Map:
         # The pieces of one crossing stay one instance.
         return shapely.linestrings(points, indices=np.unique(owner, return_inverse=True)[1][line])
 
-    def _crossing_rings(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+    def _crossing_rings(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Each crossing by itself, closed along the patch's edge (MapTR)."""
-        touching = self._crossings.touching(patch)
-        pieces, _ = clip_polygons(self._crossings.geometries[touching], patch)
-        return cut_rings(rings_of(pieces, exterior_ccw=False), patch.box(EDGE_MARGIN_M))[0]
+        pieces, _ = clip_polygons(self._crossings.near(patch), patch)
+        return cut_rings(rings_of(pieces), patch.box(EDGE_MARGIN_M))[0]
 
-    def _boundaries(self, patch: EgoPatch, lanes: np.ndarray) -> np.ndarray:
+    def _boundaries(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Outline of the drivable area, without the patch's edge (MapTR and MapTRv2)."""
-        touching = self._drivable.touching(patch)
-        pieces, _ = clip_polygons(self._drivable.geometries[touching], patch)
+        pieces, _ = clip_polygons(self._drivable.near(patch), patch)
         area = shapely.get_parts(shapely.union_all(pieces))
-        return cut_rings(rings_of(area, exterior_ccw=False), patch.box(-EDGE_MARGIN_M))[0]
+        return cut_rings(rings_of(area), patch.box(-EDGE_MARGIN_M))[0]
 
 
 def _lane_side(lanes: Sequence[LaneSegment], side: str, links: LaneLinks) -> LaneSide:

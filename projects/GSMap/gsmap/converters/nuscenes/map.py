@@ -13,8 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from gsmap.converters.argoverse2.lane_graph import LaneLinks, LanePaths
-from gsmap.converters.local_map import LocalPatch, OutlineIndex, rings_of
+from gsmap.converters.lane_graph import LaneLinks, LanePaths
+from gsmap.converters.local_map import (
+    POLYGON,
+    GeometryLayer,
+    LocalPatch,
+    OutlineIndex,
+    rings_of,
+    vertices_of,
+)
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.structures.polylines import Points
 
@@ -27,7 +34,6 @@ AREA_CLASSES = ("ped_crossing", "stop_line", "intersection", "carpark_area")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:], "centerline")
 OUTLINE_MARGIN_M = 0.2
 CENTERLINE_STEP_M = 0.5
-_POLYGON, _LINE = 3, 1  # shapely type ids
 
 
 @dataclass
@@ -152,13 +158,12 @@ class NuScenesLocalMap:
         self.classes = tuple(classes)
         self.x_range, self.y_range = x_range, y_range
         marks = [layers.lines[layer] for layer in LINE_LAYERS if layer in layers.lines]
-        self._lines = np.concatenate(marks) if marks else np.empty(0, object)
-        self._line_tree = shapely.STRtree(self._lines)
-        self._areas = {name: layers.polygons[name] for name in AREA_CLASSES if name in self.classes}
-        self._area_trees = {name: shapely.STRtree(areas) for name, areas in self._areas.items()}
+        self._lines = GeometryLayer(np.concatenate(marks) if marks else [])
+        names = [name for name in AREA_CLASSES if name in self.classes]
+        self._areas = {name: GeometryLayer(layers.polygons[name]) for name in names}
         surface = [layers.polygons[name] for name in SURFACE_LAYERS if name in layers.polygons]
         outlines = shapely.get_parts(shapely.union_all([shapely.union_all(p) for p in surface]))
-        self._outlines = OutlineIndex(rings_of(outlines, exterior_ccw=False))
+        self._outlines = OutlineIndex(rings_of(outlines))
         self._lane_paths = LanePaths(layers.centerlines, layers.links)
         lanes = [shapely.LineString(line[:, :2]) for line in layers.centerlines]
         self._lane_tree = shapely.STRtree(lanes)
@@ -172,7 +177,7 @@ class NuScenesLocalMap:
         Returns:
             Elements in the frame, class by class in label order; points are (n, 2) in metres.
         """
-        patch = LocalPatch.from_pose(global_from_frame, self.x_range, self.y_range)
+        patch = LocalPatch(global_from_frame, self.x_range, self.y_range)
         found = []
         for label, name in enumerate(self.classes):
             found += [MapInstance(label, points) for points in self._polylines(name, patch)]
@@ -180,39 +185,21 @@ class NuScenesLocalMap:
 
     def _polylines(self, name: str, patch: LocalPatch) -> list[Points]:
         if name == "divider":
-            return self._dividers(patch)
+            return self._cut(self._lines.near(patch), patch)
         if name == "boundary":
             return self._outlines.cut(patch, OUTLINE_MARGIN_M)
         if name == "centerline":
-            return self._centerlines(patch)
+            near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
+            paths = self._lane_paths.simplified(near.tolist())
+            return self._cut(shapely.force_2d(paths), patch)
         return self._area_outlines(name, patch)
-
-    def _centerlines(self, patch: LocalPatch) -> list[Points]:
-        near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
-        paths = shapely.force_2d(self._lane_paths.simplified(near.tolist()))
-        return self._cut(paths, patch)
-
-    def _dividers(self, patch: LocalPatch) -> list[Points]:
-        near = np.sort(self._line_tree.query(patch.polygon, predicate="intersects"))
-        return self._cut(self._lines[near], patch)
 
     def _cut(self, lines: np.ndarray, patch: LocalPatch) -> list[Points]:
         """Return the parts of lines inside the patch, in the frame. each (n, 2)."""
-        pieces = shapely.get_parts(shapely.intersection(lines, patch.polygon))
-        pieces = pieces[(shapely.get_type_id(pieces) == _LINE) & (shapely.length(pieces) > 0)]
-        return _vertices(patch.to_local(pieces))
+        return vertices_of(patch.to_local(patch.lines_inside(lines)), 2)
 
     def _area_outlines(self, name: str, patch: LocalPatch) -> list[Points]:
-        near = self._area_trees[name].query(patch.polygon, predicate="intersects")
-        if not len(near):
-            return []
-        pieces = shapely.intersection(self._areas[name][np.sort(near)], patch.polygon)
+        """Return the rings of the areas inside the patch, united. each (n, 2)."""
+        pieces = shapely.intersection(self._areas[name].near(patch), patch.polygon)
         merged = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
-        polygons = merged[shapely.get_type_id(merged) == _POLYGON]
-        return _vertices(rings_of(polygons, exterior_ccw=False))
-
-
-def _vertices(lines: np.ndarray) -> list[Points]:
-    """Return the vertices of each line. each (n, 2)."""
-    points, owner = shapely.get_coordinates(lines, return_index=True)
-    return np.split(points, np.flatnonzero(np.diff(owner)) + 1) if len(points) else []
+        return vertices_of(rings_of(merged[shapely.get_type_id(merged) == POLYGON]), 2)

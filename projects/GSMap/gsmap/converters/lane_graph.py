@@ -10,8 +10,7 @@ ROUND_DECIMALS = 3  # points closer than a millimetre are one node of the graph
 SIMPLIFY_TOLERANCE_M = 0.2
 MAX_PATHS = 20_000
 
-# An edge leads to a node by way of the private points of one lane: (interior point ids, end point
-# id).
+# An edge leads to a node by way of one lane's private points: (interior point ids, end point id).
 Edge = tuple[tuple[int, ...], int]
 
 
@@ -51,9 +50,8 @@ class LanePaths:
     of its successors. A path runs from a node that nothing leads to, to a node that leads nowhere,
     without visiting a node twice.
 
-    Points that only one lane of the map has can neither start, end nor branch a path; they are
-    folded into the edges once per map, so that the search for paths in a frame takes about one step
-    per lane instead of one per point.
+    Points that only one lane has can neither start, end nor branch a path; they are folded into the
+    edges once per map, so that a frame's search takes about one step per lane.
 
     Args:
         polylines: Points of each lane's line, in metres, map frame. list of (n >= 2, 3)
@@ -89,8 +87,7 @@ class LanePaths:
     def simplified(self, lanes: Sequence[int]) -> np.ndarray:
         """Return every simple path through the given lanes, simplified (Douglas-Peucker, 0.2 m).
 
-        The answer for the latest set of lanes is kept: neighbouring frames usually see the same
-        lanes.
+        The latest answer is kept: neighbouring frames usually see the same lanes.
 
         Args:
             lanes: Positions of the lanes that take part, in the order of the map.
@@ -104,12 +101,9 @@ class LanePaths:
         key = tuple(lanes)
         if key != self._memo[0]:
             paths = self._simple_paths(key)
-            if paths:
-                points = self._points[np.concatenate(paths)]
-                indices = np.repeat(np.arange(len(paths)), [len(p) for p in paths])
-                lines = shapely.linestrings(points, indices=indices)
-            else:
-                lines = np.empty(0, dtype=object)
+            nodes = np.array([node for path in paths for node in path], dtype=np.int64)
+            indices = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+            lines = shapely.linestrings(self._points[nodes], indices=indices)
             self._memo = (key, shapely.simplify(lines, SIMPLIFY_TOLERANCE_M))
         return self._memo[1]
 
@@ -161,9 +155,8 @@ def _paths_from(source: int, graph: dict[int, list[Edge]], limit: int) -> list[l
     """Return the nodes of every simple path from ``source`` to a node that leads nowhere."""
     paths: list[list[int]] = []
     path, visited = [source], {source}
-    stack = [
-        (1, source, iter(graph[source]))
-    ]  # (length of the path up to the node, node, edges still to try)
+    # (length of the path up to the node, node, edges still to try)
+    stack = [(1, source, iter(graph[source]))]
     while stack:
         length, node, edges = stack[-1]
         del path[length:]
