@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import shapely
 
-from gsmap.converters.lane_graph import LaneLinks
 from gsmap.converters.export import export_json
+from gsmap.converters.lane_graph import LaneLinks
 from gsmap.converters.nuscenes import convert as nuscenes
 from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.converters.nuscenes.map import MapLayers, NuScenesLocalMap

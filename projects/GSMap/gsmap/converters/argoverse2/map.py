@@ -13,7 +13,6 @@ import shapely
 from av2.map.lane_segment import LaneMarkType, LaneSegment
 from av2.map.map_api import ArgoverseStaticMap
 
-from gsmap.converters.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths
 from gsmap.converters.argoverse2.rules import (
     EDGE_MARGIN_M,
     clip_lines,
@@ -23,6 +22,7 @@ from gsmap.converters.argoverse2.rules import (
     merge_parallel,
     merge_until_stable,
 )
+from gsmap.converters.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths
 from gsmap.converters.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 
 COMPAT_MODES = ("maptrv2", "maptr")
