@@ -10,16 +10,17 @@ import importlib
 import shlex
 import sys
 
-from gsmap.converters.command_line import run_command
+from gsmap.utils.cli import run_command
 
 COMMANDS = {
     "minicity": ("minicity.cli", "generate the MiniCity data set"),
-    "nuscenes": ("gsmap.converters.nuscenes.cli", "convert nuScenes or MiniCity"),
+    "nuscenes": ("gsmap.converters.nuscenes.convert", "convert nuScenes or MiniCity"),
     "av2": ("gsmap.converters.argoverse2.convert", "convert Argoverse 2 logs"),
     "av2-render": (
         "gsmap.converters.argoverse2.render",
         "render camera images for real Argoverse 2 logs",
     ),
+    "infos": ("gsmap.converters.infos", "convert an info file of MapTR or MapTRv2"),
     "export": ("gsmap.converters.export", "write an annotation file's vectors as JSON"),
 }
 

@@ -22,11 +22,7 @@ from argoverse2_road import (
 )
 
 from benchmarks.argoverse2 import measure_extraction
-from gsmap.converters.argoverse2.convert import (
-    Argoverse2Options,
-    SampleOptions,
-    convert_argoverse2,
-)
+from gsmap.converters.argoverse2.convert import convert_argoverse2
 from gsmap.converters.argoverse2.log import (
     BROKEN_LOGS,
     MAP_CHANGE_LOGS,
@@ -34,7 +30,7 @@ from gsmap.converters.argoverse2.log import (
     Argoverse2Log,
     closest_ns,
 )
-from gsmap.converters.argoverse2.samples import sample_times, thin_out
+from gsmap.converters.argoverse2.samples import Argoverse2Options, sample_times, thin_out
 from gsmap.converters.command_line import parse_rate
 from gsmap.converters.export import export_json
 from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
@@ -44,10 +40,9 @@ REPO = Path(__file__).resolve().parents[2]
 
 def convert(root: Path, **options) -> tuple[str, AnnotationFile]:
     """Convert and return the summary's text with the file."""
-    samples = {k: options.pop(k) for k in list(options) if k in SampleOptions.__dataclass_fields__}
-    wanted = Argoverse2Options(root, samples=SampleOptions(**samples), **options)
+    wanted = Argoverse2Options(root, **options)
     summary = convert_argoverse2(wanted)
-    return summary.text(), AnnotationFile(wanted.target)
+    return summary.text(), AnnotationFile(wanted.path_of("av2", wanted.split))
 
 
 def test_samples_at_two_hertz_hold_map_cameras_and_sweep(tmp_path):
@@ -82,7 +77,7 @@ def test_cameras_account_for_the_vehicles_motion(tmp_path):
 
 def test_earlier_sweeps_are_placed_by_their_own_pose(tmp_path):
     write_log(tmp_path / "val" / "log-a")
-    lidar = convert(tmp_path, num_sweeps=2)[1][1].lidar
+    lidar = convert(tmp_path, max_sweeps=2)[1][1].lidar
     ages = [START_NS + 500_000_000 - s.timestamp_ns for s in lidar.sweeps]
     assert ages == [SWEEP_EVERY_NS, 2 * SWEEP_EVERY_NS]
     shift = [s.frame_from_lidar[0, 3] for s in lidar.sweeps]
@@ -131,14 +126,13 @@ def test_every_nth_pose_needs_neither_sensors_nor_calibration(tmp_path):
 def test_auto_takes_images_where_there_are_no_sweeps(tmp_path):
     write_log(tmp_path / "log-a")
     log = Argoverse2Log(tmp_path / "log-a")
-    assert (
-        sample_times(log, SampleOptions(rate_hz=None)).tolist() == log.lidar_timestamps_ns.tolist()
-    )
+    all_times = Argoverse2Options(tmp_path, rate_hz=None)
+    assert sample_times(log, all_times).tolist() == log.lidar_timestamps_ns.tolist()
     log.lidar_timestamps_ns = np.empty(0, dtype=np.int64)
     images = log.image_timestamps_ns[RING_CAMERAS[0]].tolist()
-    assert sample_times(log, SampleOptions(rate_hz=None)).tolist() == images
+    assert sample_times(log, all_times).tolist() == images
     with pytest.raises(ValueError, match=r"no LiDAR sweeps .*--at poses:10"):
-        sample_times(log, SampleOptions(at="lidar"))
+        sample_times(log, Argoverse2Options(tmp_path, at="lidar"))
 
 
 def test_a_sample_with_a_missing_image_is_left_out_and_counted(tmp_path):
@@ -283,7 +277,7 @@ def test_bad_rates_are_refused(text):
 )
 def test_bad_options_are_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
-        SampleOptions(**wrong)
+        Argoverse2Options(Path(), **wrong)
 
 
 def test_the_closest_time_within_the_tolerance():

@@ -1,5 +1,7 @@
 """Rendered Argoverse 2 logs: the ground as the map has it, and pictures that fit the labels."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -16,11 +18,7 @@ from argoverse2_road import (
 from av2.datasets.sensor.av2_sensor_dataloader import AV2SensorDataLoader
 from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 
-from gsmap.converters.argoverse2.convert import (
-    Argoverse2Options,
-    SampleOptions,
-    convert_argoverse2,
-)
+from gsmap.converters.argoverse2.convert import convert_argoverse2
 from gsmap.converters.argoverse2.log import RING_CAMERAS, Argoverse2Log
 from gsmap.converters.argoverse2.map import find_map
 from gsmap.converters.argoverse2.render import (
@@ -29,6 +27,7 @@ from gsmap.converters.argoverse2.render import (
     render_logs,
     scaled_camera,
 )
+from gsmap.converters.argoverse2.samples import Argoverse2Options
 from gsmap.converters.argoverse2.scene import height_grid, lane_paint, make_scene
 from gsmap.datasets.annotations.file import AnnotationFile
 from minicity.terrain import sample_height
@@ -138,9 +137,8 @@ def rendered(tmp_path_factory):
     )
     out = root / "rendered"
     count = render_log(root / "real" / "val" / "log-a", out / "val" / "log-a", RenderOptions())
-    options = Argoverse2Options(out, samples=SampleOptions(dim=3))
-    convert_argoverse2(options)
-    return count, out, AnnotationFile(options.target)
+    convert_argoverse2(Argoverse2Options(out, dim=3))
+    return count, out, AnnotationFile(out / "gsmap_av2_val.arrow")
 
 
 def test_a_rendered_log_reads_like_a_real_one(rendered):
@@ -216,7 +214,7 @@ def test_a_full_disk_leaves_no_half_log(tmp_path, monkeypatch):
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gsmap.converters.argoverse2.render._write_jpeg", fail)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(OSError, match="No space left"):
         render_logs([tmp_path / "log-a"], tmp_path / "out", RenderOptions(scale=0.1))
     assert list((tmp_path / "out").iterdir()) == []

@@ -14,8 +14,7 @@ from argoverse2_road import write_log
 
 from gsmap.converters.argoverse2 import convert as argoverse2
 from gsmap.converters.argoverse2 import render as argoverse2_render
-from gsmap.converters.command_line import run_command
-from gsmap.converters.nuscenes import cli as nuscenes_cli
+from gsmap.converters.nuscenes import convert as nuscenes
 
 TOOL = Path(__file__).resolve().parents[2] / "tools/create_data.py"
 
@@ -24,8 +23,8 @@ TOOL = Path(__file__).resolve().parents[2] / "tools/create_data.py"
     ("module", "required", "expected"),
     [
         (argoverse2, [], {"x_range": (-30.0, 30.0), "y_range": (-15.0, 15.0), "max_sweeps": 0}),
-        (nuscenes_cli, [], {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0), "max_sweeps": 10}),
-        (argoverse2_render, ["--out", "b"], {"rate": 2.0, "split": "val", "logs": ()}),
+        (nuscenes, [], {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0), "max_sweeps": 10}),
+        (argoverse2_render, ["--out", "b"], {"rate_hz": 2.0, "split": "val", "logs": ()}),
     ],
 )
 def test_shared_options_keep_each_command_s_defaults(module, required, expected):
@@ -34,27 +33,6 @@ def test_shared_options_keep_each_command_s_defaults(module, required, expected)
     found = vars(parser.parse_args(["--root", "a", *required]))
     assert found["workers"] >= 1
     assert {name: found[name] for name in expected} == expected
-
-
-def test_a_report_is_printed_and_an_error_is_one_line(capsys):
-    run_command(lambda: "3 samples")
-    assert capsys.readouterr().out == "3 samples\n"
-
-    def fail() -> None:
-        raise ValueError("no such split")
-
-    with pytest.raises(SystemExit, match="error: no such split"):
-        run_command(fail)
-
-
-def test_ctrl_c_is_one_line_and_130(capsys):
-    def interrupted() -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(SystemExit) as left:
-        run_command(interrupted)
-    assert left.value.code == 130
-    assert capsys.readouterr().err == "interrupted: nothing half-written is left\n"
 
 
 def interrupt(command: list[str], ready: Callable[[int], bool]) -> subprocess.CompletedProcess:

@@ -15,9 +15,9 @@ from mmengine.registry import init_default_scope
 from pyarrow import feather
 
 import gsmap.registered  # noqa: F401
-from gsmap.converters.argoverse2.convert import Argoverse2Options, convert_argoverse2
+from gsmap.converters.argoverse2.convert import convert_argoverse2
 from gsmap.converters.argoverse2.log import RING_CAMERAS
-from gsmap.converters.argoverse2.samples import SampleOptions
+from gsmap.converters.argoverse2.samples import Argoverse2Options
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.transforms.points import LoadLidarPoints, LoadLidarSweeps, read_points
 
@@ -60,8 +60,7 @@ def write_files(log: Path) -> None:
 def depth_data(root: Path, **options) -> torch.utils.data.Dataset:
     """Convert a root and open it with the data set of MapTRv2 with depth."""
     init_default_scope("mmdet3d")
-    samples = SampleOptions(rate_hz=None, **options)
-    convert_argoverse2(Argoverse2Options(root, samples=samples))
+    convert_argoverse2(Argoverse2Options(root, rate_hz=None, **options))
     config = Config.fromfile(CONFIGS / "av2_depth_seg.py").train_dataloader.dataset
     config.update(data_root=str(root), ann_file="gsmap_av2_val.arrow", split="val")
     return DATASETS.build(config)
@@ -124,7 +123,7 @@ def test_a_sample_without_lidar_is_named():
 
 
 def test_earlier_sweeps_are_moved_aged_and_named_when_missing(road):
-    info = depth_data(road, num_sweeps=2).get_data_info(2)
+    info = depth_data(road, max_sweeps=2).get_data_info(2)
     results = LoadLidarPoints(**LOAD).transform(info)
     points = LoadLidarSweeps(sweeps_num=2, use_dim=list(range(5))).transform(results)["points"]
     age = points.tensor[:, 4]
@@ -149,9 +148,7 @@ def test_depth_of_a_sweep_between_two_images(road):
     x appears at v = 600 + 1650 / depth; images are scaled by 0.3.
     """
     dataset = depth_data(road, at="cameras")
-    summary = convert_argoverse2(
-        Argoverse2Options(road, samples=SampleOptions(at="cameras", rate_hz=None))
-    )
+    summary = convert_argoverse2(Argoverse2Options(road, at="cameras", rate_hz=None))
     assert "LiDAR sweep named by 5 of 6 samples, at most 40 ms away" in summary.notes
     for idx, shift_m in ((0, 0.1), (1, -0.4)):  # 10 ms after a sweep, 40 ms before the next
         data = dataset[idx]["data_samples"]
@@ -200,7 +197,7 @@ def test_depth_of_a_real_log(shared_dir: Path, tmp_path: Path):
             folder = log / "sensors/cameras" / name
             shutil.copy(folder / f"{sweeps[0].stem}.jpg", folder / f"{sweep.stem}.jpg")
 
-    dataset = depth_data(tmp_path, num_sweeps=1)
+    dataset = depth_data(tmp_path, max_sweeps=1)
     assert len(dataset) == len(sweeps)
     info = dataset.get_data_info(len(sweeps) - 1)
     points = LoadLidarPoints(**LOAD).transform(info)["points"].tensor

@@ -1,44 +1,90 @@
-"""What the commands that make data share: common options, and how they end."""
+"""What the commands that make data share: options, where files go, and a progress bar."""
 
 import argparse
-import signal
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import KW_ONLY, dataclass, fields
 from pathlib import Path
+from typing import Any, TypeVar
 
+from tqdm import tqdm
+
+from gsmap.datasets.annotations.record import CLASSES, RANGES, AnnotationMeta
 from gsmap.utils.parallel import default_workers
 
+Options = TypeVar("Options")
 
-def add_file_options(
-    parser: argparse.ArgumentParser,
-    x_range: tuple[float, float],
-    y_range: tuple[float, float],
-    max_sweeps: int,
-) -> None:
-    """Add what every converter to annotation files asks: range, sweeps, name and folder.
+
+@dataclass(frozen=True)
+class FileOptions:
+    """What every converter of a data set to annotation files is told.
+
+    Args:
+        root: Data root, to which paths are relative.
+        classes: Class names in label order.
+        x_range: Smallest and largest x of the ground truth in metres.
+        y_range: Smallest and largest y of the ground truth in metres.
+        max_sweeps: How many earlier LiDAR sweeps each sample lists at most.
+        out_dir: Folder of the annotation files; the data root if None.
+        tag: Appended to the file names.
+        workers: Number of processes.
+        command: The command line, for messages of readers.
+    """
+
+    root: Path
+    _: KW_ONLY
+    classes: tuple[str, ...] = CLASSES
+    x_range: tuple[float, float] = RANGES["lidar"][0]
+    y_range: tuple[float, float] = RANGES["lidar"][1]
+    max_sweeps: int = 0
+    out_dir: Path | None = None
+    tag: str = ""
+    workers: int = 1
+    command: str = ""
+
+    def meta(self, dataset: str, frame: str, split: str, **more: Any) -> AnnotationMeta:
+        """Describe a split's annotation file; ``more`` are further fields."""
+        ranges = self.x_range, self.y_range
+        return AnnotationMeta(
+            dataset, frame, split, self.classes, *ranges, command=self.command, **more
+        )
+
+    def path_of(self, dataset: str, split: str) -> Path:
+        """Return where a split goes: ``gsmap_<dataset>_<split><tag>.arrow``."""
+        return (self.out_dir or self.root) / f"gsmap_{dataset}_{split}{self.tag}.arrow"
+
+
+def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: int) -> None:
+    """Add what every converter of a data set asks: range, sweeps, name, folder, processes.
 
     Args:
         parser: Parser to add to.
-        x_range: Default smallest and largest x of the ground truth in metres.
-        y_range: Default smallest and largest y of the ground truth in metres.
+        frame: Frame of the data set, whose usual range is the default.
         max_sweeps: Default number of earlier LiDAR sweeps per sample.
     """
-    for name, default in (("x", x_range), ("y", y_range)):
-        parser.add_argument(
-            f"--{name}-range", type=float, nargs=2, default=default, metavar=("MIN", "MAX"),
-            help=f"{name} of the ground truth in metres (default: {default[0]:g} {default[1]:g})",
-        )  # fmt: skip
+    add_range_options(parser, RANGES[frame])
     parser.add_argument(
-        "--max-sweeps",
-        type=int,
-        default=max_sweeps,
+        "--max-sweeps", type=int, default=max_sweeps,
         help="earlier LiDAR sweeps to list per sample (default: %(default)s)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--out-dir", type=Path, help="where the annotation files go (default: the data root)"
     )
     parser.add_argument("--tag", default="", help="appended to the file names, such as _extended")
     add_workers_option(parser)
+
+
+def add_range_options(
+    parser: argparse.ArgumentParser, ranges: tuple[tuple[float, float], ...] | None
+) -> None:
+    """Add the range of the ground truth; None leaves the default to the command."""
+    for axis, name in enumerate("xy"):
+        default = ranges and ranges[axis]
+        usual = f"{default[0]:g} {default[1]:g}" if default else "the data set's usual"
+        parser.add_argument(
+            f"--{name}-range", type=float, nargs=2, default=default, metavar=("MIN", "MAX"),
+            help=f"{name} of the ground truth in metres (default: {usual})",
+        )  # fmt: skip
 
 
 def add_workers_option(parser: argparse.ArgumentParser) -> None:
@@ -58,21 +104,13 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
         "--logs", nargs="+", default=(), metavar="LOG", help="only these (ids, or how they begin)"
     )
     parser.add_argument(
-        "--rate",
-        type=parse_rate,
-        default=2.0,
-        help="samples or pictures per second, such as 2hz, or all (default: %(default)s)",
-    )
+        "--rate", type=parse_rate, default=2.0, dest="rate_hz",
+        help="samples or pictures per second, such as 2.5hz, or all (default: %(default)s)",
+    )  # fmt: skip
 
 
 def parse_rate(text: str) -> float | None:
-    """Read a rate such as ``2hz``, ``2.5`` or ``all``.
-
-    Args:
-        text: What the user wrote.
-
-    Returns:
-        Samples per second, or None for all.
+    """Read samples per second, such as ``2.5hz`` or ``2``; ``all`` gives None.
 
     Raises:
         ValueError: If it is neither a positive number nor ``all``.
@@ -85,30 +123,32 @@ def parse_rate(text: str) -> float | None:
     return rate
 
 
-def run_command(command: Callable[[], str | None]) -> None:
-    """Run a command of a tool, print what it reports, and leave in words whatever happens.
-
-    Bad input ends with ``error: ...`` and exit code 1, Ctrl-C with one line and 130, ``kill`` with
-    143; each after the clean-up of half-written files.
+def options_from(
+    kind: type[Options], arguments: argparse.Namespace, command: str, **more: Any
+) -> Options:
+    """Build a dataclass of options from the arguments that have the names of its fields.
 
     Args:
-        command: Returns what to print.
-
-    Raises:
-        SystemExit: If the command fails or is interrupted.
+        kind: The dataclass.
+        arguments: Parsed arguments; lists become tuples.
+        command: The command line, for the field ``command``.
+        **more: Further fields; they come before the arguments.
     """
-    signal.signal(signal.SIGTERM, _leave)
-    try:
-        report = command()
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted: nothing half-written is left\n")
-        sys.exit(128 + signal.SIGINT)
-    except (OSError, ValueError, RuntimeError) as error:
-        sys.exit(f"error: {error}")
-    if report is not None:
-        sys.stdout.write(f"{report}\n")
+    given = vars(arguments) | {"command": command} | more
+    names = {field.name for field in fields(kind)} & given.keys()  # type: ignore[arg-type]
+    return kind(**{n: tuple(v) if isinstance(v := given[n], list) else v for n in names})
 
 
-def _leave(number: int, _frame: object) -> None:
-    """Leave through the clean-up of half-written files, as Ctrl-C does."""
-    sys.exit(128 + number)
+@contextmanager
+def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield what shows how many are done, of how many; the bar appears with the first call."""
+    with ExitStack() as stack:
+        bar: tqdm | None = None
+
+        def advance(done: int, total: int) -> None:
+            nonlocal bar
+            if bar is None:
+                bar = stack.enter_context(tqdm(desc=title, unit=unit, total=total, smoothing=0.05))
+            bar.update(done - bar.n)
+
+        yield advance

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from PIL import Image, UnidentifiedImageError
 
+from gsmap.converters.local_map import POLYGON
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import (
     AnnotationMeta,
@@ -23,7 +24,6 @@ _RECORD_KEYS = {
     "token", "cameras", "instances", "global_from_frame", "ego_from_frame", "timestamp_ns", "scene",
     "map_name", "lidar", "can_bus",
 }  # fmt: skip
-_POLYGON = 3  # shapely type id
 
 
 def from_records(
@@ -34,22 +34,19 @@ def from_records(
 ) -> int:
     """Write an annotation file from plain records.
 
-    A record is a mapping with
+    A record is a mapping. All but the first two keys may be left out:
 
-    - ``token``: unique name (str);
-    - ``cameras``: list of mappings with ``name``, ``path`` (relative to ``data_root``),
-    ``intrinsics`` (3, 3) in
-      pixels, ``cam_from_frame`` (4, 4); ``width`` and ``height`` are read from the image if left
-      out;
-    - ``instances`` (optional; without it no ground truth is known): list of mappings with ``label``
-    (name or index)
-      and ``points`` (n, 2) or (n, 3) in metres, a ring's last equal to its first. What lies outside
-      the range of ``meta`` is cut off; rings stay rings;
-    - ``lidar`` (optional): mapping with ``path``, ``frame_from_lidar`` (4, 4), and optionally
-    ``sweeps``, a list of
-      mappings with ``path``, ``timestamp_ns``, ``frame_from_lidar``;
+    - ``token``: unique name;
+    - ``cameras``: mappings with ``name``, ``path`` (relative to ``data_root``), ``intrinsics``
+      (3, 3) in pixels, ``cam_from_frame`` (4, 4), and, unless the image is to be asked, ``width``
+      and ``height``;
+    - ``instances`` (absent: no ground truth is known): mappings with ``label`` (name or index) and
+      ``points`` (n, 2 or 3) in metres, a ring's last equal to its first. What lies outside the
+      range of ``meta`` is cut off; rings stay rings;
+    - ``lidar``: mapping with ``path``, ``frame_from_lidar`` (4, 4) and ``sweeps``, mappings with
+      ``path``, ``timestamp_ns``, ``frame_from_lidar``;
     - ``scene``, ``map_name``, ``timestamp_ns``, ``global_from_frame``, ``ego_from_frame``,
-    ``can_bus``: optional.
+      ``can_bus``.
 
     Args:
         path: Annotation file to write.
@@ -62,8 +59,7 @@ def from_records(
 
     Raises:
         FileNotFoundError: If an image is missing whose size is not given.
-        ValueError: If a record is malformed; the message names its token. Nothing is left behind
-            then.
+        ValueError: If a record is malformed; the message names its token. No file is left then.
     """
     return write_annotations(path, meta, _samples(records, meta, Path(data_root)))
 
@@ -87,7 +83,7 @@ def _samples(
 
 def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     token = record["token"]
-    can_bus, instances = record.get("can_bus"), record.get("instances")
+    can_bus, instances, lidar = (record.get(key) for key in ("can_bus", "instances", "lidar"))
     return MapSample(
         token=token,
         scene=record.get("scene", ""),
@@ -96,7 +92,7 @@ def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapS
         cameras=[_camera(camera, token, root) for camera in record["cameras"]],
         global_from_frame=_matrix(record.get("global_from_frame")),
         ego_from_frame=_matrix(record.get("ego_from_frame")),
-        lidar=None if record.get("lidar") is None else _lidar(record["lidar"]),
+        lidar=None if lidar is None else _lidar(lidar),
         can_bus=None if can_bus is None else np.asarray(can_bus, np.float64),
         instances=None if instances is None else _instances(instances, meta, token),
     )
@@ -179,5 +175,5 @@ def _clipped(points: Points, meta: AnnotationMeta, token: str) -> list[Points]:
     return [
         shapely.get_coordinates(part.exterior, include_z=meta.dim == 3)
         for part in parts
-        if shapely.get_type_id(part) == _POLYGON
+        if shapely.get_type_id(part) == POLYGON
     ]

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -14,21 +13,35 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
+from gsmap.utils.files import atomic_write
 
 _DECIMALS = 6
 
 
-def frame_record(sample: MapSample) -> dict[str, Any]:
+def frame_record(sample: MapSample, row: int | None = None) -> dict[str, Any]:
     """Return one sample as a JSON object.
 
     Args:
         sample: A sample with ground truth.
+        row: Its row in the pose table of its Argoverse 2 log, which is ordered by time, if known.
 
     Returns:
-        Identity and pose (position and yaw in degrees of the annotation frame) with the
-        ``vectors``: label and points in metres, rounded to 1e-6 m.
+        Identity and pose (of a log: log, row and pose; else position and yaw in degrees of the
+        annotation frame) with the ``vectors``: label and points in metres, rounded to 1e-6 m.
     """
     pose = sample.global_from_frame
+    vectors = [
+        {"label": i.label, "pts": i.points.astype(np.float64).round(_DECIMALS).tolist()}
+        for i in sample.instances or []
+    ]
+    if row is not None:
+        return {
+            "log": sample.scene,
+            "row": row,
+            "timestamp_ns": sample.timestamp_ns,
+            "city_from_ego": pose.tolist(),
+            "vectors": vectors,
+        }
     return {
         "sample_token": sample.token,
         "scene": sample.scene,
@@ -36,30 +49,7 @@ def frame_record(sample: MapSample) -> dict[str, Any]:
         "timestamp": sample.timestamp_ns // 1000,
         "lidar2global_xy": pose[:2, 3].tolist(),
         "patch_angle_deg": float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0]))),
-        "vectors": [
-            {"label": i.label, "pts": i.points.astype(np.float64).round(_DECIMALS).tolist()}
-            for i in sample.instances or []
-        ],
-    }
-
-
-def log_frame_record(sample: MapSample, row: int) -> dict[str, Any]:
-    """Return one sample of an Argoverse 2 log as a JSON object.
-
-    Args:
-        sample: A sample with ground truth.
-        row: Row of the log's pose table, which is ordered by time.
-
-    Returns:
-        Log, row and pose with the ``vectors``: label and points in metres, rounded to 1e-6 m.
-    """
-    record = frame_record(sample)
-    return {
-        "log": sample.scene,
-        "row": row,
-        "timestamp_ns": sample.timestamp_ns,
-        "city_from_ego": sample.global_from_frame.tolist(),
-        "vectors": record["vectors"],
+        "vectors": vectors,
     }
 
 
@@ -86,18 +76,12 @@ def export_json(annotations: Path | Sequence[Path], target: Path) -> int:
     for file in files:
         file.require(**same)
     head = {**same, "split": [file.meta.split for file in files], "versions": meta.versions}
-    partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with partial.open("w") as out:
-            out.write(f'{{"meta": {json.dumps(head)}, "frames": [')
-            for number, record in enumerate(chain.from_iterable(_records(file) for file in files)):
-                out.write(",\n" if number else "\n")
-                json.dump(record, out)
-            out.write("\n]}\n")
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    with atomic_write(target) as out:
+        out.write(f'{{"meta": {json.dumps(head)}, "frames": [')
+        for number, record in enumerate(chain.from_iterable(_records(file) for file in files)):
+            out.write(",\n" if number else "\n")
+            json.dump(record, out)
+        out.write("\n]}\n")
     return sum(len(file) for file in files)
 
 
@@ -105,19 +89,12 @@ def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
     """Yield each sample as JSON: by log and row where the rows of the pose table are known."""
     stride = re.fullmatch(r"poses:(\d+)", str(file.meta.options.get("at")))
     position: Counter[str] = Counter()
-    for sample in _known(file):
-        if stride is None:
-            yield frame_record(sample)
-        else:  # every N-th row was taken and none left out
-            yield log_frame_record(sample, int(stride[1]) * position[sample.scene])
-            position[sample.scene] += 1
-
-
-def _known(file: AnnotationFile) -> Iterator[MapSample]:
     for sample in file:
         if sample.instances is None:
             raise ValueError(f"{file.path}: sample {sample.token!r} has no ground truth to export.")
-        yield sample
+        # every N-th row was taken and none left out
+        yield frame_record(sample, int(stride[1]) * position[sample.scene] if stride else None)
+        position[sample.scene] += 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

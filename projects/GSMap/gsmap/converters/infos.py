@@ -7,8 +7,9 @@ the ground truth too. The pickles are read without running code from them.
 
 import argparse
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,14 @@ from PIL import Image
 from pyquaternion import Quaternion
 from tqdm import tqdm
 
-from gsmap.converters.nuscenes.map import NuScenesLocalMap, read_layers
+from gsmap.converters.command_line import add_range_options, options_from
+from gsmap.converters.nuscenes.can_bus import pose_signals
+from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import (
-    CAN_BUS_SIZE,
     CLASSES,
+    RANGES,
     AnnotationMeta,
     CameraRecord,
     LidarRecord,
@@ -33,7 +36,7 @@ from gsmap.datasets.annotations.record import (
 from gsmap.datasets.plain_pickle import load_plain_pickle
 
 NUSCENES_IMAGE_SIZE = (1600, 900)
-_RANGES = {"lidar": ((-15.0, 15.0), (-30.0, 30.0)), "ego": ((-30.0, 30.0), (-15.0, 15.0))}
+_BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,8 @@ class InfoOptions:
         data_root: Folder that image and LiDAR paths shall be relative to; maps are read from it.
         split: Name of the split.
         classes: Class names in label order.
+        x_range: Smallest and largest x of the ground truth in metres; the frame's usual if None.
+        y_range: Smallest and largest y of the ground truth in metres; the frame's usual if None.
         command: The command line, for messages of readers.
     """
 
@@ -54,6 +59,8 @@ class InfoOptions:
     data_root: Path
     split: str
     classes: tuple[str, ...] = CLASSES
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
     command: str = ""
 
 
@@ -67,11 +74,7 @@ def _transform(translation: Any, rotation: Any) -> np.ndarray:
 
 
 def _relative(path: str, root: Path) -> str:
-    """Return a path of an info file relative to the data root, wherever it was made.
-
-    Raises:
-        ValueError: If no part of it leads to the data root.
-    """
+    """Return a path of an info file relative to the data root, wherever it was made."""
     parts = Path(path.replace("\\", "/")).parts
     for start in range(len(parts)):
         if (root / Path(*parts[start:])).is_file() and parts[start] != "/":
@@ -134,22 +137,18 @@ def _nuscenes_sample(info: Mapping[str, Any], options: InfoOptions) -> MapSample
         global_from_frame=pose,
         ego_from_frame=ego_from_frame,
         lidar=LidarRecord(_relative(info["lidar_path"], options.data_root), np.eye(4), sweeps),
-        can_bus=None if can_bus is None else _complete_can_bus(can_bus, info, pose),
+        can_bus=None if can_bus is None else _complete_can_bus(can_bus, info),
         instances=None if annotation is None else _instances(annotation, options.classes, 2),
     )
 
 
-def _complete_can_bus(can_bus: Any, info: Mapping[str, Any], pose: np.ndarray) -> np.ndarray:
+def _complete_can_bus(can_bus: Any, info: Mapping[str, Any]) -> np.ndarray:
     """Put the vehicle's pose into the signals, as MapTR does when it loads them. (18,)."""
-    signals = np.zeros(CAN_BUS_SIZE)
-    signals[: len(can_bus)] = can_bus
-    signals[:3] = info["ego2global_translation"]
+    pose = _transform(info["ego2global_translation"], info["ego2global_rotation"])
+    signals = pose_signals(pose)
     signals[3:7] = np.asarray(info["ego2global_rotation"])
-    global_from_ego = pose @ np.linalg.inv(
-        _transform(info["lidar2ego_translation"], info["lidar2ego_rotation"])
-    )
-    yaw_deg = np.degrees(np.arctan2(global_from_ego[1, 0], global_from_ego[0, 0])) % 360.0
-    signals[16:] = np.radians(yaw_deg), yaw_deg
+    measured = np.asarray(can_bus, np.float64)[7:16]
+    signals[7 : 7 + len(measured)] = measured
     return signals
 
 
@@ -195,89 +194,84 @@ def _argoverse_size(name: str, path: Path) -> tuple[int, int]:
 
 
 def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
-    """Return the samples of an info file and the frame of its data set.
-
-    Raises:
-        ValueError: If it is of no known form.
-    """
-    if isinstance(content, Mapping) and isinstance(content.get("infos"), list):
-        entries, frame = content["infos"], "lidar"
-    elif isinstance(content, Mapping) and isinstance(content.get("samples"), list):
-        entries, frame = content["samples"], "ego"
-    else:
-        raise ValueError(
-            f"{path} is no info file of MapTR or MapTRv2: it holds neither a list `infos` "
-            f"(nuScenes) nor a list `samples` (Argoverse 2)."
-        )
-    if not entries:
-        raise ValueError(f"{path} holds no sample.")
-    return entries, frame
+    """Return the samples of an info file and the frame of its data set."""
+    for key, frame in (("infos", "lidar"), ("samples", "ego")):
+        entries = content.get(key) if isinstance(content, Mapping) else None
+        if isinstance(entries, list):
+            if not entries:
+                raise ValueError(f"{path} holds no sample.")
+            return entries, frame
+    raise ValueError(
+        f"{path} is no info file of MapTR or MapTRv2: it holds neither a list `infos` (nuScenes) "
+        "nor a list `samples` (Argoverse 2)."
+    )
 
 
-class _GroundTruth:
-    """Ground truth from the map expansion, for info files without it."""
+def _maps(meta: AnnotationMeta, root: Path) -> Callable[[str], NuScenesLocalMap | None]:
+    """Return what opens a map by its name, once; None where the expansion does not have it."""
 
-    def __init__(self, options: InfoOptions, summary: ConversionSummary) -> None:
-        self._options = options
-        self._summary = summary
-        self._maps: dict[str, NuScenesLocalMap | None] = {}
+    @cache
+    def open_map(name: str) -> NuScenesLocalMap | None:
+        if not name or not (root / f"maps/expansion/{name}.json").is_file():
+            return None
+        layers = open_layers(root, name, meta.classes)
+        return NuScenesLocalMap(layers, meta.classes, meta.x_range, meta.y_range)
 
-    def _map(self, name: str) -> NuScenesLocalMap | None:
-        if name not in self._maps:
-            path = self._options.data_root / f"maps/expansion/{name}.json"
-            self._maps[name] = None
-            if name and path.is_file():
-                from nuscenes.map_expansion.map_api import NuScenesMap
-
-                layers = read_layers(
-                    NuScenesMap(str(self._options.data_root), name), self._options.classes
-                )
-                self._maps[name] = NuScenesLocalMap(
-                    layers, self._options.classes, *_RANGES["lidar"]
-                )
-        return self._maps[name]
-
-    def add(self, sample: MapSample) -> None:
-        """Add the instances of a sample, if its map is there."""
-        local_map = self._map(sample.map_name)
-        if local_map is None:
-            reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
-            self._summary.add_problem(f"{reason} (sample kept without)", sample.token)
-        else:
-            sample.instances = local_map.instances(sample.global_from_frame)
+    return open_map
 
 
 def _samples(
     entries: Sequence[Mapping[str, Any]],
-    frame: str,
     options: InfoOptions,
-    dim: int,
+    meta: AnnotationMeta,
     summary: ConversionSummary,
 ) -> Iterator[MapSample]:
-    truth = _GroundTruth(options, summary)
+    """Yield the samples of an info file, with ground truth where it is known."""
+    local_map = _maps(meta, options.data_root)
+    read = partial(_argoverse_sample, dim=meta.dim) if meta.frame == "ego" else _nuscenes_sample
     for number, info in enumerate(entries):
         try:
-            if frame == "lidar":
-                sample = _nuscenes_sample(info, options)
-                if sample.instances is None:
-                    truth.add(sample)
-            else:
-                sample = _argoverse_sample(info, options, dim)
+            sample = read(info, options)
         except KeyError as error:
             raise ValueError(f"{options.infos}: sample {number} has no {error}.") from error
+        if sample.instances is not None:
+            _check_range(sample, meta)
+        elif meta.frame == "lidar":
+            town = local_map(sample.map_name)
+            if town is not None:
+                sample.instances = town.instances(sample.global_from_frame)
+            else:
+                reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
+                summary.add_problem(f"{reason} (sample kept without)", sample.token)
         summary.add_sample(options.split, sample)
         yield sample
 
 
+def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
+    """Raise a ``ValueError`` if ground truth lies outside the range that the file will name."""
+    low, high = np.array([meta.x_range, meta.y_range]).T
+    for instance in sample.instances or []:
+        points = instance.points[:, :2]
+        outside = (points < low - _BEYOND_M) | (points > high + _BEYOND_M)
+        if outside.any():
+            x, y = points[outside.any(1)][0]
+            raise ValueError(
+                f"sample {sample.token!r} has a vertex at ({x:.1f}, {y:.1f}), outside x "
+                f"{meta.x_range} and y {meta.y_range}: give the range that the info file was made "
+                "for with --x-range and --y-range."
+            )
+
+
 def _dim(entries: Sequence[Mapping[str, Any]], frame: str, classes: Sequence[str]) -> int:
     """Return how many coordinates the points of the first element have; nuScenes has 2."""
-    if frame == "lidar":
-        return 2
-    for info in entries:
-        for name in classes:
-            for points in info.get("annotation", {}).get(name, []):
-                return min(np.asarray(points).shape[-1], 3)
-    return 2
+    lines = (
+        line
+        for info in entries
+        for name in classes
+        for line in info.get("annotation", {}).get(name, [])
+    )
+    first = None if frame == "lidar" else next(lines, None)
+    return 2 if first is None else min(np.asarray(first).shape[-1], 3)
 
 
 def convert_infos(options: InfoOptions) -> ConversionSummary:
@@ -291,31 +285,31 @@ def convert_infos(options: InfoOptions) -> ConversionSummary:
 
     Raises:
         FileNotFoundError: If the pickle does not exist.
-        ValueError: If it holds more than plain data, or is of no known form.
+        ValueError: If it holds more than plain data, is of no known form, or holds ground truth
+            outside the range.
     """
     entries, frame = _entries(load_plain_pickle(options.infos), options.infos)
-    dim = _dim(entries, frame, options.classes)
     meta = AnnotationMeta(
         dataset="nuscenes" if frame == "lidar" else "av2",
         frame=frame,
         split=options.split,
         classes=options.classes,
-        x_range=_RANGES[frame][0],
-        y_range=_RANGES[frame][1],
-        dim=dim,
+        x_range=options.x_range or RANGES[frame][0],
+        y_range=options.y_range or RANGES[frame][1],
+        dim=_dim(entries, frame, options.classes),
         source_fingerprint=hashlib.sha256(options.infos.read_bytes()).hexdigest()[:16],
         options={"infos": options.infos.name},
         command=options.command,
     )
     summary = ConversionSummary(options.classes)
     with AnnotationWriter(options.target, meta) as writer:
-        for sample in _samples(tqdm(entries, unit="sample"), frame, options, dim, summary):
+        for sample in _samples(tqdm(entries, unit="sample"), options, meta, summary):
             writer.write(sample)
     return summary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of ``tools/convert_infos.py``."""
+    """Add the options of ``tools/create_data.py infos``."""
     parser.add_argument("infos", type=Path, help="info file of MapTR or MapTRv2 (.pkl)")
     parser.add_argument("target", type=Path, help="annotation file to write (.arrow)")
     parser.add_argument(
@@ -323,17 +317,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--split", help="name of the split (default: what the file's name ends in)")
     parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="CLASS")
+    add_range_options(parser, None)
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:
     """Convert as the command line asks and return the summary."""
     split = arguments.split or arguments.infos.stem.rsplit("_", 1)[-1]
-    options = InfoOptions(
-        arguments.infos,
-        arguments.target,
-        arguments.data_root,
-        split,
-        tuple(arguments.classes),
-        command,
-    )
-    return convert_infos(options).text()
+    return convert_infos(options_from(InfoOptions, arguments, command, split=split)).text()

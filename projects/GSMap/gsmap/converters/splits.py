@@ -1,7 +1,7 @@
 """Which scenes belong to which split, and whether splits overlap on the ground."""
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +14,6 @@ def read_split_file(path: Path) -> dict[str, list[str]]:
     """Read a split file: JSON, an object with a list of scene names or tokens for each split.
 
     It is the format of the nuScenes devkit's own ``splits.json``.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Scene names or tokens by split.
 
     Raises:
         FileNotFoundError: If it does not exist.
@@ -76,8 +70,8 @@ def resolve_scenes(
 
 
 def overlap_share(
-    train: Mapping[str, np.ndarray],
-    val: Mapping[str, np.ndarray],
+    train: Mapping[str, Sequence[np.ndarray]],
+    val: Mapping[str, Sequence[np.ndarray]],
     distance_m: float = OVERLAP_DISTANCE_M,
 ) -> float:
     """Return the share of validation positions that lie near a training position on the same map.

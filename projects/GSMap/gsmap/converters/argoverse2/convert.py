@@ -3,58 +3,29 @@
 import argparse
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
 import shapely
-from tqdm import tqdm
 
 from gsmap.converters.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_split
 from gsmap.converters.argoverse2.map import COMPAT_MODES
-from gsmap.converters.argoverse2.samples import LogSamples, SampleOptions, read_log
-from gsmap.converters.command_line import add_file_options, add_log_options
+from gsmap.converters.argoverse2.samples import Argoverse2Options, LogSamples, read_log
+from gsmap.converters.command_line import (
+    add_file_options,
+    add_log_options,
+    options_from,
+    progress_bar,
+)
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
 from gsmap.utils.parallel import ordered_map
 
 
-@dataclass(frozen=True)
-class Argoverse2Options:
-    """What to convert and how.
-
-    Args:
-        root: Data root: the folder above the splits, or the one above ``sensor``.
-        split: ``train``, ``val`` or ``test``.
-        samples: Which samples to make of a log, and how.
-        out_dir: Folder of the annotation file; the data root if None.
-        logs: Ids of the logs to convert, or how they begin; empty takes all.
-        keep_map_changes: Whether to keep the four logs whose map was changed on purpose.
-        workers: Number of processes.
-        tag: Appended to the file name.
-        command: The command line, for messages of readers.
-    """
-
-    root: Path
-    split: str = "val"
-    samples: SampleOptions = field(default_factory=SampleOptions)
-    out_dir: Path | None = None
-    logs: Sequence[str] = ()
-    keep_map_changes: bool = False
-    workers: int = 1
-    tag: str = ""
-    command: str = ""
-
-    @property
-    def target(self) -> Path:
-        """The annotation file."""
-        return (self.out_dir or self.root) / f"gsmap_av2_{self.split}{self.tag}.arrow"
-
-
 def convert_argoverse2(
-    options: Argoverse2Options, advance: Callable[[int, int], None] | None = None
+    options: Argoverse2Options, advance: Callable[[int, int], object] = lambda _done, _all: None
 ) -> ConversionSummary:
     """Convert the logs of a split to one annotation file, which appears when it is whole.
 
@@ -72,29 +43,40 @@ def convert_argoverse2(
         RuntimeError: If no sample is left, or a worker process dies; then nothing is written.
         OSError: If the file cannot be written, for example on a full disk; nothing is left behind.
     """
-    summary = ConversionSummary(options.samples.classes)
+    summary = ConversionSummary(options.classes)
+    target = options.path_of("av2", options.split)
     log_dirs = select_logs(find_split(options.root, options.split), options.logs)
     log_dirs = _drop_listed(log_dirs, options.keep_map_changes, summary)
-    read = partial(_try_log, root=options.root, options=options.samples)
+    read = partial(_try_log, options=options)
     sweep_offsets_ns: list[int] = []
-    with AnnotationWriter(options.target, _meta(options, log_dirs)) as writer:
+    advance(0, len(log_dirs))
+    with AnnotationWriter(target, _meta(options, log_dirs)) as writer:
         results = ordered_map(read, log_dirs, min(options.workers, max(len(log_dirs), 1)))
         for done, (log_dir, result) in enumerate(zip(log_dirs, results, strict=True), 1):
             if isinstance(result, str):
                 summary.add_problem(f"log left out: {result}", log_dir.name)
             else:
-                for sample in result.samples:
-                    writer.write(sample)
-                    summary.add_sample(options.split, sample)
-                _add_problems(summary, log_dir.name, result)
+                _write_log(writer, result, log_dir.name, summary)
                 sweep_offsets_ns += result.sweep_offsets_ns
-            if advance is not None:
-                advance(done, len(log_dirs))
+            advance(done, len(log_dirs))
         if not len(writer):
-            raise RuntimeError(f"no sample is left for {options.target}:\n{summary.text()}")
+            raise RuntimeError(f"no sample is left for {target}:\n{summary.text()}")
         summary.notes.append(_lidar_note(sweep_offsets_ns, len(writer)))
-    summary.notes.append(f"written to {options.target}")
+    summary.notes.append(f"written to {target}")
     return summary
+
+
+def _write_log(
+    writer: AnnotationWriter, result: LogSamples, log_id: str, summary: ConversionSummary
+) -> None:
+    """Write a log's samples and count what it leaves out."""
+    for sample in result.samples:
+        writer.write(sample)
+        summary.add_sample(writer.meta.split, sample)
+    for reason, count in result.left_out.items():
+        summary.add_problem(f"sample left out: {reason}", log_id, count)
+    for kind, count in result.invalid.items():
+        summary.add_problem(f"invalid polygon among the {kind} takes no part", log_id, count)
 
 
 def _lidar_note(offsets_ns: Sequence[int], samples: int) -> str:
@@ -103,28 +85,16 @@ def _lidar_note(offsets_ns: Sequence[int], samples: int) -> str:
     return f"{named}, at most {max(offsets_ns) / 1e6:.0f} ms away" if offsets_ns else named
 
 
-def _try_log(log_dir: Path, root: Path, options: SampleOptions) -> LogSamples | str:
+def _try_log(log_dir: Path, options: Argoverse2Options) -> LogSamples | str:
     """Read a log; return the reason where that fails (a bug of ours still stops everything)."""
     try:
-        return read_log(log_dir, root, options)
+        return read_log(log_dir, options)
     except (OSError, ValueError, shapely.errors.ShapelyError) as error:
         return str(error)
 
 
-def _add_problems(summary: ConversionSummary, log_id: str, result: LogSamples) -> None:
-    """Count what a log that was read leaves out."""
-    for reason, count in result.left_out.items():
-        summary.add_problem(f"sample left out: {reason}", log_id, count)
-    for kind, count in result.invalid.items():
-        summary.add_problem(f"invalid polygon among the {kind} takes no part", log_id, count)
-
-
 def select_logs(split_dir: Path, logs: Sequence[str] = ()) -> list[Path]:
-    """Return the log folders of a split, sorted by id.
-
-    Args:
-        split_dir: Folder of the split.
-        logs: Ids, or how they begin; empty takes all.
+    """Return a split's log folders whose ids begin as asked (empty takes all), sorted.
 
     Raises:
         FileNotFoundError: If the split holds no log, or none that begins as asked.
@@ -163,24 +133,23 @@ def _drop_listed(
 
 def _meta(options: Argoverse2Options, log_dirs: Iterable[Path]) -> AnnotationMeta:
     """Describe the file: what it holds, and what it was made from."""
-    samples = options.samples
-    content = ("at", "rate_hz", "compat", "num_sweeps")
-    return AnnotationMeta(
-        dataset="av2",
-        frame="ego",
-        split=options.split,
-        classes=samples.classes,
-        x_range=samples.x_range,
-        y_range=samples.y_range,
-        dim=samples.dim,
+    return options.meta(
+        "av2",
+        "ego",
+        options.split,
+        dim=options.dim,
         source_fingerprint=_fingerprint(log_dirs),
         versions={
             "av2": version("av2"),
             "shapely": version("shapely"),
             "geos": ".".join(map(str, shapely.geos_version)),
         },
-        options={name: value for name, value in asdict(samples).items() if name in content},
-        command=options.command,
+        options={
+            "at": options.at,
+            "rate_hz": options.rate_hz,
+            "compat": options.compat,
+            "num_sweeps": options.max_sweeps,
+        },
     )
 
 
@@ -216,44 +185,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="keep the four logs whose map was changed on purpose",
     )
-    add_file_options(parser, x_range=(-30.0, 30.0), y_range=(-15.0, 15.0), max_sweeps=0)
+    add_file_options(parser, "ego", max_sweeps=0)
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:
-    """Convert as the command line asks.
-
-    Args:
-        arguments: Parsed options.
-        command: The command line as typed.
-
-    Returns:
-        The summary as text.
-    """
-    samples = SampleOptions(
-        at=arguments.at,
-        rate_hz=arguments.rate,
-        compat=arguments.compat,
-        classes=(*CLASSES, "centerline") if arguments.centerline else CLASSES,
-        dim=arguments.dim,
-        x_range=tuple(arguments.x_range),
-        y_range=tuple(arguments.y_range),
-        num_sweeps=arguments.max_sweeps,
-    )
-    options = Argoverse2Options(
-        root=arguments.root,
-        split=arguments.split,
-        samples=samples,
-        out_dir=arguments.out_dir,
-        logs=arguments.logs,
-        keep_map_changes=arguments.keep_map_changes,
-        workers=arguments.workers,
-        tag=arguments.tag,
-        command=command,
-    )
-    with tqdm(desc=f"av2 {options.split}", unit="log") as bar:
-
-        def advance(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
+    """Convert as the command line asks and return the summary."""
+    classes = (*CLASSES, "centerline") if arguments.centerline else CLASSES
+    options = options_from(Argoverse2Options, arguments, command, classes=classes)
+    with progress_bar(f"av2 {options.split}", "log") as advance:
         return convert_argoverse2(options, advance).text()

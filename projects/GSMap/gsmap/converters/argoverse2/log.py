@@ -5,7 +5,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from av2.datasets.sensor.constants import RingCameras
 from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.geometry.geometry import quat_to_mat
 from av2.utils.io import read_feather
@@ -13,20 +12,15 @@ from av2.utils.synchronization_database import SynchronizationDB
 
 # The order of MapTR and MapTRv2: camera embeddings of their checkpoints depend on it.
 RING_CAMERAS = (
-    RingCameras.RING_FRONT_CENTER.value,
-    RingCameras.RING_FRONT_RIGHT.value,
-    RingCameras.RING_FRONT_LEFT.value,
-    RingCameras.RING_REAR_RIGHT.value,
-    RingCameras.RING_REAR_LEFT.value,
-    RingCameras.RING_SIDE_RIGHT.value,
-    RingCameras.RING_SIDE_LEFT.value,
-)
+    "ring_front_center", "ring_front_right", "ring_front_left", "ring_rear_right", "ring_rear_left",
+    "ring_side_right", "ring_side_left",
+)  # fmt: skip
 MAX_CAMERA_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_RING_CAM_TIMESTAMP_DIFF)  # 25 ms
 MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 51 ms
 
 BROKEN_LOGS = {
-    "01bb304d-7bd8-35f8-bbef-7086b688e35e": "its map or sensor data cannot be used (known to fail)",
-    "453e5558-6363-38e3-bf9b-42b5ba0a6f1d": "its map or sensor data cannot be used (known to fail)",
+    log_id: "its map or sensor data cannot be used (known to fail)"
+    for log_id in ("01bb304d-7bd8-35f8-bbef-7086b688e35e", "453e5558-6363-38e3-bf9b-42b5ba0a6f1d")
 }
 MAP_CHANGE_LOGS = {
     log_id: "its map was changed on purpose and contradicts the images (Argoverse 2's own note)"
@@ -53,10 +47,7 @@ class PoseTable:
 
     @classmethod
     def read(cls, log_dir: Path) -> "PoseTable":
-        """Read ``city_SE3_egovehicle.feather``.
-
-        Args:
-            log_dir: The log's folder.
+        """Read ``city_SE3_egovehicle.feather`` of a log's folder.
 
         Raises:
             FileNotFoundError: If the table is missing.
@@ -149,13 +140,7 @@ class Argoverse2Log:
 
 
 def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> int | None:
-    """Return the time closest to the wanted one, or None if it is farther than the tolerance.
-
-    Args:
-        timestamps_ns: Ascending. (n,)
-        wanted_ns: Time to come close to.
-        tolerance_ns: Largest allowed difference.
-    """
+    """Return which of ascending times (n,) is closest to the wanted one; None beyond tolerance."""
     if len(timestamps_ns) == 0:
         return None
     after = int(np.searchsorted(timestamps_ns, wanted_ns))
@@ -165,11 +150,7 @@ def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> 
 
 
 def find_split(root: Path, split: str) -> Path:
-    """Return the folder that holds a split's logs.
-
-    Args:
-        root: Data root: the folder above the splits, or the one above ``sensor``.
-        split: ``train``, ``val`` or ``test``.
+    """Return the folder of a split's logs under a data root, or under its folder ``sensor``.
 
     Raises:
         FileNotFoundError: If there is no such split.

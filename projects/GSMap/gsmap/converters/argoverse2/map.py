@@ -6,6 +6,7 @@ of rules.
 """
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,17 +25,24 @@ from gsmap.converters.argoverse2.rules import (
 )
 from gsmap.converters.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths
 from gsmap.converters.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
+from gsmap.datasets.annotations.record import RANGES
 
 COMPAT_MODES = ("maptrv2", "maptr")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
 NO_LANE = -1
 
 
-def find_map(log_dir: Path) -> Path:
-    """Return the file that holds a log's vector map.
+def check_rules(classes: Collection[str], compat: str) -> None:
+    """Raise a ``ValueError`` unless the classes and the rules are known."""
+    if compat not in COMPAT_MODES:
+        raise ValueError(f"compat must be one of {COMPAT_MODES}, got {compat!r}.")
+    unknown = set(classes) - set(MAP_CLASSES)
+    if unknown:
+        raise ValueError(f"classes must be among {MAP_CLASSES}, got {sorted(unknown)}.")
 
-    Args:
-        log_dir: The log's folder, which holds ``map/log_map_archive_*.json``.
+
+def find_map(log_dir: Path) -> Path:
+    """Return the file of a log's vector map, ``map/log_map_archive_*.json`` in its folder.
 
     Raises:
         FileNotFoundError: If it is missing.
@@ -48,27 +56,20 @@ def find_map(log_dir: Path) -> Path:
     return found[0]
 
 
+@dataclass(frozen=True)
 class LaneSide:
     """The left or right boundaries of a log's lanes: which divide lanes, and how they join.
 
     Args:
-        polylines: The boundary of each lane on this side. list of (n, 3)
+        paths: The boundaries of the lanes on this side, as a graph.
         neighbours: Position of the lane beyond the boundary; ``NO_LANE`` if it is not in the map.
             (lanes,)
         has_neighbour: Whether the lane names a lane beyond the boundary. (lanes,)
-        links: Which lanes follow which.
     """
 
-    def __init__(
-        self,
-        polylines: Sequence[np.ndarray],
-        neighbours: np.ndarray,
-        has_neighbour: np.ndarray,
-        links: LaneLinks,
-    ) -> None:
-        self.neighbours = neighbours
-        self.has_neighbour = has_neighbour
-        self.paths = LanePaths(polylines, links)
+    paths: LanePaths
+    neighbours: np.ndarray
+    has_neighbour: np.ndarray
 
     def dividing(self, lanes: np.ndarray) -> np.ndarray:
         """Return those of the given lanes that name a neighbour on this side."""
@@ -109,10 +110,7 @@ class Argoverse2Map:
 
     @classmethod
     def from_log(cls, log_dir: Path) -> "Argoverse2Map":
-        """Read the map of a log.
-
-        Args:
-            log_dir: The log's folder, which holds ``map/log_map_archive_*.json``.
+        """Read the map in a log's folder.
 
         Raises:
             FileNotFoundError: If the map is missing.
@@ -138,8 +136,8 @@ class Argoverse2Map:
         city_from_ego: np.ndarray,
         classes: Collection[str] = MAP_CLASSES[:3],
         compat: str = "maptrv2",
-        x_range: tuple[float, float] = (-30.0, 30.0),
-        y_range: tuple[float, float] = (-15.0, 15.0),
+        x_range: tuple[float, float] = RANGES["ego"][0],
+        y_range: tuple[float, float] = RANGES["ego"][1],
     ) -> dict[str, list[np.ndarray]]:
         """Return the map elements around the vehicle, in its frame (x forward, y left, z up).
 
@@ -156,11 +154,7 @@ class Argoverse2Map:
         Raises:
             ValueError: If a class or the rules are unknown, or the pose is malformed.
         """
-        if compat not in COMPAT_MODES:
-            raise ValueError(f"compat must be one of {COMPAT_MODES}, got {compat!r}.")
-        unknown = set(classes) - set(MAP_CLASSES)
-        if unknown:
-            raise ValueError(f"classes must be among {MAP_CLASSES}, got {sorted(unknown)}.")
+        check_rules(classes, compat)
         patch = LocalPatch(np.asarray(city_from_ego, dtype=np.float64), x_range, y_range)
         lanes = self._lanes.touching(patch)
         maptr = compat == "maptr"
@@ -222,10 +216,9 @@ def _lane_side(lanes: Sequence[LaneSegment], side: str, links: LaneLinks) -> Lan
     position = {segment.id: i for i, segment in enumerate(lanes)}
     neighbour_ids = [getattr(segment, f"{side}_neighbor_id") for segment in lanes]
     return LaneSide(
-        [getattr(segment, f"{side}_lane_boundary").xyz for segment in lanes],
+        LanePaths([getattr(segment, f"{side}_lane_boundary").xyz for segment in lanes], links),
         np.array([position.get(i, NO_LANE) for i in neighbour_ids], dtype=np.int64),
         np.array([i is not None for i in neighbour_ids], dtype=bool),
-        links,
     )
 
 

@@ -16,14 +16,18 @@ import shapely
 from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 from av2.utils.io import read_feather
-from tqdm import tqdm
 
 from gsmap.converters.argoverse2.convert import select_logs
 from gsmap.converters.argoverse2.log import RING_CAMERAS, Argoverse2Log, find_split
 from gsmap.converters.argoverse2.map import find_map
 from gsmap.converters.argoverse2.samples import thin_out
 from gsmap.converters.argoverse2.scene import make_scene
-from gsmap.converters.command_line import add_log_options, add_workers_option
+from gsmap.converters.command_line import (
+    add_log_options,
+    add_workers_option,
+    options_from,
+    progress_bar,
+)
 from gsmap.utils.parallel import ordered_map
 from minicity.camera import Camera
 from minicity.lighting import random_lighting
@@ -41,7 +45,8 @@ class RenderOptions:
     Args:
         rate_hz: Pictures per second and camera; None takes every row of the pose table.
         scale: Size of the pictures relative to the real cameras'.
-        calibration: Log whose calibration stands in for a missing one; None leaves such logs out.
+        calibration: Folder of the log whose calibration stands in for a missing one; None leaves
+            logs without one out.
         max_frames: Render only so many moments per log, evenly spread; None renders all.
 
     Raises:
@@ -63,13 +68,9 @@ class RenderOptions:
 
 
 def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int, int]:
-    """Return a camera's intrinsics (3, 3), width and height when its pictures are scaled.
+    """Return a camera's intrinsics (3, 3), width and height for pictures of ``scale`` its size.
 
     Integer pixel coordinates lie at pixel centres, so the picture's corner (-0.5, -0.5) stays put.
-
-    Args:
-        camera: The camera.
-        scale: Factor of the picture's size, which is rounded.
     """
     width, height = (max(1, round(n * scale)) for n in (camera.width_px, camera.height_px))
     ratio = np.array([width / camera.width_px, height / camera.height_px])
@@ -121,12 +122,8 @@ class LogRenderer:
             self._rng,
         )
 
-    def render(self, name: str, timestamp_ns: int) -> np.ndarray:
-        """Take the picture of a camera at a row of the pose table. (H, W, 3), BGR
-
-        Args:
-            name: Camera.
-            timestamp_ns: Time of a row of the pose table.
+    def render(self, name: str, timestamp_ns: int) -> bytes:
+        """Take the picture of a camera at a row of the pose table, as JPEG.
 
         Raises:
             ValueError: If the pose table has no such row.
@@ -137,9 +134,12 @@ class LogRenderer:
         camera = self._calibration[name]
         intrinsics, width, height = scaled_camera(camera, self._scale)
         cam_from_city = np.linalg.inv(pose @ camera.ego_SE3_cam.transform_matrix)
-        return self._renderer.render_camera(
+        image = self._renderer.render_camera(
             Camera(intrinsics, width, height, cam_from_city), [], self._rng
         )
+        encoded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        assert encoded, image.shape
+        return data.tobytes()
 
 
 def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
@@ -183,7 +183,7 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         for timestamp_ns in times.tolist():
             for name in RING_CAMERAS:
                 path = partial_dir / "sensors" / "cameras" / name / f"{timestamp_ns}.jpg"
-                _write_jpeg(path, renderer.render(name, timestamp_ns))
+                path.write_bytes(renderer.render(name, timestamp_ns))
         os.rename(partial_dir, out_dir)
     finally:
         shutil.rmtree(partial_dir, ignore_errors=True)
@@ -212,13 +212,6 @@ def _copy_log(log_dir: Path, source: Argoverse2Log, target: Path, scale: float) 
         (target / "sensors" / "cameras" / name).mkdir(parents=True)
 
 
-def _write_jpeg(path: Path, image: np.ndarray) -> None:
-    encoded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not encoded:
-        raise ValueError(f"could not encode an image of shape {image.shape} for {path}.")
-    path.write_bytes(data.tobytes())
-
-
 def _try_log(log_dir: Path, out: Path, options: RenderOptions) -> int | str:
     """Render a log; return the reason where it cannot be rendered. A full disk stops everything."""
     try:
@@ -232,7 +225,7 @@ def render_logs(
     out: Path,
     options: RenderOptions,
     workers: int = 1,
-    advance: Callable[[], None] | None = None,
+    advance: Callable[[int, int], object] = lambda _done, _all: None,
 ) -> str:
     """Render logs; one that cannot be rendered does not stop the others.
 
@@ -241,21 +234,21 @@ def render_logs(
         out: Folder of the split that the rendered logs go to.
         options: How.
         workers: Number of processes.
-        advance: Called after each log.
+        advance: Called after each log with the number of logs done and of all logs.
 
     Returns:
         What was rendered and what was left out, for people.
     """
     lines, pictures, rendered = [], 0, 0
     render = partial(_try_log, out=out, options=options)
+    advance(0, len(log_dirs))
     results = ordered_map(render, log_dirs, min(workers, max(len(log_dirs), 1)), timeout_s=3600.0)
-    for log_dir, result in zip(log_dirs, results, strict=True):
+    for done, (log_dir, result) in enumerate(zip(log_dirs, results, strict=True), 1):
         if isinstance(result, str):
             lines.append(f"log {log_dir.name} left out: {result}")
         else:
             rendered, pictures = rendered + 1, pictures + result
-        if advance is not None:
-            advance()
+        advance(done, len(log_dirs))
     return "\n".join([f"{pictures} pictures of {rendered} logs in {out}", *lines])
 
 
@@ -275,22 +268,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:
-    """Render as the command line asks.
-
-    Args:
-        arguments: Parsed options.
-        command: The command line as typed.
-
-    Returns:
-        The summary as text.
-    """
-    del command
+    """Render as the command line asks and return the summary."""
     split_dir = find_split(arguments.root, arguments.split)
-    calibration = None
-    if arguments.calibration_from:
-        calibration = select_logs(split_dir, [arguments.calibration_from])[0]
-    options = RenderOptions(arguments.rate, arguments.scale, calibration, arguments.max_frames)
+    log, calibration = arguments.calibration_from, None
+    if log:
+        calibration = select_logs(split_dir, [log])[0]
+    options = options_from(RenderOptions, arguments, command, calibration=calibration)
     log_dirs = select_logs(split_dir, arguments.logs)
-    with tqdm(desc="av2-render", unit="log", total=len(log_dirs)) as bar:
-        out = arguments.out / (arguments.out_split or arguments.split)
-        return render_logs(log_dirs, out, options, arguments.workers, lambda: bar.update() and None)
+    out = arguments.out / (arguments.out_split or arguments.split)
+    with progress_bar("av2-render", "log") as advance:
+        return render_logs(log_dirs, out, options, arguments.workers, advance)

@@ -17,11 +17,7 @@ def clip_lines(lines: np.ndarray, patch: LocalPatch) -> np.ndarray:
 
 
 def clip_polygons(polygons: np.ndarray, patch: LocalPatch) -> tuple[np.ndarray, np.ndarray]:
-    """Cut polygons of the city with the patch and move the pieces to the vehicle's frame.
-
-    Args:
-        polygons: Valid polygons in the city frame.
-        patch: What the sample sees.
+    """Cut valid polygons of the city with the patch and move the pieces to the vehicle's frame.
 
     Returns:
         Valid pieces (pieces,), and which polygon each came from (pieces,).
@@ -38,10 +34,6 @@ def clip_polygons(polygons: np.ndarray, patch: LocalPatch) -> tuple[np.ndarray, 
 def cut_rings(rings: np.ndarray, box: shapely.Polygon) -> tuple[np.ndarray, np.ndarray]:
     """Return what of each ring lies in the box, its pieces joined where they touch.
 
-    Args:
-        rings: Rings in the vehicle's frame.
-        box: Where they are cut.
-
     Returns:
         Lines (pieces,), and which ring each came from (pieces,).
     """
@@ -55,14 +47,7 @@ def cut_rings(rings: np.ndarray, box: shapely.Polygon) -> tuple[np.ndarray, np.n
 
 
 def drop_duplicates(lines: np.ndarray) -> np.ndarray:
-    """Leave out each line that an earlier kept one covers: IoU >= 0.9 of their 2 m wide strips.
-
-    Args:
-        lines: Lines in the vehicle's frame.
-
-    Returns:
-        The lines that stay, in their order.
-    """
+    """Leave out each line that an earlier kept one covers: IoU >= 0.9 of their 2 m wide strips."""
     strips = shapely.buffer(lines, DUPLICATE_BUFFER_M, cap_style="flat", join_style="mitre")
     area = shapely.area(strips)
     first, second = _possible_duplicates(shapely.bounds(strips), area)
@@ -134,14 +119,7 @@ def _long_side(geometry: shapely.Geometry) -> np.ndarray:
 
 
 def merge_until_stable(lines: np.ndarray) -> np.ndarray:
-    """Node lines where they meet and join them at their ends, until their number no longer changes.
-
-    Args:
-        lines: Lines, possibly several times the same.
-
-    Returns:
-        Lines without duplicates.
-    """
+    """Node lines where they meet and join them at their ends, until their number stays the same."""
     merged = shapely.union_all(lines)
     count = shapely.get_num_geometries(merged)
     while count > 1:

@@ -2,8 +2,8 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,10 @@ from gsmap.converters.argoverse2.log import (
     Argoverse2Log,
     closest_ns,
 )
-from gsmap.converters.argoverse2.map import COMPAT_MODES, MAP_CLASSES, Argoverse2Map
-from gsmap.datasets.annotations.file import (
-    CLASSES,
+from gsmap.converters.argoverse2.map import Argoverse2Map, check_rules
+from gsmap.converters.command_line import FileOptions
+from gsmap.datasets.annotations.record import (
+    RANGES,
     CameraRecord,
     LidarRecord,
     MapInstance,
@@ -27,45 +28,43 @@ from gsmap.datasets.annotations.file import (
 
 
 @dataclass(frozen=True)
-class SampleOptions:
-    """Which samples to make of a log, and how.
+class Argoverse2Options(FileOptions):
+    """What to convert and how, besides what every converter is told.
 
     Args:
+        split: ``train``, ``val`` or ``test``.
         at: ``lidar``: at the sweeps; ``cameras``: at the front centre camera's images; ``auto``: at
             the sweeps where the log has some, else at the images; ``poses:N``: at every N-th row of
             the pose table, whether or not there are sensor data.
         rate_hz: Samples per second, thinned out from the times of ``at``; None takes them all.
         compat: Whose rules the ground truth follows: ``maptrv2`` or ``maptr``.
-        classes: Classes in label order.
         dim: Coordinates per point: 2 or 3.
-        x_range: Smallest and largest x (forward) in metres.
-        y_range: Smallest and largest y (left) in metres.
-        num_sweeps: How many earlier LiDAR sweeps to name.
+        logs: Ids of the logs to convert, or how they begin; empty takes all.
+        keep_map_changes: Whether to keep the four logs whose map was changed on purpose.
 
     Raises:
         ValueError: If a value is out of its domain.
     """
 
+    _: KW_ONLY
+    split: str = "val"
     at: str = "auto"
     rate_hz: float | None = 2.0
     compat: str = "maptrv2"
-    classes: tuple[str, ...] = CLASSES
     dim: int = 2
-    x_range: tuple[float, float] = (-30.0, 30.0)
-    y_range: tuple[float, float] = (-15.0, 15.0)
-    num_sweeps: int = 0
+    logs: Sequence[str] = ()
+    keep_map_changes: bool = False
+    x_range: tuple[float, float] = RANGES["ego"][0]
+    y_range: tuple[float, float] = RANGES["ego"][1]
 
     def __post_init__(self) -> None:
         if self.at not in ("auto", "lidar", "cameras") and self.pose_stride is None:
             raise ValueError(f"at must be auto, lidar, cameras or poses:N, got {self.at!r}.")
         if self.rate_hz is not None and not self.rate_hz > 0:
             raise ValueError(f"rate_hz must be > 0, got {self.rate_hz}.")
-        if self.compat not in COMPAT_MODES:
-            raise ValueError(f"compat must be one of {COMPAT_MODES}, got {self.compat!r}.")
-        if not set(self.classes) <= set(MAP_CLASSES):
-            raise ValueError(f"classes must be among {MAP_CLASSES}, got {self.classes}.")
         if self.dim not in (2, 3):
             raise ValueError(f"dim must be 2 or 3, got {self.dim}.")
+        check_rules(self.classes, self.compat)
 
     @property
     def pose_stride(self) -> int | None:
@@ -91,16 +90,8 @@ class LogSamples:
     sweep_offsets_ns: list[int] = field(default_factory=list)
 
 
-def read_log(log_dir: Path, root: Path, options: SampleOptions) -> LogSamples:
+def read_log(log_dir: Path, options: Argoverse2Options) -> LogSamples:
     """Make the samples of one log.
-
-    Args:
-        log_dir: The log's folder.
-        root: Data root, to which paths are relative.
-        options: Which samples, and how.
-
-    Returns:
-        The samples, and what was left out.
 
     Raises:
         FileNotFoundError: If the map or the poses are missing.
@@ -110,7 +101,7 @@ def read_log(log_dir: Path, root: Path, options: SampleOptions) -> LogSamples:
     times = sample_times(log, options)
     log_map = Argoverse2Map.from_log(log_dir)
     result = LogSamples(invalid=Counter({k: n for k, n in log_map.invalid_counts.items() if n}))
-    builder = _SampleBuilder(log, log_map, log_dir.relative_to(root).as_posix(), options)
+    builder = _SampleBuilder(log, log_map, log_dir.relative_to(options.root).as_posix(), options)
     for timestamp_ns in times.tolist():
         try:
             sample = builder.build(timestamp_ns)
@@ -124,15 +115,8 @@ def read_log(log_dir: Path, root: Path, options: SampleOptions) -> LogSamples:
     return result
 
 
-def sample_times(log: Argoverse2Log, options: SampleOptions) -> np.ndarray:
-    """Return when the samples of a log are.
-
-    Args:
-        log: The log.
-        options: ``at`` and ``rate_hz`` count.
-
-    Returns:
-        Times in nanoseconds, ascending. (n,)
+def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
+    """Return when the samples of a log are, in nanoseconds, ascending. (n,)
 
     Raises:
         ValueError: If the log lacks the sensor data that ``options.at`` asks for.
@@ -146,25 +130,19 @@ def sample_times(log: Argoverse2Log, options: SampleOptions) -> np.ndarray:
     sweeps = log.lidar_timestamps_ns
     images = log.image_timestamps_ns[RING_CAMERAS[0]]
     at = options.at if options.at != "auto" else "lidar" if len(sweeps) else "cameras"
-    times = sweeps if at == "lidar" else images
+    times, kind = (
+        (sweeps, "LiDAR sweeps") if at == "lidar" else (images, f"images of {RING_CAMERAS[0]}")
+    )
     if len(times) == 0:
-        found = "LiDAR sweeps" if at == "lidar" else f"images of {RING_CAMERAS[0]}"
-        raise ValueError(f"no {found} (--at poses:10 needs neither sweeps nor images)")
+        raise ValueError(f"no {kind} (--at poses:10 needs neither sweeps nor images)")
     return times if options.rate_hz is None else thin_out(times, options.rate_hz)
 
 
 def thin_out(times_ns: np.ndarray, rate_hz: float) -> np.ndarray:
-    """Keep the first time, then each time that follows the latest kept one after a period.
+    """Keep the first of ascending times, then each that follows the latest kept after a period.
 
-    Half the sensor's own period is tolerated, so that 10 Hz with jitter thins out to every fifth
-    at 2 Hz, and what is already slower stays whole.
-
-    Args:
-        times_ns: Ascending, in nanoseconds. (n,)
-        rate_hz: Times to keep per second.
-
-    Returns:
-        The kept times. (m,)
+    Half the sensor's own period is tolerated, so that 10 Hz with jitter thins out to every fourth
+    at 2.5 Hz, and what is already slower stays whole. (n,) -> (m,)
     """
     if len(times_ns) < 2:
         return times_ns
@@ -184,7 +162,7 @@ class _SampleBuilder:
     """Makes the samples of one log."""
 
     def __init__(
-        self, log: Argoverse2Log, log_map: Argoverse2Map, folder: str, options: SampleOptions
+        self, log: Argoverse2Log, log_map: Argoverse2Map, folder: str, options: Argoverse2Options
     ) -> None:
         self._log = log
         self._map = log_map
@@ -253,7 +231,7 @@ class _SampleBuilder:
             return None
         last = int(np.searchsorted(times, sweep_ns))
         sweeps = []
-        for time in times[max(last - self._options.num_sweeps, 0) : last + 1][::-1].tolist():
+        for time in times[max(last - self._options.max_sweeps, 0) : last + 1][::-1].tolist():
             city_from_ego_then = self._log.poses.at(time)
             if city_from_ego_then is not None:
                 path = f"{self._folder}/sensors/lidar/{time}.feather"

@@ -42,9 +42,6 @@ def make_scene(
         heights: The log's ground height.
         bounds: xmin, ymin, xmax, ymax of the part that will be seen, city frame, in metres.
 
-    Returns:
-        The ground inside the bounds.
-
     Raises:
         ValueError: If no ground height is known inside the bounds.
     """
@@ -72,14 +69,8 @@ def lane_paint(
 ) -> dict[str, list[np.ndarray]]:
     """Return the painted areas of all marked lane boundaries, by colour.
 
-    Two lanes that share a line describe it twice; it is painted once.
-
-    Args:
-        static_map: The log's map.
-        window: Lines outside are left out.
-
-    Returns:
-        Outlines in the city frame for ``white`` and ``yellow``. each (n, 2)
+    Two lanes that share a line describe it twice; it is painted once. Lines outside ``window`` are
+    left out; outlines for ``white`` and ``yellow`` are in the city frame. each (n, 2)
     """
     markings = [
         marking

@@ -9,6 +9,20 @@ from pyquaternion import Quaternion
 from gsmap.datasets.annotations.record import CAN_BUS_SIZE
 
 
+def pose_signals(global_from_ego: np.ndarray) -> np.ndarray:
+    """Return the signals that a vehicle's pose tells, the others zero. (4, 4) -> (18,).
+
+    Entries: position (3), orientation (w, x, y, z), acceleration (3), rotation rate (3), velocity
+    (3), yaw in radians, yaw in degrees in [0, 360).
+    """
+    values = np.zeros(CAN_BUS_SIZE)
+    values[:3] = global_from_ego[:3, 3]
+    values[3:7] = Quaternion(matrix=global_from_ego, atol=1e-6, rtol=1e-6).elements
+    yaw_deg = np.degrees(np.arctan2(global_from_ego[1, 0], global_from_ego[0, 0])) % 360.0
+    values[16:] = np.radians(yaw_deg), yaw_deg
+    return values
+
+
 class CanBusReader:
     """Read the ``pose`` messages of scenes; without the expansion the signals are zero.
 
@@ -36,12 +50,7 @@ class CanBusReader:
         self._times = np.array([message["utime"] for message in self._messages])
 
     def signals(self, scene: str, timestamp_ns: int, global_from_ego: np.ndarray) -> np.ndarray:
-        """Return the signals at a time.
-
-        Entries: position (3), orientation (w, x, y, z), acceleration (3), rotation rate (3),
-            velocity (3), yaw in
-        radians, yaw in degrees in [0, 360). Position, orientation and yaw are the vehicle's pose;
-        the others come from the latest message, and are zero where there is none.
+        """Return the vehicle's pose with the latest message; zeros in place of one that is absent.
 
         Args:
             scene: Scene name.
@@ -49,13 +58,9 @@ class CanBusReader:
             global_from_ego: Pose of the vehicle. (4, 4)
 
         Returns:
-            The signals. (18,)
+            The signals, as ``pose_signals`` says. (18,)
         """
-        values = np.zeros(CAN_BUS_SIZE)
-        values[:3] = global_from_ego[:3, 3]
-        values[3:7] = Quaternion(matrix=global_from_ego, atol=1e-6, rtol=1e-6).elements
-        yaw_deg = np.degrees(np.arctan2(global_from_ego[1, 0], global_from_ego[0, 0])) % 360.0
-        values[16:] = np.radians(yaw_deg), yaw_deg
+        values = pose_signals(global_from_ego)
         if self.available and scene != self._scene:
             self._open(scene)
         latest = int(np.searchsorted(self._times, timestamp_ns // 1000, side="right")) - 1

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from importlib.metadata import version as package_version
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 
+from gsmap.converters.command_line import (
+    FileOptions,
+    add_file_options,
+    options_from,
+    progress_bar,
+)
 from gsmap.converters.nuscenes.map import (
     MAP_CLASSES,
     MapLayers,
     NuScenesLocalMap,
-    read_layers,
+    check_classes,
+    open_layers,
 )
 from gsmap.converters.splits import overlap_share, read_split_file, resolve_scenes
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
-from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapInstance, MapSample
+from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.parallel import ordered_map
 
@@ -44,49 +53,25 @@ _FRAMES_PER_WORKER = 500  # a process takes about as long to start as these take
 
 
 @dataclass(frozen=True)
-class NuScenesOptions:
-    """What to convert and how.
+class NuScenesOptions(FileOptions):
+    """What to convert and how, besides what every converter is told.
 
     Args:
-        root: Data root with the version folder, ``maps`` and ``samples``.
         version: Version folder, such as ``v1.0-trainval``.
-        out_dir: Folder of the annotation files; the data root if None.
         dataset: Name of the data set in the files.
         split_file: Own split file; else ``<root>/<version>/splits.json`` if it is there, else the
             official splits.
-        classes: Names out of ``MAP_CLASSES`` in label order.
-        x_range: Smallest and largest x of the ground truth in metres.
-        y_range: Smallest and largest y of the ground truth in metres.
-        max_sweeps: How many earlier LiDAR sweeps each sample lists at most.
-        workers: Number of processes.
-        tag: Appended to the file names.
-        command: The command line, for messages of readers.
     """
 
-    root: Path
     version: str
-    out_dir: Path | None = None
+    _: KW_ONLY
     dataset: str = "nuscenes"
     split_file: Path | None = None
-    classes: tuple[str, ...] = CLASSES
-    x_range: tuple[float, float] = (-15.0, 15.0)
-    y_range: tuple[float, float] = (-30.0, 30.0)
     max_sweeps: int = 10
-    workers: int = 1
-    tag: str = ""
-    command: str = ""
 
 
 def check_root(root: Path, version: str) -> None:
-    """Say what is missing before anything is read.
-
-    Args:
-        root: Data root.
-        version: Version folder.
-
-    Raises:
-        FileNotFoundError: If the data root, the version or the map expansion is not there.
-    """
+    """Raise a ``FileNotFoundError`` if the data root, the version or the maps are not there."""
     if not root.is_dir():
         raise FileNotFoundError(
             f"no data set at {root}: give the folder that holds `maps`, `samples` and `v1.0-...`; "
@@ -111,10 +96,8 @@ def fingerprint(root: Path, version: str) -> str:
     digest = hashlib.sha256()
     for path in sorted((root / version).glob("*.json")):
         digest.update(f"{path.name} {path.stat().st_size}\n".encode())
-    for path in [
-        root / version / "scene.json",
-        *sorted((root / "maps" / "expansion").glob("*.json")),
-    ]:
+    maps = sorted((root / "maps" / "expansion").glob("*.json"))
+    for path in (root / version / "scene.json", *maps):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -149,27 +132,12 @@ def _splits(
     return resolved
 
 
-_local_map: NuScenesLocalMap | None = None
-
-
-def _prepare(
-    layers: MapLayers,
-    classes: Sequence[str],
-    x_range: tuple[float, float],
-    y_range: tuple[float, float],
-) -> None:
-    """Prepare the map once per process."""
-    global _local_map
-    _local_map = NuScenesLocalMap(layers, classes, x_range, y_range)
-
-
-def _instances_of(poses: np.ndarray) -> list[list[MapInstance] | str]:
+def _instances_of(local_map: NuScenesLocalMap, poses: np.ndarray) -> list[list[MapInstance] | str]:
     """Return the instances at each pose (n, 4, 4), or why there are none."""
-    assert _local_map is not None
     results: list[list[MapInstance] | str] = []
     for pose in poses:
         try:
-            results.append(_local_map.instances(pose))
+            results.append(local_map.instances(pose))
         except (shapely.errors.ShapelyError, ValueError) as error:
             results.append(f"ground truth failed ({type(error).__name__}: {error})")
     return results
@@ -178,12 +146,11 @@ def _instances_of(poses: np.ndarray) -> list[list[MapInstance] | str]:
 class _Conversion:
     """One run over all scenes; holds what its steps share."""
 
-    def __init__(self, options: NuScenesOptions, progress: Callable[[str, int], None]) -> None:
+    def __init__(self, options: NuScenesOptions) -> None:
         from gsmap.converters.nuscenes.can_bus import CanBusReader
         from gsmap.converters.nuscenes.tables import NuScenesTables, SampleReader
 
         self.options = options
-        self.progress = progress
         self.summary = ConversionSummary(options.classes)
         self.tables = NuScenesTables(options.version, options.root, options.max_sweeps > 0)
         self.reader = SampleReader(self.tables, options.max_sweeps)
@@ -194,7 +161,51 @@ class _Conversion:
             split: {} for split in self.splits
         }
 
-    def scene_samples(self, scene: dict[str, Any]) -> list[MapSample]:
+    def run(
+        self, writers: dict[str, AnnotationWriter], advance: Callable[[int, int], object]
+    ) -> None:
+        """Convert map by map, so that one map at a time is in memory."""
+        scenes = [scene for scene in self.tables.scene if scene["name"] in self.split_of]
+        done, total = 0, sum(scene["nbr_samples"] for scene in scenes)
+        advance(done, total)
+        for location in sorted({self.tables.location_of(scene) for scene in scenes}):
+            local = [scene for scene in scenes if self.tables.location_of(scene) == location]
+            for sample, instances in self._with_instances(location, local):
+                self._write(writers[self.split_of[sample.scene]], sample, instances)
+                advance(done := done + 1, total)
+
+    def _with_instances(
+        self, location: str, scenes: list[dict[str, Any]]
+    ) -> Iterator[tuple[MapSample, list[MapInstance] | str]]:
+        """Yield the samples of one map with their instances, or why there are none."""
+        options, waiting = self.options, []
+
+        def poses() -> Iterator[np.ndarray]:
+            for scene in scenes:
+                waiting.append(self._scene_samples(scene))
+                yield np.array([s.global_from_frame for s in waiting[-1]]).reshape(-1, 4, 4)
+
+        layers = self._layers(location)
+        local_map = NuScenesLocalMap(layers, options.classes, options.x_range, options.y_range)
+        frames = sum(scene["nbr_samples"] for scene in scenes)
+        workers = max(1, min(options.workers, len(scenes), frames // _FRAMES_PER_WORKER))
+        for results in ordered_map(partial(_instances_of, local_map), poses(), workers):
+            yield from zip(waiting.pop(0), results, strict=True)
+
+    def _layers(self, location: str) -> MapLayers:
+        """Read one map and count its unusable elements."""
+        file = self.options.root / f"maps/expansion/{location}.json"
+        if location not in LOCATIONS or not file.is_file():
+            raise FileNotFoundError(
+                f"no map expansion for {location!r} in {self.options.root}/maps/expansion; the "
+                f"devkit knows {', '.join(LOCATIONS)}. Unpack the map expansion pack (v1.3) there."
+            )
+        layers = open_layers(self.options.root, location, self.options.classes)
+        for reason, count in layers.skipped.items():
+            self.summary.add_problem(f"{reason} left out", location, count)
+        return layers
+
+    def _scene_samples(self, scene: dict[str, Any]) -> list[MapSample]:
         """Read a scene's samples without ground truth, counting what is missing."""
         samples = []
         for record in self.tables.samples_of(scene):
@@ -205,86 +216,36 @@ class _Conversion:
                 continue
             self._count_missing(sample)
             pose = sample.global_from_frame @ invert_rigid(sample.ego_from_frame)
-            can_bus = self.can_bus.signals(sample.scene, sample.timestamp_ns, pose)
-            samples.append(replace(sample, can_bus=can_bus))
+            sample.can_bus = self.can_bus.signals(sample.scene, sample.timestamp_ns, pose)
+            samples.append(sample)
         return samples
 
     def _count_missing(self, sample: MapSample) -> None:
+        """Count the cameras and files that a sample lacks."""
         from gsmap.converters.nuscenes.tables import CAMERAS
 
-        present = {camera.name for camera in sample.cameras}
+        files = {camera.name: camera.path for camera in sample.cameras}
         for name in CAMERAS:
-            if name not in present:
+            if name not in files:
                 self.summary.add_problem(f"{name} absent (sample kept without it)", sample.token)
-        for camera in sample.cameras:
-            if not (self.options.root / camera.path).is_file():
-                self.summary.add_problem(f"{camera.name} image file missing", camera.path)
+        for name, path in files.items():
+            if not (self.options.root / path).is_file():
+                self.summary.add_problem(f"{name} image file missing", path)
         if sample.lidar is not None and not (self.options.root / sample.lidar.path).is_file():
             self.summary.add_problem("LIDAR_TOP file missing", sample.lidar.path)
 
-    def layers(self, location: str) -> MapLayers:
-        """Read one map with the devkit and count its unusable elements."""
-        from nuscenes.map_expansion.map_api import NuScenesMap
-
-        if (
-            location not in LOCATIONS
-            or not (self.options.root / f"maps/expansion/{location}.json").is_file()
-        ):
-            raise FileNotFoundError(
-                f"no map expansion for {location!r} in {self.options.root}/maps/expansion; the "
-                f"devkit knows {', '.join(LOCATIONS)}. Unpack the map expansion pack (v1.3) there."
-            )
-        layers = read_layers(NuScenesMap(str(self.options.root), location), self.options.classes)
-        for reason, count in layers.skipped.items():
-            self.summary.add_problem(f"{reason} left out", location, count)
-        return layers
-
-    def run(self, writers: dict[str, AnnotationWriter]) -> None:
-        """Convert map by map, so that one map at a time is in memory."""
-        scenes = [scene for scene in self.tables.scene if scene["name"] in self.split_of]
-        total = sum(scene["nbr_samples"] for scene in scenes)
-        self.progress("samples", total)
-        for location in sorted({self.tables.location_of(scene) for scene in scenes}):
-            local = [scene for scene in scenes if self.tables.location_of(scene) == location]
-            for samples, results in self._with_instances(location, local):
-                self._write(writers, samples, results)
-
-    def _with_instances(
-        self, location: str, scenes: list[dict[str, Any]]
-    ) -> Iterator[tuple[list[MapSample], list[list[MapInstance] | str]]]:
-        options, waiting = self.options, []
-
-        def poses() -> Iterator[np.ndarray]:
-            for scene in scenes:
-                waiting.append(self.scene_samples(scene))
-                yield np.array([s.global_from_frame for s in waiting[-1]]).reshape(-1, 4, 4)
-
-        arguments = (self.layers(location), options.classes, options.x_range, options.y_range)
-        frames = sum(scene["nbr_samples"] for scene in scenes)
-        workers = max(1, min(options.workers, len(scenes), frames // _FRAMES_PER_WORKER))
-        for results in ordered_map(_instances_of, poses(), workers, _prepare, arguments):
-            yield waiting.pop(0), results
-
     def _write(
-        self,
-        writers: dict[str, AnnotationWriter],
-        samples: list[MapSample],
-        results: list[list[MapInstance] | str],
+        self, writer: AnnotationWriter, sample: MapSample, instances: list[MapInstance] | str
     ) -> None:
-        for sample, instances in zip(samples, results, strict=True):
-            self.progress("", 1)
-            if isinstance(instances, str):
-                self.summary.add_problem(f"sample left out: {instances}", sample.token)
-                continue
-            split = self.split_of[sample.scene]
-            complete = replace(sample, instances=instances)
-            writers[split].write(complete)
-            self.summary.add_sample(split, complete)
-            places = self.positions[split].setdefault(sample.map_name, [])
-            places.append(sample.global_from_frame[:2, 3])
-
-    def _stacked(self, split: str) -> dict[str, np.ndarray]:
-        return {name: np.array(places) for name, places in self.positions[split].items()}
+        """Write a sample, or count why it has no ground truth."""
+        if isinstance(instances, str):
+            self.summary.add_problem(f"sample left out: {instances}", sample.token)
+            return
+        sample.instances = instances
+        writer.write(sample)
+        self.summary.add_sample(writer.meta.split, sample)
+        places = self.positions[writer.meta.split].setdefault(sample.map_name, [])
+        places.append(sample.global_from_frame[:2, 3])
 
     def note_overlap(self) -> None:
         """Note how many validation samples lie near a training sample."""
@@ -292,7 +253,7 @@ class _Conversion:
         val = next((s for s in self.splits if s.endswith("val")), None)
         if train is None or val is None:
             return
-        share = overlap_share(self._stacked(train), self._stacked(val))
+        share = overlap_share(self.positions[train], self.positions[val])
         if share > 0:
             self.summary.notes.append(
                 f"warning: {share:.1%} of the {val} samples lie within 5 m of a {train} sample: "
@@ -300,37 +261,14 @@ class _Conversion:
             )
 
 
-def _meta(options: NuScenesOptions, split: str) -> AnnotationMeta:
-    return AnnotationMeta(
-        dataset=options.dataset,
-        frame="lidar",
-        split=split,
-        classes=options.classes,
-        x_range=options.x_range,
-        y_range=options.y_range,
-        source_fingerprint=fingerprint(options.root, options.version),
-        versions={
-            name: package_version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")
-        },
-        options={"version": options.version, "max_sweeps": options.max_sweeps},
-        command=options.command,
-    )
-
-
-def annotation_path(options: NuScenesOptions, split: str) -> Path:
-    """Return where a split's annotation file goes: ``gsmap_<dataset>_<split><tag>.arrow``."""
-    name = f"gsmap_{options.dataset}_{split}{options.tag}.arrow"
-    return (options.out_dir or options.root) / name
-
-
 def convert_nuscenes(
-    options: NuScenesOptions, progress: Callable[[str, int], None] = lambda _kind, _count: None
+    options: NuScenesOptions, advance: Callable[[int, int], object] = lambda _done, _all: None
 ) -> ConversionSummary:
     """Write one annotation file per split; all appear together, when all are whole.
 
     Args:
         options: What to convert and how.
-        progress: Called with ("samples", total) once, then with ("", 1) for each sample.
+        advance: Called after each sample with the number of samples done and of all samples.
 
     Returns:
         What was written and what was left out.
@@ -339,23 +277,50 @@ def convert_nuscenes(
         FileNotFoundError: If the data set, its version or a map is missing.
         ValueError: If splits or classes do not fit the data set.
     """
-    unknown = [name for name in options.classes if name not in MAP_CLASSES]
-    if unknown:
-        raise ValueError(f"classes must be among {MAP_CLASSES}, got {unknown}.")
+    check_classes(options.classes)
     check_root(options.root, options.version)
-    conversion = _Conversion(options, progress)
+    conversion = _Conversion(options)
+    made_from = {
+        "source_fingerprint": fingerprint(options.root, options.version),
+        "versions": {name: version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")},
+        "options": {"version": options.version, "max_sweeps": options.max_sweeps},
+    }
     with ExitStack() as stack:
-        writers = {
-            split: stack.enter_context(
-                AnnotationWriter(annotation_path(options, split), _meta(options, split))
-            )
-            for split, scenes in conversion.splits.items()
-            if scenes
-        }
-        conversion.run(writers)
+        writers = {}
+        for split in (split for split, scenes in conversion.splits.items() if scenes):
+            meta = options.meta(options.dataset, "lidar", split, **made_from)
+            writer = AnnotationWriter(options.path_of(options.dataset, split), meta)
+            writers[split] = stack.enter_context(writer)
+        conversion.run(writers, advance)
     if not conversion.can_bus.available:
         conversion.summary.notes.append(
             "no CAN bus expansion: acceleration, rotation rate and velocity are 0."
         )
     conversion.note_overlap()
     return conversion.summary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``tools/create_data.py nuscenes``."""
+    parser.add_argument(
+        "--root", type=Path, required=True, help="data root with maps, samples, v1.0-..."
+    )
+    parser.add_argument(
+        "--version", default="v1.0-trainval", help="version folder (default: %(default)s)"
+    )
+    parser.add_argument("--dataset", help="name in the files (default: minicity or nuscenes)")
+    parser.add_argument("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
+    parser.add_argument(
+        "--classes", nargs="+", default=list(CLASSES), choices=MAP_CLASSES, metavar="CLASS",
+        help=f"classes in label order, of {', '.join(MAP_CLASSES)} (default: the first three)",
+    )  # fmt: skip
+    add_file_options(parser, "lidar", max_sweeps=10)
+
+
+def run(arguments: argparse.Namespace, command: str) -> str:
+    """Convert as the command line asks and return the summary."""
+    is_minicity = (arguments.root / "minicity.json").is_file()  # it says so in its root
+    dataset = arguments.dataset or ("minicity" if is_minicity else "nuscenes")
+    options = options_from(NuScenesOptions, arguments, command, dataset=dataset)
+    with progress_bar(f"{dataset} {options.version}", "sample") as advance:
+        return convert_nuscenes(options, advance).text()

@@ -8,6 +8,7 @@ near.
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from gsmap.converters.local_map import (
     rings_of,
     vertices_of,
 )
-from gsmap.datasets.annotations.record import MapInstance
+from gsmap.datasets.annotations.record import RANGES, MapInstance
 from gsmap.structures.polylines import Points
 
 if TYPE_CHECKING:
@@ -81,6 +82,20 @@ def _read_polygons(nusc_map: "NuScenesMap", name: str, skipped: Counter[str]) ->
     if len(valid) < len(polygons):
         skipped[f"invalid {name} polygon"] += len(polygons) - len(valid)
     return np.array(valid, dtype=object)
+
+
+def check_classes(classes: Collection[str]) -> None:
+    """Raise a ``ValueError`` unless the classes are known."""
+    unknown = [name for name in classes if name not in MAP_CLASSES]
+    if unknown:
+        raise ValueError(f"classes must be among {MAP_CLASSES}, got {unknown}.")
+
+
+def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
+    """Collect the geometries that the classes need from a map under a data root."""
+    from nuscenes.map_expansion.map_api import NuScenesMap
+
+    return read_layers(NuScenesMap(str(root), name), classes)
 
 
 def read_layers(nusc_map: "NuScenesMap", classes: Collection[str]) -> MapLayers:
@@ -149,12 +164,10 @@ class NuScenesLocalMap:
         self,
         layers: MapLayers,
         classes: Sequence[str],
-        x_range: tuple[float, float] = (-15.0, 15.0),
-        y_range: tuple[float, float] = (-30.0, 30.0),
+        x_range: tuple[float, float] = RANGES["lidar"][0],
+        y_range: tuple[float, float] = RANGES["lidar"][1],
     ) -> None:
-        unknown = [name for name in classes if name not in MAP_CLASSES]
-        if unknown:
-            raise ValueError(f"classes must be among {MAP_CLASSES}, got {unknown}.")
+        check_classes(classes)
         self.classes = tuple(classes)
         self.x_range, self.y_range = x_range, y_range
         marks = [layers.lines[layer] for layer in LINE_LAYERS if layer in layers.lines]

@@ -15,13 +15,8 @@ from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSamp
 from gsmap.structures.rigid import invert_rigid
 
 CAMERAS = (
-    "CAM_FRONT",
-    "CAM_FRONT_RIGHT",
-    "CAM_FRONT_LEFT",
-    "CAM_BACK",
-    "CAM_BACK_LEFT",
-    "CAM_BACK_RIGHT",
-)
+    "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
+)  # fmt: skip
 LIDAR = "LIDAR_TOP"
 _UNUSED = {"sample_annotation", "instance", "image_annotations"}
 _SAMPLE_DATA_FIELDS = (
@@ -33,13 +28,7 @@ _CHUNK_CHARACTERS = 1 << 20
 
 
 def iterate_records(path: Path) -> Iterator[dict[str, Any]]:
-    """Read the records of a table one after another; the file is never in memory as a whole.
-
-    Args:
-        path: JSON file that holds a list of objects.
-
-    Yields:
-        Its records.
+    """Read the records of a table (a JSON list) one by one; it is never in memory as a whole.
 
     Raises:
         ValueError: If the file ends inside a record.
@@ -138,14 +127,7 @@ class SampleReader:
         return _pose(self._tables.get("ego_pose", data["ego_pose_token"])) @ sensor, sensor
 
     def read(self, sample: dict[str, Any], scene: dict[str, Any]) -> MapSample:
-        """Read one sample; cameras without a record are left out of it.
-
-        Args:
-            sample: Record of the table ``sample``.
-            scene: Record of its scene.
-
-        Returns:
-            The sample in the LIDAR_TOP frame, without instances.
+        """Read a sample in the LIDAR_TOP frame, without instances and cameras that have no record.
 
         Raises:
             ValueError: If it has no LIDAR_TOP key frame, so that its frame is unknown.
@@ -175,17 +157,10 @@ class SampleReader:
             data = self._tables.get("sample_data", sample["data"][name])
             calibration = self._tables.get("calibrated_sensor", data["calibrated_sensor_token"])
             global_from_cam, _ = self._global_from(data)
+            size = int(data["width"] or 0), int(data["height"] or 0)
             intrinsics = np.array(calibration["camera_intrinsic"], np.float64)
-            cameras.append(
-                CameraRecord(
-                    name,
-                    data["filename"],
-                    int(data["width"] or 0),
-                    int(data["height"] or 0),
-                    intrinsics,
-                    invert_rigid(global_from_cam) @ global_from_frame,
-                )
-            )
+            cam_from_frame = invert_rigid(global_from_cam) @ global_from_frame
+            cameras.append(CameraRecord(name, data["filename"], *size, intrinsics, cam_from_frame))
         return cameras
 
     def _sweeps(self, lidar: dict[str, Any], global_from_frame: np.ndarray) -> list[SweepRecord]:
@@ -194,13 +169,8 @@ class SampleReader:
         token = lidar["prev"]
         while token and len(sweeps) < self._max_sweeps:
             data = self._tables.get("sample_data", token)
-            global_from_sweep, _ = self._global_from(data)
-            sweeps.append(
-                SweepRecord(
-                    data["filename"],
-                    int(data["timestamp"]) * 1000,
-                    frame_from_global @ global_from_sweep,
-                )
-            )
+            frame_from_sweep = frame_from_global @ self._global_from(data)[0]
+            timestamp_ns = int(data["timestamp"]) * 1000
+            sweeps.append(SweepRecord(data["filename"], timestamp_ns, frame_from_sweep))
             token = data["prev"]
         return sweeps

@@ -5,8 +5,8 @@ something else.
 """
 
 import json
-import os
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -26,6 +26,7 @@ from gsmap.datasets.annotations.record import (
     validate_sample,
 )
 from gsmap.datasets.annotations.schema import FIELDS, META_KEY, Batch, row_of, schema_of
+from gsmap.utils.files import atomic_write
 
 __all__ = [
     "CLASSES",
@@ -44,24 +45,11 @@ __all__ = [
 _ROWS_PER_BATCH = 256
 
 
-def _remove_stale(path: Path) -> None:
-    """Remove what a killed writer of the same file left behind."""
-    for partial in path.parent.glob(f"{path.name}.*.partial"):
-        pid = partial.name.split(".")[-2]
-        if (
-            pid.isdigit()
-            and int(pid) != os.getpid()
-            and not Path("/proc", pid).exists()
-            and Path("/proc/self").exists()
-        ):
-            partial.unlink(missing_ok=True)
-
-
 class AnnotationWriter:
     """Write an annotation file that appears only when it is whole.
 
-    A context manager: rows go to ``PATH.<pid>.partial``, which takes its final name when the block
-    ends well and is removed when it ends with an exception.
+    A context manager: the file takes its name when the block ends well, and is removed when it ends
+    with an exception.
 
     Args:
         path: File to write; parent folders are made.
@@ -72,15 +60,13 @@ class AnnotationWriter:
         self.path = Path(path)
         self.meta = meta
         self._schema = schema_of(meta)
-        self._partial = self.path.with_name(f"{self.path.name}.{os.getpid()}.partial")
+        self._opened = ExitStack()
         self._rows: list[dict[str, Any]] = []
         self._tokens: set[str] = set()
 
     def __enter__(self) -> "AnnotationWriter":
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_stale(self.path)
-        self._sink = pa.OSFile(str(self._partial), "wb")
-        self._writer = pa.ipc.new_file(self._sink, self._schema)
+        file = self._opened.enter_context(atomic_write(self.path, "wb"))
+        self._writer = pa.ipc.new_file(file, self._schema)
         return self
 
     def __len__(self) -> int:
@@ -117,17 +103,11 @@ class AnnotationWriter:
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        try:
-            if kind is None:
-                self._flush()
-                self._writer.close()
-                self._sink.close()
-                os.replace(self._partial, self.path)
-        finally:
-            try:
-                self._sink.close()
-            finally:
-                self._partial.unlink(missing_ok=True)
+        with self._opened:
+            if value is not None:
+                raise value
+            self._flush()
+            self._writer.close()
 
 
 def write_annotations(path: str | Path, meta: AnnotationMeta, samples: Iterable[MapSample]) -> int:

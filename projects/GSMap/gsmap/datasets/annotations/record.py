@@ -9,7 +9,8 @@ import numpy as np
 FORMAT_VERSION = 1
 CLASSES = ("divider", "ped_crossing", "boundary")
 CAN_BUS_SIZE = 18
-FRAMES = ("lidar", "ego")
+RANGES = {"lidar": ((-15.0, 15.0), (-30.0, 30.0)), "ego": ((-30.0, 30.0), (-15.0, 15.0))}
+"""The usual range of each annotation frame: smallest and largest x, and y, in metres."""
 
 
 @dataclass(eq=False)
@@ -121,8 +122,8 @@ class AnnotationMeta:
             coordinates.
         split: Split that the file holds, such as ``train`` or ``val``.
         classes: Class names in label order.
-        x_range: Smallest and largest x of the ground truth in metres.
-        y_range: Smallest and largest y of the ground truth in metres.
+        x_range: Smallest and largest x of the ground truth in metres; the frame's usual if None.
+        y_range: Smallest and largest y of the ground truth in metres; the frame's usual if None.
         dim: Coordinates per point: 2 or 3.
         source_fingerprint: Digest of what the file was made from; empty if unknown.
         versions: Versions of the libraries that took part.
@@ -138,8 +139,8 @@ class AnnotationMeta:
     frame: str
     split: str
     classes: tuple[str, ...] = CLASSES
-    x_range: tuple[float, float] = (-15.0, 15.0)
-    y_range: tuple[float, float] = (-30.0, 30.0)
+    x_range: tuple[float, float] = None  # type: ignore[assignment]  # a pair once it is made
+    y_range: tuple[float, float] = None  # type: ignore[assignment]
     dim: int = 2
     source_fingerprint: str = ""
     versions: dict[str, str] = field(default_factory=dict)
@@ -148,8 +149,8 @@ class AnnotationMeta:
     format_version: int = FORMAT_VERSION
 
     def __post_init__(self) -> None:
-        if self.frame not in FRAMES:
-            raise ValueError(f"frame must be one of {FRAMES}, got {self.frame!r}.")
+        if self.frame not in RANGES:
+            raise ValueError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
         if self.dim not in (2, 3):
             raise ValueError(f"dim must be 2 or 3, got {self.dim!r}.")
         if not self.classes or len(set(self.classes)) != len(self.classes):
@@ -157,8 +158,9 @@ class AnnotationMeta:
                 f"classes must be different names, at least one, got {self.classes!r}."
             )
         object.__setattr__(self, "classes", tuple(self.classes))
-        for name in ("x_range", "y_range"):
-            low, high = (float(v) for v in getattr(self, name))
+        for name, usual in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):
+            given = getattr(self, name)
+            low, high = (float(v) for v in (usual if given is None else given))
             if not low < high:
                 raise ValueError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
             object.__setattr__(self, name, (low, high))
