@@ -156,6 +156,21 @@ def test_argoverse_infos_keep_three_coordinates(tmp_path):
     np.testing.assert_allclose(sample.cameras[0].cam_from_frame[:3, 3], [0, 1, 0], atol=1e-12)
 
 
+def test_truth_beyond_the_range_is_refused_until_the_range_is_given(known, tmp_path):
+    info = nuscenes_info(known[0])
+    far = {"divider": [np.array([[0.0, -45], [0, 45]])], "ped_crossing": [], "boundary": []}
+    content = {"infos": [{**info, "annotation": far}]}
+    name = "nuscenes_map_infos_temporal_train.pkl"
+    with pytest.raises(ValueError, match=r"vertex at \(0.0, -45.0\), outside .* --y-range"):
+        convert(tmp_path, name, content, tmp_path)
+    ranges = {"x_range": (-25.0, 25.0), "y_range": (-50.0, 50.0)}
+    options = InfoOptions(tmp_path / name, tmp_path / "far.arrow", tmp_path, "train", **ranges)
+    convert_infos(options)
+    file = AnnotationFile(tmp_path / "far.arrow")
+    assert (file.meta.x_range, file.meta.y_range) == ((-25, 25), (-50, 50))
+    np.testing.assert_allclose(file[0].instances[0].points, far["divider"][0])
+
+
 class RunsCode:
     def __reduce__(self):
         return os.system, ("touch /tmp/gsmap_was_here",)

@@ -190,12 +190,13 @@ def test_samples_without_elements_train_only_if_asked(build, minicity_annotation
     ("option", "message"),
     [
         ({"classes": ["divider"]}, "classes .*config asks for"),
-        ({"pc_range": [-30, -15, -2, 30, 15, 2]}, "x_range .*config asks for"),
+        ({"grid": {"x_range": [-30, 30], "y_range": [-15, 15]}}, "x_range .*config asks for"),
         ({"split": "train"}, "split val, the config asks for train"),
         ({"frame": "ego"}, "frame lidar, the config asks for ego"),
         ({"broken_samples": "ignore"}, "broken_samples"),
+        ({"indices": 0}, "at least one sample"),
         ({"broken_samples": "skip", "test_mode": True}, "a test must see every sample"),
-        ({"pc_range": [1, 2]}, "6 values"),
+        ({"grid": {"x_range": [2, 1], "y_range": [0, 1]}}, "x_range"),
     ],
 )
 def test_what_does_not_fit_is_refused(build, minicity_annotations, option, message):
@@ -272,3 +273,21 @@ def test_nan_in_an_image_is_named(build, minicity_annotations, minicity_root):
     dataset = build(**{**config, "pipeline": [*config.pipeline[:-1], poison, config.pipeline[-1]]})
     with pytest.raises(BrokenSampleError, match="CAM_FRONT_LEFT: the image holds NaN"):
         dataset[0]
+
+
+def test_it_keeps_the_contract_of_a_base_dataset(build, minicity_root, minicity_annotations):
+    """Opened late, cut to subsets by number, from the end or by list, and told its labels."""
+    config = {"ann_file": "gsmap_minicity_val.arrow", "data_root": str(minicity_root)}
+    whole = AnnotationFile(minicity_annotations["val"])
+    for serialize_data in (True, False):
+        dataset = build(**config, lazy_init=True, serialize_data=serialize_data)
+        assert dataset.metainfo == {}
+        dataset.full_init()
+        assert dataset.metainfo["split"] == "val"
+        for indices, row in ((1, 0), (-1, 1), ([1], 1)):
+            subset = dataset.get_subset(indices)
+            assert (len(subset), len(dataset)) == (1, 2)
+            assert subset.get_data_info(0)["token"] == whole[row].token
+        assert dataset.get_cat_ids(1) == [i.label for i in whole[1].instances]
+        dataset.get_subset_([1])
+        assert dataset.sample(0).token == whole[1].token

@@ -34,7 +34,7 @@ def read_info_file(
     if not isinstance(content, Mapping) or not isinstance(content.get("data_list"), list):
         raise ValueError(
             f"{path} is not an info file of mmdet3d's format v2 (no data_list); those of MapTR and "
-            "MapTRv2 convert with tools/convert_infos.py, older ones of mmdet3d with its "
+            "MapTRv2 convert with tools/create_data.py infos, older ones of mmdet3d with its "
             "tools/dataset_converters/update_infos_to_v2.py."
         )
     return [

@@ -19,6 +19,7 @@ from gsmap.apis.checkpoint import load_weights
 from gsmap.apis.info_file import read_info_file
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
+from gsmap.datasets.transforms.points import read_points
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.launch import read_config
 from gsmap.evaluation.map_metric import MapMetric
@@ -209,7 +210,7 @@ class MapInferencer:
 
         Raises:
             FileNotFoundError: If the sweep's file does not exist.
-            ValueError: If it is not in nuScenes' format: five float32 values per point.
+            ValueError: If it is neither nuScenes' (five float32 values per point) nor Argoverse 2's.
         """
         lidar = dataset.sample(index).lidar
         if lidar is None:
@@ -217,11 +218,8 @@ class MapInferencer:
         path = Path(dataset.data_root, lidar.path)
         if not path.is_file():
             raise FileNotFoundError(f"There is no LiDAR sweep {path}.")
-        values = np.fromfile(path, np.float32)
-        if path.suffix != ".bin" or values.size % 5:
-            raise ValueError(f"{path} is not a LiDAR sweep of five float32 values per point.")
         matrix = lidar.frame_from_lidar
-        return values.reshape(-1, 5)[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
+        return read_points(str(path), 5)[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
 
     @torch.no_grad()
     def predict(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from mmdet3d.registry import DATASETS
-from mmengine.dataset import BaseDataset, Compose
+from mmengine.dataset import BaseDataset
 from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -22,11 +22,6 @@ def _homogeneous(intrinsics: np.ndarray) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = intrinsics
     return matrix
-
-
-def _selection(indices: int | Sequence[int]) -> slice | list[int]:
-    """Return what picks the first samples (an integer) or the listed ones."""
-    return slice(indices) if isinstance(indices, int) else list(indices)
 
 
 @DATASETS.register_module()
@@ -52,9 +47,10 @@ class VectorizedMapDataset(BaseDataset):
             seed: what a model then still scores, it does not see in the images.
         broken_samples: ``raise`` stops at a sample with a missing or damaged file; ``skip`` takes
             another one in its place, and counts and logs it (in training only).
-        indices: Number of first samples, or list of samples, to use.
-        lazy_init: Whether to open the file later, with ``full_init``.
         max_refetch: How many samples in a row may be skipped.
+        indices: Of the samples that are left, the first N, the last -N, or the listed ones.
+        lazy_init: Whether to open the file later, with ``full_init``.
+        serialize_data: Whether the list of samples is kept as bytes that worker processes share.
 
     Raises:
         FileNotFoundError: If there is no annotation file.
@@ -75,22 +71,22 @@ class VectorizedMapDataset(BaseDataset):
         filter_empty_gt: bool = True,
         shuffle_images_seed: int | None = None,
         broken_samples: str = "raise",
+        max_refetch: int = 100,
         indices: int | Sequence[int] | None = None,
         lazy_init: bool = False,
-        max_refetch: int = 100,
+        serialize_data: bool = True,
     ) -> None:
         if broken_samples not in _BROKEN:
             raise ValueError(f"broken_samples must be one of {_BROKEN}, got {broken_samples!r}.")
         if broken_samples == "skip" and test_mode:
             raise ValueError("broken_samples='skip' is for training: a test must see every sample.")
+        if indices is not None and not indices:
+            raise ValueError(f"indices must leave at least one sample, got {indices!r}.")
         extent = None if grid is None else BEVGrid(**grid)
-        self.ann_file = str(Path(data_root, ann_file))
-        self.data_root = str(data_root)
         self.cameras = None if cameras is None else tuple(cameras)
-        self.test_mode = test_mode
-        self.max_refetch = max_refetch
         self.broken_samples = broken_samples
         self.broken_tokens: dict[str, str] = {}
+        self._broken_in_a_row = 0
         self._expected = {
             "classes": None if classes is None else tuple(classes),
             "x_range": None if extent is None else extent.x_range,
@@ -100,82 +96,63 @@ class VectorizedMapDataset(BaseDataset):
         }
         self._filter_empty_gt = filter_empty_gt and not test_mode
         self._shuffle_images_seed = shuffle_images_seed
-        self._indices = indices
-        self._metainfo: dict[str, Any] = {}
-        self.pipeline = Compose(pipeline)
-        self._fully_initialized = False
-        if not lazy_init:
-            self.full_init()
+        super().__init__(
+            ann_file,
+            data_root=str(data_root),
+            pipeline=list(pipeline),
+            test_mode=test_mode,
+            max_refetch=max_refetch,
+            indices=indices,
+            lazy_init=lazy_init,
+            serialize_data=serialize_data,
+        )
 
-    def full_init(self) -> None:
-        """Open the annotation file, check it, and choose the samples."""
-        if self._fully_initialized:
-            return
+    def load_data_list(self) -> list[dict[str, int]]:
+        """Open the annotation file, check it, and list its rows."""
         self.annotations = AnnotationFile(self.ann_file)
         self.annotations.require(**self._expected)
-        meta = self.annotations.meta
-        self._metainfo = {
-            "classes": meta.classes,
-            "x_range": meta.x_range,
-            "y_range": meta.y_range,
-            "dataset": meta.dataset,
-            "split": meta.split,
-            "frame": meta.frame,
-        }
-        self._rows = np.arange(len(self.annotations))
-        if self._indices is not None:
-            self._rows = self._rows[_selection(self._indices)]
-        self._filter_empty()
-        if not len(self._rows):
-            raise ValueError(f"{self.ann_file} has no sample to use (of {len(self.annotations)}).")
-        self._image_rows = self._shuffled_rows()
-        self._fully_initialized = True
+        for name in ("classes", "x_range", "y_range", "dataset", "split", "frame"):
+            self._metainfo[name] = getattr(self.annotations.meta, name)
+        return [{"row": row, "image_row": row} for row in range(len(self.annotations))]
 
-    def _filter_empty(self) -> None:
-        if not self._filter_empty_gt:
-            return
-        counts = self.annotations.instance_counts()[self._rows]
+    def filter_data(self) -> list[dict[str, int]]:
+        """Leave out samples without elements, and shuffle images, where that is asked for."""
+        rows = np.array([entry["row"] for entry in self.data_list], np.int64)
+        if self._filter_empty_gt:
+            rows = rows[self._has_elements(rows)]
+        if not len(rows):
+            raise ValueError(f"{self.ann_file} has no sample to use (of {len(self.annotations)}).")
+        donors = rows
+        if self._shuffle_images_seed is not None:  # no sample keeps its own
+            order = np.random.default_rng(self._shuffle_images_seed).permutation(len(rows))
+            donors = np.empty_like(rows)
+            donors[order] = rows[np.roll(order, 1)]
+        pairs = zip(rows.tolist(), donors.tolist(), strict=True)
+        return [{"row": row, "image_row": donor} for row, donor in pairs]
+
+    def _has_elements(self, rows: np.ndarray) -> np.ndarray:
+        """Say which samples have map elements, and log how many have none. (samples,) bool."""
+        counts = self.annotations.instance_counts()[rows]
         if (counts < 0).any():
             raise ValueError(
                 f"{(counts < 0).sum()} samples of {self.ann_file} have no ground truth, so it "
                 "cannot be trained on."
             )
-        if (counts == 0).any():
-            empty = int((counts == 0).sum())
+        empty = int((counts == 0).sum())
+        if empty:
             print_log(
                 f"{self.ann_file}: {empty} samples without any map element are left out.", "current"
             )
-            self._rows = self._rows[counts > 0]
-
-    def _shuffled_rows(self) -> np.ndarray:
-        """Return the row whose images each sample gets; no sample keeps its own. (samples,)."""
-        rows = self._rows
-        if self._shuffle_images_seed is None:
-            return rows
-        order = np.random.default_rng(self._shuffle_images_seed).permutation(len(rows))
-        donors = np.empty_like(rows)
-        donors[order] = rows[np.roll(order, 1)]
-        return donors
-
-    @property
-    def metainfo(self) -> dict[str, Any]:
-        """Classes, range and name of the data; a copy."""
-        return dict(self._metainfo)
-
-    def __len__(self) -> int:
-        self.full_init()
-        return len(self._rows)
-
-    def get_subset_(self, indices: int | Sequence[int]) -> None:
-        """Keep the first samples (an integer) or the listed ones."""
-        self.full_init()
-        chosen = _selection(indices)
-        self._rows, self._image_rows = self._rows[chosen], self._image_rows[chosen]
+        return counts > 0
 
     def sample(self, idx: int) -> MapSample:
         """Return a sample as the annotation file has it."""
-        self.full_init()
-        return self.annotations[int(self._rows[idx])]
+        row = super().get_data_info(idx)["row"]  # opens the file, if that is yet to be done
+        return self.annotations[row]
+
+    def get_cat_ids(self, idx: int) -> list[int]:
+        """Return the labels of a sample's elements, for mmengine's ``ClassBalancedDataset``."""
+        return [instance.label for instance in self.sample(idx).instances or []]
 
     def get_data_info(self, idx: int) -> dict[str, Any]:
         """Return a sample as the pipeline takes it.
@@ -191,9 +168,10 @@ class VectorizedMapDataset(BaseDataset):
         Raises:
             BrokenSampleError: If a camera that the config asks for is absent.
         """
-        sample = self.sample(idx)
+        entry = super().get_data_info(idx)
+        sample = self.annotations[entry["row"]]
         info: dict[str, Any] = {
-            "sample_idx": idx,
+            "sample_idx": entry["sample_idx"],
             "token": sample.token,
             "scene": sample.scene,
             "map_name": sample.map_name,
@@ -202,9 +180,9 @@ class VectorizedMapDataset(BaseDataset):
             "lidar2global": sample.global_from_frame,
             "lidar2ego": sample.ego_from_frame,
             "can_bus": self._can_bus(sample),
-            "x_range": self._metainfo["x_range"],
-            "y_range": self._metainfo["y_range"],
-            "images": self._images(sample, idx),
+            "x_range": self.annotations.meta.x_range,
+            "y_range": self.annotations.meta.y_range,
+            "images": self._images(sample, entry),
             "map_instances": sample.instances,
             "eval_ann_info": None,
         }
@@ -225,13 +203,13 @@ class VectorizedMapDataset(BaseDataset):
             signals[3:17] = sample.can_bus[3:17]
         return signals
 
-    def _images(self, sample: MapSample, idx: int) -> dict[str, dict[str, Any]]:
+    def _images(self, sample: MapSample, entry: dict[str, int]) -> dict[str, dict[str, Any]]:
         """Return path and calibration of each camera; paths may come from another sample."""
         cameras = {camera.name: camera for camera in sample.cameras}
         names = tuple(cameras) if self.cameras is None else self.cameras
         paths = {camera.name: camera.path for camera in sample.cameras}
-        if self._image_rows[idx] != self._rows[idx]:
-            donor = self.annotations[int(self._image_rows[idx])]
+        if entry["image_row"] != entry["row"]:
+            donor = self.annotations[entry["image_row"]]
             paths = {camera.name: camera.path for camera in donor.cameras}
         for name in names:
             if name not in cameras or name not in paths:
@@ -277,33 +255,28 @@ class VectorizedMapDataset(BaseDataset):
 
         Raises:
             BrokenSampleError: If a file is missing or damaged and ``broken_samples`` is ``raise``.
+            RuntimeError: If more than ``max_refetch`` samples in a row are broken.
         """
         try:
-            return self.pipeline(self.get_data_info(idx))
+            data = self.pipeline(self.get_data_info(idx))
         except BrokenSampleError as error:
             if self.broken_samples == "raise":
                 raise
             self._count_broken(self.sample(idx).token, str(error))
             return None
+        self._broken_in_a_row = 0
+        return data
 
     def _count_broken(self, token: str, reason: str) -> None:
+        """Count and log a broken sample, and stop when there is nothing but such."""
+        self._broken_in_a_row += 1
+        if self._broken_in_a_row > self.max_refetch:
+            raise RuntimeError(
+                f"{self._broken_in_a_row} samples in a row are broken; the latest: {reason}"
+            )
         if token not in self.broken_tokens:
             self.broken_tokens[token] = reason
             count = len(self.broken_tokens)
             MMLogger.get_current_instance().warning(
                 f"broken sample skipped ({count} so far): {reason}"
             )
-
-    def __getitem__(self, idx: int) -> Any:
-        self.full_init()
-        if self.test_mode:
-            return self.prepare_data(idx)
-        for _ in range(self.max_refetch + 1):
-            data = self.prepare_data(idx)
-            if data is not None:
-                return data
-            idx = int(np.random.randint(len(self)))  # noqa: NPY002 - mmengine seeds this generator in each worker
-        raise RuntimeError(
-            f"{self.max_refetch + 1} samples in a row are broken; the latest: "
-            f"{next(reversed(self.broken_tokens.values()), 'the pipeline gave None')}"
-        )
