@@ -145,6 +145,10 @@ class VectorizedMapDataset(BaseDataset):
             )
         return counts > 0
 
+    def _copy_without_annotation(self, memo: dict[int, Any] | None = None) -> BaseDataset:
+        """Copy with a memo of its own: mmengine's is shared by all calls and mixes objects up."""
+        return super()._copy_without_annotation({} if memo is None else memo)
+
     def sample(self, idx: int) -> MapSample:
         """Return a sample as the annotation file has it."""
         row = super().get_data_info(idx)["row"]  # opens the file, if that is yet to be done
