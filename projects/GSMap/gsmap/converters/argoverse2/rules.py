@@ -51,12 +51,15 @@ def drop_duplicates(lines: np.ndarray) -> np.ndarray:
     strips = shapely.buffer(lines, DUPLICATE_BUFFER_M, cap_style="flat", join_style="mitre")
     area = shapely.area(strips)
     first, second = _possible_duplicates(shapely.bounds(strips), area)
-    overlap = shapely.area(shapely.intersection(strips[first], strips[second]))
-    union = area[first] + area[second] - overlap
-    same = overlap >= DUPLICATE_IOU * union
     keep = np.ones(len(lines), dtype=bool)
-    for i, j in zip(first[same].tolist(), second[same].tolist(), strict=True):
-        keep[j] &= not keep[i]
+    starts = np.searchsorted(first, np.arange(len(lines) + 1))  # of the pairs of each line
+    for i in np.flatnonzero(np.diff(starts)).tolist():
+        if not keep[i]:
+            continue
+        others = second[starts[i] : starts[i + 1]]
+        others = others[keep[others]]  # what is dropped already needs no comparison
+        overlap = shapely.area(shapely.intersection(strips[i], strips[others]))
+        keep[others[overlap >= DUPLICATE_IOU * (area[i] + area[others] - overlap)]] = False
     return lines[keep]
 
 
