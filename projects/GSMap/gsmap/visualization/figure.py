@@ -1,6 +1,5 @@
 """Composition of cameras and bird's-eye views into one picture, rendered or written."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from matplotlib.lines import Line2D
 
 from gsmap.structures import BEVGrid
 from gsmap.structures.elements import MapElements
+from gsmap.utils.files import atomic_write
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
 from gsmap.visualization.frame_view import FrameView
@@ -248,21 +248,16 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
             f"Cannot write a picture to {path}: "
             f"the name must end in one of {VECTOR_SUFFIXES + RASTER_SUFFIXES}."
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{suffix}")
-    try:
+    with atomic_write(path, "wb") as file:
         if suffix in VECTOR_SUFFIXES:
             undated = {"CreationDate": None} if suffix == ".pdf" else {"Date": None}
-            figure.savefig(partial, metadata=undated)
+            figure.savefig(file, format=suffix[1:], metadata=undated)
         else:
-            _write_pixels(figure_to_rgb(figure), partial, suffix)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+            file.write(_encode_pixels(figure_to_rgb(figure), suffix))
     return path
 
 
-def _write_pixels(picture: np.ndarray, path: Path, suffix: str) -> None:
+def _encode_pixels(picture: np.ndarray, suffix: str) -> bytes:
     """Encode an RGB picture."""
     options = {
         ".png": [cv2.IMWRITE_PNG_COMPRESSION, 4],
@@ -270,5 +265,5 @@ def _write_pixels(picture: np.ndarray, path: Path, suffix: str) -> None:
     }.get(suffix, [cv2.IMWRITE_JPEG_QUALITY, 92])
     good, encoded = cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
     if not good:
-        raise ValueError(f"OpenCV could not encode {path}.")
-    path.write_bytes(encoded.tobytes())
+        raise ValueError(f"OpenCV could not encode a picture as {suffix}.")
+    return encoded.tobytes()
