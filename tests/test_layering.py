@@ -25,7 +25,7 @@ ALLOWED = {
     "converters": {"datasets", "structures", "utils", "minicity"},
     "evaluation": {"datasets", "ops", "structures", "utils"},
     "visualization": {"datasets", "ops", "structures", "utils"},
-    "engine": {"utils"},
+    "engine": {"checkpoints", "utils"},
     "apis": {
         "checkpoints",
         "converters",

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from torch import Tensor, nn
 
-import gsmap.engine.checkpoint_io  # noqa: F401  (lets weights_only read mmengine's own data)
 from gsmap.checkpoints.convert import read_state
 
 _SHOWN = 5

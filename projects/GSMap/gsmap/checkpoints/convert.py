@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gsmap.checkpoints.key_map import KeyMap, find_key_map, is_upstream
+from gsmap.checkpoints.safe_globals import mmengine_globals
 
 
 def ours_from_upstream(
@@ -77,7 +78,8 @@ def read_state(path: str | Path) -> dict[str, Tensor]:
     Raises:
         ValueError: If the file holds no weights.
     """
-    checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
+    with torch.serialization.safe_globals(mmengine_globals()):
+        checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
     state = checkpoint.get("state_dict", checkpoint) if isinstance(checkpoint, Mapping) else None
     if not state or not all(isinstance(value, Tensor) for value in state.values()):
         raise ValueError(f"{path} holds no state dict of tensors.")

@@ -29,6 +29,17 @@ class MapLogProcessor(LogProcessor):
             mode: ``val`` or ``test``.
             with_non_scalar: Whether to return what is no number, too.
         """
+        self._details: dict[str, Any] = {}
         figures, line = super().get_log_after_epoch(runner, batch_idx, mode, with_non_scalar)
-        items = line.split("  ")  # mmengine joins its "name: value" so
-        return figures, "  ".join(item for item in items if not _DETAIL.match(item.split(": ")[0]))
+        return {**self._details, **figures}, line
+
+    def _collect_scalars(
+        self, custom_cfg: list[dict], runner: Runner, mode: str, reserve_prefix: bool = False
+    ) -> dict[str, Any]:
+        """Put the details of an evaluation aside, before mmengine makes its line."""
+        figures = super()._collect_scalars(custom_cfg, runner, mode, reserve_prefix)
+        if mode != "train":
+            self._details = {
+                name: figures.pop(name) for name in list(figures) if _DETAIL.match(name)
+            }
+        return figures

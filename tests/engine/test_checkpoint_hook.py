@@ -13,9 +13,46 @@ from mmengine.fileio import get_file_backend
 from mmengine.logging import MessageHub
 from mmengine.runner.checkpoint import save_checkpoint
 
-from gsmap.engine.checkpoint_io import AtomicLocalBackend
+from gsmap.checkpoints.safe_globals import mmengine_globals
+from gsmap.engine.checkpoint_hook import AtomicCheckpointHook, AtomicLocalBackend
 
 
+@pytest.fixture
+def safe_globals():
+    """What a run's hook does before mmengine reads a checkpoint, for one test."""
+    with torch.serialization.safe_globals(mmengine_globals()):
+        yield
+
+
+def test_an_import_changes_nothing_of_mmengine_and_torch():
+    code = (
+        "import torch\n"
+        "import gsmap.registered, gsmap.apis.map_inferencer\n"
+        "from mmengine.fileio import LocalBackend, get_file_backend\n"
+        "from mmengine.logging import HistoryBuffer\n"
+        "assert HistoryBuffer not in torch.serialization.get_safe_globals()\n"
+        "assert type(get_file_backend('a.pth')) is LocalBackend\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_hook_writes_through_the_atomic_backend_and_lets_torch_read(tmp_path):
+    before = torch.serialization.get_safe_globals()
+    hook = AtomicCheckpointHook(interval=1)
+    assert isinstance(get_file_backend("a.pth", backend_args=hook.backend_args), AtomicLocalBackend)
+    assert (
+        AtomicCheckpointHook(backend_args={"backend": "local"}).backend_args["backend"] == "local"
+    )
+    try:
+        hook.before_run(None)
+        assert set(mmengine_globals()) <= set(torch.serialization.get_safe_globals())
+    finally:
+        torch.serialization.clear_safe_globals()
+        torch.serialization.add_safe_globals(before)
+
+
+@pytest.mark.usefixtures("safe_globals")
 def test_a_message_hub_comes_back_with_weights_only(tmp_path):
     hub = MessageHub.get_instance("checkpoint-io-test")
     for value in (3.0, 2.0, np.float64(1.0)):
@@ -47,16 +84,16 @@ class LooksUp:
         return getattr, (np.dtype, "__init__")
 
 
+@pytest.mark.usefixtures("safe_globals")
 def test_a_checkpoint_may_not_look_up_anything_else(tmp_path):
     torch.save({"state_dict": LooksUp()}, tmp_path / "bad.pth")
     with pytest.raises(pickle.UnpicklingError, match="must not look up '__init__'"):
         torch.load(tmp_path / "bad.pth")
 
 
-def test_mmengine_writes_through_the_atomic_backend(tmp_path):
-    assert isinstance(get_file_backend(str(tmp_path / "a.pth")), AtomicLocalBackend)
+def test_text_is_written_in_one_step(tmp_path):
     path = tmp_path / "new" / "log.txt"
-    get_file_backend(str(path)).put_text("h\u00e9", path)
+    AtomicLocalBackend().put_text("h\u00e9", path)
     assert path.read_text(encoding="utf-8") == "h\u00e9"
     assert os.listdir(path.parent) == ["log.txt"]
 
@@ -75,7 +112,7 @@ def test_a_killed_writer_leaves_the_old_file_whole(tmp_path):
     path.write_bytes(b"whole")
     code = textwrap.dedent(
         f"""
-        from gsmap.engine.checkpoint_io import AtomicLocalBackend
+        from gsmap.engine.checkpoint_hook import AtomicLocalBackend
         backend = AtomicLocalBackend()
         print("ready", flush=True)
         while True:
