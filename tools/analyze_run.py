@@ -6,15 +6,16 @@ Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out cur
 """
 
 import argparse
-import sys
 from pathlib import Path
 
+from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.files import write_text
 from gsmap.visualization.figure import save_figure
 from gsmap.visualization.run_curves import plot_runs, plot_series, read_run, summary_table
 
 
 def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = CommandParser(description=__doc__)
     parser.add_argument(
         "runs", nargs="+", type=Path, help="work folders of runs, or scalars.json files"
     )
@@ -25,23 +26,20 @@ def parse_args() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def main() -> None:
+def main() -> str:
     args = parse_args()
     names = args.names or [None] * len(args.runs)
     if len(names) != len(args.runs):
-        sys.exit(f"--names gives {len(names)} names for {len(args.runs)} runs.")
-    try:
-        runs = [read_run(path, name) for path, name in zip(args.runs, names, strict=True)]
-        table = summary_table(runs)
-        print(table)
-        if args.table:
-            args.table.write_text(table + "\n")
-        if args.out:
-            figure = plot_series(runs, args.keys) if args.keys else plot_runs(runs)
-            print(f"curves: {save_figure(figure, args.out)}")
-    except (FileNotFoundError, ValueError) as error:
-        sys.exit(str(error))
+        raise ValueError(f"--names gives {len(names)} names for {len(args.runs)} runs.")
+    runs = [read_run(path, name) for path, name in zip(args.runs, names, strict=True)]
+    report = summary_table(runs)
+    if args.table:
+        write_text(args.table, report + "\n")
+    if args.out:
+        figure = plot_series(runs, args.keys) if args.keys else plot_runs(runs)
+        report += f"\ncurves: {save_figure(figure, args.out)}"
+    return report
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

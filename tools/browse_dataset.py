@@ -5,19 +5,19 @@ Example: ``python tools/browse_dataset.py CONFIG --split train --num 20 --show-d
 """
 
 import argparse
-import sys
 
 from mmdet3d.registry import DATASETS
 from mmengine.utils import track_iter_progress
 
 from gsmap.apis.map_inferencer import spread_evenly
 from gsmap.engine.launch import add_config_options, read_config
+from gsmap.utils.cli import CommandParser, run_command
 from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
 from gsmap.visualization.pictures import add_picture_arguments, save_picture
 
 
 def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = CommandParser(description=__doc__)
     parser.add_argument("config", help="config file")
     parser.add_argument("--split", default="train", choices=["train", "val", "test"])
     parser.add_argument("--num", type=int, default=20, help="how many samples, evenly spread")
@@ -29,7 +29,8 @@ def parse_args() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def run(args: argparse.Namespace) -> None:
+def main() -> str:
+    args = parse_args()
     cfg = read_config(args.config, args.cfg_options)
     dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
     visualizer = MapVisualizer("browse", show_order=args.order)
@@ -41,15 +42,8 @@ def run(args: argparse.Namespace) -> None:
         images = None if args.original else images_from_inputs(item["inputs"]["img"])
         figure = visualizer.draw_sample(sample, images)
         save_picture(figure, args.show_dir, sample.metainfo["token"], f".{args.format}")
-    print(f"\n{len(indices)} pictures: {args.show_dir}")
-
-
-def main() -> None:
-    try:
-        run(parse_args())
-    except (FileNotFoundError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    return f"\n{len(indices)} pictures: {args.show_dir}"
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

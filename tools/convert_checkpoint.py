@@ -1,48 +1,31 @@
 """Rename a checkpoint between the format of the earlier systems and ours, whichever it is in."""
 
-import argparse
-import os
-import sys
-import tempfile
 from pathlib import Path
 
 import torch
 
-from gsmap.checkpoints.convert import convert_state, read_state
+from gsmap.apis.checkpoint import read_weights
+from gsmap.checkpoints.convert import convert_state
+from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.files import atomic_write
 
 
-def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+def main() -> str:
+    parser = CommandParser(description=__doc__)
     parser.add_argument("source", type=Path, help="checkpoint to read")
     parser.add_argument("target", type=Path, help="checkpoint to write; must not exist")
-    return parser.parse_args()
-
-
-def save_atomically(checkpoint: dict, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-    os.close(handle)
-    try:
-        torch.save(checkpoint, temporary)
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def main() -> None:
-    args = parse_args()
-    if not args.source.is_file():
-        sys.exit(f"{args.source} does not exist.")
+    args = parser.parse_args()
     if args.target.exists():
-        sys.exit(f"{args.target} exists already: choose another name or remove it.")
+        raise FileExistsError(f"{args.target} exists already: choose another name or remove it.")
+    weights = read_weights(args.source)
     try:
-        state, done = convert_state(read_state(args.source))
+        state, done = convert_state(weights)
     except ValueError as error:
-        sys.exit(f"{args.source}: {error}")
-    save_atomically({"state_dict": state, "meta": {"converted": done}}, args.target)
-    print(f"{done}, {len(state)} tensors, {args.target}")
+        raise ValueError(f"{args.source}: {error}") from error
+    with atomic_write(args.target, "wb") as file:
+        torch.save({"state_dict": state, "meta": {"converted": done}}, file)
+    return f"{done}, {len(state)} tensors, {args.target}"
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

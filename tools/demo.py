@@ -4,7 +4,6 @@
 What is done is skipped on the next run; an interrupted training goes on where it stopped.
 """
 
-import argparse
 import hashlib
 import json
 import os
@@ -17,6 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+
+from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.files import write_text
 
 REPO = Path(__file__).resolve().parents[1]
 CONFIGS = {
@@ -84,9 +86,10 @@ class Step:
         missing = [str(product) for product in self.products if not product.exists()]
         if status or missing:
             reason = f"made no {', '.join(missing)}" if not status else f"ended with {status}"
-            sys.exit(f"{position} {self.title} {reason}; run the command above to see why.")
-        stamp.parent.mkdir(parents=True, exist_ok=True)
-        stamp.write_text(f"{time.monotonic() - started:.0f} s\n")
+            raise RuntimeError(
+                f"{position} {self.title} {reason}; run the command above to see why."
+            )
+        write_text(stamp, f"{time.monotonic() - started:.0f} s\n")
         print(f"{position} {self.title}: {time.monotonic() - started:.0f} s", flush=True)
 
 
@@ -184,7 +187,7 @@ def table(folder: Path, models: Iterable[str]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--dir", default="demo", help="where everything goes")
     parser.add_argument("--budget", choices=BUDGETS, default="demo", help="how long to train")
     parser.add_argument(
@@ -199,7 +202,7 @@ def main() -> None:
     for number, step in enumerate(steps, 1):
         step.run(folder, f"[{number}/{len(steps)}]")
     summary = table(folder, args.models)
-    (folder / "summary.md").write_text(summary + "\n")
+    write_text(folder / "summary.md", summary + "\n")
     print(f"\nAP in percent on MiniCity's validation towns, {budget.epochs} epochs\n\n{summary}\n")
     for name in args.models:
         pictures = sorted((folder / name.lower() / "pictures").iterdir())
@@ -208,4 +211,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -30,7 +30,7 @@ from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files
 from gsmap.evaluation.prior import PriorConfig, evaluate_prior
 from gsmap.evaluation.raster_ap import POLYGON_CLASSES, RasterConfig
 from gsmap.evaluation.report import format_table
-from gsmap.utils.cli import run_command
+from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 
 DEFAULT_CLASSES = ("divider", "ped_crossing", "boundary")
@@ -38,7 +38,7 @@ DEFAULT_RANGE = (-15.0, -30.0, 15.0, 30.0)
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("results", type=Path, nargs="?", help="results in MapTR's JSON form")

@@ -7,16 +7,16 @@ folder with one.
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.engine.launch import add_config_options
+from gsmap.utils.cli import CommandParser, run_command
 from gsmap.visualization.pictures import add_picture_arguments, save_picture
 
 
 def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = CommandParser(description=__doc__)
     parser.add_argument("config", help="config file of the model")
     parser.add_argument("checkpoint", help="its checkpoint")
     parser.add_argument(
@@ -41,7 +41,8 @@ def parse_args() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def run(args: argparse.Namespace) -> None:
+def main() -> None:
+    args = parse_args()
     if not args.out and not args.show_dir:
         raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
     inferencer = MapInferencer(args.config, args.checkpoint, args.device, args.cfg_options)
@@ -66,12 +67,5 @@ def run(args: argparse.Namespace) -> None:
         print(f"predictions of {len(samples)} samples: {args.out}")
 
 
-def main() -> None:
-    try:
-        run(parse_args())
-    except (FileNotFoundError, ValueError) as error:
-        sys.exit(f"error: {error}")
-
-
 if __name__ == "__main__":
-    main()
+    run_command(main)

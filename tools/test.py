@@ -2,17 +2,19 @@
 """Test a model: ``python tools/test.py CONFIG CHECKPOINT --eval chamfer raster``."""
 
 import argparse
+import json
 from pathlib import Path
 
 from mmengine.config import Config
-from mmengine.fileio import dump
 from mmengine.runner import Runner
 
 from gsmap.engine.launch import add_common_arguments, load_config
+from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.files import write_text
 
 
 def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = CommandParser(description=__doc__)
     parser.add_argument("config", help="config file")
     parser.add_argument("checkpoint", help="checkpoint file, ours or in the format of MapTR")
     parser.add_argument(
@@ -62,16 +64,16 @@ def apply_options(cfg: Config, args: argparse.Namespace) -> None:
 def main() -> None:
     args = parse_args()
     if not Path(args.checkpoint).is_file():
-        raise SystemExit(f"There is no checkpoint {args.checkpoint}.")
+        raise FileNotFoundError(f"There is no checkpoint {args.checkpoint}.")
     if not args.eval and not args.out:
-        raise SystemExit("Nothing to do: name a metric after --eval, or a file after --out.")
+        raise ValueError("Nothing to do: name a metric after --eval, or a file after --out.")
     cfg = load_config(args)
     apply_options(cfg, args)
     runner = Runner.from_cfg(cfg)
     metrics = runner.test()
     if args.metrics_out and runner.rank == 0:
-        dump(metrics, args.metrics_out, indent=2)
+        write_text(args.metrics_out, json.dumps(metrics, indent=2))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, heed_kill=False)

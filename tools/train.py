@@ -6,10 +6,11 @@ import argparse
 from mmengine.runner import Runner
 
 from gsmap.engine.launch import add_common_arguments, load_config
+from gsmap.utils.cli import CommandParser, run_command
 
 
 def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = CommandParser(description=__doc__)
     parser.add_argument("config", help="config file")
     parser.add_argument(
         "--resume",
@@ -35,7 +36,7 @@ def main() -> None:
         cfg.optim_wrapper.setdefault("loss_scale", "dynamic")
     if args.auto_scale_lr:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
-            raise SystemExit(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
+            raise ValueError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
         cfg.auto_scale_lr.enable = True
     if args.resume:
         cfg.resume = True
@@ -44,4 +45,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, heed_kill=False)

@@ -160,8 +160,10 @@ def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch,
     assert "maptr: gsmap to upstream" in capsys.readouterr().out
     upstream = read_state(target)
     assert all(torch.equal(upstream[MAPTR.to_upstream(key)], state[key]) for key in state)
-    with pytest.raises(SystemExit, match="exists already"):
+    with pytest.raises(SystemExit) as left:
         runpy.run_path(tool, run_name="__main__")
+    assert left.value.code == 2
+    assert "exists already" in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == [source, target]
 
 

@@ -132,5 +132,5 @@ def test_a_missing_checkpoint_is_named(config):
         [sys.executable, "tools/test.py", str(config), "nowhere.pth"],
         cwd=REPO, env=environment(), text=True, capture_output=True, check=False,
     )  # fmt: skip
-    assert done.returncode == 1
-    assert "There is no checkpoint nowhere.pth" in done.stderr
+    assert done.returncode == 2
+    assert done.stderr == "error: There is no checkpoint nowhere.pth.\n"

@@ -103,14 +103,11 @@ def load_config(args: argparse.Namespace) -> Config:
     Without a GPU several processes talk through gloo, whatever the config says.
 
     Raises:
-        SystemExit: If the file does not exist.
+        FileNotFoundError: If the file does not exist.
         ValueError: If the config cannot mean what was intended (see `check_config`).
     """
     os.environ.setdefault("LOCAL_RANK", str(args.local_rank))
-    try:
-        cfg = read_config(args.config, args.cfg_options)
-    except FileNotFoundError as error:
-        raise SystemExit(str(error)) from None
+    cfg = read_config(args.config, args.cfg_options)
     cfg.launcher = args.launcher
     if args.work_dir:
         cfg.work_dir = args.work_dir
