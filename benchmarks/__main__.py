@@ -1,26 +1,33 @@
-"""Measure speed and memory: ``python -m benchmarks SUBCOMMAND --help``."""
+"""Measure speed, memory and size: ``python -m benchmarks COMMAND --help``."""
 
-import argparse
+import importlib
+import sys
 
-from benchmarks import evaluation, masks, model_commands, raster
+from gsmap.utils.cli import CommandParser, run_command
 
-# each adds its own parser, with ``run`` as a default
-SUBCOMMANDS = (
-    evaluation.add_parser,
-    masks.add_parser,
-    model_commands.add_parser,
-    raster.add_parser,
-)
+# command -> module, imported when asked for: the libraries of one would count in another's memory
+COMMANDS = {
+    "data": "data_commands",
+    "eval": "evaluation",
+    "fps": "fps",
+    "masks": "masks",
+    "minicity": "minicity",
+    "parameters": "parameters",
+    "profile": "profile",
+    "raster": "raster",
+    "step": "step",
+}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = CommandParser(description=__doc__)
     subparsers = parser.add_subparsers(required=True)
-    for add_parser in SUBCOMMANDS:
-        add_parser(subparsers)
+    asked_for = COMMANDS.keys() & set(sys.argv[1:2])
+    for name in sorted(asked_for or COMMANDS):
+        importlib.import_module(f"benchmarks.{COMMANDS[name]}").add_parser(subparsers)
     args = parser.parse_args()
     args.run(args)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

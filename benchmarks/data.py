@@ -1,4 +1,4 @@
-"""Measurements behind ``docs/benchmarks/data.md``, run by ``benchmarks.data_command``."""
+"""Measurements behind ``docs/benchmarks/data.md``, run by ``python -m benchmarks data``."""
 
 import multiprocessing
 import time

@@ -1,11 +1,9 @@
-"""Whole models on random inputs: frames per second, and the cost of a training step."""
+"""Whole models on random inputs: what the commands that measure them share."""
 
 import argparse
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,50 +12,18 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
-from benchmarks.measure import MIB, Cost, markdown_table, measure
+from benchmarks.measure import Cost, markdown_table
 from gsmap.engine.launch import read_config
 
 
-def run_fps(args: argparse.Namespace) -> None:
-    """Measure and print the frames per second of every config."""
-    costs = in_fresh_processes(frame_cost, [(path, args) for path in args.configs])
-    device = torch.device(args.device)
-    first = costs[0][1].time_s(device)
-    report(
-        args,
-        ["model", "s a frame", "FPS, ratio to the first", "wall s", "FPS", "peak memory (MiB)"],
-        [
-            [
-                *(Path(path).stem, f"{cost.time_s(device):.3f}"),
-                f"{first / cost.time_s(device):.3f}",
-                *(f"{cost.wall_s:.3f}", f"{1 / cost.wall_s:.2f}"),
-                f"{cost.peak_bytes / MIB:.0f}",
-            ]
-            for path, cost in costs
-        ],
-    )
-
-
-def run_step(args: argparse.Namespace) -> None:
-    """Measure and print forward, losses and backward of every config and raster size."""
-    tasks = []
-    for path in args.configs:
-        sizes = args.rasters if "GSMap" in read_config(path).model.map_head.type else [""]
-        tasks += [(path, args, raster) for raster in sizes]
-    costs = [cost for _, cost in in_fresh_processes(step_cost, tasks)]
-    seconds = [cost.time_s(torch.device(args.device)) for cost in costs]
-    peaks = [cost.peak_bytes for cost in costs]
-    report(
-        args,
-        ["model", "raster", "s a step", "ratio", "peak memory (MiB)", "ratio"],
-        [
-            [
-                *(Path(path).stem, raster, f"{s:.3f}", f"{s / seconds[0]:.3f}"),
-                *(f"{peak / MIB:.0f}", f"{peak / peaks[0]:.3f}"),
-            ]
-            for (path, _, raster), s, peak in zip(tasks, seconds, peaks, strict=True)
-        ],
-    )
+def add_model_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add which models to measure, and how."""
+    parser.add_argument("configs", nargs="+", help="ratios are to the first of them")
+    parser.add_argument("--size", type=int, nargs=2, default=(480, 800), metavar=("H", "W"))
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--fp16", action="store_true", help="mixed precision")
 
 
 def in_fresh_processes(
@@ -76,53 +42,6 @@ def in_fresh_processes(
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             results.append((each[0], pool.submit(task, *each).result()))
     return results
-
-
-def frame_cost(path: str, args: argparse.Namespace) -> Cost:
-    """Measure a config's way from images to decoded elements."""
-    model = build(path, args)
-    model.eval()
-    inputs, samples = random_batch(model, 1, tuple(args.size), args.device)
-    predict = partial(predict_once, model, inputs, samples, args)
-    return measure(predict, torch.device(args.device), args.repeats)
-
-
-def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
-    """Measure a config's training step, with another raster size if one is given."""
-    model = build(path, args, raster)
-    model.train()
-    inputs, samples = random_batch(model, args.batch, tuple(args.size), args.device)
-    step = training_step(model, inputs, samples, args)
-    return measure(step, torch.device(args.device), args.repeats)
-
-
-@torch.no_grad()
-def predict_once(
-    model: Any,
-    inputs: dict[str, torch.Tensor],
-    samples: list[Det3DDataSample],
-    args: argparse.Namespace,
-) -> None:
-    """Run a model from images to decoded elements."""
-    with torch.autocast(args.device, torch.float16, enabled=args.fp16):
-        model.predict(inputs, samples)
-
-
-def training_step(
-    model: Any,
-    inputs: dict[str, torch.Tensor],
-    samples: list[Det3DDataSample],
-    args: argparse.Namespace,
-) -> Callable[[], None]:
-    """Return a function that runs forward, losses and backward once."""
-
-    def step() -> None:
-        model.zero_grad(set_to_none=True)
-        with torch.autocast(args.device, torch.float16, enabled=args.fp16):
-            losses = model.loss(inputs, samples)
-        sum(losses.values()).backward()
-
-    return step
 
 
 def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:

@@ -4,14 +4,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import model_commands
+from benchmarks import fps, profile, step
 
 REPO = Path(__file__).resolve().parents[2]
 
 
 def run(*arguments: str) -> None:
     parser = argparse.ArgumentParser()
-    model_commands.add_parser(parser.add_subparsers(required=True))
+    subparsers = parser.add_subparsers(required=True)
+    for module in (fps, profile, step):
+        module.add_parser(subparsers)
     args = parser.parse_args([*arguments, "--size", "64", "96", "--repeats", "1"])
     threads = torch.get_num_threads()
     args.threads = threads
@@ -42,3 +44,12 @@ def test_a_step_is_measured_for_every_raster_of_gsmap(capsys):
     rows = cells(capsys.readouterr().out)
     assert [row[1] for row in rows] == ["16x8", "20x10"]
     assert all(float(row[2]) > 0 for row in rows)
+
+
+def test_the_parts_of_a_forward_pass_add_up(capsys):
+    run("profile", str(REPO / "configs/maptr/maptr_r18_nano_110e.py"))
+    lines = [line.rsplit(" s ", 1) for line in capsys.readouterr().out.splitlines()[1:]]
+    seconds = {line[0].rsplit(None, 1)[0].strip(): float(line[0].split()[-1]) for line in lines}
+    assert list(seconds) == ["image backbone", "image neck", "BEV encoder", "map head", "total"]
+    total = seconds.pop("total")
+    assert sum(seconds.values()) == pytest.approx(total, abs=0.003)  # printed to a millisecond

@@ -22,7 +22,6 @@ from gsmap.checkpoints.convert import (
     upstream_from_ours,
 )
 from gsmap.checkpoints.key_map import KEY_MAPS, MAPTR, MAPTR_BEVFORMER, find_key_map
-from gsmap.checkpoints.parameters import count_parameters
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
 
 REPO = Path(__file__).resolve().parents[2]
@@ -165,15 +164,6 @@ def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch,
     assert left.value.code == 2
     assert "exists already" in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == [source, target]
-
-
-def test_parameters_are_counted_by_module():
-    model = nn.Sequential(nn.Linear(2, 3), nn.ReLU(), nn.Sequential(nn.Linear(3, 1)))
-    model[0].bias.requires_grad_(False)
-    counts = {count.module: (count.total, count.trainable) for count in count_parameters(model, 1)}
-    assert counts == {"": (13, 10), "0": (9, 6), "2": (4, 4)}
-    with pytest.raises(ValueError, match="depth must be >= 0, got -1"):
-        count_parameters(model, -1)
 
 
 def test_every_unused_key_is_documented():

@@ -8,8 +8,8 @@ import gsmap.datasets.transforms.masks
 import gsmap.datasets.transforms.packing
 import gsmap.datasets.transforms.points
 import gsmap.datasets.vectorized_map_dataset
-import gsmap.engine.gaussian_health_hook
 import gsmap.engine.checkpoint_hook
+import gsmap.engine.gaussian_health_hook
 import gsmap.engine.log_processor
 import gsmap.evaluation.gaussian_metric
 import gsmap.evaluation.map_metric

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Measure how fast MiniCity is made: images per second of one core's time, everything included.
 
 Everything: town, ground, six cameras with JPEG, LiDAR sweeps, boxes and records. CPU time is
@@ -16,12 +15,17 @@ from minicity.cli import image_size
 from minicity.generate import generate
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the subcommand ``minicity``."""
+    parser = subparsers.add_parser("minicity", help=__doc__)
     parser.add_argument("--image-size", type=image_size, default=[(800, 450)], nargs="+")
     parser.add_argument("--scenes", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Generate a data set of each size, measure and print."""
     cv2.setNumThreads(1)
     for size in arguments.image_size:
         with tempfile.TemporaryDirectory() as folder:
@@ -33,7 +37,3 @@ def main() -> None:
             f"{size[0]}x{size[1]}: {images / seconds:.1f} images/s of one core "
             f"({1000 * seconds / images:.1f} ms an image, {images} images)"
         )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,8 +1,30 @@
-"""Parameter counts of a model by module."""
+"""Parameters of a config's model by module; papers count the trainable ones."""
 
+import argparse
 from dataclasses import dataclass
 
+from mmdet3d.registry import MODELS
 from torch import nn
+
+from gsmap.engine.launch import read_config
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the subcommand ``parameters``."""
+    parser = subparsers.add_parser("parameters", help=__doc__)
+    parser.add_argument("config", help="config file")
+    parser.add_argument("--depth", type=int, default=2, help="levels of modules to list")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Count and print."""
+    counts = count_parameters(MODELS.build(read_config(args.config).model), args.depth)
+    width = max(len(count.module) for count in counts)
+    print(f"{'module'.ljust(width)}  {'all':>12}  {'trainable':>12}")
+    for count in counts:
+        name = count.module or "model"
+        print(f"{name.ljust(width)}  {count.total:>12,}  {count.trainable:>12,}")
 
 
 @dataclass(frozen=True)

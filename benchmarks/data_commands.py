@@ -1,5 +1,4 @@
-#!/usr/bin/env python
-"""Measure what docs/benchmarks/{data,argoverse2}.md state: loading, ground truth, pipeline."""
+"""Loading, ground truth, pipeline: what docs/benchmarks/{data,argoverse2}.md state."""
 
 import argparse
 import json
@@ -43,37 +42,38 @@ def memory(args: argparse.Namespace) -> dict[str, float]:
     return measure_memory(args.root, args.version, tuple(args.copies))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the subcommand ``data`` with its own."""
+    parser = subparsers.add_parser("data", help=__doc__)
+    parser.set_defaults(run=run)
     commands = parser.add_subparsers(required=True)
     command = commands.add_parser("loading", help="open and read a file of many samples")
     command.add_argument("annotations", type=Path)
     command.add_argument("--samples", type=int, default=28_130)
-    command.set_defaults(run=loading)
+    command.set_defaults(measure=loading)
     command = commands.add_parser("ground-truth", help="per frame, prepared and per item")
     command.add_argument("root", type=Path)
     command.add_argument("annotations", type=Path)
-    command.set_defaults(run=ground_truth)
+    command.set_defaults(measure=ground_truth)
     command = commands.add_parser("pipeline", help="training samples, from the file and per item")
     command.add_argument("root", type=Path)
     command.add_argument("annotations", type=Path)
     command.add_argument("--config", default="configs/_base_/datasets/minicity.py")
     command.add_argument("--samples", type=int, default=20)
-    command.set_defaults(run=pipeline)
+    command.set_defaults(measure=pipeline)
     command = commands.add_parser("av2", help="Argoverse 2 ground truth per frame")
     command.add_argument("root", type=Path)
     command.add_argument("--split", default="val")
     command.add_argument("--stride", type=int, default=10, help="every N-th pose")
-    command.set_defaults(run=argoverse2)
+    command.set_defaults(measure=argoverse2)
     command = commands.add_parser("memory", help="peak of the conversion, extrapolated")
     command.add_argument("root", type=Path)
     command.add_argument("--version", default="v1.0-mini")
     command.add_argument("--copies", type=int, nargs=2, default=(16, 48))
-    command.set_defaults(run=memory)
-    args = parser.parse_args()
-    result = args.run(args)
+    command.set_defaults(measure=memory)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure and print the figures as JSON."""
+    result = args.measure(args)
     print(json.dumps({name: round(value, 4) for name, value in result.items()}, indent=1))
-
-
-if __name__ == "__main__":
-    main()

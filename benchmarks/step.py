@@ -1,0 +1,78 @@
+"""Time and memory of a training step: forward, losses and backward."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from mmdet3d.structures import Det3DDataSample
+
+from benchmarks.measure import MIB, Cost, measure
+from benchmarks.model import (
+    add_model_arguments,
+    build,
+    in_fresh_processes,
+    random_batch,
+    report,
+)
+from gsmap.engine.launch import read_config
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the subcommand ``step``."""
+    parser = subparsers.add_parser("step", help=__doc__)
+    add_model_arguments(parser)
+    parser.add_argument("--batch", type=int, default=1)
+    parser.add_argument(
+        "--rasters", nargs="+", default=["200x100"], metavar="HxW", help="of GSMap's loss"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure and print forward, losses and backward of every config and raster size."""
+    tasks = []
+    for path in args.configs:
+        sizes = args.rasters if "GSMap" in read_config(path).model.map_head.type else [""]
+        tasks += [(path, args, raster) for raster in sizes]
+    costs = [cost for _, cost in in_fresh_processes(step_cost, tasks)]
+    seconds = [cost.time_s(torch.device(args.device)) for cost in costs]
+    peaks = [cost.peak_bytes for cost in costs]
+    report(
+        args,
+        ["model", "raster", "s a step", "ratio", "peak memory (MiB)", "ratio"],
+        [
+            [
+                *(Path(path).stem, raster, f"{s:.3f}", f"{s / seconds[0]:.3f}"),
+                *(f"{peak / MIB:.0f}", f"{peak / peaks[0]:.3f}"),
+            ]
+            for (path, _, raster), s, peak in zip(tasks, seconds, peaks, strict=True)
+        ],
+    )
+
+
+def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
+    """Measure a config's training step, with another raster size if one is given."""
+    model = build(path, args, raster)
+    model.train()
+    inputs, samples = random_batch(model, args.batch, tuple(args.size), args.device)
+    step = training_step(model, inputs, samples, args)
+    return measure(step, torch.device(args.device), args.repeats)
+
+
+def training_step(
+    model: Any,
+    inputs: dict[str, torch.Tensor],
+    samples: list[Det3DDataSample],
+    args: argparse.Namespace,
+) -> Callable[[], None]:
+    """Return a function that runs forward, losses and backward once."""
+
+    def step() -> None:
+        model.zero_grad(set_to_none=True)
+        with torch.autocast(args.device, torch.float16, enabled=args.fp16):
+            losses = model.loss(inputs, samples)
+        sum(losses.values()).backward()
+
+    return step
