@@ -49,7 +49,9 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
     torch.set_num_threads(args.threads)
     cfg = read_config(path)
     if raster:
-        cfg.model.map_head.raster_size = tuple(int(side) for side in raster.split("x"))
+        rows, columns = (int(side) for side in raster.split("x"))
+        (x0, x1), (y0, y1) = cfg.model.grid.x_range, cfg.model.grid.y_range
+        cfg.model.map_head.masks = {"pixel_m": ((x1 - x0) / columns, (y1 - y0) / rows)}
     if cfg.model.get("img_backbone"):
         cfg.model.img_backbone.init_cfg = None
     torch.manual_seed(0)
@@ -71,7 +73,7 @@ def random_batch(
         ends = grid.metres_from_norm(torch.rand(elements, 2, 2, generator=generator))
         steps = torch.linspace(0, 1, model.map_head.num_points)[:, None]
         pts = ends[:, :1] * (1 - steps) + ends[:, 1:] * steps  # (K, P, 2)
-        labels = torch.randint(model.map_head.num_classes, (elements,), generator=generator)
+        labels = torch.randint(len(model.map_head.classes), (elements,), generator=generator)
         sample = Det3DDataSample(metainfo=metainfo)
         sample.gt_instances_3d = InstanceData(
             labels_3d=labels, pts=pts, pts_shifts=torch.stack([pts, pts.flip(1)], 1)

@@ -39,10 +39,10 @@ def test_frames_per_second_are_those_of_the_time(capsys):
 def test_a_step_is_measured_for_every_raster_of_gsmap(capsys):
     run(
         "step", str(REPO / "projects/GSMap/configs/gsmap_maptr_r50_24e.py"),
-        "--rasters", "16x8", "20x10",
+        "--rasters", "64x32", "80x40",
     )  # fmt: skip
     rows = cells(capsys.readouterr().out)
-    assert [row[1] for row in rows] == ["16x8", "20x10"]
+    assert [row[1] for row in rows] == ["64x32", "80x40"]
     assert all(float(row[2]) > 0 for row in rows)
 
 

@@ -14,12 +14,13 @@ REPO = Path(__file__).resolve().parents[2]
 CONFIG = """
 _base_ = '{repo}/projects/GSMap/configs/gsmap_maptr_r18_minicity.py'
 _data = dict(data_root='{root}')
-_heads = dict(embed_dims=16, num_heads=4, ffn_dims=16)
+_heads = dict(num_heads=4, ffn_dims=16)
 model = dict(
     img_backbone=dict(base_channels=8),
     img_neck=dict(in_channels=[16, 32, 64], out_channels=[8, 4, 4]),
-    bev_encoder=dict(embed_dims=16, bev_size=(50, 25), layer_cfg=dict(num_heads=4, ffn_dims=16)),
-    map_head=dict(embed_dims=16, num_instances=5, decoder=dict(num_layers=2, layer=_heads)))
+    bev_encoder=dict(embed_dims=16, layer_cfg=dict(num_heads=4, ffn_dims=16)),
+    map_head=dict(
+        embed_dims=16, query_groups=[dict(num=5)], decoder=dict(num_layers=2, layer=_heads)))
 train_dataloader = dict(batch_size=1, num_workers=0, persistent_workers=False, dataset=_data)
 val_dataloader = dict(num_workers=0, persistent_workers=False, dataset=_data)
 test_dataloader = dict(num_workers=0, persistent_workers=False, dataset=_data)
@@ -81,17 +82,18 @@ def test_a_killed_training_goes_on_where_it_stopped(trained):
 
 
 def test_one_and_two_processes_score_and_write_the_same(config, trained, tmp_path):
-    options = ["--eval", "chamfer", "raster", "--work-dir", tmp_path / "work"]
+    metrics = ["--eval", "chamfer", "raster"]
+    options = ["--work-dir", tmp_path / "work"]
     one, two = tmp_path / "one", tmp_path / "two"
     for folder in (one, two):
         folder.mkdir()
     run(
-        sys.executable, "tools/test.py", config, trained / "epoch_3.pth", *options,
+        sys.executable, "tools/test.py", *metrics, config, trained / "epoch_3.pth", *options,
         "--metrics-out", one / "metrics.json", "--out", one / "results.json",
         "--show-dir", one / "pictures",
     )  # fmt: skip
     run(
-        "tools/dist_test.sh", config, trained / "epoch_3.pth", 2, *options,
+        "tools/dist_test.sh", config, trained / "epoch_3.pth", 2, *metrics, *options,
         "--metrics-out", two / "metrics.json", "--out", two / "results.json",
     )  # fmt: skip
     assert json.loads((one / "metrics.json").read_text()) == json.loads(

@@ -11,9 +11,27 @@ from minicity.camera import Camera
 from minicity.curves import Array
 from minicity.texture import Image
 
-NOISE_PX = 1024
-WET_SLOPE = 0.12
 BGR = tuple[float, float, float]
+
+# What is drawn at random for a scene, as (smallest, largest)
+BRIGHTNESS = (0.88, 1.12)
+CLEAR_ELEVATION_RAD = (0.45, 1.1)
+CLEAR_WARMTH = (-0.04, 0.04)  # of the gain: added to red, taken from blue
+RAIN_STREAKS = (60, 160)
+VEILED_ELEVATION_RAD = 0.3  # of a sun that is not seen
+
+SKY_CURVE = 0.6  # exponent: the sky changes fastest just above the horizon
+WET_SLOPE = 0.12  # of the line of sight at which a wet road mirrors 1 / e of what it does at most
+LEAST_VEIL = 0.02  # weaker haze is not drawn
+NEAREST_GROUND_M = 0.1
+
+NOISE_PX = 1024  # edge of the tile of noise
+NOISE_SEED = 7
+COLOR_NOISE = 0.5  # noise of each colour channel alone, as a share of the grey noise
+STREAK_LENGTH_PX = (8, 30)  # in an image of REFERENCE_WIDTH_PX
+STREAK_SLANT = 0.15  # sideways per length
+STREAK_GREY = 70.0  # added to the picture
+REFERENCE_WIDTH_PX = 800
 
 
 @dataclass(frozen=True)
@@ -49,44 +67,91 @@ class Lighting:
     streaks: int
 
 
+@dataclass(frozen=True)
+class _Weather:
+    """How often a kind of weather comes, and what `Lighting` it gives."""
+
+    share: float
+    ambient: float
+    direct: float
+    gain: BGR
+    sky_top: BGR
+    haze: BGR
+    haze_m: float
+    noise: float
+    shadow: float = 0.0
+    wet: float = 0.0
+
+
+WEATHERS = {
+    "clear": _Weather(
+        share=0.5,
+        ambient=0.62,
+        direct=0.5,
+        shadow=0.42,
+        gain=(1.08, 1.1, 1.12),
+        sky_top=(205, 150, 95),
+        haze=(225, 205, 185),
+        haze_m=320,
+        noise=2.0,
+    ),
+    "cloudy": _Weather(
+        share=0.24,
+        ambient=0.88,
+        direct=0.12,
+        gain=(1.02, 1.0, 0.98),
+        sky_top=(190, 182, 175),
+        haze=(212, 208, 204),
+        haze_m=220,
+        noise=2.5,
+    ),
+    "dusk": _Weather(
+        share=0.13,
+        ambient=0.8,
+        direct=0.25,
+        gain=(0.52, 0.5, 0.62),
+        sky_top=(140, 95, 90),
+        haze=(120, 150, 215),
+        haze_m=260,
+        noise=4.5,
+    ),
+    "rain": _Weather(
+        share=0.13,
+        ambient=0.9,
+        direct=0.08,
+        gain=(0.74, 0.72, 0.7),
+        sky_top=(165, 160, 155),
+        haze=(200, 196, 192),
+        haze_m=110,
+        wet=0.55,
+        noise=4.0,
+    ),
+}
+
+
 def random_lighting(rng: np.random.Generator) -> Lighting:
     """Draw the light of a scene: mostly clear or cloudy, sometimes dusk or rain."""
-    weather = str(rng.choice(["clear", "cloudy", "dusk", "rain"], p=[0.5, 0.24, 0.13, 0.13]))
-    azimuth, bright = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.88, 1.12))
-    elevation = float(rng.uniform(0.45, 1.1)) if weather == "clear" else 0.3
-    horizontal = np.cos(elevation)
-    sun = np.array([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)])
-    if weather == "clear":
-        warm = float(rng.uniform(-0.04, 0.04))
-        gain = (bright * (1.08 - warm), bright * 1.1, bright * (1.12 + warm))
-        return Lighting(
-            weather, sun, 0.62, 0.5, 0.42, gain, (205, 150, 95), (225, 205, 185), 320, 0, 2.0, 0
-        )
-    if weather == "cloudy":
-        gain = (bright * 1.02, bright, bright * 0.98)
-        return Lighting(
-            weather, sun, 0.88, 0.12, 0.0, gain, (190, 182, 175), (212, 208, 204), 220, 0, 2.5, 0
-        )
-    if weather == "dusk":
-        gain = (0.52 * bright, 0.5 * bright, 0.62 * bright)
-        return Lighting(
-            weather, sun, 0.8, 0.25, 0.0, gain, (140, 95, 90), (120, 150, 215), 260, 0, 4.5, 0
-        )
-    gain = (0.74 * bright, 0.72 * bright, 0.7 * bright)
-    streaks = int(rng.integers(60, 160))
+    shares = [weather.share for weather in WEATHERS.values()]
+    name = str(rng.choice(list(WEATHERS), p=shares))
+    weather, clear = WEATHERS[name], name == "clear"
+    azimuth, bright = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(*BRIGHTNESS))
+    elevation = float(rng.uniform(*CLEAR_ELEVATION_RAD)) if clear else VEILED_ELEVATION_RAD
+    warm = float(rng.uniform(*CLEAR_WARMTH)) if clear else 0.0
+    level = np.cos(elevation)
+    blue, green, red = weather.gain
     return Lighting(
-        weather,
-        sun,
-        0.9,
-        0.08,
-        0.0,
-        gain,
-        (165, 160, 155),
-        (200, 196, 192),
-        110,
-        0.55,
-        4.0,
-        streaks,
+        weather=name,
+        sun=np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]),
+        ambient=weather.ambient,
+        direct=weather.direct,
+        shadow=weather.shadow,
+        gain=(bright * (blue - warm), bright * green, bright * (red + warm)),
+        sky_top=weather.sky_top,
+        haze=weather.haze,
+        haze_m=weather.haze_m,
+        wet=weather.wet,
+        noise=weather.noise,
+        streaks=int(rng.integers(*RAIN_STREAKS)) if name == "rain" else 0,
     )
 
 
@@ -95,7 +160,7 @@ def render_sky(camera: Camera, lighting: Lighting) -> Image:
     rows = np.arange(camera.height)
     pixels = np.stack([np.full(rows.shape, camera.width / 2), rows, np.ones(rows.shape)])
     directions = camera.world_from_pixel @ pixels
-    rise = np.clip(directions[2] / np.linalg.norm(directions, axis=0), 0, 1) ** 0.6
+    rise = np.clip(directions[2] / np.linalg.norm(directions, axis=0), 0, 1) ** SKY_CURVE
     top, low = np.array(lighting.sky_top), np.array(lighting.haze)
     column = (low + rise[:, None] * (top - low)).astype(np.uint8)
     size = (camera.width, camera.height)
@@ -112,9 +177,9 @@ def haze_ground(image: Image, distance_m: Array, eye_m: float, lighting: Lightin
         lighting: Haze and wetness.
     """
     veil = 1 - np.exp(-distance_m / lighting.haze_m)
-    slope = eye_m / np.maximum(distance_m, 0.1)
+    slope = eye_m / np.maximum(distance_m, NEAREST_GROUND_M)
     veil = np.maximum(veil, lighting.wet * np.exp(-slope / WET_SLOPE))
-    touched = np.flatnonzero((veil > 0.02) & np.isfinite(distance_m))
+    touched = np.flatnonzero((veil > LEAST_VEIL) & np.isfinite(distance_m))
     if not len(touched):
         return
     window = slice(int(touched[0]), int(touched[-1]) + 1)
@@ -143,9 +208,9 @@ def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:
 
 @lru_cache(maxsize=1)
 def _unit_noise() -> NDArray[np.float32]:
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(NOISE_SEED)
     gray = rng.standard_normal((NOISE_PX, NOISE_PX, 1), np.float32)
-    return gray + 0.5 * rng.standard_normal((NOISE_PX, NOISE_PX, 3), np.float32)
+    return gray + COLOR_NOISE * rng.standard_normal((NOISE_PX, NOISE_PX, 3), np.float32)
 
 
 @lru_cache(maxsize=8)
@@ -155,18 +220,12 @@ def _sensor_noise(deviation: float) -> NDArray[np.int16]:
 
 
 def _draw_streaks(image: Image, lighting: Lighting, rng: np.random.Generator) -> None:
+    """Draw rain, in place."""
     rows, columns = image.shape[:2]
-    scale = columns / 800
     veil = np.zeros((rows, columns), np.uint8)
     starts = rng.uniform([0, 0], [columns, rows], (lighting.streaks, 2))
-    lengths = rng.uniform(8, 30, lighting.streaks) * scale
+    lengths = rng.uniform(*STREAK_LENGTH_PX, lighting.streaks) * (columns / REFERENCE_WIDTH_PX)
     for (x, y), length in zip(starts, lengths, strict=True):
-        cv2.line(
-            veil,
-            (int(x), int(y)),
-            (int(x + 0.15 * length), int(y + length)),
-            (70.0,),
-            1,
-            cv2.LINE_AA,
-        )
+        start, end = (int(x), int(y)), (int(x + STREAK_SLANT * length), int(y + length))
+        cv2.line(veil, start, end, (STREAK_GREY,), 1, cv2.LINE_AA)
     cv2.add(image, cv2.merge([veil] * 3), dst=image)

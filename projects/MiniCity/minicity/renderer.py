@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from minicity.camera import NEAR_M, Camera, clip_near
 from minicity.curves import Array
 from minicity.ground import render_flat_ground, render_uneven_ground
-from minicity.lighting import Lighting, finish, haze_ground, render_sky
+from minicity.lighting import REFERENCE_WIDTH_PX, Lighting, finish, haze_ground, render_sky
 from minicity.meshes import FrozenMesh, Mesh, merge
 from minicity.scene_map import MATERIALS, HeightGrid, SceneMap
 from minicity.terrain import sample_height
@@ -22,6 +22,14 @@ MIN_PIXELS = 1.2
 BACKDROP_RADIUS_M = 26.0
 SMALL_RADIUS_M = 9.0
 SHADOW_FAR_M = 45.0
+LIGHT_UNDER_VEHICLES = 0.62  # share of the ground's light left under a vehicle, without sun
+LIGHT_IN_SHADOW = 0.52  # and under it or in its shadow, with sun
+LOWEST_SUN = 0.2  # sine of the elevation below which shadows grow no longer
+TOP_LIGHT = 0.1  # share of the ambient light that depends on how far a face looks up
+GLOW = 1.3  # brightness of lamps and lit windows, whatever the light
+PAINTED_MARGIN_M = 50.0  # ground that is painted around a camera
+FINE_RESOLUTION_M = 0.06  # edge of a ground pixel for images of REFERENCE_WIDTH_PX
+NARROWEST_PX = 400
 
 
 class SceneRenderer:
@@ -103,16 +111,19 @@ def render_camera(
 ) -> Image:
     """One picture, BGR; for many of one scene make a ``SceneRenderer`` once. (H, W, 3)"""
     x, y = camera.center[:2]
-    resolution = 0.06 * 800 / max(camera.width, 400)
+    resolution = FINE_RESOLUTION_M * REFERENCE_WIDTH_PX / max(camera.width, NARROWEST_PX)
+    edge = PAINTED_MARGIN_M
     rng = np.random.default_rng(seed)
-    renderer = SceneRenderer(scene_map, (x - 50, y - 50, x + 50, y + 50), lighting, resolution, rng)
+    renderer = SceneRenderer(
+        scene_map, (x - edge, y - edge, x + edge, y + edge), lighting, resolution, rng
+    )
     return renderer.render_camera(camera, vehicles, rng)
 
 
 def _shade_under(image: Image, camera: Camera, vehicles: list[Vehicle], lighting: Lighting) -> None:
     """Darken the ground under vehicles and in their shadows, in place."""
     mask: Image | None = None
-    dark = 255 * (0.52 if lighting.shadow > 0 else 0.62)
+    dark = 255 * (LIGHT_IN_SHADOW if lighting.shadow > 0 else LIGHT_UNDER_VEHICLES)
     forward = camera.cam_from_world[2, :3]
     for vehicle in vehicles:
         sight = vehicle.center - camera.center
@@ -140,7 +151,7 @@ def vehicle_shadow(vehicle: Vehicle, lighting: Lighting) -> Array:
     base = half @ np.array([[c, s], [-s, c]]) + vehicle.center[:2]
     if lighting.shadow <= 0:
         return base
-    cast = -lighting.sun[:2] / max(float(lighting.sun[2]), 0.2) * vehicle.size[2]
+    cast = -lighting.sun[:2] / max(float(lighting.sun[2]), LOWEST_SUN) * vehicle.size[2]
     hull = cv2.convexHull(np.concatenate([base, base + cast]).astype(np.float32))
     return hull[:, 0].astype(float)
 
@@ -222,8 +233,10 @@ def _lit(
     """Colours of faces under sky and sun; outward normals in the camera's frame. (F, 3)"""
     unit = normals_cam / np.maximum(np.linalg.norm(normals_cam, axis=1, keepdims=True), 1e-9)
     up, sun = camera.cam_from_world[:3, 2], camera.cam_from_world[:3, :3] @ lighting.sun
-    light = lighting.ambient * (0.9 + 0.1 * unit @ up) + lighting.direct * np.maximum(unit @ sun, 0)
-    return colors * np.where(glow, 1.3, light)[:, None]
+    light = lighting.ambient * (
+        1 - TOP_LIGHT + TOP_LIGHT * unit @ up
+    ) + lighting.direct * np.maximum(unit @ sun, 0)
+    return colors * np.where(glow, GLOW, light)[:, None]
 
 
 def _visible_discs(
