@@ -183,7 +183,7 @@ def test_truncated_and_missing_images_are_named(inferencer, tmp_path):
 
 def test_file_of_another_range_is_refused(inferencer, tmp_path):
     cfg = make_config()
-    cfg.test_dataloader.dataset.pc_range = [-30.0, -15.0, -2.0, 30.0, 15.0, 2.0]
+    cfg.test_dataloader.dataset.grid = {"x_range": [-30.0, 30.0], "y_range": [-15.0, 15.0]}
     other = MapInferencer(cfg, None, device="cpu")
     write_annotations(
         tmp_path / "a.arrow", AnnotationMeta("x", "lidar", "val"), make_samples(tmp_path, 1)

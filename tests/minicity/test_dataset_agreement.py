@@ -1,9 +1,9 @@
 """What the map says, what the cameras show and what the devkit draws agree."""
 
+import argparse
 from pathlib import Path
 
 import cv2
-import matplotlib as mpl
 import numpy as np
 import pytest
 import shapely
@@ -12,7 +12,7 @@ from nuscenes.map_expansion.map_api import NuScenesMap
 from pyquaternion import Quaternion
 from shapely.geometry import Polygon
 
-from minicity.devkit_plots import polygon_path, repair_descartes
+from minicity import devkit_plots
 
 LOCATIONS = (
     "singapore-onenorth",
@@ -125,30 +125,24 @@ def test_drivable_area_mask_of_the_map_picture_agrees_with_the_roads(
         assert maps[location].layers_on_point(x, y)["drivable_area"]
 
 
-def test_the_devkit_draws_a_sample_and_a_map_patch(
-    nusc: NuScenes, maps: dict[str, NuScenesMap], tmp_path: Path
-) -> None:
-    mpl.use("Agg")
-    repair_descartes()
-    token = nusc.sample[0]["token"]
-    nusc.render_sample(token, out_path=str(tmp_path / "sample.png"), verbose=False)
-    nusc.render_pointcloud_in_image(token, out_path=str(tmp_path / "cloud.png"), verbose=False)
-    town = maps["boston-seaport"]
-    figure, _ = town.render_map_patch(
-        (100, 100, 250, 250), ["lane", "ped_crossing"], figsize=(3, 3)
-    )
-    figure.savefig(tmp_path / "map.png")
-    for name in ("sample", "cloud", "map"):
-        picture = cv2.imread(str(tmp_path / f"{name}.png"))
+def test_the_devkit_draws_a_sample_and_a_map_patch(nusc: NuScenes, tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    devkit_plots.add_arguments(parser)
+    arguments = [nusc.dataroot, "--out", str(tmp_path / "pictures")]
+    assert "map.png" in devkit_plots.run(parser.parse_args(arguments))
+    for name in ("sample", "lidar", "map"):
+        picture = cv2.imread(str(tmp_path / "pictures" / f"{name}.png"))
         assert picture.std() > 10, f"{name} is blank"
+    with pytest.raises(ValueError, match=r"--sample must lie in 0\.\.\d+, got 99"):
+        devkit_plots.run(parser.parse_args([*arguments, "--sample", "99"]))
 
 
 def test_polygon_path_keeps_holes() -> None:
     square = Polygon([(0, 0), (4, 0), (4, 4), (0, 4)], [[(1, 1), (3, 1), (3, 3), (1, 3)]])
-    path = polygon_path(square)
+    path = devkit_plots.polygon_path(square)
     assert path.contains_point((0.5, 2))
     assert len(path.to_polygons()) == 2
-    assert len(polygon_path(Polygon())) == 0
+    assert len(devkit_plots.polygon_path(Polygon())) == 0
 
 
 def test_centre_lines_run_inside_their_lanes(maps: dict[str, NuScenesMap]) -> None:

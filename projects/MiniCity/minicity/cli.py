@@ -1,4 +1,4 @@
-"""The command ``tools/create_data.py minicity``."""
+"""Generate the MiniCity data set."""
 
 import argparse
 

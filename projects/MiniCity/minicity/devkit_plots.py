@@ -1,17 +1,68 @@
-"""Makes the devkit's map pictures work beside shapely 2.
+"""Draw a sample and the map around it with the nuScenes devkit.
 
-``descartes``, with which nuscenes-devkit draws polygons, was last released before shapely 2 and
-reads rings as arrays.
+``descartes``, with which the devkit draws polygons, was last released before shapely 2 and reads
+rings as arrays; `repair_descartes` mends that.
 """
 
+import argparse
+from pathlib import Path
+
 import descartes
+import matplotlib as mpl
 import numpy as np
-from matplotlib.path import Path
+from matplotlib.path import Path as Outline
 from shapely import get_parts
 from shapely.geometry import MultiPolygon, Polygon
 
+from minicity.config import VERSION
 
-def polygon_path(polygon: Polygon | MultiPolygon) -> Path:
+LAYERS = ["drivable_area", "road_segment", "lane", "ped_crossing", "walkway"]
+RADIUS_M = 75.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the command's arguments."""
+    parser.add_argument("root", help="folder of the data set")
+    parser.add_argument("--out", type=Path, default=Path("work_dirs/minicity"), help="for pictures")
+    parser.add_argument("--sample", type=int, default=0, help="number of the key frame")
+
+
+def run(arguments: argparse.Namespace, _command: str = "") -> str:
+    """Draw the sensors of a key frame, its LiDAR in the front camera, and the map around it.
+
+    Args:
+        arguments: Parsed arguments.
+
+    Returns:
+        A line for the user.
+
+    Raises:
+        ValueError: If there is no such key frame.
+    """
+    from nuscenes import NuScenes
+    from nuscenes.map_expansion.map_api import NuScenesMap
+
+    mpl.use("Agg")
+    repair_descartes()
+    nusc = NuScenes(VERSION, arguments.root, verbose=False)
+    if not 0 <= arguments.sample < len(nusc.sample):
+        raise ValueError(f"--sample must lie in 0..{len(nusc.sample) - 1}, got {arguments.sample}.")
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    sample = nusc.sample[arguments.sample]
+    nusc.render_sample(sample["token"], out_path=str(out / "sample.png"), verbose=False)
+    nusc.render_pointcloud_in_image(sample["token"], out_path=str(out / "lidar.png"), verbose=False)
+    log = nusc.get("log", nusc.get("scene", sample["scene_token"])["log_token"])
+    lidar = nusc.get("sample_data", sample["data"]["LIDAR_TOP"])
+    x, y, _ = nusc.get("ego_pose", lidar["ego_pose_token"])["translation"]
+    patch = (x - RADIUS_M, y - RADIUS_M, x + RADIUS_M, y + RADIUS_M)
+    town = NuScenesMap(arguments.root, log["location"])
+    figure, _ = town.render_map_patch(patch, LAYERS, figsize=(10, 10))
+    figure.savefig(out / "map.png")
+    return f"sample.png, lidar.png, map.png: {out}"
+
+
+def polygon_path(polygon: Polygon | MultiPolygon) -> Outline:
     """A polygon, holes included, as a matplotlib path."""
     rings = [
         np.asarray(ring.coords)[:, :2]
@@ -20,13 +71,13 @@ def polygon_path(polygon: Polygon | MultiPolygon) -> Path:
         for ring in (part.exterior, *part.interiors)
     ]
     if not rings:
-        return Path(np.zeros((0, 2)))
+        return Outline(np.zeros((0, 2)))
     codes = []
     for ring in rings:
-        code = np.full(len(ring), Path.LINETO, dtype=Path.code_type)
-        code[0] = Path.MOVETO
+        code = np.full(len(ring), Outline.LINETO, dtype=Outline.code_type)
+        code[0] = Outline.MOVETO
         codes.append(code)
-    return Path(np.concatenate(rings), np.concatenate(codes))
+    return Outline(np.concatenate(rings), np.concatenate(codes))
 
 
 def repair_descartes() -> None:

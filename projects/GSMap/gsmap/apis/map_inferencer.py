@@ -135,7 +135,8 @@ class MapInferencer:
         options = options if kind == "MapVisualizer" else {}
         for name in ("name", "vis_backends", "save_dir"):
             options.pop(name, None)
-        options.setdefault("pc_range", self.cfg.model.map_head.pc_range)
+        (x_min, x_max), (y_min, y_max) = self.cfg.model.grid.x_range, self.cfg.model.grid.y_range
+        options.setdefault("pc_range", (x_min, y_min, 0.0, x_max, y_max, 0.0))
         return MapVisualizer(name=f"inferencer-{id(self)}", **options)
 
     def dataset(
@@ -180,16 +181,14 @@ class MapInferencer:
     def _annotation_file(self, samples: Sequence[MapSample], frame: str) -> Path:
         """Write samples to an annotation file that lives as long as the inferencer."""
         options = self.cfg.test_dataloader.dataset
-        x_min, y_min, _, x_max, y_max, _ = (
-            options.get("pc_range") or self.cfg.model.map_head.pc_range
-        )
+        grid = options.get("grid") or self.cfg.model.grid
         meta = AnnotationMeta(
             dataset="samples",
             frame=frame,
             split="test",
             classes=tuple(options.get("classes") or CLASSES),
-            x_range=(x_min, x_max),
-            y_range=(y_min, y_max),
+            x_range=tuple(grid["x_range"]),
+            y_range=tuple(grid["y_range"]),
             command="tools/infer.py",
         )
         self._files += 1

@@ -1,0 +1,24 @@
+"""The generated data set by itself: ``python -m minicity generate`` and ``draw``."""
+
+import argparse
+import shlex
+import sys
+
+from gsmap.utils.cli import CommandParser, run_command
+from minicity import cli, devkit_plots
+
+
+def main() -> str:
+    """Run the command that is asked for and return its report."""
+    parser = CommandParser(prog="python -m minicity", description=__doc__)
+    commands = parser.add_subparsers(required=True)
+    for name, module in (("generate", cli), ("draw", devkit_plots)):
+        command = commands.add_parser(name, help=module.__doc__, description=module.__doc__)
+        module.add_arguments(command)
+        command.set_defaults(run=module.run)
+    arguments: argparse.Namespace = parser.parse_args()
+    return arguments.run(arguments, shlex.join(["python", "-m", "minicity", *sys.argv[1:]]))
+
+
+if __name__ == "__main__":
+    run_command(main)
