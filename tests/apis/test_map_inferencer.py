@@ -24,10 +24,12 @@ def make_config():
     cfg.merge_from_dict(
         {
             "model.bev_encoder.num_cams": 2,
-            "model.bev_encoder.bev_size": (10, 6),
+            "model.grid": {"x_range": [-15.0, 15.0], "y_range": [-30.0, 30.0]},
+            "model.classes": ["divider", "ped_crossing", "boundary"],
+            "model.bev_encoder.bev_pixel_m": 6.0,
             "model.img_backbone.base_channels": 8,
             "model.img_neck.in_channels": [16, 32, 64],
-            "model.map_head.num_instances": 6,
+            "model.map_head.query_groups": [{"num": 6}],
             "model.map_head.coder.max_num": 6,
             "visualizer.width_px": 400,
             "test_dataloader": {
@@ -128,7 +130,7 @@ def test_checkpoint_is_loaded(inferencer, tmp_path):
         if value.is_floating_point()
     )
     other = make_config()
-    other.merge_from_dict({"model.map_head.num_instances": 7})
+    other.merge_from_dict({"model.map_head.query_groups": [{"num": 7}]})
     with pytest.raises(
         ValueError, match=r"weights.pth does not belong to this config: .*instance_embedding"
     ):
