@@ -3,7 +3,6 @@
 from itertools import pairwise
 
 import numpy as np
-import shapely
 from shapely.geometry import Polygon, box
 
 from minicity.curves import Array, unit
@@ -170,14 +169,3 @@ def _arrows(road: Road) -> list[Array]:
             base = road.point(at, 0.5 * (inner + outer))
             painted.append(base + _ARROW[:, :1] * forward + _ARROW[:, 1:] * side)
     return painted
-
-
-def boundary_polygons(town: Town) -> list[Polygon]:
-    """Road and junction polygons of a town, whose union's outline is the road boundary."""
-    roads = [p for road in town.roads for p in road_surface(road)]
-    return [*roads, *[Polygon(j.outline) for j in town.junctions]]
-
-
-def all_valid(polygons: list[Polygon]) -> bool:
-    """Whether every polygon is valid."""
-    return bool(np.all(shapely.is_valid(polygons)))
