@@ -8,34 +8,37 @@ from mmengine.structures import InstanceData
 from model_cases import straight_elements
 
 import gsmap.registered  # noqa: F401
+from gsmap.structures.grid import BEVGrid
 
 N, P, C = 4, 5, 16
+CLASSES = ("divider", "ped_crossing", "boundary")
+ALONG_Y = BEVGrid((-15, 15), (-30, 30))  # nuScenes: y points forward
+ALONG_X = BEVGrid((-30, 30), (-15, 15))  # Argoverse 2: x points forward
 HEAD = {
     "type": "MapHead",
-    "num_classes": 3,
-    "pc_range": [-15.0, -30.0, -10.0, 15.0, 30.0, 10.0],
-    "num_instances": N,
+    "grid": ALONG_Y,
+    "classes": CLASSES,
+    "query_groups": [{"num": N}],
     "num_points": P,
     "embed_dims": C,
-    "decoder": {
-        "type": "MapDecoder",
-        "num_layers": 2,
-        "layer": {"embed_dims": C, "num_heads": 4, "ffn_dims": 32, "dropout": 0.0},
-    },
-    "assigner": {
-        "type": "MapAssigner",
-        "match_costs": [
-            {"type": "mmdet.FocalLossCost", "weight": 2.0},
-            {"type": "OrderedPointsCost", "weight": 5.0},
-        ],
-    },
-    "coder": {"type": "MapCoder", "max_num": 8, "post_center_range": [-20, -35, 20, 35]},
+    "decoder": {"num_layers": 2, "layer": {"num_heads": 4, "ffn_dims": 32, "dropout": 0.0}},
+    "match_costs": [
+        {"type": "mmdet.FocalLossCost", "weight": 2.0},
+        {"type": "OrderedPointsCost", "weight": 5.0},
+    ],
     "loss_cls": {"type": "mmdet.FocalLoss", "use_sigmoid": True, "loss_weight": 2.0},
-    "loss_weights": {"pts": 5.0, "dir": 0.005},
+    "losses": [
+        {"type": "PointsLoss", "loss_weight": 5.0},
+        {"type": "DirectionLoss", "loss_weight": 0.005},
+    ],
+    "coder": {"max_num": 8},
 }
-GAUSSIANS = {
-    "loss_raster": {"type": "RasterLoss", "loss_weight": 10.0},
-    "iou_cost": {"type": "IoUCost", "weight": 2.0},
+MASKS = {"pixel_m": 1.5, "cost_pixel_m": 0.75}  # 40 x 20 and 80 x 40
+GSMAP = {
+    **HEAD,
+    "type": "GSMapHead",
+    "masks": MASKS,
+    "reference": {"min_scale_m": 0.15},  # finer than half of these coarse pixels
 }
 
 
@@ -69,3 +72,20 @@ def elements(*lines, labels=None) -> InstanceData:
 def along_y(*xs: float) -> list:
     """Return lines of 40 m along y, at these x."""
     return [((x, -20), (x, 20)) for x in xs]
+
+
+def losses_of(head: torch.nn.Module, *gts: InstanceData) -> dict[str, torch.Tensor]:
+    """Return a head's losses of one batch."""
+    return head.loss_by_feat(head(bev(len(gts))), gts, [{"token": "a"}] * len(gts))
+
+
+def train_a_step(head: torch.nn.Module, gt: InstanceData) -> dict[str, torch.Tensor]:
+    """Train one step, check that every gradient is finite, and return the losses before it."""
+    losses = losses_of(head.train(), gt)
+    head.zero_grad()
+    sum(value for name, value in losses.items() if "loss" in name).backward()
+    gradients = [p.grad for p in head.parameters() if p.grad is not None]
+    assert gradients
+    assert all(gradient.isfinite().all() for gradient in gradients)
+    torch.optim.SGD(head.parameters(), 1e-3).step()
+    return losses

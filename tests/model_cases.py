@@ -22,18 +22,19 @@ def small_config() -> dict:
     cfg = Config.fromfile(
         CONFIGS / "_base_/models/maptr_r18_minicity.py", import_custom_modules=False
     )
-    heads = {"embed_dims": 16, "num_heads": 4, "ffn_dims": 16}
+    heads = {"num_heads": 4, "ffn_dims": 16}
     overrides = {
+        "grid": {"x_range": [-15.0, 15.0], "y_range": [-30.0, 30.0]},
+        "classes": ["divider", "ped_crossing", "boundary"],
         "img_backbone": {"base_channels": 8},
         "img_neck": {"in_channels": [16, 32, 64], "out_channels": [8, 4, 4]},
         "bev_encoder": {
             "embed_dims": 16,
-            "bev_size": (12, 6),
+            "bev_pixel_m": 5.0,
             "layer_cfg": {"num_heads": 4, "ffn_dims": 16},
         },
         "map_head": {
-            "num_instances": 8,
-            "num_points": 20,
+            "query_groups": [{"num": 8}],
             "embed_dims": 16,
             "decoder": {"num_layers": 2, "layer": heads},
             "coder": {"max_num": 8},
@@ -79,6 +80,7 @@ def straight_elements(*lines, labels=None, num_points: int = 20) -> InstanceData
         pts=pts,
         pts_shifts=torch.stack([pts, pts.flip(1)], 1),
         boxes=torch.cat([pts.amin(1), pts.amax(1)], -1),
+        polylines=ends,
         closed=torch.zeros(len(pts), dtype=torch.bool),
     )
 

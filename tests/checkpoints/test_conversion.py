@@ -36,7 +36,7 @@ PAIRS = {
     "pts_bbox_head.transformer.decoder.layers.3.attentions.1.value_proj.bias": (
         "map_head.decoder.layers.3.cross_attn.value_proj.bias"
     ),
-    "pts_bbox_head.reg_branches.5.4.weight": "map_head.reg_branches.5.4.weight",
+    "pts_bbox_head.reg_branches.5.4.weight": "map_head.reference.branches.5.4.weight",
     LAYER + "attentions.1.output_proj.weight": "bev_encoder.layers.0.cross_attn.output_proj.weight",
 }
 
@@ -94,7 +94,7 @@ def test_gsmap_starts_where_an_upstream_maptr_checkpoint_ended(tmp_path):
         expected, outputs = maptr._forward(images, samples), gsmap._forward(images, samples)
     assert torch.equal(outputs["all_pts_preds"], expected["all_pts_preds"])
     assert torch.equal(outputs["all_cls_scores"], expected["all_cls_scores"])
-    with pytest.raises(ValueError, match=r"does not have: .*map_head\.gaussian_init"):
+    with pytest.raises(ValueError, match=r"does not have: .*map_head\.reference\.gaussian_init"):
         upstream_from_ours(gsmap.state_dict())
 
 
@@ -103,7 +103,7 @@ def test_missing_left_over_and_reshaped_keys_are_errors_that_name_them(tmp_path,
     model = build_small()
     state = dict(model.state_dict())
     state["map_head.cls_branches.0.6.bias"] = torch.zeros(7)
-    del state["map_head.reference_points.bias"]
+    del state["map_head.reference.initial.bias"]
     state["map_head.cls_branches.9.0.weight"] = torch.zeros(1)
     if upstream:
         state = upstream_from_ours(state)
@@ -112,7 +112,7 @@ def test_missing_left_over_and_reshaped_keys_are_errors_that_name_them(tmp_path,
     with pytest.raises(ValueError, match="does not fit the model") as error:
         load_checkpoint(model, str(path))
     message = str(error.value)
-    assert "missing: map_head.reference_points.bias" in message
+    assert "missing: map_head.reference.initial.bias" in message
     assert "left over: map_head.cls_branches.9.0.weight" in message
     assert "map_head.cls_branches.0.6.bias (7,) instead of (3,)" in message
 

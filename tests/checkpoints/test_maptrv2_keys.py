@@ -9,18 +9,19 @@ from gsmap.checkpoints.key_map import MAPTR, MAPTRV2, find_key_map
 LAYER = "pts_bbox_head.transformer.decoder.layers.3."
 OURS = "map_head.decoder.layers.3."
 PAIRS = {
-    LAYER + "attentions.0.attn.in_proj_bias": OURS + "self_attn.in_proj_bias",
-    LAYER + "attentions.1.attn.out_proj.bias": OURS + "point_attn.out_proj.bias",
+    LAYER + "attentions.0.attn.in_proj_bias": OURS + "self_attn.instance_attn.in_proj_bias",
+    LAYER + "attentions.1.attn.out_proj.bias": OURS + "self_attn.point_attn.out_proj.bias",
     LAYER + "attentions.2.value_proj.weight": OURS + "cross_attn.value_proj.weight",
-    LAYER + "norms.3.weight": OURS + "norms.3.weight",
+    LAYER + "norms.0.weight": OURS + "self_attn.norm.weight",
+    LAYER + "norms.3.weight": OURS + "norms.2.weight",
     "pts_bbox_head.transformer.encoder.depth_net.depth_conv.3.aspp2.bn.bias": (
         "bev_encoder.depth_net.depth_conv.3.aspp2.bn.bias"
     ),
     "pts_bbox_head.transformer.encoder.downsample.4.running_var": (
         "bev_encoder.downsample.4.running_var"
     ),
-    "pts_bbox_head.seg_head.2.bias": "map_head.seg_head.2.bias",
-    "pts_bbox_head.pv_seg_head.0.weight": "map_head.pv_seg_head.0.weight",
+    "pts_bbox_head.seg_head.2.bias": "map_head.aux_heads.seg.2.bias",
+    "pts_bbox_head.pv_seg_head.0.weight": "map_head.aux_heads.pv_seg.0.weight",
 }
 
 

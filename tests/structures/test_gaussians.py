@@ -3,19 +3,22 @@ import math
 import pytest
 import torch
 
-from gsmap.structures.gaussians import GaussianSpace
+from gsmap.structures.gaussians import Gaussians, GaussianSpace, extents_along_line
 from gsmap.structures.grid import BEVGrid
 
-SPACE = GaussianSpace(
-    BEVGrid((-15, 15), (-30, 30), 1, 1), min_scale_m=0.15, max_scale_m=5.0, init_scales_m=(0.4, 1.0)
-)
+GRID = BEVGrid((-15, 15), (-30, 30))  # y points forward
+SPACE = GaussianSpace(GRID, min_scale_m=0.15, max_scale_m=5.0, init_scales_m=(1.0, 0.4))
+FORWARD_X = BEVGrid((-30, 30), (-15, 15))
 
 
 def test_zeros_stand_for_the_first_gaussian():
     gaussians = SPACE.decode(torch.tensor([[0.5, 0.75, 0.0, 0.0, 0.0]], dtype=torch.float64))
     torch.testing.assert_close(gaussians.means, torch.tensor([[0.0, 15.0]], dtype=torch.float64))
-    torch.testing.assert_close(gaussians.scales, torch.tensor([[0.4, 1.0]], dtype=torch.float64))
-    torch.testing.assert_close(gaussians.rotations, torch.zeros(1, dtype=torch.float64))
+    torch.testing.assert_close(gaussians.scales, torch.tensor([[1.0, 0.4]], dtype=torch.float64))
+    along_y = torch.full((1,), math.pi / 2, dtype=torch.float64)
+    torch.testing.assert_close(gaussians.rotations, along_y)
+    along_x = GaussianSpace(FORWARD_X).decode(torch.zeros(1, 5)).rotations
+    torch.testing.assert_close(along_x, torch.zeros(1))
 
 
 def test_scales_stay_between_their_bounds_and_grow_with_the_raw_value():
@@ -31,13 +34,74 @@ def test_half_precision_is_decoded_in_float32():
     assert gaussians.means.dtype == gaussians.scales.dtype == torch.float32
 
 
-def test_the_first_frame_is_exactly_the_identity():
-    frames = SPACE.frames(torch.rand(3, 7, 5) * torch.tensor([1.0, 1, 0, 0, 0]))
+@pytest.mark.parametrize("grid", [GRID, FORWARD_X], ids=["forward y", "forward x"])
+@pytest.mark.parametrize("invariant", [False, True])
+@pytest.mark.parametrize("literal", [False, True])
+def test_the_first_frame_is_exactly_the_identity(grid, invariant, literal):
+    space = GaussianSpace(grid, literal_covariance=literal)
+    frames = space.frames(torch.rand(3, 7, 5) * torch.tensor([1.0, 1, 0, 0, 0]), invariant)
     assert torch.equal(frames, torch.eye(2).expand(3, 7, 2, 2))
 
 
+def test_the_invariant_frame_is_the_same_for_a_gaussian_turned_by_half_a_circle():
+    reference = torch.tensor([0.3, 0.6, 0.9, -0.4, 0.7], dtype=torch.float64)
+    turned = reference + torch.tensor([0, 0, 0, 0, math.pi])
+    frame = SPACE.frames(reference, invariant=True)
+    torch.testing.assert_close(SPACE.frames(turned, invariant=True), frame)
+    torch.testing.assert_close(SPACE.frames(turned), -SPACE.frames(reference))
+    gaussian = SPACE.decode(reference)
+    along = torch.stack([gaussian.rotations.cos(), gaussian.rotations.sin()])
+    torch.testing.assert_close(frame @ along, along * gaussian.scales[0] / 1.0)
+
+
+@pytest.mark.parametrize("activation", ["sigmoid", "softplus", "exp"])
+def test_every_activation_starts_with_the_same_gaussian_and_has_its_own_slope(activation):
+    space = GaussianSpace(GRID, activation=activation)
+    raw = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    scales = space.scales(raw)
+    torch.testing.assert_close(scales, torch.tensor([1.0, 0.4], dtype=torch.float64))
+    (slope,) = torch.autograd.grad(scales.sum(), raw)
+    rise = torch.tensor([0.85, 0.25], dtype=torch.float64)  # above the floor of 0.15 m
+    expected = {"sigmoid": rise * (1 - rise / 4.85), "softplus": 1 - (-rise).exp(), "exp": rise}
+    torch.testing.assert_close(slope, expected[activation])
+
+
+@pytest.mark.parametrize("activation", ["sigmoid", "softplus", "exp"])
+def test_every_activation_has_a_slope_close_to_its_floor_and_an_end(activation):
+    space = GaussianSpace(GRID, activation=activation)
+    raw = torch.tensor([-3.0, 50.0], requires_grad=True)
+    small, large = space.scales(raw)
+    assert 0.15 < small < 0.3
+    assert large.item() == pytest.approx(5.0)
+    (slope,) = torch.autograd.grad(small, raw)
+    assert slope[0] == pytest.approx(small.item() - 0.15, rel=0.1)  # all alike down there
+    with pytest.raises(ValueError, match=r"activation must be one of .*, got 'relu'"):
+        GaussianSpace(GRID, activation="relu")
+
+
+def test_the_literal_covariance_squares_sigma_and_its_floor():
+    literal = GaussianSpace(GRID, literal_covariance=True)
+    reference = torch.tensor([0.5, 0.5, 0.3, -0.2, 0.0])
+    scales = SPACE.decode(reference).scales
+    torch.testing.assert_close(literal.decode(reference).scales, scales.square())
+    assert literal.floor_m == pytest.approx(0.15**2)
+    assert SPACE.floor_m == 0.15
+
+
+def test_extents_along_the_line_by_hand():
+    """Three Gaussians on a line along x: along it, across it, and at 45 degrees."""
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]),
+        scales=torch.tensor([[2.0, 0.5]]).expand(3, 2),
+        rotations=torch.tensor([0.0, math.pi / 2, math.pi / 4]),
+    )
+    mean = math.sqrt((4 + 0.25) / 2)
+    expected = torch.tensor([[2.0, 0.5], [0.5, 2.0], [mean, mean]])
+    torch.testing.assert_close(extents_along_line(gaussians), expected)
+
+
 def test_a_frame_stretches_along_the_gaussians_axes_and_then_turns():
-    """A Gaussian twice as long along its second axis, turned by 90 degrees anticlockwise.
+    """A Gaussian twice as long along the direction of travel, turned by 90 degrees anticlockwise.
 
     ::
 
@@ -49,7 +113,7 @@ def test_a_frame_stretches_along_the_gaussians_axes_and_then_turns():
     target = (2.0 - 0.15) / (5.0 - 0.15)
     start = (1.0 - 0.15) / (5.0 - 0.15)
     long = math.log(target / (1 - target)) - math.log(start / (1 - start))
-    reference = torch.tensor([0.5, 0.5, 0.0, long, math.pi / 2])
+    reference = torch.tensor([0.5, 0.5, long, 0.0, math.pi / 2])
     moved = SPACE.frames(reference) @ torch.tensor([0.0, 1.0])
     torch.testing.assert_close(moved, torch.tensor([-2.0, 0.0]), atol=1e-6, rtol=0)
 
@@ -82,5 +146,7 @@ def test_impossible_scales_are_refused(settings):
 
 
 def test_a_reference_of_points_is_refused():
-    with pytest.raises(ValueError, match=r"reference must have shape \(\.\.\., 5\), got \(4, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"reference must have shape \(\.\.\., 5\) or more, got \(4, 2\)"
+    ):
         SPACE.decode(torch.zeros(4, 2))

@@ -6,6 +6,7 @@ from mmcv.ops.multi_scale_deform_attn import multi_scale_deformable_attn_pytorch
 from gsmap.models.bev_encoders.bev_query_encoder import BEVQueryEncoder, BEVSelfAttention
 from gsmap.models.bev_encoders.bevformer import SpatialCrossAttention
 from gsmap.models.bev_encoders.projection import PillarProjection
+from gsmap.structures.grid import BEVGrid
 
 KERNEL = {"type": "GeometryKernelAttention", "num_heads": 2, "kernel_size": (3, 3)}
 DEFORMABLE = {
@@ -18,9 +19,9 @@ DEFORMABLE = {
 
 def small_encoder(cross_attn=KERNEL, num_cams=2, **kwargs):
     return BEVQueryEncoder(
-        cross_attn=cross_attn,
-        pc_range=(-4, -8, -2, 4, 8, 2),
-        bev_size=(8, 4),
+        cross_attn,
+        BEVGrid((-4, 4), (-8, 8)),
+        bev_pixel_m=2.0,
         embed_dims=16,
         layer_cfg={"num_heads": 2, "num_points": 2, "ffn_dims": 24},
         num_cams=num_cams,

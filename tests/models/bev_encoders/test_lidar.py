@@ -14,15 +14,17 @@ from model_cases import (
 )
 
 from gsmap.models.bev_encoders.lidar import ConvFuser, LidarEncoder
+from gsmap.structures.grid import BEVGrid
 
 BASE = "_base_/models/maptr_r18_pointpillars_minicity.py"
+GRID = BEVGrid((-15, 15), (-30, 30))
 LINE = straight_elements(((-5.0, -20.0), (-5.0, 20.0)))
 
 
 @pytest.fixture(scope="module")
 def config():
     cfg = Config.fromfile(CONFIGS / BASE, import_custom_modules=False).model
-    cfg.lidar_encoder.bev_size = (12, 6)
+    cfg.lidar_encoder.bev_pixel_m = 5.0
     cfg.bev_fuser.update(camera_channels=16, out_channels=16)
     return cfg
 
@@ -41,7 +43,7 @@ def cloud(*points):
 def test_a_point_lights_up_its_own_cell_of_its_own_sample(config):
     torch.manual_seed(0)
     encoder_config = copy.deepcopy(config.lidar_encoder)
-    encoder_config.update(backbone=None, neck=None, bev_size=(100, 50))
+    encoder_config.update(backbone=None, neck=None, bev_pixel_m=0.6, grid=GRID)
     encoder = LidarEncoder(**{k: v for k, v in encoder_config.items() if k != "type"}).eval()
     voxels = voxelise(config, cloud((-14.9, -29.9, 0.0)), cloud((0.1, 29.9, 1.0), (14.9, 0.1, 0.0)))
     with torch.no_grad():
@@ -53,7 +55,7 @@ def test_a_point_lights_up_its_own_cell_of_its_own_sample(config):
 
 
 def test_features_are_interpolated_to_the_size_of_the_grid(config):
-    encoder = MODELS.build(config.lidar_encoder).eval()
+    encoder = MODELS.build({**config.lidar_encoder, "grid": GRID}).eval()
     with torch.no_grad():
         feats = encoder(voxelise(config, cloud((0.0, 0.0, 0.0))), 1)
     assert feats.shape == (1, 128, 12, 6)
@@ -109,6 +111,6 @@ def test_a_sparse_encoder_without_its_package_says_so(monkeypatch):
     path = CONFIGS / "_base_/models/maptr_r50_second.py"
     cfg = Config.fromfile(path, import_custom_modules=False)
     monkeypatch.setattr("gsmap.models.bev_encoders.lidar.IS_SPCONV2_AVAILABLE", False)
-    encoder = MODELS.build(cfg.model.lidar_encoder)
+    encoder = MODELS.build({**cfg.model.lidar_encoder, "grid": GRID})
     with pytest.raises(RuntimeError, match="use a PointPillars config"):
         encoder({"coors": torch.zeros(1, 4, dtype=torch.int32)}, 1)

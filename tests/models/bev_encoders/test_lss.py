@@ -8,8 +8,10 @@ from mmdet3d.structures import Det3DDataSample
 
 import gsmap.registered  # noqa: F401
 from gsmap.models.bev_encoders.lss import LSSEncoder
+from gsmap.models.heads.aux_heads import DepthSupervision
+from gsmap.structures.grid import BEVGrid
 
-PC_RANGE = [-4.0, -8.0, -5.0, 4.0, 8.0, 5.0]
+GRID = BEVGrid((-4, 4), (-8, 8))
 DEPTH_RANGE = (1.0, 7.0, 1.0)
 
 
@@ -17,8 +19,9 @@ def encoder(**settings) -> LSSEncoder:
     torch.manual_seed(0)
     config = {
         "type": "LSSEncoder",
-        "pc_range": PC_RANGE,
-        "bev_size": (8, 4),
+        "grid": GRID,
+        "z_range": (-5.0, 5.0),
+        "bev_pixel_m": 2.0,
         "embed_dims": 8,
         "depth_range": DEPTH_RANGE,
         "aspp_channels": 4,
@@ -88,27 +91,20 @@ def test_samples_of_a_batch_are_independent():
 
 
 def test_depth_loss_and_its_gradient():
-    module = encoder(loss_depth_weight=3.0)
+    module, supervision = encoder(), DepthSupervision(loss_weight=3.0)
     outputs = module([feats()], [meta()])
     outputs["depth"] = torch.full((1, 1, 6, 3, 5), 1 / 6)
-    loss = module.loss(outputs, [sample_with_depth(2.5)])["loss_depth"]
+    loss = supervision.loss(outputs, [sample_with_depth(2.5)])
     assert loss.item() == pytest.approx(3 * np.log(6), rel=1e-5)
     outputs = module([feats()], [meta()])
-    module.loss(outputs, [sample_with_depth(2.5)])["loss_depth"].backward()
+    supervision.loss(outputs, [sample_with_depth(2.5)]).backward()
     assert module.depth_net.depth_conv[-1].weight.grad.abs().sum() > 0
 
 
-def test_without_depth_weight_no_lidar_is_needed():
-    module = encoder(loss_depth_weight=0.0)
-    outputs = module([feats()], [meta()])
-    assert module.loss(outputs, [Det3DDataSample()]) == {}
-
-
 def test_missing_depth_is_named():
-    module = encoder()
-    outputs = module([feats()], [meta()])
+    outputs = encoder()([feats()], [meta()])
     with pytest.raises(ValueError, match=r"sample 'b' has no gt_depth"):
-        module.loss(outputs, [Det3DDataSample(metainfo={"token": "b"})])
+        DepthSupervision().loss(outputs, [Det3DDataSample(metainfo={"token": "b"})])
 
 
 def test_missing_matrix_is_named():
@@ -119,7 +115,7 @@ def test_missing_matrix_is_named():
 
 
 def test_plain_depth_net_needs_projection_only():
-    module = encoder(camera_aware=False, loss_depth_weight=0.0)
+    module = encoder(camera_aware=False)
     few = {key: meta()[key] for key in ("token", "batch_input_shape", "lidar2img")}
     assert module([feats()], [few])["bev_feats"].shape == (1, 8, 8, 4)
 
@@ -136,7 +132,7 @@ def test_mixed_precision_keeps_depth_and_pooling_in_float32():
     exact = module([feats()], [meta()])
     with torch.autocast("cpu", torch.bfloat16):
         outputs = module([feats()], [meta()])
-        loss = module.loss(outputs, [sample_with_depth(2.5)])["loss_depth"]
+        loss = DepthSupervision().loss(outputs, [sample_with_depth(2.5)])
     assert outputs["depth"].dtype == loss.dtype == torch.float32
     assert outputs["bev_feats"].isfinite().all()
     torch.testing.assert_close(outputs["depth"], exact["depth"], atol=0.02, rtol=0)

@@ -1,25 +1,35 @@
-import torch
-from gsmap.models.decoders.gaussian_layer import GaussianDecoderLayer
+"""The guided layer: gradients from Gaussians to Gaussians, and where it looks."""
 
-from gsmap.models.decoders.map_decoder import refine_reference
+import math
+
+import pytest
+import torch
+
+from gsmap.models.decoders.map_decoder import GaussianDecoderLayer, MapDecoderLayer
+from gsmap.models.heads.references import refine_reference
+from gsmap.models.layers.gaussian_guidance import GaussianGuidance, turn_offsets
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
 
-SPACE = GaussianSpace(BEVGrid((-15, 15), (-30, 30), 1, 1))
+SPACE = GaussianSpace(BEVGrid((-15, 15), (-30, 30)))
+SELF = {"self_attn": {"type": "PointSelfAttention"}}
+DECOUPLED = {"self_attn": {"type": "DecoupledSelfAttention"}}
 
 
-def double_layer() -> GaussianDecoderLayer:
+def double_layer(**settings) -> GaussianDecoderLayer:
     """Return a small layer in float64 whose added parts are not neutral any more."""
     torch.manual_seed(0)
-    settings = {"embed_dims": 8, "num_heads": 2, "num_sampling_points": 2, "ffn_dims": 8}
-    layer = GaussianDecoderLayer(SPACE, dropout=0.0, **settings).double()
+    sizes = {"embed_dims": 8, "num_heads": 2, "num_points": 3, "ffn_dims": 8, "dropout": 0.0}
+    settings = {"cross_attn": {"num_points": 2}, "space": SPACE, **sizes, **settings}
+    layer = GaussianDecoderLayer(**settings).double()
     for parameter in layer.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     return layer
 
 
-def test_the_path_from_gaussians_through_the_layer_to_gaussians_has_its_true_gradient():
-    layer = double_layer()
+@pytest.mark.parametrize("attention", [SELF, DECOUPLED], ids=["MapTR", "MapTRv2"])
+def test_the_path_from_gaussians_through_the_layer_to_gaussians_has_its_true_gradient(attention):
+    layer = double_layer(**attention)
     query, position = torch.randn(2, 1, 3, 8, dtype=torch.float64)
     bev = torch.randn(1, 8, 6, 5, dtype=torch.float64)
     predict = torch.nn.Linear(8, 5).double()
@@ -34,13 +44,55 @@ def test_the_path_from_gaussians_through_the_layer_to_gaussians_has_its_true_gra
     assert torch.autograd.gradcheck(gaussians, inputs)
 
 
+def places(layer: GaussianDecoderLayer, reference: torch.Tensor) -> torch.Tensor:
+    """Return where a layer samples a map of 6 x 5 cells for one and the same query."""
+    query = torch.ones(1, reference.shape[1], 8, dtype=torch.float64)
+    frames = layer.guidance.frames(reference, (6, 5))
+    return layer.cross_attn.sampling_locations(query, reference, (6, 5), frames)
+
+
 def test_each_of_the_five_parameters_changes_where_the_layer_looks():
     layer = double_layer()
-    query = torch.randn(1, 3, 8, dtype=torch.float64)
     reference = torch.full((1, 3, 5), 0.4, dtype=torch.float64)
-    before = layer.cross_attn.sampling_locations(query, reference, (6, 5))
+    before = places(layer, reference)
     for entry in range(5):
         changed = reference.clone()
         changed[..., entry] += 0.1
-        after = layer.cross_attn.sampling_locations(query, changed, (6, 5))
-        assert (after - before).abs().max() > 1e-3
+        assert (places(layer, changed) - before).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("invariant", [False, True])
+def test_half_a_turn_keeps_the_places_of_the_invariant_frame_only(invariant):
+    layer = double_layer(invariant_frame=invariant)
+    reference = torch.full((1, 3, 5), 0.4, dtype=torch.float64)
+    turned = reference + torch.tensor([0, 0, 0, 0, math.pi])
+    assert torch.allclose(places(layer, turned), places(layer, reference)) == invariant
+
+
+def test_frames_act_on_metres_whatever_the_cells():
+    """Cells of 6 x 10 m; a quarter turn brings one cell along y to 10 m along -x: 10 / 6 cells."""
+    guidance = GaussianGuidance(SPACE, 8)
+    reference = torch.tensor([[[0.5, 0.5, 0.0, 0.0, math.pi / 2]]])
+    offsets = torch.tensor([[[0.0, 1.0]]])
+    turned = turn_offsets(offsets, guidance.frames(reference, (6, 5)))
+    torch.testing.assert_close(turned, torch.tensor([[[-10 / 6, 0.0]]]), atol=1e-6, rtol=0)
+    assert torch.equal(turn_offsets(offsets, None), offsets)
+
+
+def test_a_new_guided_layer_computes_what_the_plain_one_does():
+    torch.manual_seed(0)
+    sizes = {"embed_dims": 8, "num_heads": 2, "num_points": 3, "ffn_dims": 8}
+    plain = MapDecoderLayer(**sizes).eval()
+    guided = GaussianDecoderLayer(space=SPACE, **sizes).eval()
+    left = guided.load_state_dict(plain.state_dict(), strict=False)
+    assert all(key.startswith("guidance.embedding.") for key in left.missing_keys)
+    query, position = torch.randn(2, 1, 6, 8)
+    reference = torch.rand(1, 6, 5) * torch.tensor([1.0, 1, 0, 0, 0])
+    bev = torch.randn(1, 8, 6, 5)
+    expected = plain(query, position, reference, bev)
+    assert torch.equal(guided(query, position, reference, bev), expected)
+
+
+def test_guidance_without_gaussians_is_refused():
+    with pytest.raises(ValueError, match="needs a reference that holds Gaussians"):
+        GaussianDecoderLayer()

@@ -1,41 +1,22 @@
 import pytest
 import torch
 
-from gsmap.models.decoders.map_decoder import MapDecoder, MapDecoderLayer, refine_reference
+import gsmap.registered  # noqa: F401
+from gsmap.models.decoders.map_decoder import MapDecoder, MapDecoderLayer
+from gsmap.models.heads.references import refine_reference
+
+SIZES = {"embed_dims": 8, "num_heads": 2, "num_points": 1, "ffn_dims": 16}
+LAYER = {**SIZES, "cross_attn": {"num_points": 2}}
 
 
-def test_refinement_moves_centres_before_the_sigmoid_and_adds_the_rest():
-    reference = torch.tensor([[0.5, 0.2, 1.0, -2.0, 0.3]])
-    offsets = torch.tensor([[0.0, 1.0, 0.5, 0.5, -0.3]])
-    logit = torch.logit(torch.tensor(0.2))
-    expected = torch.tensor([[0.5, torch.sigmoid(logit + 1.0), 1.5, -1.5, 0.0]])
-    torch.testing.assert_close(refine_reference(reference, offsets), expected)
-
-
-def test_refinement_at_the_border_stays_finite_and_has_a_gradient():
-    reference = torch.tensor([[0.0, 1.0]])
-    offsets = torch.zeros(1, 2, requires_grad=True)
-    refined = refine_reference(reference, offsets)
-    torch.testing.assert_close(refined, torch.tensor([[0.0, 1.0]]), atol=2e-5, rtol=0)
-    refined.sum().backward()
-    assert torch.isfinite(offsets.grad).all()
-    assert (offsets.grad > 0).all()
-
-
-def test_refinement_is_float32_under_mixed_precision():
-    refined = refine_reference(torch.rand(1, 2), torch.rand(1, 2, dtype=torch.bfloat16))
-    assert refined.dtype == torch.float32
-
-
-def test_refinement_refuses_other_shapes():
-    with pytest.raises(ValueError, match=r"offsets must have shape \(3, 2\) of reference"):
-        refine_reference(torch.rand(3, 2), torch.rand(3, 5))
-
-
-def small_decoder(num_layers=2):
+def small_decoder(num_layers=2, **settings):
     torch.manual_seed(0)
-    layer = {"embed_dims": 8, "num_heads": 2, "num_sampling_points": 2, "ffn_dims": 16}
-    return MapDecoder(layer, num_layers).eval()
+    return MapDecoder({"type": "MapDecoderLayer", **LAYER}, num_layers, **settings).eval()
+
+
+def stepping(steps):
+    """Return a refinement that moves the reference by given offsets."""
+    return lambda number, _, reference: refine_reference(reference, steps[number])
 
 
 def test_each_layer_refines_what_the_one_before_returned():
@@ -47,7 +28,7 @@ def test_each_layer_refines_what_the_one_before_returned():
         torch.randn(2, 6, 8),
         reference,
         torch.randn(2, 8, 5, 4),
-        lambda number, _: steps[number],
+        stepping(steps),
     )
     assert states.shape == (2, 2, 6, 8)
     first = refine_reference(reference, steps[0])
@@ -55,18 +36,19 @@ def test_each_layer_refines_what_the_one_before_returned():
     torch.testing.assert_close(references[1], refine_reference(first, steps[1]))
 
 
-def test_the_gradient_is_cut_between_layers():
-    decoder = small_decoder()
+@pytest.mark.parametrize("cut", [True, False])
+def test_the_gradient_between_layers_is_cut_or_not(cut):
+    decoder = small_decoder(**({} if cut else {"detach_reference": False}))
     steps = [torch.zeros(1, 6, 2, requires_grad=True) for _ in range(2)]
     _, references = decoder(
         torch.randn(1, 6, 8),
         torch.randn(1, 6, 8),
         torch.rand(1, 6, 2),
         torch.randn(1, 8, 5, 4),
-        lambda number, _: steps[number],
+        stepping(steps),
     )
     references[1].sum().backward()
-    assert not steps[0].grad.any()
+    assert (steps[0].grad is None or not steps[0].grad.any()) == cut
     assert steps[1].grad.abs().min() > 0
 
 
@@ -75,7 +57,7 @@ def test_a_masked_query_does_not_change_the_others():
     query, position = torch.randn(1, 6, 8), torch.randn(1, 6, 8)
     mask = torch.zeros(6, 6, dtype=torch.bool)
     mask[:5, 5] = True  # nobody looks at the last query
-    arguments = (torch.rand(1, 6, 2), torch.randn(1, 8, 5, 4), lambda *_: torch.zeros(1, 6, 2))
+    arguments = (torch.rand(1, 6, 2), torch.randn(1, 8, 5, 4), stepping([torch.zeros(1, 6, 2)]))
     before, _ = decoder(query, position, *arguments, mask)
     changed = query.clone()
     changed[:, 5] += 3.0
@@ -86,11 +68,22 @@ def test_a_masked_query_does_not_change_the_others():
 
 def test_a_layer_is_three_residual_blocks_with_norms_after():
     torch.manual_seed(0)
-    layer = MapDecoderLayer(embed_dims=8, num_heads=2, num_sampling_points=2, ffn_dims=16).eval()
+    layer = MapDecoderLayer(**LAYER).eval()
     query, position = torch.randn(1, 6, 8), torch.randn(1, 6, 8)
     reference, bev = torch.rand(1, 6, 2), torch.randn(1, 8, 5, 4)
-    key = query + position
-    x = layer.norms[0](query + layer.self_attn(key, key, query)[0])
+    x = layer.norms[0](layer.self_attn(query, position))
     x = layer.norms[1](x + layer.cross_attn(x + position, reference, bev))
     x = layer.norms[2](x + layer.ffn.layers(x))
     torch.testing.assert_close(layer(query, position, reference, bev), x)
+
+
+def test_a_layer_takes_its_attentions_as_parts():
+    decoupled = {"type": "DecoupledSelfAttention"}
+    layer = MapDecoderLayer(**{**LAYER, "num_points": 2}, self_attn=decoupled).train()
+    inputs = torch.randn(2, 1, 6, 8)
+    out = layer(*inputs, torch.rand(1, 6, 2), torch.randn(1, 8, 5, 4))
+    out.square().sum().backward()
+    assert type(layer.self_attn).__name__ == "DecoupledSelfAttention"
+    norms = [*layer.norms, layer.self_attn.norm]  # four, as MapTRv2 has
+    assert all(norm.weight.grad.abs().sum() > 0 for norm in norms)
+    assert layer.cross_attn.num_points == 2

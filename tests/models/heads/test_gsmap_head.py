@@ -1,45 +1,77 @@
 import pytest
 import torch
-from gsmap.models.decoders.gaussian_layer import GaussianDecoderLayer
-from head_cases import GAUSSIANS, HEAD, along_y, bev, build_head, elements, with_layer
-from mmengine.structures import InstanceData
+from head_cases import (
+    ALONG_X,
+    ALONG_Y,
+    GSMAP,
+    HEAD,
+    MASKS,
+    along_y,
+    bev,
+    build_head,
+    elements,
+    losses_of,
+    with_layer,
+)
 
+from gsmap.models.decoders.map_decoder import GaussianDecoderLayer
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.grid import BEVGrid
 
-MAPTR = {**HEAD, "num_instances": 6}
-RASTERS = {"raster_size": (40, 20), "cost_raster_size": (80, 40)}
-GSMAP = {**MAPTR, **GAUSSIANS, **RASTERS, "type": "GSMapHead"}
+SIX = {"query_groups": [{"num": 6}]}
+MAPTR, GSMAP = {**HEAD, **SIX}, {**GSMAP, **SIX}
+DECOUPLED = with_layer(HEAD, self_attn={"type": "DecoupledSelfAttention"})
 LANES = elements(((-3, -20), (-3, 20)), ((3, -20), (4, 20)), labels=[0, 2])
 EMPTY = elements()
 
 
-def test_with_maptr_weights_the_points_and_scores_are_maptrs_exactly():
-    maptr, gsmap_head = build_head(MAPTR).eval(), build_head(GSMAP).eval()
-    left = gsmap_head.load_state_dict(maptr.state_dict(), strict=False)
+@pytest.mark.parametrize("grid", [ALONG_Y, ALONG_X], ids=["forward y", "forward x"])
+@pytest.mark.parametrize("decoder", [HEAD["decoder"], DECOUPLED], ids=["MapTR", "MapTRv2"])
+def test_with_the_weights_of_another_head_its_points_and_scores_are_exactly_the_same(decoder, grid):
+    settings = {"decoder": decoder, "grid": grid}
+    other, gsmap_head = build_head(MAPTR, **settings).eval(), build_head(GSMAP, **settings).eval()
+    for parameter in other.parameters():  # as if trained: no sampling offset is a round number
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    left = gsmap_head.load_state_dict(other.state_dict(), strict=False)
     assert not left.unexpected_keys
-    assert all("gaussian_" in key for key in left.missing_keys)
-    expected, actual = maptr(bev()), gsmap_head(bev())
+    parts = ("reference.gaussian_init.", "reference.gaussian_branches.", ".guidance.embedding.")
+    assert all(any(part in key for part in parts) for key in left.missing_keys)
+    expected, actual = other(bev()), gsmap_head(bev())
     assert torch.equal(actual["all_pts_preds"], expected["all_pts_preds"])
     assert torch.equal(actual["all_cls_scores"], expected["all_cls_scores"])
 
 
 def test_the_guided_attention_is_as_large_as_maptrs_and_drops_as_much():
     decoder = with_layer(MAPTR, dropout=0.25)
-    plain = build_head(MAPTR, decoder=decoder).decoder.layers[0].cross_attn
-    guided = build_head(GSMAP, decoder=decoder).decoder.layers[0].cross_attn
-    assert type(guided) is not type(plain)
+    layers = [build_head(c, decoder=decoder).decoder.layers[0] for c in (MAPTR, GSMAP)]
+    assert [type(layer.guidance).__name__ for layer in layers] == ["NoneType", "GaussianGuidance"]
+    plain, guided = (layer.cross_attn for layer in layers)
     assert guided.dropout.p == plain.dropout.p == 0.25
     shapes = [{k: v.shape for k, v in part.state_dict().items()} for part in (plain, guided)]
     assert shapes[0] == shapes[1]
 
 
+def test_the_older_form_of_a_gsmap_config_builds_the_same_head():
+    """The README's lines name every part; the head's own defaults are these."""
+    older = build_head(
+        GSMAP,
+        decoder=with_layer(HEAD, type="GaussianDecoderLayer"),
+        loss_raster={"type": "RasterLoss", "loss_weight": 10.0},
+        iou_cost={"type": "IoUCost", "weight": 2.0},
+    )
+    short = build_head(GSMAP)
+    assert repr(older) == repr(short)
+    expected, losses = losses_of(short, LANES), losses_of(older, LANES)
+    assert losses.keys() == expected.keys()
+    assert all(torch.equal(losses[name], expected[name]) for name in losses)
+
+
 def test_every_parameter_learns():
     head = build_head(GSMAP)
     for step in range(2):  # what feeds a matrix of zeros learns from the second step on
-        losses = head.loss_by_feat(head(bev(2)), [LANES, EMPTY], [{}, {}])
+        losses = losses_of(head, LANES, EMPTY)
         head.zero_grad()
-        sum(losses.values()).backward()
+        sum(value for name, value in losses.items() if "loss" in name).backward()
         with torch.no_grad():
             for parameter in head.parameters():
                 parameter -= 1e-3 * parameter.grad if step == 0 else 0
@@ -48,13 +80,12 @@ def test_every_parameter_learns():
 
 
 def test_each_layer_has_its_raster_loss_or_only_the_last():
-    every, last = build_head(GSMAP), build_head(GSMAP, raster_layers="last")
-    outputs = every(bev())
+    every = build_head(GSMAP)
+    last = build_head(GSMAP, loss_raster={"type": "RasterLoss", "last_layer_only": True})
     names = {"loss_cls", "loss_pts", "loss_dir", "loss_raster"}
-    assert set(every.loss_by_feat(outputs, [LANES], [{}])) == names | {f"d0.{n}" for n in names}
-    losses = last.loss_by_feat(outputs, [LANES], [{}])
-    assert "loss_raster" in losses
-    assert "d0.loss_raster" not in losses
+    found = {name for name in losses_of(every, LANES) if "loss" in name}
+    assert found == names | {f"d0.{name}" for name in names}
+    assert found - set(losses_of(last, LANES)) == {"d0.loss_raster"}
 
 
 def perfect_outputs(head, gt, scales=(0.0, 0.0), rotation=0.0):
@@ -76,8 +107,8 @@ def perfect_outputs(head, gt, scales=(0.0, 0.0), rotation=0.0):
 def test_a_band_along_the_line_has_a_smaller_raster_loss_than_one_across_it():
     head = build_head(GSMAP)
     lane = elements(((-3, -20), (-3, 20)))
-    along = head.loss_by_feat(perfect_outputs(head, lane, scales=(0.0, 3.0)), [lane], [{}])
-    across = head.loss_by_feat(perfect_outputs(head, lane, scales=(3.0, 0.0)), [lane], [{}])
+    along = head.loss_by_feat(perfect_outputs(head, lane, scales=(3.0, 0.0)), [lane], [{}])
+    across = head.loss_by_feat(perfect_outputs(head, lane, scales=(0.0, 3.0)), [lane], [{}])
     assert along["loss_pts"] < 1e-5
     assert along["loss_raster"] < 0.6 * across["loss_raster"]
 
@@ -99,9 +130,9 @@ def test_matching_reads_the_rendered_masks():
     lane = elements(((-3, -20), (-3, 20)))
     outputs = perfect_outputs(head, lane)
     references = outputs["all_references"].detach().clone()
-    references[-1, 0, 0, :, 2:] = torch.tensor([3.0, 0.0, 0.0])
+    references[-1, 0, 0, :, 2:] = torch.tensor([0.0, 3.0, 0.0])
     references[-1, 0, 1] = references[-1, 0, 0]
-    references[-1, 0, 1, :, 2:] = torch.tensor([0.0, 3.0, 0.0])
+    references[-1, 0, 1, :, 2:] = torch.tensor([3.0, 0.0, 0.0])
     outputs["all_references"], outputs["all_pts_preds"] = references, references[..., :2]
     outputs["all_cls_scores"][-1, 0, 1] = outputs["all_cls_scores"][-1, 0, 0]
     predictions = head.layer_predictions(outputs, 1)
@@ -130,32 +161,25 @@ def test_the_rendered_mask_is_that_of_the_predicted_gaussians():
     grid = BEVGrid((-15, 15), (-30, 30), 40, 20)
     expected = render_gaussians(result.pts, result.scales, result.rotations, grid, "reference")
     order = outputs["all_cls_scores"][-1, 0].sigmoid().flatten().topk(len(result)).indices // 3
-    actual = head.render(outputs["all_references"][-1, 0], head.raster_grid)[order]
+    gaussians = head.reference.gaussians(outputs["all_references"][-1, 0])
+    actual = head.masks.render(gaussians, head.masks.grid)[order]
     torch.testing.assert_close(actual, expected, atol=1e-5, rtol=0)
 
 
 def test_no_ground_truth_gives_only_a_classification_loss():
     head = build_head(GSMAP)
-    losses = head.loss_by_feat(head(bev()), [EMPTY], [{}])
+    losses = losses_of(head, EMPTY)
     assert losses["loss_cls"] > 0
     assert losses["loss_raster"] == losses["loss_pts"] == losses["loss_dir"] == 0
-    sum(losses.values()).backward()
+    sum(value for name, value in losses.items() if "loss" in name).backward()
 
 
 def test_more_ground_truth_than_queries_is_matched_as_far_as_it_goes():
     head = build_head(GSMAP)
     crowd = elements(*along_y(*range(-9, 9, 2)))
-    losses = head.loss_by_feat(head(bev()), [crowd], [{}])
+    losses = losses_of(head, crowd)
     assert all(torch.isfinite(loss) for loss in losses.values())
     assert losses["loss_raster"] > 0
-
-
-def test_filled_classes_have_filled_masks():
-    square = torch.tensor([[[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-4, -4]]])
-    gt = InstanceData(labels_3d=torch.tensor([1]), pts=square, pts_shifts=square[:, None])
-    hollow, filled = build_head(GSMAP), build_head(GSMAP, filled_classes=(1,))
-    assert hollow.prepare_gt(gt).masks[0, 20, 10] == 0
-    assert filled.prepare_gt(gt).masks[0, 20, 10] == 1
 
 
 @pytest.mark.parametrize("part", ["guide_sampling", "embed_gaussians"])
@@ -163,11 +187,11 @@ def test_parts_of_the_guided_layer_switch_off_by_themselves(part):
     decoder = with_layer(GSMAP, **{part: False})
     head, full = build_head(GSMAP, decoder=decoder), build_head(GSMAP)
     for changed in (head, full):  # Gaussians that are not the first ones any more
-        torch.nn.init.constant_(changed.gaussian_init.bias, 0.5)
+        torch.nn.init.constant_(changed.reference.gaussian_init.bias, 0.5)
     layer = full.decoder.layers[0]
     if part == "embed_gaussians":
-        torch.nn.init.constant_(layer.gaussian_embedding[-1].bias, 0.5)
-        assert head.decoder.layers[0].gaussian_embedding is None
+        torch.nn.init.constant_(layer.guidance.embedding[-1].bias, 0.5)
+        assert head.decoder.layers[0].guidance.embedding is None
     assert isinstance(head.decoder.layers[0], GaussianDecoderLayer)
     weights = {k: v for k, v in full.state_dict().items() if k in head.state_dict()}
     head.load_state_dict(weights)
@@ -176,9 +200,48 @@ def test_parts_of_the_guided_layer_switch_off_by_themselves(part):
 
 def test_a_plain_layer_may_stand_under_the_head():
     head = build_head(GSMAP, decoder=with_layer(GSMAP, type="MapDecoderLayer"))
-    assert "loss_raster" in head.loss_by_feat(head(bev()), [LANES], [{}])
+    assert head.decoder.layers[0].guidance is None
+    assert "loss_raster" in losses_of(head, LANES)
 
 
-def test_unknown_raster_layers_are_refused():
-    with pytest.raises(ValueError, match="raster_layers must be 'all' or 'last', got 'first'"):
-        build_head(GSMAP, raster_layers="first")
+def test_gaussians_of_the_queries_that_predict_are_returned():
+    groups = [{"num": 6}, {"name": "one2many", "num": 4, "repeats": 2}]
+    head = build_head(GSMAP, query_groups=groups, decoder=DECOUPLED).eval()
+    (result,) = head.predict_by_feat(head(bev()), [{}])
+    assert result.scales.shape == result.pts.shape
+    assert result.rotations.shape == result.pts.shape[:2]
+
+
+def test_the_log_says_how_the_gaussians_of_each_class_live():
+    losses = losses_of(build_head(GSMAP), LANES)
+    figures = {name for name in losses if "loss" not in name}
+    kinds = ("soft_iou", "sigma_along", "sigma_across")
+    expected = {f"{kind}/{name}" for kind in kinds for name in ("divider", "boundary")}
+    assert figures == expected | {"at_floor"}
+    assert losses["sigma_along/divider"] == pytest.approx(1.0, abs=0.3)
+    assert not losses["soft_iou/divider"].requires_grad
+    assert not {name for name in losses_of(build_head(GSMAP), EMPTY) if "loss" not in name}
+
+
+def test_without_either_mask_nothing_is_drawn_or_rendered(monkeypatch):
+    head = build_head(GSMAP, loss_raster=None, iou_cost=None)
+    for name in ("draw", "render"):
+        monkeypatch.setattr(head.masks, name, lambda *_: pytest.fail("a mask was made"))
+    losses = losses_of(head, LANES)
+    assert set(losses) == {f"{p}loss_{n}" for p in ("", "d0.") for n in ("cls", "pts", "dir")}
+
+
+def test_the_smallest_gaussian_is_half_a_pixel_of_the_masks():
+    assert (
+        build_head(GSMAP, masks={"pixel_m": 0.3}, reference=None).reference.space.min_scale_m
+        == 0.15
+    )
+    assert (
+        build_head(GSMAP, masks={"pixel_m": 0.6}, reference=None).reference.space.min_scale_m == 0.3
+    )
+    oblong = build_head(GSMAP, masks={"pixel_m": (0.3, 0.5)}, reference=None)
+    assert oblong.reference.space.min_scale_m == 0.25
+    own = build_head(GSMAP, masks={"pixel_m": 0.3}, reference={"min_scale_m": 0.2})
+    assert own.reference.space.min_scale_m == 0.2
+    with pytest.raises(ValueError, match=r"min_scale_m < init_scales_m .* got 0.75, "):
+        build_head(GSMAP, masks=MASKS, reference={"init_scales_m": (1.0, 0.4)})

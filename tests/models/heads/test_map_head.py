@@ -2,10 +2,15 @@ import math
 
 import pytest
 import torch
+from mmdet3d.registry import MODELS
 from mmengine.structures import InstanceData
-from model_cases import build_small, straight_elements
+from model_cases import build_small, small_config, straight_elements
+from torch import nn
+
+from gsmap.models.decoders.map_decoder import MapDecoder
 
 LINE = ((-6.0, -12.0), (6.0, 12.0))
+NUM = 8  # queries
 
 
 @pytest.fixture(scope="module")
@@ -15,10 +20,10 @@ def head():
 
 def outputs_with(pts_m, head, scores=None, layers=1):
     """Return a head's outputs in which the first queries predict given points in metres."""
-    pts = torch.full((layers, 1, head.num_instances, 20, 2), 0.99)
+    pts = torch.full((layers, 1, NUM, 20, 2), 0.99)
     pts[:, 0, : len(pts_m)] = head.grid.norm_from_metres(pts_m)
     if scores is None:
-        scores = torch.zeros(layers, 1, head.num_instances, 3)
+        scores = torch.zeros(layers, 1, NUM, 3)
     return {"all_cls_scores": scores, "all_pts_preds": pts, "all_references": pts}
 
 
@@ -37,7 +42,7 @@ def test_losses_by_hand(head):
     losses = head.loss_by_feat(outputs_with(predicted[None], head), [gt], [{}])
     assert losses["loss_pts"].item() == pytest.approx(5 * 20 * 0.05, rel=1e-4)
     assert losses["loss_dir"].item() == pytest.approx(0.0, abs=1e-6)
-    entries = head.num_instances * 3
+    entries = NUM * 3
     expected = 2 * (focal(0, True) + (entries - 1) * focal(0, False))
     assert losses["loss_cls"].item() == pytest.approx(expected, rel=1e-5)
 
@@ -58,7 +63,7 @@ def test_the_divisor_is_the_number_of_matched_elements_in_the_batch(head):
     targets = head.get_targets(head.layer_predictions(both, 0), gts, [{}, {}])
     assert targets.avg_factor.item() == 4.0
     assert targets.pts.shape == (4, 20, 2)
-    assert (targets.labels[: head.num_instances] < 3).sum() == 1
+    assert (targets.labels[:NUM] < 3).sum() == 1
 
 
 def test_only_the_last_layer_has_plain_names(head):
@@ -74,7 +79,7 @@ def test_only_the_last_layer_has_plain_names(head):
 def test_no_element_leaves_the_class_loss_alone(head):
     outputs = outputs_with(torch.zeros(0, 20, 2), head)
     losses = head.loss_by_feat(outputs, [straight_elements()], [{}])
-    expected = 2 * head.num_instances * 3 * focal(0, False)
+    expected = 2 * NUM * 3 * focal(0, False)
     assert losses["loss_cls"].item() == pytest.approx(expected, rel=1e-5)
     assert losses["loss_pts"].item() == losses["loss_dir"].item() == 0.0
 
@@ -101,41 +106,60 @@ def test_every_class_starts_improbable():
     torch.testing.assert_close(bias.sigmoid(), torch.full((3,), 0.01))
 
 
-def test_a_subclass_can_add_what_costs_and_losses_read(head):
-    """The hooks that GSMap uses: fields before the matching, a loss after it."""
-    base = type(head)
+@MODELS.register_module()
+class QueryNumberLoss(nn.Module):
+    """Adds what a decoder calls ``number`` of the matched queries, and their ground truths."""
 
-    class WithLengths(base):
-        def prepare_gt(self, gt_instances):
-            gt = super().prepare_gt(gt_instances)
-            gt.weight = torch.full((len(gt.labels),), 7.0)
-            return gt
+    name = "new"
+    reads = ("pred.number", "gt.labels", "gt.samples")
 
-        def layer_predictions(self, outputs, layer):
-            predictions = super().layer_predictions(outputs, layer)
-            for prediction in predictions:
-                prediction.number = torch.arange(len(prediction.scores))
-            return predictions
+    def forward(self, numbers, labels, samples, avg_factor):
+        return (numbers + 10 * labels + 100 * samples).sum() / avg_factor
 
-        def matched_losses(self, predictions, gts, targets):
-            losses = super().matched_losses(predictions, gts, targets)
-            query = predictions[0].number[targets.matches[0].query_inds]
-            losses["loss_new"] = gts[0].weight[targets.matches[0].gt_inds].sum() + query.sum()
-            return losses
 
-    gt = straight_elements(LINE)
-    far, near = gt.pts + 5, gt.pts
-    head.__class__ = WithLengths
-    try:
-        losses = head.loss_by_feat(outputs_with(torch.cat([far, near]), head), [gt], [{}])
-    finally:
-        head.__class__ = base
-    assert losses["loss_new"].item() == 8.0  # 7 + query 1
+@MODELS.register_module()
+class NumberingDecoder(MapDecoder):
+    """A decoder with one field more."""
+
+    fields = ("number",)
+
+
+def test_a_loss_reads_what_a_decoder_adds_of_the_matched_pairs():
+    head = small_config().map_head
+    head.decoder.type = "NumberingDecoder"
+    head.losses = [{"type": "QueryNumberLoss"}]
+    head = build_small(map_head=head).map_head
+    gt = straight_elements(LINE, labels=[2])
+    outputs = outputs_with(torch.cat([gt.pts + 5, gt.pts]), head)
+    outputs = {name: value.expand(-1, 2, *value.shape[2:]) for name, value in outputs.items()}
+    outputs["all_number"] = torch.arange(NUM).expand(1, 2, NUM)
+    losses = head.loss_by_feat(outputs, [gt, gt], [{}, {}])
+    assert losses["loss_new"].item() == (21 + 121) / 2  # query 1, class 2, in both samples
+    assert "loss_pts" not in losses
+
+
+def test_the_class_loss_needs_no_compiled_op(head, monkeypatch):
+    def refuse(*_, **__):
+        raise RuntimeError("mmcv was built without CUDA")
+
+    monkeypatch.setattr("mmdet.models.losses.focal_loss.sigmoid_focal_loss", refuse)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)  # where mmdet would call it
+    gt = straight_elements(LINE, labels=[1])
+    scores = torch.full((1, 1, NUM, 3), 0.3)
+    losses = head.loss_by_feat(outputs_with(gt.pts, head, scores), [gt], [{}])
+    expected = 2 * (focal(0.3, True) + (NUM * 3 - 1) * focal(0.3, False))
+    assert losses["loss_cls"].item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_head_gets_grid_and_classes_from_the_detector(head):
+    assert head.grid.extent_m == head.coder.grid.extent_m == (30.0, 60.0)
+    assert head.masks.grid.extent_m == (30.0, 60.0)
+    assert len(head.classes) == head.cls_branches[0][-1].out_features == 3
 
 
 def test_predictions_are_instance_data_in_metres(head):
     gt = straight_elements(LINE)
-    scores = torch.full((1, 1, head.num_instances, 3), -5.0)
+    scores = torch.full((1, 1, NUM, 3), -5.0)
     scores[0, 0, 0, 1] = 3.0
     (found,) = head.predict_by_feat(outputs_with(gt.pts, head, scores), [{}])
     assert isinstance(found, InstanceData)

@@ -15,7 +15,7 @@ def gaussian_statistics(
     masks: Tensor,
     labels: Tensor,
     class_names: Sequence[str],
-    min_scale_m: float,
+    floor_m: float,
 ) -> dict[str, Tensor]:
     """Summarise matched elements by class; a class without one is left out.
 
@@ -25,7 +25,7 @@ def gaussian_statistics(
         masks: Masks of their ground truths. (M, H, W)
         labels: Classes of their ground truths. (M,)
         class_names: Names of the classes.
-        min_scale_m: Smallest sigma in metres.
+        floor_m: Smallest sigma in metres.
 
     Returns:
         Per class ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>``
@@ -45,6 +45,6 @@ def gaussian_statistics(
             along, across = extents[chosen].flatten(0, 1).median(0).values
             figures[f"soft_iou/{name}"] = iou[chosen].mean()
             figures[f"sigma_along/{name}"], figures[f"sigma_across/{name}"] = along, across
-    floor = (gaussians.scales < AT_FLOOR * min_scale_m).all(-1)
+    floor = (gaussians.scales < AT_FLOOR * floor_m).all(-1)
     figures["at_floor"] = floor.float().mean()
     return figures

@@ -12,8 +12,16 @@ from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
 from gsmap.models.heads.masks import ElementMasks
-from gsmap.models.heads.matched import GT_FIELDS, MapTargets, MatchedPairs, collect_targets
+from gsmap.models.heads.matched import (
+    AFTER_MATCHING,
+    GT_FIELDS,
+    MapTargets,
+    MatchedPairs,
+    collect_targets,
+)
+from gsmap.models.heads.parts import by_name, fields_read, refuse_twins, refuse_unknown_losses
 from gsmap.models.heads.query_groups import QueryGroup, fit_instance_queries, group_mask
+from gsmap.models.layers.branches import classification_branch
 from gsmap.models.layers.deformable_attention import init_matrices
 from gsmap.models.task_modules.map_assigner import MapAssigner
 from gsmap.models.task_modules.map_coder import MapCoder
@@ -95,65 +103,51 @@ class MapHead(BaseModule):
                 **self.reference_settings(reference or {}),
             }
         )
-        self.decoder = MODELS.build(
-            {
-                "type": "MapDecoder",
-                "embed_dims": embed_dims,
-                "num_points": num_points,
-                "space": getattr(self.reference, "space", None),
-                **decoder,
-                "layer": {"type": self.default_layer, **decoder.get("layer", {})},
-            }
-        )
+        self.decoder = self.build_decoder(decoder)
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
         self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
         self.cls_branches = nn.ModuleList(
-            self.build_cls_branch(num_reg_layers) for _ in range(num_layers)
+            classification_branch(embed_dims, num_reg_layers, len(self.classes))
+            for _ in range(num_layers)
         )
         self.loss_cls = MODELS.build(loss_cls)
-        self.losses = nn.ModuleDict(_by_name([MODELS.build(loss) for loss in losses]))
+        self.losses = nn.ModuleDict(by_name([MODELS.build(loss) for loss in losses]))
         self.aux_heads = nn.ModuleDict(
-            _by_name([MODELS.build({"embed_dims": embed_dims, **head}) for head in aux_heads])
+            by_name([MODELS.build({"embed_dims": embed_dims, **head}) for head in aux_heads])
         )
         self.assigner = MapAssigner(match_costs)
         self.coder = MapCoder(grid=grid, **(coder or {}))
-        self._check_parts()
+        self._reads = self._check_parts()
 
     def reference_settings(self, reference: PARTS) -> PARTS:
         """Return the reference's settings, with what this head knows better than the defaults."""
         return reference
 
-    def build_cls_branch(self, num_hidden: int) -> nn.Sequential:
-        """Return one layer's classifier: hidden layers with LayerNorm, then logits."""
-        layers: list[nn.Module] = []
-        for _ in range(num_hidden):
-            layers += [
-                nn.Linear(self.embed_dims, self.embed_dims),
-                nn.LayerNorm(self.embed_dims),
-                nn.ReLU(True),
-            ]
-        return nn.Sequential(*layers, nn.Linear(self.embed_dims, len(self.classes)))
+    def build_decoder(self, decoder: PARTS) -> nn.Module:
+        """Return the decoder; what the head knows is handed on to its layers."""
+        return MODELS.build(
+            {
+                "type": "MapDecoder",
+                "embed_dims": self.embed_dims,
+                "num_points": self.num_points,
+                "space": getattr(self.reference, "space", None),
+                **decoder,
+                "layer": {"type": self.default_layer, **decoder.get("layer", {})},
+            }
+        )
 
-    def _check_parts(self) -> None:
-        """Refuse a part that reads what nothing offers, and a group's loss that does not exist."""
+    def _check_parts(self) -> set[str]:
+        """Refuse parts that do not fit together; return the fields that they read."""
         pred = {"scores", *self.reference.fields, *getattr(self.decoder, "fields", ())}
         offered = {f"pred.{name}" for name in pred} | {f"gt.{name}" for name in GT_FIELDS}
-        parts = [*self.losses.values(), *self.assigner.match_costs]
-        for part in parts:
-            missing = sorted(set(getattr(part, "reads", ())) - offered)
-            if missing:
-                raise ValueError(
-                    f"{type(part).__name__} reads {missing}, which neither "
-                    f"{type(self.reference).__name__} nor the decoder nor the ground truth offers."
-                )
-        self._reads = {field for part in parts for field in getattr(part, "reads", ())}
-        for group in self.query_groups:
-            unknown = sorted(set(group.losses or ()) - {"cls", *self.losses})
-            if unknown:
-                raise ValueError(
-                    f"query group {group.name!r} names losses {unknown}; there are "
-                    f"{['cls', *self.losses]}."
-                )
+        where = f"{type(self.reference).__name__}, the decoder and the ground truth"
+        names = ["cls", *self.losses]
+        refuse_twins(names, "losses")
+        refuse_twins([group.name for group in self.query_groups], "query groups")
+        refuse_unknown_losses(self.query_groups, names)
+        costs = self.assigner.match_costs
+        read = fields_read(costs, offered - AFTER_MATCHING, f"before the matching, {where}")
+        return read | fields_read(self.losses.values(), offered, where)
 
     def init_weights(self) -> None:
         """Initialise the decoder's matrices (Xavier) and let every class start improbable."""
@@ -401,15 +395,3 @@ class MapHead(BaseModule):
             chosen.update(scores_3d=best.scores, labels_3d=best.labels)
             results.append(InstanceData(metainfo=self.reference.metainfo, **chosen))
         return results
-
-
-def _by_name(modules: Sequence[nn.Module]) -> dict[str, nn.Module]:
-    """Return modules by their ``name``.
-
-    Raises:
-        ValueError: If two have the same.
-    """
-    named = {str(module.name): module for module in modules}
-    if len(named) < len(modules):
-        raise ValueError(f"two parts have one name: {[module.name for module in modules]}.")
-    return named

@@ -19,8 +19,9 @@ class ElementMasks:
 
     Args:
         grid: The map's extent.
-        pixel_m: Side of a pixel of the losses' masks in metres, or its sizes along x and y.
-        cost_pixel_m: The same for matching.
+        pixel_m: Side of a pixel of the losses' masks in metres, or its sizes along x and y; by
+            default a 200th of the map's longer side, 0.3 m for 60 m.
+        cost_pixel_m: The same for matching; by default a 128th.
         line_width_m: Width of a line in the ground-truth mask, in metres.
         filled_classes: Classes whose ground-truth mask is filled; the others are bands.
         source: ``"full"``: the ground truth is drawn at full resolution; ``"points"``: by its P
@@ -33,16 +34,17 @@ class ElementMasks:
     def __init__(
         self,
         grid: BEVGrid,
-        pixel_m: float | Sequence[float] = 0.3,
-        cost_pixel_m: float | Sequence[float] = 0.46875,
+        pixel_m: float | Sequence[float] | None = None,
+        cost_pixel_m: float | Sequence[float] | None = None,
         line_width_m: float = 0.75,
         filled_classes: Sequence[int] = (),
         source: str = "full",
     ) -> None:
         if source not in SOURCES:
             raise ValueError(f"source must be one of {SOURCES}, got {source!r}.")
-        self.grid = grid.rasterized(pixel_m)
-        self.cost_grid = grid.rasterized(cost_pixel_m)
+        longer_m = max(grid.extent_m)
+        self.grid = grid.rasterized(pixel_m or longer_m / 200)
+        self.cost_grid = grid.rasterized(cost_pixel_m or longer_m / 128)
         self.line_width_m = line_width_m
         self.filled_classes = tuple(filled_classes)
         self.source = source

@@ -15,6 +15,10 @@ from gsmap.models.task_modules.map_assigner import MapMatch
 GT_FIELDS = (
     "labels", "pts", "pts_m", "pts_shifts", "first_pts", "masks", "rasters", "samples"
 )  # fmt: skip
+# what only matched pairs have: a loss may read it, a matching cost may not
+AFTER_MATCHING = frozenset(
+    {"pred.pts_m", "pred.masks", "gt.pts", "gt.pts_m", "gt.masks", "gt.samples"}
+)
 
 
 @dataclass

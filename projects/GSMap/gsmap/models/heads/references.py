@@ -9,6 +9,7 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule, constant_init, xavier_init
 from torch import Tensor, nn
 
+from gsmap.models.layers.branches import regression_branch
 from gsmap.models.layers.deformable_attention import at_least_float32
 from gsmap.structures.gaussians import Gaussians, GaussianSpace
 from gsmap.structures.grid import BEVGrid
@@ -39,14 +40,6 @@ def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Ten
     reference, offsets = at_least_float32(reference), at_least_float32(offsets)
     points = inverse_sigmoid(reference[..., :coords], eps=1e-5) + offsets[..., :coords]
     return torch.cat([points.sigmoid(), reference[..., coords:] + offsets[..., coords:]], -1)
-
-
-def regression_branch(embed_dims: int, num_layers: int, out_dims: int) -> nn.Sequential:
-    """Return a regressor of ``out_dims`` numbers with ``num_layers`` hidden layers."""
-    layers: list[nn.Module] = []
-    for _ in range(num_layers):
-        layers += [nn.Linear(embed_dims, embed_dims), nn.ReLU(True)]
-    return nn.Sequential(*layers, nn.Linear(embed_dims, out_dims))
 
 
 @MODELS.register_module()
@@ -92,7 +85,7 @@ class PointReference(BaseModule):
     @property
     def fields(self) -> frozenset[str]:
         """Names of what a loss or a cost may read of a prediction."""
-        return frozenset({"pts", "pts_m"})
+        return frozenset({"pts", "pts_m", "references"})
 
     @property
     def metainfo(self) -> dict[str, float]:
@@ -182,7 +175,7 @@ class GaussianReference(PointReference):
     @property
     def fields(self) -> frozenset[str]:
         """Names of what a loss or a cost may read of a prediction."""
-        return super().fields | {"gaussians", "masks", "rasters"}
+        return super().fields | {"masks", "rasters"}
 
     @property
     def metainfo(self) -> dict[str, float]:

@@ -109,7 +109,9 @@ class MaskOverlapLoss(nn.Module):
     def forward(
         self, preds: Tensor, targets: Tensor, avg_factor: float | Tensor | None = None
     ) -> Tensor:
-        """Return the weighted loss. 2 x (n, H, W) -> ()"""
+        """Return the weighted loss, 0 if nothing is matched. 2 x (n, H, W) -> ()"""
+        if not len(preds):
+            return preds.float().sum() * 0
         if self.kind == "dice":
             losses = dice_loss(preds, targets)
         else:
