@@ -14,14 +14,17 @@ from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
 
 import gsmap.registered  # noqa: F401
+from gsmap.checkpoints.strict import neutral_keys
 from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.engine.launch import check_config
+from gsmap.structures.grid import BEVGrid
 
 REPO = Path(__file__).resolve().parents[1]
+BASELINES = REPO / "configs"
 LEAVES = sorted(
     path
-    for folder in (REPO / "configs", REPO / "projects/GSMap/configs")
+    for folder in (BASELINES, REPO / "projects/GSMap/configs")
     for path in folder.rglob("*.py")
     if "_base_" not in path.parts
 )
@@ -43,19 +46,50 @@ def test_a_leaf_is_short_and_passes_the_checks_of_the_tools(path):
 @names
 def test_data_and_model_agree(path):
     cfg = load(path)
-    head = cfg.model.map_head
+    assert cfg.model.grid == cfg.grid  # the one place
+    assert cfg.model.classes == cfg.classes
     for part in ("train", "val", "test"):
         dataset = cfg[f"{part}_dataloader"].dataset
-        assert len(dataset.classes) == head.num_classes
-        assert (
-            dataset.pc_range[:2] + dataset.pc_range[3:5] == head.pc_range[:2] + head.pc_range[3:5]
-        )
-    encoder = cfg.model.bev_encoder or cfg.model.lidar_encoder
-    if "bev_size" in encoder:  # rows lie along y, columns along x
-        x_extent, y_extent = (head.pc_range[3 + i] - head.pc_range[i] for i in range(2))
-        rows, cols = encoder.bev_size
-        assert rows * x_extent == cols * y_extent
+        assert dataset.grid == cfg.grid
+        assert dataset.classes == cfg.classes
     assert METRICS.build(cfg.test_evaluator).eval == ("chamfer", "raster")
+
+
+@names
+def test_the_auxiliary_bev_mask_is_as_large_as_the_bev_features(path):
+    cfg = load(path)
+    heads = {head.type for head in cfg.model.map_head.get("aux_heads", [])}
+    steps = {step.type: step for step in cfg.train_dataloader.dataset.pipeline}
+    assert ("BEVMaskHead" in heads) <= ("MakeBEVMask" in steps)
+    assert ("PVMaskHead" in heads) == ("MakePVMask" in steps)
+    assert ("DepthSupervision" in heads) == ("MakeDepthMap" in steps)
+    if "BEVMaskHead" in heads:
+        cells = BEVGrid(**cfg.grid).rasterized(cfg.model.bev_encoder.bev_pixel_m)
+        assert tuple(steps["MakeBEVMask"].size) == (cells.height, cells.width)
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in LEAVES if path.is_relative_to(BASELINES)], ids=lambda p: p.stem
+)
+def test_one_word_makes_a_gsmap_of_any_config(path):
+    cfg, swapped = load(path), load(path)
+    swapped.merge_from_dict({"model.map_head.type": "GSMapHead"})
+    shared = {"grid": BEVGrid(**cfg.grid), "classes": cfg.classes}
+    plain, gsmap_head = (MODELS.build({**shared, **c.model.map_head}) for c in (cfg, swapped))
+    assert list(gsmap_head.losses) == [*plain.losses, "raster"]
+    assert len(gsmap_head.assigner.match_costs) == len(plain.assigner.match_costs) + 1
+    assert gsmap_head.query_groups == plain.query_groups
+    assert list(gsmap_head.aux_heads) == list(plain.aux_heads)
+    layers = gsmap_head.decoder.layers, plain.decoder.layers
+    for guided, layer in zip(*layers, strict=True):
+        assert guided.guidance is not None
+        assert type(guided.self_attn) is type(layer.self_attn)
+        assert type(guided.cross_attn) is type(layer.cross_attn)
+    neutral = set(gsmap_head.state_dict()) - set(plain.state_dict())
+    assert set(plain.state_dict()) <= set(gsmap_head.state_dict())
+    assert neutral == neutral_keys(gsmap_head)
+    half_pixel = gsmap_head.masks.half_pixel_m
+    assert gsmap_head.reference.space.min_scale_m == half_pixel
 
 
 def small(cfg: Config) -> Config:
@@ -78,13 +112,12 @@ def annotations(minicity_root: Path, tmp_path_factory) -> Callable[[ConfigDict],
     folders: dict[tuple, Path] = {}
 
     def find(dataset: ConfigDict) -> Path:
-        x0, y0, _, x1, y1, _ = dataset.pc_range
-        wanted = (x0, x1), (y0, y1), tuple(dataset.classes)
+        x_range, y_range = tuple(dataset.grid.x_range), tuple(dataset.grid.y_range)
+        wanted = x_range, y_range, tuple(dataset.classes)
         if wanted not in folders:
             folders[wanted] = tmp_path_factory.mktemp("annotations")
-            x_range, y_range, classes = wanted
             options = NuScenesOptions(minicity_root, "v1.0-trainval", folders[wanted], "minicity")
-            convert_nuscenes(replace(options, x_range=x_range, y_range=y_range, classes=classes))
+            convert_nuscenes(replace(options, x_range=x_range, y_range=y_range, classes=wanted[2]))
         return folders[wanted] / f"gsmap_minicity_{dataset.split}.arrow"
 
     return find
@@ -103,6 +136,24 @@ def check_gradients(model: torch.nn.Module, losses: dict[str, torch.Tensor]) -> 
     gradients = [p.grad for p in model.parameters() if p.grad is not None]
     assert all(torch.isfinite(gradient).all() for gradient in gradients)
     assert sum(float(gradient.abs().sum()) for gradient in gradients) > 0
+
+
+SWAPPED = [path for path in LEAVES if path.is_relative_to(BASELINES) and "minicity" in path.stem]
+
+
+@pytest.mark.parametrize("path", SWAPPED, ids=lambda path: path.stem)
+def test_the_gsmap_of_one_word_trains_a_step(path, minicity_root, annotations):
+    cfg = small(load(path))
+    cfg.merge_from_dict({"model.map_head.type": "GSMapHead"})
+    train = cfg.train_dataloader.dataset
+    on_minicity(train, minicity_root, annotations)
+    model = MODELS.build(cfg.model)
+    model.init_weights()
+    batch = pseudo_collate([DATASETS.build(train)[0]])
+    losses = model.train()(**model.data_preprocessor(batch, True), mode="loss")
+    assert losses["loss_raster"] > 0
+    assert "at_floor" in losses
+    check_gradients(model, losses)
 
 
 @names
@@ -140,7 +191,7 @@ def test_one_step_of_training_and_testing(path, minicity_root, annotations):
     for name in test.classes:  # AP_raster leaves out what the ground truth does not have
         assert 0 <= figures[f"chamfer/{name}/AP"] <= 1
     predicted = samples[0].pred_instances_3d
-    assert predicted.pts.shape[1:] == (cfg.model.map_head.num_points, 2)
+    assert predicted.pts.shape[1:] == (20, 2)
     assert ("scales" in predicted) == ("GSMap" in cfg.model.map_head.type)
 
 
@@ -155,7 +206,7 @@ def test_extended_classes_become_targets_that_both_metrics_score(minicity_root, 
     extended = labels >= 3
     assert extended.any()
     assert closed[extended].all()
-    assert int(labels.max()) < cfg.model.map_head.num_classes == len(train.classes) == 6
+    assert int(labels.max()) < len(cfg.model.classes) == len(train.classes) == 6
 
     dataset = DATASETS.build(test)
     metric = METRICS.build(cfg.test_evaluator)

@@ -67,21 +67,47 @@ def test_targets_without_polylines_are_named():
         masks.draw_sample(gt, masks.grid)
 
 
+@pytest.fixture(scope="module")
+def crossing():
+    """A crossing of 12 x 3.5 m whose matched order starts at the corner opposite to the first."""
+    corners = np.array([[-6.0, 0], [6, 0.5], [6, 4], [-6, 3.5], [-6, 0]])
+    gt = map_targets([MapInstance(1, corners)], 20, ALONG_Y.x_range, ALONG_Y.y_range)
+    matched = gt.pts_shifts[:, 2]
+    assert (matched[0, 0] - gt.pts[0, 0]).norm() > 12
+    return gt, matched
+
+
 def fit(target_pts: torch.Tensor, mask: torch.Tensor, masks: ElementMasks) -> float:
-    """Fit Gaussians to points (L1) and a mask together; return how far a centre ends off, in m."""
+    """Fit Gaussians to points (L1) and to a mask; return how far off a centre ends, in metres."""
     space = GaussianSpace(ALONG_Y, min_scale_m=masks.half_pixel_m)
-    norm = ALONG_Y.norm_from_metres(target_pts)
-    reference = torch.cat([norm, torch.zeros(1, 20, 3)], -1).requires_grad_()
-    optimizer = torch.optim.Adam([reference], 2e-2)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 100)
+    target = ALONG_Y.norm_from_metres(target_pts)
+    centres = target.clone().requires_grad_()
+    shapes = torch.zeros(1, 20, 3, requires_grad=True)
+    rates = [{"params": [centres], "lr": 4e-3}, {"params": [shapes], "lr": 0.1}]
+    optimizer = torch.optim.Adam(rates)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 60)
     raster = RasterLoss(loss_weight=10.0)
-    for _ in range(100):
-        centres = reference[..., :2]
-        rendered = masks.render(space.decode(reference), masks.grid)
-        loss = 5 * (centres - norm).abs().sum() + raster(rendered, mask)
+    for _ in range(60):
+        rendered = masks.render(space.decode(torch.cat([centres, shapes], -1)), masks.grid)
+        loss = 5 * (centres - target).abs().sum() + raster(rendered, mask)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
-    off = ALONG_Y.metres_from_norm(reference[..., :2].detach()) - target_pts
+    off = ALONG_Y.metres_from_norm(centres.detach()) - target_pts
     return off.norm(dim=-1).max().item()
+
+
+def test_a_crossings_mask_fits_its_points_whichever_order_is_matched(crossing):
+    gt, matched = crossing
+    masks = ElementMasks(ALONG_Y)
+    full, own = masks.draw_sample(gt, masks.grid), masks.draw(matched, gt.labels_3d, masks.grid)
+    assert fit(matched, full, masks) < 0.2
+    assert fit(matched, own, masks) < 0.2  # source='points'
+
+
+def test_the_mask_of_another_order_would_pull_centres_off_their_points(crossing):
+    gt, matched = crossing
+    masks = ElementMasks(ALONG_Y)
+    first = masks.draw(gt.pts, gt.labels_3d, masks.grid)
+    assert fit(matched, first, masks) > 0.5
