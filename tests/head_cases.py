@@ -74,6 +74,12 @@ def along_y(*xs: float) -> list:
     return [((x, -20), (x, 20)) for x in xs]
 
 
+def predictions_of(head: torch.nn.Module, outputs: dict, layer: int = 1) -> list[InstanceData]:
+    """Return what costs and losses read of the first query group's predictions."""
+    _, own = next(head.split_groups(outputs))
+    return head.layer_predictions(own, layer)
+
+
 def losses_of(head: torch.nn.Module, *gts: InstanceData) -> dict[str, torch.Tensor]:
     """Return a head's losses of one batch."""
     return head.loss_by_feat(head(bev(len(gts))), gts, [{"token": "a"}] * len(gts))

@@ -11,6 +11,7 @@ from head_cases import (
     build_head,
     elements,
     losses_of,
+    predictions_of,
     with_layer,
 )
 
@@ -135,12 +136,12 @@ def test_matching_reads_the_rendered_masks():
     references[-1, 0, 1, :, 2:] = torch.tensor([3.0, 0.0, 0.0])
     outputs["all_references"], outputs["all_pts_preds"] = references, references[..., :2]
     outputs["all_cls_scores"][-1, 0, 1] = outputs["all_cls_scores"][-1, 0, 0]
-    predictions = head.layer_predictions(outputs, 1)
+    predictions = predictions_of(head, outputs, 1)
     targets = head.get_targets(predictions, [head.prepare_gt(lane)], [{}])
     assert targets.matches[0].query_inds.tolist() == [1]
 
     blind = build_head(GSMAP, iou_cost=None)
-    predictions = blind.layer_predictions(outputs, 1)
+    predictions = predictions_of(blind, outputs, 1)
     assert "rasters" not in predictions[0]
     targets = blind.get_targets(predictions, [blind.prepare_gt(lane)], [{}])
     assert targets.matches[0].query_inds.tolist() == [0]
@@ -148,7 +149,7 @@ def test_matching_reads_the_rendered_masks():
 
 def test_the_masks_of_matching_carry_no_gradient():
     head = build_head(GSMAP)
-    predictions = head.layer_predictions(head(bev()), 1)
+    predictions = predictions_of(head, head(bev()), 1)
     assert predictions[0].rasters.shape == (6, 80, 40)
     assert not predictions[0].rasters.requires_grad
     assert predictions[0].references.requires_grad

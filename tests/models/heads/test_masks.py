@@ -1,10 +1,13 @@
 """Masks of elements: their sizes, their pixels, and that they fit the points beside them."""
 
+import numpy as np
 import pytest
 import torch
 from head_cases import ALONG_Y, elements
 
 import gsmap.registered  # noqa: F401
+from gsmap.datasets.annotations.record import MapInstance
+from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.losses.raster import RasterLoss
 from gsmap.structures.gaussians import GaussianSpace

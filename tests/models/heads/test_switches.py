@@ -12,6 +12,7 @@ from head_cases import (
     build_head,
     elements,
     losses_of,
+    predictions_of,
     train_a_step,
     with_layer,
 )
@@ -102,7 +103,7 @@ def test_an_unknown_overlap_is_refused():
 
 def total_cost(head: torch.nn.Module) -> torch.Tensor:
     """Return the summed matching costs of a new model's first prediction. (N, K)"""
-    (prediction,) = head.layer_predictions(head(bev()), 0)
+    (prediction,) = predictions_of(head, head(bev()), 0)
     gt = head.prepare_gt(LANES)
     return sum(cost(prediction, gt, {}) for cost in head.assigner.match_costs)
 
@@ -149,7 +150,7 @@ def test_masks_come_from_full_resolution_or_from_the_matched_points(source):
     """The ground truth's polyline is a ring; its points are one side of it."""
     head = build_head(GSMAP, masks={**MASKS, "source": source})
     train_a_step(head, SQUARE)
-    predictions = head.layer_predictions(head(bev()), 1)
+    predictions = predictions_of(head, head(bev()), 1)
     gts = [head.prepare_gt(SQUARE)]
     targets = head.get_targets(predictions, gts, [{}])
     pairs = MatchedPairs(predictions, gts, targets, head.reference, head.masks)
