@@ -1,5 +1,6 @@
 """Every config: known keys, a short leaf, and a model that trains and predicts one step."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -136,6 +137,69 @@ def check_gradients(model: torch.nn.Module, losses: dict[str, torch.Tensor]) -> 
     gradients = [p.grad for p in model.parameters() if p.grad is not None]
     assert all(torch.isfinite(gradient).all() for gradient in gradients)
     assert sum(float(gradient.abs().sum()) for gradient in gradients) > 0
+
+
+README = REPO / "README.md"
+SETTINGS = {  # every line of the table in GSMap's README, with another value than by default
+    "reference.literal_covariance": True,
+    "reference.activation": "exp",
+    "reference.max_scale_m": 8.0,
+    "reference.min_scale_m": 0.3,
+    "reference.init_scales_m": [2.0, 0.5],
+    "reference.mlp": True,
+    "decoder.detach_reference": False,
+    "decoder.layer.guide_sampling": False,
+    "decoder.layer.invariant_frame": True,
+    "decoder.layer.embed_gaussians": False,
+    "masks.source": "points",
+    "masks.line_width_m": 1.0,
+    "masks.filled_classes": [1],
+    "masks.pixel_m": 0.6,
+    "masks.cost_pixel_m": 1.2,
+    "loss_raster.alpha": 1.0,
+    "loss_raster.foreground_weight": 5.0,
+    "loss_raster.normalize": "foreground",
+    "loss_raster.kind": "iou",
+    "loss_raster.last_layer_only": True,
+    "query_groups.1.losses": ["cls", "pts", "dir"],
+    "query_groups.1.repeats": 3,
+    "iou_cost.weight": 10.0,
+    "iou_cost.kind": "dice",
+    "losses.0.loss_weight": 1.0,
+    "losses.1.loss_weight": 0.0,
+}
+
+
+def test_each_line_of_the_table_of_departures_is_a_setting():
+    text = (REPO / "projects/GSMap/README.md").read_text()
+    table = text[text.index("| point |") :].split("\n\n")[0]
+    cells = [line.split("|")[-2] for line in table.splitlines()]
+    named = {name for cell in cells for name in re.findall(r"`([a-z_]+\.[\w.]+)`", cell)}
+    assert {name for name in named if not name.startswith("train_dataloader")} == set(SETTINGS)
+    path = REPO / "projects/GSMap/configs/gsmap_maptrv2_r18_minicity.py"
+    for name, value in SETTINGS.items():
+        cfg = load(path)
+        overlap = {"loss_raster.type": "MaskOverlapLoss"} if name == "loss_raster.kind" else {}
+        options = {f"model.map_head.{key}": v for key, v in {name: value, **overlap}.items()}
+        cfg.merge_from_dict(options)  # what --cfg-options does
+        MODELS.build({"grid": BEVGrid(**cfg.grid), "classes": cfg.classes, **cfg.model.map_head})
+
+
+@pytest.mark.parametrize("base", ["maptr/maptr_r18_minicity", "maptrv2/maptrv2_r18_minicity"])
+def test_the_lines_in_the_readme_make_the_gsmap_that_one_word_makes(base, tmp_path):
+    text = README.read_text()
+    (code,) = re.findall(r"```python\n(_base_ = 'your_maptr_config.py'.*?)```", text, re.DOTALL)
+    path = tmp_path / "gsmap.py"
+    path.write_text(code.replace("your_maptr_config.py", str(BASELINES / f"{base}.py")))
+    older, short = load(path), load(BASELINES / f"{base}.py")
+    short.merge_from_dict({"model.map_head.type": "GSMapHead"})
+    shared = {"grid": BEVGrid(**short.grid), "classes": short.classes}
+    heads = [MODELS.build({**shared, **cfg.model.map_head}) for cfg in (older, short)]
+    assert repr(heads[0]) == repr(heads[1])
+    assert [vars(cost) for cost in heads[0].assigner.match_costs] == [
+        vars(cost) for cost in heads[1].assigner.match_costs
+    ]
+    assert heads[0].losses["raster"].loss_weight == heads[1].losses["raster"].loss_weight == 10
 
 
 SWAPPED = [path for path in LEAVES if path.is_relative_to(BASELINES) and "minicity" in path.stem]

@@ -36,6 +36,10 @@ class HeightLoss(nn.Module):
         ),
         ({"losses": [{"type": "HeightLoss"}]}, r"HeightLoss reads \['gt.height'\]"),
         ({"losses": [HEAD["losses"][0]] * 2}, "two parts have one name, 'pts'"),
+        (
+            {"aux_heads": [{"type": "BEVMaskHead", "name": "pts"}]},
+            r"two losses have one name, 'pts'; there are \['cls', 'pts', 'dir', 'pts'\]",
+        ),
         ({"aux_heads": [{"type": "BEVMaskHead"}] * 2}, "two parts have one name, 'seg'"),
         (
             {"query_groups": [{"num": N}, {"num": 6, "name": "more", "losses": ("raster",)}]},

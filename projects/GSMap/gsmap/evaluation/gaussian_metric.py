@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from mmdet3d.registry import METRICS
 from mmengine.evaluator import BaseMetric
@@ -16,6 +17,8 @@ from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.ops.soft_iou import pairwise_soft_iou
 from gsmap.structures.gaussians import AT_FLOOR, Gaussians, extents_along_line
 from gsmap.structures.grid import BEVGrid
+
+Array = npt.NDArray[Any]
 
 
 @METRICS.register_module()
@@ -101,7 +104,7 @@ class GaussianMetric(BaseMetric):
             figures["extents"][label] = extents[own].flatten(0, 1).numpy()
         return figures
 
-    def _matched_iou(self, masks: Tensor, lines: Sequence[np.ndarray], grid: BEVGrid) -> np.ndarray:
+    def _matched_iou(self, masks: Tensor, lines: Sequence[Array], grid: BEVGrid) -> Array:
         """Return the soft IoU of every matched pair of one class. (n,)"""
         if not len(masks) or not lines:
             return np.empty(0)
@@ -147,7 +150,7 @@ class GaussianMetric(BaseMetric):
         return metrics
 
     @staticmethod
-    def _row(name: str, iou: np.ndarray, size: np.ndarray) -> str:
+    def _row(name: str, iou: Array, size: Array) -> str:
         """Return a class's line of the table."""
         if not len(size):
             return f"  {name}: no confident prediction"

@@ -12,6 +12,14 @@ from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.matched import MatchedPairs
 from gsmap.structures.grid import BEVGrid
 
+_RASTER_LOSS: PARTS = {"type": "RasterLoss", "loss_weight": 10.0}
+_IOU_COST: PARTS = {"type": "IoUCost", "weight": 2.0}
+
+
+def _over(default: PARTS, settings: PARTS | None) -> list[PARTS]:
+    """Return a part's default with other settings, or nothing if it is switched off."""
+    return [] if settings is None else [{**default, **settings}]
+
 
 @MODELS.register_module()
 class GSMapHead(MapHead):
@@ -25,8 +33,9 @@ class GSMapHead(MapHead):
         grid: The map's extent.
         losses: Configs of the losses of the head that this one extends.
         match_costs: Configs of its matching costs.
-        loss_raster: Config of a loss of the rendered masks, or None to train without it.
-        iou_cost: Config of a matching cost of the rendered masks, or None to match without it.
+        loss_raster: Settings of the loss of the rendered masks, or None to train without it; what
+            they leave out is as by default.
+        iou_cost: The same of the matching cost of the rendered masks.
         masks: Settings of `ElementMasks`.
         kwargs: Further arguments of `MapHead`; ``reference`` also takes the settings of
             `GaussianSpace`, whose smallest sigma is half a pixel of the masks by default.
@@ -40,16 +49,16 @@ class GSMapHead(MapHead):
         grid: BEVGrid,
         losses: Sequence[PARTS],
         match_costs: Sequence[PARTS],
-        loss_raster: PARTS | None = {"type": "RasterLoss", "loss_weight": 10.0},  # noqa: B006
-        iou_cost: PARTS | None = {"type": "IoUCost", "weight": 2.0},  # noqa: B006
+        loss_raster: PARTS | None = _RASTER_LOSS,
+        iou_cost: PARTS | None = _IOU_COST,
         masks: PARTS | None = None,
         **kwargs: Any,
     ) -> None:
         self._min_scale_m = ElementMasks(grid, **(masks or {})).half_pixel_m
         super().__init__(
             grid=grid,
-            losses=[*losses, *([loss_raster] if loss_raster else [])],
-            match_costs=[*match_costs, *([iou_cost] if iou_cost else [])],
+            losses=[*losses, *_over(_RASTER_LOSS, loss_raster)],
+            match_costs=[*match_costs, *_over(_IOU_COST, iou_cost)],
             masks=masks,
             **kwargs,
         )

@@ -1,7 +1,7 @@
 """The map head, composed of parts: queries, predictions of every layer, matching, losses."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -142,7 +142,7 @@ class MapHead(BaseModule):
         offered = {f"pred.{name}" for name in pred} | {f"gt.{name}" for name in GT_FIELDS}
         where = f"{type(self.reference).__name__}, the decoder and the ground truth"
         names = ["cls", *self.losses]
-        refuse_twins(names, "losses")
+        refuse_twins([*names, *self.aux_heads], "losses")
         refuse_twins([group.name for group in self.query_groups], "query groups")
         refuse_unknown_losses(self.query_groups, names)
         costs = self.assigner.match_costs
@@ -220,7 +220,7 @@ class MapHead(BaseModule):
             [sample.metainfo for sample in batch_data_samples],
         )
         for name, head in self.aux_heads.items():
-            losses[f"loss_{name}"] = head.loss(bev_outputs, batch_data_samples)
+            losses[f"loss_{name}"] = cast(Any, head).loss(bev_outputs, batch_data_samples)
         return losses
 
     def loss_by_feat(
@@ -355,7 +355,7 @@ class MapHead(BaseModule):
         pairs = MatchedPairs(predictions, gts, targets, self.reference, self.masks)
         for name, loss in self.losses.items():
             if group.has(name) and (is_last or not getattr(loss, "last_layer_only", False)):
-                values = [pairs[field] for field in loss.reads]
+                values = [pairs[field] for field in cast(Any, loss).reads]
                 losses[f"loss_{name}"] = loss(*values, avg_factor=targets.avg_factor)
         if is_last and group is self.query_groups[0]:
             losses.update(self.statistics(pairs))

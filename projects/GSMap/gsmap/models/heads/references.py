@@ -191,7 +191,8 @@ class GaussianReference(PointReference):
         """Let every query start with the same Gaussian, and every layer leave it as it is."""
         constant_init(self.gaussian_init, 0.0)
         for branch in self.gaussian_branches:
-            constant_init(branch[-1], 0.0)
+            *_, last = branch.children()
+            constant_init(last, 0.0)
 
     def start(self, query_pos: Tensor) -> Tensor:
         """Return the Gaussians that the first layer starts from. (..., C) -> (..., D)"""
