@@ -76,7 +76,10 @@ def random_batch(
         labels = torch.randint(len(model.map_head.classes), (elements,), generator=generator)
         sample = Det3DDataSample(metainfo=metainfo)
         sample.gt_instances_3d = InstanceData(
-            labels_3d=labels, pts=pts, pts_shifts=torch.stack([pts, pts.flip(1)], 1)
+            labels_3d=labels,
+            pts=pts,
+            pts_shifts=torch.stack([pts, pts.flip(1)], 1),
+            polylines=pts,
         ).to(device)
         samples.append(sample)
     return {"imgs": images}, samples

@@ -209,7 +209,7 @@ class MapInferencer:
 
         Raises:
             FileNotFoundError: If the sweep's file does not exist.
-            ValueError: If it is neither nuScenes' (five float32 values per point) nor Argoverse 2's.
+            ValueError: If it is neither nuScenes' (five float32 values a point) nor Argoverse 2's.
         """
         lidar = dataset.sample(index).lidar
         if lidar is None:
