@@ -69,7 +69,7 @@ def test_every_key_of_the_full_model_has_its_place(golden_dir):
     state = {key: torch.ones(()) for key in keys}
     ours = ours_from_upstream(state)
     assert upstream_from_ours(ours).keys() == keys
-    assert "map_head.seg_head.2.bias" in ours
+    assert "map_head.aux_heads.seg.2.bias" in ours
 
 
 def test_argoverse_2s_simple_model_holds_keys_of_losses_that_are_off():
