@@ -246,3 +246,13 @@ def test_the_smallest_gaussian_is_half_a_pixel_of_the_masks():
     assert own.reference.space.min_scale_m == 0.2
     with pytest.raises(ValueError, match=r"min_scale_m < init_scales_m .* got 0.75, "):
         build_head(GSMAP, masks=MASKS, reference={"init_scales_m": (1.0, 0.4)})
+
+
+@pytest.mark.parametrize("extent", [(30, 60), (50, 100), (100, 200)])
+def test_any_range_has_a_first_gaussian_above_its_smallest(extent):
+    x, y = extent
+    grid = BEVGrid((-x / 2, x / 2), (-y / 2, y / 2))
+    config = {k: v for k, v in GSMAP.items() if k not in ("masks", "reference")}
+    space = build_head({**config, "grid": grid}).reference.space
+    assert space.min_scale_m == pytest.approx(y / 200 / 2)
+    assert space.min_scale_m * 1.49 < min(space.init_scales_m)

@@ -64,8 +64,13 @@ class GSMapHead(MapHead):
         )
 
     def reference_settings(self, reference: PARTS) -> PARTS:
-        """Let the smallest Gaussian be half a pixel of the masks: smaller ones get no gradient."""
-        return {"min_scale_m": self._min_scale_m, **reference}
+        """Let the smallest Gaussian be half a pixel of the masks: smaller ones get no gradient.
+
+        On rasters so coarse that the usual first Gaussian comes close to that, it grows with it.
+        """
+        smallest = reference.get("min_scale_m", self._min_scale_m)
+        first = (max(1.0, 3 * smallest), max(0.4, 1.5 * smallest))
+        return {"min_scale_m": smallest, "init_scales_m": first, **reference}
 
     def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:
         """Return what says whether the Gaussians live (see `gaussian_statistics`)."""

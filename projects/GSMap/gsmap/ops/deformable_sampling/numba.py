@@ -51,8 +51,9 @@ def _backward(grads: Tensor, table: Tensor, weights: Tensor, rows: Tensor) -> tu
     """Return the gradients in the table and in the weights."""
     grad_table = torch.zeros(table.shape)
     grad_weights = torch.empty(weights.shape)
-    arrays = (x.contiguous().numpy() for x in (grads, table, weights, rows))
-    scatter_rows(*arrays, grad_table.numpy(), grad_weights.numpy())
+    inputs = [x.contiguous().numpy() for x in (grads, table, weights, rows)]
+    outputs = [x.numpy() for x in (grad_table, grad_weights)]
+    scatter_rows(*inputs, *outputs)  # type: ignore[call-arg]
     return grad_table, grad_weights
 
 
