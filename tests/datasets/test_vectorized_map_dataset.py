@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from mmengine.config import Config
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
+from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs/_base_/datasets"
@@ -73,6 +75,65 @@ def test_a_training_sample_is_packed_as_the_contract_says(
         meta["img_aug_matrix"][2] @ meta["cam2img"][2] @ meta["lidar2cam"][2],
     )
     assert meta["can_bus"].shape == (18,)
+
+
+@pytest.fixture(scope="module")
+def with_heights(minicity_annotations, tmp_path_factory) -> Path:
+    """MiniCity's training file with points of three coordinates: z = 0.1 x - 1.8."""
+    flat = AnnotationFile(minicity_annotations["train"])
+    path = tmp_path_factory.mktemp("heights") / "gsmap_minicity_train.arrow"
+    write_annotations(path, replace(flat.meta, dim=3), (raised(sample) for sample in flat))
+    return path
+
+
+def raised(sample: MapSample) -> MapSample:
+    instances = [
+        replace(i, points=np.c_[i.points, 0.1 * i.points[:, 0] - 1.8]) for i in sample.instances
+    ]
+    return replace(sample, instances=instances)
+
+
+def test_two_coordinates_of_a_file_of_three_are_those_of_a_file_of_two(
+    build, minicity_root, minicity_annotations, with_heights
+):
+    """Reading heights as further points of the plane would give an mAP of 0."""
+    config = dataset_config("nuscenes_depth_seg", "train_dataloader", minicity_root)
+    flat, high = build(**config), build(**{**config, "ann_file": str(with_heights)})
+    for index in range(len(flat)):
+        np.random.seed(index)  # noqa: NPY002 - draws the orders of long rings
+        wanted = flat[index]["data_samples"]
+        np.random.seed(index)  # noqa: NPY002
+        found = high[index]["data_samples"]
+        for name in wanted.gt_instances_3d.keys():  # noqa: SIM118 - InstanceData is no mapping
+            assert torch.equal(found.gt_instances_3d[name], wanted.gt_instances_3d[name])
+        assert torch.equal(found.gt_pv_seg, wanted.gt_pv_seg)
+        assert torch.equal(found.gt_seg, wanted.gt_seg)
+        truth, expected = found.eval_ann_info, wanted.eval_ann_info
+        for line, other in zip(truth["polylines"], expected["polylines"], strict=True):
+            np.testing.assert_array_equal(line, other)
+    assert high.metainfo == flat.metainfo
+
+
+def test_three_coordinates_reach_targets_and_evaluation(build, minicity_root, with_heights):
+    config = dataset_config("minicity", "train_dataloader", minicity_root, dim=3)
+    dataset = build(**{**config, "ann_file": str(with_heights)})
+    sample = dataset[0]["data_samples"]
+    targets = sample.gt_instances_3d
+    assert targets.pts.shape == (len(targets), 20, 3)
+    assert targets.pts_shifts.shape == (len(targets), 19, 20, 3)
+    assert targets.boxes.shape == (len(targets), 4)
+    torch.testing.assert_close(targets.pts[..., 2], 0.1 * targets.pts[..., 0] - 1.8)
+    assert {line.shape[1] for line in sample.eval_ann_info["polylines"]} == {3}
+    assert dataset.metainfo["dim"] == 3
+    assert build(ann_file=str(with_heights), dim=None).metainfo["dim"] == 3
+
+
+def test_a_file_of_two_coordinates_is_refused_for_three(build, minicity_annotations):
+    message = r"made with dim 2, the config asks for 3: .*create_data.py"
+    with pytest.raises(ValueError, match=message):
+        build(ann_file=str(minicity_annotations["val"]), dim=3)
+    with pytest.raises(ValueError, match="dim must be 2, 3 or None, got 4"):
+        build(ann_file=str(minicity_annotations["val"]), dim=4)
 
 
 def test_lidar_points_meet_their_depths_in_the_cameras(build, minicity_root, minicity_annotations):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from gsmap.structures.polylines import (
     PADDING,
@@ -61,6 +62,15 @@ def test_many_polylines_are_resampled_at_once():
     assert found[2].tolist() == [[0, 0]] * 6
     assert found[3].tolist() == [[1, 2]] * 6
     assert resample_all(np.zeros((0, 2)), np.array([0, 0]), 3).tolist() == [[[0, 0]] * 3]
+
+
+def test_height_does_not_lengthen_a_line():
+    """A ramp of 3 m in the plane that climbs 4 m, then 1 m on the level; as shapely measures it."""
+    ramp = np.array([[0, 0, 0], [3, 0, 4], [3, 1, 4]], float)
+    np.testing.assert_allclose(arc_lengths(ramp), [0, 3, 4])
+    line = shapely.LineString(ramp)
+    wanted = [line.interpolate(distance).coords[0] for distance in range(5)]
+    np.testing.assert_allclose(resample(ramp, 5), wanted)
 
 
 def test_an_open_line_has_two_orders():

@@ -57,6 +57,28 @@ def test_three_coordinates_are_kept_or_refused():
         map_targets([flat], 3, **RANGES, dim=3)
 
 
+def test_points_of_three_coordinates_lie_above_those_of_two():
+    """A ramp: 3 m along the plane while climbing 4, then 1 m on the level. Lengths are the plane's.
+
+    Points at 0, 1, ... 4 m of the plane, as without height; along the ramp they would be elsewhere.
+    """
+    ramp = MapInstance(0, np.array([[0.0, 0, 0], [3, 0, 4], [3, 1, 4]]))
+    ring = MapInstance(1, np.array([[0.0, 0, 0], [4, 0, 3], [4, 4, 3], [0, 0, 0]]))
+    flat, high = (map_targets([ramp, ring], 5, **RANGES, dim=dim) for dim in (2, 3))
+    np.testing.assert_allclose(high.pts[0, :, 2], [0, 4 / 3, 8 / 3, 4, 4], rtol=1e-6)
+    for name in ("labels_3d", "boxes", "closed", "polylines"):
+        assert torch.equal(high[name], flat[name])
+    for name in ("pts", "pts_shifts"):
+        torch.testing.assert_close(high[name][..., :2], flat[name])
+    assert high.closed.tolist() == [False, True]
+
+
+def test_heights_are_not_clamped():
+    line = MapInstance(2, np.array([[14.0, 0, 0], [18.0, 0, 40]]))
+    targets = map_targets([line], 3, **RANGES, dim=3)
+    np.testing.assert_allclose(targets.pts[0], [[14, 0, 0], [15, 0, 20], [15, 0, 40]])
+
+
 def test_a_sample_without_truth_is_refused():
     with pytest.raises(ValueError, match=r"'a' has no ground truth"):
         FormatMapTargets().transform({"map_instances": None, "token": "a", **RANGES})

@@ -10,7 +10,12 @@ from mmengine.dataset import BaseDataset
 from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.annotations.record import CAN_BUS_SIZE, LidarRecord, MapSample
+from gsmap.datasets.annotations.record import (
+    CAN_BUS_SIZE,
+    LidarRecord,
+    MapInstance,
+    MapSample,
+)
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.structures.grid import BEVGrid
 
@@ -40,6 +45,8 @@ class VectorizedMapDataset(BaseDataset):
             model's affair); None takes the file's.
         split: Split that the file must hold; None takes any.
         frame: ``lidar`` or ``ego``, which the file must have; None takes any.
+        dim: Coordinates per point of the ground truth, 2 or 3; None takes the file's. A file with
+            heights also serves 2, which drops them; one without is refused for 3.
         cameras: Names of the cameras to use, in order; None takes all of each sample.
         test_mode: Whether every sample is delivered, in order, ground truth or not.
         filter_empty_gt: Whether training leaves out samples without any map element.
@@ -66,6 +73,7 @@ class VectorizedMapDataset(BaseDataset):
         grid: dict[str, Any] | None = None,
         split: str | None = None,
         frame: str | None = None,
+        dim: int | None = 2,
         cameras: Sequence[str] | None = None,
         test_mode: bool = False,
         filter_empty_gt: bool = True,
@@ -78,6 +86,8 @@ class VectorizedMapDataset(BaseDataset):
     ) -> None:
         if broken_samples not in _BROKEN:
             raise ValueError(f"broken_samples must be one of {_BROKEN}, got {broken_samples!r}.")
+        if dim not in (None, 2, 3):
+            raise ValueError(f"dim must be 2, 3 or None, got {dim!r}.")
         if broken_samples == "skip" and test_mode:
             raise ValueError("broken_samples='skip' is for training: a test must see every sample.")
         if indices is not None and not indices:
@@ -93,7 +103,9 @@ class VectorizedMapDataset(BaseDataset):
             "y_range": None if extent is None else extent.y_range,
             "split": split,
             "frame": frame,
+            "dim": 3 if dim == 3 else None,
         }
+        self._dim = dim
         self._filter_empty_gt = filter_empty_gt and not test_mode
         self._shuffle_images_seed = shuffle_images_seed
         super().__init__(
@@ -113,6 +125,7 @@ class VectorizedMapDataset(BaseDataset):
         self.annotations.require(**self._expected)
         for name in ("classes", "x_range", "y_range", "dataset", "split", "frame"):
             self._metainfo[name] = getattr(self.annotations.meta, name)
+        self._metainfo["dim"] = self._dim or self.annotations.meta.dim
         return [{"row": row, "image_row": row} for row in range(len(self.annotations))]
 
     def filter_data(self) -> list[dict[str, int]]:
@@ -166,14 +179,17 @@ class VectorizedMapDataset(BaseDataset):
 
         Returns:
             Keys of mmdet3d's multi-view pipelines (``images``, ``lidar_points``, ``lidar_sweeps``,
-            ``timestamp``), the keys of the packed metainfo, and ``map_instances``: the elements at
-            full resolution, or None.
+            ``timestamp``), the keys of the packed metainfo, ``dim`` and ``map_instances``: the
+            elements at full resolution with ``dim`` coordinates per point, or None.
 
         Raises:
             BrokenSampleError: If a camera that the config asks for is absent.
         """
         entry = super().get_data_info(idx)
         sample = self.annotations[entry["row"]]
+        dim, instances = self._metainfo["dim"], sample.instances
+        if instances is not None:
+            instances = [MapInstance(i.label, i.points[:, :dim]) for i in instances]
         info: dict[str, Any] = {
             "sample_idx": entry["sample_idx"],
             "token": sample.token,
@@ -186,15 +202,16 @@ class VectorizedMapDataset(BaseDataset):
             "can_bus": self._can_bus(sample),
             "x_range": self.annotations.meta.x_range,
             "y_range": self.annotations.meta.y_range,
+            "dim": dim,
             "images": self._images(sample, entry),
-            "map_instances": sample.instances,
+            "map_instances": instances,
             "eval_ann_info": None,
         }
         info["cam_names"] = list(info["images"])
-        if sample.instances is not None:
+        if instances is not None:
             info["eval_ann_info"] = {
-                "polylines": [instance.points[:, :2] for instance in sample.instances],
-                "labels": np.array([instance.label for instance in sample.instances], np.int64),
+                "polylines": [instance.points for instance in instances],
+                "labels": np.array([instance.label for instance in instances], np.int64),
             }
         if sample.lidar is not None:
             info.update(self._lidar(sample.lidar))

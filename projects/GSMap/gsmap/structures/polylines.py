@@ -25,7 +25,10 @@ def is_closed(points: Points) -> bool:
 
 
 def arc_lengths(points: Points) -> NDArray[np.float64]:
-    """Return the distance from the first point to each point along a polyline.
+    """Return the distance in the plane from the first point to each point along a polyline.
+
+    Heights do not lengthen a line, as in shapely, which MapTRv2 resamples 3D lines with: the same
+    line with and without z is resampled at the same (x, y).
 
     Args:
         points: Vertices in metres. (n, D)
@@ -33,7 +36,7 @@ def arc_lengths(points: Points) -> NDArray[np.float64]:
     Returns:
         Distances in metres, from 0 to the length. (n,)
     """
-    steps = np.linalg.norm(np.diff(np.asarray(points, np.float64), axis=0), axis=-1)
+    steps = np.linalg.norm(np.diff(np.asarray(points, np.float64)[:, :2], axis=0), axis=-1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
@@ -53,10 +56,10 @@ def points_at(points: Points, distances: NDArray[np.floating[Any]]) -> NDArray[n
 
 
 def resample(points: Points, num_points: int) -> NDArray[np.float64]:
-    """Resample a polyline at equal arc length, both end points included.
+    """Resample a polyline at equal arc length in the plane, both end points included.
 
     Args:
-        points: Vertices in metres. (n, D)
+        points: Vertices in metres; z is interpolated. (n, D)
         num_points: Number P of points to return, >= 2.
 
     Returns:

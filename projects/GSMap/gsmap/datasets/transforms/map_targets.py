@@ -35,7 +35,7 @@ def map_targets(
         num_points: Points P per element.
         x_range: Smallest and largest x in metres; points beyond are moved onto the edge.
         y_range: Smallest and largest y in metres.
-        dim: Coordinates per point, 2 or 3.
+        dim: Coordinates per point, 2 or 3; heights are interpolated and kept as they are.
         rng: Draws the orders of rings with more than P - 1 vertices; None spreads them evenly.
 
     Returns:
@@ -76,7 +76,7 @@ def map_targets(
         boxes=torch.from_numpy(corners.reshape(-1, 4).astype(np.float32)),
         polylines=torch.from_numpy(clamp(polylines, x_range, y_range).astype(np.float32)),
         closed=torch.tensor(
-            [is_closed(instance.points) for instance in instances], dtype=torch.bool
+            [is_closed(instance.points[:, :dim]) for instance in instances], dtype=torch.bool
         ),
     )
 
@@ -85,16 +85,16 @@ def map_targets(
 class FormatMapTargets(BaseTransform):
     """Add ``gt_instances_3d``, the training targets, from ``map_instances``.
 
+    Points have as many coordinates as the data set hands on (its ``dim``).
+
     Args:
         num_points: Points P per element.
-        dim: Coordinates per point, 2 or 3.
         random_orders: Whether the orders of rings with more than P - 1 vertices are drawn anew each
             time, as in MapTR; else they are evenly spread over the ring.
     """
 
-    def __init__(self, num_points: int = 20, dim: int = 2, random_orders: bool = True) -> None:
+    def __init__(self, num_points: int = 20, random_orders: bool = True) -> None:
         self.num_points = num_points
-        self.dim = dim
         self.random_orders = random_orders
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
@@ -116,7 +116,7 @@ class FormatMapTargets(BaseTransform):
             self.num_points,
             results["x_range"],
             results["y_range"],
-            self.dim,
+            results.get("dim", 2),
             rng,
         )
         return results

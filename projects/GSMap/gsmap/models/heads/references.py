@@ -56,7 +56,7 @@ class PointReference(BaseModule):
         init_cfg: As in mmengine.
 
     Raises:
-        ValueError: If ``coords`` is not 2 or 3, or a height lacks its range.
+        ValueError: If ``coords`` is not 2 or 3, a height lacks its range, or that is empty.
     """
 
     def __init__(
@@ -74,6 +74,8 @@ class PointReference(BaseModule):
             raise ValueError(
                 f"coords must be 2, or 3 with a z_range, got coords={coords}, z_range={z_range}."
             )
+        if z_range is not None and not z_range[0] < z_range[1]:
+            raise ValueError(f"z_range must be (low, high) with low < high, got {z_range}.")
         self.grid = grid
         self.coords = coords
         self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
@@ -118,12 +120,24 @@ class PointReference(BaseModule):
         return torch.cat([points[..., :2], low + (high - low) * points[..., 2:]], -1)
 
     def norm(self, points_m: Tensor) -> Tensor:
-        """Bring points in metres to [0, 1]; the inverse of :meth:`metres`."""
+        """Bring points in metres to [0, 1]; the inverse of :meth:`metres`.
+
+        A height outside ``z_range`` becomes the nearest one in it, as in MapTRv2.
+
+        Raises:
+            ValueError: If the points have no height and the reference has.
+        """
+        if points_m.shape[-1] < self.coords:
+            raise ValueError(
+                f"the model's points have {self.coords} coordinates, the targets' "
+                f"{points_m.shape[-1]}: set dim={self.coords} in the data set."
+            )
         points = self.grid.norm_from_metres(points_m[..., : self.coords])
         if self.z_range is None:
             return points
         low, high = self.z_range
-        return torch.cat([points[..., :2], (points[..., 2:] - low) / (high - low)], -1)
+        height = (points[..., 2:].clamp(low, high) - low) / (high - low)
+        return torch.cat([points[..., :2], height], -1)
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:
         """Return what references (N, P, D) say in metres: ``pts`` (N, P, coords)."""
