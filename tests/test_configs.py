@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from height_cases import write_raised
 from mmdet3d.models.layers.spconv import IS_SPCONV2_AVAILABLE
 from mmdet3d.registry import DATASETS, METRICS, MODELS
 from mmengine.config import Config, ConfigDict
@@ -44,6 +45,11 @@ def test_a_leaf_is_short_and_passes_the_checks_of_the_tools(path):
     check_config(load(path))
 
 
+def coordinates(cfg: Config) -> int:
+    """Return how many coordinates the points of a config's model have."""
+    return cfg.model.map_head.get("reference", {}).get("coords", 2)
+
+
 @names
 def test_data_and_model_agree(path):
     cfg = load(path)
@@ -53,6 +59,7 @@ def test_data_and_model_agree(path):
         dataset = cfg[f"{part}_dataloader"].dataset
         assert dataset.grid == cfg.grid
         assert dataset.classes == cfg.classes
+        assert dataset.get("dim", 2) == coordinates(cfg)
     assert METRICS.build(cfg.test_evaluator).eval == ("chamfer", "raster")
 
 
@@ -106,7 +113,7 @@ def small(cfg: Config) -> Config:
 
 @pytest.fixture(scope="module")
 def annotations(minicity_root: Path, tmp_path_factory) -> Callable[[ConfigDict], Path]:
-    """Find the annotation file that fits a data set's range, classes and split.
+    """Find the annotation file that fits a data set's range, classes, split and coordinates.
 
     Each is MiniCity converted as the data set's own data would be, once per range and class list.
     """
@@ -119,7 +126,10 @@ def annotations(minicity_root: Path, tmp_path_factory) -> Callable[[ConfigDict],
             folders[wanted] = tmp_path_factory.mktemp("annotations")
             options = NuScenesOptions(minicity_root, "v1.0-trainval", folders[wanted], "minicity")
             convert_nuscenes(replace(options, x_range=x_range, y_range=y_range, classes=wanted[2]))
-        return folders[wanted] / f"gsmap_minicity_{dataset.split}.arrow"
+        flat = folders[wanted] / f"gsmap_minicity_{dataset.split}.arrow"
+        if dataset.get("dim", 2) == 2:
+            return flat
+        return write_raised(flat, flat.with_name(f"heights_{dataset.split}.arrow"))
 
     return find
 
@@ -255,7 +265,7 @@ def test_one_step_of_training_and_testing(path, minicity_root, annotations):
     for name in test.classes:  # AP_raster leaves out what the ground truth does not have
         assert 0 <= figures[f"chamfer/{name}/AP"] <= 1
     predicted = samples[0].pred_instances_3d
-    assert predicted.pts.shape[1:] == (20, 2)
+    assert predicted.pts.shape[1:] == (20, coordinates(cfg))
     assert ("scales" in predicted) == ("GSMap" in cfg.model.map_head.type)
 
 

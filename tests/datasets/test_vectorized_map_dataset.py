@@ -2,16 +2,15 @@
 
 import pickle
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from height_cases import write_raised
 from mmengine.config import Config
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
-from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs/_base_/datasets"
@@ -80,17 +79,8 @@ def test_a_training_sample_is_packed_as_the_contract_says(
 @pytest.fixture(scope="module")
 def with_heights(minicity_annotations, tmp_path_factory) -> Path:
     """MiniCity's training file with points of three coordinates: z = 0.1 x - 1.8."""
-    flat = AnnotationFile(minicity_annotations["train"])
     path = tmp_path_factory.mktemp("heights") / "gsmap_minicity_train.arrow"
-    write_annotations(path, replace(flat.meta, dim=3), (raised(sample) for sample in flat))
-    return path
-
-
-def raised(sample: MapSample) -> MapSample:
-    instances = [
-        replace(i, points=np.c_[i.points, 0.1 * i.points[:, 0] - 1.8]) for i in sample.instances
-    ]
-    return replace(sample, instances=instances)
+    return write_raised(minicity_annotations["train"], path)
 
 
 def test_two_coordinates_of_a_file_of_three_are_those_of_a_file_of_two(

@@ -171,7 +171,7 @@ class MapInferencer:
             frame = self.cfg.test_dataloader.dataset.get("frame") or "lidar"
             path = self._annotation_file(source, frame)
         options: dict[str, Any] = dict(self.cfg.test_dataloader.dataset)
-        options |= {"ann_file": str(path.resolve()), "test_mode": True, "split": None}
+        options |= {"ann_file": str(path.resolve()), "test_mode": True, "split": None, "dim": None}
         if data_root is not None:
             options["data_root"] = str(Path(data_root).resolve())
         dataset = DATASETS.build(options)
@@ -189,6 +189,7 @@ class MapInferencer:
             classes=tuple(options.get("classes") or CLASSES),
             x_range=tuple(grid["x_range"]),
             y_range=tuple(grid["y_range"]),
+            dim=max((i.points.shape[1] for s in samples for i in s.instances or ()), default=2),
             command="tools/infer.py",
         )
         self._files += 1
