@@ -56,6 +56,13 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--thresholds", nargs="+", type=float, help="of AP_chamfer, in metres (0.5 1.0 1.5)"
     )
+    parser.add_argument(
+        "--dim",
+        type=int,
+        default=2,
+        choices=(2, 3),
+        help="coordinates that AP_chamfer counts; 3 needs heights in results and ground truth",
+    )
     parser.add_argument("--hard", action="store_true", help="AP_chamfer at 0.2, 0.5 and 1.0 m")
     parser.add_argument("--classes", nargs="+", help="default: the annotation file's, or MapTR's")
     parser.add_argument(
@@ -119,6 +126,7 @@ def config_from(args: argparse.Namespace) -> EvaluationConfig:
             tuple(thresholds or CHAMFER_THRESHOLDS),
             resample_predictions=not args.keep_pred_points,
             resample_ground_truth=not args.keep_gt_points,
+            dim=args.dim,
         )
     if "raster" in args.eval:
         raster = RasterConfig(classes, tuple(args.polygon_classes), (x0, x1), (y0, y1))

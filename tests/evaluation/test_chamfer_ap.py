@@ -141,3 +141,88 @@ def test_bad_configuration_is_refused():
         ChamferConfig(("divider",), (0.0, 1.0))
     with pytest.raises(ValueError, match="num_points"):
         ChamferConfig(("divider",), num_points=1)
+
+
+def sloped(x: float, low: float, high: float) -> list[list[float]]:
+    """A line of 40 m along y whose height runs from ``low`` to ``high``."""
+    return [[x, -20.0, low], [x, 20.0, high]]
+
+
+IN_SPACE = ChamferConfig(("divider", "boundary"), dim=3)
+
+
+def test_chamfer_distance_in_space():
+    """A 3-4-5 triangle; points of one and of two or three coordinates do not mix."""
+    first, second = np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])
+    assert chamfer_distance(first, second) == 1.25
+    with pytest.raises(ValueError, match="both need as many coordinates"):
+        chamfer_distance(first, second[:, :2])
+
+
+def test_an_error_of_height_misses_near_thresholds_and_hits_far_ones():
+    """Predicted 1.2 m too high all along: the distance of every point is 1.2 m.
+
+    In the plane the same prediction is perfect.
+    """
+    gt = MapElements.from_polylines([sloped(0.0, 0.0, 2.0)], [0])
+    pred = MapElements.from_polylines([sloped(0.0, 1.2, 3.2)], [0], [0.9])
+    metrics = chamfer_report([match_chamfer(pred, gt, IN_SPACE)], IN_SPACE).metrics
+    assert metrics["chamfer/divider/AP@1.0"] == 0.0
+    assert metrics["chamfer/divider/AP@1.5"] == 1.0
+    assert metrics["chamfer/divider/error_m@1.5"] == pytest.approx(1.2)
+    assert match_chamfer(pred, gt, CONFIG).quality[0] == 0.0
+
+
+def test_a_line_above_another_is_matched_at_its_own_height():
+    """Two levels of a junction 5 m apart; in the plane the better score takes the first."""
+    gt = MapElements.from_polylines([sloped(0.0, 0.0, 0.0), sloped(0.0, 5.0, 5.0)], [0, 0])
+    pred = MapElements.from_polylines(
+        [sloped(0.1, 5.0, 5.0), sloped(0.1, 0.0, 0.0)], [0, 0], [0.9, 0.8]
+    )
+    assert match_chamfer(pred, gt, IN_SPACE).matched_gt[:, 0].tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("resampled", [True, False])
+def test_constant_heights_change_nothing(resampled):
+    """Random lines at z = 1.5 m: every match and distance as without heights, to the digit."""
+    rng = np.random.default_rng(5)
+    lines = [np.cumsum(rng.normal(0, 2, (8, 2)), 0) for _ in range(12)]
+    moved = [line + rng.normal(0, 0.3, 2) for line in lines]
+    labels, scores = rng.integers(0, 2, 12), rng.uniform(size=12)
+    raised = [[np.c_[line, np.full(8, 1.5)] for line in side] for side in (lines, moved)]
+    found = []
+    for (truth, predicted), dim in (((lines, moved), 2), (raised, 3)):
+        rules = ChamferConfig(
+            CONFIG.classes,
+            resample_predictions=resampled,
+            resample_ground_truth=resampled,
+            dim=dim,
+        )
+        gt = MapElements.from_polylines(truth, labels)
+        found.append(
+            match_chamfer(MapElements.from_polylines(predicted, labels, scores), gt, rules)
+        )
+    assert (found[0].matched_gt >= 0).any()
+    np.testing.assert_array_equal(found[1].matched_gt, found[0].matched_gt)
+    np.testing.assert_allclose(found[1].quality, found[0].quality, rtol=1e-12)
+
+
+def test_strips_touch_in_the_plane():
+    """End to end, 0.9 m apart: no strip touches the other, whatever the heights; so no match."""
+    for dim in (2, 3):
+        rules = ChamferConfig(CONFIG.classes, (99.0,), dim=dim)
+        ends = [[[0.0, 0.0, 0.0], [0.0, 1.0, 1.0]], [[0.0, 1.9, 0.0], [0.0, 2.9, 1.0]]]
+        gt, pred = (MapElements.from_polylines([line], [0], [1.0]) for line in ends)
+        assert match_chamfer(pred, gt, rules).matched_gt.tolist() == [[-1]]
+
+
+def test_without_heights_a_metric_in_space_is_refused():
+    flat = MapElements.from_polylines([upright(0.0)], [0], [0.9])
+    high = MapElements.from_polylines([sloped(0.0, 0.0, 0.0)], [0])
+    with pytest.raises(ValueError, match="sample 'a', AP_chamfer of dim 3: points must have 3"):
+        match_chamfer(flat, high, IN_SPACE, "a")
+    nothing = MapElements.from_polylines()
+    assert match_chamfer(nothing, high, IN_SPACE).num_gts.tolist() == [1, 0]
+    assert match_chamfer(high, nothing, IN_SPACE).matched_gt.tolist() == [[-1, -1, -1]]
+    with pytest.raises(ValueError, match="dim must be 2 or 3, got 4"):
+        ChamferConfig(CONFIG.classes, dim=4)

@@ -156,6 +156,28 @@ def test_z_other_classes_and_single_points_are_said(tmp_path):
     assert "1 predictions of class 'kerb' are not scored" in text
 
 
+def test_heights_count_in_chamfer_if_asked_and_never_in_raster(tmp_path):
+    """A line that is right in the plane and 1.2 m too high."""
+    results, truth = tmp_path / "results.json", tmp_path / "truth.arrow"
+    high = [[*point, 1.2] for point in LINE]
+    write_results(results, [("a", [vector(high, "divider", 0.9)])])
+    instances = [MapInstance(0, np.array([[*point, 0.0] for point in LINE]))]
+    sample = MapSample("a", "s", "", 0, [], np.eye(4), instances=instances)
+    write_annotations(truth, AnnotationMeta("mine", "lidar", "val", dim=3), [sample])
+    figures = {}
+    for dim in ("2", "3"):
+        out = tmp_path / f"{dim}.json"
+        command()([str(results), str(truth), "--dim", dim, "--out", str(out)])
+        figures[dim] = json.loads(out.read_text())
+    assert figures["2"]["chamfer/divider/AP@0.5"] == 1.0
+    assert figures["3"]["chamfer/divider/AP@1.0"] == 0.0
+    assert figures["3"]["chamfer/divider/AP@1.5"] == 1.0
+    assert figures["3"]["raster/divider/AP"] == figures["2"]["raster/divider/AP"] > 0.99
+    write_results(results, [("a", [vector(LINE, "divider", 0.9)])])
+    with pytest.raises(ValueError, match="sample 'a', AP_chamfer of dim 3: points must have 3"):
+        command()([str(results), str(truth), "--dim", "3"])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

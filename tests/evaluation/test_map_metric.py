@@ -16,6 +16,7 @@ from mmengine.evaluator import Evaluator  # noqa: E402
 from mmengine.structures import InstanceData  # noqa: E402
 
 from gsmap.evaluation import map_metric  # noqa: E402
+from gsmap.evaluation.results_json import read_samples  # noqa: E402
 
 RANGES = {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0)}
 
@@ -88,6 +89,31 @@ def test_results_are_written_with_gaussians_and_without_ground_truth(tmp_path):
     assert vector["pts"][0] == pytest.approx([0.2, -20.0])
     assert len(vector["gaussian_rotations"]) == 20
     assert written["meta"]["classes"] == list(CLASSES)
+
+
+def raised(found: Det3DDataSample, predicted_m: float) -> Det3DDataSample:
+    """Lay the ground truth at z = 0 and the prediction at another height."""
+    (line,), pts = found.eval_ann_info["polylines"], found.pred_instances_3d.pts
+    found.eval_ann_info["polylines"] = [np.c_[line, np.zeros(len(line))]]
+    found.pred_instances_3d.pts = torch.cat([pts, torch.full((1, 20, 1), predicted_m)], -1)
+    return found
+
+
+def test_heights_count_where_the_data_set_hands_them_on(tmp_path):
+    """The data set's dim decides: 1.2 m too high misses the thresholds below."""
+    path, wanted = tmp_path / "results.json", {2: (1.0, 1.0), 3: (0.0, 1.0)}
+    for dim, aps in wanted.items():
+        evaluator = build(out_file=str(path))
+        evaluator.dataset_meta = {**evaluator.dataset_meta, "dim": dim}
+        evaluator.process([raised(sample("a", 0.0), 1.2)])
+        metrics = evaluator.evaluate(1)
+        assert tuple(metrics[f"chamfer/divider/AP@{t}"] for t in (1.0, 1.5)) == aps
+        assert metrics["raster/divider/AP"] == pytest.approx(1.0)
+    (vector,) = json.loads(path.read_text())["results"][0]["vectors"]
+    assert vector["pts"][0] == pytest.approx([0.0, -20.0, 1.2])
+    read, _ = read_samples(path, "results", CLASSES)
+    assert read["a"].points.shape == (20, 3)
+    np.testing.assert_allclose(read["a"].points[:, 2], 1.2, rtol=1e-6)
 
 
 def test_samples_without_ground_truth_and_bad_settings_are_refused():

@@ -35,9 +35,13 @@ def test_z_is_kept_if_all_have_it():
     line_3d = [[0.0, 1.0, 5.0], [2.0, 3.0, 6.0]]
     elements = MapElements.from_polylines([line_3d], [0])
     assert elements.points.tolist() == line_3d
-    assert elements.planar().points.tolist() == LINE
+    assert elements.with_coordinates(2).points.tolist() == LINE
     assert MapElements.from_polylines([line_3d, RING], [0, 1]).points.tolist() == LINE + RING
-    assert elements.planar().planar().points.flags.c_contiguous
+    assert elements.with_coordinates(2).with_coordinates(2).points.flags.c_contiguous
+    assert elements.with_coordinates(3).points.tolist() == line_3d
+    assert MapElements.from_polylines().with_coordinates(3).points.shape == (0, 3)
+    with pytest.raises(ValueError, match="points must have 3 coordinates, got 2"):
+        elements.with_coordinates(2).with_coordinates(3)
 
 
 def test_ground_truth_has_full_confidence_and_a_sample_may_be_empty():

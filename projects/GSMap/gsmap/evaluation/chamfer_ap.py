@@ -2,7 +2,9 @@
 
 Rules (equal to MapTR's evaluator): every line is resampled to 100 points; a prediction looks only
 at its nearest ground truth and matches if the distance is within the threshold and no prediction
-with a higher score has taken it; pairs whose 4 m wide strips do not touch never match.
+with a higher score has taken it; pairs whose 4 m wide strips do not touch never match. With
+heights the distances are those in space, as in MapTRv2's; lines are resampled and strips touch in
+the plane.
 """
 
 from collections.abc import Iterable
@@ -32,6 +34,7 @@ class ChamferConfig:
         num_points: Points that each line is resampled to.
         resample_predictions: If False, predictions are compared at the points they come with.
         resample_ground_truth: If False, ground truth is compared at its own vertices.
+        dim: Coordinates that distances count: 2, or 3 with heights, which both sides must have.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -42,6 +45,7 @@ class ChamferConfig:
     num_points: int = 100
     resample_predictions: bool = True
     resample_ground_truth: bool = True
+    dim: int = 2
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "classes", tuple(self.classes))
@@ -53,37 +57,45 @@ class ChamferConfig:
             )
         if self.num_points < 2:
             raise ValueError(f"num_points must be >= 2, got {self.num_points}.")
+        if self.dim not in (2, 3):
+            raise ValueError(f"dim must be 2 or 3, got {self.dim!r}.")
 
 
-def _lines(elements: MapElements, num_points: int, resample: bool) -> kernels.Lines:
+def _lines(elements: MapElements, config: ChamferConfig, resample: bool) -> kernels.Lines:
     """Resample, or keep, the lines of one sample; those of no length get the label -1."""
-    points, offsets = elements.planar().points, elements.offsets
-    moved = np.append(0, np.cumsum((points[1:] != points[:-1]).any(axis=1)))
+    points, offsets = elements.with_coordinates(config.dim).points, elements.offsets
+    moved = np.append(0, np.cumsum((points[1:, :2] != points[:-1, :2]).any(axis=1)))
     long = elements.num_points >= 2
     long[long] = moved[offsets[1:][long] - 1] > moved[offsets[:-1][long]]
     if resample:
-        points = resample_all(points, offsets, num_points).reshape(-1, 2)
-        offsets = np.arange(len(elements) + 1) * num_points
-    x, y = np.ascontiguousarray(points.T)
-    return x, y, offsets, np.where(long, elements.labels, -1)
+        points = resample_all(points, offsets, config.num_points).reshape(-1, config.dim)
+        offsets = np.arange(len(elements) + 1) * config.num_points
+    xyz = _with_z(*np.ascontiguousarray(points.T))
+    return *xyz, offsets, np.where(long, elements.labels, -1)
 
 
 def chamfer_distance(first: FloatArray, second: FloatArray) -> float:
     """Return the mean of the two directed mean nearest-neighbour distances.
 
     Args:
-        first: Points in metres. (P, 2)
-        second: Points in metres. (Q, 2)
+        first: Points in metres. (P, 2 or 3)
+        second: Points in metres. (Q, 2 or 3)
 
     Raises:
-        ValueError: If a point set is empty or not (n, 2).
+        ValueError: If a point set is empty, or they are not both (n, 2) or both (n, 3).
     """
     for points in (first, second):
-        if points.ndim != 2 or points.shape[1] != 2 or not len(points):
-            raise ValueError(f"point sets must be (n, 2) with n >= 1, got {points.shape}.")
+        if points.ndim != 2 or points.shape[1] not in (2, 3) or not len(points):
+            raise ValueError(f"point sets must be (n, 2 or 3) with n >= 1, got {points.shape}.")
+    if first.shape[1] != second.shape[1]:
+        raise ValueError(f"both need as many coordinates, got {first.shape}, {second.shape}.")
     columns = (np.ascontiguousarray(points.T, np.float64) for points in (first, second))
-    (ax, ay), (bx, by) = columns
-    return float(kernels.chamfer(ax, ay, bx, by))
+    return float(kernels.chamfer(*(_with_z(*xyz) for xyz in columns)))
+
+
+def _with_z(x: FloatArray, y: FloatArray, z: FloatArray | None = None) -> kernels.Points:
+    """Return coordinates as the kernels take them: no heights are an empty array."""
+    return x, y, np.empty(0) if z is None else z
 
 
 def _strips_touch(first: FloatArray, second: FloatArray) -> bool:
@@ -91,7 +103,7 @@ def _strips_touch(first: FloatArray, second: FloatArray) -> bool:
     import shapely  # only a handful of pairs per thousand frames come here
 
     a, b = shapely.buffer(
-        [shapely.LineString(first), shapely.LineString(second)],
+        [shapely.LineString(first[:, :2]), shapely.LineString(second[:, :2])],
         STRIP_HALF_WIDTH_M,
         quad_segs=16,
         cap_style="flat",
@@ -106,7 +118,7 @@ def _nearest_touching(
     """Return the nearest ground truth whose strip touches the prediction's, or (-1, inf)."""
     best, distance = -1, np.inf
     line = _points(pred, row)
-    for k in np.flatnonzero(gt[3] == pred[3][row]).tolist():
+    for k in np.flatnonzero(gt[-1] == pred[-1][row]).tolist():
         other = _points(gt, k)
         d = chamfer_distance(line, other)
         if d < distance and d <= max_distance and _strips_touch(line, other):
@@ -115,10 +127,10 @@ def _nearest_touching(
 
 
 def _points(lines: kernels.Lines, index: int) -> FloatArray:
-    """Return the points of one line. (P, 2)"""
-    x, y, offsets, _ = lines
+    """Return the points of one line. (P, 2 or 3)"""
+    *xyz, offsets, _ = lines
     part = slice(offsets[index], offsets[index + 1])
-    return np.stack([x[part], y[part]], axis=1)
+    return np.stack([values[part] for values in xyz if len(values)], axis=1)
 
 
 def nearest_by_chamfer(
@@ -138,9 +150,12 @@ def nearest_by_chamfer(
     Returns:
         Index of the nearest ground truth, or -1 if none is within ``max_distance`` (N,), and its
         Chamfer distance in metres, or infinity (N,).
+
+    Raises:
+        ValueError: If heights count, and a side has none.
     """
-    pred = _lines(predictions, config.num_points, config.resample_predictions)
-    gt = _lines(ground_truth, config.num_points, config.resample_ground_truth)
+    pred = _lines(predictions, config, config.resample_predictions)
+    gt = _lines(ground_truth, config, config.resample_ground_truth)
     best, distance, touching = kernels.nearest_ground_truth(
         pred, gt, max_distance, STRIP_HALF_WIDTH_M
     )
@@ -162,9 +177,16 @@ def match_chamfer(
         ground_truth: Ground truth of the sample.
         config: Rules.
         token: Name of the sample.
+
+    Raises:
+        ValueError: If heights count, and a side has none.
     """
     num_classes, scores = len(config.classes), predictions.confidence
-    best, distance = nearest_by_chamfer(predictions, ground_truth, config, config.thresholds[-1])
+    try:
+        found = nearest_by_chamfer(predictions, ground_truth, config, config.thresholds[-1])
+    except ValueError as error:
+        raise ValueError(f"sample {token!r}, AP_chamfer of dim {config.dim}: {error}") from error
+    best, distance = found
     kept = (predictions.num_points >= 2) & _known(predictions.labels, num_classes)
     rows = np.flatnonzero(kept)
     rows = rows[np.argsort(-scores[rows], kind="stable")]

@@ -1,6 +1,6 @@
 """Compiled inner loops of AP_chamfer; ``chamfer_ap`` is their only user.
 
-Coordinates come as separate x and y arrays, so that the loops vectorise.
+Coordinates come as separate arrays, so that the loops vectorise; without heights z is empty.
 """
 
 import math
@@ -10,23 +10,31 @@ from numba import njit
 
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
-Lines = tuple[FloatArray, FloatArray, IntArray, IntArray]  # x, y (M,), offsets (N + 1,), labels
+Points = tuple[FloatArray, FloatArray, FloatArray]  # x, y, z (P,), or z (0,)
+Lines = tuple[FloatArray, FloatArray, FloatArray, IntArray, IntArray]
+"""Coordinates of all points, offsets of the N lines (N + 1,), labels (N,)."""
 _NO_NAN = {"nnan", "nsz"}  # minima vectorise; the order of additions stays as it is written
 _BOUND_SLACK = 1.0 - 1e-12  # a lower bound may be too large by the rounding of its sum
 
 
 @njit(cache=True, fastmath=_NO_NAN)
-def chamfer(ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray) -> float:
-    """Return the mean of both directed mean nearest-neighbour distances, (P,) points to (Q,)."""
-    back = np.full(len(bx), np.inf)
+def chamfer(first: Points, second: Points) -> float:
+    """Return the mean of both directed mean nearest-neighbour distances; heights: both or none."""
+    (ax, ay, az), (bx, by, bz) = first, second
+    back, squared = np.full(len(bx), np.inf), np.empty(len(bx))
     there = 0.0
     for i in range(len(ax)):
-        nearest = np.inf
         for j in range(len(bx)):
             dx, dy = ax[i] - bx[j], ay[i] - by[j]
-            squared = dx * dx + dy * dy
-            back[j] = min(back[j], squared)
-            nearest = min(nearest, squared)
+            squared[j] = dx * dx + dy * dy
+        if len(az):
+            for j in range(len(bx)):
+                dz = az[i] - bz[j]
+                squared[j] += dz * dz
+        nearest = np.inf
+        for j in range(len(bx)):
+            back[j] = min(back[j], squared[j])
+            nearest = min(nearest, squared[j])
         there += math.sqrt(nearest)
     return (there / len(ax) + np.sqrt(back).sum() / len(bx)) / 2.0
 
@@ -76,8 +84,8 @@ def nearest_ground_truth(
 ) -> tuple[IntArray, FloatArray, BoolArray]:
     """Find each prediction's nearest ground truth of its class.
 
-    No point of a set is nearer than the set's bounding box, which bounds the distance from below;
-    few pairs are left to compute in full.
+    No point of a set is nearer than the set's bounding box in the plane, which bounds the distance
+    from below; few pairs are left to compute in full.
 
     Args:
         pred: N predictions; a label of -1 marks one that cannot match.
@@ -89,8 +97,8 @@ def nearest_ground_truth(
         Index of the nearest ground truth or -1 (N,); Chamfer distance or infinity (N,); whether
         the pair's strips are known to touch (N,).
     """
-    px, py, p_off, p_labels = pred
-    gx, gy, g_off, g_labels = gt
+    px, py, pz, p_off, p_labels = pred
+    gx, gy, gz, g_off, g_labels = gt
     n = len(p_labels)
     best, distance, touching = np.full(n, -1), np.full(n, np.inf), np.zeros(n, np.bool_)
     p_boxes, g_boxes = _boxes(px, py, p_off), _boxes(gx, gy, g_off)
@@ -104,7 +112,8 @@ def nearest_ground_truth(
             bound = _mean_distance_to_box(ax, ay, g_boxes[k])
             bound += _mean_distance_to_box(bx, by, p_boxes[i])
             if bound / 2.0 * _BOUND_SLACK <= min(distance[i], max_distance):
-                d = chamfer(ax, ay, bx, by)
+                az, bz = pz[p_off[i] : p_off[i + 1]], gz[g_off[k] : g_off[k + 1]]
+                d = chamfer((ax, ay, az), (bx, by, bz))
                 if d < distance[i] and d <= max_distance:
                     distance[i], best[i] = d, k
         if best[i] >= 0:

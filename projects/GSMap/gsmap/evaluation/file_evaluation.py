@@ -109,11 +109,14 @@ def mismatch_notes(results: Samples, truth: Samples, allow_mismatch: bool) -> li
     return [": ".join(note) for note in notes]
 
 
-def _content_notes(truth: Samples, ignored: Mapping[str, Counter[str]]) -> list[str]:
+def _content_notes(
+    truth: Samples, ignored: Mapping[str, Counter[str]], config: EvaluationConfig
+) -> list[str]:
     """Say what is ignored."""
     notes = []
-    if sum(counts.pop(THREE_D, 0) for counts in ignored.values()):
-        notes.append("some elements have 3D points: z is ignored, both metrics are planar")
+    with_height = sum(counts.pop(THREE_D, 0) for counts in ignored.values())
+    if with_height and not (config.chamfer and config.chamfer.dim == 3):
+        notes.append("some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)")
     degenerate = sum(int((elements.num_points < 2).sum()) for elements in truth.values())
     if degenerate:
         notes.append(
@@ -153,7 +156,8 @@ def evaluate_files(
     ignored: dict[str, Counter[str]] = {}
     results, ignored["predictions"] = read_samples(results_path, RESULTS_KEY, config.classes)
     truth, ignored["ground truths"] = read_ground_truth(truth_path, config.classes)
-    notes = mismatch_notes(results, truth, allow_mismatch) + _content_notes(truth, ignored)
+    notes = mismatch_notes(results, truth, allow_mismatch)
+    notes += _content_notes(truth, ignored, config)
     return Evaluation(score(results, truth, config, num_workers, progress), notes)
 
 

@@ -39,6 +39,7 @@ class MapMetric(BaseMetric):
         pc_range: (x_min, y_min, z_min, x_max, y_max, z_max) in metres, for the canvas of
             AP_raster; the data set's if left out.
         thresholds: Thresholds of AP_chamfer in metres.
+        dim: Coordinates that AP_chamfer counts, 2 or 3; the data set's if left out.
         polygon_classes: Classes that AP_raster fills.
         out_file: Where to write the predictions in MapTR's JSON form, or None.
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
@@ -55,6 +56,7 @@ class MapMetric(BaseMetric):
         classes: Sequence[str] | None = None,
         pc_range: Sequence[float] | None = None,
         thresholds: Sequence[float] = CHAMFER_THRESHOLDS,
+        dim: int | None = None,
         polygon_classes: Sequence[str] = POLYGON_CLASSES,
         out_file: str | None = None,
         **kwargs: Any,
@@ -72,6 +74,7 @@ class MapMetric(BaseMetric):
             self._settings["x_range"] = (pc_range[0], pc_range[3])
             self._settings["y_range"] = (pc_range[1], pc_range[4])
         self._thresholds = tuple(thresholds)
+        self._dim = dim
         self._polygon_classes = tuple(polygon_classes)
 
     def _setting(self, key: str) -> Any:
@@ -96,7 +99,8 @@ class MapMetric(BaseMetric):
             return None
         chamfer = raster = None
         if "chamfer" in self.eval:
-            chamfer = ChamferConfig(self.classes, self._thresholds)
+            dim = self._dim or (self.dataset_meta or {}).get("dim", 2)
+            chamfer = ChamferConfig(self.classes, self._thresholds, dim=dim)
         if "raster" in self.eval:
             x_range, y_range = (self._setting(key) for key in ("x_range", "y_range"))
             raster = RasterConfig(self.classes, self._polygon_classes, x_range, y_range)

@@ -71,11 +71,13 @@ class _ClassFit:
     ) -> None:
         self.label, self.chamfer, self.num_samples = label, chamfer, len(truth)
         self.thresholds = np.asarray(chamfer.thresholds)
+        truth = [elements.with_coordinates(chamfer.dim) for elements in truth]
         frames = [elements.select(elements.labels == label) for elements in truth]
         self.frames = [frame for frame in frames if len(frame)]
         self.first = np.cumsum([0, *map(len, self.frames)])  # where each frame starts, (F + 1,)
         points = [resample_all(f.points, f.offsets, config.num_points) for f in self.frames]
-        self.points = np.concatenate([np.empty((0, config.num_points, 2)), *points])  # (K, P, 2)
+        none = np.empty((0, config.num_points, chamfer.dim))
+        self.points = np.concatenate([none, *points])  # (K, P, 2 or 3)
         self.taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)
         drawn = np.random.default_rng(config.seed).permutation(len(self.points))
         self.candidates = self.points[np.sort(drawn[: config.max_candidates])]

@@ -128,7 +128,7 @@ def rasterize(elements: MapElements, config: RasterConfig) -> Masks:
         elements: N elements with labels below the number of classes.
         config: Rules.
     """
-    pixels = pixels_from_metres(elements.planar().points, config)
+    pixels = pixels_from_metres(elements.with_coordinates(2).points, config)
     filled = np.array(config.is_polygon)[elements.labels]
     size, radius = (config.height, config.width), config.dilation_px // 2
     return draw(pixels, elements.offsets, elements.labels, filled, size, radius)

@@ -108,11 +108,22 @@ class MapElements:
         """Whether every vertex carries a Gaussian."""
         return self.scales is not None and self.rotations is not None
 
-    def planar(self) -> "MapElements":
-        """Return the elements without z."""
-        if self.points.shape[1] == 2:
+    def with_coordinates(self, dim: int) -> "MapElements":
+        """Return the elements with (x, y), or (x, y, z), per vertex.
+
+        Args:
+            dim: Coordinates per vertex, 2 or 3.
+
+        Raises:
+            ValueError: If there are vertices of fewer coordinates.
+        """
+        found = self.points.shape[1]
+        if found == dim:
             return self
-        return replace(self, points=np.ascontiguousarray(self.points[:, :2]))
+        if found < dim and len(self.points):
+            raise ValueError(f"points must have {dim} coordinates, got {found}.")
+        points = self.points[:, :dim] if len(self.points) else np.empty((0, dim))
+        return replace(self, points=np.ascontiguousarray(points))
 
     def select(self, index: IntArray | BoolArray) -> "MapElements":
         """Return some of the elements, in the order that is asked for.

@@ -77,10 +77,10 @@ def resample(points: Points, num_points: int) -> NDArray[np.float64]:
 def resample_all(
     points: Points, offsets: NDArray[np.integer[Any]], num_points: int
 ) -> NDArray[np.float64]:
-    """Resample many polylines at equal arc length, both end points included.
+    """Resample many polylines at equal arc length in the plane, both end points included.
 
     Args:
-        points: Vertices of all polylines in metres. (M, D)
+        points: Vertices of all polylines in metres; z is interpolated. (M, D)
         offsets: Polyline i owns the vertices ``offsets[i]:offsets[i + 1]``. (N + 1,)
         num_points: Number P of points of each, >= 2.
 
@@ -94,7 +94,7 @@ def resample_all(
     vertex = np.minimum(np.arange(counts.max()), counts[:, None] - 1) + offsets[:-1, None]
     padded = points[vertex.clip(0)]  # (N, n, D), the last vertex repeated
     along = np.zeros(vertex.shape)
-    np.cumsum(np.linalg.norm(np.diff(padded, axis=1), axis=-1), axis=1, out=along[:, 1:])
+    np.cumsum(np.linalg.norm(np.diff(padded[..., :2], axis=1), axis=-1), axis=1, out=along[:, 1:])
     distances = np.arange(num_points) * (along[:, -1:] / (num_points - 1))  # (N, P)
     distances[:, -1] = along[:, -1]
     for i in np.flatnonzero(counts):
