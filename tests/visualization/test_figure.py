@@ -98,6 +98,43 @@ def test_line_ahead_appears_in_the_front_camera_only():
         assert (colour_share(body, STYLE.colour(0)) > 1e-3) == expected
 
 
+@pytest.mark.parametrize(("z", "row"), [(2.0, 19.4), (-2.0, 70.6), (None, 68.552)])
+def test_cameras_project_the_height_of_points(z, row):
+    """A line across, 10 m ahead: its row of 90 is 45 - 128 z / 10; the ground lies at -1.84 m."""
+    ends = np.array([[-5.0, 10], [5, 10]])
+    points = ends if z is None else np.c_[ends, [z, z]]
+    line = MapElements.from_polylines((points,), np.array([0]))
+    figure = compose_figure([RIG[0]], [], GRID, VIEW, STYLE, line)
+    picture = figure_to_rgb(figure)
+    box = figure.axes[0].get_window_extent()
+    bottom = picture.shape[0] - round(box.y0)
+    window = picture[bottom - round(box.height) : bottom, round(box.x0) : round(box.x1)]
+    wanted = np.round(np.array(mcolors.to_rgb(STYLE.colour(0))) * 255)
+    rows, _ = np.nonzero(np.abs(window.astype(int) - wanted).max(axis=-1) <= 3)
+    assert rows.mean() / len(window) * 90 == pytest.approx(row, abs=0.5)
+
+
+def test_bird_s_eye_views_ignore_the_height_of_points():
+    extra = {
+        "scores": np.array([0.9, 0.5]),
+        "scales": (np.full((2, 2), 0.5), np.full((5, 2), 0.5)),
+        "rotations": (np.zeros(2), np.zeros(5)),
+    }
+    flat = elements(**extra)
+    z = np.linspace(-3, 3, 2), np.linspace(2, 5, 5)
+    lines = [np.c_[line, height] for line, height in zip(flat.polylines, z, strict=True)]
+    high = MapElements.from_polylines(lines, flat.labels, **extra)
+    for frame in ("lidar", "ego"):
+        first, second = (
+            figure_to_rgb(compose_figure([], panels, GRID, FRAME_VIEWS[frame], STYLE))
+            for panels in (
+                [BEVPanel("", e, vertices=True, order=True, gaussians=True, scores=True)]
+                for e in (flat, high)
+            )
+        )
+        np.testing.assert_array_equal(first, second)
+
+
 def test_elements_appear_in_bev_where_they_are():
     panel = BEVPanel(
         "", MapElements.from_polylines((np.array([[-14.0, 29], [-1, 29]]),), np.array([2]))
