@@ -124,7 +124,9 @@ def annotations(minicity_root: Path, tmp_path_factory) -> Callable[[ConfigDict],
         wanted = x_range, y_range, tuple(dataset.classes)
         if wanted not in folders:
             folders[wanted] = tmp_path_factory.mktemp("annotations")
-            options = NuScenesOptions(minicity_root, "v1.0-trainval", folders[wanted], "minicity")
+            options = NuScenesOptions(
+                minicity_root, "v1.0-trainval", dataset="minicity", out_dir=folders[wanted]
+            )
             convert_nuscenes(replace(options, x_range=x_range, y_range=y_range, classes=wanted[2]))
         flat = folders[wanted] / f"gsmap_minicity_{dataset.split}.arrow"
         if dataset.get("dim", 2) == 2:
