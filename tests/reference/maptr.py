@@ -210,6 +210,36 @@ def loss_rows(
         yield Row(name, f"{key} (relative)", relative_norm(grad, data[key]), 1e-3)
 
 
+def head_loss_rows(
+    golden: Golden, name: str, head: MapHead, forward_file: str, renamed: dict[str, str]
+) -> Iterator[Row]:
+    """Compare matches and losses of a method's head on saved predictions of reduced size.
+
+    Args:
+        golden: The reference data.
+        name: The file, whose last part but one is the set of ground truth.
+        head: A head with the method's losses.
+        forward_file: The file of saved predictions.
+        renamed: Names of the losses in the file, and ours.
+
+    Yields:
+        The compared quantities.
+    """
+    data, saved = golden.read_arrays(name), golden.read_arrays(forward_file)
+    scores, pts = (torch.from_numpy(saved[key]) for key in ("all_cls_scores", "all_pts_preds"))
+    outputs = {"all_cls_scores": scores, "all_pts_preds": pts, "all_references": pts}
+    batch_gt = [gt_instances(golden.gt_sets[name.split("_")[2]])]
+    metas = [golden.meta("reduced")]
+    matches = {f"{key}_b0": value for key, value in data.items() if key.startswith("match_")}
+    yield from match_rows(name, matches, head, outputs, batch_gt, metas)
+    losses = head.loss_by_feat(outputs, batch_gt, metas)
+    layers = [*(f"d{layer}." for layer in range(len(scores) - 1)), ""]
+    for theirs, ours in renamed.items():
+        values = [losses[layer + ours].item() for layer in layers]
+        wanted = [data[f"loss/{layer}{theirs}"] for layer in layers]
+        yield Row(name, f"{ours} (relative)", largest_relative(values, wanted), 1e-4)
+
+
 def match_rows(
     name: str,
     data: dict[str, np.ndarray],

@@ -1,4 +1,4 @@
-"""MapVR: soft rasters, the dice loss between them with its gradient, and the matching cost."""
+"""MapVR: soft rasters, the dice loss between them with its gradient, matching cost, head."""
 
 from collections.abc import Iterator
 
@@ -7,9 +7,17 @@ import torch
 from gsmap.models.losses.dice import ElementRenderer, RenderedDiceLoss, rendered_dice_cost
 from gsmap.ops.polyline_raster import soft_rasters
 from reference.golden import Golden
+from reference.maptr import head_loss_rows
 from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 
+CONFIG, STATE = "mapvr/mapvr_r50_24e.py", "mapvr_r50_state.json"
+LOSSES = {
+    "loss_cls": "loss_cls",
+    "loss_pts": "loss_pts",
+    "loss_dir": "loss_dir",
+    "loss_rendered_mask": "loss_dice",
+}
 COST_WEIGHT, COST_RENDERER = 10.0, ElementRenderer((128, 64))
 # How the suffix of a raster's name says it was rendered: whether as a polygon. Boundaries of
 # polygons and hard masks serve nothing in MapVR's training and have no counterpart here.
@@ -52,3 +60,11 @@ def check_dice(golden: Golden, name: str) -> Iterator[Row]:
         cost = rendered_dice_cost(data[f"{case}_cost_pred"], gt, labels, COST_RENDERER)
         off = largest_difference(COST_WEIGHT * cost, data[f"{case}_cost_w10"])
         yield Row(name, f"{case}: cost", off, 1e-4)
+
+
+@check("mapvr_headloss_*_{variant}.npz")
+def check_head(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare matches and losses of the head on MapTR's predictions."""
+    head = golden.model(CONFIG, STATE).map_head
+    predictions = f"maptr_r50_forward_reduced_{golden.variant}.npz"
+    yield from head_loss_rows(golden, name, head, predictions, LOSSES)

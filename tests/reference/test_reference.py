@@ -24,6 +24,8 @@ FILES = [
     "ops_gka_*.npz",
     "mapvr_rasters_*.npz",
     "mapvr_dice_*.npz",
+    "mapvr_headloss_closed_*.npz",
+    "mapvr_headloss_many_*.npz",
     "maptr_r50_forward_reduced_*.npz",
     "maptr_r50_forward_full_*.npz",
     "maptr_gt_*.npz",

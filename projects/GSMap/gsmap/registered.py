@@ -24,6 +24,7 @@ import gsmap.models.detectors.map_detector
 import gsmap.models.heads.aux_heads
 import gsmap.models.heads.gsmap_head
 import gsmap.models.heads.map_head
+import gsmap.models.heads.mapvr_head
 import gsmap.models.heads.references
 import gsmap.models.layers.geometry_attention
 import gsmap.models.layers.grid_mask
@@ -35,7 +36,7 @@ import gsmap.models.task_modules.raster_costs
 import gsmap.visualization.map_visualization_hook
 import gsmap.visualization.map_visualizer  # noqa: F401
 from gsmap.models.losses.dice import RenderedDiceLoss
-from gsmap.models.losses.direction import DirectionLoss
+from gsmap.models.losses.direction import DirectionLoss, SelfDirectionLoss
 from gsmap.models.losses.geometry import EuclideanLoss
 from gsmap.models.losses.point import PointsLoss, SamplingLocationLoss
 from gsmap.models.losses.raster import MaskOverlapLoss, RasterLoss
@@ -48,6 +49,7 @@ LOSSES = (
     RasterLoss,
     RenderedDiceLoss,
     SamplingLocationLoss,
+    SelfDirectionLoss,
 )
 # The losses are plain torch modules, usable without OpenMMLab; they enter the registry here.
 for loss in LOSSES:

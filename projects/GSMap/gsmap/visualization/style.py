@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from gsmap.structures.classes import AREA_CLASSES
+
 CLASS_COLOURS: dict[str, str] = {
     "divider": "#FF9500",
     "ped_crossing": "#2D8CFF",
@@ -34,7 +36,7 @@ class MapStyle:
     """
 
     classes: Sequence[str] = ("divider", "ped_crossing", "boundary")
-    closed_classes: Sequence[str] = ("ped_crossing", "stop_line", "intersection", "carpark_area")
+    closed_classes: Sequence[str] = AREA_CLASSES
     font_family: str = "DejaVu Sans"
     bev_line_pt: float = 1.6
     camera_line_pt: float = 1.7

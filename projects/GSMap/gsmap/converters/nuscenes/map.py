@@ -24,6 +24,7 @@ from gsmap.converters.local_map import (
     vertices_of,
 )
 from gsmap.datasets.annotations.record import RANGES, MapInstance
+from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.polylines import Points
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 LINE_LAYERS = ("road_divider", "lane_divider")
 SURFACE_LAYERS = ("road_segment", "lane")
-AREA_CLASSES = ("ped_crossing", "stop_line", "intersection", "carpark_area")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:], "centerline")
 OUTLINE_MARGIN_M = 0.2
 CENTERLINE_STEP_M = 0.5

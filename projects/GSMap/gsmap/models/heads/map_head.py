@@ -19,7 +19,13 @@ from gsmap.models.heads.matched import (
     MatchedPairs,
     collect_targets,
 )
-from gsmap.models.heads.parts import by_name, fields_read, refuse_twins, refuse_unknown_losses
+from gsmap.models.heads.parts import (
+    by_name,
+    fields_read,
+    refuse_twins,
+    refuse_unknown_classes,
+    refuse_unknown_losses,
+)
 from gsmap.models.heads.query_groups import QueryGroup, fit_instance_queries, group_mask
 from gsmap.models.layers.branches import classification_branch
 from gsmap.models.layers.deformable_attention import init_matrices
@@ -59,8 +65,8 @@ class MapHead(BaseModule):
         init_cfg: As in mmengine.
 
     Raises:
-        ValueError: If a loss or a cost reads a field that nothing here offers, or two parts have
-            one name.
+        ValueError: If a loss or a cost reads a field that nothing here offers or names a class
+            that there is not, or two parts have one name.
     """
 
     default_reference = "PointReference"
@@ -146,6 +152,7 @@ class MapHead(BaseModule):
         refuse_twins([group.name for group in self.query_groups], "query groups")
         refuse_unknown_losses(self.query_groups, names)
         costs = self.assigner.match_costs
+        refuse_unknown_classes(self.masks, [*self.losses.values(), *costs], self.classes)
         read = fields_read(costs, offered - AFTER_MATCHING, f"before the matching, {where}")
         return read | fields_read(self.losses.values(), offered, where)
 

@@ -1,10 +1,11 @@
-"""What a head checks of its parts when it is built: names, and the fields that each part reads."""
+"""What a head checks of its parts when it is built: names, classes, the fields that each reads."""
 
 from collections.abc import Iterable, Sequence, Set
 from typing import Any
 
 from torch import nn
 
+from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.query_groups import QueryGroup
 
 
@@ -65,3 +66,20 @@ def refuse_unknown_losses(groups: Sequence[QueryGroup], losses: Sequence[str]) -
             raise ValueError(
                 f"query group {group.name!r} names losses {unknown}; there are {list(losses)}."
             )
+
+
+def refuse_unknown_classes(
+    masks: ElementMasks, parts: Iterable[Any], classes: Sequence[str]
+) -> None:
+    """Refuse masks, losses and costs that fill or render as polygons what is no class.
+
+    Raises:
+        ValueError: If an index is beyond the classes.
+    """
+    named = {"masks.filled_classes": masks.filled_classes}
+    for part in parts:
+        if hasattr(part, "renderer"):
+            named[f"{type(part).__name__}.polygon_classes"] = part.renderer.polygon_classes
+    for name, indices in named.items():
+        if any(not 0 <= index < len(classes) for index in indices):
+            raise ValueError(f"{name} must be indices of {list(classes)}, got {tuple(indices)}.")

@@ -1,0 +1,98 @@
+"""MapVR's head: points supervised through their soft rasters."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from mmdet3d.registry import MODELS
+
+from gsmap.models.heads.map_head import PARTS, MapHead
+from gsmap.models.heads.masks import ElementMasks
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.grid import BEVGrid
+
+
+@MODELS.register_module()
+class MapVRHead(MapHead):
+    """The map head with MapVR's parts as defaults, on whatever decoder and references there are.
+
+    Matched points are rendered softly, as lines or as polygons by their class, and compared by the
+    dice loss; matching does the same on coarser rasters. Points weigh less than in MapTR, and the
+    direction loss asks for straight predictions instead of the ground truth's directions.
+
+    Args:
+        grid: The map's extent.
+        classes: Names of the classes.
+        decoder: Config of the decoder.
+        losses: Configs of the losses of the head that this one extends; of these, `PointsLoss` gets
+            another weight, `DirectionLoss` is replaced.
+        match_costs: Configs of its matching costs; `OrderedPointsCost` gets another weight.
+        loss_dice: Settings of the dice loss, or None to train without it.
+        dice_cost: Settings of the matching cost of the same, or None to match without it.
+        loss_direction: Config of the direction loss, or None to train without one.
+        points_weight: Weight of the points in losses and in matching.
+        polygons: Names of the classes that are rendered as filled polygons; None: those that are
+            areas (`AREA_CLASSES`).
+        rendering: Further settings of `ElementRenderer`, for loss and cost.
+        masks: Sizes of pixels as in `ElementMasks`: 256 x 128 and, for matching, 128 x 64 on a map
+            of 60 x 30 m.
+        dropout: Dropout in the decoder's layers.
+        kwargs: Further arguments of `MapHead`.
+
+    Raises:
+        ValueError: If ``polygons`` names what is no class.
+    """
+
+    def __init__(
+        self,
+        grid: BEVGrid,
+        classes: Sequence[str],
+        decoder: PARTS,
+        losses: Sequence[PARTS],
+        match_costs: Sequence[PARTS],
+        loss_dice: PARTS | None = {"loss_weight": 15.0},  # noqa: B006
+        dice_cost: PARTS | None = {"weight": 10.0},  # noqa: B006
+        loss_direction: PARTS | None = {"type": "SelfDirectionLoss"},  # noqa: B006
+        points_weight: float = 1.0,
+        polygons: Sequence[str] | None = None,
+        rendering: PARTS | None = None,
+        masks: PARTS | None = None,
+        dropout: float = 0.0,
+        **kwargs: Any,
+    ) -> None:
+        masks = {"pixel_m": 60 / 256, "cost_pixel_m": 60 / 128, **(masks or {})}
+        rasters = ElementMasks(grid, **masks)
+        shared = {"polygon_classes": _indices(polygons, classes), **(rendering or {})}
+        losses = [loss for loss in losses if loss["type"] != "DirectionLoss"]
+        losses = _weighted(losses, "PointsLoss", "loss_weight", points_weight)
+        match_costs = _weighted(match_costs, "OrderedPointsCost", "weight", points_weight)
+        if loss_direction:
+            losses.append(loss_direction)
+        if loss_dice:
+            size = rasters.grid.height, rasters.grid.width
+            losses.append({"type": "RenderedDiceLoss", "size": size, **shared, **loss_dice})
+        if dice_cost:
+            size = rasters.cost_grid.height, rasters.cost_grid.width
+            match_costs.append({"type": "RenderedDiceCost", "size": size, **shared, **dice_cost})
+        super().__init__(
+            grid=grid,
+            classes=classes,
+            decoder={**decoder, "layer": {**decoder.get("layer", {}), "dropout": dropout}},
+            losses=losses,
+            match_costs=match_costs,
+            masks=masks,
+            **kwargs,
+        )
+
+
+def _indices(names: Sequence[str] | None, classes: Sequence[str]) -> tuple[int, ...]:
+    """Return the indices of classes by name; None stands for those that are areas."""
+    unknown = sorted(set(names or ()) - set(classes))
+    if unknown:
+        raise ValueError(f"polygons must be classes of {list(classes)}, got {unknown}.")
+    chosen = AREA_CLASSES if names is None else names
+    return tuple(index for index, name in enumerate(classes) if name in chosen)
+
+
+def _weighted(parts: Sequence[PARTS], kind: str, name: str, weight: float) -> list[PARTS]:
+    """Return configs of parts, with another weight in those of one type."""
+    return [{**part, name: weight} if part["type"] == kind else part for part in parts]
