@@ -1,4 +1,4 @@
-"""GeMap: the geometry-decoupled attention and the Euclidean loss with its gradient."""
+"""GeMap: its attention, its loss with the gradient, state, forward pass and head."""
 
 from collections.abc import Iterator
 
@@ -12,8 +12,18 @@ from gsmap.models.losses.geometry import (
     euclidean_shape_loss,
 )
 from reference.golden import Golden
+from reference.maptr import decoded_rows, head_loss_rows, state_rows
 from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
+
+CONFIG = "gemap/gemap_simple_r50_24e.py"
+MODEL_STATE = "gemap_simple_r50_state.json"
+LOSSES = {
+    "loss_cls": "loss_cls",
+    "loss_pts": "loss_pts",
+    "loss_dir": "loss_dir",
+    "loss_geo_2": "loss_euclidean",
+}
 
 UPSTREAM = "pts_bbox_head.transformer.decoder.layers.0.attentions.0."
 OURS = "map_head.decoder.layers.0.self_attn."
@@ -65,3 +75,33 @@ def check_loss(golden: Golden, name: str) -> Iterator[Row]:
         off = largest_relative(value.detach(), data[quantity])
         yield Row(name, f"{quantity} (relative)", off, 1e-4)
     yield Row(name, "gradient (relative)", relative_norm(leaf.grad, data["grad"]), 1e-3)
+
+
+@check(MODEL_STATE)
+def check_state(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the state of GeMap with its simple objective with ours."""
+    yield from state_rows(golden, name, CONFIG)
+
+
+@check("gemap_simple_r50_forward_reduced_{variant}.npz")
+@torch.no_grad()
+def check_forward(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the way from the images to the detections."""
+    data = golden.read_arrays(name)
+    model, meta = golden.model(CONFIG, MODEL_STATE), golden.meta("reduced")
+    bev_outputs = model.bev_encoder(model.extract_img_feats(golden.images("reduced")), [meta])
+    bev = bev_outputs["bev_feats"][0][:, data["bev_rows"]][:, :, data["bev_cols"]]  # (C, h, w)
+    off = largest_difference(bev.flatten(1).T, data["bev_embed_sub"])
+    yield Row(name, "BEV features", off, 1e-4)
+    outputs = model.map_head(bev_outputs)
+    for key, atol in (("all_cls_scores", 5e-4), ("all_pts_preds", 1e-4)):
+        yield Row(name, key, largest_difference(outputs[key], data[key]), atol)
+    yield from decoded_rows(name, data, model.map_head.predict_by_feat(outputs, [meta])[0])
+
+
+@check("gemap_headloss_*_{variant}.npz")
+def check_head(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare matches and losses of the head on its own predictions."""
+    head = golden.model(CONFIG, MODEL_STATE).map_head
+    predictions = f"gemap_simple_r50_forward_reduced_{golden.variant}.npz"
+    yield from head_loss_rows(golden, name, head, predictions, LOSSES)

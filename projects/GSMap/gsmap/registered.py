@@ -22,6 +22,7 @@ import gsmap.models.decoders.map_decoder
 import gsmap.models.decoders.mgmapnet_decoder
 import gsmap.models.detectors.map_detector
 import gsmap.models.heads.aux_heads
+import gsmap.models.heads.gemap_head
 import gsmap.models.heads.gsmap_head
 import gsmap.models.heads.map_head
 import gsmap.models.heads.mapvr_head

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from mmdet.utils import reduce_mean
@@ -13,7 +14,7 @@ from gsmap.models.heads.references import PointReference
 from gsmap.models.task_modules.map_assigner import MapMatch
 
 GT_FIELDS = (
-    "labels", "pts", "pts_m", "pts_shifts", "first_pts", "masks", "rasters", "samples"
+    "labels", "pts", "pts_m", "pts_shifts", "first_pts", "masks", "rasters", "samples", "counts"
 )  # fmt: skip
 # what only matched pairs have: a loss may read it, a matching cost may not
 AFTER_MATCHING = frozenset(
@@ -63,7 +64,8 @@ class MatchedPairs:
     ``pred.<name>`` is a field of the predictions, ``gt.<name>`` one of the ground truths, samples
     concatenated. Besides the samples' own fields: ``pred.pts_m``, ``gt.pts_m`` in metres (M, P, 2);
     ``gt.pts``, normalised, in the matched order (M, P, 2); ``pred.masks``, rendered from the
-    Gaussians, and ``gt.masks`` (M, H, W); ``gt.samples``, the sample's number in the batch (M,).
+    Gaussians, and ``gt.masks`` (M, H, W); ``gt.samples``, the sample's number in the batch (M,);
+    ``gt.counts``, each sample's number of pairs, Python integers.
 
     Args:
         predictions: Predictions of one layer, per sample.
@@ -85,9 +87,10 @@ class MatchedPairs:
         self._targets = targets
         self._reference = reference
         self._masks = masks
-        self._made: dict[str, Tensor] = {"gt.pts": targets.pts}
+        counts = [len(match.gt_inds) for match in targets.matches]
+        self._made: dict[str, Any] = {"gt.pts": targets.pts, "gt.counts": counts}
 
-    def __getitem__(self, field: str) -> Tensor:
+    def __getitem__(self, field: str) -> Any:
         if field not in self._made:
             self._made[field] = self._make(field)
         return self._made[field]
@@ -102,7 +105,7 @@ class MatchedPairs:
         if field == "gt.masks" and self._masks.source == "points":
             return self._masks.draw(self["gt.pts_m"], self["gt.labels"], self._masks.grid)
         if field == "gt.samples":
-            counts = torch.tensor([len(match.gt_inds) for match in self._targets.matches])
+            counts = torch.tensor(self["gt.counts"])
             samples = torch.arange(len(counts)).repeat_interleave(counts)
             return samples.to(self._targets.labels.device)
         side, name = field.split(".")

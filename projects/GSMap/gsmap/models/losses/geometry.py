@@ -107,6 +107,9 @@ class EuclideanLoss(nn.Module):
         relation_weight: Weight of the relations in it.
     """
 
+    name = "euclidean"
+    reads = ("pred.pts", "gt.pts", "gt.counts")
+
     def __init__(
         self, loss_weight: float = 0.005, shape_weight: float = 1.0, relation_weight: float = 1.0
     ) -> None:
@@ -114,7 +117,13 @@ class EuclideanLoss(nn.Module):
         self.loss_weight = loss_weight
         self.shape_weight, self.relation_weight = shape_weight, relation_weight
 
-    def forward(self, pred: Tensor, target: Tensor, counts: Sequence[int]) -> Tensor:
+    def forward(
+        self,
+        pred: Tensor,
+        target: Tensor,
+        counts: Sequence[int],
+        avg_factor: float | Tensor | None = None,
+    ) -> Tensor:
         """Return the weighted loss. Its parts are means: no number of matches divides them.
 
         Args:
@@ -122,6 +131,7 @@ class EuclideanLoss(nn.Module):
                 (M, P, 2)
             target: Points of their ground truth, in the order that was matched. (M, P, 2)
             counts: Number of matches of each sample.
+            avg_factor: Not used.
 
         Returns:
             The loss; 0 with a gradient of 0 if nothing is matched. ()
