@@ -1,0 +1,1 @@
+"""Configs of the original repositories, read without running them and turned into ours."""

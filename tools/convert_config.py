@@ -1,0 +1,45 @@
+#!/usr/bin/env python
+"""Turn a config of the original MapTR, MapTRv2, GeMap or MapVR into ours.
+
+The file is read, not run; what has no place in ours is named. Example:
+    python tools/convert_config.py maptr_tiny_r50_24e.py configs/mine/maptr_tiny.py
+"""
+
+import argparse
+from pathlib import Path
+
+from gsmap.converters.config.reader import read_assignments
+from gsmap.converters.config.upstream import convert_upstream, merge
+from gsmap.utils.cli import run_command
+from gsmap.utils.files import write_text
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+
+
+def parse_args() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("source", type=Path, help="config of an original repository")
+    parser.add_argument("target", type=Path, help="config to write")
+    return parser.parse_args()
+
+
+def convert(source: Path, target: Path) -> str:
+    """Write the converted config and return what to say of it."""
+    conversion = convert_upstream(read_assignments(source))
+    write_text(target, merge(conversion, CONFIGS).pretty_text)
+    lines = [f"{target} is written: configs/{conversion.base} with the settings of {source}"]
+    if conversion.unplaced:
+        lines.append("not placed, see docs/migration.md:")
+        lines += [f"  {setting}" for setting in conversion.unplaced]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    args = parse_args()
+    run_command(lambda: convert(args.source, args.target))
+
+
+if __name__ == "__main__":
+    main()
