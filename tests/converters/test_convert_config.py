@@ -123,15 +123,13 @@ def test_settings_of_ones_own_arrive(tmp_path):
 
 
 def test_what_has_no_place_is_named_with_its_value(tmp_path):
+    collect = "dict(type='CustomCollect3D"
     text = (
         upstream_configs.maptr()
         .replace("dir_interval=1", "dir_interval=2")
         .replace("weight=0.0, box_format", "weight=0.25, box_format")
         .replace("policy='CosineAnnealing'", "policy='step'")
-        .replace(
-            "dict(type='CustomCollect3D",
-            "dict(type='MixUp', alpha=0.3), dict(type='CustomCollect3D",
-        )
+        .replace(collect, f"dict(type='MixUp', alpha=0.3), {collect}")
         .replace("type='MapTR',", "type='MapTR', modality='fusion', lidar_encoder=dict(a=1),")
     )
     _, unplaced = converted(text, tmp_path)

@@ -18,7 +18,7 @@ GT_FIELDS = (
 )  # fmt: skip
 # what only matched pairs have: a loss may read it, a matching cost may not
 AFTER_MATCHING = frozenset(
-    {"pred.pts_m", "pred.masks", "gt.pts", "gt.pts_m", "gt.masks", "gt.samples"}
+    {"pred.pts_m", "pred.masks", "gt.pts", "gt.pts_m", "gt.masks", "gt.samples", "gt.counts"}
 )
 
 
