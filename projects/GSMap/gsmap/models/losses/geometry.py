@@ -127,9 +127,9 @@ class EuclideanLoss(nn.Module):
         """Return the weighted loss. Its parts are means: no number of matches divides them.
 
         Args:
-            pred: Points of matched predictions, normalised to [0, 1], sample after sample.
-                (M, P, 2)
-            target: Points of their ground truth, in the order that was matched. (M, P, 2)
+            pred: Points of matched predictions, normalised to [0, 1], sample after sample;
+                heights are left out. (M, P, 2 or 3)
+            target: Points of their ground truth, in the order that was matched. (M, P, 2 or 3)
             counts: Number of matches of each sample.
             avg_factor: Not used.
 
@@ -138,7 +138,7 @@ class EuclideanLoss(nn.Module):
         """
         with torch.autocast(pred.device.type, enabled=False):
             dtype = torch.promote_types(pred.dtype, torch.float32)
-            pred, target = pred.to(dtype), target.to(dtype)
+            pred, target = pred[..., :2].to(dtype), target[..., :2].to(dtype)  # in the plane
             shape = euclidean_shape_loss(pred, target)
             relation = euclidean_relation_loss(pred, target, counts)
         return self.loss_weight * (self.shape_weight * shape + self.relation_weight * relation)

@@ -53,7 +53,7 @@ def _backward(grads: Tensor, table: Tensor, weights: Tensor, rows: Tensor) -> tu
     grad_weights = torch.empty(weights.shape)
     inputs = [x.contiguous().numpy() for x in (grads, table, weights, rows)]
     outputs = [x.numpy() for x in (grad_table, grad_weights)]
-    scatter_rows(*inputs, *outputs)  # type: ignore[call-arg]
+    scatter_rows(*inputs, *outputs)
     return grad_table, grad_weights
 
 
