@@ -24,7 +24,7 @@ PAIRS = {
     TRANSFORMER + "decoder.point_ffn.3.layers.1.bias": LAYER + "point_ffn.layers.1.bias",
     TRANSFORMER + "decoder.point_norm.3.weight": LAYER + "point_norm.weight",
     TRANSFORMER + "decoder.gen_pos_embed.3.0.bias": LAYER + "reference_code.0.bias",
-    "pts_bbox_head.ins_seg_head.4.bias": "map_head.aux_heads.ins_seg.4.bias",
+    "pts_bbox_head.ins_seg_head.4.bias": "map_head.losses.ins_seg.embedding.4.bias",
 }
 UNUSED = [
     ATTENTION + "output_proj_instance.weight",

@@ -10,7 +10,7 @@ train_dataloader = dict(
         _base_._photometric,
         dict(type='FormatMapTargets', num_points=20),
         dict(type='MakeDepthMap'),
-        dict(type='MakeBEVMask', size=(100, 200)),
-        dict(type='MakePVMask', stride=32, ground_z_m=-0.3),  # the origin is the rear axle
+        dict(type='MakeBEVMask', size=(100, 200), num_classes=3),
+        dict(type='MakePVMask', stride=32, ground_z_m=-0.3, num_classes=3),  # the origin is the rear axle
         dict(type='PackMapInputs', with_points=False),
     ]))

@@ -9,7 +9,7 @@ train_dataloader = dict(
         _base_._photometric,
         dict(type='FormatMapTargets', num_points=20),
         dict(type='MakeDepthMap'),
-        dict(type='MakeBEVMask', size=(200, 100)),
-        dict(type='MakePVMask', stride=32),
+        dict(type='MakeBEVMask', size=(200, 100), num_classes=3),
+        dict(type='MakePVMask', stride=32, num_classes=3),
         dict(type='PackMapInputs', with_points=False),
     ]))

@@ -26,6 +26,7 @@ import gsmap.models.heads.gemap_head
 import gsmap.models.heads.gsmap_head
 import gsmap.models.heads.map_head
 import gsmap.models.heads.mapvr_head
+import gsmap.models.heads.mgmapnet_head
 import gsmap.models.heads.references
 import gsmap.models.layers.geometry_attention
 import gsmap.models.layers.grid_mask
@@ -41,10 +42,12 @@ from gsmap.models.losses.direction import DirectionLoss, SelfDirectionLoss
 from gsmap.models.losses.geometry import EuclideanLoss
 from gsmap.models.losses.point import PointsLoss, SamplingLocationLoss
 from gsmap.models.losses.raster import MaskOverlapLoss, RasterLoss
+from gsmap.models.losses.segmentation import InstanceMaskLoss
 
 LOSSES = (
     DirectionLoss,
     EuclideanLoss,
+    InstanceMaskLoss,
     MaskOverlapLoss,
     PointsLoss,
     RasterLoss,

@@ -269,7 +269,7 @@ MGMAPNET = KeyMap(
     name="mgmapnet",
     rules=(
         *LIFTED_RULES,
-        (_HEAD + "ins_seg_head.", "map_head.aux_heads.ins_seg."),
+        (_HEAD + "ins_seg_head.", "map_head.losses.ins_seg.embedding."),
         _DOWN_SAMPLING,
         *_INTERACTION_RULES,
         (_MG_ATTENTION + "point_pos.", _LAYER + "cross_attn.point_code."),

@@ -1,4 +1,4 @@
-"""Segmentation targets of MapTRv2: map elements drawn in BEV and in each camera's feature map."""
+"""Segmentation targets: map elements drawn in BEV and in each camera's feature map."""
 
 from typing import Any
 
@@ -8,6 +8,7 @@ import torch
 from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
 
+from gsmap.datasets.annotations.record import MapInstance
 from gsmap.structures.polylines import resample
 
 _PV_SAMPLES = 200
@@ -16,35 +17,43 @@ _MIN_DEPTH = 1e-7
 
 @TRANSFORMS.register_module()
 class MakeBEVMask(BaseTransform):
-    """Add ``gt_seg``: all elements drawn in one channel. (1, H, W)
+    """Add ``gt_seg``: elements drawn in one channel, or in that of their class. (channels, H, W)
 
     Pixel coordinates are truncated to integers, as in MapTRv2.
 
     Args:
         size: Rows H and columns W over the ground truth's range.
         thickness_px: Width of the lines.
+        num_classes: Number of channels; None draws all elements in one.
     """
 
-    def __init__(self, size: tuple[int, int] = (200, 100), thickness_px: int = 3) -> None:
+    def __init__(
+        self,
+        size: tuple[int, int] = (200, 100),
+        thickness_px: int = 3,
+        num_classes: int | None = None,
+    ) -> None:
         self.size = tuple(size)
         self.thickness_px = thickness_px
+        self.num_classes = num_classes
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Draw the mask."""
-        mask = np.zeros(self.size, np.uint8)
+        masks = np.zeros((self.num_classes or 1, *self.size), np.uint8)
         origin = np.array([results["x_range"][0], results["y_range"][0]])
         extent = np.array([results["x_range"][1], results["y_range"][1]]) - origin
         scale = np.array(self.size[::-1]) / extent
         for instance in results["map_instances"]:
             pixels = ((instance.points[:, :2].astype(np.float64) - origin) * scale).astype(np.int32)
-            cv2.polylines(mask, [pixels], False, (1,), self.thickness_px)
-        results["gt_seg"] = torch.from_numpy(mask[None].astype(np.float32))
+            channel = channel_of(instance, self.num_classes)
+            cv2.polylines(masks[channel], [pixels], False, (1,), self.thickness_px)
+        results["gt_seg"] = torch.from_numpy(masks.astype(np.float32))
         return results
 
 
 @TRANSFORMS.register_module()
 class MakePVMask(BaseTransform):
-    """Add ``gt_pv_seg``: all elements projected into each camera's feature map. (V, 1, h, w)
+    """Add ``gt_pv_seg``: elements projected into each camera's feature map. (V, channels, h, w)
 
     Comes after the images have their final scale. Two-dimensional elements lie at one height.
 
@@ -53,6 +62,7 @@ class MakePVMask(BaseTransform):
         pad_size_divisor: To what the images are padded later.
         ground_z_m: Height of the ground in the annotation frame, in metres.
         thickness_px: Width of the lines in feature pixels.
+        num_classes: Number of channels; None draws all elements in one.
     """
 
     def __init__(
@@ -61,11 +71,13 @@ class MakePVMask(BaseTransform):
         pad_size_divisor: int = 32,
         ground_z_m: float = -1.6,
         thickness_px: int = 1,
+        num_classes: int | None = None,
     ) -> None:
         self.stride = stride
         self.pad_size_divisor = pad_size_divisor
         self.ground_z_m = ground_z_m
         self.thickness_px = thickness_px
+        self.num_classes = num_classes
 
     def _points(self, points: np.ndarray) -> np.ndarray:
         """Return an element as homogeneous points along it. (200, 4)."""
@@ -76,21 +88,37 @@ class MakePVMask(BaseTransform):
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Draw the masks."""
         height, width = padded_size(results["img_shape"], self.pad_size_divisor)
-        masks = np.zeros(
-            (len(results["lidar2img"]), height // self.stride, width // self.stride), np.uint8
-        )
-        lines = [self._points(instance.points) for instance in results["map_instances"]]
+        size = height // self.stride, width // self.stride
+        views = results["lidar2img"]
+        masks = np.zeros((len(views), self.num_classes or 1, *size), np.uint8)
+        lines = [
+            (channel_of(instance, self.num_classes), self._points(instance.points))
+            for instance in results["map_instances"]
+        ]
         shrink = np.diag([1 / self.stride, 1 / self.stride, 1.0, 1.0])
-        for mask, lidar2img in zip(masks, results["lidar2img"], strict=True):
-            for line in lines:
+        for view, lidar2img in zip(masks, views, strict=True):
+            for channel, line in lines:
                 u, v, depth = (line @ (shrink @ lidar2img).T)[:, :3].T
                 front = depth > 0
                 pixels = np.stack([u[front], v[front]], -1) / (depth[front, None] + _MIN_DEPTH)
                 if len(pixels):
                     clipped = pixels.clip(-1e6, 1e6).astype(np.int32)
-                    cv2.polylines(mask, [clipped], False, (1,), self.thickness_px)
-        results["gt_pv_seg"] = torch.from_numpy(masks[:, None].astype(np.float32))
+                    cv2.polylines(view[channel], [clipped], False, (1,), self.thickness_px)
+        results["gt_pv_seg"] = torch.from_numpy(masks.astype(np.float32))
         return results
+
+
+def channel_of(instance: MapInstance, num_classes: int | None) -> int:
+    """Return the channel that an element is drawn in.
+
+    Raises:
+        ValueError: If its label is beyond the classes.
+    """
+    if num_classes is None:
+        return 0
+    if not 0 <= instance.label < num_classes:
+        raise ValueError(f"label {instance.label} of an element, but num_classes={num_classes}.")
+    return instance.label
 
 
 def padded_size(size: tuple[int, int], divisor: int) -> tuple[int, int]:

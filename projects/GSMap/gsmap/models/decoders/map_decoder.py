@@ -1,7 +1,7 @@
 """MapTR's decoder: point queries interact, look at the BEV and refine their reference."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from mmcv.cnn.bricks.transformer import FFN
@@ -122,6 +122,18 @@ class GaussianDecoderLayer(MapDecoderLayer):
         super().__init__(guidance=guidance, **kwargs)
 
 
+class Decoded(NamedTuple):
+    """What a decoder returns.
+
+    Attributes:
+        point_states: Point queries after each layer. (L, B, N * P, C)
+        references: Refined references, float32. (L, B, N * P, D)
+    """
+
+    point_states: Tensor
+    references: Tensor
+
+
 @MODELS.register_module()
 class MapDecoder(BaseModule):
     """A stack of decoder layers that refine one reference.
@@ -132,7 +144,15 @@ class MapDecoder(BaseModule):
         detach_reference: Cut the gradient through the reference between layers, as MapTR does.
         init_cfg: As in mmengine.
         shared: What the head hands on to every layer: ``embed_dims``, ``num_points``, ``space``.
+
+    Attributes:
+        point_queries: Whether it takes point queries (B, N * P, C), or instance queries (B, N, C).
+        fields: What else it returns, (L, B, N, ...) each; losses may read it of the predictions.
+            ``instance_states``, if among them, say the class in place of the mean over points.
     """
+
+    point_queries = True
+    fields: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -154,7 +174,7 @@ class MapDecoder(BaseModule):
         bev_feats: Tensor,
         refine: Callable[[int, Tensor, Tensor], Tensor],
         attn_mask: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Decoded:
         """Run all layers, each on the reference that the one before refined.
 
         Args:
@@ -167,8 +187,7 @@ class MapDecoder(BaseModule):
             attn_mask: True where an instance may not attend to another, or None. (N, N)
 
         Returns:
-            The layers' states (L, B, N * P, C) and refined references (L, B, N * P, D), the latter
-            float32.
+            The states and refined references of all layers.
         """
         states, references = [], []
         for number, layer in enumerate(self.layers):
@@ -178,4 +197,4 @@ class MapDecoder(BaseModule):
             references.append(reference)
             if self.detach_reference:
                 reference = reference.detach()
-        return torch.stack(states), torch.stack(references)
+        return Decoded(torch.stack(states), torch.stack(references))

@@ -148,7 +148,8 @@ class MGMapNetDecoder(MapDecoder):
         **kwargs: Further arguments of `MapDecoder`.
     """
 
-    fields = ("mean_locations",)
+    point_queries = False
+    fields = ("instance_states", "mean_locations")
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Auxiliary heads of MapTRv2: masks in bird's-eye and camera view, depth. They only help training.
+"""Auxiliary heads: masks in bird's-eye and camera view, depth. They only help training.
 
 Each has a ``name`` and ``loss(bev_outputs, batch_data_samples)``; predictions do not run them.
 """
@@ -11,7 +11,9 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from torch import Tensor, nn
 
-from gsmap.models.losses.auxiliary import depth_bins, depth_loss, mask_loss
+from gsmap.models.layers.mask_heads import bev_mask_head, camera_mask_head
+from gsmap.models.losses.auxiliary import depth_bins, depth_loss
+from gsmap.models.losses.segmentation import class_mask_losses
 
 
 def stack_targets(
@@ -33,30 +35,36 @@ def stack_targets(
 
 @MODELS.register_module()
 class BEVMaskHead(nn.Sequential):
-    """All elements drawn in one mask in bird's-eye view: two convolutions and a cross-entropy.
+    """Elements drawn in bird's-eye view, all in one mask (MapTRv2) or one mask a class (MGMapNet).
 
     Args:
         embed_dims: Channels C of the features.
-        loss_weight: Weight of the loss.
+        loss_weight: Weight of the cross-entropy.
         pos_weight: Weight of the drawn cells in it.
+        dice_weight: Weight of the dice loss of all masks together.
+        num_masks: 1 for all elements in one mask, else the number of classes.
         name: Name of its weights and of its loss.
     """
 
-    feats, target = "bev_feats", "gt_seg"  # (B, C, H, W) and (B, 1, H, W)
+    feats, target = "bev_feats", "gt_seg"  # (B, C, H, W) and (B, classes or 1, H, W)
 
     def __init__(
         self,
         embed_dims: int = 256,
         loss_weight: float = 1.0,
         pos_weight: float = 4.0,
+        dice_weight: float = 0.0,
+        num_masks: int = 1,
         name: str = "seg",
     ) -> None:
-        super().__init__(
-            nn.Conv2d(embed_dims, embed_dims, 3, padding=1, bias=False),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(embed_dims, 1, 1),
-        )
-        self.loss_weight, self.pos_weight, self.name = loss_weight, pos_weight, name
+        super().__init__(*self.layers(embed_dims, num_masks))
+        self.loss_weight, self.pos_weight, self.dice_weight = loss_weight, pos_weight, dice_weight
+        self.num_masks, self.name = num_masks, name
+
+    @staticmethod
+    def layers(embed_dims: int, num_masks: int) -> nn.Sequential:
+        """Return the network. (B, C, H, W) -> (B, num_masks, H, W)"""
+        return bev_mask_head(embed_dims, num_masks)
 
     def loss(
         self, bev_outputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
@@ -64,16 +72,32 @@ class BEVMaskHead(nn.Sequential):
         """Return the weighted loss on the encoder's features."""
         feats = bev_outputs[self.feats]
         target = stack_targets(batch_data_samples, self.target, feats.device)
+        target = target.reshape(-1, *target.shape[-3:])
+        if self.num_masks == 1:
+            target = target.amax(1, keepdim=True)
+        elif target.shape[1] != self.num_masks:
+            raise ValueError(
+                f"{self.target} has {target.shape[1]} channels, {self.num_masks} masks are "
+                f"predicted: set num_classes={self.num_masks} in its transform."
+            )
         logits = self(feats.reshape(-1, *feats.shape[-3:]))
-        target = target.reshape(logits.shape)
-        return self.loss_weight * mask_loss(logits, target, self.pos_weight)
+        cross_entropy, dice = class_mask_losses(logits, target, self.pos_weight)
+        return self.loss_weight * cross_entropy + self.dice_weight * dice
 
 
 @MODELS.register_module()
 class PVMaskHead(BEVMaskHead):
-    """The same in the view of each camera, on the encoder's image features."""
+    """The same in the view of each camera, on the encoder's image features.
 
-    feats, target = "img_feats", "gt_pv_seg"  # (B, V, C, h, w) and (B, V, 1, h, w)
+    Args:
+        embed_dims: As above.
+        loss_weight: As above.
+        pos_weight: As above.
+        name: As above.
+        kwargs: Further arguments of `BEVMaskHead`.
+    """
+
+    feats, target = "img_feats", "gt_pv_seg"  # (B, V, C, h, w) and (B, V, classes or 1, h, w)
 
     def __init__(
         self,
@@ -81,8 +105,19 @@ class PVMaskHead(BEVMaskHead):
         loss_weight: float = 2.0,
         pos_weight: float = 1.0,
         name: str = "pv_seg",
+        **kwargs: Any,
     ) -> None:
-        super().__init__(embed_dims, loss_weight, pos_weight, name)
+        super().__init__(embed_dims, loss_weight, pos_weight, name=name, **kwargs)
+
+
+@MODELS.register_module()
+class NormedPVMaskHead(PVMaskHead):
+    """The same with one more convolution, and BatchNorm (MGMapNet)."""
+
+    @staticmethod
+    def layers(embed_dims: int, num_masks: int) -> nn.Sequential:
+        """Return the network. (B, C, h, w) -> (B, num_masks, h, w)"""
+        return camera_mask_head(embed_dims, num_masks)
 
 
 @MODELS.register_module()

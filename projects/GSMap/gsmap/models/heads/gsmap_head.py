@@ -1,7 +1,7 @@
 """GSMap's head: elements as ordered Gaussians, supervised as polylines and as rendered masks."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from mmdet3d.registry import MODELS
 from torch import Tensor
@@ -42,7 +42,8 @@ class GSMapHead(MapHead):
     """
 
     default_reference = "GaussianReference"
-    default_layer = "GaussianDecoderLayer"
+    default_layer: ClassVar[PARTS] = {"type": "GaussianDecoderLayer"}
+    own_layer: ClassVar[PARTS] = {"guidance": {}}
 
     def __init__(
         self,

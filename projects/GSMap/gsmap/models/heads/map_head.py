@@ -1,7 +1,7 @@
 """The map head, composed of parts: queries, predictions of every layer, matching, losses."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -11,6 +11,7 @@ from mmengine.model import BaseModule, bias_init_with_prob
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
+from gsmap.models.decoders.map_decoder import MapDecoder
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.matched import (
     AFTER_MATCHING,
@@ -28,7 +29,7 @@ from gsmap.models.heads.parts import (
 )
 from gsmap.models.heads.query_groups import QueryGroup, fit_instance_queries, group_mask
 from gsmap.models.layers.branches import classification_branch
-from gsmap.models.layers.deformable_attention import init_matrices
+from gsmap.models.layers.deformable_attention import at_least_float32, init_matrices
 from gsmap.models.task_modules.map_assigner import MapAssigner
 from gsmap.models.task_modules.map_coder import MapCoder
 from gsmap.structures.grid import BEVGrid
@@ -70,7 +71,8 @@ class MapHead(BaseModule):
     """
 
     default_reference = "PointReference"
-    default_layer = "MapDecoderLayer"
+    default_layer: ClassVar[PARTS] = {"type": "MapDecoderLayer"}
+    own_layer: ClassVar[PARTS] = {}  # for a decoder that knows its layer's type
 
     def __init__(
         self,
@@ -109,9 +111,11 @@ class MapHead(BaseModule):
                 **self.reference_settings(reference or {}),
             }
         )
-        self.decoder = self.build_decoder(decoder)
+        self.decoder: MapDecoder = self.build_decoder(decoder)
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
-        self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
+        self.pts_embedding: nn.Embedding | None = None
+        if self.decoder.point_queries:
+            self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
         self.cls_branches = nn.ModuleList(
             classification_branch(embed_dims, num_reg_layers, len(self.classes))
             for _ in range(num_layers)
@@ -129,8 +133,10 @@ class MapHead(BaseModule):
         """Return the reference's settings, with what this head knows better than the defaults."""
         return reference
 
-    def build_decoder(self, decoder: PARTS) -> nn.Module:
+    def build_decoder(self, decoder: PARTS) -> MapDecoder:
         """Return the decoder; what the head knows is handed on to its layers."""
+        own = decoder.get("type", "MapDecoder") != "MapDecoder"
+        layer = self.own_layer if own else self.default_layer
         return MODELS.build(
             {
                 "type": "MapDecoder",
@@ -138,14 +144,15 @@ class MapHead(BaseModule):
                 "num_points": self.num_points,
                 "space": getattr(self.reference, "space", None),
                 **decoder,
-                "layer": {"type": self.default_layer, **decoder.get("layer", {})},
+                "layer": {**layer, **decoder.get("layer", {})},
             }
         )
 
     def _check_parts(self) -> set[str]:
         """Refuse parts that do not fit together; return the fields that they read."""
-        pred = {"scores", *self.reference.fields, *getattr(self.decoder, "fields", ())}
+        pred = {"scores", "instance_states", *self.reference.fields, *self.decoder.fields}
         offered = {f"pred.{name}" for name in pred} | {f"gt.{name}" for name in GT_FIELDS}
+        offered |= {"bev_feats"}
         where = f"{type(self.reference).__name__}, the decoder and the ground truth"
         names = ["cls", *self.losses]
         refuse_twins([*names, *self.aux_heads], "losses")
@@ -165,15 +172,19 @@ class MapHead(BaseModule):
         super().init_weights()  # parts that start neutral have the last word
 
     def queries(self) -> tuple[Tensor, Tensor]:
-        """Return position and content of the point queries. 2 x (N * P, C)
+        """Return position and content of the queries as the decoder takes them.
 
         All groups in training; else the one that predicts.
+
+        Returns:
+            Of the point queries, 2 x (N * P, C), or of the instance queries, 2 x (N, C).
         """
-        instances = self.instance_embedding.weight
+        both = self.instance_embedding.weight
         if not self.training:
-            instances = instances[: self.query_groups[0].num]
-        both = instances[:, None] + self.pts_embedding.weight
-        position, content = both.flatten(0, 1).split(self.embed_dims, -1)
+            both = both[: self.query_groups[0].num]
+        if self.pts_embedding is not None:
+            both = (both[:, None] + self.pts_embedding.weight).flatten(0, 1)
+        position, content = both.split(self.embed_dims, -1)
         return position, content
 
     def attention_mask(self) -> Tensor | None:
@@ -195,11 +206,12 @@ class MapHead(BaseModule):
 
         Returns:
             ``all_cls_scores`` logits (L, B, N, classes), ``all_pts_preds`` normalised (L, B, N, P,
-            2 or 3) and ``all_references`` (L, B, N, P, D), float32; ``states`` (L, B, N * P, C).
+            2 or 3) and ``all_references`` (L, B, N, P, D), float32; ``all_instance_states`` (L, B,
+            N, C) and the decoder's further ``fields``; ``states`` (L, B, N * P, C), ``bev_feats``.
         """
         bev_feats = bev_outputs["bev_feats"]
         query_pos, query = (part.expand(len(bev_feats), -1, -1) for part in self.queries())
-        states, references = self.decoder(
+        decoded = self.decoder(
             query,
             query_pos,
             self.reference.start(query_pos),
@@ -207,14 +219,20 @@ class MapHead(BaseModule):
             self.reference.refine,
             self.attention_mask(),
         )
-        instances = states.unflatten(2, (-1, self.num_points)).mean(3)  # (L, B, N, C)
-        scores = [branch(layer) for branch, layer in zip(self.cls_branches, instances, strict=True)]
-        references = references.unflatten(2, (-1, self.num_points))  # (L, B, N, P, D)
+        by_point = (-1, self.num_points)
+        fields = {name: getattr(decoded, name) for name in self.decoder.fields}
+        if "instance_states" not in fields:
+            fields["instance_states"] = decoded.point_states.unflatten(2, by_point).mean(3)
+        states = fields["instance_states"]  # (L, B, N, C)
+        scores = [branch(layer) for branch, layer in zip(self.cls_branches, states, strict=True)]
+        references = decoded.references.unflatten(2, by_point)  # (L, B, N, P, D)
         return {
-            "all_cls_scores": torch.stack(scores).float(),
+            "all_cls_scores": at_least_float32(torch.stack(scores)),
             "all_pts_preds": references[..., : self.reference.coords],
             "all_references": references,
-            "states": states,
+            **{f"all_{name}": value for name, value in fields.items()},
+            "states": decoded.point_states,
+            "bev_feats": bev_feats,
         }
 
     def loss(
@@ -262,13 +280,12 @@ class MapHead(BaseModule):
         self, outputs: dict[str, Tensor]
     ) -> Iterator[tuple[QueryGroup, dict[str, Tensor]]]:
         """Yield each query group with its predictions, ``all_*`` (L, B, N of the group, ...)."""
+        shared = {k: v for k, v in outputs.items() if k == "bev_feats"}
         start = 0
         for group in self.query_groups:
             chosen = slice(start, start + group.num)
-            yield (
-                group,
-                {k: v[:, :, chosen] for k, v in outputs.items() if k.startswith("all_")},
-            )
+            own = {k: v[:, :, chosen] for k, v in outputs.items() if k.startswith("all_")}
+            yield group, own | shared
             start += group.num
 
     def group_losses(
@@ -285,7 +302,9 @@ class MapHead(BaseModule):
         for layer in range(last + 1):
             predictions = self.layer_predictions(outputs, layer)
             targets = self.get_targets(predictions, gts, batch_img_metas, group.repeats)
-            values = self.layer_losses(group, predictions, gts, targets, layer == last)
+            values = self.layer_losses(
+                group, predictions, gts, targets, layer == last, outputs.get("bev_feats")
+            )
             prefix = "" if layer == last else f"d{layer}."
             for name, value in values.items():
                 weight = group.weight if name.startswith("loss_") else 1.0
@@ -323,6 +342,7 @@ class MapHead(BaseModule):
         fields = {
             names.get(name, name.removeprefix("all_")): value[layer].float()
             for name, value in outputs.items()
+            if name.startswith("all_")
         }
         if "pred.rasters" in self._reads:
             gaussians = self.reference.gaussians(fields["references"].detach())
@@ -351,20 +371,23 @@ class MapHead(BaseModule):
         gts: Sequence[InstanceData],
         targets: MapTargets,
         is_last: bool,
+        bev_feats: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """Return the losses of one layer's predictions."""
         losses: dict[str, Tensor] = {}
+        first = group is self.query_groups[0]
         if group.has("cls"):
             scores = torch.cat([prediction.scores for prediction in predictions])
             # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
             one_hot = F.one_hot(targets.labels, len(self.classes) + 1)[:, :-1]
             losses["loss_cls"] = self.loss_cls(scores, one_hot, avg_factor=targets.avg_factor)
-        pairs = MatchedPairs(predictions, gts, targets, self.reference, self.masks)
+        pairs = MatchedPairs(predictions, gts, targets, self.reference, self.masks, bev_feats)
         for name, loss in self.losses.items():
-            if group.has(name) and (is_last or not getattr(loss, "last_layer_only", False)):
+            late = is_last or not getattr(loss, "last_layer_only", False)
+            if late and group.has(name) and (first or not getattr(loss, "first_group_only", False)):
                 values = [pairs[field] for field in cast(Any, loss).reads]
                 losses[f"loss_{name}"] = loss(*values, avg_factor=targets.avg_factor)
-        if is_last and group is self.query_groups[0]:
+        if is_last and first:
             losses.update(self.statistics(pairs))
         return losses
 

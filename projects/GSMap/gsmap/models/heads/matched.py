@@ -14,11 +14,13 @@ from gsmap.models.heads.references import PointReference
 from gsmap.models.task_modules.map_assigner import MapMatch
 
 GT_FIELDS = (
-    "labels", "pts", "pts_m", "pts_shifts", "first_pts", "masks", "rasters", "samples", "counts"
+    "labels", "pts", "pts_m", "pts_shifts", "first_pts", "masks", "rasters", "samples", "counts",
+    "inds",
 )  # fmt: skip
 # what only matched pairs have: a loss may read it, a matching cost may not
 AFTER_MATCHING = frozenset(
-    {"pred.pts_m", "pred.masks", "gt.pts", "gt.pts_m", "gt.masks", "gt.samples", "gt.counts"}
+    {"pred.pts_m", "pred.masks", "bev_feats"}
+    | {f"gt.{name}" for name in ("pts", "pts_m", "masks", "samples", "counts", "inds")}
 )
 
 
@@ -65,7 +67,8 @@ class MatchedPairs:
     concatenated. Besides the samples' own fields: ``pred.pts_m``, ``gt.pts_m`` in metres (M, P, 2);
     ``gt.pts``, normalised, in the matched order (M, P, 2); ``pred.masks``, rendered from the
     Gaussians, and ``gt.masks`` (M, H, W); ``gt.samples``, the sample's number in the batch (M,);
-    ``gt.counts``, each sample's number of pairs, Python integers.
+    ``gt.inds``, the ground truth's number in its sample (M,); ``gt.counts``, each sample's number
+    of pairs, Python integers; ``bev_feats`` of the batch (B, C, H, W).
 
     Args:
         predictions: Predictions of one layer, per sample.
@@ -73,6 +76,7 @@ class MatchedPairs:
         targets: Their matches.
         reference: What the predictions' references mean.
         masks: How masks are made.
+        bev_feats: BEV features, for losses that read them. (B, C, H, W)
     """
 
     def __init__(
@@ -82,13 +86,18 @@ class MatchedPairs:
         targets: MapTargets,
         reference: PointReference,
         masks: ElementMasks,
+        bev_feats: Tensor | None = None,
     ) -> None:
         self._sides = {"pred": list(predictions), "gt": list(gts)}
         self._targets = targets
         self._reference = reference
         self._masks = masks
         counts = [len(match.gt_inds) for match in targets.matches]
-        self._made: dict[str, Any] = {"gt.pts": targets.pts, "gt.counts": counts}
+        self._made: dict[str, Any] = {
+            "gt.pts": targets.pts,
+            "gt.counts": counts,
+            "bev_feats": bev_feats,
+        }
 
     def __getitem__(self, field: str) -> Any:
         if field not in self._made:
@@ -108,6 +117,8 @@ class MatchedPairs:
             counts = torch.tensor(self["gt.counts"])
             samples = torch.arange(len(counts)).repeat_interleave(counts)
             return samples.to(self._targets.labels.device)
+        if field == "gt.inds":
+            return torch.cat([match.gt_inds for match in self._targets.matches])
         side, name = field.split(".")
         index = "query_inds" if side == "pred" else "gt_inds"
         pairs = zip(self._sides[side], self._targets.matches, strict=True)

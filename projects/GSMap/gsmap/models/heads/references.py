@@ -101,11 +101,11 @@ class PointReference(BaseModule):
 
     def start(self, query_pos: Tensor) -> Tensor:
         """Return the reference that the first layer starts from. (..., C) -> (..., D)"""
-        return self.initial(query_pos).float().sigmoid()
+        return at_least_float32(self.initial(query_pos)).sigmoid()
 
     def offsets(self, layer: int, states: Tensor) -> Tensor:
-        """Return a layer's change of the reference, float32. (..., C) -> (..., D)"""
-        return self.branches[layer](states).float()
+        """Return a layer's change of the reference, at least float32. (..., C) -> (..., D)"""
+        return at_least_float32(self.branches[layer](states))
 
     def refine(self, layer: int, states: Tensor, reference: Tensor) -> Tensor:
         """Return the reference after a layer. (..., C), (..., D) -> (..., D)"""
@@ -210,12 +210,14 @@ class GaussianReference(PointReference):
 
     def start(self, query_pos: Tensor) -> Tensor:
         """Return the Gaussians that the first layer starts from. (..., C) -> (..., D)"""
-        return torch.cat([super().start(query_pos), self.gaussian_init(query_pos).float()], -1)
+        shapes = at_least_float32(self.gaussian_init(query_pos))
+        return torch.cat([super().start(query_pos), shapes], -1)
 
     def offsets(self, layer: int, states: Tensor) -> Tensor:
         """Return a layer's change of the Gaussians (Eq. 8). (..., C) -> (..., D)"""
         centres = super().offsets(layer, states)
-        return torch.cat([centres, self.gaussian_branches[layer](states).float()], -1)
+        shapes = at_least_float32(self.gaussian_branches[layer](states))
+        return torch.cat([centres, shapes], -1)
 
     def gaussians(self, references: Tensor) -> Gaussians:
         """Return the Gaussians that references (..., D) stand for, centres in the plane."""

@@ -1,21 +1,27 @@
 """Mask losses of MGMapNet: classes in BEV, and instances."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
+from gsmap.models.layers.mask_heads import instance_mask_embedding
 from gsmap.models.losses.auxiliary import mask_loss
 from gsmap.models.losses.dice import dice_loss
 
 PAIRINGS = ("matched", "released")
 
 
-def class_mask_losses(logits: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+def class_mask_losses(
+    logits: Tensor, targets: Tensor, pos_weight: float = 1.0
+) -> tuple[Tensor, Tensor]:
     """Return cross-entropy and dice of class masks.
 
     Args:
         logits: Predicted masks, one channel per class. (B, classes, H, W)
         targets: 0 or 1, any dtype. (B, classes, H, W)
+        pos_weight: Weight of the cells where ``targets`` is 1, in the cross-entropy.
 
     Returns:
         The mean binary cross-entropy () and the mean over samples of the dice loss of all classes
@@ -24,7 +30,7 @@ def class_mask_losses(logits: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: If the shapes disagree.
     """
-    cross_entropy = mask_loss(logits, targets)
+    cross_entropy = mask_loss(logits, targets, pos_weight)
     probs, truth = logits.float().sigmoid().flatten(1, 2), targets.float().flatten(1, 2)
     return cross_entropy, dice_loss(probs, truth).mean()
 
@@ -36,7 +42,7 @@ def instance_mask_losses(
 
     Args:
         logits: Predicted masks. (M, H, W)
-        targets: Masks of their ground truths, 0 or 1, any dtype. (M, H, W)
+        targets: Masks of their ground truths in [0, 1], any dtype. (M, H, W)
         avg_factor: The divisor: the number of matched elements, at least 1.
 
     Returns:
@@ -56,27 +62,72 @@ def instance_mask_losses(
     return cross_entropy.mean((1, 2)).sum() / avg_factor, dice.sum() / avg_factor
 
 
-def pair_masks(
-    query_inds: Tensor, gt_inds: Tensor, pairing: str = "matched"
-) -> tuple[Tensor, Tensor]:
-    """Say which instance's mask each matched query is compared with.
-
-    The released code of MGMapNet compares the i-th matched query, in ascending order, with the i-th
-    ground truth, which is right only if the matching happens to be sorted.
+class InstanceMaskLoss(nn.Module):
+    """Masks of matched instances, by the product of their states and the BEV features (MGMapNet).
 
     Args:
-        query_inds: Matched queries of a sample. (M,)
-        gt_inds: The ground truth of each. (M,)
-        pairing: ``"matched"``: its own ground truth; ``"released"``: as in the released code.
-
-    Returns:
-        Queries (M,) and the ground truths whose masks they are compared with (M,).
+        embed_dims: Channels C of states and features.
+        loss_weight: Weight of the cross-entropy.
+        dice_weight: Weight of the dice loss.
+        pairing: ``"matched"``: each query is compared with the mask of its own ground truth;
+            ``"released"``: as in MGMapNet's released code, the i-th matched query with the i-th
+            ground truth, which is right only if the matching happens to be sorted.
 
     Raises:
         ValueError: If ``pairing`` is unknown.
     """
-    if pairing not in PAIRINGS:
-        raise ValueError(f"pairing must be one of {PAIRINGS}, got {pairing!r}.")
-    if pairing == "matched":
-        return query_inds, gt_inds
-    return query_inds.sort().values, torch.arange(len(gt_inds), device=gt_inds.device)
+
+    name = "ins_seg"
+    reads = ("pred.instance_states", "gt.masks", "gt.inds", "gt.counts", "bev_feats")
+    last_layer_only = True
+    first_group_only = True
+
+    def __init__(
+        self,
+        embed_dims: int = 256,
+        loss_weight: float = 3.0,
+        dice_weight: float = 3.0,
+        pairing: str = "matched",
+    ) -> None:
+        super().__init__()
+        if pairing not in PAIRINGS:
+            raise ValueError(f"pairing must be one of {PAIRINGS}, got {pairing!r}.")
+        self.embedding = instance_mask_embedding(embed_dims)
+        self.loss_weight, self.dice_weight, self.pairing = loss_weight, dice_weight, pairing
+
+    def forward(
+        self,
+        states: Tensor,
+        masks: Tensor,
+        gt_inds: Tensor,
+        counts: Sequence[int],
+        bev_feats: Tensor,
+        avg_factor: float | Tensor,
+    ) -> Tensor:
+        """Return the weighted loss.
+
+        Args:
+            states: Instance states of matched queries, samples concatenated, queries of a sample in
+                ascending order. (M, C)
+            masks: Masks of their ground truths; those of another size than the features are
+                averaged over the cells. (M, h, w)
+            gt_inds: Number of each one's ground truth in its sample. (M,)
+            counts: Matches of each sample.
+            bev_feats: BEV features. (B, C, H, W)
+            avg_factor: The divisor: the number of matched elements, at least 1.
+
+        Returns:
+            The loss, 0 if nothing is matched. ()
+        """
+        embeddings = self.embedding(states).split(list(counts))
+        samples = zip(embeddings, bev_feats.to(states), strict=True)
+        logits = torch.cat([torch.einsum("mc,chw->mhw", *sample) for sample in samples])
+        masks = masks.to(logits)
+        if self.pairing == "released":
+            split = zip(masks.split(list(counts)), gt_inds.split(list(counts)), strict=True)
+            masks = torch.cat([own[inds.argsort()] for own, inds in split])
+        if masks.shape != logits.shape and len(masks):
+            masks = F.interpolate(masks[:, None], size=logits.shape[-2:], mode="area")[:, 0]
+        masks = masks.reshape(logits.shape)
+        cross_entropy, dice = instance_mask_losses(logits, masks, avg_factor)
+        return self.loss_weight * cross_entropy + self.dice_weight * dice

@@ -1,0 +1,4 @@
+# MGMapNet for Argoverse 2, whose config was not released: the encoder's voxels are those of MapTRv2 there.
+_base_ = './mgmapnet_r50.py'
+
+model = dict(bev_encoder=dict(z_range=(-5.0, 3.0)))

@@ -1,0 +1,11 @@
+# A small model of Gaussians on MGMapNet's decoder, with its losses of samples and instance masks, for MiniCity.
+_base_ = '../../../configs/mgmapnet/mgmapnet_r18_minicity.py'
+
+model = dict(
+    map_head=dict(
+        type='GSMapHead',
+        losses=[
+            *_base_.model.map_head.losses,
+            dict(type='SamplingLocationLoss', loss_weight=5.0),
+            dict(type='InstanceMaskLoss', embed_dims=128),
+        ]))

@@ -1,0 +1,69 @@
+"""MGMapNet's head: instance and point queries, masks of the instances, supervised samples."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from mmdet3d.registry import MODELS
+
+from gsmap.models.heads.map_head import PARTS, MapHead
+from gsmap.models.heads.masks import ElementMasks
+from gsmap.structures.grid import BEVGrid
+
+DECODER = "MGMapNetDecoder"
+LINE_PX = 3
+QUERY_GROUPS: tuple[PARTS, ...] = ({"num": 100}, {"name": "one2many", "num": 600, "repeats": 6})
+
+
+@MODELS.register_module()
+class MGMapHead(MapHead):
+    """The map head with MGMapNet's parts as defaults, on whatever else it is made of.
+
+    Args:
+        grid: The map's extent.
+        decoder: Config of the decoder; one of another type becomes `MGMapNetDecoder`, its layers
+            without the attentions that are not MGMapNet's.
+        losses: Configs of the losses of the head that this one extends.
+        query_groups: Settings of each query group.
+        loss_mean_loc: Settings of `SamplingLocationLoss`, or None to train without it.
+        loss_ins_seg: Settings of `InstanceMaskLoss`, or None to train without it.
+        masks: Settings of `ElementMasks`; its lines are 3 pixels wide by default.
+        embed_dims: Channels C.
+        kwargs: Further arguments of `MapHead`.
+    """
+
+    def __init__(
+        self,
+        grid: BEVGrid,
+        decoder: PARTS,
+        losses: Sequence[PARTS],
+        query_groups: Sequence[PARTS] = QUERY_GROUPS,
+        loss_mean_loc: PARTS | None = {"loss_weight": 5.0},  # noqa: B006
+        loss_ins_seg: PARTS | None = {"loss_weight": 3.0, "dice_weight": 3.0},  # noqa: B006
+        masks: PARTS | None = None,
+        embed_dims: int = 256,
+        **kwargs: Any,
+    ) -> None:
+        if loss_mean_loc is not None:
+            losses = [*losses, {"type": "SamplingLocationLoss", **loss_mean_loc}]
+        if loss_ins_seg is not None:
+            part = {"type": "InstanceMaskLoss", "embed_dims": embed_dims, **loss_ins_seg}
+            losses = [*losses, part]
+        pixel_m = max(ElementMasks(grid, **(masks or {})).grid.pixel_size_m)
+        super().__init__(
+            grid=grid,
+            decoder=_mgmapnet_decoder(decoder),
+            losses=losses,
+            query_groups=query_groups,
+            masks={"line_width_m": LINE_PX * pixel_m, **(masks or {})},
+            embed_dims=embed_dims,
+            **kwargs,
+        )
+
+
+def _mgmapnet_decoder(decoder: PARTS) -> PARTS:
+    """Return a decoder's config as MGMapNet's, without the attentions of another."""
+    if decoder.get("type") == DECODER:
+        return decoder
+    others = ("type", "self_attn", "cross_attn")
+    layer = {k: v for k, v in decoder.get("layer", {}).items() if k not in others}
+    return {**decoder, "type": DECODER, "layer": layer}
