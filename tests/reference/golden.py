@@ -96,7 +96,8 @@ class Golden:
 
     def upstream_state(self, name: str) -> dict[str, Tensor]:
         """Return the upstream state that the recipe makes for a state list."""
-        arrays = self.weights.state(self.state_shapes(name), self.seed)
+        recipe = self.mgmapnet if name.startswith("mgmapnet") else self.weights
+        arrays = recipe.state(self.state_shapes(name), self.seed)
         return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}
 
     def model(self, config: str, state_list: str) -> BaseModel:

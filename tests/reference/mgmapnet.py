@@ -12,9 +12,11 @@ from gsmap.checkpoints.key_map import MGMAPNET
 from gsmap.models.decoders.mgmapnet_decoder import MGMapNetDecoder
 from gsmap.models.layers.multi_granularity import Granularities, MultiGranularityAttention
 from reference.golden import Golden
+from reference.maptr import state_rows
 from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 
+CONFIG = "mgmapnet/mgmapnet_r50_110e.py"
 STATE = "mgmapnet_state.json"
 B, N, P, C = 2, 12, 20, 256
 BEV = (50, 26)
@@ -104,15 +106,9 @@ def gradients_of(module: nn.Module, prefix: str, upstream_prefix: str = "") -> d
 
 @check(STATE)
 def check_state(golden: Golden, name: str) -> Iterator[Row]:
-    """Compare the decoder's share of the state; every other key has a name or a reason."""
+    """Compare MGMapNet's state with ours."""
+    yield from state_rows(golden, name, CONFIG)
     shapes = golden.state_shapes(name)
-    unnamed = [key for key in shapes if not MGMAPNET.to_ours(key) and key not in MGMAPNET.unused]
-    yield Row(name, "keys without a place", len(unnamed), 0)
-    renamed = {MGMAPNET.to_ours(key): shape for key, shape in shapes.items()}
-    theirs = {key: shape for key, shape in renamed.items() if key and ".decoder." in key}
-    decoder = MGMapNetDecoder()
-    ours = {f"map_head.decoder.{k}": tuple(v.shape) for k, v in decoder.state_dict().items()}
-    yield Row(name, "decoder: keys or shapes that differ", len(ours.items() ^ theirs.items()), 0)
     made = {key: unused.value() for key, unused in MGMAPNET.unused.items() if unused.value}
     wrong = [key for key, value in made.items() if tuple(value.shape) != shapes.get(key)]
     yield Row(name, "unused keys of another shape", len(wrong), 0)

@@ -1,70 +1,65 @@
 """MGMapNet: the decoder with its branches and masks, values and gradients."""
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from mmdet3d.registry import MODELS
+from mmengine.config import Config
+from mmengine.registry import init_default_scope
+from torch import Tensor
 
 from gsmap.checkpoints.key_map import MGMAPNET
-from gsmap.models.decoders.mgmapnet_decoder import MGMapNetDecoder
-from gsmap.models.heads.references import PointReference, refine_reference
-from gsmap.models.layers.mask_heads import (
-    bev_mask_head,
-    instance_mask_embedding,
-    instance_mask_logits,
-)
+from gsmap.models.heads.map_head import MapHead
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
-from reference.mgmapnet import GRAD_L2, B, C, GoldenParts, N, P, gradients_of
+from reference.maptr import decoded_rows
+from reference.maptrv2 import all_queries
+from reference.mgmapnet import CONFIG, GRAD_L2, STATE, B, GoldenParts, N, P, gradients_of
 from reference.registry import check
-from reference.report import Row, largest_difference, largest_relative, relative_norm
+from reference.report import (
+    Row,
+    fraction_beyond,
+    largest_difference,
+    largest_relative,
+    relative_norm,
+)
 
 FURTHER = 24  # one-to-many queries of the training set
 
 
-class Head(nn.Module):
-    """What a head puts around the decoder: queries, branches and masks."""
+def build_head(golden: Golden, **settings: Any) -> MapHead:
+    """Return the head of the released config, with other settings."""
+    init_default_scope("mmdet3d")
+    cfg = Config.fromfile(golden.configs / CONFIG, import_custom_modules=False)
+    shared = {"grid": BEVGrid(**cfg.grid), "classes": cfg.classes}
+    return MODELS.build({**cfg.model.map_head, **shared, **settings})
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.decoder = MGMapNetDecoder()
-        self.instance_embedding = nn.Embedding(N + FURTHER, 2 * C)
-        self.reference = PointReference(BEVGrid((-15, 15), (-30, 30), 1, 1))
-        self.cls_branches = nn.ModuleList(self.cls_branch() for _ in range(6))
-        masks = {"seg": bev_mask_head(C, 3), "ins_seg": instance_mask_embedding(C)}
-        self.aux_heads = nn.ModuleDict(masks)
 
-    @staticmethod
-    def cls_branch() -> nn.Sequential:
-        """Return one layer's classifier."""
-        layers: list[nn.Module] = []
-        for _ in range(2):
-            layers += [nn.Linear(C, C), nn.LayerNorm(C), nn.ReLU()]
-        return nn.Sequential(*layers, nn.Linear(C, 3))
+def small_head(golden: Golden) -> MapHead:
+    """Return the released head with few queries and without masks in the cameras."""
+    groups = [{"num": N}, {"name": "one2many", "num": FURTHER}]
+    seg = {"type": "BEVMaskHead", "num_masks": 3}
+    return build_head(golden, query_groups=groups, aux_heads=[seg])
 
-    def forward(self, bev_feats: Tensor, attn_mask: Tensor | None = None) -> dict[str, Tensor]:
-        """Return all predictions by the golden names; with a mask, of the further queries too."""
-        chosen = self.instance_embedding.weight[: N if attn_mask is None else None]
-        position, content = chosen.expand(B, -1, -1).split(C, 2)
-        start = self.reference.initial(position).sigmoid()
-        states = self.decoder(content, position, start, bev_feats, self.refine, attn_mask)
-        scores = [b(s) for b, s in zip(self.cls_branches, states.instance_states, strict=True)]
-        embeddings = self.aux_heads["ins_seg"](states.instance_states[-1])
-        return {
-            "init_reference": start[:, :, None].expand(-1, -1, P, -1),
-            "instance_states": states.instance_states.transpose(1, 2),
-            "point_states": states.point_states.unflatten(2, (-1, P)),
-            "references": states.references.unflatten(2, (-1, P)),
-            "mean_loc": states.mean_locations,
-            "all_cls_scores": torch.stack(scores),
-            "seg": self.aux_heads["seg"](bev_feats),
-            "ins_seg": instance_mask_logits(embeddings, bev_feats),
-        }
 
-    def refine(self, layer: int, states: Tensor, reference: Tensor) -> Tensor:
-        """Refine as `PointReference` does, in any precision."""
-        return refine_reference(reference, self.reference.branches[layer](states))
+def run(head: MapHead, bev_feats: Tensor) -> dict[str, Tensor]:
+    """Return all predictions by the golden names."""
+    outputs = head({"bev_feats": bev_feats})
+    states = outputs["all_instance_states"]
+    position, _ = head.queries()
+    samples = zip(states[-1], bev_feats, strict=True)
+    return {
+        "init_reference": head.reference.start(position)[:, None].expand(B, -1, P, -1),
+        "instance_states": states.transpose(1, 2),
+        "point_states": outputs["states"].unflatten(2, (-1, P)),
+        "references": outputs["all_references"],
+        "mean_loc": outputs["all_mean_locations"],
+        "all_cls_scores": outputs["all_cls_scores"],
+        "seg": head.aux_heads["seg"](bev_feats),
+        "ins_seg": torch.stack([head.losses["ins_seg"].logits(*sample) for sample in samples]),
+    }
 
 
 DECODER_ROWS = {  # what the file holds of each output, and the tolerance
@@ -90,9 +85,9 @@ LOSS_OF = {  # the outputs that the scalar weighs, by upstream's name, and their
 def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
     """Compare six layers with their branches and masks: values and gradients."""
     data, parts = golden.read_arrays(name), GoldenParts(golden)
-    head = parts.load(Head(), "map_head.")
+    head = parts.load(small_head(golden), "map_head.")
     with torch.no_grad():
-        outputs = head(parts.bev)
+        outputs = run(head, parts.bev)
     for key, (part, tolerance) in DECODER_ROWS.items():
         yield Row(name, key, largest_difference(outputs[key][part], data[key]), tolerance)
     yield from group_rows(name, data, parts, head)
@@ -100,11 +95,11 @@ def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
 
 
 def decoder_gradient_rows(
-    name: str, data: Mapping[str, np.ndarray], parts: GoldenParts, head: Head
+    name: str, data: Mapping[str, np.ndarray], parts: GoldenParts, head: MapHead
 ) -> Iterator[Row]:
     """Compare gradients, ours in float64: in float32 a single ReLU that flips moves them by 1 %."""
     bev = parts.bev.double().requires_grad_()
-    outputs = head(bev)
+    outputs = run(head, bev)
     scalar = sum(
         factor * (outputs[key] * parts.normal(f"mgm_gd_{theirs}", tuple(outputs[key].shape))).sum()
         for theirs, (key, factor) in LOSS_OF.items()
@@ -124,11 +119,11 @@ def decoder_gradient_rows(
 
 @torch.no_grad()
 def group_rows(
-    name: str, data: Mapping[str, np.ndarray], parts: GoldenParts, head: Head
+    name: str, data: Mapping[str, np.ndarray], parts: GoldenParts, head: MapHead
 ) -> Iterator[Row]:
     """Compare the training queries: a mask keeps the groups apart in the self-attention only."""
-    group = torch.arange(N + FURTHER) >= N
-    outputs = head(parts.bev, group[:, None] != group)
+    with all_queries(head):
+        outputs = run(head, parts.bev)
     ours = {
         "one2one_cls": (outputs["all_cls_scores"][:, :, :N], 3e-4),
         "one2one_pts": (outputs["references"][:, :, :N], 3e-5),
@@ -138,3 +133,48 @@ def group_rows(
     }
     for key, (value, tolerance) in ours.items():
         yield Row(name, f"train_{key}", largest_difference(value, data[f"train_{key}"]), tolerance)
+
+
+@check("mgmapnet_forward_reduced_{variant}.npz")
+@torch.no_grad()
+def check_forward(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the way from the images to the detections."""
+    data, meta = golden.read_arrays(name), golden.meta("reduced")
+    model = golden.model(CONFIG, STATE)
+    bev_outputs = model.bev_encoder(model.extract_img_feats(golden.images("reduced")), [meta])
+    bev, head = bev_outputs["bev_feats"], model.map_head
+    cells = bev[0][:, data["bev_rows"]][:, :, data["bev_cols"]].flatten(1).T  # (cells, C)
+    off = fraction_beyond(cells, data["bev_embed_sub"], 1e-4)
+    yield Row(name, "share of BEV that is off by > 1e-4", off, 0.01)
+    outputs = head(bev_outputs)
+    scores = outputs["all_cls_scores"]
+    ours = {
+        "all_cls_scores": (scores, 1e-3),
+        "all_pts_preds": (outputs["all_pts_preds"], 1e-4),
+        "mean_loc_last": (outputs["all_mean_locations"][-1], 1e-4),
+    }
+    for key, (value, tolerance) in ours.items():
+        yield Row(name, key, largest_difference(value, data[key]), tolerance)
+    yield from decoded_rows(name, data, head.predict_by_feat(outputs, [meta])[0])
+    masks = head.aux_heads
+    instances = head.losses["ins_seg"].logits(outputs["all_instance_states"][-1, 0], bev[0])
+    for key, value in {
+        "seg": masks["seg"](bev)[..., ::2, ::2],
+        "ins_seg": instances[None, ::10, ::4, ::4],
+        "pv_seg": masks["pv_seg"](bev_outputs["img_feats"].flatten(0, 1))[None],
+    }.items():
+        off = fraction_beyond(value, data[key], 1e-3)
+        yield Row(name, f"cells with {key} off by > 1e-3", off, 0.01)
+    with all_queries(head):
+        (_, first), (_, further) = head.split_groups(head(bev_outputs))
+    change = (first["all_cls_scores"] - scores).abs().amax((1, 2, 3))
+    ours = {
+        "one2one_cls": (first["all_cls_scores"], 1e-3),
+        "one2one_pts_last": (first["all_pts_preds"][-1], 1e-4),
+        "one2many_cls_sub": (further["all_cls_scores"][:, :, ::20], 1e-3),
+        "one2many_pts_last_sub": (further["all_pts_preds"][-1, :, ::20], 1e-4),
+        "minus_eval_cls_maxabs": (change, 1e-4),
+    }
+    for key, (value, tolerance) in ours.items():
+        off = largest_difference(value, data[f"train_{key}"])
+        yield Row(name, f"train_{key}", off, tolerance)

@@ -50,6 +50,7 @@ FILES = [
     "mgmapnet_layer_*.npz",
     "mgmapnet_decoder_*.npz",
     "mgmapnet_losses_*.npz",
+    "mgmapnet_forward_reduced_*.npz",
 ]
 
 

@@ -1,7 +1,6 @@
 """Small networks that predict masks: of classes in BEV and camera view, of instances in BEV."""
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 
 def bev_mask_head(embed_dims: int, num_masks: int) -> nn.Sequential:
@@ -31,16 +30,3 @@ def instance_mask_embedding(embed_dims: int) -> nn.Sequential:
     for _ in range(2):
         layers += [nn.Linear(embed_dims, embed_dims), nn.ReLU(True)]
     return nn.Sequential(*layers, nn.Linear(embed_dims, embed_dims))
-
-
-def instance_mask_logits(embeddings: Tensor, bev_feats: Tensor) -> Tensor:
-    """Compare mask embeddings with every BEV cell.
-
-    Args:
-        embeddings: Mask embedding of each instance. (B, N, C)
-        bev_feats: BEV features. (B, C, H, W)
-
-    Returns:
-        Logits of the instances' masks. (B, N, H, W)
-    """
-    return torch.einsum("bnc,bchw->bnhw", embeddings, bev_feats)

@@ -95,6 +95,10 @@ class InstanceMaskLoss(nn.Module):
         self.embedding = instance_mask_embedding(embed_dims)
         self.loss_weight, self.dice_weight, self.pairing = loss_weight, dice_weight, pairing
 
+    def logits(self, states: Tensor, bev_feats: Tensor) -> Tensor:
+        """Return the masks of a sample's instances. (n, C), (C, H, W) -> (n, H, W)"""
+        return torch.einsum("nc,chw->nhw", self.embedding(states), bev_feats.to(states))
+
     def forward(
         self,
         states: Tensor,
@@ -119,9 +123,8 @@ class InstanceMaskLoss(nn.Module):
         Returns:
             The loss, 0 if nothing is matched. ()
         """
-        embeddings = self.embedding(states).split(list(counts))
-        samples = zip(embeddings, bev_feats.to(states), strict=True)
-        logits = torch.cat([torch.einsum("mc,chw->mhw", *sample) for sample in samples])
+        samples = zip(states.split(list(counts)), bev_feats, strict=True)
+        logits = torch.cat([self.logits(*sample) for sample in samples])
         masks = masks.to(logits)
         if self.pairing == "released":
             split = zip(masks.split(list(counts)), gt_inds.split(list(counts)), strict=True)
