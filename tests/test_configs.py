@@ -69,7 +69,7 @@ def test_the_auxiliary_bev_mask_is_as_large_as_the_bev_features(path):
     heads = {head.type for head in cfg.model.map_head.get("aux_heads", [])}
     steps = {step.type: step for step in cfg.train_dataloader.dataset.pipeline}
     assert ("BEVMaskHead" in heads) <= ("MakeBEVMask" in steps)
-    assert ("PVMaskHead" in heads) == ("MakePVMask" in steps)
+    assert bool(heads & {"PVMaskHead", "NormedPVMaskHead"}) == ("MakePVMask" in steps)
     assert ("DepthSupervision" in heads) == ("MakeDepthMap" in steps)
     if "BEVMaskHead" in heads:
         cells = BEVGrid(**cfg.grid).rasterized(cfg.model.bev_encoder.bev_pixel_m)

@@ -127,6 +127,28 @@ def test_a_camera_mask_draws_what_lies_in_front():
     assert mask[0, 0].nonzero().tolist() == [[6, col] for col in (3, 4, 5, 6)]
 
 
+def test_each_class_can_have_a_channel(golden_dir: Path):
+    """Together the channels are the one mask of all elements; a class has its own elements only."""
+    instances = golden_instances(golden_dir, "many")
+    lidar2img = np.array([[100, 50, 0, 0], [0, 50, -100, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+    shared = {"lidar2img": [lidar2img], "img_shape": (96, 96), **RANGES}
+    for kind, key in ((MakeBEVMask, "gt_seg"), (MakePVMask, "gt_pv_seg")):
+        one = kind().transform({"map_instances": instances, **shared})[key]
+        apart = kind(num_classes=3).transform({"map_instances": instances, **shared})[key]
+        assert apart.shape[-3:] == (3, *one.shape[-2:])
+        assert torch.equal(apart.amax(-3, keepdim=True), one)
+        for label in range(3):
+            own = [instance for instance in instances if instance.label == label]
+            alone = kind().transform({"map_instances": own, **shared})[key]
+            assert torch.equal(apart[..., label, :, :], alone[..., 0, :, :])
+
+
+def test_a_label_beyond_the_channels_is_refused():
+    line = MapInstance(3, np.array([[-15.0, -30.0], [15.0, -30.0]]))
+    with pytest.raises(ValueError, match="label 3 of an element, but num_classes=3"):
+        MakeBEVMask(num_classes=3).transform({"map_instances": [line], **RANGES})
+
+
 @pytest.mark.parametrize("size", ["reduced", "full"])
 @pytest.mark.parametrize("name", ["closed", "many"])
 def test_masks_equal_the_reference(golden_dir: Path, name: str, size: str):
