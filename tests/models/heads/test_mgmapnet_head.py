@@ -131,6 +131,16 @@ def test_gaussians_on_mgmapnets_decoder():
     assert all(part.guidance is None for part in head.decoder.layers)
 
 
+def test_points_with_height_are_codes_and_predictions_of_three_numbers():
+    layer = {**HEAD["decoder"]["layer"], "reference_dims": 3}
+    decoder = {"type": "MGMapNetDecoder", "num_layers": 2, "layer": layer}
+    head = build_head(MGMAP, decoder=decoder, reference={"coords": 3, "z_range": (-5, 3)})
+    assert head.decoder.layers[1].reference_code[0].in_features == 3 * P
+    outputs = head(BEV)
+    assert outputs["all_pts_preds"].shape[-1] == 3
+    assert outputs["all_mean_locations"].shape[-1] == 2
+
+
 def test_a_loss_of_samples_needs_a_decoder_that_tells_them():
     with pytest.raises(ValueError, match=r"SamplingLocationLoss reads \['pred.mean_locations'\]"):
         build_head(HEAD, losses=[{"type": "SamplingLocationLoss"}])
