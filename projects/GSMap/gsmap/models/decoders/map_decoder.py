@@ -147,11 +147,13 @@ class MapDecoder(BaseModule):
 
     Attributes:
         point_queries: Whether it takes point queries (B, N * P, C), or instance queries (B, N, C).
+        knows_its_layer: Whether it chooses the layer's type itself, or the head does.
         fields: What else it returns, (L, B, N, ...) each; losses may read it of the predictions.
             ``instance_states``, if among them, say the class in place of the mean over points.
     """
 
     point_queries = True
+    knows_its_layer = False
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __init__(

@@ -149,6 +149,7 @@ class MGMapNetDecoder(MapDecoder):
     """
 
     point_queries = False
+    knows_its_layer = True
     fields = ("instance_states", "mean_locations")
 
     def __init__(

@@ -135,8 +135,8 @@ class MapHead(BaseModule):
 
     def build_decoder(self, decoder: PARTS) -> MapDecoder:
         """Return the decoder; what the head knows is handed on to its layers."""
-        own = decoder.get("type", "MapDecoder") != "MapDecoder"
-        layer = self.own_layer if own else self.default_layer
+        knows_its_layer = MODELS.get(decoder.get("type", "MapDecoder")).knows_its_layer
+        layer = self.own_layer if knows_its_layer else self.default_layer
         return MODELS.build(
             {
                 "type": "MapDecoder",
