@@ -13,9 +13,9 @@ help:
 setup:
 	@tools/setup_env.sh $(VENV)
 
-# One thread: on a machine that does other work too, threads that wait for each other cost far more than they give.
+# One process of one thread per core: threads that wait for each other cost more than they give. A file stays in one process.
 test: setup
-	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest $(ARGS)
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest -n auto --dist loadfile $(ARGS)
 
 lint: setup
 	$(PY) -m ruff check .
