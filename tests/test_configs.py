@@ -39,7 +39,7 @@ def load(path: Path) -> Config:
 
 
 def distinct(paths: list[Path]) -> list[Path]:
-    """Return one leaf of each model and data set: schedules of other lengths train the same step."""
+    """Return one leaf of each model and data set; other schedules train the same step."""
     chosen: dict[str, Path] = {}
     for path in paths:
         cfg = load(path)
