@@ -140,8 +140,8 @@ def test_lidar_points_meet_their_depths_in_the_cameras(build, minicity_root, min
     # a pixel is as wide as the point may be off
     pixel_m = d * np.abs(frame_from_img[:3, :2]).sum()
     assert np.linalg.norm(points - point[:3], axis=1).min() < pixel_m
-    assert data.gt_seg.shape == (1, 200, 100)
-    assert data.gt_pv_seg.shape == (6, 1, 4, 7)
+    assert data.gt_seg.shape == (3, 200, 100)  # a channel a class
+    assert data.gt_pv_seg.shape == (6, 3, 4, 7)
     assert 0 < data.gt_seg.mean() < 0.5
     assert 0 < data.gt_pv_seg.mean() < 1
 
