@@ -81,8 +81,21 @@ def random_batch(
             pts_shifts=torch.stack([pts, pts.flip(1)], 1),
             polylines=pts,
         ).to(device)
-        samples.append(sample)
+        add_auxiliary_targets(sample, model, size, generator)
+        samples.append(sample.to(device))
     return {"imgs": images}, samples
+
+
+def add_auxiliary_targets(
+    sample: Det3DDataSample, model: Any, size: tuple[int, int], generator: torch.Generator
+) -> None:
+    """Add what auxiliary heads train on: masks of every class and depth, at random."""
+    classes, stride = len(model.map_head.classes), 32
+    cells = model.bev_encoder.grid
+    features = size[0] // stride, size[1] // stride
+    sample.gt_seg = torch.rand(classes, cells.height, cells.width, generator=generator).round()
+    sample.gt_pv_seg = torch.rand(6, classes, *features, generator=generator).round()
+    sample.gt_depth = 1 + 33 * torch.rand(6, *size, generator=generator)
 
 
 def ring_of_cameras(num_cams: int, size: tuple[int, int]) -> np.ndarray:
