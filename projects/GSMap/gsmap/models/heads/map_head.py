@@ -1,5 +1,7 @@
 """The map head, composed of parts: queries, predictions of every layer, matching, losses."""
 
+# Over 400 lines: one story from queries to losses; its parts have files of their own.
+
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, cast
 
