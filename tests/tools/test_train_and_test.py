@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 REPO = Path(__file__).resolve().parents[2]
 CONFIG = """
@@ -121,12 +122,33 @@ def test_the_data_set_and_what_a_model_finds_are_drawn(config, trained, minicity
     assert len(list(browsed.glob("*.png"))) == 1
 
 
-def test_two_processes_train_one_model(config, tmp_path):
-    log = run("tools/dist_train.sh", config, 2, "--work-dir", tmp_path, "--cfg-options",
-              "train_cfg.max_epochs=1")  # fmt: skip
-    assert (tmp_path / "epoch_1.pth").exists()
-    assert "Distributed training: True" in log
-    assert "[1][1/1]" in log.replace(" ", "")  # two samples on two ranks: one iteration
+WITHOUT_CHANCE = """
+_base_ = '{config}'
+model = dict(
+    img_backbone=dict(norm_eval=True),
+    img_neck=dict(norm_cfg=dict(type='GN', num_groups=2)))
+train_dataloader = dict(batch_size={batch_size})
+train_cfg = dict(max_epochs=2)
+optim_wrapper = dict(optimizer=dict(_delete_=True, type='SGD', lr=1e-4))
+randomness = dict(seed=0)
+"""
+
+
+def test_two_processes_learn_what_one_learns_from_the_same_batch(config, tmp_path):
+    weights = []
+    for ranks in (1, 2):
+        work = tmp_path / str(ranks)
+        leaf = tmp_path / f"ranks_{ranks}.py"
+        leaf.write_text(WITHOUT_CHANCE.format(config=config, batch_size=2 // ranks))
+        log = run("tools/dist_train.sh", leaf, ranks, "--work-dir", work)
+        assert "Distributed training: True" in log
+        assert "[2][1/1]" in log.replace(" ", "")  # both samples in one iteration
+        weights.append(torch.load(work / "epoch_2.pth", weights_only=False)["state_dict"])
+    first = torch.load(tmp_path / "1" / "epoch_1.pth", weights_only=False)["state_dict"]
+    moved = [(weights[0][name] - value).abs().max() for name, value in first.items()]
+    assert max(moved) > 1e-4
+    for name, value in weights[0].items():
+        torch.testing.assert_close(weights[1][name], value, rtol=0, atol=1e-6, msg=name)
 
 
 def test_a_missing_checkpoint_is_named(config):
