@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.measure import markdown_table
 from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import EvaluationConfig, MapEvaluator, flat_metrics
+from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.results_json import write_results
 from gsmap.structures.elements import MapElements
@@ -169,19 +169,17 @@ def _reference_table(frames: list[Record], count: int) -> str:
     samples = [_frame(frames[k % len(frames)]) for k in range(count)]
     chamfer, raster = ChamferConfig(CLASSES), RasterConfig(CLASSES)
     rows = []
-    for name, config, slow in (
-        ("chamfer", EvaluationConfig(chamfer, None), lambda: reference.chamfer_map(samples, 3)),
-        ("raster", EvaluationConfig(None, raster), lambda: reference.raster_map(samples, raster)),
+    for name, evaluator, slow in (
+        ("chamfer", MapEvaluator(chamfer, None), lambda: reference.chamfer_map(samples, 3)),
+        ("raster", MapEvaluator(None, raster), lambda: reference.raster_map(samples, raster)),
     ):
-        MapEvaluator(config).update("warm-up", *samples[0])
+        evaluator.match("warm-up", *samples[0])
         start = time.process_time()
         theirs = slow()
         slow_ms = (time.process_time() - start) / count * 1e3
         start = time.process_time()
-        evaluator = MapEvaluator(config)
-        for k, sample in enumerate(samples):
-            evaluator.update(f"{k:06d}", *sample)
-        ours = flat_metrics(evaluator.compute())[f"{name}/mAP"]
+        matches = [evaluator.match(f"{k:06d}", *sample) for k, sample in enumerate(samples)]
+        ours = evaluator.reports(matches)[0].metrics[f"{name}/mAP"]
         fast_ms = (time.process_time() - start) / count * 1e3
         rows.append(
             [

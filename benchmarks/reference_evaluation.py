@@ -129,7 +129,8 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig) -> float:
         config: Rules.
     """
     aps = []
-    for label, polygon in enumerate(config.is_polygon):
+    pairs = zip(config.is_polygon, config.thresholds.values(), strict=True)
+    for label, (polygon, thresholds) in enumerate(pairs):
         scores, ious, num_gts = [], [], 0
         for pred, gt in frames:
             rows = _ranked(pred, label, config.min_score)[: config.max_predictions]
@@ -140,7 +141,7 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig) -> float:
             scores.append(pred.confidence[rows])
             ious.append(np.asarray(found).reshape(len(rows), len(truths)))
         order = np.argsort(-np.concatenate(scores), kind="stable")
-        for threshold in config.thresholds_of(label):
+        for threshold in thresholds:
             hits = [hit for frame in ious for hit in _raster_hits(frame, threshold)]
             aps.append(interpolated_ap(np.array(hits, dtype=bool)[order], num_gts))
     return float(np.mean([ap for ap in aps if ap >= 0]))

@@ -25,11 +25,13 @@ from gsmap.evaluation.chamfer_ap import (
     HARD_CHAMFER_THRESHOLDS,
     ChamferConfig,
 )
-from gsmap.evaluation.evaluator import METRIC_NAMES, EvaluationConfig, flat_metrics
+from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files
-from gsmap.evaluation.prior import PriorConfig, evaluate_prior
-from gsmap.evaluation.raster_ap import POLYGON_CLASSES, RasterConfig
-from gsmap.evaluation.report import format_table
+from gsmap.evaluation.prior import evaluate_prior
+from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.report import flat_metrics, format_table
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 
@@ -68,7 +70,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--polygon-classes",
         nargs="*",
-        default=list(POLYGON_CLASSES),
+        default=list(AREA_CLASSES),
         help="classes that AP_raster fills",
     )
     parser.add_argument(
@@ -108,7 +110,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     return args
 
 
-def config_from(args: argparse.Namespace) -> EvaluationConfig:
+def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
     """Join the arguments with what the annotation file says."""
     classes, extent = args.classes, args.range
     if args.ground_truth.suffix.lower() != ".json":
@@ -129,8 +131,8 @@ def config_from(args: argparse.Namespace) -> EvaluationConfig:
             dim=args.dim,
         )
     if "raster" in args.eval:
-        raster = RasterConfig(classes, tuple(args.polygon_classes), (x0, x1), (y0, y1))
-    return EvaluationConfig(chamfer, raster, args.gt_points)
+        raster = RasterConfig(classes, BEVGrid((x0, x1), (y0, y1)), tuple(args.polygon_classes))
+    return MapEvaluator(chamfer, raster, args.gt_points)
 
 
 def show_progress(done: int, total: int) -> None:
@@ -140,38 +142,39 @@ def show_progress(done: int, total: int) -> None:
 
 
 def report(outcome: Evaluation, args: argparse.Namespace) -> None:
-    for found in outcome.reports:
+    reports, notes = outcome
+    for found in reports:
         print(format_table(found) + "\n")
-    for note in outcome.notes:
+    for note in notes:
         print(f"note: {note}")
     if args.out:
-        write_text(args.out, json.dumps(flat_metrics(outcome.reports), indent=1) + "\n")
+        write_text(args.out, json.dumps(flat_metrics(reports), indent=1) + "\n")
         print(f"figures: {args.out}")
     if args.pr_curves:
         from gsmap.evaluation.curves import draw_curves
 
-        draw_curves(outcome.reports, args.pr_curves)
+        draw_curves(reports, args.pr_curves)
         print(f"curves: {args.pr_curves}")
 
 
 def main(argv: list[str] | None = None) -> str:
     args = parse_args(argv)
     start = time.perf_counter()
-    config = config_from(args)
+    evaluator = evaluator_from(args)
     if args.prior:
-        prior = PriorConfig(max_elements=args.prior_elements)
-        outcome = evaluate_prior(args.prior, args.ground_truth, config, prior)
+        outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, args.prior_elements)
     else:
         outcome = evaluate_files(
             args.results,
             args.ground_truth,
-            config,
+            evaluator,
             args.workers,
             args.allow_mismatch,
             show_progress,
         )
     report(outcome, args)
-    number = int(next(iter(outcome.reports)).metrics[f"{outcome.reports[0].name}/num_samples"])
+    first = outcome[0][0]
+    number = int(first.metrics[f"{first.name}/num_samples"])
     return f"{number} samples in {time.perf_counter() - start:.1f} s"
 
 

@@ -4,13 +4,16 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import EvaluationConfig
+from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.raster_drawing import Masks
 from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing", "boundary")
-CONFIG = EvaluationConfig(ChamferConfig(CLASSES), RasterConfig(CLASSES))
+EVALUATOR = MapEvaluator(ChamferConfig(CLASSES), RasterConfig(CLASSES))
 Frame = tuple[str, MapElements, MapElements]
 
 
@@ -30,15 +33,12 @@ def frame_of(record: dict[str, Any]) -> Frame:
     )
 
 
-def vectors_of(elements: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Convert the golden form of elements to MapTR's."""
-    return [
-        {
-            "pts": e["pts"],
-            "pts_num": len(e["pts"]),
-            "cls_name": CLASSES[e["label"]],
-            "type": e["label"],
-            **({"confidence_level": e["score"]} if "score" in e else {}),
-        }
-        for e in elements
-    ]
+def full_mask(masks: Masks, index: int, height: int, width: int) -> np.ndarray:
+    """Unpack one mask to the whole canvas. (H, W)"""
+    top, left, rows, words = masks.boxes[index]
+    packed = masks.words[masks.starts[index] : masks.starts[index + 1]].astype("<u8")
+    bits = np.unpackbits(packed.view(np.uint8), bitorder="little").reshape(rows, 64 * words)
+    canvas = np.zeros((height, width), dtype=np.bool_)
+    columns = min(64 * int(words), width - 64 * int(left))
+    canvas[top : top + rows, 64 * left : 64 * left + columns] = bits[:, :columns]
+    return canvas

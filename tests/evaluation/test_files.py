@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from golden_data import CLASSES, CONFIG
+from golden_data import CLASSES, EVALUATOR
 
 from gsmap.datasets.annotations.file import (
     AnnotationMeta,
@@ -16,7 +16,7 @@ from gsmap.datasets.annotations.file import (
     MapSample,
     write_annotations,
 )
-from gsmap.evaluation.file_evaluation import evaluate_files, read_annotations
+from gsmap.evaluation.file_evaluation import evaluate_files, read_ground_truth
 from gsmap.evaluation.results_json import read_samples, vectors_of, write_results
 from gsmap.structures.elements import MapElements
 
@@ -105,7 +105,7 @@ def test_two_workers_give_the_same_digits(tmp_path):
     results, truth = tmp_path / "results.json", tmp_path / "truth.json"
     write_results(results, results_of(150))
     write_results(truth, truth_of(150), key="GTs")
-    one, two = (evaluate_files(results, truth, CONFIG, n).reports for n in (1, 2))
+    one, two = (evaluate_files(results, truth, EVALUATOR, n)[0] for n in (1, 2))
     assert [r.metrics for r in one] == [r.metrics for r in two]
 
 
@@ -133,11 +133,11 @@ def test_missing_and_unknown_samples_are_an_error_unless_allowed(tmp_path):
     write_results(results, results_of(3))
     write_results(truth, truth_of(4)[1:], key="GTs")
     with pytest.raises(ValueError, match=r"1 samples have no results, such as 't3'.*'t0'"):
-        evaluate_files(results, truth, CONFIG)
-    found = evaluate_files(results, truth, CONFIG, allow_mismatch=True)
-    assert found.reports[0].metrics["chamfer/divider/recall@0.5"] == pytest.approx(2 / 3)
-    assert "counted as without predictions" in found.notes[0]
-    assert "left out" in found.notes[1]
+        evaluate_files(results, truth, EVALUATOR)
+    reports, notes = evaluate_files(results, truth, EVALUATOR, allow_mismatch=True)
+    assert reports[0].metrics["chamfer/divider/recall@0.5"] == pytest.approx(2 / 3)
+    assert "counted as without predictions" in notes[0]
+    assert "left out" in notes[1]
 
 
 def test_z_other_classes_and_single_points_are_said(tmp_path):
@@ -147,10 +147,10 @@ def test_z_other_classes_and_single_points_are_said(tmp_path):
     write_results(
         truth, [("a", [vector(LINE, "divider"), vector([[0, 0]], "boundary")])], key="GTs"
     )
-    found = evaluate_files(results, truth, CONFIG)
-    assert found.reports[0].metrics["chamfer/divider/AP"] == 1.0
-    assert found.reports[0].metrics["chamfer/boundary/num_gts"] == 1
-    text = "; ".join(found.notes)
+    reports, notes = evaluate_files(results, truth, EVALUATOR)
+    assert reports[0].metrics["chamfer/divider/AP"] == 1.0
+    assert reports[0].metrics["chamfer/boundary/num_gts"] == 1
+    text = "; ".join(notes)
     assert "z is ignored" in text
     assert "1 ground truths have fewer than two points" in text
     assert "1 predictions of class 'kerb' are not scored" in text
@@ -215,7 +215,7 @@ def test_malformed_results_name_the_file_and_the_sample(tmp_path, text, message)
     results.write_text(text)
     write_results(truth, truth_of(1), key="GTs")
     with pytest.raises(ValueError, match=message):
-        evaluate_files(results, truth, CONFIG)
+        evaluate_files(results, truth, EVALUATOR)
     with pytest.raises(ValueError, match=message):
         command()([str(results), str(truth)])
 
@@ -263,6 +263,6 @@ def test_annotation_file_without_ground_truth_or_class_is_refused(tmp_path):
     sample = MapSample("t0", "s", "", 0, [], np.eye(4))
     write_annotations(arrow, AnnotationMeta("minicity", "lidar", "val"), [sample])
     with pytest.raises(ValueError, match="'t0' has no ground truth"):
-        read_annotations(arrow, CLASSES)
+        read_ground_truth(arrow, CLASSES)
     with pytest.raises(ValueError, match="stop_line"):
-        read_annotations(arrow, ("divider", "stop_line"))
+        read_ground_truth(arrow, ("divider", "stop_line"))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from golden_data import CLASSES, CONFIG, Frame, frame_of, read
+from golden_data import CLASSES, EVALUATOR, Frame, frame_of, full_mask, read
 
 from gsmap.evaluation.chamfer_ap import (
     ChamferConfig,
@@ -12,9 +12,9 @@ from gsmap.evaluation.chamfer_ap import (
     match_chamfer,
     nearest_by_chamfer,
 )
-from gsmap.evaluation.evaluator import MapEvaluator, flat_metrics
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, rasterize
 from gsmap.evaluation.raster_kernels import mask_ious
+from gsmap.evaluation.report import flat_metrics
 from gsmap.structures.elements import MapElements
 
 AP_TOLERANCE = 1e-6  # the reference computes precision and recall of AP_chamfer in float32
@@ -37,10 +37,7 @@ def metrics(frames: list[Frame]) -> dict[str, float]:
 
 
 def score(frames: list[Frame]) -> dict[str, float]:
-    evaluator = MapEvaluator(CONFIG)
-    for frame in frames:
-        evaluator.update(*frame)
-    return flat_metrics(evaluator.compute())
+    return flat_metrics(EVALUATOR.reports(EVALUATOR.match(*frame) for frame in frames))
 
 
 def check_chamfer(metrics: dict[str, float], per_class: dict) -> None:
@@ -162,7 +159,7 @@ def test_masks_pixel_by_pixel(frames, eval_dir: Path, stored: str, dilation: int
     wanted = np.unpackbits(file[stored])[: np.prod(shape)].reshape(shape).astype(bool)
     for (frame, is_pred, index, _, _), want in zip(file["info"], wanted, strict=True):
         elements = frames[frame][1 if is_pred else 2].select(np.array([index]))
-        assert (rasterize(elements, config).full(0, 480, 240) == want).all()
+        assert (full_mask(rasterize(elements, config), 0, 480, 240) == want).all()
 
 
 def test_edge_cases(eval_dir: Path) -> None:

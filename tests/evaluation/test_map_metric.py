@@ -123,10 +123,8 @@ def test_samples_without_ground_truth_and_bad_settings_are_refused():
         map_metric.MapMetric(eval=["mIoU"])
     with pytest.raises(ValueError, match="eval must name metrics"):
         map_metric.MapMetric(eval=[])
-    with pytest.raises(ValueError, match="6 values"):
-        map_metric.MapMetric(pc_range=[0, 1])
     nameless = Evaluator(map_metric.MapMetric())
-    with pytest.raises(ValueError, match="knows no classes"):
+    with pytest.raises(ValueError, match="a data set whose metainfo has classes"):
         nameless.process([sample("x", 0.1)])
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
-from gsmap.evaluation.prior import PriorConfig, fit_prior
+from gsmap.evaluation.prior import fit_prior
 from gsmap.structures.elements import MapElements
 
 CHAMFER = ChamferConfig(("divider", "ped_crossing"))
@@ -48,7 +48,7 @@ def test_refinement_moves_an_element_to_the_middle_of_what_it_matches():
         MapElements.from_polylines([line(x)[::-1] if i % 2 else line(x)], [0])
         for i, x in enumerate(np.linspace(-0.9, 0.9, 7))
     ]
-    prior = fit_prior(truth, CHAMFER, PriorConfig(max_elements=1, max_candidates=1, seed=1))
+    prior = fit_prior(truth, CHAMFER, max_elements=1, max_candidates=1, seed=1)
     assert abs(prior.polylines[0][:, 0]).max() < 0.4
     assert score(prior, truth)["chamfer/divider/AP@1.0"] == 1.0
 
@@ -59,7 +59,7 @@ def test_rings_that_start_elsewhere_are_averaged_as_rings():
         for k in range(4)
     ]
     truth = [MapElements.from_polylines([ring + 0.1 * i], [1]) for i, ring in enumerate(rings)]
-    prior = fit_prior(truth, CHAMFER, PriorConfig(max_elements=1))
+    prior = fit_prior(truth, CHAMFER, max_elements=1)
     assert score(prior, truth)["chamfer/ped_crossing/AP"] == 1.0
 
 
@@ -69,12 +69,11 @@ def test_the_number_of_elements_is_limited_and_fitting_is_deterministic():
         MapElements.from_polylines([line(x) for x in rng.uniform(-15, 15, 6)], [0] * 6)
         for _ in range(20)
     ]
-    config = PriorConfig(max_elements=5, max_candidates=30)
-    first, second = fit_prior(truth, CHAMFER, config), fit_prior(truth, CHAMFER, config)
+    first, second = (fit_prior(truth, CHAMFER, 5, max_candidates=30) for _ in range(2))
     assert len(first) == 5
     np.testing.assert_array_equal(first.points, second.points)
     assert (np.diff(first.scores) <= 0).all()
-    larger = fit_prior(truth, CHAMFER, PriorConfig(max_elements=10, max_candidates=30))
+    larger = fit_prior(truth, CHAMFER, max_elements=10, max_candidates=30)
     found = [score(p, truth)["chamfer/mAP"] for p in (first, larger)]
     assert found[1] >= found[0] > 0
 

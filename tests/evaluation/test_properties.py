@@ -5,20 +5,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import EvaluationConfig, MapEvaluator, flat_metrics
+from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.report import flat_metrics
 from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing")
-CONFIG = EvaluationConfig(ChamferConfig(CLASSES), RasterConfig(CLASSES))
+EVALUATOR = MapEvaluator(ChamferConfig(CLASSES), RasterConfig(CLASSES))
 AP_KEYS = tuple(f"{m}/{c}/AP" for m in ("chamfer", "raster") for c in CLASSES)
 
 
 def score(frames: list[tuple[MapElements, MapElements]]) -> dict[str, float]:
-    evaluator = MapEvaluator(CONFIG)
-    for i, (pred, gt) in enumerate(frames):
-        evaluator.update(f"{i:03d}", pred, gt)
-    return flat_metrics(evaluator.compute())
+    matches = [EVALUATOR.match(f"{i:03d}", pred, gt) for i, (pred, gt) in enumerate(frames)]
+    return flat_metrics(EVALUATOR.reports(matches))
 
 
 @st.composite
@@ -42,10 +41,6 @@ def maps(draw: st.DrawFn) -> MapElements:
     return MapElements.from_polylines(lines, labels, np.round(rng.permutation(count) / 10 + 0.3, 3))
 
 
-def lines_of(elements: MapElements) -> list[np.ndarray]:
-    return [elements.polylines[i] for i in range(len(elements))]
-
-
 @given(gt=maps())
 @settings(max_examples=40, deadline=None)
 def test_ground_truth_as_prediction_gives_one(gt):
@@ -59,7 +54,7 @@ def test_ground_truth_as_prediction_gives_one(gt):
 @settings(max_examples=20, deadline=None)
 def test_moved_by_a_hundred_metres_gives_zero(gt):
     moved = MapElements.from_polylines(
-        [p + np.array([100.0, 0.0]) for p in lines_of(gt)], gt.labels, gt.scores
+        [p + np.array([100.0, 0.0]) for p in gt.polylines], gt.labels, gt.scores
     )
     metrics = score([(moved, gt)])
     assert all(metrics[key] in (0.0, -1.0) for key in AP_KEYS)
@@ -70,7 +65,7 @@ def test_moved_by_a_hundred_metres_gives_zero(gt):
 @settings(max_examples=40, deadline=None)
 def test_reversing_lines_and_rings_changes_nothing(pred, gt, turn):
     flip = np.random.default_rng(turn).integers(2, size=len(pred)).astype(bool)
-    lines = [p[::-1] if f else p for p, f in zip(lines_of(pred), flip, strict=True)]
+    lines = [p[::-1] if f else p for p, f in zip(pred.polylines, flip, strict=True)]
     before = score([(pred, gt)])
     after = score([(MapElements.from_polylines(lines, pred.labels, pred.scores), gt)])
     for key, value in before.items():
@@ -83,7 +78,7 @@ def test_a_miss_below_all_scores_never_raises_ap(pred, gt, label):
     far = [[90.0, 0.0], [95.0, 5.0], [90.0, 5.0]]
     scores = np.append(pred.scores, 0.1)
     more = MapElements.from_polylines(
-        [*lines_of(pred), np.array(far)], np.append(pred.labels, label), scores
+        [*pred.polylines, np.array(far)], np.append(pred.labels, label), scores
     )
     before, after = score([(pred, gt)]), score([(more, gt)])
     assert all(after[key] <= before[key] + 1e-12 for key in AP_KEYS)

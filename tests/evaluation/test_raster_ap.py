@@ -1,16 +1,17 @@
 import cv2
 import numpy as np
 import pytest
+from golden_data import full_mask
 
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report, rasterize
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 
 CLASSES = ("divider", "ped_crossing")
 CONFIG = RasterConfig(CLASSES)
 RAW = RasterConfig(CLASSES, dilation_px=1)
-TINY = RasterConfig(
-    CLASSES, x_range=(0, 12), y_range=(0, 8), px_per_m=1, dilation_px=1
-)  # a pixel per metre
+SMALL = BEVGrid((0, 12), (0, 8))
+TINY = RasterConfig(CLASSES, SMALL, px_per_m=1, dilation_px=1)  # a pixel per metre
 
 
 def rows(mask: np.ndarray) -> list[str]:
@@ -23,13 +24,13 @@ def test_line_and_polygon_by_hand():
         [[[1, 0], [4, 3]], [[6, 1], [9, 1], [9, 3], [6, 3]]], [0, 1]
     )
     masks = rasterize(elements, TINY)
-    assert rows(masks.full(0, 8, 12))[:4] == [
+    assert rows(full_mask(masks, 0, 8, 12))[:4] == [
         ".#..........",
         "..#.........",
         "...#........",
         "....#.......",
     ]
-    assert rows(masks.full(1, 8, 12))[:5] == [
+    assert rows(full_mask(masks, 1, 8, 12))[:5] == [
         "............",
         "......####..",
         "......####..",
@@ -41,9 +42,9 @@ def test_line_and_polygon_by_hand():
 def test_dilation_is_a_square_and_ends_at_the_canvas():
     masks = rasterize(
         MapElements.from_polylines([[[0, 0], [0, 0]]], [0]),
-        RasterConfig(CLASSES, x_range=(0, 12), y_range=(0, 8), px_per_m=1),
+        RasterConfig(CLASSES, SMALL, px_per_m=1),
     )
-    assert rows(masks.full(0, 8, 12))[:4] == [
+    assert rows(full_mask(masks, 0, 8, 12))[:4] == [
         "###.........",
         "###.........",
         "###.........",
@@ -72,7 +73,7 @@ def test_lines_are_opencv_lines_on_and_off_the_canvas():
         want = np.zeros((480, 240), np.uint8)
         cv2.polylines(want, [opencv_pixels(line)], False, 1)
         want = cv2.dilate(want, np.ones((5, 5), np.uint8))
-        assert (masks.full(i, 480, 240) == want).all(), i
+        assert (full_mask(masks, i, 480, 240) == want).all(), i
 
 
 def test_polygons_contain_opencv_outlines_and_little_else():
@@ -83,7 +84,7 @@ def test_polygons_contain_opencv_outlines_and_little_else():
         outline, filled = np.zeros((2, 480, 240), np.uint8)
         cv2.polylines(outline, [opencv_pixels(line)], True, 1)
         cv2.fillPoly(filled, [opencv_pixels(line)], 1)
-        ours = masks.full(i, 480, 240)
+        ours = full_mask(masks, i, 480, 240)
         assert (ours >= outline.astype(bool)).all()
         if np.abs(opencv_pixels(line) - [120, 240]).max(axis=0).max() < 120:  # nothing is cut
             near_outline = cv2.dilate(outline, np.ones((3, 3), np.uint8)).astype(bool)
@@ -93,7 +94,7 @@ def test_polygons_contain_opencv_outlines_and_little_else():
 def test_self_intersection_is_even_odd():
     """The two wings of a bow tie are filled, what lies beside its waist is not."""
     elements = MapElements.from_polylines([[[1, 1], [9, 7], [9, 1], [1, 7]]], [1])
-    mask = rasterize(elements, TINY).full(0, 8, 12)
+    mask = full_mask(rasterize(elements, TINY), 0, 8, 12)
     assert mask[4, 2]
     assert mask[4, 8]
     assert not mask[1, 5]
@@ -166,11 +167,10 @@ def test_low_scores_and_more_than_the_limit_are_dropped():
 
 
 def test_argoverse_range_turns_the_canvas():
-    config = RasterConfig(CLASSES, x_range=(-30, 30), y_range=(-15, 15))
+    config = RasterConfig(CLASSES, BEVGrid((-30, 30), (-15, 15)))
     assert (config.width, config.height) == (480, 240)
-    mask = rasterize(MapElements.from_polylines([[[-30, 0], [29.9, 0]]], [0]), config).full(
-        0, 240, 480
-    )
+    line = MapElements.from_polylines([[[-30, 0], [29.9, 0]]], [0])
+    mask = full_mask(rasterize(line, config), 0, 240, 480)
     assert mask[118:123].all()
     assert not mask[117].any()
 
@@ -179,7 +179,7 @@ def test_extended_classes_are_polygons():
     config = RasterConfig(("divider", "stop_line", "intersection", "carpark"))
     assert config.is_polygon == (False, True, True, True)
     square = [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]]
-    mask = rasterize(MapElements.from_polylines([square], [2]), config).full(0, 480, 240)
+    mask = full_mask(rasterize(MapElements.from_polylines([square], [2]), config), 0, 480, 240)
     assert mask[256, 136]  # the middle of the square: (2 + 15) * 8, (2 + 30) * 8
 
 
@@ -188,8 +188,8 @@ def test_far_points_do_not_overflow():
         MapElements.from_polylines([[[0.0, 0.0], [1e30, 1e30]], [[1e12, 0], [1e12, 5]]], [0, 1]),
         CONFIG,
     )
-    assert masks.full(0, 480, 240)[240, 120]
-    assert not masks.full(1, 480, 240).any()
+    assert full_mask(masks, 0, 480, 240)[240, 120]
+    assert not full_mask(masks, 1, 480, 240).any()
 
 
 def test_bad_configuration_is_refused():
@@ -197,7 +197,7 @@ def test_bad_configuration_is_refused():
         RasterConfig(CLASSES, line_thresholds=(0.5,))
     with pytest.raises(ValueError, match="odd"):
         RasterConfig(CLASSES, dilation_px=4)
-    with pytest.raises(ValueError, match="low < high"):
-        RasterConfig(CLASSES, x_range=(5, 5))
+    with pytest.raises(ValueError, match="at least one pixel"):
+        RasterConfig(CLASSES, px_per_m=0.01)
     with pytest.raises(ValueError, match=r"\(0, 1\]"):
         RasterConfig(CLASSES, line_thresholds=(0.5, 1.5))

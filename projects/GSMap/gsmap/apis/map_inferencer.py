@@ -262,7 +262,8 @@ class MapInferencer:
             path: File to write.
             data_samples: Samples from ``predict``.
         """
-        metric = MapMetric(eval=(), classes=self.visualizer.style.classes, out_file=str(path))
+        metric = MapMetric(eval=(), out_file=str(path))
+        metric.dataset_meta = self.visualizer.dataset_meta
         metric.process(None, [sample.to_dict() for sample in data_samples])
         metric.evaluate(len(data_samples))
 

@@ -10,8 +10,7 @@ _RECALL_POINTS = np.linspace(0.0, 1.0, 101)
 def precision_recall(hits: BoolArray, num_gts: int) -> tuple[FloatArray, FloatArray]:
     """Return recall and precision after each prediction, in descending order of score. 2 x (N,)"""
     found = np.cumsum(hits, dtype=np.float64)
-    recall = found / max(num_gts, 1)
-    return recall, found / np.arange(1, len(found) + 1)
+    return found / max(num_gts, 1), found / np.arange(1, len(found) + 1)
 
 
 def area_ap(hits: BoolArray, num_gts: int) -> float:
@@ -21,7 +20,7 @@ def area_ap(hits: BoolArray, num_gts: int) -> float:
         hits: Whether each prediction matches, in descending order of score. (N,)
         num_gts: Number of ground truths; without any the result is 0.
     """
-    if num_gts == 0 or not len(hits):
+    if num_gts == 0:
         return 0.0
     recall, precision = precision_recall(hits, num_gts)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
@@ -37,8 +36,6 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
     """
     if num_gts == 0:
         return -1.0
-    if not len(hits):
-        return 0.0
     found = np.cumsum(hits, dtype=np.float64)
     # COCO adds the spacing of 1 to the denominator, so a perfect class gives 1 - 2e-16
     precision = found / (np.arange(1, len(found) + 1) + np.spacing(1.0))
@@ -58,31 +55,29 @@ def reliability(
         num_bins: Number of bins.
 
     Returns:
-        Mean score and share of matches, NaN in an empty bin, and the number of predictions of
-        each bin. 3 x (num_bins,)
+        Mean score, share of matches and number of predictions of each bin that is not empty.
+        3 x (<= num_bins,)
     """
     bins = np.clip((scores * num_bins).astype(np.int64), 0, num_bins - 1)
-    counts = np.bincount(bins, minlength=num_bins).astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        mean_score = np.bincount(bins, weights=scores, minlength=num_bins) / counts
-        share = np.bincount(bins, weights=hits.astype(np.float64), minlength=num_bins) / counts
-    return mean_score, share, counts
+    counts, total, found = (
+        np.bincount(bins, weights=values, minlength=num_bins)
+        for values in (np.ones(len(bins)), scores, hits)
+    )
+    filled = counts > 0
+    return total[filled] / counts[filled], found[filled] / counts[filled], counts[filled]
 
 
-def calibration_error(scores: FloatArray, hits: BoolArray, num_bins: int = 10) -> float:
+def calibration_error(scores: FloatArray, hits: BoolArray) -> float:
     """Return the expected calibration error: the mean gap between score and share of matches.
 
     Args:
         scores: Confidence in [0, 1]. (N,)
         hits: Whether each prediction matches. (N,)
-        num_bins: Number of bins of equal width.
 
     Returns:
-        The error in [0, 1]; -1 without predictions.
+        The error in [0, 1], of ten bins; -1 without predictions.
     """
     if not len(scores):
         return -1.0
-    mean_score, share, counts = reliability(scores, hits, num_bins)
-    filled = counts > 0
-    gaps = np.abs(mean_score[filled] - share[filled])
-    return float(np.sum(gaps * counts[filled]) / len(scores))
+    mean_score, share, counts = reliability(scores, hits)
+    return float(np.sum(np.abs(mean_score - share) * counts) / len(scores))

@@ -1,7 +1,7 @@
 """Both metrics over a stream of samples: match each sample once, keep only its matches."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
 from gsmap.evaluation.matches import FrameMatches
@@ -15,8 +15,10 @@ SampleMatches = dict[str, FrameMatches]  # by the name of the metric
 
 
 @dataclass(frozen=True)
-class EvaluationConfig:
-    """Which metrics to compute and their rules.
+class MapEvaluator:
+    """Which metrics to compute, and how: ``match`` each sample, then make ``reports`` of all.
+
+    Matches take a few kilobytes a sample and may come from several processes.
 
     Args:
         chamfer: Rules of AP_chamfer, or None to leave it out.
@@ -33,15 +35,11 @@ class EvaluationConfig:
     ground_truth_points: int | None = None
 
     def __post_init__(self) -> None:
-        if self.chamfer is None and self.raster is None:
-            raise ValueError(f"name at least one metric of {METRIC_NAMES}.")
+        classes = {config.classes for config in (self.chamfer, self.raster) if config}
+        if len(classes) != 1:
+            raise ValueError(f"name at least one of {METRIC_NAMES}, with the same classes.")
         if self.ground_truth_points is not None and self.ground_truth_points < 2:
             raise ValueError(f"ground_truth_points must be >= 2, got {self.ground_truth_points}.")
-        if self.chamfer and self.raster and self.chamfer.classes != self.raster.classes:
-            raise ValueError(
-                "both metrics must have the same classes, got "
-                f"{self.chamfer.classes} and {self.raster.classes}."
-            )
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -50,85 +48,38 @@ class EvaluationConfig:
         assert config is not None
         return config.classes
 
-
-def with_points(elements: MapElements, num_points: int) -> MapElements:
-    """Return ground truth with a fixed number of points at equal arc lengths.
-
-    Args:
-        elements: Polylines and rings; those of fewer than two points are kept as they are.
-        num_points: Number of points of each.
-    """
-    resampled = resample_all(elements.points, elements.offsets, num_points)
-    pairs = zip(elements.polylines, resampled, strict=True)
-    polylines = [new if len(old) >= 2 else old for old, new in pairs]
-    return MapElements.from_polylines(polylines, elements.labels)
-
-
-def match_sample(
-    token: str, predictions: MapElements, ground_truth: MapElements, config: EvaluationConfig
-) -> SampleMatches:
-    """Match one sample under every metric that is asked for.
-
-    Args:
-        token: Name of the sample.
-        predictions: Its predictions.
-        ground_truth: Its ground truth.
-        config: Metrics and their rules.
-    """
-    if config.ground_truth_points is not None:
-        ground_truth = with_points(ground_truth, config.ground_truth_points)
-    found: SampleMatches = {}
-    if config.chamfer:
-        found["chamfer"] = match_chamfer(predictions, ground_truth, config.chamfer, token)
-    if config.raster:
-        found["raster"] = match_raster(predictions, ground_truth, config.raster, token)
-    return found
-
-
-def reports(samples: Iterable[SampleMatches], config: EvaluationConfig) -> list[MetricReport]:
-    """Compute the metrics from the matches of all samples.
-
-    Args:
-        samples: Matches in any order; repeated tokens count once.
-        config: Metrics and their rules.
-    """
-    records, found = list(samples), []
-    if config.chamfer:
-        found.append(chamfer_report((r["chamfer"] for r in records), config.chamfer))
-    if config.raster:
-        found.append(raster_report((r["raster"] for r in records), config.raster))
-    return found
-
-
-def flat_metrics(found: Sequence[MetricReport]) -> dict[str, float]:
-    """Join the figures of several metrics under their flat keys."""
-    return {key: value for report in found for key, value in report.metrics.items()}
-
-
-@dataclass
-class MapEvaluator:
-    """Streaming evaluation: update per sample while a network runs, compute at the end.
-
-    Memory grows by a few kilobytes per sample; masks and points are not kept.
-
-    Args:
-        config: Metrics and their rules.
-        samples: Matches so far; those of another process may be added.
-    """
-
-    config: EvaluationConfig
-    samples: list[SampleMatches] = field(default_factory=list)
-
-    def update(self, token: str, predictions: MapElements, ground_truth: MapElements) -> None:
-        """Match one sample and keep its matches.
+    def match(
+        self, token: str, predictions: MapElements, ground_truth: MapElements
+    ) -> SampleMatches:
+        """Match one sample under every metric that is asked for.
 
         Args:
-            token: Name of the sample; a repeated one counts once.
+            token: Name of the sample.
             predictions: Its predictions.
             ground_truth: Its ground truth.
         """
-        self.samples.append(match_sample(token, predictions, ground_truth, self.config))
+        if self.ground_truth_points is not None:
+            points, offsets = ground_truth.points, ground_truth.offsets
+            resampled = resample_all(points, offsets, self.ground_truth_points)
+            pairs = zip(ground_truth.polylines, resampled, strict=True)
+            polylines = [new if len(old) >= 2 else old for old, new in pairs]
+            ground_truth = MapElements.from_polylines(polylines, ground_truth.labels)
+        found: SampleMatches = {}
+        if self.chamfer:
+            found["chamfer"] = match_chamfer(predictions, ground_truth, self.chamfer, token)
+        if self.raster:
+            found["raster"] = match_raster(predictions, ground_truth, self.raster, token)
+        return found
 
-    def compute(self) -> list[MetricReport]:
-        """Return one report per metric."""
-        return reports(self.samples, self.config)
+    def reports(self, samples: Iterable[SampleMatches]) -> list[MetricReport]:
+        """Compute the metrics from the matches of all samples.
+
+        Args:
+            samples: Matches in any order; repeated tokens count once.
+        """
+        records, found = list(samples), []
+        if self.chamfer:
+            found.append(chamfer_report((r["chamfer"] for r in records), self.chamfer))
+        if self.raster:
+            found.append(raster_report((r["raster"] for r in records), self.raster))
+        return found

@@ -1,4 +1,4 @@
-"""Whether predicted Gaussians live: overlap of their masks with the map, their sizes."""
+"""How predicted Gaussians live: overlap of their masks with the map, their sizes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -32,77 +32,57 @@ class GaussianMetric(BaseMetric):
         score_threshold: Smallest score of a confident prediction.
         pixel_m: Side of a pixel of the masks in metres.
         line_width_m: Width of a line in the ground-truth mask, in metres.
-        collect_device: As in mmengine.
-        prefix: Prefix of the figures' names.
+        **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
     """
+
+    default_prefix = "gaussians"
 
     def __init__(
         self,
         score_threshold: float = 0.3,
         pixel_m: float = 0.3,
         line_width_m: float = 0.75,
-        collect_device: str = "cpu",
-        prefix: str = "gaussians",
+        **kwargs: Any,
     ) -> None:
-        super().__init__(collect_device, prefix)
+        super().__init__(**kwargs)
         self.score_threshold = score_threshold
         self.pixel_m = pixel_m
         self.line_width_m = line_width_m
 
     def process(self, data_batch: Any, data_samples: Sequence[dict[str, Any]]) -> None:
-        """Measure the samples of a batch."""
-        for sample in data_samples:
-            predicted, truth = sample["pred_instances_3d"], sample.get("eval_ann_info")
-            figures = {}
-            if "scales" in predicted and truth is not None:
-                figures = self.measure(predicted, truth, sample["x_range"], sample["y_range"])
-            self.results.append((sample["token"], figures))
-
-    def measure(
-        self,
-        predicted: dict[str, Any],
-        truth: dict[str, Any],
-        x_range: tuple[float, float],
-        y_range: tuple[float, float],
-    ) -> dict[str, Any]:
-        """Measure one sample.
+        """Measure the samples of a batch.
 
         Args:
-            predicted: ``scores_3d`` (N,), ``labels_3d`` (N,), ``pts`` (N, P, 2), ``scales`` (N, P,
-                2), ``rotations`` (N, P) and ``min_scale_m``.
-            truth: ``polylines``, list of (n, 2), and ``labels`` (K,).
-            x_range: Smallest and largest x of the map in metres.
-            y_range: Smallest and largest y of the map in metres.
-
-        Returns:
-            ``iou``: per class the soft IoU of each matched pair; ``extents``: per class sigma along
-            and across (n, 2) in metres; ``at_floor``: whether each Gaussian is at its smallest.
+            data_batch: Not used.
+            data_samples: Samples with ``token``, ``x_range`` and ``y_range`` in metres,
+                ``eval_ann_info`` (``polylines``, K x (n, 2), ``labels``), and ``pred_instances_3d``
+                (``scores_3d``, ``labels_3d`` (N,), ``pts``, ``scales`` (N, P, 2), ``rotations``
+                (N, P), ``min_scale_m``).
         """
-        grid = BEVGrid(x_range, y_range).rasterized(self.pixel_m)
+        for sample in data_samples:
+            measured = sample.get("eval_ann_info") and "scales" in sample["pred_instances_3d"]
+            self.results.append((sample["token"], self._measure(sample) if measured else None))
+
+    def _measure(self, sample: dict[str, Any]) -> tuple[Array, dict[int, tuple[Array, Array]]]:
+        """Return which Gaussians are at their floor; per class soft IoUs, sizes (n, 2)."""
+        predicted, truth = sample["pred_instances_3d"], sample["eval_ann_info"]
+        grid = BEVGrid(sample["x_range"], sample["y_range"]).rasterized(self.pixel_m)
         chosen = predicted["scores_3d"] >= self.score_threshold
-        labels = predicted["labels_3d"][chosen]
-        gaussians = Gaussians(
-            *(predicted[name][chosen].float().cpu() for name in ("pts", "scales", "rotations"))
+        labels = predicted["labels_3d"][chosen].cpu()
+        means, scales, rotations = (
+            predicted[name][chosen].float().cpu() for name in ("pts", "scales", "rotations")
         )
-        gaussians = Gaussians(gaussians.means[..., :2], gaussians.scales, gaussians.rotations)
-        masks = render_gaussians(gaussians.means, gaussians.scales, gaussians.rotations, grid)
-        extents = extents_along_line(gaussians)
-        floor = AT_FLOOR * predicted["min_scale_m"]
-        figures: dict[str, Any] = {
-            "iou": {},
-            "extents": {},
-            "at_floor": (gaussians.scales < floor).all(-1).flatten().numpy(),
-        }
+        means = means[..., :2]
+        masks = render_gaussians(means, scales, rotations, grid)
+        extents = extents_along_line(Gaussians(means, scales, rotations))
+        figures = {}
         for label in set(truth["labels"].tolist()) | set(labels.tolist()):
-            own = (labels == label).cpu()
-            lines = [
-                line
-                for line, other in zip(truth["polylines"], truth["labels"], strict=True)
-                if other == label
-            ]
-            figures["iou"][label] = self._matched_iou(masks[own], lines, grid)
-            figures["extents"][label] = extents[own].flatten(0, 1).numpy()
-        return figures
+            own = labels == label
+            lines = [truth["polylines"][i] for i in np.flatnonzero(truth["labels"] == label)]
+            iou = self._matched_iou(masks[own], lines, grid)
+            figures[label] = iou, extents[own].flatten(0, 1).numpy()
+        at_floor = (scales < AT_FLOOR * predicted["min_scale_m"]).all(-1)
+        return at_floor.flatten().numpy(), figures
 
     def _matched_iou(self, masks: Tensor, lines: Sequence[Array], grid: BEVGrid) -> Array:
         """Return the soft IoU of every matched pair of one class. (n,)"""
@@ -114,48 +94,38 @@ class GaussianMetric(BaseMetric):
         iou = pairwise_soft_iou(masks, draw_polylines(vertices, grid, self.line_width_m)).numpy()
         return iou[linear_sum_assignment(-iou)]
 
-    def compute_metrics(self, results: list[tuple[str, dict[str, Any]]]) -> dict[str, float]:
+    def compute_metrics(self, results: list[tuple[str, Any]]) -> dict[str, float]:
         """Average over all samples and print a table.
 
         Returns:
             Per class ``soft_iou/<name>``, ``sigma_along/<name>`` and ``sigma_across/<name>``
             (medians in metres), and ``at_floor``, a share; empty without Gaussians.
         """
-        samples = [figures for _, figures in sorted(dict(results).items()) if figures]
+        samples = [measured for _, measured in sorted(dict(results).items()) if measured]
         if not samples:
             return {}
-        floor = np.concatenate([figures["at_floor"] for figures in samples])
+        floor = np.concatenate([at_floor for at_floor, _ in samples])
         metrics = {"at_floor": float(floor.mean()) if len(floor) else 0.0}
-        rows = []
+        rows = [
+            f"Gaussians of predictions with a score of {self.score_threshold} or more, "
+            f"{100 * metrics['at_floor']:.1f} % of them at their smallest size:"
+        ]
         for label, name in enumerate(self.dataset_meta["classes"]):
-            ious = [figures["iou"][label] for figures in samples if label in figures["iou"]]
-            sizes = [figures["extents"][label] for figures in samples if label in figures["iou"]]
-            iou, size = (
-                np.concatenate([np.empty(0), *ious]),
-                np.concatenate([np.empty((0, 2)), *sizes]),
-            )
+            of_class = [figures[label] for _, figures in samples if label in figures]
+            iou = np.concatenate([np.empty(0), *(iou for iou, _ in of_class)])
+            size = np.concatenate([np.empty((0, 2)), *(size for _, size in of_class)])
+            overlap = "none matched"
             if len(iou):
                 metrics[f"soft_iou/{name}"] = float(iou.mean())
-            if len(size):
-                along, across = np.median(size, 0)
-                metrics[f"sigma_along/{name}"] = float(along)
-                metrics[f"sigma_across/{name}"] = float(across)
-            rows.append(self._row(name, iou, size))
-        table = "\n".join(rows)
-        print_log(
-            f"Gaussians of predictions with a score of {self.score_threshold} or more, "
-            f"{100 * metrics['at_floor']:.1f} % of them at their smallest size:\n{table}",
-            "current",
-        )
+                overlap = f"soft IoU {iou.mean():.3f} of {len(iou)} matched masks"
+            if not len(size):
+                rows.append(f"  {name}: no confident prediction")
+                continue
+            along, across = np.median(size, 0)
+            metrics[f"sigma_along/{name}"] = float(along)
+            metrics[f"sigma_across/{name}"] = float(across)
+            rows.append(
+                f"  {name}: {overlap}, sigma {along:.2f} m along, {across:.2f} m across (medians)"
+            )
+        print_log("\n".join(rows), "current")
         return metrics
-
-    @staticmethod
-    def _row(name: str, iou: Array, size: Array) -> str:
-        """Return a class's line of the table."""
-        if not len(size):
-            return f"  {name}: no confident prediction"
-        along, across = np.median(size, 0)
-        overlap = (
-            f"soft IoU {iou.mean():.3f} of {len(iou)} matched masks" if len(iou) else "none matched"
-        )
-        return f"  {name}: {overlap}, sigma {along:.2f} m along, {across:.2f} m across (medians)"

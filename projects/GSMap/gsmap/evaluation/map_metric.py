@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 from mmdet3d.registry import METRICS
@@ -10,18 +11,13 @@ from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_truth
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.evaluator import (
-    METRIC_NAMES,
-    EvaluationConfig,
-    SampleMatches,
-    flat_metrics,
-    match_sample,
-    reports,
-)
-from gsmap.evaluation.raster_ap import POLYGON_CLASSES, RasterConfig
-from gsmap.evaluation.report import format_table
+from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.report import flat_metrics, format_table
 from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 
 
 @METRICS.register_module()
@@ -30,22 +26,19 @@ class MapMetric(BaseMetric):
 
     Samples are matched as they come, so evaluation overlaps inference; what is kept and collected
     from the ranks are matches, never masks. Figures do not depend on the number of ranks, the
-    order of the samples or the padding of the last batch.
+    order of the samples or the padding of the last batch. Classes, range and coordinates per point
+    are those of the data set's metainfo (``classes``, ``x_range``, ``y_range``, ``dim``).
 
     Args:
         eval: Metrics to compute: ``chamfer``, ``raster``; may be empty if only ``out_file`` is
             wanted.
-        classes: Names of the classes; the data set's if left out.
-        pc_range: (x_min, y_min, z_min, x_max, y_max, z_max) in metres, for the canvas of
-            AP_raster; the data set's if left out.
         thresholds: Thresholds of AP_chamfer in metres.
-        dim: Coordinates that AP_chamfer counts, 2 or 3; the data set's if left out.
         polygon_classes: Classes that AP_raster fills.
         out_file: Where to write the predictions in MapTR's JSON form, or None.
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
 
     Raises:
-        ValueError: If a metric is unknown, there is nothing to do, or ``pc_range`` is malformed.
+        ValueError: If a metric is unknown or there is nothing to do.
     """
 
     default_prefix = ""  # the keys carry the name of the metric already
@@ -53,58 +46,39 @@ class MapMetric(BaseMetric):
     def __init__(
         self,
         eval: Sequence[str] = METRIC_NAMES,
-        classes: Sequence[str] | None = None,
-        pc_range: Sequence[float] | None = None,
         thresholds: Sequence[float] = CHAMFER_THRESHOLDS,
-        dim: int | None = None,
-        polygon_classes: Sequence[str] = POLYGON_CLASSES,
+        polygon_classes: Sequence[str] = AREA_CLASSES,
         out_file: str | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
-        unknown = set(eval) - set(METRIC_NAMES)
-        if unknown or (not eval and out_file is None):
+        if set(eval) - set(METRIC_NAMES) or (not eval and out_file is None):
             raise ValueError(f"eval must name metrics of {METRIC_NAMES}, got {list(eval)}.")
         self.eval = tuple(eval)
+        self.thresholds = tuple(thresholds)
+        self.polygon_classes = tuple(polygon_classes)
         self.out_file = out_file
-        self._settings: dict[str, Any] = {"classes": classes}
-        if pc_range is not None:
-            if len(pc_range) != 6:
-                raise ValueError(f"pc_range must hold 6 values, got {len(pc_range)}.")
-            self._settings["x_range"] = (pc_range[0], pc_range[3])
-            self._settings["y_range"] = (pc_range[1], pc_range[4])
-        self._thresholds = tuple(thresholds)
-        self._dim = dim
-        self._polygon_classes = tuple(polygon_classes)
 
-    def _setting(self, key: str) -> Any:
-        """Return a setting, or the data set's metainfo of the same name."""
-        found = self._settings.get(key) or (self.dataset_meta or {}).get(key)
-        if found is None:
-            raise ValueError(
-                f"MapMetric knows no {key}: set classes and pc_range, or use a data set whose "
-                "metainfo has them."
-            )
-        return tuple(found)
+    def _meta(self, key: str) -> Any:
+        """Return an entry of the data set's metainfo."""
+        if key not in (self.dataset_meta or {}):
+            raise ValueError(f"MapMetric needs a data set whose metainfo has {key}.")
+        return self.dataset_meta[key]
 
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the classes."""
-        return self._setting("classes")
-
-    @property
-    def config(self) -> EvaluationConfig | None:
+    @cached_property
+    def evaluator(self) -> MapEvaluator | None:
         """Metrics and their rules; None if there is only a file to write."""
         if not self.eval:
             return None
+        classes = tuple(self._meta("classes"))
         chamfer = raster = None
         if "chamfer" in self.eval:
-            dim = self._dim or (self.dataset_meta or {}).get("dim", 2)
-            chamfer = ChamferConfig(self.classes, self._thresholds, dim=dim)
+            dim = self.dataset_meta.get("dim", 2)
+            chamfer = ChamferConfig(classes, self.thresholds, dim=dim)
         if "raster" in self.eval:
-            x_range, y_range = (self._setting(key) for key in ("x_range", "y_range"))
-            raster = RasterConfig(self.classes, self._polygon_classes, x_range, y_range)
-        return EvaluationConfig(chamfer, raster)
+            grid = BEVGrid(self._meta("x_range"), self._meta("y_range"))
+            raster = RasterConfig(classes, grid, self.polygon_classes)
+        return MapEvaluator(chamfer, raster)
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
         """Match one batch and keep its matches.
@@ -115,15 +89,17 @@ class MapMetric(BaseMetric):
                 ``labels_3d``) and, if a metric is asked for, ``eval_ann_info`` (``polylines``,
                 ``labels``).
         """
-        config = self.config
         for sample in data_samples:
             token = str(sample["token"])
-            predictions = _predictions(sample["pred_instances_3d"], token)
+            try:
+                predictions = elements_of_predictions(sample["pred_instances_3d"])
+            except ValueError as error:
+                raise ValueError(f"predictions of sample {token}: {error}") from error
             record: dict[str, Any] = {"token": token}
-            if config is not None:
-                record["matches"] = match_sample(token, predictions, _truth(sample), config)
+            if self.evaluator is not None:
+                record["matches"] = self.evaluator.match(token, predictions, _truth(sample))
             if self.out_file is not None:
-                record["vectors"] = vectors_of(predictions, self.classes)
+                record["vectors"] = vectors_of(predictions, self._meta("classes"))
             self.results.append(record)
 
     def evaluate(self, size: int) -> dict[str, float]:
@@ -144,35 +120,23 @@ class MapMetric(BaseMetric):
         """
         unique = {record["token"]: record for record in reversed(results)}
         records = [unique[token] for token in sorted(unique)]
-        expected = getattr(self, "_size", len(records))
-        if len(records) != expected:
+        if len(records) != self._size:
             print_log(
                 f"MapMetric: {len(records)} different samples were scored, the data set has "
-                f"{expected}.",
+                f"{self._size}.",
                 "current",
                 level=30,
             )
         if self.out_file is not None:
             samples = ((record["token"], record["vectors"]) for record in records)
-            write_results(self.out_file, samples, {"classes": list(self.classes)})
+            write_results(self.out_file, samples, {"classes": list(self._meta("classes"))})
             print_log(f"Results of {len(records)} samples written to {self.out_file}", "current")
-        config = self.config
-        if config is None:
+        if self.evaluator is None:
             return {}
-        matches: list[SampleMatches] = [record["matches"] for record in records]
-        found = reports(matches, config)
-        logger = MMLogger.get_current_instance()
-        for report in found:
-            logger.info("\n%s", format_table(report))
-        return flat_metrics(found)
-
-
-def _predictions(instances: Mapping[str, Any], token: str) -> MapElements:
-    """Read the predictions of one sample."""
-    try:
-        return elements_of_predictions(instances)
-    except ValueError as error:
-        raise ValueError(f"predictions of sample {token}: {error}") from error
+        reports = self.evaluator.reports(record["matches"] for record in records)
+        for report in reports:
+            MMLogger.get_current_instance().info("\n%s", format_table(report))
+        return flat_metrics(reports)
 
 
 def _truth(sample: Mapping[str, Any]) -> MapElements:

@@ -1,9 +1,10 @@
 """What the metrics keep of one sample: scores and matches, never masks or points."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
@@ -43,6 +44,7 @@ class ClassDetections:
     """The predictions of one class over all samples, in descending order of score.
 
     Args:
+        thresholds: Thresholds of a match, ascending: metres for AP_chamfer, IoU for AP_raster. (T,)
         scores: Confidence. (N,)
         hits: Whether the prediction matches, at each threshold. (N, T)
         quality: As in ``FrameMatches``. (N,)
@@ -50,11 +52,17 @@ class ClassDetections:
         num_gts: Number of ground truths.
     """
 
+    thresholds: Sequence[float]
     scores: FloatArray
     hits: BoolArray
     quality: FloatArray
     ranks: IntArray
     num_gts: int
+
+
+def is_known(labels: IntArray, num_classes: int) -> BoolArray:
+    """Whether labels are those of classes that are scored. (N,)"""
+    return (labels >= 0) & (labels < num_classes)
 
 
 def unique_by_token(matches: Iterable[FrameMatches]) -> list[FrameMatches]:
@@ -68,7 +76,7 @@ def unique_by_token(matches: Iterable[FrameMatches]) -> list[FrameMatches]:
 
 
 def detections_per_class(
-    records: Sequence[FrameMatches], classes: Sequence[str], num_thresholds: int
+    records: Sequence[FrameMatches], thresholds: Mapping[str, Sequence[float]]
 ) -> dict[str, ClassDetections]:
     """Gather the predictions of each class over all samples and rank them by score.
 
@@ -78,23 +86,46 @@ def detections_per_class(
 
     Args:
         records: The samples, from ``unique_by_token``.
-        classes: Names of the classes.
-        num_thresholds: Number of thresholds T.
+        thresholds: Thresholds of each class, by its name, in the order of the labels. C x (T,)
     """
     none = np.zeros(0)
+    num_thresholds = len(next(iter(thresholds.values())))
     labels = np.concatenate([none, *(m.labels for m in records)])
     scores = np.concatenate([none, *(m.scores for m in records)])
     quality = np.concatenate([none, *(m.quality for m in records)])
     matched = np.concatenate([np.zeros((0, num_thresholds)), *(m.matched_gt for m in records)])
-    num_gts = sum((m.num_gts for m in records), np.zeros(len(classes), np.int64))
     frame = np.repeat(np.arange(len(records)), [len(m.labels) for m in records])
     detections = {}
-    for label, name in enumerate(classes):
+    for label, (name, of_class) in enumerate(thresholds.items()):
         rows = np.flatnonzero(labels == label)
         ranks = np.arange(len(rows)) - np.searchsorted(frame[rows], frame[rows])
         order = np.argsort(-scores[rows], kind="stable")
-        rows = rows[order]
+        rows, num_gts = rows[order], sum(int(m.num_gts[label]) for m in records)
         detections[name] = ClassDetections(
-            scores[rows], matched[rows] >= 0, quality[rows], ranks[order], int(num_gts[label])
+            of_class, scores[rows], matched[rows] >= 0, quality[rows], ranks[order], num_gts
         )
     return detections
+
+
+@njit(cache=True)
+def assign(quality: FloatArray, thresholds: FloatArray) -> IntArray:
+    """Match greedily: each prediction takes its best free ground truth, the later one of equals.
+
+    Args:
+        quality: How well each pair fits, predictions in descending order of score. (N, K)
+        thresholds: Smallest quality of a match, inclusive, for each prediction. (N, T)
+
+    Returns:
+        The matched ground truth, or -1. (N, T)
+    """
+    matched = np.full(thresholds.shape, -1)
+    for t in range(thresholds.shape[1]):
+        taken = np.zeros(quality.shape[1], np.bool_)
+        for i in range(len(quality)):
+            best, match = thresholds[i, t], -1
+            for k in range(quality.shape[1]):
+                if not taken[k] and quality[i, k] >= best:
+                    best, match = quality[i, k], k
+            if match >= 0:
+                taken[match], matched[i, t] = True, match
+    return matched

@@ -6,13 +6,12 @@ as high as it gets.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig, nearest_by_chamfer
-from gsmap.evaluation.evaluator import EvaluationConfig, flat_metrics
+from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.file_evaluation import Evaluation, read_ground_truth, score
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
@@ -20,25 +19,8 @@ from gsmap.structures.polylines import resample_all
 _LOWEST_SCORE = 0.05  # AP_raster drops lower ones; the order, which is all that counts, stays
 _MIN_PRECISION = 1e-3  # an element that is right once in a thousand samples adds nothing
 _REFINEMENTS = 3  # how often a chosen element is moved to the mean of what it matches
-
-
-@dataclass(frozen=True)
-class PriorConfig:
-    """How the prior is fitted.
-
-    Args:
-        max_elements: Elements in the set, over all classes; a network of 50 queries predicts 50.
-        max_candidates: Ground truths of a class that are tried, evenly drawn from the training set.
-        max_samples: Training samples to use, evenly spread over the file.
-        num_points: Points of each element.
-        seed: Draws the candidates.
-    """
-
-    max_elements: int = 50
-    max_candidates: int = 400
-    max_samples: int = 2000
-    num_points: int = 20
-    seed: int = 0
+_NUM_POINTS = 20  # of each element
+_MAX_TRAINING_SAMPLES = 2000  # evenly spread over the file
 
 
 def _aligned_mean(line: FloatArray, others: FloatArray) -> FloatArray:
@@ -67,7 +49,8 @@ class _ClassFit:
         label: int,
         truth: Sequence[MapElements],
         chamfer: ChamferConfig,
-        config: PriorConfig,
+        max_candidates: int,
+        seed: int,
     ) -> None:
         self.label, self.chamfer, self.num_samples = label, chamfer, len(truth)
         self.thresholds = np.asarray(chamfer.thresholds)
@@ -75,12 +58,12 @@ class _ClassFit:
         frames = [elements.select(elements.labels == label) for elements in truth]
         self.frames = [frame for frame in frames if len(frame)]
         self.first = np.cumsum([0, *map(len, self.frames)])  # where each frame starts, (F + 1,)
-        points = [resample_all(f.points, f.offsets, config.num_points) for f in self.frames]
-        none = np.empty((0, config.num_points, chamfer.dim))
+        points = [resample_all(f.points, f.offsets, _NUM_POINTS) for f in self.frames]
+        none = np.empty((0, _NUM_POINTS, chamfer.dim))
         self.points = np.concatenate([none, *points])  # (K, P, 2 or 3)
         self.taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)
-        drawn = np.random.default_rng(config.seed).permutation(len(self.points))
-        self.candidates = self.points[np.sort(drawn[: config.max_candidates])]
+        drawn = np.random.default_rng(seed).permutation(len(self.points))
+        self.candidates = self.points[np.sort(drawn[:max_candidates])]
         self.nearest, self.distance = self._compare(self.candidates)
 
     def _compare(self, lines: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -103,8 +86,7 @@ class _ClassFit:
             ((distance <= threshold) & ~taken[nearest]).sum(axis=-1)
             for threshold, taken in zip(self.thresholds, self.taken, strict=True)
         ]
-        mean: FloatArray = np.mean(hits, axis=0)
-        return mean
+        return np.asarray(np.mean(hits, axis=0))
 
     def propose(self) -> tuple[float, float, int]:
         """Return the gain in AP of the best candidate, its precision and its position."""
@@ -135,7 +117,11 @@ class _ClassFit:
 
 
 def fit_prior(
-    truth: Sequence[MapElements], chamfer: ChamferConfig, config: PriorConfig | None = None
+    truth: Sequence[MapElements],
+    chamfer: ChamferConfig,
+    max_elements: int = 50,
+    max_candidates: int = 400,
+    seed: int = 0,
 ) -> MapElements:
     """Fit the fixed set of elements that scores best on a training set.
 
@@ -148,7 +134,9 @@ def fit_prior(
     Args:
         truth: Ground truth of each training sample.
         chamfer: Rules of AP_chamfer.
-        config: How the prior is fitted.
+        max_elements: Elements in the set, over all classes; a network of 50 queries predicts 50.
+        max_candidates: Ground truths of a class that are tried, evenly drawn from the training set.
+        seed: Draws the candidates.
 
     Returns:
         The elements, with their scores.
@@ -156,50 +144,45 @@ def fit_prior(
     Raises:
         ValueError: If the training set holds no ground truth.
     """
-    config = config or PriorConfig()
-    fits = [_ClassFit(label, truth, chamfer, config) for label in range(len(chamfer.classes))]
+    labels = range(len(chamfer.classes))
+    fits = [_ClassFit(label, truth, chamfer, max_candidates, seed) for label in labels]
     if not any(len(fit.candidates) for fit in fits):
         raise ValueError("the training set holds no ground truth of these classes.")
-    lines: list[FloatArray] = []
-    labels: list[int] = []
-    scores: list[float] = []
-    while len(lines) < config.max_elements:
+    chosen: list[tuple[FloatArray, int, float]] = []  # line, label, score
+    while len(chosen) < max_elements:
         proposals = [fit.propose() for fit in fits]
         label = int(np.argmax([gain for gain, _, _ in proposals]))
         _, precision, index = proposals[label]
         if precision < _MIN_PRECISION:
             break
         line, share = fits[label].take(index)
-        lines.append(line)
-        labels.append(label)
-        scores.append(share)
-    lifted = _LOWEST_SCORE + (1.0 - _LOWEST_SCORE) * np.clip(scores, 0.0, 1.0)
-    return MapElements.from_polylines(lines, labels, lifted)
+        chosen.append((line, label, _LOWEST_SCORE + (1.0 - _LOWEST_SCORE) * min(share, 1.0)))
+    return MapElements.from_polylines(*zip(*chosen, strict=True))
 
 
 def evaluate_prior(
     train_path: str | Path,
     truth_path: str | Path,
-    config: EvaluationConfig,
-    prior: PriorConfig | None = None,
+    evaluator: MapEvaluator,
+    max_elements: int = 50,
 ) -> Evaluation:
     """Fit the prior on one file of ground truth and score it on another.
 
     Args:
         train_path: Ground truth to fit on: an annotation file, or MapTR's JSON.
         truth_path: Ground truth to score on.
-        config: Metrics and their rules.
-        prior: How the prior is fitted.
+        evaluator: Metrics and their rules.
+        max_elements: Elements in the set.
     """
-    prior, chamfer = prior or PriorConfig(), config.chamfer or ChamferConfig(config.classes)
-    everything, _ = read_ground_truth(train_path, config.classes)
-    step = max(1, -(-len(everything) // prior.max_samples))
+    chamfer = evaluator.chamfer or ChamferConfig(evaluator.classes)
+    everything, _ = read_ground_truth(train_path, evaluator.classes)
+    step = max(1, -(-len(everything) // _MAX_TRAINING_SAMPLES))
     train = dict(list(everything.items())[::step])
-    truth, _ = read_ground_truth(truth_path, config.classes)
-    fitted = fit_prior(list(train.values()), chamfer, prior)
-    on_train = score(dict.fromkeys(train, fitted), train, EvaluationConfig(chamfer, None))
+    truth, _ = read_ground_truth(truth_path, evaluator.classes)
+    fitted = fit_prior(list(train.values()), chamfer, max_elements)
+    (on_train,) = score(dict.fromkeys(train, fitted), train, MapEvaluator(chamfer, None))
     note = (
         f"the same {len(fitted)} elements in every sample, fitted on {len(train)} training "
-        f"samples; mAP_chamfer there {flat_metrics(on_train)['chamfer/mAP']:.6f}"
+        f"samples; mAP_chamfer there {on_train.metrics['chamfer/mAP']:.6f}"
     )
-    return Evaluation(score(dict.fromkeys(truth, fitted), truth, config), [note])
+    return score(dict.fromkeys(truth, fitted), truth, evaluator), [note]

@@ -5,8 +5,8 @@ thick and polygons filled, everything dilated 5 x 5; predictions with a score be
 than two points are dropped, and at most 100 per class and sample count.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,17 +15,21 @@ from gsmap.evaluation.average_precision import interpolated_ap
 from gsmap.evaluation.matches import (
     ClassDetections,
     FrameMatches,
+    assign,
     detections_per_class,
+    is_known,
     unique_by_token,
 )
 from gsmap.evaluation.raster_drawing import Masks, draw
 from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
-from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.elements import FloatArray, IntArray, MapElements
+from gsmap.structures.grid import BEVGrid
 
 LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 POLYGON_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
-POLYGON_CLASSES = ("ped_crossing", "stop_line", "intersection", "carpark", "carpark_area")
 RECALL_LIMITS = (1, 10, 100)
+_COCO_SLACK = 1.0 - 1e-10  # COCO lowers a threshold of 1, so that equal masks match
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
 
 
@@ -35,9 +39,8 @@ class RasterConfig:
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        polygon_classes: Those of them that are filled; names that do not occur are allowed.
-        x_range: Smallest and largest x of the canvas, in metres.
-        y_range: Smallest and largest y of the canvas, in metres.
+        grid: Extent of the canvas; its raster is not used.
+        polygon_classes: The classes that are filled; names that do not occur are allowed.
         px_per_m: Pixels per metre.
         line_thresholds: Smallest IoUs of a match of lines.
         polygon_thresholds: Smallest IoUs of a match of polygons, as many as of lines.
@@ -50,22 +53,18 @@ class RasterConfig:
     """
 
     classes: tuple[str, ...]
-    polygon_classes: tuple[str, ...] = POLYGON_CLASSES
-    x_range: tuple[float, float] = (-15.0, 15.0)
-    y_range: tuple[float, float] = (-30.0, 30.0)
+    grid: BEVGrid = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
+    polygon_classes: tuple[str, ...] = AREA_CLASSES
     px_per_m: float = 8.0
     line_thresholds: tuple[float, ...] = LINE_THRESHOLDS
     polygon_thresholds: tuple[float, ...] = POLYGON_THRESHOLDS
     dilation_px: int = 5
     min_score: float = 0.05
     max_predictions: int = 100
-    is_polygon: tuple[bool, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        for name in ("classes", "polygon_classes", "x_range", "y_range"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
         for name in ("line_thresholds", "polygon_thresholds"):
-            values = tuple(sorted(float(t) for t in getattr(self, name)))
+            values = tuple(sorted(round(float(t), 6) for t in getattr(self, name)))
             object.__setattr__(self, name, values)
             if not values or not 0 < values[0] <= values[-1] <= 1:
                 raise ValueError(f"{name} must lie in (0, 1], got {values}.")
@@ -76,30 +75,34 @@ class RasterConfig:
             )
         if not self.classes:
             raise ValueError("classes must not be empty.")
-        for name in ("x_range", "y_range"):
-            low, high = getattr(self, name)
-            if not low < high:
-                raise ValueError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
         if self.px_per_m <= 0 or min(self.width, self.height) < 1:
             raise ValueError(f"px_per_m must give at least one pixel, got {self.px_per_m}.")
         if self.dilation_px < 1 or self.dilation_px % 2 == 0:
             raise ValueError(f"dilation_px must be odd and >= 1, got {self.dilation_px}.")
-        polygons = tuple(name in self.polygon_classes for name in self.classes)
-        object.__setattr__(self, "is_polygon", polygons)
 
     @property
     def width(self) -> int:
         """Columns of the canvas (along x)."""
-        return round((self.x_range[1] - self.x_range[0]) * self.px_per_m)
+        return round(self.grid.extent_m[0] * self.px_per_m)
 
     @property
     def height(self) -> int:
         """Rows of the canvas (along y)."""
-        return round((self.y_range[1] - self.y_range[0]) * self.px_per_m)
+        return round(self.grid.extent_m[1] * self.px_per_m)
 
-    def thresholds_of(self, label: int) -> tuple[float, ...]:
-        """Return the IoU thresholds of a class."""
-        return self.polygon_thresholds if self.is_polygon[label] else self.line_thresholds
+    @property
+    def is_polygon(self) -> tuple[bool, ...]:
+        """Whether each class is filled. (C,)"""
+        return tuple(name in self.polygon_classes for name in self.classes)
+
+    @property
+    def thresholds(self) -> dict[str, tuple[float, ...]]:
+        """The IoU thresholds of each class, by its name. C x (T,)"""
+        both = (self.line_thresholds, self.polygon_thresholds)
+        return {
+            name: both[polygon]
+            for name, polygon in zip(self.classes, self.is_polygon, strict=True)
+        }
 
 
 def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
@@ -112,9 +115,8 @@ def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
     Returns:
         Column and row. (M, 2)
     """
-    origin = np.array([config.x_range[0], config.y_range[0]])
-    extent = np.array([config.x_range[1], config.y_range[1]]) - origin
-    pixels = (points - origin) / extent * np.array([config.width, config.height])
+    origin = (config.grid.x_range[0], config.grid.y_range[0])
+    pixels = (points - origin) / config.grid.extent_m * (config.width, config.height)
     np.clip(pixels, -_FAR_PX, _FAR_PX, out=pixels)
     return np.rint(pixels).astype(np.int64)
 
@@ -159,39 +161,33 @@ def match_raster(
     """
     num_classes = len(config.classes)
     rows = _ranked_predictions(predictions, config)
-    gt_index = np.flatnonzero((ground_truth.labels >= 0) & (ground_truth.labels < num_classes))
+    gt_index = np.flatnonzero(is_known(ground_truth.labels, num_classes))
     pred = rasterize(predictions.select(rows), config)
     gt = rasterize(ground_truth.select(gt_index), config)
     ious = kernels.mask_ious(pred, gt)
-    thresholds = np.array([config.thresholds_of(c) for c in range(num_classes)])
-    matched = kernels.assign(ious, pred.labels, gt.labels, thresholds)
-    loosest = matched[:, 0]
-    quality = np.full(len(rows), np.nan)
-    quality[loosest >= 0] = ious[loosest >= 0, loosest[loosest >= 0]]
+    thresholds = np.minimum(list(config.thresholds.values()), _COCO_SLACK)
+    matched = assign(ious, thresholds[pred.labels])
+    matched_iou = np.pad(ious, ((0, 0), (0, 1)), constant_values=np.nan)  # column -1: no match
     return FrameMatches(
         token=token,
         pred_index=rows,
         labels=pred.labels,
         scores=predictions.confidence[rows],
         matched_gt=np.append(gt_index, -1)[matched],
-        quality=quality,
+        quality=matched_iou[np.arange(len(rows)), matched[:, 0]],
         num_gts=np.bincount(gt.labels, minlength=num_classes),
         class_iou=kernels.class_ious(pred, gt, num_classes, config.height, config.width),
     )
 
 
-def _recall(hits: BoolArray, num_gts: int) -> float:
-    return float(hits.sum()) / num_gts if num_gts else UNDEFINED
-
-
-def _class_figures(
-    found: ClassDetections, thresholds: tuple[float, ...], ious: FloatArray
-) -> dict[str, float]:
+def _class_figures(found: ClassDetections, ious: FloatArray) -> dict[str, float]:
     """Return the figures of one class, by the last part of their key."""
-    figures = class_figures(found, thresholds, interpolated_ap, absent=UNDEFINED)
+    figures = class_figures(found, interpolated_ap, absent=UNDEFINED)
     for limit in RECALL_LIMITS:
-        recalls = [_recall(hits, found.num_gts) for hits in found.hits[found.ranks < limit].T]
-        figures[f"AR@{limit}"] = float(np.mean(recalls))
+        hits = found.hits[found.ranks < limit].sum(axis=0)
+        figures[f"AR@{limit}"] = (
+            float(np.mean(hits / found.num_gts)) if found.num_gts else UNDEFINED
+        )
     ious = ious[~np.isnan(ious)]
     figures["mIoU"] = float(np.mean(ious)) if len(ious) else UNDEFINED
     return figures
@@ -200,13 +196,6 @@ def _class_figures(
 def _mean_of_defined(values: Iterable[float]) -> float:
     defined = [v for v in values if v != UNDEFINED]
     return float(np.mean(defined)) if defined else UNDEFINED
-
-
-def _group_figures(metrics: dict[str, float], names: Sequence[str]) -> dict[str, float]:
-    """Average the figures of the classes of one group that have ground truth."""
-    keys = [key.split("/")[1] for key in metrics if key.startswith(f"{names[0]}/")]
-    averaged = [k for k in keys if k.startswith(("AP", "AR", "recall")) or k == "mIoU"]
-    return {k: _mean_of_defined(metrics[f"{name}/{k}"] for name in names) for k in averaged}
 
 
 def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> MetricReport:
@@ -218,21 +207,24 @@ def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> Metr
         matches: All samples, in any order; repeated tokens count once.
         config: Rules.
     """
-    records, classes = unique_by_token(matches), config.classes
-    found = detections_per_class(records, classes, len(config.line_thresholds))
-    by_class = {name: config.thresholds_of(c) for c, name in enumerate(classes)}
-    metrics: dict[str, float] = {}
-    for c, name in enumerate(classes):
+    records = unique_by_token(matches)
+    detections = detections_per_class(records, config.thresholds)
+    figures: dict[str, dict[str, float]] = {}
+    for c, (name, found) in enumerate(detections.items()):
         ious = np.array([m.class_iou[c] for m in records if m.class_iou is not None])
-        figures = _class_figures(found[name], by_class[name], ious)
-        metrics |= {f"{name}/{key}": value for key, value in figures.items()}
-    metrics["mAP"] = _mean_of_defined(metrics[f"{name}/AP"] for name in classes)
-    metrics["mIoU"] = _mean_of_defined(metrics[f"{name}/mIoU"] for name in classes)
+        figures[name] = _class_figures(found, ious)
     groups: dict[str, list[str]] = {}
-    for name, polygon in zip(classes, config.is_polygon, strict=True):
+    for name, polygon in zip(config.classes, config.is_polygon, strict=True):
         groups.setdefault("polygon" if polygon else "line", []).append(name)
+    metrics = {
+        f"{name}/{key}": value for name, found in figures.items() for key, value in found.items()
+    }
     for group, names in groups.items():
-        means = _group_figures(metrics, names)
-        metrics |= {f"{group}/{key}": value for key, value in means.items()}
+        for key in figures[names[0]]:
+            if key.startswith(("AP", "AR", "recall", "mIoU")):
+                metrics[f"{group}/{key}"] = _mean_of_defined(figures[name][key] for name in names)
+    for mean, key in (("mAP", "AP"), ("mIoU", "mIoU")):
+        metrics[mean] = _mean_of_defined(found[key] for found in figures.values())
     metrics["num_samples"] = float(len(records))
-    return MetricReport.of("raster", groups, by_class, metrics, found)
+    flat = {f"raster/{key}": value for key, value in metrics.items()}
+    return MetricReport("raster", groups, flat, detections)

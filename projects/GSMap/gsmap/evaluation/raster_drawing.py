@@ -37,16 +37,6 @@ class Masks(NamedTuple):
     starts: IntArray
     labels: IntArray
 
-    def full(self, index: int, height: int, width: int) -> BoolArray:
-        """Return one mask on the whole canvas. (H, W)"""
-        top, left, rows, words = self.boxes[index]
-        packed = self.words[self.starts[index] : self.starts[index + 1]].astype("<u8")
-        bits = np.unpackbits(packed.view(np.uint8), bitorder="little").reshape(rows, 64 * words)
-        canvas = np.zeros((height, width), dtype=np.bool_)
-        columns = min(64 * int(words), width - 64 * int(left))
-        canvas[top : top + rows, 64 * left : 64 * left + columns] = bits[:, :columns]
-        return canvas
-
 
 @njit(cache=True)
 def _crops(

@@ -6,8 +6,6 @@ from numba import njit
 from gsmap.evaluation.raster_drawing import Masks, WordArray
 from gsmap.structures.elements import FloatArray, IntArray
 
-_COCO_SLACK = 1.0 - 1e-10  # COCO lowers a threshold of 1, so that equal masks match
-
 
 @njit(cache=True)
 def _count(word: int) -> int:
@@ -47,36 +45,6 @@ def mask_ious(pred: Masks, gt: Masks) -> FloatArray:
                 if shared:
                     ious[i, k] = shared / (area + gt_areas[k] - shared)
     return ious
-
-
-@njit(cache=True)
-def assign(
-    ious: FloatArray, pred_labels: IntArray, gt_labels: IntArray, thresholds: FloatArray
-) -> IntArray:
-    """Match greedily as COCO: take the best free ground truth, the later one of equals.
-
-    Args:
-        ious: IoU, predictions in descending order of score. (N, K)
-        pred_labels: Class of each prediction. (N,)
-        gt_labels: Class of each ground truth. (K,)
-        thresholds: Smallest IoU of a match, inclusive, for each class. (C, T)
-
-    Returns:
-        The matched ground truth, or -1. (N, T)
-    """
-    n, k_total = ious.shape
-    matched = np.full((n, thresholds.shape[1]), -1)
-    for t in range(thresholds.shape[1]):
-        taken = np.zeros(k_total, np.bool_)
-        for i in range(n):
-            best = min(thresholds[pred_labels[i], t], _COCO_SLACK)
-            match = -1
-            for k in range(k_total):
-                if pred_labels[i] == gt_labels[k] and not taken[k] and ious[i, k] >= best:
-                    best, match = ious[i, k], k
-            if match >= 0:
-                taken[match], matched[i, t] = True, match
-    return matched
 
 
 @njit(cache=True)

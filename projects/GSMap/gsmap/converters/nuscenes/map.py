@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 LINE_LAYERS = ("road_divider", "lane_divider")
 SURFACE_LAYERS = ("road_segment", "lane")
-MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:], "centerline")
+MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:4], "centerline")
 OUTLINE_MARGIN_M = 0.2
 CENTERLINE_STEP_M = 0.5
 
