@@ -5,6 +5,7 @@ Example: ``python tools/browse_dataset.py CONFIG --split train --num 20 --show-d
 """
 
 import argparse
+from pathlib import Path
 
 from mmdet3d.registry import DATASETS
 from mmengine.utils import track_iter_progress
@@ -12,8 +13,8 @@ from mmengine.utils import track_iter_progress
 from gsmap.apis.map_inferencer import spread_evenly
 from gsmap.engine.launch import add_config_options, read_config
 from gsmap.utils.cli import CommandParser, run_command
+from gsmap.visualization.figure import FORMATS, picture_name, save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
-from gsmap.visualization.pictures import add_picture_arguments, save_picture
 
 
 def parse_args() -> argparse.Namespace:
@@ -21,7 +22,11 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("config", help="config file")
     parser.add_argument("--split", default="train", choices=["train", "val", "test"])
     parser.add_argument("--num", type=int, default=20, help="how many samples, evenly spread")
-    add_picture_arguments(parser, folder="work_dirs/browse", picture_format="jpg")
+    parser.add_argument(
+        "--show-dir", type=Path, default="work_dirs/browse", help="folder for pictures"
+    )
+    parser.add_argument("--format", default="jpg", choices=FORMATS)
+    parser.add_argument("--order", action="store_true", help="mark start and direction of elements")
     parser.add_argument(
         "--original", action="store_true", help="draw the image files, not the inputs"
     )
@@ -41,7 +46,8 @@ def main() -> str:
         sample = item["data_samples"]
         images = None if args.original else images_from_inputs(item["inputs"]["img"])
         figure = visualizer.draw_sample(sample, images)
-        save_picture(figure, args.show_dir, sample.metainfo["token"], f".{args.format}")
+        name = picture_name(sample.metainfo["token"], f".{args.format}")
+        save_figure(figure, args.show_dir / name)
     return f"\n{len(indices)} pictures: {args.show_dir}"
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.engine.launch import add_config_options
 from gsmap.utils.cli import CommandParser, run_command
-from gsmap.visualization.pictures import add_picture_arguments, save_picture
+from gsmap.visualization.figure import FORMATS, picture_name, save_figure
 
 
 def parse_args() -> argparse.Namespace:
@@ -29,7 +29,9 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
     parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
     parser.add_argument("--out", type=Path, help="JSON file for the predictions")
-    add_picture_arguments(parser, folder=None, picture_format="png")
+    parser.add_argument("--show-dir", type=Path, help="folder for pictures")
+    parser.add_argument("--format", default="png", choices=FORMATS)
+    parser.add_argument("--order", action="store_true", help="mark start and direction of elements")
     parser.add_argument("--score-thr", type=float, help="smallest drawn score")
     parser.add_argument(
         "--ground-z", type=float, help="height of a level ground in the frame, in metres"
@@ -59,8 +61,8 @@ def main() -> None:
         if args.show_dir:
             points = inferencer.lidar_points(dataset, index) if args.lidar else None
             figure = inferencer.draw(sample, score_thr=args.score_thr, points=points)
-            token = sample.metainfo["token"]
-            path = save_picture(figure, args.show_dir, token, f".{args.format}")
+            name = picture_name(sample.metainfo["token"], f".{args.format}")
+            path = save_figure(figure, args.show_dir / name)
             print(f"[{len(samples)}/{len(chosen)}] {path}")
     if args.out:
         inferencer.write(args.out, samples)

@@ -9,7 +9,6 @@ import numpy as np
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.raster_drawing import Masks
 from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing", "boundary")
@@ -33,12 +32,7 @@ def frame_of(record: dict[str, Any]) -> Frame:
     )
 
 
-def full_mask(masks: Masks, index: int, height: int, width: int) -> np.ndarray:
-    """Unpack one mask to the whole canvas. (H, W)"""
-    top, left, rows, words = masks.boxes[index]
-    packed = masks.words[masks.starts[index] : masks.starts[index + 1]].astype("<u8")
-    bits = np.unpackbits(packed.view(np.uint8), bitorder="little").reshape(rows, 64 * words)
-    canvas = np.zeros((height, width), dtype=np.bool_)
-    columns = min(64 * int(words), width - 64 * int(left))
-    canvas[top : top + rows, 64 * left : 64 * left + columns] = bits[:, :columns]
-    return canvas
+def unpacked(masks: np.ndarray, width: int) -> np.ndarray:
+    """Unpack masks of 64 columns to a word. (N, H, words) -> (N, H, W)"""
+    bits = np.unpackbits(masks.astype("<u8").view(np.uint8), axis=-1, bitorder="little")
+    return bits[..., :width].astype(bool)

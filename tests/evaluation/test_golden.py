@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from golden_data import CLASSES, EVALUATOR, Frame, frame_of, full_mask, read
+from golden_data import CLASSES, EVALUATOR, Frame, frame_of, read, unpacked
 
 from gsmap.evaluation.chamfer_ap import (
     ChamferConfig,
@@ -142,12 +142,14 @@ def test_ious_and_matches_of_every_frame(frames, eval_dir: Path) -> None:
             truths = np.array([*rows["gt_index"], -1])
             matched = truths[np.array(rows["matched_gt"], dtype=int).reshape(-1, 6)]
             assert matches.matched_gt[mine].tolist() == matched.tolist()
-            masks = [
-                rasterize(e.select(np.array(i, dtype=int)), config)
+            chosen = [
+                e.select(np.array(i, dtype=int))
                 for e, i in ((pred, rows["pred_index"]), (gt, rows["gt_index"]))
             ]
+            masks = [rasterize(elements, config) for elements in chosen]
+            labels = [elements.labels for elements in chosen]
             ious = np.array(rows["iou"]).reshape(len(rows["pred_index"]), len(rows["gt_index"]))
-            np.testing.assert_allclose(mask_ious(*masks), ious, rtol=0, atol=STORED)
+            np.testing.assert_allclose(mask_ious(*masks, *labels), ious, rtol=0, atol=STORED)
             assert matches.class_iou[label] == pytest.approx(rows["frame_iou"], abs=STORED)
 
 
@@ -159,7 +161,7 @@ def test_masks_pixel_by_pixel(frames, eval_dir: Path, stored: str, dilation: int
     wanted = np.unpackbits(file[stored])[: np.prod(shape)].reshape(shape).astype(bool)
     for (frame, is_pred, index, _, _), want in zip(file["info"], wanted, strict=True):
         elements = frames[frame][1 if is_pred else 2].select(np.array([index]))
-        assert (full_mask(rasterize(elements, config), 0, 480, 240) == want).all()
+        assert (unpacked(rasterize(elements, config), 240)[0] == want).all()
 
 
 def test_edge_cases(eval_dir: Path) -> None:

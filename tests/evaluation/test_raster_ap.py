@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from golden_data import full_mask
+from golden_data import unpacked
 
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report, rasterize
 from gsmap.structures.elements import MapElements
@@ -23,14 +23,14 @@ def test_line_and_polygon_by_hand():
     elements = MapElements.from_polylines(
         [[[1, 0], [4, 3]], [[6, 1], [9, 1], [9, 3], [6, 3]]], [0, 1]
     )
-    masks = rasterize(elements, TINY)
-    assert rows(full_mask(masks, 0, 8, 12))[:4] == [
+    masks = unpacked(rasterize(elements, TINY), 12)
+    assert rows(masks[0])[:4] == [
         ".#..........",
         "..#.........",
         "...#........",
         "....#.......",
     ]
-    assert rows(full_mask(masks, 1, 8, 12))[:5] == [
+    assert rows(masks[1])[:5] == [
         "............",
         "......####..",
         "......####..",
@@ -40,11 +40,9 @@ def test_line_and_polygon_by_hand():
 
 
 def test_dilation_is_a_square_and_ends_at_the_canvas():
-    masks = rasterize(
-        MapElements.from_polylines([[[0, 0], [0, 0]]], [0]),
-        RasterConfig(CLASSES, SMALL, px_per_m=1),
-    )
-    assert rows(full_mask(masks, 0, 8, 12))[:4] == [
+    dot = MapElements.from_polylines([[[0, 0], [0, 0]]], [0])
+    masks = unpacked(rasterize(dot, RasterConfig(CLASSES, SMALL, px_per_m=1)), 12)
+    assert rows(masks[0])[:4] == [
         "###.........",
         "###.........",
         "###.........",
@@ -68,23 +66,23 @@ def opencv_pixels(line: np.ndarray) -> np.ndarray:
 
 def test_lines_are_opencv_lines_on_and_off_the_canvas():
     lines = random_lines(300)
-    masks = rasterize(MapElements.from_polylines(lines, [0] * len(lines)), CONFIG)
+    masks = unpacked(rasterize(MapElements.from_polylines(lines, [0] * len(lines)), CONFIG), 240)
     for i, line in enumerate(lines):
         want = np.zeros((480, 240), np.uint8)
         cv2.polylines(want, [opencv_pixels(line)], False, 1)
         want = cv2.dilate(want, np.ones((5, 5), np.uint8))
-        assert (full_mask(masks, i, 480, 240) == want).all(), i
+        assert (masks[i] == want).all(), i
 
 
 def test_polygons_contain_opencv_outlines_and_little_else():
     """OpenCV's versions differ along the outline of a filled polygon, never by more than it."""
     lines = [line for line in random_lines(200) if len(line) > 2]
-    masks = rasterize(MapElements.from_polylines(lines, [1] * len(lines)), RAW)
+    masks = unpacked(rasterize(MapElements.from_polylines(lines, [1] * len(lines)), RAW), 240)
     for i, line in enumerate(lines):
         outline, filled = np.zeros((2, 480, 240), np.uint8)
         cv2.polylines(outline, [opencv_pixels(line)], True, 1)
         cv2.fillPoly(filled, [opencv_pixels(line)], 1)
-        ours = full_mask(masks, i, 480, 240)
+        ours = masks[i]
         assert (ours >= outline.astype(bool)).all()
         if np.abs(opencv_pixels(line) - [120, 240]).max(axis=0).max() < 120:  # nothing is cut
             near_outline = cv2.dilate(outline, np.ones((3, 3), np.uint8)).astype(bool)
@@ -94,7 +92,7 @@ def test_polygons_contain_opencv_outlines_and_little_else():
 def test_self_intersection_is_even_odd():
     """The two wings of a bow tie are filled, what lies beside its waist is not."""
     elements = MapElements.from_polylines([[[1, 1], [9, 7], [9, 1], [1, 7]]], [1])
-    mask = full_mask(rasterize(elements, TINY), 0, 8, 12)
+    mask = unpacked(rasterize(elements, TINY), 12)[0]
     assert mask[4, 2]
     assert mask[4, 8]
     assert not mask[1, 5]
@@ -170,7 +168,7 @@ def test_argoverse_range_turns_the_canvas():
     config = RasterConfig(CLASSES, BEVGrid((-30, 30), (-15, 15)))
     assert (config.width, config.height) == (480, 240)
     line = MapElements.from_polylines([[[-30, 0], [29.9, 0]]], [0])
-    mask = full_mask(rasterize(line, config), 0, 240, 480)
+    mask = unpacked(rasterize(line, config), 480)[0]
     assert mask[118:123].all()
     assert not mask[117].any()
 
@@ -179,17 +177,15 @@ def test_extended_classes_are_polygons():
     config = RasterConfig(("divider", "stop_line", "intersection", "carpark"))
     assert config.is_polygon == (False, True, True, True)
     square = [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]]
-    mask = full_mask(rasterize(MapElements.from_polylines([square], [2]), config), 0, 480, 240)
+    mask = unpacked(rasterize(MapElements.from_polylines([square], [2]), config), 240)[0]
     assert mask[256, 136]  # the middle of the square: (2 + 15) * 8, (2 + 30) * 8
 
 
 def test_far_points_do_not_overflow():
-    masks = rasterize(
-        MapElements.from_polylines([[[0.0, 0.0], [1e30, 1e30]], [[1e12, 0], [1e12, 5]]], [0, 1]),
-        CONFIG,
-    )
-    assert full_mask(masks, 0, 480, 240)[240, 120]
-    assert not full_mask(masks, 1, 480, 240).any()
+    lines = [[[0.0, 0.0], [1e30, 1e30]], [[1e12, 0], [1e12, 5]]]
+    masks = unpacked(rasterize(MapElements.from_polylines(lines, [0, 1]), CONFIG), 240)
+    assert masks[0][240, 120]
+    assert not masks[1].any()
 
 
 def test_bad_configuration_is_refused():

@@ -5,7 +5,6 @@ focal length of 100 px and the principal point in the middle of an image of 200 
 """
 
 import numpy as np
-import pytest
 
 from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
 
@@ -103,17 +102,3 @@ def test_subdivided_keeps_vertices_and_bounds_the_step():
     np.testing.assert_allclose(dense[[0, 3, 4]], line)
     np.testing.assert_allclose(dense[1], [2.5 / 3, 0, 1 / 3])
     assert np.linalg.norm(np.diff(dense, axis=0), axis=1).max() <= 1.0
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: project((0, 0, 1), (0, 0, 2), near_m=0), "near_m must be > 0"),
-        (lambda: project_polygon(np.zeros((3, 2)), CAMERA, SIZE), r"shape \(n, 3\)"),
-        (lambda: project_polygon(np.zeros((3, 3)), np.eye(3), SIZE), r"shape \(4, 4\)"),
-        (lambda: subdivided(np.zeros((2, 2)), 0.0), "step_m must be > 0"),
-    ],
-)
-def test_bad_arguments(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()

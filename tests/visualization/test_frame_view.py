@@ -1,8 +1,7 @@
 import numpy as np
-import pytest
 
 from gsmap.datasets.plain_pickle import load_plain_pickle
-from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView, resolve_frame_view
+from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
 
 
 def test_ahead_is_up_in_both_frames():
@@ -38,18 +37,8 @@ def test_tilted_plane_is_the_vehicles_ground():
     np.testing.assert_allclose(in_vehicle[:, 2], 0, atol=1e-12)
 
 
-def test_level_ground_and_identity_mounting():
+def test_identity_mounting_leaves_the_ground_level():
     assert FRAME_VIEWS["ego"].tilted(np.eye(4)).ground == (0, 0, -0.31)
-    assert FRAME_VIEWS["ego"].level(-2).ground == (0, 0, -2)
-
-
-def test_resolution_by_data_set():
-    assert resolve_frame_view(None) is FRAME_VIEWS["lidar"]
-    assert resolve_frame_view({"frame": "ego"}) is FRAME_VIEWS["ego"]
-    with pytest.raises(ValueError, match="No view is known for frame 'map'"):
-        resolve_frame_view({"frame": "map"})
-    with pytest.raises(ValueError, match="forward must be"):
-        FrameView("z", (0, 0, 0), (-1, 1, 1))
 
 
 def test_ground_of_a_real_sweep(shared_dir):

@@ -7,9 +7,13 @@ from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
 import gsmap.visualization.map_visualization_hook  # noqa: F401 (registers the hook)
-from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
-from gsmap.visualization.map_visualizer import images_from_inputs
-from gsmap.visualization.pictures import picture_name
+from gsmap.visualization.figure import picture_name
+from gsmap.visualization.frame_view import FRAME_VIEWS
+from gsmap.visualization.map_visualizer import (
+    ground_truth_elements,
+    images_from_inputs,
+    predicted_elements,
+)
 
 CLASSES = ("divider", "ped_crossing", "boundary")
 
@@ -106,12 +110,16 @@ def test_ground_follows_the_mounting_or_the_option():
     assert fixed.frame_view({"lidar2ego": mounting}).ground == (0, 0, -1.0)
 
 
-def test_extent_comes_from_the_data_set_or_the_option():
+def test_extent_and_frame_come_from_the_data_set():
     visualizer = make_visualizer("extent")
+    visualizer.dataset_meta = None
+    assert visualizer.frame_view({}) is FRAME_VIEWS["lidar"]
     visualizer.dataset_meta = {"x_range": (-30, 30), "y_range": (-15, 15), "frame": "ego"}
     assert visualizer.grid.x_range == (-30, 30)
-    chosen = make_visualizer("chosen", pc_range=[-1, -2, -3, 1, 2, 3])
-    assert (chosen.grid.x_range, chosen.grid.y_range) == ((-1, 1), (-2, 2))
+    assert visualizer.frame_view({}) is FRAME_VIEWS["ego"]
+    visualizer.dataset_meta = {"frame": "map"}
+    with pytest.raises(ValueError, match="No view is known for frame 'map'"):
+        visualizer.frame_view({})
 
 
 def test_pictures_reach_tensorboard(tmp_path):

@@ -135,8 +135,6 @@ class MapInferencer:
         options = options if kind == "MapVisualizer" else {}
         for name in ("name", "vis_backends", "save_dir"):
             options.pop(name, None)
-        (x_min, x_max), (y_min, y_max) = self.cfg.model.grid.x_range, self.cfg.model.grid.y_range
-        options.setdefault("pc_range", (x_min, y_min, 0.0, x_max, y_max, 0.0))
         return MapVisualizer(name=f"inferencer-{id(self)}", **options)
 
     def dataset(

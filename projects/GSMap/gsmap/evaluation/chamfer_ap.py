@@ -19,6 +19,7 @@ from gsmap.evaluation.matches import (
     assign,
     detections_per_class,
     is_known,
+    ranked_predictions,
     unique_by_token,
 )
 from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
@@ -148,16 +149,14 @@ def match_chamfer(
     Raises:
         ValueError: If heights count, and a side has none.
     """
-    num_classes, scores = len(config.classes), predictions.confidence
+    num_classes = len(config.classes)
     try:
         best, distance = nearest_by_chamfer(
             predictions, ground_truth, config, config.thresholds[-1]
         )
     except ValueError as error:
         raise ValueError(f"sample {token!r}, AP_chamfer of dim {config.dim}: {error}") from error
-    kept = (predictions.num_points >= 2) & is_known(predictions.labels, num_classes)
-    rows = np.flatnonzero(kept)
-    rows = rows[np.argsort(-scores[rows], kind="stable")]
+    rows = ranked_predictions(predictions, num_classes)
     fit = np.full((len(rows), len(ground_truth) + 1), -np.inf)
     fit[np.arange(len(rows)), best[rows]] = -distance[rows]  # in the last column without a nearest
     matched = assign(fit, np.tile(np.negative(config.thresholds), (len(rows), 1)))
@@ -166,7 +165,7 @@ def match_chamfer(
         token=token,
         pred_index=rows,
         labels=predictions.labels[rows],
-        scores=scores[rows],
+        scores=predictions.confidence[rows],
         matched_gt=matched,
         quality=np.where((matched >= 0).any(axis=1), distance[rows], np.nan),
         num_gts=np.bincount(known_gts, minlength=num_classes),

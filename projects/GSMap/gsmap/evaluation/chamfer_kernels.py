@@ -54,7 +54,7 @@ def _mean_distance_to_box(line: FloatArray, box: FloatArray) -> float:
 
 @njit(cache=True)
 def _boxes(points: FloatArray, offsets: IntArray) -> FloatArray:
-    """Return each line's bounding box in the plane, (x0, y0, x1, y1), zeros without points. (N, 4)"""
+    """Return the boxes (x0, y0, x1, y1) of lines in the plane, zeros without points. (N, 4)"""
     boxes = np.zeros((len(offsets) - 1, 4))
     for i in range(len(boxes)):
         x, y = points[0, offsets[i] : offsets[i + 1]], points[1, offsets[i] : offsets[i + 1]]

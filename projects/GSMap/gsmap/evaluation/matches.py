@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from gsmap.structures.elements import BoolArray, FloatArray, IntArray
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,31 @@ class ClassDetections:
 def is_known(labels: IntArray, num_classes: int) -> BoolArray:
     """Whether labels are those of classes that are scored. (N,)"""
     return (labels >= 0) & (labels < num_classes)
+
+
+def ranked_predictions(
+    predictions: MapElements,
+    num_classes: int,
+    min_score: float = -np.inf,
+    max_num: int | None = None,
+) -> IntArray:
+    """Choose the predictions of a sample that count: lines of known classes with enough score.
+
+    Args:
+        predictions: N predictions.
+        num_classes: Number of classes.
+        min_score: Smallest score that counts.
+        max_num: How many of each class count; None: all.
+
+    Returns:
+        Their positions, in descending order of score. (<= N,)
+    """
+    scores = predictions.confidence
+    rows = np.flatnonzero((predictions.num_points >= 2) & (scores >= min_score))
+    rows = rows[np.argsort(-scores[rows], kind="stable")]
+    labels = predictions.labels[rows]
+    counted = [np.flatnonzero(labels == label)[:max_num] for label in range(num_classes)]
+    return rows[np.sort(np.concatenate(counted))]
 
 
 def unique_by_token(matches: Iterable[FrameMatches]) -> list[FrameMatches]:

@@ -5,7 +5,7 @@ thick and polygons filled, everything dilated 5 x 5; predictions with a score be
 than two points are dropped, and at most 100 per class and sample count.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,9 +18,9 @@ from gsmap.evaluation.matches import (
     assign,
     detections_per_class,
     is_known,
+    ranked_predictions,
     unique_by_token,
 )
-from gsmap.evaluation.raster_drawing import Masks, draw
 from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
@@ -29,6 +29,7 @@ from gsmap.structures.grid import BEVGrid
 LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 POLYGON_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
 RECALL_LIMITS = (1, 10, 100)
+NUSCENES_GRID = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
 _COCO_SLACK = 1.0 - 1e-10  # COCO lowers a threshold of 1, so that equal masks match
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
 
@@ -53,7 +54,7 @@ class RasterConfig:
     """
 
     classes: tuple[str, ...]
-    grid: BEVGrid = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
+    grid: BEVGrid = NUSCENES_GRID
     polygon_classes: tuple[str, ...] = AREA_CLASSES
     px_per_m: float = 8.0
     line_thresholds: tuple[float, ...] = LINE_THRESHOLDS
@@ -100,8 +101,7 @@ class RasterConfig:
         """The IoU thresholds of each class, by its name. C x (T,)"""
         both = (self.line_thresholds, self.polygon_thresholds)
         return {
-            name: both[polygon]
-            for name, polygon in zip(self.classes, self.is_polygon, strict=True)
+            name: both[polygon] for name, polygon in zip(self.classes, self.is_polygon, strict=True)
         }
 
 
@@ -121,7 +121,7 @@ def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
     return np.rint(pixels).astype(np.int64)
 
 
-def rasterize(elements: MapElements, config: RasterConfig) -> Masks:
+def rasterize(elements: MapElements, config: RasterConfig) -> kernels.WordArray:
     """Draw and dilate the elements of one sample.
 
     The parts of an element outside the canvas are cut off before the dilation.
@@ -129,23 +129,27 @@ def rasterize(elements: MapElements, config: RasterConfig) -> Masks:
     Args:
         elements: N elements with labels below the number of classes.
         config: Rules.
+
+    Returns:
+        The masks, 64 columns to a word. (N, H, words)
     """
     pixels = pixels_from_metres(elements.with_coordinates(2).points, config)
     filled = np.array(config.is_polygon)[elements.labels]
     size, radius = (config.height, config.width), config.dilation_px // 2
-    return draw(pixels, elements.offsets, elements.labels, filled, size, radius)
+    return kernels.draw(pixels, elements.offsets, filled, size, radius)
 
 
-def _ranked_predictions(predictions: MapElements, config: RasterConfig) -> IntArray:
-    """Return the predictions that count, in descending order of score."""
-    scores = predictions.confidence
-    rows = np.flatnonzero((predictions.num_points >= 2) & (scores >= config.min_score))
-    rows = rows[np.argsort(-scores[rows], kind="stable")]
-    counted = [
-        np.flatnonzero(predictions.labels[rows] == c)[: config.max_predictions]
-        for c in range(len(config.classes))
-    ]
-    return rows[np.sort(np.concatenate(counted))]
+def _class_ious(
+    pred: kernels.WordArray, gt: kernels.WordArray, labels: Sequence[IntArray], num_classes: int
+) -> FloatArray:
+    """Return the IoU of all predictions of a class with all its ground truths, or NaN. (C,)"""
+    classes = np.arange(num_classes)
+    unions = (
+        np.stack([np.bitwise_or.reduce(masks[own == c]) for c in classes])
+        for masks, own in zip((pred, gt), labels, strict=True)
+    )
+    ious = np.diagonal(kernels.mask_ious(*unions, classes, classes))
+    return np.where(np.isin(classes, np.concatenate(labels)), ious, np.nan)
 
 
 def match_raster(
@@ -160,23 +164,24 @@ def match_raster(
         token: Name of the sample.
     """
     num_classes = len(config.classes)
-    rows = _ranked_predictions(predictions, config)
+    rows = ranked_predictions(predictions, num_classes, config.min_score, config.max_predictions)
     gt_index = np.flatnonzero(is_known(ground_truth.labels, num_classes))
     pred = rasterize(predictions.select(rows), config)
     gt = rasterize(ground_truth.select(gt_index), config)
-    ious = kernels.mask_ious(pred, gt)
+    labels = predictions.labels[rows], ground_truth.labels[gt_index]
+    ious = kernels.mask_ious(pred, gt, *labels)
     thresholds = np.minimum(list(config.thresholds.values()), _COCO_SLACK)
-    matched = assign(ious, thresholds[pred.labels])
+    matched = assign(ious, thresholds[labels[0]])
     matched_iou = np.pad(ious, ((0, 0), (0, 1)), constant_values=np.nan)  # column -1: no match
     return FrameMatches(
         token=token,
         pred_index=rows,
-        labels=pred.labels,
+        labels=labels[0],
         scores=predictions.confidence[rows],
         matched_gt=np.append(gt_index, -1)[matched],
         quality=matched_iou[np.arange(len(rows)), matched[:, 0]],
-        num_gts=np.bincount(gt.labels, minlength=num_classes),
-        class_iou=kernels.class_ious(pred, gt, num_classes, config.height, config.width),
+        num_gts=np.bincount(labels[1], minlength=num_classes),
+        class_iou=_class_ious(pred, gt, labels, num_classes),
     )
 
 

@@ -7,8 +7,7 @@ what is imported here needs numpy, OpenCV and matplotlib alone.
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
 from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure
-from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView, resolve_frame_view
-from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
+from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
 from gsmap.visualization.style import MapStyle
 
 __all__ = [
@@ -19,8 +18,5 @@ __all__ = [
     "MapStyle",
     "compose_figure",
     "figure_to_rgb",
-    "ground_truth_elements",
-    "predicted_elements",
-    "resolve_frame_view",
     "save_figure",
 ]

@@ -70,14 +70,13 @@ def _draw_grid(ax: Axes, extent: tuple[float, float, float, float], style: MapSt
     ax.grid(True, color=style.grid, linewidth=0.6, zorder=0)
     ax.set_axisbelow(True)
     ax.tick_params(length=0, labelsize=6.5, colors=style.muted, pad=2)
-    for spine in ax.spines.values():
-        spine.set(color=style.grid, linewidth=0.8)
+    ax.spines[:].set(color=style.grid, linewidth=0.8)
 
 
-def draw_vehicle(ax: Axes, view: FrameView, style: MapStyle) -> None:
+def _draw_vehicle(ax: Axes, view: FrameView) -> None:
     """Draw the ego vehicle to scale, its windscreen towards the road ahead."""
     rear, front, width = view.vehicle_m
-    half = width / 2
+    half, glass = width / 2, front - 0.30 * (front - rear)
     body = FancyBboxPatch(
         (-half + 0.35, rear + 0.35),
         width - 0.7,
@@ -88,36 +87,26 @@ def draw_vehicle(ax: Axes, view: FrameView, style: MapStyle) -> None:
         linewidth=0.9,
         zorder=30,
     )
+    top, bottom, low = 0.72 * half, 0.55 * half, glass - 0.62
+    windscreen = [(-top, glass), (top, glass), (bottom, low), (-bottom, low)]
     ax.add_patch(body)
-    glass = front - 0.30 * (front - rear)
-    windscreen = [
-        (-0.72 * half, glass),
-        (0.72 * half, glass),
-        (0.55 * half, glass - 0.62),
-        (-0.55 * half, glass - 0.62),
-    ]
-    ax.add_patch(Polygon(windscreen, closed=True, facecolor="#D5E3F2", edgecolor="none", zorder=31))
+    ax.add_patch(Polygon(windscreen, facecolor="#D5E3F2", edgecolor="none", zorder=31))
 
 
 def _draw_lines(
     ax: Axes, lines: list[np.ndarray], labels: np.ndarray, style: MapStyle, width_pt: float
 ) -> None:
     """Draw polylines in their classes' colours and fill the closed ones faintly."""
-    colours = [style.colour(label) for label in labels]
-    areas = [
-        (line, c)
-        for line, c, label in zip(lines, colours, labels, strict=True)
-        if style.is_closed(label)
-    ]
-    if areas:
-        faces = [mcolors.to_rgba(c, 0.16) for _, c in areas]
-        ax.add_collection(
-            PolyCollection([a for a, _ in areas], facecolors=faces, edgecolors="none", zorder=4)
-        )
+    closed = [i for i, label in enumerate(labels) if style.is_closed(label)]
+    faces = mcolors.to_rgba_array(style.colours(labels[closed]), 0.16)
+    areas = PolyCollection(
+        [lines[i] for i in closed], facecolors=faces, edgecolors="none", zorder=4
+    )
+    ax.add_collection(areas)
     ax.add_collection(
         LineCollection(
             lines,
-            colors=colours,
+            colors=style.colours(labels),
             linewidths=width_pt,
             capstyle="round",
             joinstyle="round",
@@ -126,48 +115,22 @@ def _draw_lines(
     )
 
 
-def _draw_vertices(ax: Axes, lines: list[np.ndarray], labels: np.ndarray, style: MapStyle) -> None:
-    """Mark every vertex with a small dot."""
-    points = np.concatenate(lines)
-    colours = np.repeat([style.colour(label) for label in labels], [len(line) for line in lines])
-    ax.scatter(points[:, 0], points[:, 1], s=7, c=colours, linewidths=0, zorder=12)
-
-
-def _draw_order(ax: Axes, lines: list[np.ndarray], labels: np.ndarray, style: MapStyle) -> None:
+def _draw_order(ax: Axes, lines: list[np.ndarray], colours: list[str]) -> None:
     """Mark the first vertex with a ring and the direction with an arrow head at the middle."""
-    for line, label in zip(lines, labels, strict=True):
-        colour = style.colour(label)
-        ax.scatter(
-            line[0, 0],
-            line[0, 1],
-            s=20,
-            facecolors="white",
-            edgecolors=colour,
-            linewidths=1.1,
-            zorder=13,
-        )
+    starts = np.stack([line[0] for line in lines])
+    ax.scatter(*starts.T, s=20, facecolors="white", edgecolors=colours, linewidths=1.1, zorder=13)
+    head = {"arrowstyle": "-|>", "lw": 0, "mutation_scale": 9, "shrinkA": 0, "shrinkB": 0}
+    for line, colour in zip(lines, colours, strict=True):
         middle = max(len(line) // 2, 1)
-        ax.annotate(
-            "",
-            xy=tuple(line[middle]),
-            xytext=tuple(line[middle - 1]),
-            arrowprops={
-                "arrowstyle": "-|>",
-                "color": colour,
-                "lw": 0,
-                "mutation_scale": 9,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            },
-            zorder=13,
-        )
+        ends = {"xy": tuple(line[middle]), "xytext": tuple(line[middle - 1])}
+        ax.annotate("", **ends, arrowprops={**head, "color": colour}, zorder=13)
 
 
 def _draw_gaussians(ax: Axes, elements: MapElements, view: FrameView, style: MapStyle) -> None:
     """Draw each Gaussian as the ellipse at one standard deviation."""
     assert elements.scales is not None
     assert elements.rotations is not None
-    colours = np.repeat([style.colour(label) for label in elements.labels], elements.num_points)
+    colours = style.colours(np.repeat(elements.labels, elements.num_points))
     ellipses = EllipseCollection(
         widths=2 * elements.scales[:, 0],
         heights=2 * elements.scales[:, 1],
@@ -175,7 +138,7 @@ def _draw_gaussians(ax: Axes, elements: MapElements, view: FrameView, style: Map
         units="xy",
         offsets=view.display_from_frame(elements.points),
         transOffset=ax.transData,
-        facecolors=[mcolors.to_rgba(c, 0.22) for c in colours],
+        facecolors=mcolors.to_rgba_array(colours, 0.22),
         edgecolors=colours,
         linewidths=0.8,
         zorder=11,
@@ -183,28 +146,22 @@ def _draw_gaussians(ax: Axes, elements: MapElements, view: FrameView, style: Map
     ax.add_collection(ellipses)
 
 
-def _darker(colour: str) -> tuple[float, float, float]:
-    """Return a colour dark enough for small text."""
-    red, green, blue = mcolors.to_rgb(colour)
-    return 0.62 * red, 0.62 * green, 0.62 * blue
-
-
 def _draw_scores(ax: Axes, lines: list[np.ndarray], elements: MapElements, style: MapStyle) -> None:
-    """Write each score at the middle of its element."""
-    halo = [withStroke(linewidth=1.8, foreground="white")]
-    left, right = sorted(ax.get_xlim())
-    bottom, top = sorted(ax.get_ylim())
-    for line, label, score in zip(lines, elements.labels, elements.confidence, strict=True):
+    """Write each score at the middle of its element, in a darker colour."""
+    left, right = ax.get_xlim()
+    bottom, top = ax.get_ylim()
+    colours = 0.62 * mcolors.to_rgba_array(style.colours(elements.labels))[:, :3]
+    for line, colour, score in zip(lines, colours, elements.confidence, strict=True):
         x, y = line[len(line) // 2]
         ax.text(
             np.clip(x, left + 1.2, right - 1.2),
             np.clip(y, bottom + 0.8, top - 0.8),
             f"{score:.2f}",
             fontsize=5.5,
-            color=_darker(style.colour(label)),
+            color=tuple(colour),
             ha="center",
             va="center",
-            path_effects=halo,
+            path_effects=[withStroke(linewidth=1.8, foreground="white")],
             zorder=20,
         )
 
@@ -223,31 +180,8 @@ def raster_picture(rasters: np.ndarray, labels: np.ndarray, style: MapStyle) -> 
     picture = np.ones((*rasters.shape[1:], 3))
     for label in np.unique(labels):
         cover = rasters[labels == label].max(axis=0)[..., None]
-        picture = picture * (1 - cover) + cover * np.asarray(
-            mcolors.to_rgb(style.colour(int(label)))
-        )
+        picture = picture * (1 - cover) + cover * mcolors.to_rgb(style.colour(label))
     return picture.clip(0, 1)
-
-
-def _draw_rasters(
-    ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: MapStyle
-) -> None:
-    """Show the rendered masks, turned into the display's orientation."""
-    assert panel.elements is not None
-    assert panel.rasters is not None
-    picture = raster_picture(
-        panel.rasters, panel.elements.labels, style
-    )  # (H, W, 3), row 0 = smallest y
-    if view.forward == "x":
-        picture = picture.transpose(1, 0, 2)[:, ::-1]  # row = x, column = -y
-    ax.imshow(
-        picture,
-        origin="lower",
-        extent=display_extent(grid, view),
-        interpolation="bilinear",
-        zorder=1,
-    )
-    ax.grid(False)
 
 
 def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: MapStyle) -> None:
@@ -265,25 +199,29 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
     ax.set_title(panel.title, fontsize=8.5, color=style.ink, pad=5)
     if panel.points is not None and len(panel.points):
         dots = view.display_from_frame(panel.points)
-        ax.scatter(dots[:, 0], dots[:, 1], s=0.25, c="#9AA3AE", alpha=0.55, linewidths=0, zorder=2)
-    draw_vehicle(ax, view, style)
+        ax.scatter(*dots.T, s=0.25, c="#9AA3AE", alpha=0.55, linewidths=0, zorder=2)
+    _draw_vehicle(ax, view)
     elements = panel.elements
     if elements is None or len(elements) == 0:
         ax.text(0, extent[2] + 2, panel.note, fontsize=7, color=style.muted, ha="center")
         return
     if panel.rasters is not None:
-        _draw_rasters(ax, panel, grid, view, style)
+        picture = raster_picture(panel.rasters, elements.labels, style)
+        if view.forward == "x":
+            picture = picture.transpose(1, 0, 2)[:, ::-1]  # row = x, column = -y
+        ax.imshow(picture, origin="lower", extent=extent, interpolation="bilinear", zorder=1)
+        ax.grid(False)
     lines = [view.display_from_frame(line) for line in elements.polylines]
     if panel.gaussians and elements.has_gaussians:
         _draw_gaussians(ax, elements, view, style)
     if panel.lines:
-        _draw_lines(
-            ax, lines, elements.labels, style, style.bev_line_pt * (0.5 if panel.gaussians else 1)
-        )
+        width_pt = style.bev_line_pt * (0.5 if panel.gaussians else 1)
+        _draw_lines(ax, lines, elements.labels, style, width_pt)
     if panel.vertices:
-        _draw_vertices(ax, lines, elements.labels, style)
+        colours = style.colours(np.repeat(elements.labels, elements.num_points))
+        ax.scatter(*np.concatenate(lines).T, s=7, c=colours, linewidths=0, zorder=12)
     if panel.order:
-        _draw_order(ax, lines, elements.labels, style)
+        _draw_order(ax, lines, style.colours(elements.labels))
     if panel.scores and elements.scores is not None:
         _draw_scores(ax, lines, elements, style)
     ax.set(xlim=extent[:2], ylim=extent[2:])

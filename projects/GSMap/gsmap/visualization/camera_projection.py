@@ -10,33 +10,16 @@ import numpy as np
 NEAR_M = 0.3
 
 
+def _homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarray:
+    """Map points in metres (n, 3) to (u w, v w, w), where w is the depth in metres. (n, 3)"""
+    return points @ img_from_frame[:3, :3].T + img_from_frame[:3, 3]
+
+
 def _frustum_values(points: np.ndarray, size_px: tuple[int, int], near_m: float) -> np.ndarray:
     """Signed distances to the five planes of the frustum, >= 0 inside. (n, 3) -> (5, n)"""
     width, height = size_px
     u, v, w = points.T
     return np.stack([w - near_m, u, width * w - u, v, height * w - v])
-
-
-def homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarray:
-    """Map points of the frame to homogeneous pixel coordinates.
-
-    Args:
-        points: Points (x, y, z) in metres. (n, 3)
-        img_from_frame: Projection matrix, intrinsics times extrinsics; its third row yields the
-            depth. (4, 4)
-
-    Returns:
-        (u w, v w, w), where w is the depth in metres. (n, 3)
-
-    Raises:
-        ValueError: If a shape is wrong.
-    """
-    points, matrix = np.asarray(points, dtype=np.float64), np.asarray(img_from_frame, np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points must have shape (n, 3), got {points.shape}.")
-    if matrix.shape != (4, 4):
-        raise ValueError(f"img_from_frame must have shape (4, 4), got {matrix.shape}.")
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def project_segments(
@@ -51,30 +34,24 @@ def project_segments(
     Args:
         starts: First end points in metres. (n, 3)
         ends: Second end points in metres. (n, 3)
-        img_from_frame: Projection matrix. (4, 4)
+        img_from_frame: Projection matrix, intrinsics times extrinsics. (4, 4)
         size_px: Width and height of the image.
         near_m: Smallest depth that is drawn, > 0.
 
     Returns:
         The visible segments as pixel coordinates (m, 2, 2), the depth of their middle in metres
         (m,), and the index of the segment that each came from (m,).
-
-    Raises:
-        ValueError: If ``near_m`` is not positive.
     """
-    if near_m <= 0:
-        raise ValueError(f"near_m must be > 0, got {near_m}.")
-    first, last = homogeneous_px(starts, img_from_frame), homogeneous_px(ends, img_from_frame)
-    f0, f1 = (_frustum_values(p, size_px, near_m) for p in (first, last))  # (5, n)
+    first, last = (_homogeneous_px(points, img_from_frame) for points in (starts, ends))
+    f0, f1 = (_frustum_values(points, size_px, near_m) for points in (first, last))  # (5, n)
     crossing = (f0 < 0) != (f1 < 0)
     t = np.where(crossing, f0 / np.where(crossing, f0 - f1, 1.0), 0.0)
     enter = np.where(crossing & (f0 < 0), t, 0.0).max(axis=0)  # (n,)
     leave = np.where(crossing & (f1 < 0), t, 1.0).min(axis=0)
     index = np.flatnonzero((enter < leave) & ~((f0 < 0) & (f1 < 0)).any(axis=0))
     direction = (last - first)[index]
-    cut = np.stack(
-        [first[index] + s[index, None] * direction for s in (enter, leave)], axis=1
-    )  # (m, 2, 3)
+    at = np.stack([enter, leave], axis=1)[index, :, None]  # (m, 2, 1)
+    cut = first[index, None] + at * direction[:, None]  # (m, 2, 3)
     return cut[..., :2] / cut[..., 2:], cut[..., 2].mean(axis=1), index
 
 
@@ -84,7 +61,7 @@ def project_polygon(
     size_px: tuple[int, int],
     near_m: float = NEAR_M,
 ) -> np.ndarray:
-    """Project a flat polygon into an image and cut it (Sutherland-Hodgman clipping).
+    """Project a polygon and cut it to the image (Sutherland and Hodgman, 1974).
 
     Args:
         ring: Vertices in metres; repeating the first one at the end is optional. (n, 3)
@@ -95,7 +72,7 @@ def project_polygon(
     Returns:
         Pixel coordinates of the visible part, empty if there is none. (m, 2)
     """
-    points = homogeneous_px(ring, img_from_frame)
+    points = _homogeneous_px(ring, img_from_frame)
     for plane in range(5):
         values = _frustum_values(points, size_px, near_m)[plane]
         following, next_values = np.roll(points, -1, axis=0), np.roll(values, -1)
@@ -112,7 +89,7 @@ def project_polygon(
 
 
 def subdivided(points: np.ndarray, step_m: float) -> np.ndarray:
-    """Insert vertices so that no segment is longer than ``step_m``; every original vertex is kept.
+    """Insert vertices so that no segment is longer than a step; every original vertex is kept.
 
     Args:
         points: Polyline in metres, at least one point. (n, D)
@@ -120,17 +97,9 @@ def subdivided(points: np.ndarray, step_m: float) -> np.ndarray:
 
     Returns:
         The denser polyline. (m, D)
-
-    Raises:
-        ValueError: If ``step_m`` is not positive.
     """
-    if step_m <= 0:
-        raise ValueError(f"step_m must be > 0, got {step_m}.")
-    points = np.asarray(points, dtype=np.float64)
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     counts = np.maximum(np.ceil(lengths / step_m).astype(int), 1)
-    position = np.concatenate(
-        [i + np.arange(n) / n for i, n in enumerate(counts)] + [np.array([len(points) - 1.0])]
-    )
-    knots = np.arange(len(points))
-    return np.stack([np.interp(position, knots, column) for column in points.T], axis=1)
+    parts = [i + np.arange(n) / n for i, n in enumerate(counts)]
+    position = np.concatenate([*parts, [len(points) - 1.0]])
+    return np.stack([np.interp(position, range(len(points)), xyz) for xyz in points.T], axis=1)

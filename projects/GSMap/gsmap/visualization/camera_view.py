@@ -36,16 +36,21 @@ class CameraView:
     img_from_frame: np.ndarray
 
     def __post_init__(self) -> None:
-        if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
+        image, matrix = self.image, self.img_from_frame
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ValueError(
                 f"image of camera {self.name} must be RGB uint8 (h, w, 3), "
-                f"got {self.image.dtype} {self.image.shape}."
+                f"got {image.dtype} {image.shape}."
             )
-        if np.shape(self.img_from_frame) != (4, 4):
+        if np.shape(matrix) != (4, 4):
             raise ValueError(
-                f"img_from_frame of camera {self.name} must be (4, 4), "
-                f"got {np.shape(self.img_from_frame)}."
+                f"img_from_frame of camera {self.name} must be (4, 4), got {np.shape(matrix)}."
             )
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the image."""
+        return self.image.shape[1], self.image.shape[0]
 
     @property
     def title(self) -> str:
@@ -80,69 +85,54 @@ def arrange_cameras(cameras: Sequence[CameraView], view: FrameView) -> list[list
     Returns:
         One or two rows of cameras, without empty rows.
     """
-    azimuth = [viewing_azimuth(camera.img_from_frame, view) for camera in cameras]
-    order = np.argsort(azimuth)
-    ahead = [cameras[i] for i in order[::-1] if abs(azimuth[i]) <= np.pi / 2 + 1e-3]
-    back = sorted(
-        (i for i in order if abs(azimuth[i]) > np.pi / 2 + 1e-3),
-        key=lambda i: azimuth[i] % (2 * np.pi),
-    )
-    return [row for row in (ahead, [cameras[i] for i in back]) if row]
-
-
-def _line_widths(depth_m: np.ndarray, style: MapStyle, scale: float) -> np.ndarray:
-    """Widths in points that fall with distance, within what stays legible. (m,)"""
-    return (
-        scale * style.camera_line_pt * np.clip((10.0 / np.maximum(depth_m, 0.1)) ** 0.6, 0.45, 2.6)
-    )
+    ahead: list[tuple[float, CameraView]] = []
+    back: list[tuple[float, CameraView]] = []
+    for camera in cameras:
+        azimuth = viewing_azimuth(camera.img_from_frame, view)
+        if abs(azimuth) <= np.pi / 2 + 1e-3:
+            ahead.append((-azimuth, camera))
+        else:
+            back.append((azimuth % (2 * np.pi), camera))
+    rows = (sorted(row, key=lambda pair: pair[0]) for row in (ahead, back) if row)
+    return [[camera for _, camera in row] for row in rows]
 
 
 def _draw_areas(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
     """Fill the closed elements faintly."""
-    height, width = camera.image.shape[:2]
-    shapes, faces = [], []
+    shapes, colours = [], []
     for line, label in zip(elements.polylines, elements.labels, strict=True):
         if style.is_closed(label):
-            ring = project_polygon(view.lifted(line), camera.img_from_frame, (width, height))
-            if len(ring):
-                shapes.append(ring)
-                faces.append(mcolors.to_rgba(style.colour(label), 0.25))
+            shapes.append(project_polygon(view.lifted(line), camera.img_from_frame, camera.size_px))
+            colours.append(style.colour(label))
+    faces = mcolors.to_rgba_array(colours, 0.25)
     ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=3))
 
 
 def _draw_polylines(
-    ax: Axes,
-    elements: MapElements,
-    camera: CameraView,
-    view: FrameView,
-    style: MapStyle,
-    scale: float,
+    ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
-    """Draw the polylines, thinner with distance, on a dark edge."""
-    height, width = camera.image.shape[:2]
+    """Draw the polylines, thinner with distance within what stays legible, on a dark edge."""
     dense = [subdivided(view.lifted(line), _STEP_M) for line in elements.polylines]
-    starts, ends = (
-        np.concatenate([line[s] for line in dense]) for s in (slice(None, -1), slice(1, None))
-    )
-    owner = np.repeat(np.arange(len(dense)), [len(line) - 1 for line in dense])
-    segments, depth, index = project_segments(starts, ends, camera.img_from_frame, (width, height))
-    widths = _line_widths(depth, style, scale)
-    colours = [style.colour(elements.labels[i]) for i in owner[index]]
-    for colour, extra, level in (
-        (mcolors.to_rgba(style.halo, 0.55), 1.1 * scale, 4),
-        (colours, 0.0, 5),
-    ):
-        ax.add_collection(
-            LineCollection(
-                list(segments),
-                colors=colour,
-                linewidths=widths + extra,
-                capstyle="round",
-                zorder=level,
-            )
+    starts = np.concatenate([line[:-1] for line in dense])
+    ends = np.concatenate([line[1:] for line in dense])
+    owner = np.repeat(elements.labels, [len(line) - 1 for line in dense])
+    segments, depth_m, index = project_segments(starts, ends, camera.img_from_frame, camera.size_px)
+    box = ax.get_window_extent()
+    scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN
+    thinning = np.clip((10.0 / np.maximum(depth_m, 0.1)) ** 0.6, 0.45, 2.6)
+    widths = scale * style.camera_line_pt * thinning
+    halo = mcolors.to_rgba(style.halo, 0.55)
+    for colour, extra, level in ((halo, 1.1, 4), (style.colours(owner[index]), 0.0, 5)):
+        lines = LineCollection(
+            list(segments),
+            colors=colour,
+            linewidths=widths + extra * scale,
+            capstyle="round",
+            zorder=level,
         )
+        ax.add_collection(lines)
 
 
 def draw_camera(
@@ -164,23 +154,15 @@ def draw_camera(
         size_px: Width and height of the axes on the canvas; the image is resampled to it with an
             area filter.
     """
-    height, width = camera.image.shape[:2]
-    shrinks = size_px[0] < width
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
-    ax.imshow(
-        cv2.resize(camera.image, size_px, interpolation=method),
-        extent=(0, width, height, 0),
-        interpolation="nearest",
-        zorder=1,
-    )
-    box = ax.get_window_extent()
-    scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN
+    width, height = camera.size_px
+    method = cv2.INTER_AREA if size_px[0] < width else cv2.INTER_CUBIC
+    image = cv2.resize(camera.image, size_px, interpolation=method)
+    ax.imshow(image, extent=(0, width, height, 0), interpolation="nearest", zorder=1)
     if elements is not None and len(elements):
         _draw_areas(ax, elements, camera, view, style)
-        _draw_polylines(ax, elements, camera, view, style, scale)
+        _draw_polylines(ax, elements, camera, view, style)
     ax.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
-    for spine in ax.spines.values():
-        spine.set_visible(False)
+    ax.spines[:].set_visible(False)
     ax.text(
         0.014,
         0.965,

@@ -1,10 +1,10 @@
 """Composition of cameras and bird's-eye views into one picture, rendered or written."""
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import cv2
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,145 +22,102 @@ from gsmap.visualization.style import MapStyle
 
 DPI = 150
 _WIDTH = 1500  # px at DPI, for which everything is laid out
-VECTOR_SUFFIXES = (".pdf", ".svg")
-RASTER_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+_SAVE_OPTIONS: dict[str, dict[str, Any]] = {
+    "png": {"pil_kwargs": {"compress_level": 4}},
+    "jpg": {"pil_kwargs": {"quality": 92}},
+    "webp": {"pil_kwargs": {"quality": 90}},
+    "pdf": {"metadata": {"CreationDate": None}},
+    "svg": {"metadata": {"Date": None}},
+}
+FORMATS = tuple(_SAVE_OPTIONS)
 _MARGIN, _GAP, _HEADER, _TICKS, _TITLE = 26, 6, 52, 38, 34  # px at DPI
+_USABLE = _WIDTH - 2 * _MARGIN
+_TALLEST = 0.5 * _USABLE  # of a camera row or a BEV panel
 _LONGEST_TITLE = 66  # characters beside the legend of three classes
-_TALLEST = 0.5  # of a camera row or a BEV panel, as a share of the figure's width
+
+Box = tuple[float, float, float, float]  # left, top, width, height in px, from the top left corner
 
 
-@dataclass(frozen=True)
-class _Box:
-    """A rectangle on the canvas, from the top left corner, in pixels."""
+def _row(aspects: Sequence[float], left: float, top: float, height: float, gap: float) -> list[Box]:
+    """Place pictures of these aspect ratios (width / height) side by side."""
+    boxes = []
+    for aspect in aspects:
+        boxes.append((left, top, height * aspect, height))
+        left += height * aspect + gap
+    return boxes
 
-    x: float
-    y: float
-    width: float
-    height: float
 
-
-def _justified_rows(
-    rows: Sequence[Sequence[float]], width: float, top: float
-) -> tuple[list[list[_Box]], float]:
-    """Place rows of pictures so that each fills the width at one height.
-
-    Args:
-        rows: Aspect ratios (width / height) of the pictures in each row.
-        width: Width of the figure in pixels.
-        top: Upper edge of the first row.
-
-    Returns:
-        The boxes of each row, and the lower edge of the last row.
-    """
-    usable, boxes = width - 2 * _MARGIN, []
+def _camera_boxes(rows: Sequence[Sequence[float]], width: float) -> tuple[list[Box], float]:
+    """Place rows of pictures, each as wide as all; return their boxes and the lower edge."""
+    boxes, top = [], float(_HEADER)
     for row in rows:
         gaps = _GAP * (len(row) - 1)
-        height = min((usable - gaps) / sum(row), _TALLEST * usable)
-        x = _MARGIN + (usable - gaps - height * sum(row)) / 2
-        placed = []
-        for aspect in row:
-            placed.append(_Box(x, top, height * aspect, height))
-            x += height * aspect + _GAP
-        boxes.append(placed)
+        height = min((width - gaps) / sum(row), _TALLEST)
+        left = _MARGIN + (width - gaps - height * sum(row)) / 2
+        boxes += _row(row, left, top, height, _GAP)
         top += height + _GAP
-    return boxes, top - _GAP if rows else top
-
-
-def _panel_boxes(count: int, aspect: float, width: float, top: float) -> tuple[list[_Box], float]:
-    """Place bird's-eye views in a centred row; return their boxes and the lower edge."""
-    usable = width - 2 * _MARGIN
-    slot = usable / count
-    height = min((slot - _TICKS) / aspect, _TALLEST * usable)
-    pitch = min(slot, height * aspect + 3 * _TICKS)
-    left = _MARGIN + (usable - pitch * count) / 2
-    boxes = [
-        _Box(
-            left + i * pitch + (pitch - height * aspect + _TICKS) / 2,
-            top + _TITLE,
-            height * aspect,
-            height,
-        )
-        for i in range(count)
-    ]
-    return boxes, top + _TITLE + height + _TICKS
-
-
-def _side_boxes(
-    rows: Sequence[Sequence[float]], aspect: float, width: float, top: float
-) -> tuple[list[list[_Box]], list[_Box], float]:
-    """Place one bird's-eye view to the right of the cameras, as high as they are together.
-
-    The cameras' height grows linearly with the width that they get, ``slope * width + offset``, so
-    the width at which both heights agree has a closed form.
-    """
-    usable = width - 2 * _MARGIN
-    slope = sum(1 / sum(row) for row in rows)
-    offset = _GAP * (len(rows) - 1) - sum(_GAP * (len(row) - 1) / sum(row) for row in rows)
-    frame = _TITLE + _TICKS  # px above and below the panel
-    taken = 2 * _TICKS + aspect * (offset - frame)
-    camera_width = (usable - taken) / (1 + aspect * slope)
-    boxes, bottom = _justified_rows(rows, camera_width + 2 * _MARGIN, top)
-    height = bottom - top - frame
-    left = width - _MARGIN - height * aspect
-    return boxes, [_Box(left, top + _TITLE, height * aspect, height)], bottom
+    return boxes, top
 
 
 def _layout(
-    rows: Sequence[Sequence[float]], num_panels: int, grid: BEVGrid, view: FrameView
-) -> tuple[list[list[_Box]], list[_Box], float]:
-    """Place all pictures: a single panel beside the cameras, several below them.
+    rows: Sequence[Sequence[float]], num_panels: int, aspect: float
+) -> tuple[list[Box], list[Box], float]:
+    """Place all pictures: a single panel beside the cameras, several in a centred row below.
 
     Args:
         rows: Aspect ratios (width / height) of the cameras in each row.
         num_panels: Number of bird's-eye views.
-        grid: Extent of the map.
-        view: Orientation of the frame.
+        aspect: Their aspect ratio.
 
     Returns:
-        The boxes of the camera rows and of the panels, and the lower edge of all.
+        The boxes of the cameras and of the panels, and the lower edge of all.
     """
-    left, right, low, high = display_extent(grid, view)
-    aspect = (right - left) / (high - low)
     if num_panels == 1 and len(rows) > 1:
-        return _side_boxes(rows, aspect, _WIDTH, _HEADER)
-    boxes, bottom = _justified_rows(rows, _WIDTH, _HEADER)
+        # The cameras' height is slope * width + offset, so both heights agree at one width.
+        slope = sum(1 / sum(row) for row in rows)
+        offset = _GAP * (len(rows) - 1) - sum(_GAP * (len(row) - 1) / sum(row) for row in rows)
+        frame = _TITLE + _TICKS  # px above and below the panel
+        taken = 2 * _TICKS + aspect * (offset - frame)
+        boxes, bottom = _camera_boxes(rows, (_USABLE - taken) / (1 + aspect * slope))
+        height = bottom - _GAP - _HEADER - frame
+        left = _WIDTH - _MARGIN - height * aspect
+        return boxes, [(left, _HEADER + _TITLE, height * aspect, height)], bottom - _GAP
+    boxes, top = _camera_boxes(rows, _USABLE)
     if not num_panels:
-        return boxes, [], bottom
-    top = bottom + (_GAP if rows else 0)
-    return boxes, *_panel_boxes(num_panels, aspect, _WIDTH, top)
+        return boxes, [], top - _GAP
+    slot = _USABLE / num_panels
+    height = min((slot - _TICKS) / aspect, _TALLEST)
+    width = height * aspect
+    pitch = min(slot, width + 3 * _TICKS)
+    left = _MARGIN + (_USABLE - pitch * num_panels + pitch - width + _TICKS) / 2
+    panels = _row([aspect] * num_panels, left, top + _TITLE, height, pitch - width)
+    return boxes, panels, top + _TITLE + height + _TICKS
 
 
-def _add_axes(figure: Figure, box: _Box) -> Axes:
-    """Add axes at a box given in pixels from the top left corner."""
-    width, height = figure.get_size_inches() * DPI
-    return figure.add_axes(
-        (box.x / width, 1 - (box.y + box.height) / height, box.width / width, box.height / height)
-    )
+def _add_axes(figure: Figure, box: Box) -> Axes:
+    """Add axes at a box."""
+    left, top, width, height = box
+    bottom = figure.get_figheight() * DPI - top - height
+    scale = np.tile(figure.get_size_inches() * DPI, 2)
+    return figure.add_axes(tuple(np.array([left, bottom, width, height]) / scale))
 
 
 def _draw_header(figure: Figure, title: str, style: MapStyle) -> None:
     """Write the title on the left and the legend of classes on the right."""
     width, height = figure.get_size_inches() * DPI
+    margin, middle = _MARGIN / width, 1 - _HEADER / 2 / height
     if len(title) > _LONGEST_TITLE:
         title = title[: _LONGEST_TITLE - 1] + "\N{HORIZONTAL ELLIPSIS}"
-    figure.text(
-        _MARGIN / width, 1 - _HEADER / 2 / height, title, fontsize=9, color=style.ink, va="center"
-    )
+    figure.text(margin, middle, title, fontsize=9, color=style.ink, va="center")
+    line = {"linewidth": 2.6, "solid_capstyle": "round"}
     handles = [
-        Line2D(
-            [],
-            [],
-            color=style.colour(i),
-            linewidth=2.6,
-            solid_capstyle="round",
-            label=style.title(i),
-        )
+        Line2D([], [], color=style.colour(i), label=style.title(i), **line)
         for i in range(len(style.classes))
     ]
     figure.legend(
         handles=handles,
         loc="center right",
-        bbox_to_anchor=(1 - _MARGIN / width, 1 - _HEADER / 2 / height),
+        bbox_to_anchor=(1 - margin, middle),
         ncols=len(handles),
         frameon=False,
         fontsize=8,
@@ -201,20 +158,20 @@ def compose_figure(
     """
     if not cameras and not panels:
         raise ValueError("compose_figure needs at least one camera or one panel.")
-    scale = _WIDTH / width_px  # boxes are laid out for one width and the dots per inch follow
     rows = arrange_cameras(cameras, view)
-    aspects = [[c.image.shape[1] / c.image.shape[0] for c in row] for row in rows]
-    camera_boxes, panel_boxes, bottom = _layout(aspects, len(panels), grid, view)
-    figure = Figure(
-        figsize=(_WIDTH / DPI, (bottom + _MARGIN / 2) / DPI), dpi=DPI / scale, facecolor="white"
-    )
+    aspects = [[c.size_px[0] / c.size_px[1] for c in row] for row in rows]
+    left, right, low, high = display_extent(grid, view)
+    layout = _layout(aspects, len(panels), (right - left) / (high - low))
+    camera_boxes, panel_boxes, bottom = layout
+    size_in = _WIDTH / DPI, (bottom + _MARGIN / 2) / DPI
+    scale = width_px / _WIDTH  # boxes are laid out for one width and the dots per inch follow
+    figure = Figure(figsize=size_in, dpi=DPI * scale, facecolor="white")
     FigureCanvasAgg(figure)
     with matplotlib.rc_context({"font.family": style.font_family}):
         _draw_header(figure, title, style)
-        for row, boxes in zip(rows, camera_boxes, strict=True):
-            for camera, box in zip(row, boxes, strict=True):
-                size_px = (max(round(box.width / scale), 1), max(round(box.height / scale), 1))
-                draw_camera(_add_axes(figure, box), camera, camera_elements, view, style, size_px)
+        for camera, box in zip((c for row in rows for c in row), camera_boxes, strict=True):
+            size_px = max(round(box[2] * scale), 1), max(round(box[3] * scale), 1)
+            draw_camera(_add_axes(figure, box), camera, camera_elements, view, style, size_px)
         for panel, box in zip(panels, panel_boxes, strict=True):
             draw_bev(_add_axes(figure, box), panel, grid, view, style)
     return figure
@@ -226,6 +183,11 @@ def figure_to_rgb(figure: Figure) -> np.ndarray:
     assert isinstance(canvas, FigureCanvasAgg)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def picture_name(token: str, suffix: str) -> str:
+    """Return a file name made of a sample's token, without characters that a file system minds."""
+    return re.sub(r"[^\w.+=-]", "_", token) + suffix
 
 
 def save_figure(figure: Figure, path: str | Path) -> Path:
@@ -242,28 +204,11 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
         ValueError: If the suffix is none of these.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in VECTOR_SUFFIXES + RASTER_SUFFIXES:
+    kind = path.suffix.lower().lstrip(".").replace("jpeg", "jpg")
+    if kind not in FORMATS:
         raise ValueError(
-            f"Cannot write a picture to {path}: "
-            f"the name must end in one of {VECTOR_SUFFIXES + RASTER_SUFFIXES}."
+            f"Cannot write a picture to {path}: the name must end in one of {FORMATS}."
         )
     with atomic_write(path, "wb") as file:
-        if suffix in VECTOR_SUFFIXES:
-            undated = {"CreationDate": None} if suffix == ".pdf" else {"Date": None}
-            figure.savefig(file, format=suffix[1:], metadata=undated)
-        else:
-            file.write(_encode_pixels(figure_to_rgb(figure), suffix))
+        figure.savefig(file, format=kind, **_SAVE_OPTIONS[kind])
     return path
-
-
-def _encode_pixels(picture: np.ndarray, suffix: str) -> bytes:
-    """Encode an RGB picture."""
-    options = {
-        ".png": [cv2.IMWRITE_PNG_COMPRESSION, 4],
-        ".webp": [cv2.IMWRITE_WEBP_QUALITY, 90],
-    }.get(suffix, [cv2.IMWRITE_JPEG_QUALITY, 92])
-    good, encoded = cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
-    if not good:
-        raise ValueError(f"OpenCV could not encode a picture as {suffix}.")
-    return encoded.tobytes()

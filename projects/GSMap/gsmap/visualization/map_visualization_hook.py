@@ -1,16 +1,16 @@
 """Draws samples while a model is validated or tested."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mmdet3d.registry import HOOKS
 from mmengine.hooks import Hook
 from mmengine.runner import Runner
-from mmengine.visualization import Visualizer
 
+from gsmap.visualization.figure import picture_name, save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer
-from gsmap.visualization.pictures import picture_name, save_picture
 
 
 def _points(data_batch: Any, index: int) -> np.ndarray | None:
@@ -66,13 +66,12 @@ class MapVisualizationHook(Hook):
     @staticmethod
     def _visualizer(runner: Runner) -> MapVisualizer:
         """Return the runner's visualizer, which must be ours."""
-        visualizer: Visualizer = runner.visualizer
-        if not isinstance(visualizer, MapVisualizer):
+        if not isinstance(runner.visualizer, MapVisualizer):
             raise TypeError(
                 "MapVisualizationHook needs visualizer=dict(type='MapVisualizer') in the config, "
-                f"got {type(visualizer).__name__}."
+                f"got {type(runner.visualizer).__name__}."
             )
-        return visualizer
+        return runner.visualizer
 
     def after_val_iter(
         self,
@@ -119,7 +118,8 @@ class MapVisualizationHook(Hook):
             figure = self._visualizer(runner).draw_sample(
                 sample, score_thr=self.score_thr, points=_points(data_batch, index)
             )
-            save_picture(figure, self.test_out_dir, sample.metainfo["token"], self.suffix)
+            name = picture_name(sample.metainfo["token"], self.suffix)
+            save_figure(figure, Path(self.test_out_dir) / name)
             self._drawn += 1
 
     def after_test_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:

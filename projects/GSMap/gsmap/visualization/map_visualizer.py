@@ -1,10 +1,10 @@
 """MMEngine's visualizer for vectorized maps."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from matplotlib.figure import Figure
@@ -12,14 +12,19 @@ from mmdet3d.registry import VISUALIZERS
 from mmengine.dist import master_only
 from mmengine.visualization import Visualizer
 
+from gsmap.datasets.elements import (
+    elements_of_predictions,
+    elements_of_targets,
+    elements_of_truth,
+)
 from gsmap.datasets.transforms.images import read_image
+from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures import BEVGrid
 from gsmap.structures.elements import MapElements
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
 from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure
-from gsmap.visualization.frame_view import FrameView, resolve_frame_view
-from gsmap.visualization.map_elements import ground_truth_elements, predicted_elements
+from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
 from gsmap.visualization.style import MapStyle
 
 PANELS = ("ground_truth", "prediction", "gaussians", "rasters")
@@ -43,31 +48,43 @@ def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
     return list(pixels.cpu().numpy())
 
 
-def render_masks(elements: MapElements, grid: BEVGrid) -> np.ndarray:
-    """Render every element's Gaussians to occupancy in [0, 1] (GSMap Eq. 6). (N, H, W)"""
-    from gsmap.ops.gaussian_raster import render_gaussians
+def ground_truth_elements(data_sample: Any) -> MapElements | None:
+    """Read a sample's ground truth: full-resolution polylines, or else the training targets.
 
-    means, scales, rotations = (
-        torch.as_tensor(values, dtype=torch.float32).unflatten(0, (len(elements), -1))
-        for values in (elements.points[:, :2], elements.scales, elements.rotations)
-    )
-    with torch.no_grad():
-        return render_gaussians(means, scales, rotations, grid).numpy()
+    Args:
+        data_sample: A ``Det3DDataSample`` with ``eval_ann_info`` among its meta data, or
+            ``gt_instances_3d``.
 
-
-def _title(scene: str | None, token: str | None) -> str:
-    """Join scene and token; a token that begins with the scene's name stands alone."""
-    if scene and token and token.startswith(scene):
-        scene = None
-    return "  \N{MIDDLE DOT}  ".join(str(part) for part in (scene, token) if part)
+    Returns:
+        The elements, or None if no ground truth is known.
+    """
+    info = data_sample.metainfo.get("eval_ann_info")
+    if info is not None:
+        return elements_of_truth(info)
+    instances = getattr(data_sample, "gt_instances_3d", ())
+    return elements_of_targets(instances) if "pts" in instances else None
 
 
-def _note(data_sample: Any, score_thr: float) -> str:
-    """Say why there is no prediction to draw."""
-    everything = predicted_elements(data_sample)
-    if everything is None or not len(everything):
-        return "no elements"
-    return f"no score reaches {score_thr:g} (highest {everything.confidence.max():.2g})"
+def predicted_elements(
+    data_sample: Any, score_thr: float = 0.0, max_num: int | None = None
+) -> MapElements | None:
+    """Read the predictions of a sample, the most confident last so that they are drawn on top.
+
+    Args:
+        data_sample: A ``Det3DDataSample`` with ``pred_instances_3d``.
+        score_thr: Smallest score that is kept.
+        max_num: Largest number of elements kept, by score; None keeps all.
+
+    Returns:
+        The elements, or None if the sample has no predictions.
+    """
+    instances = getattr(data_sample, "pred_instances_3d", ())
+    if "pts" not in instances:
+        return None
+    found = elements_of_predictions(instances)
+    order = np.argsort(found.confidence, kind="stable")
+    order = order[found.confidence[order] >= score_thr]
+    return found.select(order[::-1][:max_num][::-1])
 
 
 @VISUALIZERS.register_module()
@@ -75,11 +92,10 @@ class MapVisualizer(Visualizer):
     """Draws samples: the map over the cameras, and bird's-eye views of truth and prediction.
 
     Extent, classes and frame come from the data set's ``metainfo`` (``dataset_meta``, which the
-    runner sets); arguments given here win.
+    runner sets).
 
     Args:
         name: Name of the instance.
-        pc_range: Extent of the map (x_min, y_min, z_min, x_max, y_max, z_max) in metres.
         raster_size: Rows and columns of the rendered masks.
         ground_z_m: Level ground at this z of the frame. By default the ground follows the sensor's
             mounting (``lidar2ego`` of the sample), or else the frame's usual height.
@@ -103,7 +119,6 @@ class MapVisualizer(Visualizer):
     def __init__(
         self,
         name: str = "visualizer",
-        pc_range: Sequence[float] | None = None,
         raster_size: tuple[int, int] = (400, 200),
         ground_z_m: float | None = None,
         score_thr: float = 0.4,
@@ -123,7 +138,6 @@ class MapVisualizer(Visualizer):
             raise ValueError(f"panels must be among {PANELS}, got {sorted(unknown)}.")
         if camera_source not in PANELS[:2]:
             raise ValueError(f"camera_source must be one of {PANELS[:2]}, got {camera_source!r}.")
-        self.pc_range = pc_range
         self.raster_size = tuple(raster_size)
         self.ground_z_m = ground_z_m
         self.score_thr = score_thr
@@ -134,31 +148,32 @@ class MapVisualizer(Visualizer):
         self.show_vertices = show_vertices
         self.show_order = show_order
         self.width_px = width_px
-        self._style_options = dict(style or {})
+        self.style_options = dict(style or {})
 
     @property
     def grid(self) -> BEVGrid:
         """Extent of the map and size of its rendered masks."""
-        rows, columns = self.raster_size
-        if self.pc_range is not None:
-            return BEVGrid.from_pc_range(tuple(self.pc_range), rows, columns)
         meta = self.dataset_meta or {}
-        if "x_range" not in meta or "y_range" not in meta:
-            return BEVGrid((-15.0, 15.0), (-30.0, 30.0), rows, columns)
-        return BEVGrid(tuple(meta["x_range"]), tuple(meta["y_range"]), rows, columns)
+        x_range, y_range = meta.get("x_range", (-15.0, 15.0)), meta.get("y_range", (-30.0, 30.0))
+        return BEVGrid(x_range, y_range, *self.raster_size)
 
     @property
     def style(self) -> MapStyle:
         """Colours and widths, with the data set's classes."""
-        classes = (self.dataset_meta or {}).get("classes")
-        options = {"classes": tuple(classes)} if classes else {}
-        return MapStyle(**{**options, **self._style_options})
+        classes = (self.dataset_meta or {}).get("classes", MapStyle.classes)
+        return MapStyle(**{"classes": tuple(classes), **self.style_options})
 
     def frame_view(self, metainfo: dict) -> FrameView:
         """Return orientation and ground plane for a sample with this meta data."""
-        view = resolve_frame_view(self.dataset_meta)
+        frame = (self.dataset_meta or {}).get("frame", "lidar")
+        if frame not in FRAME_VIEWS:
+            raise ValueError(
+                f"No view is known for frame {frame!r}, only for {sorted(FRAME_VIEWS)}; "
+                "add one to gsmap.visualization.frame_view.FRAME_VIEWS."
+            )
+        view = FRAME_VIEWS[frame]
         if self.ground_z_m is not None:
-            return view.level(self.ground_z_m)
+            return replace(view, ground=(0.0, 0.0, self.ground_z_m))
         mounting = metainfo.get("lidar2ego")
         return view if mounting is None else view.tilted(np.asarray(mounting))
 
@@ -187,14 +202,14 @@ class MapVisualizer(Visualizer):
         projections = np.asarray(metainfo["lidar2img"], dtype=np.float64)  # (V, 4, 4)
         names = metainfo.get("cam_names") or [f"camera {i}" for i in range(len(projections))]
         if images is None:
-            where = f"sample {metainfo.get('token')!r}"
             if metainfo.get("img_aug_matrix") is not None:
-                unscaled = np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64))
-                projections = unscaled @ projections
-            there = [i for i, path in enumerate(paths) if path is not None]  # type: ignore[arg-type]
-            found = [read_image(paths[i], where) for i in there]  # type: ignore[index]
-            images = [cv2.cvtColor(image, cv2.COLOR_BGR2RGB) for image in found]
-            names, projections = [names[i] for i in there], projections[there]
+                projections = np.linalg.inv(metainfo["img_aug_matrix"]) @ projections
+            where = f"sample {metainfo.get('token')!r}"
+            return [
+                CameraView(name, read_image(path, where)[..., ::-1], projection)
+                for name, path, projection in zip(names, paths or (), projections, strict=True)
+                if path is not None
+            ]
         if len(images) != len(projections):
             raise ValueError(
                 f"A sample has {len(images)} images, but {len(projections)} projections."
@@ -209,28 +224,38 @@ class MapVisualizer(Visualizer):
         note: str,
     ) -> list[BEVPanel]:
         """Choose the bird's-eye views that the sample has data for."""
-        panels = []
-        if truth is not None and "ground_truth" in self.panels:
-            panels.append(BEVPanel("Ground truth", truth, order=self.show_order, points=points))
-        if found is not None and "prediction" in self.panels:
-            panels.append(
-                BEVPanel(
-                    "Prediction",
-                    found,
-                    note,
-                    vertices=self.show_vertices,
-                    order=self.show_order,
-                    scores=self.show_scores,
-                    points=points,
-                )
+        panels = {}
+        if truth is not None:
+            panels["ground_truth"] = BEVPanel(
+                "Ground truth", truth, order=self.show_order, points=points
+            )
+        if found is not None:
+            panels["prediction"] = BEVPanel(
+                "Prediction",
+                found,
+                note,
+                vertices=self.show_vertices,
+                order=self.show_order,
+                scores=self.show_scores,
+                points=points,
             )
         if found is not None and found.has_gaussians:
-            if "gaussians" in self.panels:
-                panels.append(BEVPanel("Gaussians (1$\\sigma$)", found, note, gaussians=True))
+            panels["gaussians"] = BEVPanel("Gaussians (1$\\sigma$)", found, note, gaussians=True)
             if "rasters" in self.panels:
-                masks = render_masks(found, self.grid) if len(found) else None
-                panels.append(BEVPanel("Rendered masks", found, note, lines=False, rasters=masks))
-        return panels
+                masks = self._render_masks(found) if len(found) else None
+                panels["rasters"] = BEVPanel(
+                    "Rendered masks", found, note, lines=False, rasters=masks
+                )
+        return [panel for name, panel in panels.items() if name in self.panels]
+
+    def _render_masks(self, elements: MapElements) -> np.ndarray:
+        """Render every element's Gaussians to occupancy in [0, 1] (GSMap Eq. 6). (N, H, W)"""
+        means, scales, rotations = (
+            torch.as_tensor(values, dtype=torch.float32).unflatten(0, (len(elements), -1))
+            for values in (elements.points[:, :2], elements.scales, elements.rotations)
+        )
+        with torch.no_grad():
+            return render_gaussians(means, scales, rotations, self.grid).numpy()
 
     def draw_sample(
         self,
@@ -265,11 +290,17 @@ class MapVisualizer(Visualizer):
         threshold = self.score_thr if score_thr is None else score_thr
         found = predicted_elements(data_sample, threshold, self.max_num) if draw_pred else None
         first, second = (found, truth) if self.camera_source == "prediction" else (truth, found)
+        note = "no elements"
+        everything = predicted_elements(data_sample)
+        if everything:
+            note = f"no score reaches {threshold:g} (highest {everything.confidence.max():.2g})"
         if title is None:
-            title = _title(meta.get("scene"), meta.get("token"))
+            scene, token = meta.get("scene") or "", meta.get("token") or ""
+            parts = [token] if token.startswith(scene) else [scene, token]
+            title = "  \N{MIDDLE DOT}  ".join(part for part in parts if part)
         return compose_figure(
             self.cameras(meta, images),
-            self._bev_panels(truth, found, points, _note(data_sample, threshold)),
+            self._bev_panels(truth, found, points, note),
             self.grid,
             self.frame_view(meta),
             self.style,

@@ -26,37 +26,21 @@ class RunLog:
     """
 
     name: str
-    train: tuple[Mapping[str, float], ...]
-    val: tuple[Mapping[str, float], ...]
+    train: Sequence[Mapping[str, float]]
+    val: Sequence[Mapping[str, float]]
 
     def series(self, key: str, validation: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Return steps and finite values of one scalar, both (n,)."""
         records = self.val if validation else self.train
         pairs = [(r["step"], r[key]) for r in records if math.isfinite(r.get(key, math.nan))]
-        steps, values = zip(*pairs, strict=True) if pairs else ((), ())
-        return np.array(steps, dtype=float), np.array(values, dtype=float)
+        steps, values = np.array(pairs, dtype=float).reshape(-1, 2).T
+        return steps, values
 
     @property
     def metrics(self) -> list[str]:
         """Names of the validation metrics; of those with "mAP" in a name, these summaries alone."""
-        names = [k for record in self.val for k in record if k not in _TIMING]
-        names = list(dict.fromkeys(names))
+        names = list(dict.fromkeys(k for record in self.val for k in record if k not in _TIMING))
         return [name for name in names if "map" in name.lower()] or names
-
-
-def _log_files(path: Path) -> list[Path]:
-    """Return the scalar logs of a run, oldest first: one per start."""
-    if path.is_file():
-        return [path]
-    files = sorted(path.glob("*/vis_data/scalars.json")) or sorted(
-        path.glob("vis_data/scalars.json")
-    )
-    if not files:
-        raise FileNotFoundError(
-            f"No vis_data/scalars.json under {path}: give a work folder of tools/train.py, whose "
-            "config keeps LocalVisBackend among the visualizer's vis_backends."
-        )
-    return files
 
 
 def _records(path: Path) -> list[dict[str, float]]:
@@ -89,12 +73,19 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
         ValueError: If a line is not JSON.
     """
     path = Path(path)
+    found = [*path.glob("*/vis_data/scalars.json"), *path.glob("vis_data/scalars.json")]
+    files = [path] if path.is_file() else sorted(found)
+    if not files:
+        raise FileNotFoundError(
+            f"No vis_data/scalars.json under {path}: give a work folder of tools/train.py, whose "
+            "config keeps LocalVisBackend among the visualizer's vis_backends."
+        )
     train: dict[float, dict[str, float]] = {}
     val: dict[float, dict[str, float]] = {}
-    for file in _log_files(path):
+    for file in files:  # oldest first: one per start
         for record in _records(file):
             (train if "loss" in record else val)[record["step"]] = record
-    ordered = [tuple(part[step] for step in sorted(part)) for part in (train, val)]
+    ordered = [[part[step] for step in sorted(part)] for part in (train, val)]
     return RunLog(name or path.resolve().name, *ordered)
 
 
@@ -106,10 +97,42 @@ def smoothed(values: np.ndarray, window: int) -> np.ndarray:
     return (total[upper] - total[lower]) / (upper - lower)
 
 
-def _parts_of_loss(run: RunLog) -> list[str]:
-    """Return the loss terms of the last decoder layer; those of earlier ones begin with d0., d1."""
+def _panels(count: int, width_in: float, height_in: float) -> tuple[Figure, Sequence[Axes]]:
+    """Make a figure with panels in a row."""
+    figure = Figure(figsize=(width_in * count, height_in), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(1, count, squeeze=False)[0]
+
+
+def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, window: int, title: str) -> None:
+    """Draw a figure of training, faintly as it was logged and smoothed, one colour per run."""
+    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
+        steps, values = run.series(key)
+        ax.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
+        ax.plot(steps, smoothed(values, window), color=colour, linewidth=1.6, label=run.name)
+    _finish(ax, title, "iteration")
+
+
+def _draw_parts_of_loss(ax: Axes, run: RunLog) -> None:
+    """Draw the terms of the last decoder layer; those of earlier ones begin with d0., d1."""
     keys = dict.fromkeys(k for record in run.train for k in record if "loss" in k and k != "loss")
-    return [key for key in keys if not (key[0] == "d" and key.split(".")[0][1:].isdigit())]
+    last = [key for key in keys if not (key[0] == "d" and key.split(".")[0][1:].isdigit())]
+    for name, colour in zip(last, _COLOURS * 8, strict=False):
+        steps, values = run.series(name)
+        ax.plot(steps, smoothed(values, 10), color=colour, linewidth=1.4, label=name)
+    _finish(ax, f"its parts, last decoder layer ({run.name})", "iteration")
+
+
+def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
+    """Draw the validation metrics, one colour per run and one line style per metric."""
+    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
+        styles = ("-", "--", ":", "-.") * len(run.metrics)
+        for name, style in zip(run.metrics, styles, strict=False):
+            label = f"{run.name}: {name}" if len(runs) > 1 else name
+            series = run.series(name, validation=True)
+            ax.plot(*series, style, color=colour, marker=".", label=label)
+    by_epoch = any("epoch" in record for run in runs for record in run.train)
+    _finish(ax, "validation", "epoch" if by_epoch else "iteration")
 
 
 def _finish(ax: Axes, title: str, x_label: str) -> None:
@@ -125,22 +148,8 @@ def _finish(ax: Axes, title: str, x_label: str) -> None:
     ax.tick_params(labelsize=8)
     ax.grid(True, color="#E3E6EA", linewidth=0.7)
     ax.set_axisbelow(True)
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
+    ax.spines[["top", "right"]].set_visible(False)
     ax.legend(fontsize=7.5, frameon=False)
-
-
-def _plot_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
-    """Draw the validation metrics, one colour per run."""
-    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
-        for name, style in zip(
-            run.metrics, ("-", "--", ":", "-.") * len(run.metrics), strict=False
-        ):
-            label = f"{run.name}: {name}" if len(runs) > 1 else name
-            series = run.series(name, validation=True)
-            ax.plot(*series, style, color=colour, marker=".", label=label)
-    by_epoch = any("epoch" in record for run in runs for record in run.train)
-    _finish(ax, "validation", "epoch" if by_epoch else "iteration")
 
 
 def plot_runs(runs: Sequence[RunLog]) -> Figure:
@@ -158,21 +167,11 @@ def plot_runs(runs: Sequence[RunLog]) -> Figure:
     if not any(run.train for run in runs):
         raise ValueError("plot_runs needs at least one run that logged a loss.")
     validated = any(run.val for run in runs)
-    columns = 3 if validated else 2
-    figure = Figure(figsize=(4.4 * columns, 3.8), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    total, parts, *metrics = figure.subplots(1, columns)
-    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
-        steps, values = run.series("loss")
-        total.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
-        total.plot(steps, smoothed(values, 10), color=colour, linewidth=1.6, label=run.name)
-    _finish(total, "training loss", "iteration")
-    for name, colour in zip(_parts_of_loss(runs[-1]), _COLOURS * 8, strict=False):
-        steps, values = runs[-1].series(name)
-        parts.plot(steps, smoothed(values, 10), color=colour, linewidth=1.4, label=name)
-    _finish(parts, f"its parts, last decoder layer ({runs[-1].name})", "iteration")
+    figure, panels = _panels(3 if validated else 2, 4.4, 3.8)
+    _draw_training(panels[0], runs, "loss", 10, "training loss")
+    _draw_parts_of_loss(panels[1], runs[-1])
     if validated:
-        _plot_metrics(metrics[0], runs)
+        _draw_metrics(panels[2], runs)
     return figure
 
 
@@ -193,15 +192,9 @@ def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
     unknown = [key for key in keys if key not in logged]
     if unknown:
         raise ValueError(f"no run logged {unknown}; there are {sorted(logged - set(_TIMING))}.")
-    figure = Figure(figsize=(3.6 * len(keys), 3.2), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(keys), squeeze=False)[0]
+    figure, panels = _panels(len(keys), 3.6, 3.2)
     for panel, key in zip(panels, keys, strict=True):
-        for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
-            steps, values = run.series(key)
-            panel.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
-            panel.plot(steps, smoothed(values, 5), color=colour, linewidth=1.6, label=run.name)
-        _finish(panel, key, "iteration")
+        _draw_training(panel, runs, key, 5, key)
     return figure
 
 
@@ -220,9 +213,7 @@ def summary_table(runs: Sequence[RunLog]) -> str:
             values = run.series(name, validation=True)[1]
             row.append(f"{values[-1]:.4g} / {values.max():.4g}" if len(values) else "-")
         rows.append(row)
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = [
-        "| " + " | ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)) + " |" for r in rows
-    ]
-    lines.insert(1, "| " + " | ".join("-" * width for width in widths) + " |")
-    return "\n".join(lines)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rows.insert(1, ["-" * width for width in widths])
+    padded = ([c.ljust(w) for c, w in zip(row, widths, strict=True)] for row in rows)
+    return "\n".join(f"| {' | '.join(row)} |" for row in padded)

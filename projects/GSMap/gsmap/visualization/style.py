@@ -1,24 +1,21 @@
 """Colours, widths and fonts that all pictures share."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from gsmap.structures.classes import AREA_CLASSES
 
-CLASS_COLOURS: dict[str, str] = {
+CLASS_COLOURS = {
     "divider": "#FF9500",
     "ped_crossing": "#2D8CFF",
     "boundary": "#1DB954",
     "centerline": "#8E8E93",
 }
-CLASS_TITLES: dict[str, str] = {
-    "divider": "divider",
+CLASS_TITLES = {
     "ped_crossing": "pedestrian crossing",
     "boundary": "road boundary",
     "centerline": "centre line",
 }
-# For classes that the table above does not name, in the order of their labels.
-SPARE_COLOURS = ("#AF52DE", "#FF3B30", "#5AC8FA", "#A2845E", "#FF2D92", "#34495E")
 
 
 @dataclass(frozen=True)
@@ -33,6 +30,11 @@ class MapStyle:
         camera_line_pt: Line width over an image for an element 10 m away, in points; nearer is
             thicker.
         halo: Colour of the edge that keeps lines legible over an image.
+        ink: Colour of titles.
+        muted: Colour of labels and notes.
+        ground: Background of bird's-eye views.
+        grid: Colour of their metric grid.
+        spare: Colours for classes that ``CLASS_COLOURS`` does not name, in the order of labels.
     """
 
     classes: Sequence[str] = ("divider", "ped_crossing", "boundary")
@@ -45,12 +47,15 @@ class MapStyle:
     muted: str = "#8A8F98"
     ground: str = "#F4F5F7"
     grid: str = "#DCDFE4"
-    spare: Sequence[str] = field(default=SPARE_COLOURS)
+    spare: Sequence[str] = ("#AF52DE", "#FF3B30", "#5AC8FA", "#A2845E", "#FF2D92", "#34495E")
 
     def colour(self, label: int) -> str:
         """Return the colour of a class: the same for a class name in every data set."""
-        name = self.classes[label]
-        return CLASS_COLOURS.get(name, self.spare[label % len(self.spare)])
+        return CLASS_COLOURS.get(self.classes[label], self.spare[label % len(self.spare)])
+
+    def colours(self, labels: Iterable[int]) -> list[str]:
+        """Return the colours of elements by their class index. (N,)"""
+        return [self.colour(label) for label in labels]
 
     def title(self, label: int) -> str:
         """Return the class name as a reader would write it."""
