@@ -15,7 +15,6 @@ from gsmap.structures.polylines import (
     clip_to_box,
     equivalent_orders,
     is_closed,
-    points_at,
     resample,
     resample_all,
 )
@@ -27,9 +26,6 @@ def test_resampling_keeps_both_ends_and_spaces_by_arc_length():
     corner = np.array([[0, 0], [3, 0], [3, 1]], float)
     np.testing.assert_allclose(arc_lengths(corner), [0, 3, 4])
     np.testing.assert_allclose(resample(corner, 5), [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]])
-    np.testing.assert_allclose(
-        points_at(corner, np.array([-1, 3.5, 9])), [[0, 0], [3, 0.5], [3, 1]]
-    )
 
 
 def test_resampling_interpolates_height_and_survives_repeated_points():

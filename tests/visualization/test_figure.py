@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from matplotlib import colors as mcolors
 
-from gsmap.structures import BEVGrid
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 from gsmap.visualization import (
     FRAME_VIEWS,
     BEVPanel,

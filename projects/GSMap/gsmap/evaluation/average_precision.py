@@ -59,12 +59,9 @@ def reliability(
         3 x (<= num_bins,)
     """
     bins = np.clip((scores * num_bins).astype(np.int64), 0, num_bins - 1)
-    counts, total, found = (
-        np.bincount(bins, weights=values, minlength=num_bins)
-        for values in (np.ones(len(bins)), scores, hits)
-    )
-    filled = counts > 0
-    return total[filled] / counts[filled], found[filled] / counts[filled], counts[filled]
+    _, bins, counts = np.unique(bins, return_inverse=True, return_counts=True)
+    total, found = np.bincount(bins, weights=scores), np.bincount(bins, weights=hits)
+    return total / counts, found / counts, counts.astype(np.float64)
 
 
 def calibration_error(scores: FloatArray, hits: BoolArray) -> float:

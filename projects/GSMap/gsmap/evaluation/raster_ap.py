@@ -144,11 +144,11 @@ def _class_ious(
 ) -> FloatArray:
     """Return the IoU of all predictions of a class with all its ground truths, or NaN. (C,)"""
     classes = np.arange(num_classes)
-    unions = (
+    found, true = (
         np.stack([np.bitwise_or.reduce(masks[own == c]) for c in classes])
         for masks, own in zip((pred, gt), labels, strict=True)
     )
-    ious = np.diagonal(kernels.mask_ious(*unions, classes, classes))
+    ious = np.diagonal(kernels.mask_ious(found, true, classes, classes))
     return np.where(np.isin(classes, np.concatenate(labels)), ious, np.nan)
 
 

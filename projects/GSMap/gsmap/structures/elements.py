@@ -60,10 +60,11 @@ class MapElements:
             ValueError: If the lengths disagree, the points are not (x, y[, z]), or a point or a
                 score is not finite.
         """
-        label_array = np.asarray(labels, dtype=np.int64).reshape(-1)
+        label_array = np.asarray(labels, np.int64).reshape(-1)
         score_array = None if scores is None else np.asarray(scores, np.float64).reshape(-1)
-        values = {"labels": label_array, "scores": score_array}
-        for name, given in (values | {"scales": scales, "rotations": rotations}).items():
+        values: dict[str, PerElement | None] = {"labels": label_array, "scores": score_array}
+        values |= {"scales": scales, "rotations": rotations}
+        for name, given in values.items():
             if given is not None and len(given) != len(polylines):
                 raise ValueError(
                     f"{name} must have one entry for each of the {len(polylines)} polylines, "
@@ -73,9 +74,14 @@ class MapElements:
             points = _joined(polylines)
         except (TypeError, IndexError, ValueError) as error:
             raise ValueError(f"polylines must be lists of (x, y) or (x, y, z): {error}") from error
-        offsets = np.zeros(len(polylines) + 1, dtype=np.int64)
-        np.cumsum([len(p) for p in polylines], out=offsets[1:])
-        _require_finite(points, offsets, score_array)
+        offsets = np.cumsum([0, *map(len, polylines)])
+        finite = np.isfinite(points).all(axis=1)
+        if not finite.all():
+            index = np.searchsorted(offsets, finite.argmin(), side="right") - 1
+            raise ValueError(f"element {index} has a point that is not finite.")
+        if score_array is not None and not np.isfinite(score_array).all():
+            index = np.isfinite(score_array).argmin()
+            raise ValueError(f"element {index} has a score that is not finite.")
         return cls(
             points,
             offsets,
@@ -133,8 +139,7 @@ class MapElements:
         """
         rows = np.flatnonzero(index) if index.dtype == np.bool_ else np.asarray(index)
         counts = self.num_points[rows]
-        offsets = np.zeros(len(rows) + 1, dtype=np.int64)
-        np.cumsum(counts, out=offsets[1:])
+        offsets = np.append(0, np.cumsum(counts))
         take = np.repeat(self.offsets[rows] - offsets[:-1], counts) + np.arange(offsets[-1])
         return MapElements(
             self.points[take],
@@ -171,15 +176,3 @@ def _per_vertex(values: Any, name: str, shape: tuple[int, ...]) -> FloatArray | 
     if joined.shape != shape:
         raise ValueError(f"{name} must hold {shape} values in all, got {joined.shape}.")
     return joined
-
-
-def _require_finite(points: FloatArray, offsets: IntArray, scores: FloatArray | None) -> None:
-    """Raise a ValueError that names the first element with a NaN or infinite value."""
-    bad_points = ~np.isfinite(points)
-    if bad_points.any():
-        first = np.flatnonzero(bad_points.any(axis=1))[0]
-        index = int(np.searchsorted(offsets, first, side="right")) - 1
-        raise ValueError(f"element {index} has a point that is not finite.")
-    if scores is not None and not np.isfinite(scores).all():
-        index = int(np.flatnonzero(~np.isfinite(scores))[0])
-        raise ValueError(f"element {index} has a score that is not finite.")

@@ -43,9 +43,7 @@ class BEVGrid:
             low, high = (float(v) for v in getattr(self, name))
             if not low < high:
                 raise ValueError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
-            object.__setattr__(
-                self, name, (low, high)
-            )  # lists from a config become a hashable value
+            object.__setattr__(self, name, (low, high))  # a config's lists, made hashable
         if self.height < 1 or self.width < 1:
             raise ValueError(f"height and width must be >= 1, got {self.height} x {self.width}.")
         if self.forward is None:
@@ -53,13 +51,6 @@ class BEVGrid:
             object.__setattr__(self, "forward", "x" if wide else "y")
         elif self.forward not in ("x", "y"):
             raise ValueError(f"forward must be 'x' or 'y', got {self.forward!r}.")
-
-    @classmethod
-    def from_pc_range(cls, pc_range: Sequence[float], height: int, width: int) -> "BEVGrid":
-        """Build a grid from a range (x_min, y_min, z_min, x_max, y_max, z_max) in metres."""
-        if len(pc_range) != 6:
-            raise ValueError(f"pc_range must hold 6 values, got {len(pc_range)}.")
-        return cls((pc_range[0], pc_range[3]), (pc_range[1], pc_range[4]), height, width)
 
     @property
     def extent_m(self) -> tuple[float, float]:
@@ -121,10 +112,6 @@ class BEVGrid:
         """Map metres to continuous pixels (u along x, v along y), centres at + 0.5. (..., 2)"""
         (dx, dy), x0, y0 = self.pixel_size_m, self.x_range[0], self.y_range[0]
         return self._affine(points, (1 / dx, 1 / dy), (-x0 / dx, -y0 / dy))
-
-    def metres_from_px(self, points: Array) -> Array:
-        """Map continuous pixel coordinates to metres. (..., 2)"""
-        return self._affine(points, self.pixel_size_m, (self.x_range[0], self.y_range[0]))
 
     def pixel_centres(
         self, device: "torch.device | str | None" = None, dtype: "torch.dtype | None" = None

@@ -40,21 +40,6 @@ def arc_lengths(points: Points) -> NDArray[np.float64]:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def points_at(points: Points, distances: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Return the points at given distances along a polyline.
-
-    Args:
-        points: Vertices in metres. (n, D)
-        distances: Distances from the first point in metres; beyond the ends, the ends are returned.
-            (...)
-
-    Returns:
-        Points in metres. (..., D)
-    """
-    along = arc_lengths(points)
-    return np.stack([np.interp(distances, along, column) for column in np.asarray(points).T], -1)
-
-
 def resample(points: Points, num_points: int) -> NDArray[np.float64]:
     """Resample a polyline at equal arc length in the plane, both end points included.
 
@@ -104,24 +89,14 @@ def resample_all(
     return resampled
 
 
-def rotations(
+def _rings_from(
     points: Points, num_points: int, starts: NDArray[np.integer[Any]]
 ) -> NDArray[np.float64]:
-    """Resample a ring at equal arc length from several of its vertices.
-
-    Args:
-        points: Vertices of the ring in metres, the last equal to the first. (n, D)
-        num_points: Number P of points per order, both ends included.
-        starts: Index of the vertex that each order starts at. (S,)
-
-    Returns:
-        One resampled ring per start. (S, P, D)
-    """
-    along = arc_lengths(points)
-    length = along[-1]
-    distances = along[starts][:, None] + np.linspace(0.0, length, num_points)  # (S, P)
+    """Resample a ring at equal arc length from several (S,) of its vertices. (S, P, D)"""
     twice = np.concatenate([points, points[1:]])  # a second lap, so that no distance wraps around
-    return points_at(twice, distances)
+    along = arc_lengths(twice)
+    laps = along[starts][:, None] + np.linspace(0.0, along[len(points) - 1], num_points)  # (S, P)
+    return np.stack([np.interp(laps, along, column) for column in twice.T], -1)
 
 
 def equivalent_orders(
@@ -161,7 +136,7 @@ def equivalent_orders(
             if rng is None
             else rng.choice(count, slots, replace=False)
         )
-    orders[: len(rolls)] = rotations(points, num_points, -rolls % count)
+    orders[: len(rolls)] = _rings_from(points, num_points, -rolls % count)
     return orders
 
 

@@ -9,8 +9,8 @@ from matplotlib.collections import EllipseCollection, LineCollection, PolyCollec
 from matplotlib.patches import FancyBboxPatch, Polygon
 from matplotlib.patheffects import withStroke
 
-from gsmap.structures import BEVGrid
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 from gsmap.visualization.frame_view import FrameView
 from gsmap.visualization.style import MapStyle
 
@@ -117,13 +117,13 @@ def _draw_lines(
 
 def _draw_order(ax: Axes, lines: list[np.ndarray], colours: list[str]) -> None:
     """Mark the first vertex with a ring and the direction with an arrow head at the middle."""
-    starts = np.stack([line[0] for line in lines])
-    ax.scatter(*starts.T, s=20, facecolors="white", edgecolors=colours, linewidths=1.1, zorder=13)
+    x, y = np.stack([line[0] for line in lines]).T
+    ax.scatter(x, y, s=20, facecolors="white", edgecolors=colours, linewidths=1.1, zorder=13)
     head = {"arrowstyle": "-|>", "lw": 0, "mutation_scale": 9, "shrinkA": 0, "shrinkB": 0}
     for line, colour in zip(lines, colours, strict=True):
         middle = max(len(line) // 2, 1)
-        ends = {"xy": tuple(line[middle]), "xytext": tuple(line[middle - 1])}
-        ax.annotate("", **ends, arrowprops={**head, "color": colour}, zorder=13)
+        start, end = tuple(line[middle - 1]), tuple(line[middle])
+        ax.annotate("", end, start, arrowprops={**head, "color": colour}, zorder=13)
 
 
 def _draw_gaussians(ax: Axes, elements: MapElements, view: FrameView, style: MapStyle) -> None:
@@ -198,8 +198,8 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
     _draw_grid(ax, extent, style)
     ax.set_title(panel.title, fontsize=8.5, color=style.ink, pad=5)
     if panel.points is not None and len(panel.points):
-        dots = view.display_from_frame(panel.points)
-        ax.scatter(*dots.T, s=0.25, c="#9AA3AE", alpha=0.55, linewidths=0, zorder=2)
+        x, y = view.display_from_frame(panel.points).T
+        ax.scatter(x, y, s=0.25, c="#9AA3AE", alpha=0.55, linewidths=0, zorder=2)
     _draw_vehicle(ax, view)
     elements = panel.elements
     if elements is None or len(elements) == 0:
@@ -219,7 +219,8 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
         _draw_lines(ax, lines, elements.labels, style, width_pt)
     if panel.vertices:
         colours = style.colours(np.repeat(elements.labels, elements.num_points))
-        ax.scatter(*np.concatenate(lines).T, s=7, c=colours, linewidths=0, zorder=12)
+        x, y = np.concatenate(lines).T
+        ax.scatter(x, y, s=7, c=colours, linewidths=0, zorder=12)
     if panel.order:
         _draw_order(ax, lines, style.colours(elements.labels))
     if panel.scores and elements.scores is not None:

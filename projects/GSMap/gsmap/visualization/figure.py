@@ -12,8 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from gsmap.structures import BEVGrid
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import atomic_write
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
@@ -109,9 +109,8 @@ def _draw_header(figure: Figure, title: str, style: MapStyle) -> None:
     if len(title) > _LONGEST_TITLE:
         title = title[: _LONGEST_TITLE - 1] + "\N{HORIZONTAL ELLIPSIS}"
     figure.text(margin, middle, title, fontsize=9, color=style.ink, va="center")
-    line = {"linewidth": 2.6, "solid_capstyle": "round"}
     handles = [
-        Line2D([], [], color=style.colour(i), label=style.title(i), **line)
+        Line2D([], [], color=style.colour(i), lw=2.6, solid_capstyle="round", label=style.title(i))
         for i in range(len(style.classes))
     ]
     figure.legend(

@@ -1,6 +1,5 @@
 """Draws samples while a model is validated or tested."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,11 +73,7 @@ class MapVisualizationHook(Hook):
         return runner.visualizer
 
     def after_val_iter(
-        self,
-        runner: Runner,
-        batch_idx: int,
-        data_batch: Any = None,
-        outputs: Sequence | None = None,
+        self, runner: Runner, batch_idx: int, data_batch: Any = None, outputs: Any = None
     ) -> None:
         """Draw the first sample of a few evenly spaced batches to the backends."""
         if not self.draw or not outputs or runner.rank != 0:
@@ -101,11 +96,7 @@ class MapVisualizationHook(Hook):
         self._seen = self._drawn = 0
 
     def after_test_iter(
-        self,
-        runner: Runner,
-        batch_idx: int,
-        data_batch: Any = None,
-        outputs: Sequence | None = None,
+        self, runner: Runner, batch_idx: int, data_batch: Any = None, outputs: Any = None
     ) -> None:
         """Write the pictures of a batch to ``test_out_dir``."""
         if not self.draw or self.test_out_dir is None:

@@ -19,8 +19,8 @@ from gsmap.datasets.elements import (
 )
 from gsmap.datasets.transforms.images import read_image
 from gsmap.ops.gaussian_raster import render_gaussians
-from gsmap.structures import BEVGrid
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
 from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure
@@ -49,14 +49,9 @@ def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
 
 
 def ground_truth_elements(data_sample: Any) -> MapElements | None:
-    """Read a sample's ground truth: full-resolution polylines, or else the training targets.
+    """Read a ``Det3DDataSample``'s ground truth, at full resolution, or else its training targets.
 
-    Args:
-        data_sample: A ``Det3DDataSample`` with ``eval_ann_info`` among its meta data, or
-            ``gt_instances_3d``.
-
-    Returns:
-        The elements, or None if no ground truth is known.
+    It is None if neither ``eval_ann_info`` nor ``gt_instances_3d`` is known.
     """
     info = data_sample.metainfo.get("eval_ann_info")
     if info is not None:
@@ -68,15 +63,10 @@ def ground_truth_elements(data_sample: Any) -> MapElements | None:
 def predicted_elements(
     data_sample: Any, score_thr: float = 0.0, max_num: int | None = None
 ) -> MapElements | None:
-    """Read the predictions of a sample, the most confident last so that they are drawn on top.
+    """Read a ``Det3DDataSample``'s predictions, the most confident last, to be drawn on top.
 
-    Args:
-        data_sample: A ``Det3DDataSample`` with ``pred_instances_3d``.
-        score_thr: Smallest score that is kept.
-        max_num: Largest number of elements kept, by score; None keeps all.
-
-    Returns:
-        The elements, or None if the sample has no predictions.
+    At most ``max_num`` with a score of ``score_thr`` are kept; it is None if there are no
+    ``pred_instances_3d``.
     """
     instances = getattr(data_sample, "pred_instances_3d", ())
     if "pts" not in instances:
@@ -155,7 +145,8 @@ class MapVisualizer(Visualizer):
         """Extent of the map and size of its rendered masks."""
         meta = self.dataset_meta or {}
         x_range, y_range = meta.get("x_range", (-15.0, 15.0)), meta.get("y_range", (-30.0, 30.0))
-        return BEVGrid(x_range, y_range, *self.raster_size)
+        height, width = self.raster_size
+        return BEVGrid(x_range, y_range, height, width)
 
     @property
     def style(self) -> MapStyle:
@@ -203,7 +194,8 @@ class MapVisualizer(Visualizer):
         names = metainfo.get("cam_names") or [f"camera {i}" for i in range(len(projections))]
         if images is None:
             if metainfo.get("img_aug_matrix") is not None:
-                projections = np.linalg.inv(metainfo["img_aug_matrix"]) @ projections
+                unscaled = np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64))
+                projections = unscaled @ projections
             where = f"sample {metainfo.get('token')!r}"
             return [
                 CameraView(name, read_image(path, where)[..., ::-1], projection)
