@@ -86,4 +86,4 @@ def test_no_two_rooms_import_each_other():
 
 def test_the_reader_of_imports_sees_what_a_file_imports():
     assert {"torch", "numpy"} <= imported(ROOTS["gsmap"] / "structures/grid.py")
-    assert "structures" in imported(ROOTS["gsmap"] / "structures/__init__.py")
+    assert "structures" in imported(ROOTS["gsmap"] / "structures/gaussians.py")

@@ -12,7 +12,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.evaluator import MapEvaluator, SampleMatches
 from gsmap.evaluation.report import MetricReport
-from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, read_samples
+from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, read_samples
 from gsmap.structures.elements import MapElements
 from gsmap.utils.parallel import ordered_map
 
@@ -50,7 +50,7 @@ def read_ground_truth(
         raise ValueError(f"{path} has the classes {names}, not {missing}.")
     labels = np.array([classes.index(name) if name in classes else -1 for name in names])
     samples: dict[str, MapElements] = {}
-    ignored: Counter[str] = Counter()
+    ignored = Counter({THREE_D: len(file) * (file.meta.dim == 3)})
     for sample in file:
         if sample.instances is None:
             raise ValueError(
@@ -109,8 +109,8 @@ def evaluate_files(
     results, other_results = read_samples(results_path, RESULTS_KEY, evaluator.classes)
     truth, other_truth = read_ground_truth(truth_path, evaluator.classes)
     notes = _mismatches(results, truth, allow_mismatch)
-    in_space = any(e.points.shape[1] == 3 for side in (results, truth) for e in side.values())
-    if in_space and not (evaluator.chamfer and evaluator.chamfer.dim == 3):
+    with_height = other_results.pop(THREE_D, 0) + other_truth.pop(THREE_D, 0)
+    if with_height and not (evaluator.chamfer and evaluator.chamfer.dim == 3):
         notes.append("some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)")
     degenerate = sum(int((elements.num_points < 2).sum()) for elements in truth.values())
     if degenerate:

@@ -14,6 +14,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.utils.files import atomic_write
 
 RESULTS_KEY, GROUND_TRUTH_KEY = "results", "GTs"
+THREE_D = "3D"
 
 
 def _elements(
@@ -67,7 +68,8 @@ def read_samples(
         classes: Names of the classes; elements of others get the label -1, which no metric counts.
 
     Returns:
-        The elements of each sample, by token; how many elements are of which other class.
+        The elements of each sample, by token; how many elements are of which other class, and how
+        many samples have points with heights (``THREE_D``).
 
     Raises:
         ValueError: If it has no list under the key, a sample is malformed or has no token, or a
@@ -88,6 +90,8 @@ def read_samples(
         if (elements.labels < 0).any():
             names = (vector["cls_name"] for vector in item["vectors"])
             ignored.update(name for name in names if name not in classes)
+        if any(len(point) == 3 for vector in item["vectors"] for point in vector["pts"][:1]):
+            ignored[THREE_D] += 1
         return str(item["sample_token"]), elements
 
     try:
@@ -102,7 +106,7 @@ def read_samples(
     samples: dict[str, MapElements] = {}
     for item in items:
         if not isinstance(item, tuple):
-            raise ValueError(f"{path}: no sample_token or no vectors in {item!r:.80}.")
+            raise ValueError(f"{path}: {item!r:.80} has no sample_token or no vectors.")
         token, elements = item
         if token in samples:
             raise ValueError(f"{path} holds sample {token!r} more than once.")
