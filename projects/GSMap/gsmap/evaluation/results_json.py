@@ -18,10 +18,16 @@ THREE_D = "3D"
 
 
 def _elements(
-    vectors: Sequence[Mapping[str, Any]], classes: Sequence[str], scored: bool
+    vectors: Sequence[Mapping[str, Any]],
+    classes: Sequence[str],
+    scored: bool,
+    ignored: Counter[str],
 ) -> MapElements:
-    """Convert the vectors of one sample; those of other classes get the label -1."""
+    """Convert the vectors of one sample and count what is ignored; other classes get label -1."""
     label_of = {name: label for label, name in enumerate(classes)}
+    ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in label_of)
+    if any(len(point) == 3 for v in vectors for point in v["pts"][:1]):
+        ignored[THREE_D] += 1
     return MapElements.from_polylines(
         [v["pts"] for v in vectors],
         [label_of.get(v["cls_name"], -1) for v in vectors],
@@ -81,17 +87,12 @@ def read_samples(
         if "sample_token" not in item or "vectors" not in item:
             return item
         try:
-            elements = _elements(item["vectors"], classes, key == RESULTS_KEY)
+            elements = _elements(item["vectors"], classes, key == RESULTS_KEY, ignored)
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{path}, sample {item['sample_token']!r}: {error!r}; each vector needs pts, "
                 "cls_name and, in results, confidence_level."
             ) from error
-        if (elements.labels < 0).any():
-            names = (vector["cls_name"] for vector in item["vectors"])
-            ignored.update(name for name in names if name not in classes)
-        if any(len(point) == 3 for vector in item["vectors"] for point in vector["pts"][:1]):
-            ignored[THREE_D] += 1
         return str(item["sample_token"]), elements
 
     try:
