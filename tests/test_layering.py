@@ -25,6 +25,7 @@ ALLOWED = {
     "converters": {"datasets", "structures", "utils", "minicity"},
     "evaluation": {"datasets", "ops", "structures", "utils"},
     "visualization": {"datasets", "ops", "structures", "utils"},
+    "report": {"datasets", "evaluation", "structures", "utils", "visualization"},
     "engine": {"checkpoints", "utils"},
     "apis": {
         "checkpoints",

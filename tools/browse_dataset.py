@@ -2,6 +2,7 @@
 """Draw what a data set hands to training: images after augmentation, with their ground truth.
 
 Example: ``python tools/browse_dataset.py CONFIG --split train --num 20 --show-dir pictures``.
+``--web dataset.html`` writes one page to click through instead, with the image files as they are.
 """
 
 import argparse
@@ -12,6 +13,7 @@ from mmengine.utils import track_iter_progress
 
 from gsmap.apis.map_inferencer import spread_evenly
 from gsmap.engine.launch import add_config_options, read_config
+from gsmap.report.page import ReportOptions, report_data, write_page
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.visualization.figure import FORMATS, picture_name, save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
@@ -30,6 +32,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--original", action="store_true", help="draw the image files, not the inputs"
     )
+    parser.add_argument("--web", type=Path, metavar="PAGE", help="write an HTML page instead")
     add_config_options(parser)
     return parser.parse_args()
 
@@ -38,6 +41,9 @@ def main() -> str:
     args = parse_args()
     cfg = read_config(args.config, args.cfg_options)
     dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
+    if args.web:
+        options = ReportOptions(Path(dataset.data_root), args.num)
+        return write_page(args.web, report_data(dataset.ann_file, {}, options))
     visualizer = MapVisualizer("browse", show_order=args.order)
     visualizer.dataset_meta = dataset.metainfo
     indices = spread_evenly(len(dataset), args.num)

@@ -122,6 +122,16 @@ def test_the_data_set_and_what_a_model_finds_are_drawn(config, trained, minicity
     assert len(list(browsed.glob("*.png"))) == 1
 
 
+def test_a_data_set_is_browsed_as_a_page(config, tmp_path):
+    page = tmp_path / "page.html"
+    done = run(
+        sys.executable, "tools/browse_dataset.py", config, "--num", "1", "--split", "val",
+        "--web", page,
+    )  # fmt: skip
+    assert done.splitlines()[-1].startswith("1 frames, ")
+    assert "<title>minicity val: ground truth</title>" in page.read_text()
+
+
 WITHOUT_CHANCE = """
 _base_ = '{config}'
 model = dict(

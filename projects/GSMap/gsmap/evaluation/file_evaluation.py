@@ -62,8 +62,17 @@ def read_ground_truth(
     return samples, ignored
 
 
-def _mismatches(results: Samples, truth: Samples, allowed: bool) -> list[str]:
-    """Say which tokens have no results or no ground truth, or raise an error that does."""
+def mismatch_notes(results: Samples, truth: Samples, allowed: bool) -> list[str]:
+    """Say which samples have no results or no ground truth, or raise an error that does.
+
+    Args:
+        results: Predictions by token.
+        truth: Ground truth by token.
+        allowed: As ``allow_mismatch`` of ``evaluate_files``.
+
+    Raises:
+        ValueError: If the tokens differ and that is not allowed.
+    """
     silent, extra = ([t for t in a if t not in b] for a, b in ((truth, results), (results, truth)))
     notes = []
     if silent:
@@ -108,7 +117,7 @@ def evaluate_files(
     """
     results, other_results = read_samples(results_path, RESULTS_KEY, evaluator.classes)
     truth, other_truth = read_ground_truth(truth_path, evaluator.classes)
-    notes = _mismatches(results, truth, allow_mismatch)
+    notes = mismatch_notes(results, truth, allow_mismatch)
     with_height = other_results.pop(THREE_D, 0) + other_truth.pop(THREE_D, 0)
     if with_height and not (evaluator.chamfer and evaluator.chamfer.dim == 3):
         notes.append("some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)")

@@ -21,6 +21,7 @@ def _elements(
     vectors: Sequence[Mapping[str, Any]],
     classes: Sequence[str],
     scored: bool,
+    gaussians: bool,
     ignored: Counter[str],
 ) -> MapElements:
     """Convert the vectors of one sample and count what is ignored; other classes get label -1."""
@@ -28,10 +29,16 @@ def _elements(
     ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in label_of)
     if any(len(point) == 3 for v in vectors for point in v["pts"][:1]):
         ignored[THREE_D] += 1
+    extra = {
+        name: [v[f"gaussian_{name}"] for v in vectors]
+        for name in ("scales", "rotations")
+        if gaussians and vectors and all(f"gaussian_{name}" in v for v in vectors)
+    }
     return MapElements.from_polylines(
         [v["pts"] for v in vectors],
         [label_of.get(v["cls_name"], -1) for v in vectors],
         [v["confidence_level"] for v in vectors] if scored else None,
+        **extra,
     )
 
 
@@ -62,7 +69,7 @@ def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, 
 
 
 def read_samples(
-    path: str | Path, key: str, classes: Sequence[str]
+    path: str | Path, key: str, classes: Sequence[str], gaussians: bool = False
 ) -> tuple[dict[str, MapElements], Counter[str]]:
     """Read a result or ground-truth file.
 
@@ -72,6 +79,7 @@ def read_samples(
         path: The file.
         key: ``results`` or ``GTs``.
         classes: Names of the classes; elements of others get the label -1, which no metric counts.
+        gaussians: Whether to read the Gaussians of results where all elements have them.
 
     Returns:
         The elements of each sample, by token; how many elements are of which other class, and how
@@ -87,7 +95,7 @@ def read_samples(
         if "sample_token" not in item or "vectors" not in item:
             return item
         try:
-            elements = _elements(item["vectors"], classes, key == RESULTS_KEY, ignored)
+            elements = _elements(item["vectors"], classes, key == RESULTS_KEY, gaussians, ignored)
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{path}, sample {item['sample_token']!r}: {error!r}; each vector needs pts, "

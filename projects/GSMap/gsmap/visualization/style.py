@@ -16,6 +16,13 @@ CLASS_TITLES = {
     "boundary": "road boundary",
     "centerline": "centre line",
 }
+# Where predictions are coloured by what they match instead of by class.
+MATCH_COLOURS = {
+    "hit": "#00A39A",
+    "false": "#FF3B30",
+    "found": "#8E8E93",
+    "missed": "#AF52DE",
+}
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""A page about results, in one HTML file: figures, curves, and every frame to look at."""

@@ -1,0 +1,86 @@
+"""A result file scored for the page, with the matches of each sample."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsmap.datasets.annotations.record import AnnotationMeta
+from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.evaluator import MapEvaluator
+from gsmap.evaluation.file_evaluation import mismatch_notes
+from gsmap.evaluation.matches import FrameMatches
+from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.report import MetricReport
+from gsmap.evaluation.results_json import RESULTS_KEY, THREE_D, read_samples
+from gsmap.structures.elements import IntArray, MapElements
+from gsmap.structures.grid import BEVGrid
+
+MATCH_M = 1.0
+"""Chamfer distance in metres within which the page calls a prediction a hit."""
+_COLUMN = CHAMFER_THRESHOLDS.index(MATCH_M)
+
+
+@dataclass(frozen=True)
+class ScoredResult:
+    """One result file.
+
+    Args:
+        name: What the page calls it.
+        predictions: Elements of each sample, by token.
+        matches: Their matches by Chamfer distance, by token.
+        reports: One report per metric.
+        notes: What the reader should know of the samples.
+    """
+
+    name: str
+    predictions: Mapping[str, MapElements]
+    matches: Mapping[str, FrameMatches]
+    reports: list[MetricReport]
+    notes: list[str]
+
+    def hits(self, token: str) -> IntArray:
+        """Return the ground truth that each counted prediction hits within 1 m, or -1. (N,)"""
+        return self.matches[token].matched_gt[:, _COLUMN]
+
+    def f1(self, token: str, score_thr: float) -> float:
+        """Return F1 of a sample's predictions of at least ``score_thr``; 1 if there is nothing."""
+        matches = self.matches[token]
+        kept = matches.scores >= score_thr
+        total = int(kept.sum()) + int(matches.num_gts.sum())
+        return 2 * int((self.hits(token)[kept] >= 0).sum()) / total if total else 1.0
+
+
+def score_result(
+    name: str,
+    path: str | Path,
+    truth: Mapping[str, MapElements],
+    meta: AnnotationMeta,
+    allow_mismatch: bool = False,
+) -> ScoredResult:
+    """Score a result file with the rules of ``tools/evaluate.py``.
+
+    Args:
+        name: What the page calls it.
+        path: Results in MapTR's JSON form, with or without Gaussians.
+        truth: Ground truth of each sample, by token.
+        meta: Classes and range.
+        allow_mismatch: As in ``mismatch_notes``.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If it is malformed, or its samples are not those of the ground truth.
+    """
+    predictions, others = read_samples(path, RESULTS_KEY, meta.classes, gaussians=True)
+    try:
+        notes = mismatch_notes(predictions, truth, allow_mismatch)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if others.pop(THREE_D, 0):
+        notes.append("some predictions have heights, which no figure here counts")
+    notes += [f"{n} predictions of class {c!r} are not scored" for c, n in sorted(others.items())]
+    grid = BEVGrid(meta.x_range, meta.y_range)
+    evaluator = MapEvaluator(ChamferConfig(meta.classes), RasterConfig(meta.classes, grid))
+    nothing = MapElements.from_polylines()
+    found = [evaluator.match(t, predictions.get(t, nothing), gt) for t, gt in truth.items()]
+    matches = {sample["chamfer"].token: sample["chamfer"] for sample in found}
+    return ScoredResult(name, predictions, matches, evaluator.reports(found), notes)

@@ -1,0 +1,58 @@
+#!/usr/bin/env python
+"""Write a page about a result file: figures, curves and frames in one HTML file.
+
+Examples:
+    python tools/report.py results.json --ann gsmap_nuscenes_val.arrow --out report.html
+    python tools/report.py gsmap.json --compare maptr.json --names GSMap MapTR --ann val.arrow
+"""
+
+import argparse
+from pathlib import Path
+
+from gsmap.report.page import ReportOptions, report_data, write_page
+from gsmap.utils.cli import CommandParser, run_command
+
+
+def parse_args() -> argparse.Namespace:
+    parser = CommandParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("results", type=Path, help="results in MapTR's JSON form")
+    parser.add_argument("--ann", type=Path, required=True, help="annotation file (*.arrow)")
+    parser.add_argument("--out", type=Path, default=Path("report.html"), help="page to write")
+    parser.add_argument("--compare", type=Path, metavar="RESULTS", help="other results beside them")
+    parser.add_argument("--names", nargs="+", help="a name for each result file")
+    parser.add_argument(
+        "--data-root", type=Path, help="where image paths start from; default: folder of --ann"
+    )
+    parser.add_argument("--max-frames", type=int, default=200, help="largest number of frames")
+    parser.add_argument("--score-thr", type=float, default=0.4, help="where the slider starts")
+    parser.add_argument("--image-width", type=int, default=240, help="of thumbnails, in pixels")
+    parser.add_argument("--no-images", action="store_true", help="leave the camera images out")
+    parser.add_argument(
+        "--allow-mismatch",
+        action="store_true",
+        help="samples without results count as empty, results without ground truth are left out",
+    )
+    return parser.parse_args()
+
+
+def main() -> str:
+    args = parse_args()
+    paths = [args.results, *([args.compare] if args.compare else [])]
+    names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
+    if len(names) != len(paths) or len(set(names)) != len(names):
+        raise ValueError(f"--names must give {len(paths)} different names, got {names}.")
+    options = ReportOptions(
+        args.data_root,
+        args.max_frames,
+        args.score_thr,
+        0 if args.no_images else args.image_width,
+        args.allow_mismatch,
+    )
+    data = report_data(args.ann, dict(zip(names, paths, strict=True)), options)
+    return write_page(args.out, data)
+
+
+if __name__ == "__main__":
+    run_command(main)
