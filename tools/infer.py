@@ -1,8 +1,8 @@
 #!/usr/bin/env python
 """Run a trained model on samples without ground truth, and draw what it finds.
 
-Example: ``python tools/infer.py CONFIG CHECKPOINT --sample FOLDER --out map.json --show-dir
-pictures``. ``--sample`` takes an annotation file (.arrow), an info file of mmdet3d (.pkl), or a
+Example: ``python tools/infer.py gsmap_r18_minicity --sample FOLDER --out map.json --show-dir
+pictures``, or ``CONFIG CHECKPOINT`` in place of the name. ``--sample`` takes an annotation file (.arrow), an info file of mmdet3d (.pkl), or a
 folder with one.
 """
 
@@ -11,14 +11,15 @@ from pathlib import Path
 
 from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.engine.launch import add_config_options
+from gsmap.engine.named_models import checkpoint_for
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.visualization.figure import FORMATS, picture_name, save_figure
 
 
 def parse_args() -> argparse.Namespace:
     parser = CommandParser(description=__doc__)
-    parser.add_argument("config", help="config file of the model")
-    parser.add_argument("checkpoint", help="its checkpoint")
+    parser.add_argument("config", help="config file of the model, or the name of one that ships")
+    parser.add_argument("checkpoint", nargs="?", help="its checkpoint; not needed with a name")
     parser.add_argument(
         "--sample", type=Path, required=True, help="annotation file, info file or folder"
     )
@@ -47,7 +48,8 @@ def main() -> None:
     args = parse_args()
     if not args.out and not args.show_dir:
         raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
-    inferencer = MapInferencer(args.config, args.checkpoint, args.device, args.cfg_options)
+    checkpoint = checkpoint_for(args.config, args.checkpoint)
+    inferencer = MapInferencer(args.config, checkpoint, args.device, args.cfg_options)
     visualizer = inferencer.visualizer
     visualizer.show_order = args.order
     visualizer.ground_z_m = args.ground_z if args.ground_z is not None else visualizer.ground_z_m

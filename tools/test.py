@@ -1,5 +1,8 @@
 #!/usr/bin/env python
-"""Test a model: ``python tools/test.py CONFIG CHECKPOINT --eval chamfer raster``."""
+"""Test a model: ``python tools/test.py CONFIG CHECKPOINT --eval chamfer raster``.
+
+The name of a model that ships stands for both: ``python tools/test.py gsmap_r18_minicity``.
+"""
 
 import argparse
 import json
@@ -9,14 +12,17 @@ from mmengine.config import Config
 from mmengine.runner import Runner
 
 from gsmap.engine.launch import add_common_arguments, load_config
+from gsmap.engine.named_models import checkpoint_for
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 
 
 def parse_args() -> argparse.Namespace:
     parser = CommandParser(description=__doc__)
-    parser.add_argument("config", help="config file")
-    parser.add_argument("checkpoint", help="checkpoint file, ours or in the format of MapTR")
+    parser.add_argument("config", help="config file, or the name of a model that ships")
+    parser.add_argument(
+        "checkpoint", nargs="?", help="checkpoint, ours or MapTR's; not needed with a name"
+    )
     parser.add_argument(
         "--eval",
         nargs="*",
@@ -42,7 +48,7 @@ def parse_args() -> argparse.Namespace:
 
 def apply_options(cfg: Config, args: argparse.Namespace) -> None:
     """Put the tool's own options into the config."""
-    cfg.load_from = args.checkpoint
+    cfg.load_from = str(checkpoint_for(args.config, args.checkpoint))
     cfg.resume = False
     cfg.test_evaluator = {
         "type": "MapMetric",
@@ -63,8 +69,6 @@ def apply_options(cfg: Config, args: argparse.Namespace) -> None:
 
 def main() -> None:
     args = parse_args()
-    if not Path(args.checkpoint).is_file():
-        raise FileNotFoundError(f"There is no checkpoint {args.checkpoint}.")
     if not args.eval and not args.out:
         raise ValueError("Nothing to do: name a metric after --eval, or a file after --out.")
     cfg = load_config(args)

@@ -23,7 +23,7 @@ def test_options_override_and_the_work_folder_takes_the_config_name(tmp_path):
 
 
 def test_a_missing_config_is_named():
-    with pytest.raises(FileNotFoundError, match=r"no config file nowhere\.py"):
+    with pytest.raises(FileNotFoundError, match=r"no config file nowhere\.py, and no model"):
         load_config(parse("nowhere.py"))
 
 

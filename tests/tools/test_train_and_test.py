@@ -167,4 +167,7 @@ def test_a_missing_checkpoint_is_named(config):
         cwd=REPO, env=environment(), text=True, capture_output=True, check=False,
     )  # fmt: skip
     assert done.returncode == 2
-    assert done.stderr == "error: There is no checkpoint nowhere.pth.\n"
+    assert done.stderr == (
+        "error: There is no checkpoint nowhere.pth, and no model of that name (gsmap_r18_minicity, "
+        "maptr_r18_minicity ship).\n"
+    )

@@ -7,6 +7,7 @@ from pathlib import Path
 from torch import Tensor, nn
 
 from gsmap.checkpoints.convert import read_state
+from gsmap.engine.named_models import find_checkpoint
 
 _SHOWN = 5
 
@@ -15,7 +16,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     """Read the weights of a checkpoint without running code from it.
 
     Args:
-        path: File that training wrote, or a bare state dict.
+        path: File that training wrote, a bare state dict, or the name of a model.
 
     Returns:
         The state dict.
@@ -24,11 +25,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
         FileNotFoundError: If there is no such file.
         ValueError: If it cannot be read, or holds no weights.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"There is no checkpoint {path}; tools/train.py writes them into its work folder."
-        )
+    path = find_checkpoint(path)
     try:
         return read_state(path)
     except pickle.UnpicklingError as error:
@@ -49,7 +46,7 @@ def load_weights(model: nn.Module, path: str | Path) -> None:
 
     Args:
         model: The model; its weights are replaced.
-        path: The checkpoint.
+        path: The checkpoint, or the name of a model.
 
     Raises:
         FileNotFoundError: If there is no such file.

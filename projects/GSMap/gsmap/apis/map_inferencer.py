@@ -22,6 +22,7 @@ from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.transforms.points import read_points
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.launch import read_config
+from gsmap.engine.named_models import named_models
 from gsmap.evaluation.map_metric import MapMetric
 from gsmap.visualization.map_visualizer import MapVisualizer
 
@@ -101,8 +102,10 @@ class MapInferencer:
     """Runs a trained model on samples, through the pipeline that the config tests with.
 
     Args:
-        config: Config file of the model, or a ``Config``.
-        checkpoint: Its checkpoint; None keeps the initial weights (for trying out a pipeline).
+        config: Config file of the model, a ``Config``, or the name of a model
+            (``engine/named_models.py``), such as ``gsmap_r18_minicity``.
+        checkpoint: Its checkpoint, or such a name. None means the named model's, and without a name
+            the initial weights (for trying out a pipeline).
         device: Where to run; a GPU if there is one.
         cfg_options: Overrides of the config, by dotted name.
 
@@ -114,12 +117,13 @@ class MapInferencer:
     def __init__(
         self,
         config: str | Path | Config,
-        checkpoint: str | Path | None,
+        checkpoint: str | Path | None = None,
         device: str | torch.device | None = None,
         cfg_options: dict | None = None,
     ):
         self.cfg = read_config(config, cfg_options)
         self.model = MODELS.build(self.cfg.model)
+        checkpoint = checkpoint or (str(config) if str(config) in named_models() else None)
         if checkpoint is not None:
             load_weights(self.model, checkpoint)
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))

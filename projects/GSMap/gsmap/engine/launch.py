@@ -10,6 +10,8 @@ from mmengine.config import Config, DictAction
 from mmengine.registry import init_default_scope
 from mmengine.utils import import_modules_from_strings
 
+from gsmap.engine.named_models import find_config
+
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 KNOWN_KEYS = frozenset(
     [
@@ -77,20 +79,17 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     What it registers is imported, and its scope is made the default one.
 
     Args:
-        config: A config file, or a ``Config``, which is left as it is.
+        config: A config file, the name of a model (`named_models`), or a ``Config``, which is left
+            as it is.
         cfg_options: Overrides, by dotted name.
 
     Raises:
-        FileNotFoundError: If there is no such file.
+        FileNotFoundError: If there is no such file or model.
     """
     if isinstance(config, Config):
         cfg = Config(config.to_dict())
     else:
-        if not Path(config).is_file():
-            raise FileNotFoundError(
-                f"There is no config file {config}; those of GSMap are in projects/GSMap/configs."
-            )
-        cfg = Config.fromfile(config)
+        cfg = Config.fromfile(find_config(config))
     cfg.merge_from_dict(cfg_options or {})
     import_modules_from_strings(**cfg.get("custom_imports", {"imports": ["gsmap.registered"]}))
     init_default_scope(cfg.get("default_scope", "mmdet3d"))

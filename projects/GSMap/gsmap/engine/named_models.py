@@ -1,0 +1,119 @@
+"""Trained models by name: those that ship in ``models/``, and the official ones of other systems.
+
+``models/registry.json`` lists them; a model's weights are ``models/NAME.pth``. The official ones do
+not ship: saved there under their name, they load like the others.
+"""
+
+import difflib
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+REPO = Path(__file__).resolve().parents[4]
+REGISTRY = REPO / "models/registry.json"
+
+
+@dataclass(frozen=True)
+class NamedModel:
+    """A trained model of the registry.
+
+    Attributes:
+        name: Its name.
+        config: Our config, relative to the repository.
+        sha256: Digest of the weights' file; None where it is not known.
+        source: Who trained it.
+        licence: Licence of the weights.
+        address: Where its file is fetched; None for those that ship.
+        figures: Published results on its validation split in percent, by our metrics' names.
+    """
+
+    name: str
+    config: str
+    sha256: str | None
+    source: str
+    licence: str
+    address: str | None
+    figures: dict[str, float]
+
+    @property
+    def file(self) -> Path:
+        """File of its weights."""
+        return REGISTRY.with_name(f"{self.name}.pth")
+
+
+@cache
+def named_models() -> dict[str, NamedModel]:
+    """Return the registry by name."""
+    return {row["name"]: NamedModel(**row) for row in json.loads(REGISTRY.read_text())}
+
+
+def find_config(config: str | Path) -> Path:
+    """Return a config's file.
+
+    Args:
+        config: The file, or the name of a model.
+
+    Raises:
+        FileNotFoundError: If it is neither; the message has the nearest name.
+    """
+    if Path(config).is_file():
+        return Path(config)
+    model = named_models().get(str(config))
+    if model is None:
+        raise FileNotFoundError(
+            f"There is no config file {config}, and no model of that name{_hint(config)}; configs "
+            "are in configs/ and projects/GSMap/configs/."
+        )
+    return REPO / model.config
+
+
+def find_checkpoint(checkpoint: str | Path) -> Path:
+    """Return a checkpoint's file, checked against its digest if it was asked for by name.
+
+    Args:
+        checkpoint: The file, or the name of a model.
+
+    Raises:
+        FileNotFoundError: If it is neither, or the named model's file is not there.
+        ValueError: If the named model's file is not the registry's.
+    """
+    if Path(checkpoint).is_file():
+        return Path(checkpoint)
+    model = named_models().get(str(checkpoint))
+    if model is None:
+        raise FileNotFoundError(
+            f"There is no checkpoint {checkpoint}, and no model of that name{_hint(checkpoint)}."
+        )
+    if not model.file.is_file():
+        remedy = f"fetch it from {model.address}" if model.address else "check it out again"
+        raise FileNotFoundError(
+            f"There is no {model.file}, the weights of {model.name}: {remedy} and save it there."
+        )
+    if model.sha256 and hashlib.sha256(model.file.read_bytes()).hexdigest() != model.sha256:
+        raise ValueError(
+            f"{model.file} is damaged or another file: its sha256 is not that of {model.name} in "
+            f"{REGISTRY.name}; fetch it again, or give another file by its path."
+        )
+    return model.file
+
+
+def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
+    """Return the checkpoint that a command tests: the one given, or that of a named model.
+
+    Raises:
+        FileNotFoundError: If it does not exist (see `find_checkpoint`).
+        ValueError: If none is given with a config file.
+    """
+    if checkpoint is None and Path(config).is_file():
+        raise ValueError(f"give a checkpoint after {config}: only a model's name stands for both.")
+    return find_checkpoint(config if checkpoint is None else checkpoint)
+
+
+def _hint(name: str | Path) -> str:
+    """Name the nearest model, or all that ship."""
+    close = difflib.get_close_matches(Path(name).stem, named_models(), n=1, cutoff=0.7)
+    if close:
+        return f" (did you mean {close[0]}?)"
+    return f" ({', '.join(name for name, m in named_models().items() if not m.address)} ship)"
