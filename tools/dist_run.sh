@@ -6,7 +6,7 @@ processes=$1
 shift
 python=python
 [ -x "$(dirname "$0")/../.venv/bin/python" ] && python="$(dirname "$0")/../.venv/bin/python"
-exec "${PYTHON:-$python}" -m torch.distributed.run \
+exec "${PYTHON:-$python}" -m gsmap.engine.torchrun \
     --nnodes="${NNODES:-1}" --node_rank="${NODE_RANK:-0}" \
     --master_addr="${MASTER_ADDR:-127.0.0.1}" --master_port="${PORT:-29500}" \
     --nproc_per_node="$processes" "$@"

@@ -11,9 +11,10 @@ from pathlib import Path
 from mmengine.config import Config
 from mmengine.runner import Runner
 
+from gsmap.apis.checkpoint import adopt_settings
 from gsmap.engine.launch import add_common_arguments, load_config
 from gsmap.engine.named_models import checkpoint_for
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, is_first_rank, run_command
 from gsmap.utils.files import write_text
 
 
@@ -48,7 +49,6 @@ def parse_args() -> argparse.Namespace:
 
 def apply_options(cfg: Config, args: argparse.Namespace) -> None:
     """Put the tool's own options into the config."""
-    cfg.load_from = str(checkpoint_for(args.config, args.checkpoint))
     cfg.resume = False
     cfg.test_evaluator = {
         "type": "MapMetric",
@@ -71,8 +71,13 @@ def main() -> None:
     args = parse_args()
     if not args.eval and not args.out:
         raise ValueError("Nothing to do: name a metric after --eval, or a file after --out.")
+    checkpoint = checkpoint_for(args.config, args.checkpoint)
     cfg = load_config(args)
+    notes = adopt_settings(cfg, checkpoint, args.cfg_options)
+    cfg.load_from = str(checkpoint)
     apply_options(cfg, args)
+    if notes and is_first_rank():
+        print("\n".join(notes))
     runner = Runner.from_cfg(cfg)
     metrics = runner.test()
     if args.metrics_out and runner.rank == 0:

@@ -3,10 +3,13 @@
 
 import argparse
 
+from mmengine.config import Config
 from mmengine.runner import Runner
 
-from gsmap.engine.launch import add_common_arguments, load_config
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.apis.checkpoint import read_weights
+from gsmap.engine.launch import add_common_arguments, load_config, newest_checkpoint
+from gsmap.engine.named_models import find_checkpoint
+from gsmap.utils.cli import CommandParser, is_first_rank, run_command
 
 
 def parse_args() -> argparse.Namespace:
@@ -16,7 +19,7 @@ def parse_args() -> argparse.Namespace:
         "--resume",
         nargs="?",
         const="auto",
-        help="go on from the checkpoint given, or from the last one in the work folder",
+        help="go on from the checkpoint given, or from the newest whole one in the work folder",
     )
     parser.add_argument("--amp", action="store_true", help="train with automatic mixed precision")
     parser.add_argument(
@@ -26,6 +29,20 @@ def parse_args() -> argparse.Namespace:
     )
     add_common_arguments(parser)
     return parser.parse_args()
+
+
+def choose_start(cfg: Config, resume: str | None) -> None:
+    """Say what the run goes on from or starts from, and check that file."""
+    if resume == "auto":
+        newest = newest_checkpoint(cfg.work_dir)
+        if newest is None and is_first_rank():
+            print(f"{cfg.work_dir} holds no checkpoint: the run starts at its beginning.")
+        resume = newest
+    cfg.resume = resume is not None
+    cfg.load_from = resume or cfg.get("load_from")
+    if cfg.load_from and "://" not in str(cfg.load_from):
+        cfg.load_from = str(find_checkpoint(cfg.load_from))
+        read_weights(cfg.load_from)
 
 
 def main() -> None:
@@ -38,9 +55,7 @@ def main() -> None:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
             raise ValueError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
         cfg.auto_scale_lr.enable = True
-    if args.resume:
-        cfg.resume = True
-        cfg.load_from = None if args.resume == "auto" else args.resume
+    choose_start(cfg, args.resume)
     Runner.from_cfg(cfg).train()
 
 

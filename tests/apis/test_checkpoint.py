@@ -1,8 +1,12 @@
+import json
+
 import pytest
 import torch
+from mmengine.config import Config
 from torch import nn
 
-from gsmap.apis.checkpoint import load_weights, read_weights
+from gsmap.apis.checkpoint import adopt_settings, load_weights, read_weights
+from gsmap.checkpoints.settings import MODEL_SETTINGS, differences
 
 
 class Attack:
@@ -67,3 +71,37 @@ def test_missing_truncated_and_empty_files_are_named(tmp_path):
         read_weights(path)
     with pytest.raises(ValueError, match=r"holds no state dict"):
         read_weights(save(tmp_path / "meta.pth", {"meta": {}}))
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_weights_that_are_not_finite_are_refused(tmp_path, value):
+    state = {"good": torch.ones(2), "bad": torch.tensor([1.0, value]), "count": torch.tensor(3)}
+    with pytest.raises(ValueError, match=r"failed.pth holds NaN or infinite weights \(bad\)"):
+        read_weights(save(tmp_path / "failed.pth", {"state_dict": state}))
+
+
+def test_a_model_is_tested_with_the_settings_of_its_checkpoint(tmp_path):
+    settings = {"head": {"floor_m": 0.15, "layers": [{"width": 2}, {"width": 3}]}, "same": [1, 2]}
+    path = save(
+        tmp_path / "a.pth",
+        {"state_dict": {"w": torch.ones(1)}, "meta": {MODEL_SETTINGS: json.dumps(settings)}},
+    )
+    config = {"head": {"floor_m": 0.234, "layers": [{"width": 2}]}, "same": (1, 2)}
+    cfg = Config({"model": config})
+    assert adopt_settings(cfg, path, {"data.size": 3}) == [
+        f"model.head.floor_m: 0.15, as {path} was trained; the config has 0.234",
+        f"model.head.layers.1: {{'width': 3}}, as {path} was trained; the config has None",
+    ]
+    assert cfg.model.to_dict() == settings
+    cfg = Config({"model": {**settings, "head": {**settings["head"], "floor_m": 0.5}}})
+    assert adopt_settings(cfg, path, {"model.head.floor_m": 0.5}) == [
+        f"model.head.floor_m: 0.5, as asked for; {path} was trained with 0.15"
+    ]
+    assert cfg.model.head.floor_m == 0.5
+    assert adopt_settings(cfg, save(path, {"w": torch.ones(1)}), None) == []
+
+
+def test_differences_of_other_kinds_are_named_whole():
+    assert differences({"a": [1]}, {"a": {"b": 1}}) == {"a": ([1], {"b": 1})}
+    assert differences({"a": None}, {"a": {"b": 1}}) == {"a": (None, {"b": 1})}
+    assert differences([1, 2], [1, 2, 3], "x") == {"x.2": (None, 3)}

@@ -18,7 +18,7 @@ from torch import nn
 from gsmap.checkpoints.convert import (
     convert_state,
     ours_from_upstream,
-    read_state,
+    read_checkpoint,
     upstream_from_ours,
 )
 from gsmap.checkpoints.key_map import KEY_MAPS, MAPTR, MAPTR_BEVFORMER, find_key_map
@@ -146,7 +146,7 @@ def test_a_file_of_something_else_is_refused(tmp_path):
     path = tmp_path / "other.pth"
     torch.save({"state_dict": {"epoch": 3}}, path)
     with pytest.raises(ValueError, match="holds no state dict of tensors"):
-        read_state(path)
+        read_checkpoint(path)
 
 
 def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch, capsys):
@@ -157,7 +157,7 @@ def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch,
     tool = str(REPO / "tools/convert_checkpoint.py")
     runpy.run_path(tool, run_name="__main__")
     assert "maptr: gsmap to upstream" in capsys.readouterr().out
-    upstream = read_state(target)
+    upstream, _ = read_checkpoint(target)
     assert all(torch.equal(upstream[MAPTR.to_upstream(key)], state[key]) for key in state)
     with pytest.raises(SystemExit) as left:
         runpy.run_path(tool, run_name="__main__")

@@ -1,3 +1,4 @@
+import json
 import os
 import pickle
 import signal
@@ -9,11 +10,17 @@ import time
 import numpy as np
 import pytest
 import torch
+from mmengine.evaluator import BaseMetric, Evaluator
 from mmengine.fileio import get_file_backend
 from mmengine.logging import MessageHub
+from mmengine.model import BaseModel
+from mmengine.runner import Runner
 from mmengine.runner.checkpoint import save_checkpoint
 
+import gsmap.registered  # noqa: F401
+from gsmap.checkpoints.convert import read_checkpoint
 from gsmap.checkpoints.safe_globals import mmengine_globals
+from gsmap.checkpoints.settings import MODEL_SETTINGS
 from gsmap.engine.checkpoint_hook import AtomicCheckpointHook, AtomicLocalBackend
 
 
@@ -125,3 +132,76 @@ def test_a_killed_writer_leaves_the_old_file_whole(tmp_path):
         writer.send_signal(signal.SIGKILL)
     content = path.read_bytes()
     assert content in (b"whole", b"whole" * 20_000_000)
+
+
+class Learner(BaseModel):
+    """One weight that learns to be zero, and counts its validations."""
+
+    validations = 0
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(1))
+
+    def forward(self, inputs, data_samples=None, mode="tensor"):
+        return {"loss": (self.weight**2).sum()}
+
+    def val_step(self, data):
+        type(self).validations += 1
+        return [{}]
+
+
+class Nothing(BaseMetric):
+    def process(self, data_batch, data_samples):
+        self.results.append(0)
+
+    def compute_metrics(self, results):
+        return {"figure": 1.0}
+
+
+def learn(work_dir, epochs, resume_from=None) -> int:
+    """Train for some epochs, with a validation after every second and the last; return how many."""
+    Learner.validations = 0
+    before = torch.serialization.get_safe_globals()
+    data = [{"inputs": torch.ones(1)}] * 2
+    runner = Runner(
+        Learner(),
+        str(work_dir),
+        train_dataloader=torch.utils.data.DataLoader(data),
+        val_dataloader=torch.utils.data.DataLoader(data[:1]),
+        train_cfg={"by_epoch": True, "max_epochs": epochs, "val_interval": 2},
+        val_cfg={},
+        val_evaluator=Evaluator(Nothing()),
+        optim_wrapper={"optimizer": {"type": "SGD", "lr": 0.1}},
+        default_hooks={"checkpoint": {"type": "AtomicCheckpointHook", "interval": 1}},
+        load_from=resume_from and str(resume_from),
+        resume=resume_from is not None,
+        experiment_name=f"learn-{work_dir.name}-{epochs}-{resume_from is None}",
+        default_scope="mmdet3d",
+        cfg={"model": {"type": "Learner", "size": (1, 2)}},
+    )
+    try:
+        runner.train()
+    finally:
+        torch.serialization.clear_safe_globals()
+        torch.serialization.add_safe_globals(before)
+    return Learner.validations
+
+
+def test_a_validation_that_a_kill_prevented_is_made_up_for(tmp_path):
+    assert learn(tmp_path, 3) == 2  # after epochs 2 and 3
+    assert learn(tmp_path, 3, tmp_path / "epoch_3.pth") == 0  # all is done
+    (tmp_path / "last_validation").write_text("4")  # as after a kill between epoch 3 and its end
+    assert learn(tmp_path, 3, tmp_path / "epoch_3.pth") == 1
+    assert learn(tmp_path, 3, tmp_path / "epoch_2.pth") == 2  # that of epoch 2, then 3's
+
+
+def test_a_checkpoint_holds_the_models_settings_and_no_text_that_runs(tmp_path):
+    learn(tmp_path, 1)
+    _, meta = read_checkpoint(tmp_path / "epoch_1.pth")
+    assert json.loads(meta[MODEL_SETTINGS]) == {"type": "Learner", "size": [1, 2]}
+    poisoned = torch.load(tmp_path / "epoch_1.pth", weights_only=False)
+    poisoned["meta"]["config"] = f"open({str(tmp_path / 'proof')!r}, 'w')"
+    torch.save(poisoned, tmp_path / "epoch_1.pth")
+    learn(tmp_path, 2, tmp_path / "epoch_1.pth")
+    assert not (tmp_path / "proof").exists()

@@ -1,9 +1,15 @@
 import argparse
 
 import pytest
+import torch
 from mmengine.config import Config
 
-from gsmap.engine.launch import add_common_arguments, check_config, load_config
+from gsmap.engine.launch import (
+    add_common_arguments,
+    check_config,
+    load_config,
+    newest_checkpoint,
+)
 
 
 def parse(*arguments):
@@ -44,3 +50,18 @@ def test_a_cosine_schedule_of_another_length_is_refused():
         check_config(Config(cfg))
     cfg["param_scheduler"][0]["T_max"] = 110
     check_config(Config(cfg))
+
+
+def test_the_newest_whole_checkpoint_is_found_whatever_is_noted(tmp_path, capsys):
+    assert newest_checkpoint(tmp_path) is None
+    for number in (2, 9, 10, 11):
+        torch.save({"state_dict": {"w": torch.ones(1000)}}, tmp_path / f"epoch_{number}.pth")
+    (tmp_path / "last_checkpoint").write_text(str(tmp_path / "epoch_2.pth"))
+    (tmp_path / "best.pth").write_bytes(b"")
+    assert newest_checkpoint(tmp_path).name == "epoch_11.pth"
+    content = bytearray((tmp_path / "epoch_11.pth").read_bytes())
+    content[len(content) // 2] ^= 255  # one byte of a weight
+    (tmp_path / "epoch_11.pth").write_bytes(content)
+    (tmp_path / "epoch_10.pth").write_bytes(content[:100])
+    assert newest_checkpoint(tmp_path).name == "epoch_9.pth"
+    assert "epoch_10.pth is damaged and is passed over" in capsys.readouterr().out

@@ -1,33 +1,38 @@
 """Weights from a checkpoint into a model, or an error that says what to do."""
 
+import json
 import pickle
 import zipfile
 from pathlib import Path
+from typing import Any
 
+from mmengine.config import Config
 from torch import Tensor, nn
 
-from gsmap.checkpoints.convert import read_state
+from gsmap.checkpoints.convert import read_checkpoint
+from gsmap.checkpoints.settings import MODEL_SETTINGS, differences, plain
 from gsmap.engine.named_models import find_checkpoint
 
 _SHOWN = 5
 
 
-def read_weights(path: str | Path) -> dict[str, Tensor]:
-    """Read the weights of a checkpoint without running code from it.
+def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | None]:
+    """Read a checkpoint without running code from it, and check its weights.
 
     Args:
         path: File that training wrote, a bare state dict, or the name of a model.
 
     Returns:
-        The state dict.
+        The state dict, and the model's settings in training where the checkpoint has them.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it cannot be read, or holds no weights.
+        ValueError: If it cannot be read, holds no weights, or weights that are not finite.
     """
     path = find_checkpoint(path)
     try:
-        return read_state(path)
+        state, meta = read_checkpoint(path)
+        settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
     except pickle.UnpicklingError as error:
         reason = str(error).split(". ")[0]
         raise ValueError(
@@ -39,6 +44,51 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
             f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); "
             "fetch it again, or use an earlier epoch's."
         ) from error
+    broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
+    if broken:
+        raise ValueError(
+            f"{path} holds NaN or infinite weights ({_listed(broken)}): the training that wrote it "
+            "had failed; use an earlier epoch's."
+        )
+    return state, settings
+
+
+def read_weights(path: str | Path) -> dict[str, Tensor]:
+    """Return the state dict of a checkpoint; arguments and errors as in `read_checked`."""
+    return read_checked(path)[0]
+
+
+def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> list[str]:
+    """Give a config the model settings that a checkpoint was trained with.
+
+    Overrides of the model's settings are taken to be meant and stay.
+
+    Args:
+        cfg: The config; its ``model`` changes.
+        path: The checkpoint, checked as in `read_checked`.
+        cfg_options: Overrides that were given by hand, by dotted name.
+
+    Returns:
+        What to tell: a line for each setting that the config had otherwise, and for each that is
+        kept against the checkpoint.
+    """
+    settings = read_checked(path)[1]
+    if settings is None:
+        return []
+    config = plain(cfg.model.to_dict())
+    own = Config({"model": settings})
+    own.merge_from_dict({k: v for k, v in (cfg_options or {}).items() if k.startswith("model.")})
+    used = plain(own.model.to_dict())
+    lines = [
+        f"{name}: {theirs}, as {path} was trained; the config has {mine}"
+        for name, (theirs, mine) in differences(used, config, "model").items()
+    ]
+    lines += [
+        f"{name}: {given}, as asked for; {path} was trained with {theirs}"
+        for name, (given, theirs) in differences(used, settings, "model").items()
+    ]
+    cfg.model = own.model
+    return lines
 
 
 def load_weights(model: nn.Module, path: str | Path) -> None:

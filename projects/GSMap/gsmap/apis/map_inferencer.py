@@ -1,5 +1,6 @@
 """A trained model on recorded samples: map elements and pictures out."""
 
+import logging
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ from mmengine.dataset import pseudo_collate
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from gsmap.apis.blank_cameras import BlankCameraDataset
-from gsmap.apis.checkpoint import load_weights
+from gsmap.apis.checkpoint import adopt_settings, load_weights
 from gsmap.apis.info_file import read_info_file
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
@@ -26,6 +27,7 @@ from gsmap.engine.named_models import named_models
 from gsmap.evaluation.map_metric import MapMetric
 from gsmap.visualization.map_visualizer import MapVisualizer
 
+_LOGGER = logging.getLogger(__name__)
 _PATTERNS = ("*.arrow", "*.pkl")
 
 
@@ -122,8 +124,12 @@ class MapInferencer:
         cfg_options: dict | None = None,
     ):
         self.cfg = read_config(config, cfg_options)
+        if checkpoint is None and str(config) in named_models():
+            checkpoint = str(config)
+        if checkpoint is not None:
+            for line in adopt_settings(self.cfg, checkpoint, cfg_options):
+                _LOGGER.warning(line)
         self.model = MODELS.build(self.cfg.model)
-        checkpoint = checkpoint or (str(config) if str(config) in named_models() else None)
         if checkpoint is not None:
             load_weights(self.model, checkpoint)
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))

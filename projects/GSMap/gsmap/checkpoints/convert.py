@@ -66,14 +66,14 @@ def upstream_from_ours(
     return {**renamed, **extra}
 
 
-def read_state(path: str | Path) -> dict[str, Tensor]:
-    """Read the weights of a checkpoint file without running any code from it.
+def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read a checkpoint file without running any code from it.
 
     Args:
         path: A checkpoint with or without ``state_dict`` around the weights.
 
     Returns:
-        The state dict.
+        The state dict, and what else the checkpoint says of itself (its ``meta``).
 
     Raises:
         ValueError: If the file holds no weights.
@@ -83,7 +83,8 @@ def read_state(path: str | Path) -> dict[str, Tensor]:
     state = checkpoint.get("state_dict", checkpoint) if isinstance(checkpoint, Mapping) else None
     if not state or not all(isinstance(value, Tensor) for value in state.values()):
         raise ValueError(f"{path} holds no state dict of tensors.")
-    return {key.removeprefix("module."): value for key, value in state.items()}
+    meta = checkpoint.get("meta") if state is not checkpoint else None
+    return {key.removeprefix("module."): value for key, value in state.items()}, meta or {}
 
 
 def convert_state(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:

@@ -1,5 +1,6 @@
 """Checkpoints that are whole or absent when written, and run no code when read."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -7,10 +8,13 @@ import torch
 from mmdet3d.registry import HOOKS
 from mmengine.fileio import LocalBackend, register_backend
 from mmengine.hooks import CheckpointHook
-from mmengine.runner import Runner
+from mmengine.runner import EpochBasedTrainLoop, Runner
 
 from gsmap.checkpoints.safe_globals import mmengine_globals
-from gsmap.utils.files import write_bytes
+from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
+from gsmap.utils.files import write_bytes, write_text
+
+VALIDATED = "last_validation"  # file of a work folder: the iteration validated last
 
 
 @register_backend("atomic")
@@ -31,7 +35,8 @@ class AtomicCheckpointHook(CheckpointHook):
     """mmengine's hook, for runs that may be killed and for checkpoints from strangers.
 
     A run that is killed while it saves leaves the previous checkpoint as it was, so ``--resume``
-    always finds a whole one. What is loaded and resumed from is read with torch's ``weights_only``,
+    always finds a whole one, and a validation that it missed is made up for on resuming. A
+    checkpoint holds the model's settings. What is loaded and resumed from is read with torch's ``weights_only``,
     to which the hook names mmengine's own data when a run begins.
     """
 
@@ -41,3 +46,30 @@ class AtomicCheckpointHook(CheckpointHook):
     def before_run(self, runner: Runner) -> None:
         """Let torch read mmengine's checkpoints; mmengine reads one right after this."""
         torch.serialization.add_safe_globals(mmengine_globals())
+
+    def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
+        """Drop the text that mmengine would run as a config when it resumes."""
+        checkpoint.get("meta", {}).pop("config", None)
+
+    def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
+        """Note the model's settings."""
+        settings = plain(runner.cfg.model.to_dict())
+        checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
+
+    def before_train(self, runner: Runner) -> None:
+        """Make up for the validation that was due when a run was cut off, then begin as ever."""
+        super().before_train(runner)
+        loop, marker = runner.train_loop, Path(runner.work_dir, VALIDATED)
+        by_epoch = isinstance(loop, EpochBasedTrainLoop)
+        done, end = (loop.epoch, loop.max_epochs) if by_epoch else (loop.iter, loop.max_iters)
+        due = done >= max(loop.val_begin, 1) and (done % loop.val_interval == 0 or done == end)
+        validated = marker.exists() and marker.read_text() == str(runner.iter)
+        if due and runner.val_loop is not None and not validated:
+            runner.logger.info("The run was cut off before its validation, which is made up for.")
+            runner.val_loop.run()
+
+    def after_val_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
+        """Note which state was validated."""
+        super().after_val_epoch(runner, metrics)
+        if runner.rank == 0:
+            write_text(Path(runner.work_dir, VALIDATED), str(runner.iter))

@@ -2,11 +2,15 @@
 
 import argparse
 import difflib
+import logging
 import os
+import re
+import zipfile
 from pathlib import Path
 
 import torch
 from mmengine.config import Config, DictAction
+from mmengine.logging import print_log
 from mmengine.registry import init_default_scope
 from mmengine.utils import import_modules_from_strings
 
@@ -116,6 +120,38 @@ def load_config(args: argparse.Namespace) -> Config:
     if args.launcher == "pytorch" and not torch.cuda.is_available():
         join_on_cpu(cfg)
     return cfg
+
+
+def newest_checkpoint(work_dir: str | Path) -> Path | None:
+    """Return the newest whole checkpoint of a run, whatever its ``last_checkpoint`` says.
+
+    A damaged one is named and passed over.
+
+    Args:
+        work_dir: Work folder of the run.
+
+    Returns:
+        The checkpoint; None if there is none.
+    """
+    numbered = {
+        int(match[1]): path
+        for path in Path(work_dir).glob("*.pth")
+        if (match := re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name))
+    }
+    for number in sorted(numbered, reverse=True):
+        if is_whole(numbered[number]):
+            return numbered[number]
+        print_log(f"{numbered[number]} is damaged and is passed over.", level=logging.WARNING)
+    return None
+
+
+def is_whole(checkpoint: Path) -> bool:
+    """Whether a checkpoint's archive is complete and every part has its checksum."""
+    try:
+        with zipfile.ZipFile(checkpoint) as archive:
+            return archive.testzip() is None
+    except zipfile.BadZipFile:
+        return False
 
 
 def join_on_cpu(cfg: Config) -> None:

@@ -1,6 +1,7 @@
 """What every command shares: how its words are read, and how it ends."""
 
 import argparse
+import os
 import re
 import signal
 import sys
@@ -83,6 +84,11 @@ def _fits(action: argparse.Action, word: str) -> bool:
     return action.choices is None or value in action.choices
 
 
+def is_first_rank() -> bool:
+    """Whether this process speaks for a run; known before the processes have met."""
+    return os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) == "0"
+
+
 def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> None:
     """Run a command, print what it reports, and leave in words whatever a user can cause.
 
@@ -98,12 +104,14 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     Raises:
         SystemExit: If the command fails or is interrupted.
     """
+    signal.signal(signal.SIGINT, partial(_interrupt, os.getpid()))
     if heed_kill:
         signal.signal(signal.SIGTERM, _leave)
     try:
         report = command()
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted: nothing half-written is left\n")
+        if is_first_rank():
+            sys.stderr.write("interrupted: nothing half-written is left\n")
         sys.exit(128 + signal.SIGINT)
     except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
         if not _is_for_the_user(error):
@@ -114,6 +122,12 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
         sys.exit(BAD_INPUT)
     if report is not None:
         sys.stdout.write(f"{report}\n")
+
+
+def _interrupt(main: int, _number: int, _frame: object) -> None:
+    """Answer Ctrl-C in the command's own process; forked workers, which inherit this, end with it."""
+    if os.getpid() == main:
+        raise KeyboardInterrupt
 
 
 def _leave(number: int, _frame: object) -> None:
