@@ -1,33 +1,82 @@
 #!/usr/bin/env python
-"""List every row of the papers' tables with the command that trains it here.
+r"""Train, test and tabulate several configs on the same data, seeds and budget.
 
-``configs/tables.json`` holds the rows: figures in percent by our metrics' names, config, overrides.
+``CONFIG`` is a file, the name of a model, or ``NAME=CONFIG[,KEY=VALUE...]``. A command that was
+stopped goes on when it is given again; runs that are done are not run again. ``--list`` prints
+every row of the papers' tables (``configs/tables.json``) with the command that trains it here.
 
 Examples:
-    python tools/compare.py --list
+    python tools/compare.py maptr_r18_minicity gsmap_r18_minicity --seeds 3 --budget 6400 --out s
+    python tools/compare.py base=CONFIG light=CONFIG,model.map_head.loss_raster.loss_weight=5.0 \
+        --init maptr_r18_minicity --seeds 2 --budget 1600 --out f
+    python tools/compare.py --runs MapTR=work_dirs/a MapTR=work_dirs/b GSMap=work_dirs/c --out d
     python tools/compare.py --list --tables 'MapVR Table 5*'
 """
 
 import argparse
 import json
 import shlex
+import sys
+import time
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from gsmap.utils.cli import run_command
+from mmengine.config import DictAction
+
+from gsmap.apis.comparison import Protocol, Run, execute, parse_entry, plan
+from gsmap.apis.comparison_report import (
+    apply_rescoring,
+    as_json,
+    check_one_test_set,
+    markdown,
+    plot_iterations,
+    plot_precision_recall,
+    read_result,
+)
+from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.files import write_text
+from gsmap.visualization.figure import save_figure
 
 TABLES = Path(__file__).resolve().parents[1] / "configs/tables.json"
 
 
 def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--list", action="store_true", required=True, help="print the rows")
+    parser.add_argument("configs", nargs="*", metavar="CONFIG", help="what to train and compare")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="seeds 0 to N - 1")
+    parser.add_argument("--budget", type=int, metavar="ITERATIONS", help="length of every run")
+    parser.add_argument("--batch", type=int, default=4, help="samples of an iteration")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="work folders, tables and plots")
+    parser.add_argument("--init", metavar="CHECKPOINT", help="what all start from: file or name")
+    parser.add_argument(
+        "--runs", nargs="+", default=[], metavar="NAME=DIR", help="work folders of finished runs"
+    )
+    parser.add_argument(
+        "--rescore",
+        nargs="+",
+        action=DictAction,
+        metavar="KEY=VALUE",
+        help="tabulate under other rules, such as thresholds=[0.2,0.5,1.0]; trains nothing",
+    )
+    parser.add_argument("--only", metavar="NAME/seed_N", help="this run alone, and no tables")
+    parser.add_argument("--slurm", metavar="PARTITION", help="print a Slurm command for each run")
+    parser.add_argument(
+        "--cfg-options", nargs="+", default=[], metavar="KEY=VALUE", help="overrides of all configs"
+    )
+    parser.add_argument("--list", action="store_true", help="print the papers' tables")
     parser.add_argument("--tables", default="*", metavar="PATTERN", help="names of tables to list")
-    return parser.parse_args()
+    args = parser.parse_args()
+    if not args.list and (not args.out or not (args.configs or args.runs)):
+        parser.error("give configs or --runs, and --out")
+    if args.configs and (args.budget or 0) < 1:
+        parser.error("give --budget, the iterations of every run")
+    if args.seeds < 1 or args.batch < 1:
+        parser.error("--seeds and --batch must be at least 1")
+    return args
 
 
 def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
@@ -74,10 +123,87 @@ def lines(tables: list[dict[str, Any]]) -> Iterator[str]:
                 yield f"    ({row['note']})"
 
 
-def main() -> None:
+def slurm_commands(runs: list[Run], partition: str) -> str:
+    """Return a command for each run that is not done, one a line."""
+    words = [word for word in sys.argv[1:] if word not in ("--slurm", partition)]
+    launch = ["srun", f"--partition={partition}", "--gres=gpu:1", "--ntasks=1"]
+    return "\n".join(
+        shlex.join([*launch, f"--job-name={run.label}", sys.executable, sys.argv[0], *words])
+        + f" --only {run.label}"
+        for run in runs
+        if not run.done
+    )
+
+
+def train(runs: list[Run]) -> None:
+    """Train and test what is not done, and say how far it is: one line on a terminal."""
+    terminal, last = sys.stderr.isatty(), -1e9
+
+    def progress(line: str) -> None:
+        nonlocal last
+        if terminal or time.monotonic() - last > 60:
+            last = time.monotonic()
+            end = "" if terminal else "\n"
+            print(f"\r\x1b[2K{line}" if terminal else line, end=end, file=sys.stderr, flush=True)
+
+    for run, state in execute(runs, progress):
+        print(f"\r\x1b[2K{run.label}: {state}" if terminal else f"{run.label}: {state}", flush=True)
+
+
+def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
+    """Write tables and plots of all runs, and return the tables."""
+    named = [(run.name, run.folder) for run in runs]
+    for text in args.runs:
+        name, _, folder = text.partition("=")
+        if not Path(folder or ".", "metrics.json").is_file():
+            raise FileNotFoundError(
+                f"{text!r} names no finished run: write NAME=DIR, where DIR holds metrics.json "
+                "(tools/test.py --metrics-out)."
+            )
+        named.append((name, Path(folder)))
+    results = [read_result(name, folder) for name, folder in named]
+    check_one_test_set(results)
+    reports = apply_rescoring(results, args.rescore or {})
+    rules = ", ".join(f"{k} {v}" for k, v in (args.rescore or {}).items())
+    title = f"Comparison under {rules}" if rules else "Comparison"
+    stem = "rescored" if rules else "comparison"
+    command = shlex.join(["python", *sys.argv])
+    report = markdown(results, title, command)
+    write_text(args.out / f"{stem}.md", report)
+    write_text(args.out / f"{stem}.json", as_json(results, title, command))
+    if reports:
+        save_figure(plot_precision_recall(reports), args.out / f"{stem}_precision_recall.png")
+    curves = plot_iterations(results)
+    if curves:
+        save_figure(curves, args.out / "iterations.png")
+    return f"{report}\nwritten to {args.out}"
+
+
+def main() -> str:
     args = parse_args()
-    run_command(lambda: "\n".join(lines(read_tables(args.tables))))
+    if args.list:
+        return "\n".join(lines(read_tables(args.tables)))
+    runs: list[Run] = []
+    if args.configs:
+        options = tuple(args.cfg_options)
+        rest = (args.out, args.batch, args.init, options)
+        runs = plan(
+            [parse_entry(text) for text in args.configs], Protocol(args.seeds, args.budget, *rest)
+        )
+    if args.slurm:
+        return slurm_commands(runs, args.slurm)
+    chosen = [run for run in runs if args.only in (None, run.label)]
+    if args.only and not chosen:
+        raise ValueError(f"no run is {args.only}; there are {[run.label for run in runs]}.")
+    if not args.rescore:
+        train(chosen)
+    report = "" if args.only else tabulate(runs, args)
+    failed = [run.label for run in chosen if not run.done]
+    if failed:
+        sys.stdout.write(f"{report}\n")
+        raise RuntimeError(f"{', '.join(failed)} did not end: the table says why.")
+    return report
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -2,8 +2,8 @@
 """Run a trained model on samples without ground truth, and draw what it finds.
 
 Example: ``python tools/infer.py gsmap_r18_minicity --sample FOLDER --out map.json --show-dir
-pictures``, or ``CONFIG CHECKPOINT`` in place of the name. ``--sample`` takes an annotation file (.arrow), an info file of mmdet3d (.pkl), or a
-folder with one.
+pictures``, or ``CONFIG CHECKPOINT`` in place of the name. ``--sample`` takes an annotation file
+(.arrow), an info file of mmdet3d (.pkl), or a folder with one.
 """
 
 import argparse

@@ -36,8 +36,8 @@ class AtomicCheckpointHook(CheckpointHook):
 
     A run that is killed while it saves leaves the previous checkpoint as it was, so ``--resume``
     always finds a whole one, and a validation that it missed is made up for on resuming. A
-    checkpoint holds the model's settings. What is loaded and resumed from is read with torch's ``weights_only``,
-    to which the hook names mmengine's own data when a run begins.
+    checkpoint holds the model's settings. What is loaded and resumed from is read with torch's
+    ``weights_only``, to which the hook names mmengine's own data when a run begins.
     """
 
     def __init__(self, *args: Any, backend_args: dict | None = None, **kwargs: Any) -> None:

@@ -6,7 +6,9 @@ import logging
 import os
 import re
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from mmengine.config import Config, DictAction
@@ -67,6 +69,13 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="override settings, e.g. train_dataloader.batch_size=2",
     )
+
+
+def parse_options(words: Sequence[str]) -> dict[str, Any]:
+    """Read overrides ``KEY=VALUE`` as ``--cfg-options`` does."""
+    parser = argparse.ArgumentParser()
+    add_config_options(parser)
+    return parser.parse_args(["--cfg-options", *words]).cfg_options
 
 
 def add_common_arguments(parser: argparse.ArgumentParser) -> None:

@@ -125,7 +125,7 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
 
 
 def _interrupt(main: int, _number: int, _frame: object) -> None:
-    """Answer Ctrl-C in the command's own process; forked workers, which inherit this, end with it."""
+    """Answer Ctrl-C in the command's own process; forked workers inherit this, and end with it."""
     if os.getpid() == main:
         raise KeyboardInterrupt
 

@@ -1,0 +1,337 @@
+"""What a comparison found: figures with their spread, differences, cost, curves."""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from statistics import mean, stdev
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from mmengine.config import Config
+
+from gsmap.apis.checkpoint import read_weights
+from gsmap.apis.comparison import RECORD
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.engine.launch import newest_checkpoint
+from gsmap.evaluation.average_precision import precision_recall
+from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.evaluator import METRIC_NAMES, EvaluationConfig, flat_metrics
+from gsmap.evaluation.file_evaluation import evaluate_files
+from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.report import Curve, MetricReport
+from gsmap.utils.parallel import default_workers
+from gsmap.visualization.run_curves import RunLog, read_run
+
+_COLOURS = ("#2D8CFF", "#FF9500", "#1DB954", "#AF52DE", "#FF3B30", "#5AC8FA", "#A2845E", "#34495E")
+_BATCH_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
+
+
+@dataclass
+class Result:
+    """What one run's folder tells.
+
+    Attributes:
+        name: Name of its config in the comparison.
+        seed: Its seed; None if its folder does not say.
+        folder: Its work folder.
+        state: ``done``, or what is wrong.
+        figures: All figures of its test, by flat key; empty if it is not done.
+        costs: Iterations, million parameters, seconds a step and a tested sample, peak memory in
+            MiB, as far as the folder tells.
+        record: Machine, load and commands, where the comparison ran it.
+        log: Its training log; None if there is none.
+    """
+
+    name: str
+    seed: int | None
+    folder: Path
+    state: str
+    figures: dict[str, float]
+    costs: dict[str, float]
+    record: dict[str, Any]
+    log: RunLog | None
+
+
+def read_result(name: str, folder: Path) -> Result:
+    """Read the work folder of a run that ``tools/train.py`` and ``tools/test.py`` made.
+
+    Its metrics are ``metrics.json``, from ``tools/test.py --metrics-out``.
+    """
+    record = _json(folder / RECORD) or {}
+    figures = _json(folder / "metrics.json") or {}
+    log = read_run(folder, name) if any(folder.glob("2*/vis_data/scalars.json")) else None
+    steps = [r["step"] for r in log.train] if log else []
+    state = "done" if figures else record.get("state", "cut off" if steps else "not started")
+    if not figures and steps:
+        state += f", after {max(steps):.0f} iterations"
+    costs = {}
+    if log and steps:
+        costs["iterations"] = max(steps)
+        costs["seconds a step"] = float(np.median(log.series("time")[1]))
+        memory = log.series("memory")[1]  # only logged on a GPU
+        if len(memory) or "peak_mib" in record:
+            costs["peak MiB"] = float(memory.max()) if len(memory) else record["peak_mib"]
+    newest = newest_checkpoint(folder) if figures else None
+    if newest:
+        weights = read_weights(newest).items()
+        counted = sum(w.numel() for key, w in weights if not key.endswith(_BATCH_STATISTICS))
+        costs["million parameters"] = counted / 1e6
+    tests = sorted(folder.glob("test/*/[0-9]*.json"))
+    if tests:
+        timing = json.loads(tests[-1].read_text().splitlines()[-1])
+        costs["seconds a sample"] = timing["time"] - timing["data_time"]
+    seed = _config(folder).get("randomness", {}).get("seed") if log else None
+    return Result(name, seed, folder, state, figures, costs, record, log)
+
+
+def _json(path: Path) -> Any:
+    """Read a JSON file; None if there is none."""
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def _config(folder: Path) -> Config:
+    """Return the config that a run noted in its folder."""
+    return Config.fromfile(sorted(folder.glob("2*/vis_data/config.py"))[-1])
+
+
+def check_one_test_set(results: Sequence[Result]) -> None:
+    """Refuse results of different samples or ground truth.
+
+    Raises:
+        ValueError: If the numbers of samples or of elements differ.
+    """
+    counts = {
+        r.folder: {k: v for k, v in r.figures.items() if k.endswith(("num_gts", "num_samples"))}
+        for r in results
+        if r.figures
+    }
+    first = next(iter(counts), None)
+    for folder, found in counts.items():
+        if found != counts[first]:
+            raise ValueError(
+                f"{first} and {folder} were tested on different data: {counts[first]} and {found}."
+            )
+
+
+def evaluation_config(annotations: Path, changes: Mapping[str, Any]) -> EvaluationConfig:
+    """Return the rules of both metrics for an annotation file, with some changed.
+
+    Args:
+        annotations: The file; it says classes and range.
+        changes: Fields of ``ChamferConfig``, ``RasterConfig`` or ``EvaluationConfig``.
+
+    Raises:
+        ValueError: If there is no such field.
+    """
+    meta = AnnotationFile(annotations).meta
+    own = {"classes": meta.classes, "x_range": meta.x_range, "y_range": meta.y_range, **changes}
+    known = [{f.name for f in fields(c)} for c in (ChamferConfig, RasterConfig, EvaluationConfig)]
+    unknown = own.keys() - set().union(*known)
+    if unknown:
+        allowed = sorted(set().union(*known) - set(METRIC_NAMES))
+        raise ValueError(f"no metric has the setting {sorted(unknown)}; there are {allowed}.")
+    chamfer, raster, both = ({k: v for k, v in own.items() if k in part} for part in known)
+    return EvaluationConfig(ChamferConfig(**chamfer), RasterConfig(**raster), **both)
+
+
+def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
+    """Score a run's ``results.json`` again, under changed rules if any are given."""
+    dataset = _config(result.folder).test_dataloader.dataset
+    annotations = Path(dataset.get("data_root", ""), dataset.ann_file)
+    config = evaluation_config(annotations, changes)
+    predictions = result.folder / "results.json"
+    return evaluate_files(predictions, annotations, config, default_workers()).reports
+
+
+def _columns(results: Sequence[Result]) -> list[str]:
+    """Return the keys of a table's figures: the APs of each class and their mean, both metrics."""
+    keys = next((list(r.figures) for r in results if r.figures), [])
+    columns = []
+    for metric in METRIC_NAMES:
+        counted = [k for k in keys if re.fullmatch(rf"{metric}/[^/]+/num_gts", k)]
+        columns += [key.replace("num_gts", "AP") for key in counted]
+        columns += [f"{metric}/mAP"] * bool(counted)
+    return columns
+
+
+def _cell(values: Sequence[float], factor: float = 1.0, form: str = ".1f") -> str:
+    """Write a mean and, of several values, their standard deviation."""
+    if not values:
+        return "-"
+    scaled = [factor * value for value in values]
+    spread = f" ± {stdev(scaled):{form.lstrip('+')}}" if len(scaled) > 1 else ""
+    return f"{mean(scaled):{form}}{spread}"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Lay out a Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[float]]]:
+    """Return, by name and figure, each seed's difference to the first config with that seed."""
+    done = [r for r in results if r.figures]
+    if not done:
+        return {}
+    first = {r.seed: r.figures for r in done if r.name == results[0].name}
+    found: dict[str, dict[str, list[float]]] = {}
+    for r in done:
+        if r.name != results[0].name and r.seed in first:
+            for key in _columns(results):
+                pairs = found.setdefault(r.name, {}).setdefault(key, [])
+                pairs.append(r.figures[key] - first[r.seed][key])
+    return found
+
+
+def markdown(results: Sequence[Result], title: str, command: str) -> str:
+    """Write the tables of a comparison.
+
+    Args:
+        results: All runs, those that failed as well; differences are to the first one's config.
+        title: What was compared, under which rules.
+        command: The command that made it.
+
+    Returns:
+        Markdown: figures, paired differences, cost, runs.
+    """
+    names = list(dict.fromkeys(r.name for r in results))
+    columns = _columns(results)
+    heads = [key.replace("/AP", "") for key in columns]
+    figures, costs = [], []
+    for name in names:
+        done = [r for r in results if r.name == name and r.figures]
+        cells = [_cell([r.figures[key] for r in done], 100) for key in columns]
+        failed = sum(r.name == name and not r.figures for r in results)
+        figures.append([name, f"{len(done)}" + f" ({failed} not done)" * bool(failed), *cells])
+        kinds = (("iterations", ".0f"), ("million parameters", ".2f"), ("seconds a step", ".3f"))
+        kinds += (("peak MiB", ".0f"), ("seconds a sample", ".4f"))
+        costs.append(
+            [name, *(_cell([r.costs[k] for r in done if k in r.costs], form=f) for k, f in kinds)]
+        )
+    paired = differences_to_first(results)
+    changes = [
+        [name, str(len(of[columns[0]])), *(_cell(of[key], 100, "+.1f") for key in columns)]
+        for name, of in paired.items()
+    ]
+    runs = [
+        [r.name, str(r.seed), r.state, str(r.folder), r.record.get("machine", "-"), _load(r.record)]
+        for r in results
+    ]
+    parts = [
+        f"# {title}\n\n`{command}`\n",
+        "AP in percent, mean and standard deviation over seeds.\n",
+        _table(["config", "seeds", *heads], figures),
+    ]
+    if changes:
+        parts.append(f"Differences to {names[0]}, seed by seed.\n")
+        parts.append(_table(["config", "pairs", *heads], changes))
+    parts += [
+        "Cost. Peak memory is the largest process's, or the GPU's.\n",
+        _table(["config", *(kind for kind, _ in kinds)], costs),
+        _table(["config", "seed", "state", "folder", "machine", "load"], runs),
+    ]
+    return "\n".join(parts)
+
+
+def _load(record: Mapping[str, Any]) -> str:
+    """Write the machine's load at a run's start and end."""
+    keys = ("load_at_start", "load_at_end")
+    return " to ".join(f"{record[key]:.1f}" for key in keys if key in record) or "-"
+
+
+def as_json(results: Sequence[Result], title: str, command: str) -> str:
+    """Write all figures of a comparison."""
+    runs = [
+        {
+            **{key: getattr(r, key) for key in ("name", "seed", "state", "figures", "costs")},
+            **{"folder": str(r.folder), "record": r.record},
+        }
+        for r in results
+    ]
+    content = {"title": title, "command": command, "differences": differences_to_first(results)}
+    return json.dumps({**content, "runs": runs}, indent=1)
+
+
+def plot_iterations(results: Sequence[Result]) -> Figure | None:
+    """Draw both metrics' mean over the iterations; None if no run was validated while training."""
+    runs = [r for r in results if r.log and r.log.val and r.log.train]
+    if not runs:
+        return None
+    figure, axes = _panels(1, len(METRIC_NAMES))
+    for panel, metric in zip(axes[0], METRIC_NAMES, strict=True):
+        for name, colour in zip(dict.fromkeys(r.name for r in runs), _COLOURS * 9, strict=False):
+            for index, run in enumerate(r for r in runs if r.name == name):
+                assert run.log is not None
+                per_step = 1.0
+                if "epoch" in run.log.train[-1]:  # validation counts epochs
+                    per_step = run.log.train[-1]["step"] / run.log.train[-1]["epoch"]
+                steps, values = run.log.series(f"{metric}/mAP", validation=True)
+                label = None if index else name
+                panel.plot(per_step * steps, 100 * values, ".-", color=colour, label=label)
+        panel.set(xlabel="iteration", title=f"mAP_{metric}", ylim=(0, None))
+        panel.legend(fontsize=8)
+    return figure
+
+
+def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figure:
+    """Draw precision over recall, a panel a class and metric, at the middle threshold.
+
+    Args:
+        reports: Both metrics of one run of each config, by its name.
+    """
+    first = next(iter(reports.values()))
+    figure, axes = _panels(len(first), max(len(report.thresholds) for report in first))
+    for row, metric in zip(axes, first, strict=True):
+        for panel, class_name in zip(row, metric.thresholds, strict=False):
+            thresholds = metric.thresholds[class_name]
+            middle = thresholds[len(thresholds) // 2]
+            for (name, of_run), colour in zip(reports.items(), _COLOURS * 9, strict=False):
+                curve = _curve(of_run, metric.name, class_name, middle)
+                recall, precision = precision_recall(curve.hits, curve.num_gts)
+                panel.plot(recall, precision, color=colour, label=name, linewidth=1.2)
+            panel.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
+            panel.set_title(f"{class_name}, {metric.name} at {middle:g}", fontsize=9)
+        row[0].legend(fontsize=8)
+    return figure
+
+
+def _curve(
+    reports: Sequence[MetricReport], metric: str, class_name: str, threshold: float
+) -> Curve:
+    """Find a curve."""
+    curves = next(report.curves for report in reports if report.name == metric)
+    return next(c for c in curves if (c.class_name, c.threshold) == (class_name, threshold))
+
+
+def _panels(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
+    """Return a figure and its panels. (rows, columns)"""
+    figure = Figure(figsize=(3.6 * columns, 3.2 * rows), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def apply_rescoring(
+    results: Sequence[Result], changes: Mapping[str, Any]
+) -> dict[str, list[MetricReport]]:
+    """Score again what the curves need: one run of each config, or all runs if rules change.
+
+    Args:
+        results: All runs; with changed rules their figures become the new ones.
+        changes: As in `evaluation_config`.
+
+    Returns:
+        The reports of each config's first run that is done, by its name.
+    """
+    reports: dict[str, list[MetricReport]] = {}
+    for result in results:
+        if result.figures and (changes or result.name not in reports):
+            found = rescore(result, changes)
+            reports.setdefault(result.name, found)
+            if changes:
+                result.figures = flat_metrics(found)
+    return reports
