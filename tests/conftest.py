@@ -52,6 +52,33 @@ def minicity_annotations(minicity_root: Path) -> dict[str, Path]:
     return {split: minicity_root / f"gsmap_minicity_{split}.arrow" for split in ("train", "val")}
 
 
+TINY_CONFIG = """
+_base_ = '{repo}/projects/GSMap/configs/gsmap_maptr_r18_minicity.py'
+_data = dict(data_root='{root}')
+_heads = dict(num_heads=4, ffn_dims=16)
+model = dict(
+    img_backbone=dict(base_channels=8),
+    img_neck=dict(in_channels=[16, 32, 64], out_channels=[8, 4, 4]),
+    bev_encoder=dict(embed_dims=16, layer_cfg=dict(num_heads=4, ffn_dims=16)),
+    map_head=dict(
+        embed_dims=16, query_groups=[dict(num=5)], decoder=dict(num_layers=2, layer=_heads)))
+train_dataloader = dict(batch_size=1, num_workers=0, persistent_workers=False, dataset=_data)
+val_dataloader = dict(num_workers=0, persistent_workers=False, dataset=_data)
+test_dataloader = dict(num_workers=0, persistent_workers=False, dataset=_data)
+train_cfg = dict(max_epochs=3, val_interval=9)
+param_scheduler = []
+default_hooks = dict(logger=dict(interval=1))
+"""
+
+
+@pytest.fixture(scope="session")
+def tiny_config(minicity_root: Path, minicity_annotations, tmp_path_factory) -> Path:
+    """A config of a very small GSMap on a very small MiniCity."""
+    target = tmp_path_factory.mktemp("config") / "tiny.py"
+    target.write_text(TINY_CONFIG.format(repo=REPO, root=f"{minicity_root}/"))
+    return target
+
+
 @pytest.fixture
 def poisoned_empty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fill every new tensor that a kernel is to write with NaN."""

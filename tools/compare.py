@@ -25,7 +25,8 @@ from typing import Any
 
 from mmengine.config import DictAction
 
-from gsmap.apis.comparison import Protocol, Run, execute, parse_entry, plan
+from gsmap.apis.comparison import Protocol, Run, parse_entry, plan
+from gsmap.apis.comparison_jobs import execute
 from gsmap.apis.comparison_report import (
     apply_rescoring,
     as_json,

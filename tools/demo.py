@@ -1,7 +1,9 @@
 #!/usr/bin/env python
-"""GSMap from nothing to pictures on MiniCity: generate, convert, train, test, draw (``make demo``).
+"""GSMap from nothing to a map on MiniCity (``make demo``).
 
-What is done is skipped on the next run; an interrupted training goes on where it stopped.
+First the model that ships is tested on validation towns and draws what it sees; then one is trained
+from scratch and set beside it. What is done is skipped on the next run; an interrupted training
+goes on where it stopped.
 """
 
 import hashlib
@@ -21,10 +23,7 @@ from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 
 REPO = Path(__file__).resolve().parents[1]
-CONFIGS = {
-    "GSMap": "projects/GSMap/configs/gsmap_maptr_r18_minicity.py",
-    "MapTR": "configs/maptr/maptr_r18_minicity.py",
-}
+MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}  # that ship
 CLASSES = ("divider", "ped_crossing", "boundary")
 
 
@@ -33,22 +32,24 @@ class Budget:
     """How much of everything a run makes.
 
     Attributes:
-        scenes: Scenes of MiniCity; a fifth of them is for validation.
+        train_scenes: Scenes of MiniCity to train on.
+        val_scenes: Scenes to test on, in other towns.
         samples: Key frames per scene.
         epochs: Training epochs.
         image_size: Size of the images in pixels.
     """
 
-    scenes: int
+    train_scenes: int
+    val_scenes: int
     samples: int
     epochs: int
     image_size: str = "400x225"
 
 
 BUDGETS = {
-    "tiny": Budget(scenes=5, samples=2, epochs=1, image_size="200x112"),
-    "demo": Budget(scenes=150, samples=5, epochs=11),
-    "long": Budget(scenes=400, samples=5, epochs=16),
+    "tiny": Budget(train_scenes=4, val_scenes=1, samples=2, epochs=1, image_size="200x112"),
+    "demo": Budget(train_scenes=120, val_scenes=30, samples=5, epochs=11),
+    "long": Budget(train_scenes=320, val_scenes=80, samples=5, epochs=16),
 }
 
 
@@ -101,89 +102,128 @@ def processes() -> int:
     return torch.cuda.device_count() or len(os.sched_getaffinity(0))
 
 
-def data_steps(folder: Path, budget: Budget) -> Iterable[Step]:
-    """Yield what makes the data set and scores a model that does not look at it."""
-    root = folder / f"minicity-{budget.scenes}x{budget.samples}"
-    splits = [root / f"gsmap_minicity_{split}.arrow" for split in ("train", "val")]
-    command = f"--scenes {budget.scenes} --samples-per-scene {budget.samples} --seed 0"
+def data_root(folder: Path, budget: Budget, split: str) -> Path:
+    """Return where a split's towns are."""
+    scenes = budget.val_scenes if split == "val" else budget.train_scenes
+    return folder / f"minicity-{split}-{scenes}x{budget.samples}"
+
+
+def annotations(folder: Path, budget: Budget, split: str) -> Path:
+    """Return a split's annotation file."""
+    return data_root(folder, budget, split) / f"gsmap_minicity_{split}.arrow"
+
+
+def data_steps(folder: Path, budget: Budget, split: str) -> Iterable[Step]:
+    """Yield what makes the towns of one split.
+
+    A data set has at least one scene of either split; the other one's is not used.
+    """
+    root = data_root(folder, budget, split)
+    scenes = (budget.val_scenes if split == "val" else budget.train_scenes) + 1
+    size = f"--scenes {scenes} --val-scenes {budget.val_scenes if split == 'val' else 1}"
+    size += f" --samples-per-scene {budget.samples} --seed 0 --image-size {budget.image_size}"
     yield Step(
-        "generate MiniCity",
-        [
-            "tools/create_data.py",
-            "minicity",
-            "--root",
-            str(root),
-            *command.split(),
-            "--image-size",
-            budget.image_size,
-        ],
+        f"generate the towns of {split}",
+        ["tools/create_data.py", "minicity", "--root", str(root), *size.split()],
         [root / "minicity.json"],
     )
     yield Step(
-        "convert it",
+        f"convert the towns of {split}",
         ["tools/create_data.py", "nuscenes", "--root", str(root), "--dataset", "minicity"],
-        splits,
+        [annotations(folder, budget, split)],
     )
+
+
+def prior_step(folder: Path, budget: Budget) -> Step:
+    """Return what scores a map that is the same everywhere."""
+    truth, train = (str(annotations(folder, budget, split)) for split in ("val", "train"))
     metrics = folder / "prior.json"
-    yield Step(
-        "score the prior",
-        ["tools/evaluate.py", str(splits[1]), "--prior", str(splits[0]), "--out", str(metrics)],
+    return Step(
+        "score the best fixed map (prior)",
+        ["tools/evaluate.py", truth, "--prior", train, "--out", str(metrics)],
         [metrics],
+    )
+
+
+def options_of(folder: Path, budget: Budget) -> list[str]:
+    """Return the overrides that all commands of models share."""
+    train, val = (f"{data_root(folder, budget, split)}/" for split in ("train", "val"))
+    return [
+        "--cfg-options",
+        f"train_dataloader.dataset.data_root={train}",
+        *(f"{part}_dataloader.dataset.data_root={val}" for part in ("val", "test")),
+        f"train_cfg.max_epochs={budget.epochs}",
+        f"train_cfg.val_interval={budget.epochs}",
+        f"param_scheduler.1.T_max={budget.epochs}",
+        "randomness.seed=0",
+    ]
+
+
+def test_step(title: str, model: list[str], work: Path, *extra: str, common: list[str]) -> Step:
+    """Return what tests a model into ``work/metrics.json``."""
+    metrics = work / "metrics.json"
+    command = ["tools/test.py", *model, "--work-dir", str(work), "--metrics-out", str(metrics)]
+    return Step(title, [*command, *extra, *common], [metrics])
+
+
+def drawing(work: Path) -> list[str]:
+    """Return the options that draw every tenth sample and write what was found."""
+    pictures = ["--show-dir", str(work / "pictures"), "--show-interval", "10"]
+    return [*pictures, "--out", str(work / "results.json")]
+
+
+def shipped_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
+    """Yield what tests and draws a model that ships, with its precision-recall curves."""
+    work, common = folder / f"shipped_{name.lower()}", options_of(folder, budget)
+    title = f"test and draw the {name} that ships"
+    yield test_step(title, [MODELS[name]], work, *drawing(work), common=common)
+    truth, curves = str(annotations(folder, budget, "val")), work / "curves.png"
+    yield Step(
+        f"draw the curves of the {name} that ships",
+        ["tools/evaluate.py", str(work / "results.json"), truth, "--pr-curves", str(curves)],
+        [curves],
     )
 
 
 def model_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
     """Yield what trains, tests and draws a model."""
-    config, work = CONFIGS[name], folder / name.lower()
-    root = folder / f"minicity-{budget.scenes}x{budget.samples}"
-    options = [
-        "--cfg-options",
-        *(f"{part}_dataloader.dataset.data_root={root}/" for part in ("train", "val", "test")),
-        f"train_cfg.max_epochs={budget.epochs}",
-        f"train_cfg.val_interval={budget.epochs}",
-        f"param_scheduler.1.T_max={budget.epochs}",
-    ]
+    config, work, common = MODELS[name], folder / name.lower(), options_of(folder, budget)
     checkpoint = work / f"epoch_{budget.epochs}.pth"
-    training = ["--work-dir", str(work), "--resume", *options, "randomness.seed=0"]
+    training = ["--work-dir", str(work), "--resume", *common]
     yield Step(
         f"train {name}",
         ["tools/dist_train.sh", config, str(processes()), *training],
         [checkpoint],
     )
-    test = ["tools/test.py", config, str(checkpoint), "--eval", "chamfer", "raster"]
-    metrics, pictures = work / "metrics.json", work / "pictures"
-    drawing = ["--show-dir", str(pictures), "--show-interval", "10"]
-    drawing += ["--out", str(work / "results.json"), "--metrics-out", str(metrics)]
-    yield Step(
-        f"test and draw {name}",
-        [*test, "--work-dir", str(work / "test"), *drawing, *options],
-        [metrics, pictures],
-    )
-    shuffled = work / "metrics_shuffled.json"
-    shuffling = ["--shuffle-images", "0", "--metrics-out", str(shuffled)]
-    yield Step(
-        f"test {name} on images of other samples",
-        [*test, "--work-dir", str(work / "shuffled"), *shuffling, *options],
-        [shuffled],
-    )
+    model, tested = [config, str(checkpoint)], folder / f"{name.lower()}_test"
+    yield test_step(f"test and draw {name}", model, tested, *drawing(tested), common=common)
+    shuffled, shuffling = folder / f"{name.lower()}_shuffled", ("--shuffle-images", "0")
+    title = f"test {name} on images of other samples"
+    yield test_step(title, model, shuffled, *shuffling, common=common)
 
 
 def table(folder: Path, models: Iterable[str]) -> str:
     """Return the figures of all models as a Markdown table."""
     rows = {"same map everywhere (prior)": folder / "prior.json"}
     for name in models:
-        rows[name] = folder / name.lower() / "metrics.json"
-        rows[f"{name}, images of other samples"] = folder / name.lower() / "metrics_shuffled.json"
-    head = ["model", *(f"{metric} {c}" for metric in ("chamfer", "raster") for c in CLASSES)]
-    head[4:4], head[8:8] = ["**chamfer mAP**"], ["**raster mAP**"]
+        rows[f"{name} that ships"] = folder / f"shipped_{name.lower()}/metrics.json"
+        rows[f"{name} from scratch"] = folder / f"{name.lower()}_test/metrics.json"
+        shuffled = f"{name} from scratch, images of other samples"
+        rows[shuffled] = folder / f"{name.lower()}_shuffled/metrics.json"
+    keys = [[f"{metric}/{c}/AP" for c in CLASSES] for metric in ("chamfer", "raster")]
+    keys = [*keys[0], "chamfer/mAP", *keys[1], "raster/mAP"]
+    head = ["model", *(key.replace("/AP", "").replace("/", " ") for key in keys)]
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for name, path in rows.items():
         figures = json.loads(path.read_text())
-        keys = [[f"{metric}/{c}/AP" for c in CLASSES] for metric in ("chamfer", "raster")]
-        keys = [*keys[0], "chamfer/mAP", *keys[1], "raster/mAP"]
         cells = [f"{100 * figures[key]:.1f}" if key in figures else "" for key in keys]
         lines.append("| " + " | ".join([name, *cells]) + " |")
     return "\n".join(lines)
+
+
+def first_picture(folder: Path) -> Path:
+    """Return one of the pictures that a test drew."""
+    return sorted((folder / "pictures").iterdir())[0]
 
 
 def main() -> None:
@@ -191,22 +231,29 @@ def main() -> None:
     parser.add_argument("--dir", default="demo", help="where everything goes")
     parser.add_argument("--budget", choices=BUDGETS, default="demo", help="how long to train")
     parser.add_argument(
-        "--models", nargs="+", choices=CONFIGS, default=["GSMap"], help="what to train, in order"
+        "--models", nargs="+", choices=MODELS, default=["GSMap"], help="what to train, in order"
     )
     args = parser.parse_args()
     budget, folder = BUDGETS[args.budget], Path(args.dir).resolve() / args.budget
     started = time.monotonic()
-    steps = list(data_steps(folder, budget))
+    shipped = list(data_steps(folder, budget, "val"))
     for name in args.models:
-        steps += model_steps(name, folder, budget)
-    for number, step in enumerate(steps, 1):
-        step.run(folder, f"[{number}/{len(steps)}]")
+        shipped += shipped_steps(name, folder, budget)
+    trained = [*data_steps(folder, budget, "train"), prior_step(folder, budget)]
+    for name in args.models:
+        trained += model_steps(name, folder, budget)
+    for number, step in enumerate([*shipped, *trained], 1):
+        step.run(folder, f"[{number}/{len(shipped) + len(trained)}]")
+        if number == len(shipped):
+            minutes = (time.monotonic() - started) / 60
+            for name in args.models:
+                picture = first_picture(folder / f"shipped_{name.lower()}")
+                print(f"\n{minutes:.1f} min: what the {name} that ships sees: {picture}\n")
     summary = table(folder, args.models)
     write_text(folder / "summary.md", summary + "\n")
     print(f"\nAP in percent on MiniCity's validation towns, {budget.epochs} epochs\n\n{summary}\n")
     for name in args.models:
-        pictures = sorted((folder / name.lower() / "pictures").iterdir())
-        print(f"{name}: {len(pictures)} pictures, e.g. {pictures[0]}")
+        print(f"{name} from scratch: {first_picture(folder / f'{name.lower()}_test')}")
     print(f"{(time.monotonic() - started) / 60:.1f} minutes. Figures: {folder / 'summary.md'}")
 
 

@@ -12,31 +12,6 @@ import pytest
 import torch
 
 REPO = Path(__file__).resolve().parents[2]
-CONFIG = """
-_base_ = '{repo}/projects/GSMap/configs/gsmap_maptr_r18_minicity.py'
-_data = dict(data_root='{root}')
-_heads = dict(num_heads=4, ffn_dims=16)
-model = dict(
-    img_backbone=dict(base_channels=8),
-    img_neck=dict(in_channels=[16, 32, 64], out_channels=[8, 4, 4]),
-    bev_encoder=dict(embed_dims=16, layer_cfg=dict(num_heads=4, ffn_dims=16)),
-    map_head=dict(
-        embed_dims=16, query_groups=[dict(num=5)], decoder=dict(num_layers=2, layer=_heads)))
-train_dataloader = dict(batch_size=1, num_workers=0, persistent_workers=False, dataset=_data)
-val_dataloader = dict(num_workers=0, persistent_workers=False, dataset=_data)
-test_dataloader = dict(num_workers=0, persistent_workers=False, dataset=_data)
-train_cfg = dict(max_epochs=3, val_interval=9)
-param_scheduler = []
-default_hooks = dict(logger=dict(interval=1))
-"""
-
-
-@pytest.fixture(scope="module")
-def config(minicity_root, minicity_annotations, tmp_path_factory) -> Path:
-    """A config of a very small GSMap on a very small MiniCity."""
-    target = tmp_path_factory.mktemp("config") / "tiny.py"
-    target.write_text(CONFIG.format(repo=REPO, root=f"{minicity_root}/"))
-    return target
 
 
 def environment() -> dict[str, str]:
@@ -54,10 +29,17 @@ def run(*command: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def trained(config, tmp_path_factory) -> Path:
+def trained(tiny_config, tmp_path_factory) -> Path:
     """The work folder of a run that was killed with SIGKILL after its first epoch, then resumed."""
     work = tmp_path_factory.mktemp("work")
-    command = [sys.executable, "tools/train.py", str(config), "--work-dir", str(work), "--resume"]
+    command = [
+        sys.executable,
+        "tools/train.py",
+        str(tiny_config),
+        "--work-dir",
+        str(work),
+        "--resume",
+    ]
     with subprocess.Popen(
         command, cwd=REPO, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT
     ) as training:
@@ -82,19 +64,19 @@ def test_a_killed_training_goes_on_where_it_stopped(trained):
     assert not list(trained.glob("*.partial"))  # nothing half-written is left
 
 
-def test_one_and_two_processes_score_and_write_the_same(config, trained, tmp_path):
+def test_one_and_two_processes_score_and_write_the_same(tiny_config, trained, tmp_path):
     metrics = ["--eval", "chamfer", "raster"]
     options = ["--work-dir", tmp_path / "work"]
     one, two = tmp_path / "one", tmp_path / "two"
     for folder in (one, two):
         folder.mkdir()
     run(
-        sys.executable, "tools/test.py", *metrics, config, trained / "epoch_3.pth", *options,
+        sys.executable, "tools/test.py", *metrics, tiny_config, trained / "epoch_3.pth", *options,
         "--metrics-out", one / "metrics.json", "--out", one / "results.json",
         "--show-dir", one / "pictures",
     )  # fmt: skip
     run(
-        "tools/dist_test.sh", config, trained / "epoch_3.pth", 2, *metrics, *options,
+        "tools/dist_test.sh", tiny_config, trained / "epoch_3.pth", 2, *metrics, *options,
         "--metrics-out", two / "metrics.json", "--out", two / "results.json",
     )  # fmt: skip
     assert json.loads((one / "metrics.json").read_text()) == json.loads(
@@ -106,15 +88,17 @@ def test_one_and_two_processes_score_and_write_the_same(config, trained, tmp_pat
     assert len(list((one / "pictures").iterdir())) == 2
 
 
-def test_the_data_set_and_what_a_model_finds_are_drawn(config, trained, minicity_root, tmp_path):
+def test_the_data_set_and_what_a_model_finds_are_drawn(
+    tiny_config, trained, minicity_root, tmp_path
+):
     browsed, found = tmp_path / "browsed", tmp_path / "found"
     run(
-        sys.executable, "tools/browse_dataset.py", config, "--num", "1", "--show-dir", browsed,
+        sys.executable, "tools/browse_dataset.py", tiny_config, "--num", "1", "--show-dir", browsed,
         "--format", "png",
     )  # fmt: skip
     run(
-        sys.executable, "tools/infer.py", config, trained / "epoch_3.pth", "--max-samples", "1",
-        "--sample", minicity_root / "gsmap_minicity_val.arrow", "--show-dir", found, "--order",
+        sys.executable, "tools/infer.py", tiny_config, trained / "epoch_3.pth",
+        "--max-samples", "1", "--sample", minicity_root / "gsmap_minicity_val.arrow", "--show-dir", found, "--order",
         "--out", tmp_path / "map.json", "--cfg-options", "visualizer.width_px=400",
     )  # fmt: skip
     (result,) = json.loads((tmp_path / "map.json").read_text())["results"]
@@ -144,12 +128,12 @@ randomness = dict(seed=0)
 """
 
 
-def test_two_processes_learn_what_one_learns_from_the_same_batch(config, tmp_path):
+def test_two_processes_learn_what_one_learns_from_the_same_batch(tiny_config, tmp_path):
     weights = []
     for ranks in (1, 2):
         work = tmp_path / str(ranks)
         leaf = tmp_path / f"ranks_{ranks}.py"
-        leaf.write_text(WITHOUT_CHANCE.format(config=config, batch_size=2 // ranks))
+        leaf.write_text(WITHOUT_CHANCE.format(config=tiny_config, batch_size=2 // ranks))
         log = run("tools/dist_train.sh", leaf, ranks, "--work-dir", work)
         assert "Distributed training: True" in log
         assert "[2][1/1]" in log.replace(" ", "")  # both samples in one iteration
@@ -161,9 +145,9 @@ def test_two_processes_learn_what_one_learns_from_the_same_batch(config, tmp_pat
         torch.testing.assert_close(weights[1][name], value, rtol=0, atol=1e-6, msg=name)
 
 
-def test_a_missing_checkpoint_is_named(config):
+def test_a_missing_checkpoint_is_named(tiny_config):
     done = subprocess.run(
-        [sys.executable, "tools/test.py", str(config), "nowhere.pth"],
+        [sys.executable, "tools/test.py", str(tiny_config), "nowhere.pth"],
         cwd=REPO, env=environment(), text=True, capture_output=True, check=False,
     )  # fmt: skip
     assert done.returncode == 2

@@ -1,24 +1,16 @@
-"""Runs of several configs and seeds, side by side: planned, checked, trained, tested.
+"""Runs of several configs and seeds, planned and checked before anything trains.
 
 Each run is a work folder of ``tools/train.py`` with its test in it; nothing is known of a run that
 does not stand there, so a comparison that was killed goes on when its command is given again.
 """
 
-import ctypes
-import fcntl
 import hashlib
 import json
 import math
 import os
 import re
-import shlex
-import signal
-import socket
-import subprocess
 import sys
-import time
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -32,9 +24,8 @@ from gsmap.apis.checkpoint import read_weights
 from gsmap.checkpoints.settings import differences, plain
 from gsmap.engine.launch import check_config, parse_options, read_config
 from gsmap.engine.named_models import REPO, find_checkpoint
-from gsmap.utils.files import write_text
 
-_SETTINGS = "settings.json"  # what a run was started with; another start must agree
+SETTINGS = "settings.json"  # what a run was started with; another start must agree
 RECORD = "run.json"  # machine, load, command and end of a run
 _SHOWN = 10
 _DECIDING = ("model", "optim_wrapper", "param_scheduler", "train_cfg", "randomness", "custom_hooks")
@@ -159,13 +150,6 @@ class Protocol:
     options: tuple[str, ...] = ()
 
 
-def devices() -> list[str | None]:
-    """Return the GPUs, on which runs go side by side; without one the CPU, for one at a time."""
-    count = torch.cuda.device_count()
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    return list(visible.split(",") if visible else map(str, range(count))) if count else [None]
-
-
 def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     """Plan all runs and check them, before anything trains.
 
@@ -270,7 +254,7 @@ def _refuse(found: Mapping[str, tuple[Any, Any]], what: str, remedy: str) -> Non
 
 def _check_folder(run: Run) -> None:
     """Refuse a work folder that another run made."""
-    path = run.folder / _SETTINGS
+    path = run.folder / SETTINGS
     if path.is_file():
         _refuse(
             differences(json.loads(path.read_text()), plain(run.settings)),
@@ -281,146 +265,3 @@ def _check_folder(run: Run) -> None:
         raise ValueError(
             f"{run.folder} holds something else than a run of this comparison: give another --out."
         )
-
-
-def machine() -> str:
-    """Name the processor or GPU, and how many there are."""
-    if torch.cuda.is_available():
-        return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name()}"
-    found = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
-    return f"{len(os.sched_getaffinity(0))} cores, {found[1] if found else 'unknown processor'}"
-
-
-class Job:
-    """A run under way on one device: its processes, which die with this one.
-
-    Args:
-        run: The run; its folder is locked while the job lives.
-        device: GPU that it has; None for the CPU.
-
-    Raises:
-        RuntimeError: If another process works in its folder.
-    """
-
-    def __init__(self, run: Run, device: str | None) -> None:
-        self.run = run
-        self.device = device
-        run.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = open(run.folder / ".lock", "w")  # noqa: SIM115 - held until the job ends
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RuntimeError(f"another process works in {run.folder}: wait for it.") from error
-        write_text(run.folder / _SETTINGS, json.dumps(plain(run.settings), indent=1))
-        self.record = {"machine": machine(), "load_at_start": os.getloadavg()[0], "peak_mib": 0}
-        self.record |= {k: shlex.join(command) for k, command in run.commands().items()}
-        self.stage = "test" if run.checkpoint.is_file() else "train"
-        self._start()
-
-    def _start(self) -> None:
-        """Start the processes of a stage."""
-        count = self.run.processes if self.stage == "train" else 1
-        environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
-        if self.device is not None:
-            environment = {**os.environ, "CUDA_VISIBLE_DEVICES": self.device}
-        if count > 1:
-            with socket.socket() as probe:
-                probe.bind(("127.0.0.1", 0))
-                port = str(probe.getsockname()[1])
-            environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-            environment["WORLD_SIZE"] = str(count)
-        command = self.run.commands()[self.stage]
-        with open(self.run.folder / f"{self.stage}.log", "a") as log:
-            self._processes = [
-                subprocess.Popen(
-                    command,
-                    env=environment | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
-                    if count > 1
-                    else environment,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    preexec_fn=_die_with_parent,
-                )
-                for rank in range(count)
-            ]
-
-    def ended(self) -> bool:
-        """Look at the processes, go on to the test after training, and note how the run ends."""
-        for process in self._processes:
-            if process.returncode is None:
-                pid, status, usage = os.wait4(process.pid, os.WNOHANG)
-                if pid:
-                    process.returncode = os.waitstatus_to_exitcode(status)
-                    peak = max(self.record["peak_mib"], usage.ru_maxrss // 1024)
-                    self.record["peak_mib"] = peak
-        codes = [process.returncode for process in self._processes]
-        failed = [code for code in codes if code]
-        if not failed and None in codes:
-            return False
-        if failed:
-            self.end(f"{self.stage} ended with exit code {failed[0]}: {self.stage}.log")
-        elif self.stage == "train":
-            self.stage = "test"
-            self._start()
-            return False
-        else:
-            self.end("done")
-        return True
-
-    def end(self, state: str) -> None:
-        """Stop what still runs, note the run's end and free its folder."""
-        for process in self._processes:
-            if process.returncode is None:
-                process.kill()
-                process.wait()
-        self.record |= {"state": state, "load_at_end": os.getloadavg()[0]}
-        write_text(self.run.folder / RECORD, json.dumps(self.record, indent=1))
-        self._lock.close()
-
-
-def _die_with_parent() -> None:
-    """Have Linux kill this process when its parent dies, however that dies."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
-
-
-def execute(
-    runs: Sequence[Run], progress: Callable[[str], None], pause_s: float = 2.0
-) -> Iterator[tuple[Run, str]]:
-    """Train and test the runs that are not done, one a device.
-
-    Args:
-        runs: From `plan`.
-        progress: Called with one line on the whole, every ``pause_s``.
-        pause_s: Time between two looks, in seconds.
-
-    Yields:
-        Each run with its state, as it ends: ``done``, or what went wrong.
-    """
-    waiting = deque(run for run in runs if not run.done)
-    free, jobs = devices(), []
-    start, before = time.monotonic(), sum(run.position for run in runs)
-    try:
-        while waiting or jobs:
-            while waiting and free:
-                jobs.append(Job(waiting.popleft(), free.pop(0)))
-            for job in [job for job in jobs if job.ended()]:
-                jobs.remove(job)
-                free.append(job.device)
-                yield job.run, job.record["state"]
-            progress(_line(runs, jobs, before, time.monotonic() - start))
-            time.sleep(pause_s if jobs else 0)
-    finally:
-        for job in jobs:
-            job.end("cut off")
-
-
-def _line(runs: Sequence[Run], jobs: Sequence[Job], before: int, seconds: float) -> str:
-    """Tell how far all runs are, and how long the rest takes at the pace so far."""
-    position, total = sum(run.position for run in runs), sum(run.iterations for run in runs)
-    line = f"{sum(run.done for run in runs)} of {len(runs)} runs done"
-    line += "".join(f", {job.run.label} {job.stage}s" for job in jobs)
-    line += f"; iteration {position} of {total}"
-    if position > before:
-        minutes = (total - position) * seconds / (position - before) / 60
-        line += f"; about {minutes // 60:.0f} h {minutes % 60:.0f} min left"
-    return line

@@ -1,0 +1,142 @@
+"""Comparisons: what is refused before anything trains, and the arithmetic of the tables."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gsmap.apis.comparison import Protocol, Run, parse_entry, plan
+from gsmap.apis.comparison_jobs import Job
+from gsmap.apis.comparison_report import (
+    check_one_test_set,
+    differences_to_first,
+    evaluation_config,
+    markdown,
+    read_result,
+)
+
+CLASSES = ("divider", "boundary")
+
+
+def test_entries_are_read_with_commas_in_values():
+    assert parse_entry("configs/maptr/a.py") == ("a", "configs/maptr/a.py", ())
+    assert parse_entry("b=c.py,x.y=[1,2],z=(a,b),q=1e-3") == (
+        *("b", "c.py", ("x.y=[1,2]", "z=(a,b)", "q=1e-3")),
+    )
+    with pytest.raises(ValueError, match="'typo' is no override; write KEY=VALUE"):
+        parse_entry("b=c.py,typo")
+    with pytest.raises(ValueError, match=r"got '\.\./b'"):
+        parse_entry("../b=c.py")
+
+
+@pytest.fixture
+def protocol(tmp_path) -> Protocol:
+    return Protocol(seeds=2, budget=3, out=tmp_path / "out", batch=2)
+
+
+def entries(tiny_config: Path, *texts: str):
+    return [parse_entry(text.replace("CONFIG", str(tiny_config))) for text in texts]
+
+
+def test_runs_are_planned_with_one_budget_seed_by_seed(tiny_config, protocol):
+    runs = plan(entries(tiny_config, "a=CONFIG", "b=CONFIG,optim_wrapper.optimizer.lr=1"), protocol)
+    assert [run.label for run in runs] == ["a/seed_0", "b/seed_0", "a/seed_1", "b/seed_1"]
+    assert {run.epochs for run in runs} == {3}  # two samples, two a step
+    assert runs[3].settings["randomness"]["seed"] == 1
+    assert runs[3].settings["optim_wrapper"]["optimizer"]["lr"] == 1
+    assert not protocol.out.exists()  # nothing is written yet
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["a=CONFIG", "a=CONFIG"], "two configs have one name"),
+        (["nowhere.py"], "no config file nowhere.py"),
+        (
+            ["a=CONFIG", "b=CONFIG,test_dataloader.dataset.split=train"],
+            "of different data: test.spl",
+        ),
+        (["a=CONFIG,train_cfg.max_epochs=5"], "leave it out"),
+        (["a=CONFIG,model.map_head.no_such_part=1"], "no_such_part"),
+        (["a=CONFIG,optim_wraper.x=1"], "Did you mean 'optim_wrapper'"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_trains(tiny_config, protocol, texts, message):
+    with pytest.raises((ValueError, FileNotFoundError, TypeError), match=message):
+        plan(entries(tiny_config, *texts), protocol)
+    assert not protocol.out.exists()
+
+
+def test_a_budget_is_whole_epochs_and_a_folder_one_run(tiny_config, protocol):
+    config = entries(tiny_config, "a=CONFIG")
+    with pytest.raises(ValueError, match=r"no whole number of epochs of a \(2 iterations each\)"):
+        plan(config, replace(protocol, batch=1))
+    (run, _) = plan(config, protocol)
+    run.folder.mkdir(parents=True)
+    (run.folder / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="holds something else"):
+        plan(config, protocol)
+    (run.folder / "settings.json").write_text(json.dumps(run.settings))
+    assert len(plan(config, protocol)) == 2
+    message = r"seed_0 holds a run of other settings: optim_wrapper.optimizer.lr: 0.0006 and 0.001"
+    with pytest.raises(ValueError, match=message):
+        plan(config, replace(protocol, options=("optim_wrapper.optimizer.lr=0.001",)))
+
+
+def test_a_run_is_worked_on_once_at_a_time(tmp_path):
+    run = Run("a", 0, tmp_path / "a", "a.py", (), 1, 1, 1, {})
+    job = Job(run, None)  # there is no a.py: it fails at once
+    with pytest.raises(RuntimeError, match="another process works in"):
+        Job(run, None)
+    job.end("cut off")
+    assert json.loads((run.folder / "run.json").read_text())["state"] == "cut off"
+    Job(run, None).end("cut off")
+
+
+def finished(folder: Path, divider: float, boundary: float, num_gts: int = 7) -> Path:
+    """Write the metrics of a run."""
+    folder.mkdir(parents=True)
+    figures = {f"{m}/{c}/num_gts": num_gts for m in ("chamfer", "raster") for c in CLASSES}
+    for metric in ("chamfer", "raster"):
+        figures[f"{metric}/divider/AP"] = divider
+        figures[f"{metric}/boundary/AP"] = boundary
+        figures[f"{metric}/mAP"] = (divider + boundary) / 2
+    (folder / "metrics.json").write_text(json.dumps(figures))
+    return folder
+
+
+def test_means_spread_and_paired_differences_by_hand(tmp_path):
+    """A: 0.2, 0.4; B, seed by seed 0.1 and 0.2 above it; C was cut off."""
+    results = []
+    for name, seed, divider in (("A", 0, 0.2), ("B", 0, 0.3), ("A", 1, 0.4), ("B", 1, 0.6)):
+        folder = finished(tmp_path / name / str(seed), divider, divider)
+        results.append(replace(read_result(name, folder), seed=seed))
+    (tmp_path / "C").mkdir()
+    (tmp_path / "C/run.json").write_text('{"state": "train ended with exit code -9: train.log"}')
+    results.append(replace(read_result("C", tmp_path / "C"), seed=0))
+    lines = markdown(results, "Comparison", "python tools/compare.py").splitlines()
+    row = {line.split(" | ")[0]: line for line in reversed(lines)}
+    assert row["| A"] == "| A | 2 |" + " 30.0 ± 14.1 |" * 6
+    assert row["| B"] == "| B | 2 |" + " 45.0 ± 21.2 |" * 6
+    assert row["| C"] == "| C | 0 (1 not done) |" + " - |" * 6
+    assert "| B | 2 |" + " +15.0 ± 7.1 |" * 6 in lines
+    assert any("train ended with exit code -9: train.log" in line for line in lines)
+    assert differences_to_first(results)["B"]["raster/mAP"] == pytest.approx([0.1, 0.2])
+    assert "`python tools/compare.py`" in lines
+
+
+def test_results_of_different_ground_truth_are_refused(tmp_path):
+    folders = [finished(tmp_path / "a", 0, 0), finished(tmp_path / "b", 0, 0, num_gts=8)]
+    with pytest.raises(ValueError, match=r"a and .*b were tested on different data"):
+        check_one_test_set([read_result("x", folder) for folder in folders])
+
+
+def test_rules_of_both_metrics_may_change(minicity_annotations):
+    path = minicity_annotations["val"]
+    config = evaluation_config(path, {"thresholds": [0.2, 0.5], "polygon_classes": []})
+    assert config.chamfer.thresholds == (0.2, 0.5)
+    assert config.raster.polygon_classes == ()
+    assert config.raster.y_range == (-30.0, 30.0)
+    with pytest.raises(ValueError, match=r"no metric has the setting \['threshold'\]"):
+        evaluation_config(path, {"threshold": 1})

@@ -1,0 +1,76 @@
+"""A comparison from its command to its tables: killed, resumed, with a run that fails."""
+
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[2]
+
+
+def free(folder: Path) -> bool:
+    """Whether nobody works in a run's folder."""
+    with open(folder / ".lock") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+    return True
+
+
+def ranks(folder: Path) -> list[int]:
+    """Return the processes that train in a folder."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                words = (entry / "cmdline").read_bytes().split(b"\0")
+                state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+            except (FileNotFoundError, ProcessLookupError):
+                continue  # it has just ended
+            if str(folder).encode() in words and state != "Z":
+                found.append(int(entry.name))
+    return found
+
+
+@pytest.mark.slow
+def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_config, tmp_path):
+    command = [sys.executable, "tools/compare.py", f"good={tiny_config}", "--seeds", "1"]
+    command += ["--budget", "2", "--batch", "2", "--out", str(tmp_path)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    folder = tmp_path / "good/seed_0"
+    with subprocess.Popen(command, cwd=REPO, env=environment) as comparison:
+        while not (folder / "epoch_1.pth").exists() and comparison.poll() is None:
+            time.sleep(0.02)
+        comparison.send_signal(signal.SIGKILL)
+    assert comparison.returncode == -signal.SIGKILL, "it ended before it could be killed"
+    end = time.monotonic() + 20
+    while (ranks(folder) or not free(folder)) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not ranks(folder)  # training died with it
+
+    bad = f"bad={tiny_config},optim_wrapper.optimizer.type=NoSuchOptimizer"
+    done = subprocess.run(
+        [*command, bad], cwd=REPO, env=environment, text=True, capture_output=True, check=False
+    )
+    assert done.returncode == 2
+    assert "error: bad/seed_0 did not end" in done.stderr
+    assert "runs done" in done.stderr
+    assert f"Load checkpoint from {folder}/epoch_" in (folder / "train.log").read_text()
+    assert "| good | 1 |" in done.stdout
+    assert "| bad | 0 (1 not done) |" in done.stdout
+    assert "| bad | None | train ended with exit code" in done.stdout
+    report = json.loads((tmp_path / "comparison.json").read_text())
+    good = report["runs"][0]
+    assert good["seed"] == 0
+    assert good["costs"]["iterations"] == 2
+    assert good["costs"]["peak MiB"] > 100
+    assert good["figures"]["chamfer/num_samples"] == 2
+    assert (tmp_path / "iterations.png").exists()
+    assert (tmp_path / "comparison_precision_recall.png").exists()
