@@ -1,4 +1,4 @@
-"""The script of GPU checks, in its reduced form on the CPU: every part runs and leaves its trace."""
+"""The script of GPU checks, reduced and on the CPU: every part runs and leaves its trace."""
 
 import os
 import subprocess

@@ -98,8 +98,9 @@ def test_the_data_set_and_what_a_model_finds_are_drawn(
     )  # fmt: skip
     run(
         sys.executable, "tools/infer.py", tiny_config, trained / "epoch_3.pth",
-        "--max-samples", "1", "--sample", minicity_root / "gsmap_minicity_val.arrow", "--show-dir", found, "--order",
-        "--out", tmp_path / "map.json", "--cfg-options", "visualizer.width_px=400",
+        "--max-samples", "1", "--sample", minicity_root / "gsmap_minicity_val.arrow", "--order",
+        "--show-dir", found, "--out", tmp_path / "map.json",
+        "--cfg-options", "visualizer.width_px=400",
     )  # fmt: skip
     (result,) = json.loads((tmp_path / "map.json").read_text())["results"]
     assert [path.name for path in found.iterdir()] == [f"{result['sample_token']}.png"]

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -57,8 +58,9 @@ class Job:
         except BlockingIOError as error:
             raise RuntimeError(f"another process works in {run.folder}: wait for it.") from error
         write_text(run.folder / SETTINGS, json.dumps(plain(run.settings), indent=1))
-        self.record = {"machine": machine(), "load_at_start": os.getloadavg()[0], "peak_mib": 0}
+        self.record: dict[str, Any] = {"machine": machine(), "load_at_start": os.getloadavg()[0]}
         self.record |= {k: shlex.join(command) for k, command in run.commands().items()}
+        self._peak_mib = 0
         self.stage = "test" if run.checkpoint.is_file() else "train"
         self._start()
 
@@ -96,8 +98,7 @@ class Job:
                 pid, status, usage = os.wait4(process.pid, os.WNOHANG)
                 if pid:
                     process.returncode = os.waitstatus_to_exitcode(status)
-                    peak = max(self.record["peak_mib"], usage.ru_maxrss // 1024)
-                    self.record["peak_mib"] = peak
+                    self._peak_mib = max(self._peak_mib, usage.ru_maxrss // 1024)
         codes = [process.returncode for process in self._processes]
         failed = [code for code in codes if code]
         if not failed and None in codes:
@@ -119,6 +120,7 @@ class Job:
                 process.kill()
                 process.wait()
         self.record |= {"state": state, "load_at_end": os.getloadavg()[0]}
+        self.record["peak_mib"] = self._peak_mib
         write_text(self.run.folder / RECORD, json.dumps(self.record, indent=1))
         self._lock.close()
 
@@ -142,7 +144,7 @@ def execute(
         Each run with its state, as it ends: ``done``, or what went wrong.
     """
     waiting = deque(run for run in runs if not run.done)
-    free, jobs = devices(), []
+    free, jobs = devices(), list[Job]()
     start, before = time.monotonic(), sum(run.position for run in runs)
     try:
         while waiting or jobs:

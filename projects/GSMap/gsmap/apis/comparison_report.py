@@ -27,6 +27,13 @@ from gsmap.utils.parallel import default_workers
 from gsmap.visualization.run_curves import RunLog, read_run
 
 _COLOURS = ("#2D8CFF", "#FF9500", "#1DB954", "#AF52DE", "#FF3B30", "#5AC8FA", "#A2845E", "#34495E")
+_COSTS = {
+    "iterations": ".0f",
+    "million parameters": ".2f",
+    "seconds a step": ".3f",
+    "peak MiB": ".0f",
+    "seconds a sample": ".4f",
+}
 _BATCH_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 
@@ -104,16 +111,16 @@ def check_one_test_set(results: Sequence[Result]) -> None:
     Raises:
         ValueError: If the numbers of samples or of elements differ.
     """
-    counts = {
-        r.folder: {k: v for k, v in r.figures.items() if k.endswith(("num_gts", "num_samples"))}
+    counts = [
+        (r.folder, {k: v for k, v in r.figures.items() if k.endswith(("num_gts", "num_samples"))})
         for r in results
         if r.figures
-    }
-    first = next(iter(counts), None)
-    for folder, found in counts.items():
-        if found != counts[first]:
+    ]
+    for folder, found in counts[1:]:
+        first, expected = counts[0]
+        if found != expected:
             raise ValueError(
-                f"{first} and {folder} were tested on different data: {counts[first]} and {found}."
+                f"{first} and {folder} were tested on different data: {expected} and {found}."
             )
 
 
@@ -208,11 +215,8 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
         cells = [_cell([r.figures[key] for r in done], 100) for key in columns]
         failed = sum(r.name == name and not r.figures for r in results)
         figures.append([name, f"{len(done)}" + f" ({failed} not done)" * bool(failed), *cells])
-        kinds = (("iterations", ".0f"), ("million parameters", ".2f"), ("seconds a step", ".3f"))
-        kinds += (("peak MiB", ".0f"), ("seconds a sample", ".4f"))
-        costs.append(
-            [name, *(_cell([r.costs[k] for r in done if k in r.costs], form=f) for k, f in kinds)]
-        )
+        spent = {key: [r.costs[key] for r in done if key in r.costs] for key in _COSTS}
+        costs.append([name, *(_cell(spent[key], form=form) for key, form in _COSTS.items())])
     paired = differences_to_first(results)
     changes = [
         [name, str(len(of[columns[0]])), *(_cell(of[key], 100, "+.1f") for key in columns)]
@@ -232,7 +236,7 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
         parts.append(_table(["config", "pairs", *heads], changes))
     parts += [
         "Cost. Peak memory is the largest process's, or the GPU's.\n",
-        _table(["config", *(kind for kind, _ in kinds)], costs),
+        _table(["config", *_COSTS], costs),
         _table(["config", "seed", "state", "folder", "machine", "load"], runs),
     ]
     return "\n".join(parts)
