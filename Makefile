@@ -6,7 +6,7 @@ PY := $(VENV)/bin/python
 help:
 	@echo "make setup   build the environment in $(VENV) (again: a second)"
 	@echo "make test    set up if needed, then run every test"
-	@echo "make demo    set up if needed, then generate, train, test and draw on MiniCity"
+	@echo "make demo    set up if needed, then a trained GSMap drawn on MiniCity, and one trained from scratch beside it"
 	@echo "make lint    ruff, ruff format, codespell, mypy"
 	@echo "make format  let ruff mend what it can"
 

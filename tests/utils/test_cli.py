@@ -234,3 +234,27 @@ run_command(command, heed_kill={heed_kill})
         assert process.wait() == code
         assert process.stderr.read() == b""
     assert len(os.listdir(tmp_path)) == left
+
+
+def test_ctrl_c_is_one_line_with_forked_workers_and_none_from_other_ranks(tmp_path):
+    """A terminal sends it to the whole group: workers of a data loader, all ranks of a machine."""
+    program = """
+import os, time
+from gsmap.utils.cli import run_command
+def command():
+    if os.fork() == 0:
+        print("ready", flush=True)
+        time.sleep(1)
+        os._exit(0)
+    time.sleep(60)
+run_command(command)
+"""
+    for rank, said in (("0", b"interrupted: nothing half-written is left\n"), ("1", b"")):
+        with subprocess.Popen(
+            [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            env={**os.environ, "RANK": rank}, start_new_session=True,
+        ) as process:  # fmt: skip
+            assert process.stdout.readline() == b"ready\n"
+            os.killpg(process.pid, signal.SIGINT)
+            assert process.wait() == 130
+            assert process.stderr.read() == said

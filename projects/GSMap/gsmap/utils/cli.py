@@ -104,7 +104,8 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     Raises:
         SystemExit: If the command fails or is interrupted.
     """
-    signal.signal(signal.SIGINT, partial(_interrupt, os.getpid()))
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background
+        signal.signal(signal.SIGINT, partial(_interrupt, os.getpid()))
     if heed_kill:
         signal.signal(signal.SIGTERM, _leave)
     try:

@@ -1,0 +1,41 @@
+"""The models that ship score what they should on towns that they have not seen."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
+from minicity.generate import generate
+
+REPO = Path(__file__).resolve().parents[2]
+FIGURES = {}  # mAP_chamfer, mAP_raster
+
+
+@pytest.fixture(scope="module")
+def towns(tmp_path_factory) -> Path:
+    """Six validation scenes of five samples, sized as those that the models were trained on."""
+    root = tmp_path_factory.mktemp("towns") / "root"
+    generate(root, 7, 0, (400, 225), samples_per_scene=5, val_scenes=6, workers=1)
+    convert_nuscenes(NuScenesOptions(root, "v1.0-trainval", dataset="minicity"))
+    return root
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gsmap_r18_minicity", "maptr_r18_minicity"])
+def test_a_shipped_model_scores_its_figures(name, towns, tmp_path):
+    """Measured once, of the same seed; floats of another machine may tip a pair or two."""
+    metrics = tmp_path / "metrics.json"
+    done = subprocess.run(
+        [sys.executable, "tools/test.py", name, "--work-dir", str(tmp_path), "--metrics-out",
+         str(metrics), "--cfg-options", f"test_dataloader.dataset.data_root={towns}/"],
+        cwd=REPO, env={**os.environ, "OMP_NUM_THREADS": "1"}, text=True, capture_output=True,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    figures = json.loads(metrics.read_text())
+    found = (figures["chamfer/mAP"], figures["raster/mAP"])
+    assert found == pytest.approx(FIGURES[name], abs=0.02)
