@@ -153,7 +153,7 @@ def train(runs: list[Run]) -> None:
 
 def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
     """Write tables and plots of all runs, and return the tables."""
-    named = [(run.name, run.folder) for run in runs]
+    named: list[tuple[str, Path, int | None]] = [(r.name, r.folder, r.seed) for r in runs]
     for text in args.runs:
         name, _, folder = text.partition("=")
         if not Path(folder or ".", "metrics.json").is_file():
@@ -161,8 +161,8 @@ def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
                 f"{text!r} names no finished run: write NAME=DIR, where DIR holds metrics.json "
                 "(tools/test.py --metrics-out)."
             )
-        named.append((name, Path(folder)))
-    results = [read_result(name, folder) for name, folder in named]
+        named.append((name, Path(folder), None))
+    results = [read_result(*run) for run in named]
     check_one_test_set(results)
     reports = apply_rescoring(results, args.rescore or {})
     rules = ", ".join(f"{k} {v}" for k, v in (args.rescore or {}).items())

@@ -111,10 +111,10 @@ def test_means_spread_and_paired_differences_by_hand(tmp_path):
     results = []
     for name, seed, divider in (("A", 0, 0.2), ("B", 0, 0.3), ("A", 1, 0.4), ("B", 1, 0.6)):
         folder = finished(tmp_path / name / str(seed), divider, divider)
-        results.append(replace(read_result(name, folder), seed=seed))
+        results.append(read_result(name, folder, seed))
     (tmp_path / "C").mkdir()
     (tmp_path / "C/run.json").write_text('{"state": "train ended with exit code -9: train.log"}')
-    results.append(replace(read_result("C", tmp_path / "C"), seed=0))
+    results.append(read_result("C", tmp_path / "C", 0))
     lines = markdown(results, "Comparison", "python tools/compare.py").splitlines()
     row = {line.split(" | ")[0]: line for line in reversed(lines)}
     assert row["| A"] == "| A | 2 |" + " 30.0 ± 14.1 |" * 6

@@ -65,7 +65,8 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
     assert f"Load checkpoint from {folder}/epoch_" in (folder / "train.log").read_text()
     assert "| good | 1 |" in done.stdout
     assert "| bad | 0 (1 not done) |" in done.stdout
-    assert "| bad | None | train ended with exit code" in done.stdout
+    assert "NoSuchOptimizer" in (tmp_path / "comparison.md").read_text()
+    assert "| bad | 0 | train ended with exit code" in done.stdout
     report = json.loads((tmp_path / "comparison.json").read_text())
     good = report["runs"][0]
     assert good["seed"] == 0

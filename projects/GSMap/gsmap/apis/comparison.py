@@ -22,6 +22,7 @@ from mmengine.config import Config
 
 from gsmap.apis.checkpoint import read_weights
 from gsmap.checkpoints.settings import differences, plain
+from gsmap.engine.checkpoint_hook import VALIDATED
 from gsmap.engine.launch import check_config, parse_options, read_config
 from gsmap.engine.named_models import REPO, find_checkpoint
 
@@ -97,6 +98,13 @@ class Run:
     def checkpoint(self) -> Path:
         """Checkpoint that training ends with."""
         return self.folder / f"epoch_{self.epochs}.pth"
+
+    @property
+    def trained(self) -> bool:
+        """Whether training has ended, with its last validation."""
+        validated = self.folder / VALIDATED
+        ended = validated.is_file() and validated.read_text() == str(self.iterations)
+        return ended and self.checkpoint.is_file()
 
     @property
     def done(self) -> bool:

@@ -21,6 +21,8 @@ from gsmap.apis.comparison import RECORD, SETTINGS, Run
 from gsmap.checkpoints.settings import plain
 from gsmap.utils.files import write_text
 
+_SAID = 200  # characters of a failed run's last line
+
 
 def devices() -> list[str | None]:
     """Return the GPUs, on which runs go side by side; without one the CPU, for one at a time."""
@@ -61,7 +63,7 @@ class Job:
         self.record: dict[str, Any] = {"machine": machine(), "load_at_start": os.getloadavg()[0]}
         self.record |= {k: shlex.join(command) for k, command in run.commands().items()}
         self._peak_mib = 0
-        self.stage = "test" if run.checkpoint.is_file() else "train"
+        self.stage = "test" if run.trained else "train"
         self._start()
 
     def _start(self) -> None:
@@ -104,7 +106,9 @@ class Job:
         if not failed and None in codes:
             return False
         if failed:
-            self.end(f"{self.stage} ended with exit code {failed[0]}: {self.stage}.log")
+            last = (self.run.folder / f"{self.stage}.log").read_text().splitlines()[-1:]
+            said = " ".join(last)[:_SAID]
+            self.end(f"{self.stage} ended with exit code {failed[0]} ({self.stage}.log: {said})")
         elif self.stage == "train":
             self.stage = "test"
             self._start()

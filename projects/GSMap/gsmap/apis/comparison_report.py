@@ -63,10 +63,13 @@ class Result:
     log: RunLog | None
 
 
-def read_result(name: str, folder: Path) -> Result:
+def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
     """Read the work folder of a run that ``tools/train.py`` and ``tools/test.py`` made.
 
-    Its metrics are ``metrics.json``, from ``tools/test.py --metrics-out``.
+    Args:
+        name: Name of its config in the comparison.
+        folder: The folder; its metrics are ``metrics.json`` (``tools/test.py --metrics-out``).
+        seed: Its seed; the folder's config says it if it is not given.
     """
     record = _json(folder / RECORD) or {}
     figures = _json(folder / "metrics.json") or {}
@@ -91,7 +94,8 @@ def read_result(name: str, folder: Path) -> Result:
     if tests:
         timing = json.loads(tests[-1].read_text().splitlines()[-1])
         costs["seconds a sample"] = timing["time"] - timing["data_time"]
-    seed = _config(folder).get("randomness", {}).get("seed") if log else None
+    if seed is None and log:
+        seed = _config(folder).get("randomness", {}).get("seed")
     return Result(name, seed, folder, state, figures, costs, record, log)
 
 
