@@ -8,7 +8,8 @@ from torch.distributed.elastic.multiprocessing.api import SignalException
 from torch.distributed.run import main
 
 if __name__ == "__main__":
-    logging.getLogger("torch.distributed.elastic").setLevel(logging.ERROR)
+    for part in ("agent.server.api", "multiprocessing.api"):  # torch gives each a level of its own
+        logging.getLogger(f"torch.distributed.elastic.{part}").setLevel(logging.ERROR)
     try:
         main()
     except SignalException as error:  # the ranks have had the same signal, and rank 0 has spoken

@@ -113,6 +113,9 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     except KeyboardInterrupt:
         if is_first_rank():
             sys.stderr.write("interrupted: nothing half-written is left\n")
+        if "RANK" in os.environ and not heed_kill:
+            sys.stderr.flush()
+            os._exit(128 + signal.SIGINT)  # the interpreter's own end would wait for other ranks
         sys.exit(128 + signal.SIGINT)
     except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
         if not _is_for_the_user(error):
