@@ -126,7 +126,8 @@ def lines(tables: list[dict[str, Any]]) -> Iterator[str]:
 
 def slurm_commands(runs: list[Run], partition: str) -> str:
     """Return a command for each run that is not done, one a line."""
-    words = [word for word in sys.argv[1:] if word not in ("--slurm", partition)]
+    words = sys.argv[1:]
+    del words[words.index("--slurm") : words.index("--slurm") + 2]
     launch = ["srun", f"--partition={partition}", "--gres=gpu:1", "--ntasks=1"]
     return "\n".join(
         shlex.join([*launch, f"--job-name={run.label}", sys.executable, sys.argv[0], *words])

@@ -75,3 +75,11 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
     assert good["figures"]["chamfer/num_samples"] == 2
     assert (tmp_path / "iterations.png").exists()
     assert (tmp_path / "comparison_precision_recall.png").exists()
+
+    rules = ["--rescore", "thresholds=[0.2,0.5]", "ground_truth_points=20"]
+    subprocess.run([*command, *rules], cwd=REPO, env=environment, check=True)
+    figures = json.loads((tmp_path / "rescored.json").read_text())["runs"][0]["figures"]
+    assert {key for key in figures if key.startswith("chamfer/divider/AP@")} == {
+        "chamfer/divider/AP@0.2",
+        "chamfer/divider/AP@0.5",
+    }
