@@ -173,15 +173,15 @@ def drawing(work: Path) -> list[str]:
 
 
 def shipped_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
-    """Yield what tests and draws a model that ships, with its precision-recall curves."""
+    """Yield what tests and draws a model that ships, and its report page."""
     work, common = folder / f"shipped_{name.lower()}", options_of(folder, budget)
     title = f"test and draw the {name} that ships"
     yield test_step(title, [MODELS[name]], work, *drawing(work), common=common)
-    truth, curves = str(annotations(folder, budget, "val")), work / "curves.png"
+    truth, page = str(annotations(folder, budget, "val")), work / "report.html"
     yield Step(
-        f"draw the curves of the {name} that ships",
-        ["tools/evaluate.py", str(work / "results.json"), truth, "--pr-curves", str(curves)],
-        [curves],
+        f"write the report page of the {name} that ships",
+        ["tools/report.py", str(work / "results.json"), "--ann", truth, "--out", str(page)],
+        [page],
     )
 
 
@@ -247,8 +247,9 @@ def main() -> None:
         if number == len(shipped):
             minutes = (time.monotonic() - started) / 60
             for name in args.models:
-                picture = first_picture(folder / f"shipped_{name.lower()}")
-                print(f"\n{minutes:.1f} min: what the {name} that ships sees: {picture}\n")
+                work = folder / f"shipped_{name.lower()}"
+                print(f"\n{minutes:.1f} min: what the {name} that ships sees:")
+                print(f"{first_picture(work)}\n{work / 'report.html'}\n", flush=True)
     summary = table(folder, args.models)
     write_text(folder / "summary.md", summary + "\n")
     print(f"\nAP in percent on MiniCity's validation towns, {budget.epochs} epochs\n\n{summary}\n")

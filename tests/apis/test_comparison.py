@@ -11,7 +11,7 @@ from gsmap.apis.comparison_jobs import Job
 from gsmap.apis.comparison_report import (
     check_one_test_set,
     differences_to_first,
-    evaluation_config,
+    evaluator_for,
     markdown,
     read_result,
 )
@@ -134,9 +134,9 @@ def test_results_of_different_ground_truth_are_refused(tmp_path):
 
 def test_rules_of_both_metrics_may_change(minicity_annotations):
     path = minicity_annotations["val"]
-    config = evaluation_config(path, {"thresholds": [0.2, 0.5], "polygon_classes": []})
+    config = evaluator_for(path, {"thresholds": [0.2, 0.5], "polygon_classes": []})
     assert config.chamfer.thresholds == (0.2, 0.5)
     assert config.raster.polygon_classes == ()
-    assert config.raster.y_range == (-30.0, 30.0)
+    assert config.raster.grid.y_range == (-30.0, 30.0)
     with pytest.raises(ValueError, match=r"no metric has the setting \['threshold'\]"):
-        evaluation_config(path, {"threshold": 1})
+        evaluator_for(path, {"threshold": 1})

@@ -19,10 +19,11 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import newest_checkpoint
 from gsmap.evaluation.average_precision import precision_recall
 from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import METRIC_NAMES, EvaluationConfig, flat_metrics
+from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.file_evaluation import evaluate_files
 from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.report import Curve, MetricReport
+from gsmap.evaluation.report import MetricReport, flat_metrics
+from gsmap.structures.grid import BEVGrid
 from gsmap.utils.parallel import default_workers
 from gsmap.visualization.run_curves import RunLog, read_run
 
@@ -128,34 +129,34 @@ def check_one_test_set(results: Sequence[Result]) -> None:
             )
 
 
-def evaluation_config(annotations: Path, changes: Mapping[str, Any]) -> EvaluationConfig:
+def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator:
     """Return the rules of both metrics for an annotation file, with some changed.
 
     Args:
         annotations: The file; it says classes and range.
-        changes: Fields of ``ChamferConfig``, ``RasterConfig`` or ``EvaluationConfig``.
+        changes: Fields of ``ChamferConfig``, ``RasterConfig`` or ``MapEvaluator``.
 
     Raises:
         ValueError: If there is no such field.
     """
     meta = AnnotationFile(annotations).meta
-    own = {"classes": meta.classes, "x_range": meta.x_range, "y_range": meta.y_range, **changes}
-    known = [{f.name for f in fields(c)} for c in (ChamferConfig, RasterConfig, EvaluationConfig)]
+    own = {"classes": meta.classes, "grid": BEVGrid(meta.x_range, meta.y_range), **changes}
+    known = [{f.name for f in fields(c)} for c in (ChamferConfig, RasterConfig, MapEvaluator)]
     unknown = own.keys() - set().union(*known)
     if unknown:
         allowed = sorted(set().union(*known) - set(METRIC_NAMES))
         raise ValueError(f"no metric has the setting {sorted(unknown)}; there are {allowed}.")
     chamfer, raster, both = ({k: v for k, v in own.items() if k in part} for part in known)
-    return EvaluationConfig(ChamferConfig(**chamfer), RasterConfig(**raster), **both)
+    return MapEvaluator(ChamferConfig(**chamfer), RasterConfig(**raster), **both)
 
 
 def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
     """Score a run's ``results.json`` again, under changed rules if any are given."""
     dataset = _config(result.folder).test_dataloader.dataset
     annotations = Path(dataset.get("data_root", ""), dataset.ann_file)
-    config = evaluation_config(annotations, changes)
+    evaluator = evaluator_for(annotations, changes)
     predictions = result.folder / "results.json"
-    return evaluate_files(predictions, annotations, config, default_workers()).reports
+    return evaluate_files(predictions, annotations, evaluator, default_workers())[0]
 
 
 def _columns(results: Sequence[Result]) -> list[str]:
@@ -293,27 +294,19 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
         reports: Both metrics of one run of each config, by its name.
     """
     first = next(iter(reports.values()))
-    figure, axes = _panels(len(first), max(len(report.thresholds) for report in first))
-    for row, metric in zip(axes, first, strict=True):
-        for panel, class_name in zip(row, metric.thresholds, strict=False):
-            thresholds = metric.thresholds[class_name]
-            middle = thresholds[len(thresholds) // 2]
+    figure, axes = _panels(len(first), len(first[0].detections))
+    for index, row in enumerate(axes):
+        metric = first[index]
+        for panel, (class_name, found) in zip(row, metric.detections.items(), strict=True):
+            middle = len(found.thresholds) // 2
             for (name, of_run), colour in zip(reports.items(), _COLOURS * 9, strict=False):
-                curve = _curve(of_run, metric.name, class_name, middle)
-                recall, precision = precision_recall(curve.hits, curve.num_gts)
-                panel.plot(recall, precision, color=colour, label=name, linewidth=1.2)
+                of_class = of_run[index].detections[class_name]
+                curve = precision_recall(of_class.hits[:, middle], of_class.num_gts)
+                panel.plot(*curve, color=colour, label=name, linewidth=1.2)
             panel.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
-            panel.set_title(f"{class_name}, {metric.name} at {middle:g}", fontsize=9)
+            panel.set_title(f"{class_name}, {metric.name} at {found.thresholds[middle]:g}")
         row[0].legend(fontsize=8)
     return figure
-
-
-def _curve(
-    reports: Sequence[MetricReport], metric: str, class_name: str, threshold: float
-) -> Curve:
-    """Find a curve."""
-    curves = next(report.curves for report in reports if report.name == metric)
-    return next(c for c in curves if (c.class_name, c.threshold) == (class_name, threshold))
 
 
 def _panels(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
@@ -330,7 +323,7 @@ def apply_rescoring(
 
     Args:
         results: All runs; with changed rules their figures become the new ones.
-        changes: As in `evaluation_config`.
+        changes: As in `evaluator_for`.
 
     Returns:
         The reports of each config's first run that is done, by its name.
