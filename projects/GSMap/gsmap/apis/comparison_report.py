@@ -140,7 +140,8 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
         ValueError: If there is no such field.
     """
     meta = AnnotationFile(annotations).meta
-    own = {"classes": meta.classes, "grid": BEVGrid(meta.x_range, meta.y_range), **changes}
+    own: dict[str, Any] = {"classes": meta.classes, "grid": BEVGrid(meta.x_range, meta.y_range)}
+    own |= {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
     known = [{f.name for f in fields(c)} for c in (ChamferConfig, RasterConfig, MapEvaluator)]
     unknown = own.keys() - set().union(*known)
     if unknown:
