@@ -10,6 +10,7 @@ COMMANDS = {
     "data": "data_commands",
     "eval": "evaluation",
     "fps": "fps",
+    "heads": "heads",
     "masks": "masks",
     "minicity": "minicity",
     "parameters": "parameters",

@@ -1,0 +1,171 @@
+"""Ablate the map head alone, on stored BEV features of a common checkpoint, in paired runs.
+
+Backbone, neck and BEV encoder are frozen and run once (the pipeline must not augment), so a run
+costs a fraction of fine-tuning the whole model. Every variant starts from the same weights, sees
+the same batches in the same order, and is tested on the same features.
+"""
+
+import argparse
+import json
+import multiprocessing
+import shlex
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from mmdet3d.registry import DATASETS, METRICS, MODELS
+from mmengine.config import Config
+from mmengine.dataset import pseudo_collate
+from mmengine.logging import MMLogger
+
+from benchmarks.measure import markdown_table
+from gsmap.apis.checkpoint import load_weights
+from gsmap.engine.launch import parse_options, read_config
+from gsmap.utils.files import atomic_write
+
+METRIC_NAMES = ("chamfer", "raster")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run: a variant of a config's head, and a seed."""
+
+    config: Path
+    options: dict[str, Any]
+    seed: int
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the subcommand ``heads``."""
+    parser = subparsers.add_parser("heads", help=__doc__)
+    parser.add_argument("config", type=Path, help="whose backbone, encoder and data are used")
+    parser.add_argument("checkpoint", help="of that config, or the name of a model")
+    parser.add_argument(
+        "variants", type=Path, help='JSON file, {"name": "CONFIG KEY=VALUE ...", ...}'
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of features and figures")
+    parser.add_argument("--data-root", required=True)
+    parser.add_argument("--iterations", type=int, default=1600)
+    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--lr", type=float, default=3e-4)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1, help="runs side by side")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Store the features, train and test every variant, print a table."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    options = {f"{part}_dataloader.dataset.data_root": args.data_root for part in ("train", "val")}
+    features = {part: args.out / f"{part}.pt" for part in ("train", "val")}
+    for part, path in features.items():
+        if not path.exists():
+            store_features(read_config(args.config, options), args.checkpoint, part, path)
+    tasks = {}
+    for name, text in json.loads(args.variants.read_text()).items():
+        config, *settings = shlex.split(text)
+        changed = parse_options(settings) if settings else {}
+        for seed in range(args.seeds):
+            tasks[name, seed] = Task(Path(config), changed, seed)
+    figures: dict[tuple[str, int], dict[str, float]] = {}
+    waiting = {}
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(args.workers, mp_context=context) as pool:
+        for (name, seed), task in tasks.items():
+            path = args.out / f"{name}-{seed}.json"
+            if path.exists():
+                figures[name, seed] = json.loads(path.read_text())
+            else:
+                waiting[name, seed] = path, pool.submit(train_and_test, task, args, features)
+        for key, (path, future) in waiting.items():
+            figures[key] = future.result()
+            with atomic_write(path) as file:
+                json.dump(figures[key], file, indent=1)
+            print(f"{key[0]}, seed {key[1]}: {cells(figures[key])}", flush=True)
+    table = [[name, str(seed), *cells(found)] for (name, seed), found in figures.items()]
+    header = ["head", "seed", "divider", "ped_crossing", "boundary", "mean"]
+    print(f"\n{args.iterations} iterations of {args.batch}, AP_chamfer / AP_raster\n")
+    print(markdown_table(header, table))
+
+
+def cells(figures: dict[str, float]) -> list[str]:
+    """Return both APs of every class and their mean, in percent."""
+    keys = [f"{name}/AP" for name in ("divider", "ped_crossing", "boundary")] + ["mAP"]
+    return [" / ".join(f"{100 * figures[f'{m}/{key}']:.1f}" for m in METRIC_NAMES) for key in keys]
+
+
+@torch.no_grad()
+def store_features(cfg: Config, checkpoint: str, part: str, path: Path) -> None:
+    """Save the BEV features (N, C, H, W), float16, and the samples of a split."""
+    model = MODELS.build(cfg.model).eval()
+    load_weights(model, checkpoint)
+    dataset = DATASETS.build(cfg[f"{part}_dataloader"].dataset)
+    feats, samples = [], []
+    for index in range(len(dataset)):
+        batch = model.data_preprocessor(pseudo_collate([dataset[index]]))
+        bev = model.extract_feat(batch["inputs"], batch["data_samples"])["bev_feats"]
+        feats.append(bev[0].half())
+        samples += batch["data_samples"]
+        if index % 100 == 0:
+            print(f"features of {part}: {index} of {len(dataset)}", flush=True)
+    stored = {"feats": torch.stack(feats), "samples": samples, "metainfo": dataset.metainfo}
+    with atomic_write(path, "wb") as file:
+        torch.save(stored, file)
+
+
+def train_and_test(
+    task: Task, args: argparse.Namespace, features: dict[str, Path]
+) -> dict[str, float]:
+    """Train one head on the stored features and return its figures."""
+    torch.set_num_threads(1)
+    torch.manual_seed(task.seed)
+    cfg = read_config(task.config, task.options)
+    model = MODELS.build(cfg.model)
+    model.init_weights()
+    load_weights(model, args.checkpoint)
+    head = model.map_head.train()
+    rates = cfg.optim_wrapper
+    optimizer = torch.optim.AdamW(
+        head.parameters(), args.lr, weight_decay=rates.optimizer.weight_decay, fused=True
+    )
+    schedule = torch.optim.lr_scheduler.SequentialLR(
+        optimizer,
+        [
+            torch.optim.lr_scheduler.LinearLR(optimizer, 0.1, total_iters=100),
+            torch.optim.lr_scheduler.CosineAnnealingLR(
+                optimizer, max(1, args.iterations - 100), eta_min=args.lr / 100
+            ),
+        ],
+        [100],
+    )
+    data = torch.load(features["train"], weights_only=False, mmap=True)
+    order = torch.Generator().manual_seed(task.seed)
+    batches: list[torch.Tensor] = []
+    for _ in range(args.iterations):
+        if not batches:
+            batches = list(torch.randperm(len(data["samples"]), generator=order).split(args.batch))
+        chosen = batches.pop()
+        inputs = {"bev_feats": data["feats"][chosen].float()}
+        losses = head.loss(inputs, [data["samples"][i] for i in chosen.tolist()])
+        optimizer.zero_grad(set_to_none=True)
+        sum(value for name, value in losses.items() if "loss" in name).backward()
+        torch.nn.utils.clip_grad_norm_(head.parameters(), rates.clip_grad.max_norm)
+        optimizer.step()
+        schedule.step()
+    return test(model, cfg, torch.load(features["val"], weights_only=False, mmap=True))
+
+
+@torch.no_grad()
+def test(model: Any, cfg: Config, data: dict[str, Any]) -> dict[str, float]:
+    """Return every figure of both metrics."""
+    MMLogger.get_instance("heads", log_level="ERROR")
+    model.eval()
+    metric = METRICS.build({"type": "MapMetric", "eval": METRIC_NAMES})
+    metric.dataset_meta = data["metainfo"]
+    for feats, sample in zip(data["feats"], data["samples"], strict=True):
+        found = model.map_head.predict({"bev_feats": feats[None].float()}, [sample])
+        model.add_pred_to_datasample([sample], found)
+        metric.process(None, [sample.to_dict()])
+    return metric.evaluate(len(data["samples"]))
