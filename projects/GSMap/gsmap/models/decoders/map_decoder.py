@@ -1,7 +1,7 @@
 """MapTR's decoder: point queries interact, look at the BEV and refine their reference."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from mmcv.cnn.bricks.transformer import FFN
@@ -27,7 +27,6 @@ class MapDecoderLayer(BaseModule):
         cross_attn: Config of the cross-attention (`BEVDeformableAttention`).
         guidance: Settings of `GaussianGuidance`, or None for a layer that is not guided.
         space: How the reference stands for a Gaussian, for the guidance.
-        init_cfg: As in mmengine.
 
     Raises:
         ValueError: If there is guidance but the reference holds no Gaussians.
@@ -44,9 +43,8 @@ class MapDecoderLayer(BaseModule):
         cross_attn: dict[str, Any] | None = None,
         guidance: dict[str, Any] | None = None,
         space: GaussianSpace | None = None,
-        init_cfg: dict | None = None,
     ) -> None:
-        super().__init__(init_cfg)
+        super().__init__()
         shared = {"embed_dims": embed_dims, "num_heads": num_heads, "dropout": dropout}
         self.self_attn = MODELS.build(
             {"type": "PointSelfAttention", "num_points": num_points, **shared, **(self_attn or {})}
@@ -122,38 +120,25 @@ class GaussianDecoderLayer(MapDecoderLayer):
         super().__init__(guidance=guidance, **kwargs)
 
 
-class Decoded(NamedTuple):
-    """What a decoder returns.
-
-    Attributes:
-        point_states: Point queries after each layer. (L, B, N * P, C)
-        references: Refined references, float32. (L, B, N * P, D)
-    """
-
-    point_states: Tensor
-    references: Tensor
-
-
 @MODELS.register_module()
 class MapDecoder(BaseModule):
     """A stack of decoder layers that refine one reference.
 
     Args:
-        layer: Config of the layer; its ``type`` is the head's choice unless it names one.
+        layer: Config of the layer.
         num_layers: Number of layers L.
         detach_reference: Cut the gradient through the reference between layers, as MapTR does.
-        init_cfg: As in mmengine.
         shared: What the head hands on to every layer: ``embed_dims``, ``num_points``, ``space``.
 
     Attributes:
         point_queries: Whether it takes point queries (B, N * P, C), or instance queries (B, N, C).
-        knows_its_layer: Whether it chooses the layer's type itself, or the head does.
+        guided_layer: What makes its layers guided ones, in their config.
         fields: What else it returns, (L, B, N, ...) each; losses may read it of the predictions.
             ``instance_states``, if among them, say the class in place of the mean over points.
     """
 
     point_queries = True
-    knows_its_layer = False
+    guided_layer: ClassVar[dict[str, Any]] = {"type": "GaussianDecoderLayer"}
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
@@ -161,12 +146,20 @@ class MapDecoder(BaseModule):
         layer: dict[str, Any],
         num_layers: int = 6,
         detach_reference: bool = True,
-        init_cfg: dict | None = None,
         **shared: Any,
     ) -> None:
-        super().__init__(init_cfg)
+        super().__init__()
         self.detach_reference = detach_reference
-        self.layers = ModuleList(MODELS.build({**shared, **layer}) for _ in range(num_layers))
+        layer = {"type": "MapDecoderLayer", **shared, **layer}
+        self.layers = ModuleList(MODELS.build(layer) for _ in range(num_layers))
+
+    def start(self, query: Tensor, reference: Tensor, bev_feats: Tensor) -> tuple[Any, Tensor, Any]:
+        """Return queries, reference and features as the layers take them."""
+        return query, reference, bev_feats
+
+    def read(self, state: Any) -> dict[str, Tensor]:
+        """Return ``point_states`` (B, N * P, C) and the further ``fields`` of a layer's output."""
+        return {"point_states": state}
 
     def forward(
         self,
@@ -176,27 +169,29 @@ class MapDecoder(BaseModule):
         bev_feats: Tensor,
         refine: Callable[[int, Tensor, Tensor], Tensor],
         attn_mask: Tensor | None = None,
-    ) -> Decoded:
+    ) -> dict[str, Tensor]:
         """Run all layers, each on the reference that the one before refined.
 
         Args:
-            query: Content of the point queries. (B, N * P, C)
-            query_pos: Their learned position. (B, N * P, C)
-            reference: Initial reference. (B, N * P, D)
+            query: Content of the queries, Q of points (N * P) or of instances (N). (B, Q, C)
+            query_pos: Their learned position. (B, Q, C)
+            reference: Initial reference of each. (B, Q, D)
             bev_feats: BEV features. (B, C, H, W)
-            refine: Maps a layer's number, its states (B, N * P, C) and a reference (B, N * P, D) to
-                the refined one.
+            refine: Maps a layer's number, its point states (B, N * P, C) and a reference (B, N * P,
+                D) to the refined one.
             attn_mask: True where an instance may not attend to another, or None. (N, N)
 
         Returns:
-            The states and refined references of all layers.
+            Of all layers, ``point_states`` (L, B, N * P, C), the refined ``references`` (L, B, N *
+            P, D), float32, and the decoder's further ``fields``.
         """
-        states, references = [], []
+        state, reference, feats = self.start(query, reference, bev_feats)
+        outputs: list[dict[str, Tensor]] = []
         for number, layer in enumerate(self.layers):
-            query = layer(query, query_pos, reference, bev_feats, attn_mask)
-            reference = refine(number, query, reference)
-            states.append(query)
-            references.append(reference)
+            state = layer(state, query_pos, reference, feats, attn_mask)
+            fields = self.read(state)
+            reference = refine(number, fields["point_states"], reference)
+            outputs.append({**fields, "references": reference})
             if self.detach_reference:
                 reference = reference.detach()
-        return Decoded(torch.stack(states), torch.stack(references))
+        return {name: torch.stack([output[name] for output in outputs]) for name in outputs[0]}

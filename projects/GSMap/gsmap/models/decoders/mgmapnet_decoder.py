@@ -1,33 +1,16 @@
 """MGMapNet's decoder: instance queries and point queries in one stack of layers."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
-import torch
 from mmcv.cnn.bricks.transformer import FFN
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.decoders.map_decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.layers.bev_pyramid import BEVPyramid
-from gsmap.models.layers.multi_granularity import Granularities, mlp
-
-
-class DecodedGranularities(NamedTuple):
-    """What a decoder of two granularities returns.
-
-    Attributes:
-        instance_states: Instance queries after each layer; they say the class. (L, B, N, C)
-        point_states: Point queries after each layer; they move the reference. (L, B, N * P, C)
-        references: Refined references, float32. (L, B, N * P, D)
-        mean_locations: Mean of each point's sampling locations (x, y), [0, 1] over the map, which
-            MGMapNet supervises like the points; not clipped. (L, B, N, P, 2)
-    """
-
-    instance_states: Tensor
-    point_states: Tensor
-    references: Tensor
-    mean_locations: Tensor
+from gsmap.models.layers.branches import mlp
+from gsmap.models.layers.multi_granularity import Granularities
 
 
 @MODELS.register_module()
@@ -44,7 +27,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         cross_attn: Config of the attention on the BEV (`MultiGranularityAttention`).
         reference_dims: Entries of the reference that its position code reads; None for the learned
             position instead.
-        **kwargs: Further arguments of `MapDecoderLayer`.
+        kwargs: Further arguments of `MapDecoderLayer`.
     """
 
     def __init__(
@@ -78,7 +61,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         self.point_norm = nn.LayerNorm(embed_dims)
         self.reference_code: nn.Sequential | None = None
         if reference_dims is not None:
-            self.reference_code = mlp(num_points * reference_dims, embed_dims)
+            self.reference_code = mlp(num_points * reference_dims, embed_dims, embed_dims)
 
     def forward(  # type: ignore[override]
         self,
@@ -88,17 +71,10 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         feats: Sequence[Tensor],
         attn_mask: Tensor | None = None,
     ) -> Granularities:
-        """Update the queries.
+        """Update the queries that the layer before left.
 
-        Args:
-            state: The queries that the layer before left.
-            query_pos: Learned position of the instances. (B, N, C)
-            reference: References of the points. (B, N * P, D)
-            feats: BEV features, finest level first. levels x (B, C, H, W)
-            attn_mask: True where an instance may not attend to another, or None. (N, N)
-
-        Returns:
-            The updated queries.
+        As in `MapDecoderLayer`, but that instances have the position (B, N, C) and the features
+        have levels, the finest first.
         """
         state = self.update_instances(state, query_pos, reference, feats, attn_mask)
         return state._replace(points=self.point_norm(self.point_ffn(state.points)))
@@ -138,74 +114,51 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
 class MGMapNetDecoder(MapDecoder):
     """A stack of layers with instance and point queries that refine one reference (MGMapNet).
 
+    It takes instance queries and one reference for each, which its points share at first. It also
+    returns ``instance_states`` (L, B, N, C), which say the class, and ``mean_locations`` (L, B, N,
+    P, 2), the mean of each point's sampling locations (x, y), [0, 1] over the map, not clipped.
+
     Args:
         layer: Config of the layer (`MGMapNetDecoderLayer`). Its ``reference_dims`` holds from the
             second layer on: before that no point has moved.
-        num_layers: Number of layers L.
         embed_dims: Channels C.
         num_points: Points per instance P.
         num_levels: Levels of BEV features.
-        **kwargs: Further arguments of `MapDecoder`.
+        kwargs: Further arguments of `MapDecoder`.
     """
 
     point_queries = False
-    knows_its_layer = True
+    guided_layer: ClassVar[dict[str, Any]] = {"type": "MGMapNetDecoderLayer", "guidance": {}}
     fields = ("instance_states", "mean_locations")
 
     def __init__(
         self,
         layer: dict[str, Any] | None = None,
-        num_layers: int = 6,
         embed_dims: int = 256,
         num_points: int = 20,
         num_levels: int = 2,
         **kwargs: Any,
     ) -> None:
-        super().__init__(
-            {"type": "MGMapNetDecoderLayer", **(layer or {})},
-            num_layers,
-            embed_dims=embed_dims,
-            num_points=num_points,
-            num_levels=num_levels,
-            **kwargs,
-        )
+        sizes = {"embed_dims": embed_dims, "num_points": num_points, "num_levels": num_levels}
+        super().__init__({"type": "MGMapNetDecoderLayer", **(layer or {})}, **sizes, **kwargs)
         self.num_points = num_points
         # Differs from the poster: the released model's first layer adds the learned position.
         self.layers[0].reference_code = None
         self.bev_pyramid = BEVPyramid(embed_dims, num_levels)
 
-    def forward(  # type: ignore[override]
-        self,
-        query: Tensor,
-        query_pos: Tensor,
-        reference: Tensor,
-        bev_feats: Tensor,
-        refine: Callable[[int, Tensor, Tensor], Tensor],
-        attn_mask: Tensor | None = None,
-    ) -> DecodedGranularities:
-        """Run all layers, each on the reference that the one before refined.
+    def start(
+        self, query: Tensor, reference: Tensor, bev_feats: Tensor
+    ) -> tuple[Granularities, Tensor, list[Tensor]]:
+        """Return the instances' queries, the points' references (B, N * P, D) and all levels."""
+        references = reference.repeat_interleave(self.num_points, 1)
+        return Granularities(query), references, self.bev_pyramid(bev_feats)
 
-        Args:
-            query: Content of the instance queries. (B, N, C)
-            query_pos: Their learned position. (B, N, C)
-            reference: Initial reference of each instance, which its points share. (B, N, D)
-            bev_feats: BEV features. (B, C, H, W)
-            refine: Maps a layer's number, its point states (B, N * P, C) and a reference (B, N * P,
-                D) to the refined one.
-            attn_mask: True where an instance may not attend to another, or None. (N, N)
-
-        Returns:
-            States, refined references and mean sampling locations of all layers.
-        """
-        feats = self.bev_pyramid(bev_feats)
-        state = Granularities(query)
-        reference = reference.repeat_interleave(self.num_points, 1)  # (B, N * P, D)
-        outputs = []
-        for number, layer in enumerate(self.layers):
-            state = layer(state, query_pos, reference, feats, attn_mask)
-            points = state.points.flatten(1, 2)  # (B, N * P, C)
-            reference = refine(number, points, reference)
-            outputs.append((state.instances, points, reference, state.mean_locations))
-            if self.detach_reference:
-                reference = reference.detach()
-        return DecodedGranularities(*(torch.stack(part) for part in zip(*outputs, strict=True)))
+    def read(self, state: Granularities) -> dict[str, Tensor]:
+        """Return states and mean sampling locations of a layer."""
+        assert state.points is not None
+        assert state.mean_locations is not None
+        return {
+            "point_states": state.points.flatten(1, 2),
+            "instance_states": state.instances,
+            "mean_locations": state.mean_locations,
+        }

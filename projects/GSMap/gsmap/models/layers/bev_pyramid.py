@@ -1,30 +1,22 @@
 """BEV features at several resolutions."""
 
-from mmengine.model import BaseModule
 from torch import Tensor, nn
 
 
-class PatchMerging(BaseModule):
+class PatchMerging(nn.Module):
     """Halve a map: the channels of 2 x 2 cells are joined, normalised and mixed (MGMapNet).
 
     Args:
         embed_dims: Channels C of the map and of the output.
-        init_cfg: As in mmengine.
     """
 
-    def __init__(self, embed_dims: int = 256, init_cfg: dict | None = None) -> None:
-        super().__init__(init_cfg)
+    def __init__(self, embed_dims: int) -> None:
+        super().__init__()
         self.norm = nn.LayerNorm(4 * embed_dims)
         self.reduction = nn.Linear(4 * embed_dims, embed_dims, bias=False)
 
     def forward(self, feats: Tensor) -> Tensor:
-        """Halve a map.
-
-        Args:
-            feats: The map. (B, C, H, W)
-
-        Returns:
-            The map at half the resolution. (B, C, H / 2, W / 2)
+        """Halve a map. (B, C, H, W) -> (B, C, H / 2, W / 2)
 
         Raises:
             ValueError: If a side is odd.
@@ -34,26 +26,24 @@ class PatchMerging(BaseModule):
             raise ValueError(f"a BEV level needs even sides to be halved, got {height} x {width}.")
         patches = feats.unflatten(3, (-1, 2)).unflatten(2, (-1, 2))  # (B, C, h, 2, w, 2)
         # the order of a checkpoint's channels: both rows of the even column, then of the odd one
+        # (mmdet's PatchMerging has another)
         patches = patches.permute(0, 2, 4, 5, 3, 1).flatten(3)  # (B, h, w, 4 C)
         return self.reduction(self.norm(patches)).permute(0, 3, 1, 2)
 
 
-class BEVPyramid(BaseModule):
+class BEVPyramid(nn.Module):
     """BEV features, and the same at half the resolution, a quarter and so on.
 
     Args:
         embed_dims: Channels C.
         num_levels: Number of levels; 1 adds nothing.
-        init_cfg: As in mmengine.
 
     Raises:
         ValueError: If there is no level.
     """
 
-    def __init__(
-        self, embed_dims: int = 256, num_levels: int = 2, init_cfg: dict | None = None
-    ) -> None:
-        super().__init__(init_cfg)
+    def __init__(self, embed_dims: int = 256, num_levels: int = 2) -> None:
+        super().__init__()
         if num_levels < 1:
             raise ValueError(f"num_levels must be >= 1, got {num_levels}.")
         self.merges = nn.ModuleList(PatchMerging(embed_dims) for _ in range(num_levels - 1))

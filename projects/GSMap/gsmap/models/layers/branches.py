@@ -1,6 +1,16 @@
-"""The small networks that turn a decoder's states into predictions."""
+"""The small networks that turn states into predictions, codes and embeddings."""
+
+from itertools import pairwise
 
 from torch import nn
+
+
+def mlp(*dims: int) -> nn.Sequential:
+    """Return matrices from each number of channels to the next, with ReLUs in between."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(dims):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU(True)]
+    return nn.Sequential(*layers[:-1])
 
 
 def classification_branch(embed_dims: int, num_layers: int, num_classes: int) -> nn.Sequential:
@@ -9,11 +19,3 @@ def classification_branch(embed_dims: int, num_layers: int, num_classes: int) ->
     for _ in range(num_layers):
         layers += [nn.Linear(embed_dims, embed_dims), nn.LayerNorm(embed_dims), nn.ReLU(True)]
     return nn.Sequential(*layers, nn.Linear(embed_dims, num_classes))
-
-
-def regression_branch(embed_dims: int, num_layers: int, out_dims: int) -> nn.Sequential:
-    """Return a regressor of ``out_dims`` numbers with ``num_layers`` hidden layers."""
-    layers: list[nn.Module] = []
-    for _ in range(num_layers):
-        layers += [nn.Linear(embed_dims, embed_dims), nn.ReLU(True)]
-    return nn.Sequential(*layers, nn.Linear(embed_dims, out_dims))

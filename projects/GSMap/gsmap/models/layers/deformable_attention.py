@@ -6,10 +6,9 @@ import torch
 from mmcv.ops import get_compiling_cuda_version
 from mmcv.ops.multi_scale_deform_attn import MultiScaleDeformableAttnFunction
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule, constant_init, xavier_init
+from mmengine.model import constant_init, xavier_init
 from torch import Tensor, nn
 
-from gsmap.models.layers.gaussian_guidance import turn_offsets
 from gsmap.ops.deformable_sampling import bilinear_cells, deformable_sample, sum_rows
 
 _SAMPLING_WEIGHTS = ("sampling_offsets.weight", "attention_weights.weight")
@@ -20,6 +19,11 @@ _CORNERS = 4
 def at_least_float32(values: Tensor) -> Tensor:
     """Return half-precision values in float32, others as they are: coordinates need the digits."""
     return values.to(torch.promote_types(values.dtype, torch.float32))
+
+
+def has_compiled_op(value: Tensor) -> bool:
+    """Return whether mmcv's compiled deformable attention can run on a tensor."""
+    return value.is_cuda and get_compiling_cuda_version() != "not available"
 
 
 def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor) -> Tensor:
@@ -37,11 +41,6 @@ def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights
     )
 
 
-def has_compiled_op(value: Tensor) -> bool:
-    """Return whether mmcv's compiled deformable attention can run on a tensor."""
-    return value.is_cuda and get_compiling_cuda_version() != "not available"
-
-
 def place_samples(
     offsets: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None = None
 ) -> Tensor:
@@ -56,11 +55,13 @@ def place_samples(
     Returns:
         Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
     """
+    if frames is not None:
+        offsets = torch.sum(frames[:, :, None, None] * offsets[..., None, :], -1)
     size = offsets.new_tensor([shape[1], shape[0]])
-    return reference[:, :, None, None, :2] + turn_offsets(offsets, frames) / size
+    return reference[:, :, None, None, :2] + offsets / size
 
 
-class SamplingAttention(BaseModule):
+class SamplingAttention(nn.Module):
     """The learned parts of deformable attention on one map.
 
     They are those of mmcv's ``MultiScaleDeformableAttention`` for one level.
@@ -71,7 +72,6 @@ class SamplingAttention(BaseModule):
         num_points: Samples per head and query, S.
         query_dims: Channels of the query; None means ``embed_dims``.
         dropout: Dropout on the output.
-        init_cfg: As in mmengine.
 
     Raises:
         ValueError: If ``embed_dims`` is not divisible by ``num_heads``.
@@ -84,9 +84,8 @@ class SamplingAttention(BaseModule):
         num_points: int = 4,
         query_dims: int | None = None,
         dropout: float = 0.1,
-        init_cfg: dict | None = None,
     ) -> None:
-        super().__init__(init_cfg)
+        super().__init__()
         if embed_dims % num_heads:
             raise ValueError(
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
@@ -123,6 +122,10 @@ class SamplingAttention(BaseModule):
         logits = at_least_float32(self.attention_weights(query))
         return logits.unflatten(-1, (self.num_heads, self.num_points)).softmax(-1)
 
+    def values(self, tokens: Tensor) -> Tensor:
+        """Return the projected cells of a map by head. (..., cells, C) -> (..., cells, heads, C')"""
+        return at_least_float32(self.value_proj(tokens)).unflatten(-1, (self.num_heads, -1))
+
 
 @MODELS.register_module()
 class BEVDeformableAttention(SamplingAttention):
@@ -130,27 +133,6 @@ class BEVDeformableAttention(SamplingAttention):
 
     Its arguments are those of :class:`SamplingAttention`.
     """
-
-    def sampling_locations(
-        self,
-        query: Tensor,
-        reference: Tensor,
-        shape: tuple[int, int],
-        frames: Tensor | None = None,
-    ) -> Tensor:
-        """Place the samples around the reference points; learned offsets are in cells.
-
-        Args:
-            query: Query with its position added. (B, Q, C)
-            reference: Reference; the first two entries are the point, [0, 1] over the map. (B, Q,
-                D)
-            shape: Rows and columns of the map.
-            frames: What turns each query's offsets, or None. (B, Q, 2, 2)
-
-        Returns:
-            Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
-        """
-        return place_samples(self.offsets_in_cells(query), reference, shape, frames)
 
     def forward(
         self, query: Tensor, reference: Tensor, feats: Tensor, frames: Tensor | None = None
@@ -169,33 +151,21 @@ class BEVDeformableAttention(SamplingAttention):
         """
         shape = (feats.shape[-2], feats.shape[-1])
         tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)
-        locations = self.sampling_locations(query, reference, shape, frames)
+        locations = place_samples(self.offsets_in_cells(query), reference, shape, frames)
         weights = self.weights(query)
         # Projection and sampling commute: projecting after it pays when few cells are looked at.
         if weights.numel() * _CORNERS < tokens[..., 0].numel() * self.num_heads and not (
             has_compiled_op(tokens)
         ):
-            sampled = self.sample_then_project(tokens, shape, locations, weights)
+            sampled = self._sample_then_project(tokens, shape, locations, weights)
         else:
-            value = at_least_float32(self.value_proj(tokens))
-            value = value.unflatten(-1, (self.num_heads, -1))
-            sampled = sample_map(value, shape, locations, weights)
+            sampled = sample_map(self.values(tokens), shape, locations, weights)
         return self.dropout(self.output_proj(sampled))
 
-    def sample_then_project(
+    def _sample_then_project(
         self, tokens: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor
     ) -> Tensor:
-        """Return what sampling the projected map would, by projecting each head's sample.
-
-        Args:
-            tokens: The map, row-major. (B, H * W, C)
-            shape: Rows and columns of the map.
-            locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
-            weights: Attention weights. (B, Q, heads, S)
-
-        Returns:
-            Projected samples, heads concatenated. (B, Q, C)
-        """
+        """Return what sampling the projected map would, by projecting each head's sample."""
         cells, cell_weights = bilinear_cells(locations, weights, shape)
         sample = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
         table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])
@@ -203,7 +173,7 @@ class BEVDeformableAttention(SamplingAttention):
         weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C', C)
         bias = self.value_proj.bias.view(self.num_heads, -1)
         projected = torch.einsum("bqhc,hdc->bqhd", sampled, weight)
-        return (projected + cell_weights.sum(-1, keepdim=True) * bias).flatten(2)
+        return (projected + cell_weights.sum(-1, keepdim=True) * bias).flatten(2)  # (B, Q, C)
 
 
 def directional_offsets(num_heads: int, num_points: int) -> Tensor:

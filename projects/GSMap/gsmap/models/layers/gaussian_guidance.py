@@ -1,13 +1,13 @@
 """How one layer's Gaussians guide where the next looks (GSMap section 3.4)."""
 
-import torch
-from mmengine.model import BaseModule, constant_init
+from mmengine.model import constant_init
 from torch import Tensor, nn
 
+from gsmap.models.layers.branches import mlp
 from gsmap.structures.gaussians import GaussianSpace
 
 
-class GaussianGuidance(BaseModule):
+class GaussianGuidance(nn.Module):
     """What a decoder layer takes from the Gaussians, for whichever attentions it has.
 
     Both parts start neutral: the sampling frame is the identity and the embedding zero, so a layer
@@ -37,19 +37,10 @@ class GaussianGuidance(BaseModule):
         self.space = space
         self.sampling = sampling
         self.invariant = invariant
-        self.embedding: nn.Sequential | None = None
-        if embedding:
-            self.embedding = nn.Sequential(
-                nn.Linear(6, hidden_dims), nn.ReLU(True), nn.Linear(hidden_dims, embed_dims)
-            )
-        self.reset()
+        self.embedding = mlp(6, hidden_dims, embed_dims) if embedding else None
+        self.init_weights()
 
     def init_weights(self) -> None:
-        """Start neutral."""
-        super().init_weights()
-        self.reset()
-
-    def reset(self) -> None:
         """Make what GSMap adds neutral."""
         if self.embedding is not None:
             constant_init(self.embedding[-1], 0.0)
@@ -75,12 +66,3 @@ class GaussianGuidance(BaseModule):
         cell_m = reference.new_tensor(self.space.grid.resized(*shape).pixel_size_m)
         # The frames act on metres; brought to cells, the identity stays the identity bit by bit.
         return self.space.frames(reference, self.invariant) * (cell_m / cell_m[:, None])
-
-
-def turn_offsets(offsets: Tensor, frames: Tensor | None) -> Tensor:
-    """Turn sampling offsets of each query; None leaves them. (B, Q, ..., 2), (B, Q, 2, 2)"""
-    if frames is None:
-        return offsets
-    extra = offsets.dim() - frames.dim() + 1
-    frames = frames.reshape(*frames.shape[:2], *(1,) * extra, 2, 2)
-    return torch.sum(frames * offsets[..., None, :], -1)

@@ -4,24 +4,17 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.models.layers.branches import mlp
 
-class AttentionBlock(nn.Module):
-    """Attention and feed-forward, each normalised *before* its residual is added.
 
-    Args:
-        embed_dims: Channels C.
-        num_heads: Heads.
-        ffn_dims: Hidden channels of the feed-forward network.
-        dropout: Dropout of the attention weights.
-    """
+class _AttentionBlock(nn.Module):
+    """Attention and feed-forward, each normalised *before* its residual is added."""
 
     def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float) -> None:
         super().__init__()
         self.attention = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
         self.norm1 = nn.LayerNorm(embed_dims)
-        self.ffn = nn.Sequential(
-            nn.Linear(embed_dims, ffn_dims), nn.ReLU(), nn.Linear(ffn_dims, embed_dims)
-        )
+        self.ffn = mlp(embed_dims, ffn_dims, embed_dims)
         self.norm2 = nn.LayerNorm(embed_dims)
 
     def forward(self, query: Tensor, attn_mask: Tensor | None = None) -> Tensor:
@@ -56,8 +49,8 @@ class GeometryDecoupledAttention(nn.Module):
     ) -> None:
         super().__init__()
         self.num_points = num_points
-        self.inter = AttentionBlock(embed_dims, num_heads, ffn_dims, dropout)
-        self.intra = AttentionBlock(embed_dims, num_heads, ffn_dims, dropout)
+        self.inter = _AttentionBlock(embed_dims, num_heads, ffn_dims, dropout)
+        self.intra = _AttentionBlock(embed_dims, num_heads, ffn_dims, dropout)
 
     def forward(
         self, query: Tensor, query_pos: Tensor | None = None, attn_mask: Tensor | None = None

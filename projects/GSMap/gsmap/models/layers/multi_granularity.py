@@ -6,16 +6,16 @@ from typing import Any, NamedTuple
 import torch
 from mmcv.cnn.bricks.transformer import FFN
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule
 from torch import Tensor, nn
 
+from gsmap.models.layers.branches import mlp
 from gsmap.models.layers.deformable_attention import (
     SamplingAttention,
     at_least_float32,
-    deformable_sample,
     directional_offsets,
     place_samples,
 )
+from gsmap.ops.deformable_sampling import deformable_sample
 
 
 class Granularities(NamedTuple):
@@ -50,177 +50,23 @@ class Samples(NamedTuple):
 
 
 class PerPointSampling(SamplingAttention):
-    """The sampling that both attentions of this module share: K offsets around every point.
+    """What both attentions of this module share: the BEV sampled at K offsets around every point.
 
     Args:
-        embed_dims: Channels C.
-        num_heads: Number of heads.
         num_points: Points per instance P.
         num_samples: Samples per head, level and point K.
         num_levels: Levels of BEV features.
-        dropout: Dropout on every output.
-        init_cfg: As in mmengine.
+        kwargs: ``embed_dims`` C, ``num_heads`` and ``dropout`` as in :class:`SamplingAttention`.
 
     Raises:
         ValueError: If ``embed_dims`` is not divisible by ``num_heads``.
     """
 
     def __init__(
-        self,
-        embed_dims: int = 256,
-        num_heads: int = 8,
-        num_points: int = 20,
-        num_samples: int = 8,
-        num_levels: int = 2,
-        dropout: float = 0.1,
-        init_cfg: dict | None = None,
+        self, num_points: int = 20, num_samples: int = 8, num_levels: int = 2, **kwargs: Any
     ) -> None:
         self.layout = (num_levels, num_points, num_samples)
-        total = num_levels * num_points * num_samples
-        super().__init__(embed_dims, num_heads, total, dropout=dropout, init_cfg=init_cfg)
-
-    def initial_offsets(self) -> Tensor:
-        """Return the same offsets for every level and point. (heads, levels * P * K, 2)"""
-        levels, points, samples = self.layout
-        return directional_offsets(self.num_heads, samples).repeat(1, levels * points, 1)
-
-    def look(
-        self,
-        query: Tensor,
-        reference: Tensor,
-        feats: Sequence[Tensor],
-        frames: Tensor | None = None,
-    ) -> Samples:
-        """Place and weigh the samples.
-
-        Args:
-            query: Instance queries with their position added. (B, N, C)
-            reference: References of the points; the first two entries are the point, [0, 1] over
-                the map. (B, N, P, D)
-            feats: BEV features, finest level first. levels x (B, C, H, W)
-            frames: What turns the sampling offsets of each point, or None. (B, N * P, 2, 2)
-
-        Returns:
-            Locations and weights of all samples.
-
-        Raises:
-            ValueError: If the numbers of levels or points are not the module's.
-        """
-        levels, points, _ = self.layout
-        if len(feats) != levels or reference.shape[2] != points:
-            raise ValueError(
-                f"expected {levels} levels of BEV features and {points} points per instance, got "
-                f"{len(feats)} and {reference.shape[2]}."
-            )
-        offsets = self.offsets_in_cells(query).unflatten(-2, self.layout)
-        offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6).flatten(2, 3)  # (levels, B, N P, heads, K,2)
-        locations = [
-            place_samples(by_level, reference.flatten(1, 2), map_size(feat), frames)
-            for by_level, feat in zip(offsets, feats, strict=True)
-        ]
-        logits = at_least_float32(self.attention_weights(query))
-        logits = logits.unflatten(-1, (self.num_heads, *self.layout))
-        joint = logits.flatten(-3).softmax(-1).unflatten(-1, self.layout)
-        order = (0, 1, 4, 3, 2, 5)  # (B, N, heads, levels, P, K) -> (B, N, P, levels, heads, K)
-        return Samples(
-            torch.stack(locations, 2).unflatten(1, (-1, points)),
-            logits.softmax(-1).permute(order),
-            joint.permute(order),
-        )
-
-    def values(self, feats: Tensor) -> Tensor:
-        """Return the projected cells of a level, by head. (B, C, H, W) -> (B, H W, heads, C')"""
-        value = at_least_float32(self.value_proj(feats.flatten(2).transpose(1, 2)))
-        return value.unflatten(-1, (self.num_heads, -1))
-
-
-@MODELS.register_module()
-class MultiPointAttention(PerPointSampling):
-    """Instance queries alone look around all of their points (StreamMapNet).
-
-    The point queries follow from the instance query by one matrix, as StreamMapNet's points do.
-    This is the baseline of MGMapNet's tables. Arguments as in :class:`PerPointSampling`.
-    """
-
-    def __init__(self, embed_dims: int = 256, **kwargs: Any) -> None:
-        super().__init__(embed_dims, **kwargs)
-        self.point_proj = nn.Linear(embed_dims, self.layout[1] * embed_dims)
-
-    def forward(
-        self,
-        state: Granularities,
-        position: Tensor,
-        reference: Tensor,
-        feats: Sequence[Tensor],
-        frames: Tensor | None = None,
-    ) -> Granularities:
-        """Update the queries from the BEV.
-
-        Args:
-            state: The queries; only the instances are read.
-            position: Position of the instance queries. (B, N, C)
-            reference: References of the points; the first two entries are the point, [0, 1] over
-                the map. (B, N, P, D)
-            feats: BEV features, finest level first. levels x (B, C, H, W)
-            frames: What turns the sampling offsets of each point, or None. (B, N * P, 2, 2)
-
-        Returns:
-            Updated queries, the instances' residual included.
-        """
-        samples = self.look(state.instances + position, reference, feats, frames)
-        seen = [
-            deformable_sample(
-                self.values(level_feats),
-                map_size(level_feats),
-                samples.locations[:, :, :, level].transpose(2, 3).flatten(3, 4),
-                samples.weights[:, :, :, level].transpose(2, 3).flatten(3, 4),
-            )
-            for level, level_feats in enumerate(feats)
-        ]
-        instances = state.instances + self.dropout(self.output_proj(torch.stack(seen).sum(0)))
-        points = self.point_proj(instances).unflatten(-1, (self.layout[1], -1))
-        return Granularities(instances, points, None, samples.locations.mean((3, 4, 5)))
-
-
-@MODELS.register_module()
-class MultiGranularityAttention(PerPointSampling):
-    """An aggregated instance query and its P point queries, which then interact (MGMapNet).
-
-    Each part has its switch, for the ablation tables of the paper.
-
-    Args:
-        embed_dims: Channels C.
-        ffn_dims: Hidden channels of the interactions.
-        add_instance: Add the aggregated instance query to its points, before P2I.
-        p2p: Let an instance's points attend to each other and to those of the layer before.
-        p2i: Let the points attend to all aggregated instance queries of the sample.
-        position_codes: Add codes of the sampling locations to queries and keys of both.
-        **kwargs: Arguments of :class:`PerPointSampling`.
-
-    Raises:
-        ValueError: If ``embed_dims`` is not divisible by ``num_heads``.
-    """
-
-    def __init__(
-        self,
-        embed_dims: int = 256,
-        ffn_dims: int = 1024,
-        add_instance: bool = True,
-        p2p: bool = True,
-        p2i: bool = True,
-        position_codes: bool = True,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(embed_dims, **kwargs)
-        _, points, samples = self.layout
-        settings = (embed_dims, self.num_heads, ffn_dims, self.dropout.p)
-        self.add_instance = add_instance
-        self.p2p = Interaction(*settings) if p2p else None
-        self.p2i = Interaction(*settings) if p2i else None
-        coded = position_codes and (p2p or p2i)
-        self.point_code = mlp(2 * samples, embed_dims) if coded else None
-        self.instance_code = mlp(2 * points * samples, embed_dims) if coded and p2i else None
-        self.instance_mlp = mlp(points * embed_dims, embed_dims)
+        super().__init__(num_points=num_levels * num_points * num_samples, **kwargs)
 
     def forward(
         self,
@@ -242,8 +88,138 @@ class MultiGranularityAttention(PerPointSampling):
 
         Returns:
             Updated queries, residuals included.
+
+        Raises:
+            ValueError: If the numbers of levels or points are not the module's.
         """
         samples = self.look(state.instances + position, reference, feats, frames)
+        updated = self.update(state, feats, samples)
+        return updated._replace(mean_locations=samples.locations.mean((3, 4, 5)))
+
+    def update(
+        self, state: Granularities, feats: Sequence[Tensor], samples: Samples
+    ) -> Granularities:
+        """Return the queries, updated by what the samples see."""
+        raise NotImplementedError
+
+    def initial_offsets(self) -> Tensor:
+        """Return the same offsets for every level and point. (heads, levels * P * K, 2)"""
+        levels, points, samples = self.layout
+        return directional_offsets(self.num_heads, samples).repeat(1, levels * points, 1)
+
+    def look(
+        self,
+        query: Tensor,
+        reference: Tensor,
+        feats: Sequence[Tensor],
+        frames: Tensor | None = None,
+    ) -> Samples:
+        """Place and weigh the samples of instance queries (B, N, C) with their position added."""
+        levels, points, _ = self.layout
+        if len(feats) != levels or reference.shape[2] != points:
+            raise ValueError(
+                f"expected {levels} levels of BEV features and {points} points per instance, got "
+                f"{len(feats)} and {reference.shape[2]}."
+            )
+        offsets = self.offsets_in_cells(query).unflatten(-2, self.layout)
+        offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6).flatten(2, 3)  # (levels, B, N P, heads, K,2)
+        locations = [
+            place_samples(by_level, reference.flatten(1, 2), feat.shape[-2:], frames)
+            for by_level, feat in zip(offsets, feats, strict=True)
+        ]
+        logits = at_least_float32(self.attention_weights(query))
+        logits = logits.unflatten(-1, (self.num_heads, *self.layout))
+        joint = logits.flatten(-3).softmax(-1).unflatten(-1, self.layout)
+        order = (0, 1, 4, 3, 2, 5)  # (B, N, heads, levels, P, K) -> (B, N, P, levels, heads, K)
+        return Samples(
+            torch.stack(locations, 2).unflatten(1, (-1, points)),
+            logits.softmax(-1).permute(order),
+            joint.permute(order),
+        )
+
+    def sample(self, feats: Sequence[Tensor], locations: Tensor, weights: Tensor) -> Tensor:
+        """Return weighted sums of each level, for locations (B, Q, levels, heads, S, 2) in it.
+
+        Weights have the locations' shape without its last entry. (B, Q, levels, heads, C / heads)
+        """
+        seen = [
+            deformable_sample(
+                self.values(level_feats.flatten(2).transpose(1, 2)),
+                (level_feats.shape[-2], level_feats.shape[-1]),
+                locations[:, :, level],
+                weights[:, :, level],
+            )
+            for level, level_feats in enumerate(feats)
+        ]
+        return torch.stack(seen, 2).unflatten(-1, (self.num_heads, -1))
+
+
+@MODELS.register_module()
+class MultiPointAttention(PerPointSampling):
+    """Instance queries alone look around all of their points (StreamMapNet).
+
+    The point queries follow from the instance query by one matrix, as StreamMapNet's points do.
+    This is the baseline of MGMapNet's tables. Arguments as in :class:`PerPointSampling`.
+    """
+
+    def __init__(self, embed_dims: int = 256, **kwargs: Any) -> None:
+        super().__init__(embed_dims=embed_dims, **kwargs)
+        self.point_proj = nn.Linear(embed_dims, self.layout[1] * embed_dims)
+
+    def update(
+        self, state: Granularities, feats: Sequence[Tensor], samples: Samples
+    ) -> Granularities:
+        """Return the instance queries with what they see, and their points."""
+        # (B, N, P, levels, heads, K, ...) -> (B, N, levels, heads, P * K, ...)
+        locations = samples.locations.movedim(2, 4).flatten(4, 5)
+        seen = self.sample(feats, locations, samples.weights.movedim(2, 4).flatten(4, 5)).sum(2)
+        instances = state.instances + self.dropout(self.output_proj(seen.flatten(2)))
+        points = self.point_proj(instances).unflatten(-1, (self.layout[1], -1))
+        return Granularities(instances, points)
+
+
+@MODELS.register_module()
+class MultiGranularityAttention(PerPointSampling):
+    """An aggregated instance query and its P point queries, which then interact (MGMapNet).
+
+    Each part has its switch, for the ablation tables of the paper.
+
+    Args:
+        embed_dims: Channels C.
+        ffn_dims: Hidden channels of the interactions.
+        add_instance: Add the aggregated instance query to its points, before P2I.
+        p2p: Let an instance's points attend to each other and to those of the layer before.
+        p2i: Let the points attend to all aggregated instance queries of the sample.
+        position_codes: Add codes of the sampling locations to queries and keys of both.
+        kwargs: Further arguments of :class:`PerPointSampling`.
+    """
+
+    def __init__(
+        self,
+        embed_dims: int = 256,
+        ffn_dims: int = 1024,
+        add_instance: bool = True,
+        p2p: bool = True,
+        p2i: bool = True,
+        position_codes: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(embed_dims=embed_dims, **kwargs)
+        _, points, samples = self.layout
+        settings = (embed_dims, self.num_heads, ffn_dims, self.dropout.p)
+        self.add_instance = add_instance
+        self.p2p = Interaction(*settings) if p2p else None
+        self.p2i = Interaction(*settings) if p2i else None
+        dims = (embed_dims, embed_dims)
+        coded = position_codes and (p2p or p2i)
+        self.point_code = mlp(2 * samples, *dims) if coded else None
+        self.instance_code = mlp(2 * points * samples, *dims) if coded and p2i else None
+        self.instance_mlp = mlp(points * embed_dims, *dims)
+
+    def update(
+        self, state: Granularities, feats: Sequence[Tensor], samples: Samples
+    ) -> Granularities:
+        """Return both queries after they have seen the BEV and each other."""
         instances, points = self.aggregate(feats, samples)
         point_code, instance_code = self.codes(samples)
         points = self.interact_points(points, point_code, state)
@@ -255,33 +231,16 @@ class MultiGranularityAttention(PerPointSampling):
         points = self.dropout(self.output_proj(points))
         if state.points is not None:
             points = points + state.points
-        return Granularities(instances, points, point_code, samples.locations.mean((3, 4, 5)))
+        return Granularities(instances, points, point_code)
 
     def aggregate(self, feats: Sequence[Tensor], samples: Samples) -> tuple[Tensor, Tensor]:
-        """Sum the samples for both granularities.
+        """Sum the samples to instance queries (B, N, C) and, mean over levels, points (B, N, P, C).
 
         The joint weights are the points' weights times the share that each point and level has in
         the instance, so the instance query is a weighted sum of what its points saw.
-
-        Args:
-            feats: BEV features, finest level first. levels x (B, C, H, W)
-            samples: Locations and weights of the samples.
-
-        Returns:
-            Instance queries (B, N, C) and point queries (B, N, P, C), the mean over levels.
         """
-        seen = [
-            deformable_sample(
-                self.values(level_feats),
-                map_size(level_feats),
-                samples.locations[:, :, :, level].flatten(1, 2),
-                samples.point_weights[:, :, :, level].flatten(1, 2),
-            )
-            for level, level_feats in enumerate(feats)
-        ]
-        # (B, N, P, levels, heads, C')
-        by_head = torch.stack(seen, 2).unflatten(1, (-1, self.layout[1]))
-        by_head = by_head.unflatten(-1, (self.num_heads, -1))
+        by_point = samples.locations.flatten(1, 2), samples.point_weights.flatten(1, 2)
+        by_head = self.sample(feats, *by_point).unflatten(1, (-1, self.layout[1]))
         shares = samples.weights.sum(-1)  # (B, N, P, levels, heads)
         instances = torch.einsum("bnplh,bnplhc->bnhc", shares, by_head)
         return instances.flatten(2), by_head.mean(3).flatten(3)
@@ -323,15 +282,8 @@ class MultiGranularityAttention(PerPointSampling):
         return attended.unflatten(1, points.shape[1:3])
 
 
-class Interaction(BaseModule):
-    """Attention and feed-forward network, each with residual and LayerNorm after it.
-
-    Args:
-        embed_dims: Channels C.
-        num_heads: Number of heads.
-        ffn_dims: Hidden channels of the feed-forward network.
-        dropout: Dropout of the attention and of every sublayer.
-    """
+class Interaction(nn.Module):
+    """Attention and feed-forward network, each with residual and LayerNorm after it."""
 
     def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float) -> None:
         super().__init__()
@@ -346,18 +298,6 @@ class Interaction(BaseModule):
         return self.norms[1](self.ffn(self.norms[0](content + self.dropout(attended))))
 
 
-def mlp(in_dims: int, embed_dims: int) -> nn.Sequential:
-    """Return two matrices with a ReLU in between."""
-    return nn.Sequential(
-        nn.Linear(in_dims, embed_dims), nn.ReLU(True), nn.Linear(embed_dims, embed_dims)
-    )
-
-
 def add_code(query: Tensor, code: Tensor | None) -> Tensor:
     """Return the queries with their position code, if there is one."""
     return query if code is None else query + code
-
-
-def map_size(feats: Tensor) -> tuple[int, int]:
-    """Return rows and columns of a map. (B, C, H, W)"""
-    return feats.shape[-2], feats.shape[-1]

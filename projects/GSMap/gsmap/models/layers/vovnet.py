@@ -12,12 +12,7 @@ from mmengine.model import BaseModule
 from torch import Tensor, nn
 
 STEM_CHANNELS = (64, 64, 128)
-STAGE_CHANNELS = (
-    (128, 256),
-    (160, 512),
-    (192, 768),
-    (224, 1024),
-)  # of a layer, of a block's output
+STAGE_CHANNELS = ((128, 256), (160, 512), (192, 768), (224, 1024))  # of a layer, of the output
 LAYERS_AND_BLOCKS = {  # layers per block, blocks of the four stages
     19: (3, (1, 1, 1, 1)),
     39: (5, (1, 1, 2, 2)),
@@ -41,11 +36,7 @@ def _convolution(
 class OneShotAggregation(nn.Module):
     """A chain of 3x3 convolutions, all aggregated at its end by one 1x1, whose channels are gated.
 
-    Args:
-        name: Name of the block, part of its modules' names.
-        channels: Channels of the input, of each convolution and of the output.
-        num_layers: Number of convolutions.
-        residual: Add the input to the output.
+    Its modules' names begin with its own; channels are those of input, convolutions and output.
     """
 
     def __init__(
@@ -135,8 +126,8 @@ class VoVNet(BaseModule):
     def train(self, mode: bool = True) -> "VoVNet":
         """Switch to training, but for what is frozen."""
         super().train(mode)
-        for index in range(self.frozen_stages + 1):
-            part = getattr(self, f"stage{index + 1}") if index else self.stem
+        stages = [self.stem, *(getattr(self, f"stage{index}") for index in range(2, 6))]
+        for part in stages[: self.frozen_stages + 1]:
             part.eval().requires_grad_(False)
         if self.norm_eval:
             for module in self.modules():

@@ -1,4 +1,4 @@
-"""MapVR's dice loss between softly rendered elements, and the same as a matching cost."""
+"""Dice losses of masks, and MapVR's of softly rendered elements."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -46,15 +46,7 @@ class ElementRenderer:
         return torch.isin(labels, labels.new_tensor(self.polygon_classes))
 
     def render(self, points: Tensor, is_polygon: Tensor) -> Tensor:
-        """Render elements.
-
-        Args:
-            points: Vertices (x, y), normalised to [0, 1] over the raster. (n, P, 2)
-            is_polygon: Which elements are polygons. (n,)
-
-        Returns:
-            Masks in [0, 1]. (n, H, W)
-        """
+        """Return masks of elements whose vertices are normalised. (n, P, 2), (n,) -> (n, H, W)"""
         height, width = self.size
         pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
         softness = self.line_softness, self.polygon_softness
@@ -62,15 +54,7 @@ class ElementRenderer:
 
 
 def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
-    """Dice loss of each pair of masks, 1 - (2 sum(p t) + 1) / (sum p + sum t + 1).
-
-    Args:
-        preds: Masks in [0, 1]. (n, H, W)
-        targets: Masks in [0, 1]. (n, H, W)
-
-    Returns:
-        Losses in [0, 1). (n,)
-    """
+    """Return 1 - (2 sum(p t) + 1) / (sum p + sum t + 1) of pairs of masks. 2 x (n, H, W) -> (n,)"""
     overlap = (preds * targets).sum((1, 2))
     return 1 - (2 * overlap + 1) / (preds.sum((1, 2)) + targets.sum((1, 2)) + 1)
 
@@ -80,30 +64,6 @@ def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
     preds, targets = preds.flatten(1), targets.flatten(1)
     overlap = preds @ targets.T
     return 1 - (2 * overlap + 1) / (preds.sum(-1)[:, None] + targets.sum(-1) + 1)
-
-
-def rendered_dice_cost(
-    pred_points: Tensor, gt_points: Tensor, gt_labels: Tensor, renderer: ElementRenderer
-) -> Tensor:
-    """Dice loss of every prediction with every ground truth, each rendered as the latter's class.
-
-    Args:
-        pred_points: Normalised points. (N, P, 2)
-        gt_points: Normalised points. (K, P, 2)
-        gt_labels: Class of each ground truth. (K,)
-        renderer: How elements become masks.
-
-    Returns:
-        Costs, without gradient. (N, K)
-    """
-    is_polygon = renderer.is_polygon(gt_labels)
-    with torch.no_grad(), torch.autocast(pred_points.device.type, enabled=False):
-        preds, gts = pred_points.float(), gt_points.float()
-        targets = renderer.render(gts, is_polygon)
-        lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
-        as_lines = pairwise_dice_loss(renderer.render(preds, lines), targets)
-        as_polygons = pairwise_dice_loss(renderer.render(preds, ~lines), targets)
-        return torch.where(is_polygon, as_polygons, as_lines)
 
 
 class RenderedDiceLoss(nn.Module):

@@ -10,18 +10,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from gsmap.models.losses.points import check_same_points
+
 NORM_EPS = 1e-6  # added to the product of two lengths: an edge may be a single point
 
 
 def shape_features(points: Tensor) -> Tensor:
-    """Describe each element's edges: their length, cosine and sine to the edge before.
-
-    Args:
-        points: Points of elements. (M, P, 2)
-
-    Returns:
-        Length, cosine and sine per edge. (3, M, P)
-    """
+    """Return each edge's length, cosine and sine to the edge before. (M, P, 2) -> (3, M, P)"""
     edges = _edges(points.movedim(-1, 0))
     lengths = edges.norm(dim=0)
     before = edges.roll(1, -1)
@@ -60,7 +55,7 @@ def euclidean_shape_loss(pred: Tensor, target: Tensor) -> Tensor:
     Raises:
         ValueError: If the shapes disagree.
     """
-    _check_shapes(pred, target)
+    check_same_points(pred, target)
     if not len(pred):
         return pred.sum() * 0
     return (shape_features(pred) - shape_features(target)).abs().sum(0).mean()
@@ -83,7 +78,7 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
     Raises:
         ValueError: If the shapes disagree or ``counts`` do not add up.
     """
-    _check_shapes(pred, target)
+    check_same_points(pred, target)
     if sum(counts) != len(pred):
         raise ValueError(f"counts must add up to {len(pred)} matches, got {list(counts)}.")
     pairs, shares, first = [], [], 0
@@ -155,11 +150,3 @@ def _turns(first: Tensor, second: Tensor, products: Tensor) -> tuple[Tensor, Ten
     cross = first[0] * second[1] - first[1] * second[0]
     scale = 1 / (products + NORM_EPS)
     return dot * scale, cross * scale
-
-
-def _check_shapes(pred: Tensor, target: Tensor) -> None:
-    """Raise if points are not those of the same elements."""
-    if pred.shape != target.shape:
-        raise ValueError(
-            f"target must have shape {tuple(pred.shape)} of pred, got {tuple(target.shape)}."
-        )

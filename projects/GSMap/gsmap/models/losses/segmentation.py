@@ -1,4 +1,4 @@
-"""Mask losses of MGMapNet: classes in BEV, and instances."""
+"""Losses of masks that a network predicts: of classes in BEV and camera view, of instances."""
 
 from collections.abc import Sequence
 
@@ -6,8 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gsmap.models.layers.mask_heads import instance_mask_embedding
-from gsmap.models.losses.auxiliary import mask_loss
+from gsmap.models.layers.branches import mlp
 from gsmap.models.losses.dice import dice_loss
 
 PAIRINGS = ("matched", "released")
@@ -30,9 +29,11 @@ def class_mask_losses(
     Raises:
         ValueError: If the shapes disagree.
     """
-    cross_entropy = mask_loss(logits, targets, pos_weight)
-    probs, truth = logits.float().sigmoid().flatten(1, 2), targets.float().flatten(1, 2)
-    return cross_entropy, dice_loss(probs, truth).mean()
+    _check_shapes(logits, targets)
+    logits, targets = logits.float(), targets.float()
+    weight = torch.tensor(pos_weight, device=logits.device)
+    cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
+    return cross_entropy, dice_loss(logits.sigmoid().flatten(1, 2), targets.flatten(1, 2)).mean()
 
 
 def instance_mask_losses(
@@ -52,14 +53,19 @@ def instance_mask_losses(
     Raises:
         ValueError: If the shapes disagree.
     """
-    if logits.shape != targets.shape:
-        raise ValueError(
-            f"targets must have shape {tuple(logits.shape)} of logits, got {tuple(targets.shape)}."
-        )
+    _check_shapes(logits, targets)
     logits, targets = logits.float(), targets.float()
     cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, reduction="none")
     dice = dice_loss(logits.sigmoid(), targets)
     return cross_entropy.mean((1, 2)).sum() / avg_factor, dice.sum() / avg_factor
+
+
+def _check_shapes(logits: Tensor, targets: Tensor) -> None:
+    """Raise if masks are not compared with those of the same shape."""
+    if logits.shape != targets.shape:
+        raise ValueError(
+            f"targets must have shape {tuple(logits.shape)} of logits, got {tuple(targets.shape)}."
+        )
 
 
 class InstanceMaskLoss(nn.Module):
@@ -92,7 +98,7 @@ class InstanceMaskLoss(nn.Module):
         super().__init__()
         if pairing not in PAIRINGS:
             raise ValueError(f"pairing must be one of {PAIRINGS}, got {pairing!r}.")
-        self.embedding = instance_mask_embedding(embed_dims)
+        self.embedding = mlp(embed_dims, embed_dims, embed_dims, embed_dims)
         self.loss_weight, self.dice_weight, self.pairing = loss_weight, dice_weight, pairing
 
     def logits(self, states: Tensor, bev_feats: Tensor) -> Tensor:
@@ -108,7 +114,7 @@ class InstanceMaskLoss(nn.Module):
         bev_feats: Tensor,
         avg_factor: float | Tensor,
     ) -> Tensor:
-        """Return the weighted loss.
+        """Return the weighted loss, 0 if nothing is matched.
 
         Args:
             states: Instance states of matched queries, samples concatenated, queries of a sample in
@@ -119,9 +125,6 @@ class InstanceMaskLoss(nn.Module):
             counts: Matches of each sample.
             bev_feats: BEV features. (B, C, H, W)
             avg_factor: The divisor: the number of matched elements, at least 1.
-
-        Returns:
-            The loss, 0 if nothing is matched. ()
         """
         samples = zip(states.split(list(counts)), bev_feats, strict=True)
         logits = torch.cat([self.logits(*sample) for sample in samples])

@@ -1,7 +1,6 @@
-"""Auxiliary supervision of MapTRv2 (arXiv 2308.05736): depth, BEV and perspective masks."""
+"""Depth supervision of MapTRv2 (arXiv 2308.05736)."""
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -72,23 +71,3 @@ def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
     chosen = probs.float().gather(-3, bins.clamp(min=0).unsqueeze(-3)).squeeze(-3)  # (..., h, w)
     chosen = torch.where(valid, chosen, 1).clamp(min=torch.finfo(chosen.dtype).tiny)
     return -chosen.log().sum() / valid.sum().clamp(min=1)
-
-
-def mask_loss(logits: Tensor, target: Tensor, pos_weight: float = 1.0) -> Tensor:
-    """Return the mean binary cross-entropy of a mask.
-
-    Args:
-        logits: Predicted mask. (...)
-        target: 0 or 1, any dtype. (...)
-        pos_weight: Weight of the pixels where ``target`` is 1.
-
-    Raises:
-        ValueError: If the shapes disagree.
-    """
-    if logits.shape != target.shape:
-        raise ValueError(
-            f"target must have shape {tuple(logits.shape)} to match logits, "
-            f"got {tuple(target.shape)}."
-        )
-    weight = torch.tensor(pos_weight, device=logits.device)
-    return F.binary_cross_entropy_with_logits(logits.float(), target.float(), pos_weight=weight)
