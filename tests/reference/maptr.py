@@ -253,8 +253,8 @@ def match_rows(
     wrong = 0.0
     for layer in range(len(outputs["all_cls_scores"])):
         predictions = head.layer_predictions(outputs, layer)
-        targets = head.get_targets(predictions, gts, metas)
-        for image, match in enumerate(targets.matches):
+        pairs = head.match(predictions, gts, metas)
+        for image, match in enumerate(pairs.matches):
             ours = torch.stack([match.query_inds, match.gt_inds, match.order_inds], -1)
             wrong = max(wrong, largest_difference(ours, data[f"match_l{layer}_b{image}"]))
     yield Row(name, "query, ground truth and order of matches", wrong, 0)

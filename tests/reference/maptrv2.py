@@ -14,7 +14,7 @@ from torch import Tensor
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakeBEVMask, MakePVMask
 from gsmap.models.heads.map_head import MapHead
-from gsmap.models.losses.auxiliary import depth_bins
+from gsmap.models.losses.depth import depth_bins
 from gsmap.ops.bev_pool import cell_indices
 from reference.golden import NUM_CAMS, Golden
 from reference.maptr import bev_rows, decoded_rows, head_rows, state_rows
@@ -201,7 +201,7 @@ def match_rows(
     different = total = 0
     for layer in range(len(outputs["all_cls_scores"])):
         predictions = head.layer_predictions(outputs, layer)
-        match = head.get_targets(predictions, [prepared], [meta], repeats).matches[0]
+        match = head.match(predictions, [prepared], [meta], repeats).matches[0]
         ours = zip(match.query_inds, match.gt_inds, match.order_inds, strict=True)
         listed = data[f"match_{group}_l{layer}"]
         reference = {(q, g % len(gt), order) for q, g, order in listed.tolist()}

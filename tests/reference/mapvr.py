@@ -3,8 +3,10 @@
 from collections.abc import Iterator
 
 import torch
+from mmengine.structures import InstanceData
 
-from gsmap.models.losses.dice import ElementRenderer, RenderedDiceLoss, rendered_dice_cost
+from gsmap.models.losses.dice import RenderedDiceLoss
+from gsmap.models.task_modules.match_costs import RenderedDiceCost
 from gsmap.ops.polyline_raster import soft_rasters
 from reference.golden import Golden
 from reference.maptr import head_loss_rows
@@ -18,7 +20,6 @@ LOSSES = {
     "loss_dir": "loss_dir",
     "loss_rendered_mask": "loss_dice",
 }
-COST_WEIGHT, COST_RENDERER = 10.0, ElementRenderer((128, 64))
 # How the suffix of a raster's name says it was rendered: whether as a polygon. Boundaries of
 # polygons and hard masks serve nothing in MapVR's training and have no counterpart here.
 KINDS = {"lane_boundary_s2": False, "as_lane_s2": False, "mask_s4": True}
@@ -57,8 +58,9 @@ def check_dice(golden: Golden, name: str) -> Iterator[Row]:
         yield Row(name, f"{case}: loss (relative)", off, 1e-4)
         off = relative_norm(pred.grad, data[f"{case}_grad_analytic"])
         yield Row(name, f"{case}: true gradient (relative)", off, 1e-3)
-        cost = rendered_dice_cost(data[f"{case}_cost_pred"], gt, labels, COST_RENDERER)
-        off = largest_difference(COST_WEIGHT * cost, data[f"{case}_cost_w10"])
+        predictions = InstanceData(pts=data[f"{case}_cost_pred"])
+        cost = RenderedDiceCost()(predictions, InstanceData(first_pts=gt, labels=labels))
+        off = largest_difference(cost, data[f"{case}_cost_w10"])
         yield Row(name, f"{case}: cost", off, 1e-4)
 
 

@@ -235,7 +235,7 @@ def inside_rows(
     exchanged = attention.interact_points(points, point_code, state)
     joined = exchanged + instances[:, :, None]
     out = attention.interact_instances(joined, point_code, instances, instance_code)
-    values = torch.cat([attention.values(level) for level in feats], 1)
+    values = torch.cat([attention.values(level.flatten(2).transpose(1, 2)) for level in feats], 1)
     ours = {  # (B, N, P, levels, heads, K) -> (B, N, heads, levels, P, K)
         "loc": (samples.locations.permute(0, 1, 4, 3, 2, 5, 6)[:, :, ::2], 1e-5),
         "w_instance": (samples.weights.permute(0, 1, 4, 3, 2, 5)[:, :, ::2].flatten(4), 1e-5),

@@ -132,8 +132,8 @@ def match_rows(
         wrong = 0
         for layer in range(LAYERS):
             predictions = head.layer_predictions(own, layer)
-            targets = head.get_targets(predictions, prepared, [{}] * B, group.repeats)
-            for sample, match in enumerate(targets.matches):
+            pairs = head.match(predictions, prepared, [{}] * B, group.repeats)
+            for sample, match in enumerate(pairs.matches):
                 triples = torch.stack([match.query_inds, match.gt_inds, match.order_inds], -1)
                 listed = data[f"match_{label}_l{layer}_b{sample}"]
                 wrong += len(set(map(tuple, triples.tolist())) ^ set(map(tuple, listed.tolist())))

@@ -34,13 +34,16 @@ import gsmap.models.layers.multi_granularity
 import gsmap.models.layers.self_attention
 import gsmap.models.layers.vovnet
 import gsmap.models.task_modules.match_costs
-import gsmap.models.task_modules.raster_costs
 import gsmap.visualization.map_visualization_hook
 import gsmap.visualization.map_visualizer  # noqa: F401
 from gsmap.models.losses.dice import RenderedDiceLoss
-from gsmap.models.losses.direction import DirectionLoss, SelfDirectionLoss
 from gsmap.models.losses.geometry import EuclideanLoss
-from gsmap.models.losses.point import PointsLoss, SamplingLocationLoss
+from gsmap.models.losses.points import (
+    DirectionLoss,
+    PointsLoss,
+    SamplingLocationLoss,
+    SelfDirectionLoss,
+)
 from gsmap.models.losses.raster import MaskOverlapLoss, RasterLoss
 from gsmap.models.losses.segmentation import InstanceMaskLoss
 

@@ -7,7 +7,8 @@ import torch
 
 from gsmap.models.decoders.map_decoder import GaussianDecoderLayer, MapDecoderLayer
 from gsmap.models.heads.references import refine_reference
-from gsmap.models.layers.gaussian_guidance import GaussianGuidance, turn_offsets
+from gsmap.models.layers.deformable_attention import place_samples
+from gsmap.models.layers.gaussian_guidance import GaussianGuidance
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
 
@@ -48,7 +49,8 @@ def places(layer: GaussianDecoderLayer, reference: torch.Tensor) -> torch.Tensor
     """Return where a layer samples a map of 6 x 5 cells for one and the same query."""
     query = torch.ones(1, reference.shape[1], 8, dtype=torch.float64)
     frames = layer.guidance.frames(reference, (6, 5))
-    return layer.cross_attn.sampling_locations(query, reference, (6, 5), frames)
+    offsets = layer.cross_attn.offsets_in_cells(query)
+    return place_samples(offsets, reference, (6, 5), frames)
 
 
 def test_each_of_the_five_parameters_changes_where_the_layer_looks():
@@ -73,10 +75,12 @@ def test_frames_act_on_metres_whatever_the_cells():
     """Cells of 6 x 10 m; a quarter turn brings one cell along y to 10 m along -x: 10 / 6 cells."""
     guidance = GaussianGuidance(SPACE, 8)
     reference = torch.tensor([[[0.5, 0.5, 0.0, 0.0, math.pi / 2]]])
-    offsets = torch.tensor([[[0.0, 1.0]]])
-    turned = turn_offsets(offsets, guidance.frames(reference, (6, 5)))
-    torch.testing.assert_close(turned, torch.tensor([[[-10 / 6, 0.0]]]), atol=1e-6, rtol=0)
-    assert torch.equal(turn_offsets(offsets, None), offsets)
+    offsets = torch.tensor([0.0, 1.0]).view(1, 1, 1, 1, 2)
+    turned = place_samples(offsets, reference, (6, 5), guidance.frames(reference, (6, 5)))
+    expected = torch.tensor([0.5 - 10 / 6 / 5, 0.5]).view_as(turned)  # five columns
+    torch.testing.assert_close(turned, expected, atol=1e-6, rtol=0)
+    left = place_samples(offsets, reference, (6, 5))
+    torch.testing.assert_close(left, torch.tensor([0.5, 0.5 + 1 / 6]).view_as(left))
 
 
 def test_a_new_guided_layer_computes_what_the_plain_one_does():

@@ -23,14 +23,15 @@ def test_each_layer_refines_what_the_one_before_returned():
     decoder = small_decoder()
     reference = torch.rand(2, 6, 2)
     steps = [torch.randn(2, 6, 2), torch.randn(2, 6, 2)]
-    states, references = decoder(
+    out = decoder(
         torch.randn(2, 6, 8),
         torch.randn(2, 6, 8),
         reference,
         torch.randn(2, 8, 5, 4),
         stepping(steps),
     )
-    assert states.shape == (2, 2, 6, 8)
+    assert out["point_states"].shape == (2, 2, 6, 8)
+    references = out["references"]
     first = refine_reference(reference, steps[0])
     torch.testing.assert_close(references[0], first)
     torch.testing.assert_close(references[1], refine_reference(first, steps[1]))
@@ -40,14 +41,14 @@ def test_each_layer_refines_what_the_one_before_returned():
 def test_the_gradient_between_layers_is_cut_or_not(cut):
     decoder = small_decoder(**({} if cut else {"detach_reference": False}))
     steps = [torch.zeros(1, 6, 2, requires_grad=True) for _ in range(2)]
-    _, references = decoder(
+    out = decoder(
         torch.randn(1, 6, 8),
         torch.randn(1, 6, 8),
         torch.rand(1, 6, 2),
         torch.randn(1, 8, 5, 4),
         stepping(steps),
     )
-    references[1].sum().backward()
+    out["references"][1].sum().backward()
     assert (steps[0].grad is None or not steps[0].grad.any()) == cut
     assert steps[1].grad.abs().min() > 0
 
@@ -58,10 +59,10 @@ def test_a_masked_query_does_not_change_the_others():
     mask = torch.zeros(6, 6, dtype=torch.bool)
     mask[:5, 5] = True  # nobody looks at the last query
     arguments = (torch.rand(1, 6, 2), torch.randn(1, 8, 5, 4), stepping([torch.zeros(1, 6, 2)]))
-    before, _ = decoder(query, position, *arguments, mask)
+    before = decoder(query, position, *arguments, mask)["point_states"]
     changed = query.clone()
     changed[:, 5] += 3.0
-    after, _ = decoder(changed, position, *arguments, mask)
+    after = decoder(changed, position, *arguments, mask)["point_states"]
     torch.testing.assert_close(before[:, :, :5], after[:, :, :5])
     assert not torch.allclose(before[:, :, 5], after[:, :, 5])
 

@@ -58,10 +58,10 @@ def run(decoder, mask=None, num=N, dims=2, step=0.3):
 @pytest.mark.parametrize("dims", [2, 3, 5])
 def test_shapes_and_references_of_several_entries(dims):
     out = run(build(reference_dims=min(dims, 3)), dims=dims)
-    assert out.instance_states.shape == (3, B, N, C)
-    assert out.point_states.shape == (3, B, N * P, C)
-    assert out.references.shape == (3, B, N * P, dims)
-    assert out.mean_locations.shape == (3, B, N, P, 2)
+    assert out["instance_states"].shape == (3, B, N, C)
+    assert out["point_states"].shape == (3, B, N * P, C)
+    assert out["references"].shape == (3, B, N * P, dims)
+    assert out["mean_locations"].shape == (3, B, N, P, 2)
 
 
 def test_the_gradient_is_cut_between_layers():
@@ -71,17 +71,17 @@ def test_the_gradient_is_cut_between_layers():
     out = decoder(
         query, position, reference, bev, lambda n, _, r: refine_reference(r, moves[n].expand_as(r))
     )
-    (gradient,) = torch.autograd.grad(out.references[2].sum(), moves, retain_graph=True)
+    (gradient,) = torch.autograd.grad(out["references"][2].sum(), moves, retain_graph=True)
     assert gradient.ne(0).tolist() == [False, False, True]
-    (gradient,) = torch.autograd.grad(out.mean_locations.sum(), moves, allow_unused=True)
+    (gradient,) = torch.autograd.grad(out["mean_locations"].sum(), moves, allow_unused=True)
     assert gradient is None or not gradient.any()
 
 
 def test_later_layers_look_around_the_refined_reference():
     decoder = build()
     moved, still = run(decoder, step=2.0), run(decoder, step=0.0)
-    assert torch.equal(moved.mean_locations[0], still.mean_locations[0])
-    assert not torch.allclose(moved.mean_locations[1], still.mean_locations[1])
+    assert torch.equal(moved["mean_locations"][0], still["mean_locations"][0])
+    assert not torch.allclose(moved["mean_locations"][1], still["mean_locations"][1])
 
 
 def test_a_mask_parts_the_groups_in_the_self_attention_but_not_in_p2i():
@@ -89,11 +89,11 @@ def test_a_mask_parts_the_groups_in_the_self_attention_but_not_in_p2i():
     mask = group[:, None] != group
     without = build(cross_attn={"p2i": False})
     both, alone = run(without, mask), run(without, num=2)
-    torch.testing.assert_close(both.point_states[:, :, : 2 * P], alone.point_states)
-    torch.testing.assert_close(both.instance_states[:, :, :2], alone.instance_states)
+    torch.testing.assert_close(both["point_states"][:, :, : 2 * P], alone["point_states"])
+    torch.testing.assert_close(both["instance_states"][:, :, :2], alone["instance_states"])
     full = build()
     both, alone = run(full, mask), run(full, num=2)
-    assert not torch.allclose(both.point_states[:, :, : 2 * P], alone.point_states)
+    assert not torch.allclose(both["point_states"][:, :, : 2 * P], alone["point_states"])
 
 
 ROWS = {  # the poster's tables
@@ -112,7 +112,11 @@ ROWS = {  # the poster's tables
 def test_every_row_of_the_tables_trains_with_all_of_its_parameters(row):
     decoder = build(**ROWS[row]).train()
     out = run(decoder)
-    loss = out.instance_states.square().sum() + out.references.sum() + out.mean_locations.sum()
+    loss = (
+        out["instance_states"].square().sum()
+        + out["references"].sum()
+        + out["mean_locations"].sum()
+    )
     loss.backward()
     assert [name for name, p in decoder.named_parameters() if p.grad is None] == []
 
@@ -123,10 +127,10 @@ def test_gaussians_guide_positions_and_samples_once_they_are_not_neutral():
     guided, plain = build(**settings, guidance={}), build(reference_dims=2)
     plain.load_state_dict({k: guided.state_dict()[k] for k in plain.state_dict()})
     assert not torch.allclose(
-        run(guided, dims=5).mean_locations[0], run(plain, dims=5).mean_locations[0]
+        run(guided, dims=5)["mean_locations"][0], run(plain, dims=5)["mean_locations"][0]
     )
     for layer in guided.layers:
-        layer.guidance.reset()
+        layer.guidance.init_weights()
     layer = guided.layers[0]
     neutral = torch.rand(B, N * P, 5, dtype=torch.float64)
     neutral[..., 2:] = 0

@@ -34,11 +34,11 @@ def test_the_loss_compares_relations_within_each_sample_only():
     gts = [head.prepare_gt(truth) for truth in truths]
     ((_, own),) = head.split_groups(outputs)
     predictions = head.layer_predictions(own, 1)
-    targets = head.get_targets(predictions, gts, [{}, {}])
-    matched = [p.pts[m.query_inds] for p, m in zip(predictions, targets.matches, strict=True)]
-    expected = EuclideanLoss()(torch.cat(matched), targets.pts, [2, 3])
+    pairs = head.match(predictions, gts, [{}, {}])
+    matched = [p.pts[m.query_inds] for p, m in zip(predictions, pairs.matches, strict=True)]
+    expected = EuclideanLoss()(torch.cat(matched), pairs["gt.pts"], [2, 3])
     torch.testing.assert_close(actual, expected)
-    assert not torch.isclose(expected, EuclideanLoss()(torch.cat(matched), targets.pts, [5]))
+    assert not torch.isclose(expected, EuclideanLoss()(torch.cat(matched), pairs["gt.pts"], [5]))
 
 
 def test_parts_of_gemap_can_be_left_out():

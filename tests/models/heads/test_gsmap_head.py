@@ -137,14 +137,14 @@ def test_matching_reads_the_rendered_masks():
     outputs["all_references"], outputs["all_pts_preds"] = references, references[..., :2]
     outputs["all_cls_scores"][-1, 0, 1] = outputs["all_cls_scores"][-1, 0, 0]
     predictions = predictions_of(head, outputs, 1)
-    targets = head.get_targets(predictions, [head.prepare_gt(lane)], [{}])
-    assert targets.matches[0].query_inds.tolist() == [1]
+    pairs = head.match(predictions, [head.prepare_gt(lane)], [{}])
+    assert pairs.matches[0].query_inds.tolist() == [1]
 
     blind = build_head(GSMAP, iou_cost=None)
     predictions = predictions_of(blind, outputs, 1)
     assert "rasters" not in predictions[0]
-    targets = blind.get_targets(predictions, [blind.prepare_gt(lane)], [{}])
-    assert targets.matches[0].query_inds.tolist() == [0]
+    pairs = blind.match(predictions, [blind.prepare_gt(lane)], [{}])
+    assert pairs.matches[0].query_inds.tolist() == [0]
 
 
 def test_the_masks_of_matching_carry_no_gradient():

@@ -60,10 +60,10 @@ def test_the_divisor_is_the_number_of_matched_elements_in_the_batch(head):
     outputs = outputs_with(torch.cat([one.pts + 1.0]), head)
     both = {key: value.expand(-1, 2, *value.shape[2:]) for key, value in outputs.items()}
     gts = [head.prepare_gt(gt) for gt in (one, three)]
-    targets = head.get_targets(head.layer_predictions(both, 0), gts, [{}, {}])
-    assert targets.avg_factor.item() == 4.0
-    assert targets.pts.shape == (4, 20, 2)
-    assert (targets.labels[:NUM] < 3).sum() == 1
+    pairs = head.match(head.layer_predictions(both, 0), gts, [{}, {}])
+    assert pairs.avg_factor.item() == 4.0
+    assert pairs["gt.pts"].shape == (4, 20, 2)
+    assert (pairs.query_labels()[:NUM] >= 0).sum() == 1
 
 
 def test_only_the_last_layer_has_plain_names(head):

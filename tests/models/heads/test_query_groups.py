@@ -67,9 +67,9 @@ def test_every_ground_truth_is_matched_once_and_then_several_times():
     matched = {}
     for group, own in head.split_groups(outputs):
         predictions = head.layer_predictions(own, 1)
-        targets = head.get_targets(predictions, prepared, meta, group.repeats)
-        matched[group.name] = torch.bincount(targets.matches[0].gt_inds).tolist()
-        expected = head.layer_losses(group, predictions, prepared, targets, is_last=True)
+        pairs = head.match(predictions, prepared, meta, group.repeats)
+        matched[group.name] = torch.bincount(pairs.matches[0].gt_inds).tolist()
+        expected = head.layer_losses(group, pairs, is_last=True)
         suffix = f"_{group.name}" if group.name else ""
         for name, value in expected.items():
             torch.testing.assert_close(losses[f"{name}{suffix}"], value)

@@ -17,8 +17,6 @@ from head_cases import (
     with_layer,
 )
 
-from gsmap.models.heads.matched import MatchedPairs
-
 LANES = elements(((-3, -20), (-3, 20)), ((3, -20), (4, 20)), labels=[0, 2])
 SQUARE = elements(((-4, -4), (4, -4)), labels=[1])
 SQUARE.polylines = torch.tensor([[[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-4, -4]]])
@@ -152,8 +150,7 @@ def test_masks_come_from_full_resolution_or_from_the_matched_points(source):
     train_a_step(head, SQUARE)
     predictions = predictions_of(head, head(bev()), 1)
     gts = [head.prepare_gt(SQUARE)]
-    targets = head.get_targets(predictions, gts, [{}])
-    pairs = MatchedPairs(predictions, gts, targets, head.reference, head.masks)
+    pairs = head.match(predictions, gts, [{}])
     drawn = {"full": SQUARE.polylines, "points": SQUARE.pts}[source]
     expected = head.masks.draw(drawn, SQUARE.labels_3d, head.masks.grid)
     torch.testing.assert_close(pairs["gt.masks"], expected)

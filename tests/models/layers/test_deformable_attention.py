@@ -5,6 +5,7 @@ from mmcv.ops.multi_scale_deform_attn import multi_scale_deformable_attn_pytorch
 from gsmap.models.layers.deformable_attention import (
     BEVDeformableAttention,
     directional_offsets,
+    place_samples,
 )
 
 SHAPE = (5, 7)  # rows, columns
@@ -42,7 +43,8 @@ def test_attention_equals_its_formula_whether_it_projects_before_or_after_sampli
 def test_a_new_attention_looks_in_every_direction_with_equal_weights():
     attention = BEVDeformableAttention(embed_dims=8, num_heads=4, num_points=2)
     reference = torch.full((1, 1, 2), 0.5)
-    locations = attention.sampling_locations(torch.randn(1, 1, 8), reference, (10, 20))
+    offsets = attention.offsets_in_cells(torch.randn(1, 1, 8))
+    locations = place_samples(offsets, reference, (10, 20))
     # head 0 looks along +x: one and two cells of 1 / 20
     torch.testing.assert_close(locations[0, 0, 0], torch.tensor([[0.55, 0.5], [0.6, 0.5]]))
     assert torch.equal(attention.weights(torch.randn(1, 1, 8)), torch.full((1, 1, 4, 2), 0.5))

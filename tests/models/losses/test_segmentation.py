@@ -25,6 +25,12 @@ def test_dice_takes_all_classes_of_a_sample_together():
     assert dice.item() == pytest.approx((1 - 2 / 4 + 1 - 1 / 3) / 2)
 
 
+def test_the_foreground_weighs_in_the_cross_entropy():
+    truth = torch.tensor([1, 0]).view(1, 1, 1, 2)
+    cross_entropy, _ = class_mask_losses(torch.zeros(1, 1, 1, 2), truth, pos_weight=4.0)
+    assert cross_entropy.item() == pytest.approx(2.5 * math.log(2))
+
+
 def test_instances_are_summed_over_the_divisor():
     truth = torch.tensor([[[1.0, 0.0]], [[0.0, 0.0]], [[1.0, 1.0]]])
     cross_entropy, dice = instance_mask_losses(torch.zeros(3, 1, 2), truth, avg_factor=6)
@@ -100,5 +106,5 @@ def test_without_a_match_the_network_gets_a_gradient_of_zero():
 def test_other_shapes_are_named():
     with pytest.raises(ValueError, match=r"shape \(3, 1, 2\) of logits, got \(2, 1, 2\)"):
         instance_mask_losses(torch.zeros(3, 1, 2), torch.zeros(2, 1, 2), 1)
-    with pytest.raises(ValueError, match="target must have shape"):
+    with pytest.raises(ValueError, match=r"targets must have shape \(1, 3, 4, 4\) of logits"):
         class_mask_losses(torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 4, 4))

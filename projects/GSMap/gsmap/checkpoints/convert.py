@@ -14,17 +14,10 @@ from gsmap.checkpoints.safe_globals import mmengine_globals
 def ours_from_upstream(
     state: Mapping[str, Tensor], key_map: KeyMap | None = None
 ) -> dict[str, Tensor]:
-    """Rename an upstream state to our keys.
-
-    Args:
-        state: Upstream state dict.
-        key_map: The table to use; None picks it by the keys.
-
-    Returns:
-        Our state dict; keys that the table calls unused are left out.
+    """Rename an upstream state to our keys; those that the table calls unused are left out.
 
     Raises:
-        ValueError: If a key is not in the table.
+        ValueError: If a key is not in the table (``key_map``, or the one that the keys tell).
     """
     key_map = key_map or find_key_map(state)
     renamed, unknown = {}, []
@@ -44,15 +37,8 @@ def upstream_from_ours(
 ) -> dict[str, Tensor]:
     """Rename our state to upstream's keys and add the ones that only upstream has.
 
-    Args:
-        state: Our state dict.
-        key_map: The table to use; None picks it by the keys.
-
-    Returns:
-        Upstream state dict.
-
     Raises:
-        ValueError: If a key has no upstream name.
+        ValueError: If a key is not in the table (``key_map``, or the one that the keys tell).
     """
     key_map = key_map or find_key_map(state)
     names = {key: key_map.to_upstream(key) for key in state}
@@ -62,8 +48,9 @@ def upstream_from_ours(
             f"keys that upstream's {key_map.name} does not have: {', '.join(unknown)}."
         )
     renamed = {name: state[key] for key, name in names.items() if name is not None}
-    extra = {key: unused.value() for key, unused in key_map.unused.items() if unused.value}
-    return {**renamed, **extra}
+    extra = {key: value for key, value in key_map.unused.items() if value is not None}
+    copies = {k: v.clone(memory_format=torch.contiguous_format) for k, v in extra.items()}
+    return {**renamed, **copies}
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -90,12 +77,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]
 def convert_state(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     """Turn either format into the other.
 
-    Args:
-        state: State dict in either format.
-
-    Returns:
-        The converted state dict and what was done: ``"<architecture>: upstream to gsmap"`` or the
-        reverse.
+    Also returns what was done: ``"<architecture>: upstream to gsmap"`` or the reverse.
     """
     key_map = find_key_map(state)
     if is_upstream(state):

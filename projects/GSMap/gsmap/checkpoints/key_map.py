@@ -1,28 +1,14 @@
 """The table between the state keys of the earlier systems and ours, read in both directions."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 _NUMBER = "{i}"
-
-
-class UnusedKey(NamedTuple):
-    """An upstream key that our model does not hold.
-
-    Attributes:
-        reason: Why nothing is lost without it.
-        value: Makes the tensor that upstream expects there, for conversion back; None where only
-            some of upstream's models hold the key.
-    """
-
-    reason: str
-    value: Callable[[], Tensor] | None
+Rules = tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
@@ -33,15 +19,16 @@ class KeyMap:
         name: Name of the architecture.
         rules: Pairs of key prefixes (upstream's, ours); ``{i}`` stands for a number, the same on
             both sides, in order. The first that fits wins.
-        unused: Upstream keys without a counterpart, whatever the rules say.
+        unused: Upstream keys without a counterpart, whatever the rules say, and what upstream
+            expects there, for conversion back; None where only some of its models hold the key.
         markers: Pairs of key prefixes (upstream's, ours) that, all present, tell this architecture
             from those after it in ``KEY_MAPS``.
     """
 
     name: str
-    rules: tuple[tuple[str, str], ...]
-    unused: Mapping[str, UnusedKey] = field(default_factory=dict)
-    markers: tuple[tuple[str, str], ...] = (("", ""),)
+    rules: Rules
+    unused: Mapping[str, Tensor | None] = field(default_factory=dict)
+    markers: Rules = (("", ""),)
 
     def to_ours(self, key: str) -> str | None:
         """Return our name of an upstream key, or None if there is none."""
@@ -57,7 +44,7 @@ def _pattern(template: str) -> re.Pattern[str]:
     return re.compile(r"(\d+)".join(re.escape(part) for part in template.split(_NUMBER)))
 
 
-def _rename(key: str, rules: Iterable[tuple[str, str]]) -> str | None:
+def _rename(key: str, rules: Rules) -> str | None:
     """Replace the prefix of ``key`` by the first rule that fits."""
     for source, target in rules:
         match = _pattern(source).match(key)
@@ -68,255 +55,221 @@ def _rename(key: str, rules: Iterable[tuple[str, str]]) -> str | None:
     return None
 
 
+def _moved(upstream: str, ours: str, names: Mapping[str, str]) -> Rules:
+    """Return rules for names (upstream's: ours) under a prefix on either side."""
+    return tuple((upstream + theirs, ours + own) for theirs, own in names.items())
+
+
+def _kept(upstream: str, ours: str, *names: str) -> Rules:
+    """Return rules for what has one name under a prefix on either side."""
+    return _moved(upstream, ours, {name: name for name in names})
+
+
+def _zeros(prefix: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
+    """Return zeros for parameters without effect on any output; they take no memory."""
+    return {prefix + key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}
+
+
 _HEAD = "pts_bbox_head."
 _TRANSFORMER = "pts_bbox_head.transformer."
+_ENCODER = "pts_bbox_head.transformer.encoder."
 _ENCODER_LAYER = "pts_bbox_head.transformer.encoder.layers.{i}."
 _DECODER_LAYER = "pts_bbox_head.transformer.decoder.layers.{i}."
+_OUR_ENCODER_LAYER = "bev_encoder.layers.{i}."
+_LAYER = "map_head.decoder.layers.{i}."
 
-IMAGE_RULES = (("img_backbone.", "img_backbone."), ("img_neck.", "img_neck."))
+IMAGE_RULES = _kept("", "", "img_backbone.", "img_neck.")
 HEAD_RULES = (
-    (_HEAD + "instance_embedding.", "map_head.instance_embedding."),
-    (_HEAD + "pts_embedding.", "map_head.pts_embedding."),
-    (_HEAD + "cls_branches.", "map_head.cls_branches."),
+    *_kept(_HEAD, "map_head.", "instance_embedding.", "pts_embedding.", "cls_branches."),
     (_HEAD + "reg_branches.", "map_head.reference.branches."),
     (_TRANSFORMER + "reference_points.", "map_head.reference.initial."),
 )
-DECODER_RULES = (
-    (_DECODER_LAYER + "attentions.0.attn.", "map_head.decoder.layers.{i}.self_attn."),
-    (_DECODER_LAYER + "attentions.1.", "map_head.decoder.layers.{i}.cross_attn."),
-    (_DECODER_LAYER + "ffns.0.", "map_head.decoder.layers.{i}.ffn."),
-    (_DECODER_LAYER + "norms.", "map_head.decoder.layers.{i}.norms."),
+DECODER_RULES = _moved(
+    _DECODER_LAYER,
+    _LAYER,
+    {
+        "attentions.0.attn.": "self_attn.",
+        "attentions.1.": "cross_attn.",
+        "ffns.0.": "ffn.",
+        "norms.": "norms.",
+    },
 )
 BEV_QUERY_RULES = (
-    (_HEAD + "bev_embedding.", "bev_encoder.bev_embedding."),
-    (_HEAD + "positional_encoding.", "bev_encoder.positional_encoding."),
-    (_TRANSFORMER + "level_embeds", "bev_encoder.level_embeds"),
-    (_TRANSFORMER + "cams_embeds", "bev_encoder.cams_embeds"),
-    (_TRANSFORMER + "can_bus_mlp.", "bev_encoder.can_bus_mlp."),
-    (_ENCODER_LAYER + "attentions.0.", "bev_encoder.layers.{i}.self_attn."),
-    (
-        _ENCODER_LAYER + "attentions.1.output_proj.",
-        "bev_encoder.layers.{i}.cross_attn.output_proj.",
+    *IMAGE_RULES,
+    *HEAD_RULES,
+    *DECODER_RULES,
+    *_kept(_HEAD, "bev_encoder.", "bev_embedding.", "positional_encoding."),
+    *_kept(_TRANSFORMER, "bev_encoder.", "level_embeds", "cams_embeds", "can_bus_mlp."),
+    *_moved(
+        _ENCODER_LAYER,
+        _OUR_ENCODER_LAYER,
+        {
+            "attentions.0.": "self_attn.",
+            "attentions.1.output_proj.": "cross_attn.output_proj.",
+            "ffns.0.": "ffn.",
+            "norms.": "norms.",
+        },
     ),
-    (_ENCODER_LAYER + "ffns.0.", "bev_encoder.layers.{i}.ffn."),
-    (_ENCODER_LAYER + "norms.", "bev_encoder.layers.{i}.norms."),
 )
-CODE_WEIGHTS = {
-    _HEAD + "code_weights": UnusedKey(
-        "weights of box coordinates, whose loss has weight 0", lambda: torch.ones(4)
-    )
-}
+CODE_WEIGHTS = {_HEAD + "code_weights": torch.ones(4)}  # of box coordinates: a loss of weight 0
 
-MAPTR = KeyMap(
-    name="maptr",
-    rules=(
-        *IMAGE_RULES,
-        *HEAD_RULES,
-        *DECODER_RULES,
-        *BEV_QUERY_RULES,
-        (_ENCODER_LAYER + "attentions.1.attention.", "bev_encoder.layers.{i}.cross_attn."),
-    ),
-    unused=CODE_WEIGHTS,
-)
+_KERNELS = (_ENCODER_LAYER + "attentions.1.attention.", _OUR_ENCODER_LAYER + "cross_attn.")
+_DEFORMABLE = _ENCODER_LAYER + "attentions.1.deformable_attention."
+MAPTR = KeyMap("maptr", (*BEV_QUERY_RULES, _KERNELS), CODE_WEIGHTS)
 MAPTR_BEVFORMER = KeyMap(
-    name="maptr-bevformer",
-    rules=(
-        *IMAGE_RULES,
-        *HEAD_RULES,
-        *DECODER_RULES,
-        *BEV_QUERY_RULES,
-        (
-            _ENCODER_LAYER + "attentions.1.deformable_attention.",
-            "bev_encoder.layers.{i}.cross_attn.",
-        ),
-    ),
-    unused=CODE_WEIGHTS,
-    markers=(
-        (
-            _ENCODER_LAYER + "attentions.1.deformable_attention.",
-            "bev_encoder.layers.{i}.cross_attn.sampling_offsets.",
-        ),
-    ),
+    "maptr-bevformer",
+    (*BEV_QUERY_RULES, (_DEFORMABLE, _OUR_ENCODER_LAYER + "cross_attn.")),
+    CODE_WEIGHTS,
+    markers=((_DEFORMABLE, _OUR_ENCODER_LAYER + "cross_attn.sampling_offsets."),),
 )
-
-_LAYER = "map_head.decoder.layers.{i}."
-_V2_ENCODER = _TRANSFORMER + "encoder."
-_BY_QUERIES = "part of the encoder with learned BEV queries, which depth lifting does not run"
-
-
-def _unused_zeros(reason: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, UnusedKey]:
-    """Return parameters that have no effect on any output: zeros do as well as what was trained."""
-    return {key: UnusedKey(reason, partial(torch.zeros, shape)) for key, shape in shapes.items()}
-
-
-def _constants(reason: str, values: Mapping[str, tuple[float, ...]]) -> dict[str, UnusedKey]:
-    """Return numbers of the configuration that upstream keeps in its state."""
-    return {key: UnusedKey(reason, partial(torch.tensor, value)) for key, value in values.items()}
-
 
 LIFTED_RULES = (
     *IMAGE_RULES,
     *HEAD_RULES,
-    (_HEAD + "seg_head.", "map_head.aux_heads.seg."),
-    (_HEAD + "pv_seg_head.", "map_head.aux_heads.pv_seg."),
-    (_V2_ENCODER + "depth_net.", "bev_encoder.depth_net."),
-    (_V2_ENCODER + "downsample.", "bev_encoder.downsample."),
+    *_moved(_HEAD, "map_head.aux_heads.", {"seg_head.": "seg.", "pv_seg_head.": "pv_seg."}),
+    *_kept(_ENCODER, "bev_encoder.", "depth_net.", "downsample."),
 )
-LIFTED_UNUSED = {
+LIFTED_UNUSED: dict[str, Tensor | None] = {
     **CODE_WEIGHTS,
-    **_unused_zeros(
-        _BY_QUERIES,
+    # parts of the encoder with learned BEV queries, which depth lifting does not run
+    **_zeros(
+        _HEAD + "positional_encoding.",
+        {"row_embed.weight": (200, 128), "col_embed.weight": (100, 128)},
+    ),
+    **_zeros(
+        _TRANSFORMER,
         {
-            _HEAD + "positional_encoding.row_embed.weight": (200, 128),
-            _HEAD + "positional_encoding.col_embed.weight": (100, 128),
-            _TRANSFORMER + "level_embeds": (4, 256),
-            _TRANSFORMER + "cams_embeds": (6, 256),
-            _TRANSFORMER + "can_bus_mlp.0.weight": (128, 18),
-            _TRANSFORMER + "can_bus_mlp.0.bias": (128,),
-            _TRANSFORMER + "can_bus_mlp.2.weight": (256, 128),
-            _TRANSFORMER + "can_bus_mlp.2.bias": (256,),
-            _TRANSFORMER + "can_bus_mlp.norm.weight": (256,),
-            _TRANSFORMER + "can_bus_mlp.norm.bias": (256,),
+            "level_embeds": (4, 256),
+            "cams_embeds": (6, 256),
+            "can_bus_mlp.0.weight": (128, 18),
+            "can_bus_mlp.0.bias": (128,),
+            "can_bus_mlp.2.weight": (256, 128),
+            "can_bus_mlp.2.bias": (256,),
+            "can_bus_mlp.norm.weight": (256,),
+            "can_bus_mlp.norm.bias": (256,),
         },
     ),
-    **_constants(
-        "the grid of voxels, which the config says: size, first centre and number (x, y, z)",
-        {
-            _V2_ENCODER + "dx": (0.15, 0.15, 20.0),
-            _V2_ENCODER + "bx": (-14.925, -29.925, 0.0),
-            _V2_ENCODER + "nx": (200.0, 400.0, 1.0),
-        },
-    ),
-    **_constants(
-        "weight of the foreground in a mask loss, which the config says",
-        {
-            _HEAD + "loss_seg.loss_fn.pos_weight": (4.0,),
-            _HEAD + "loss_pv_seg.loss_fn.pos_weight": (1.0,),
-        },
-    ),
+    # the grid of voxels, which the config says: size, first centre and number (x, y, z)
+    _ENCODER + "dx": torch.tensor((0.15, 0.15, 20.0)),
+    _ENCODER + "bx": torch.tensor((-14.925, -29.925, 0.0)),
+    _ENCODER + "nx": torch.tensor((200.0, 400.0, 1.0)),
+    # the weight of the foreground in a mask loss, which the config says
+    _HEAD + "loss_seg.loss_fn.pos_weight": torch.tensor((4.0,)),
+    _HEAD + "loss_pv_seg.loss_fn.pos_weight": torch.tensor((1.0,)),
 }
-LIFTED_MARKER = (_V2_ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv.")
+LIFTED_MARKER = (_ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv.")
 
 MAPTRV2 = KeyMap(
-    name="maptrv2",
-    rules=(
+    "maptrv2",
+    (
         *LIFTED_RULES,
-        (_DECODER_LAYER + "attentions.0.attn.", _LAYER + "self_attn.instance_attn."),
-        (_DECODER_LAYER + "attentions.1.attn.", _LAYER + "self_attn.point_attn."),
-        (_DECODER_LAYER + "attentions.2.", _LAYER + "cross_attn."),
-        (_DECODER_LAYER + "ffns.0.", _LAYER + "ffn."),
-        (_DECODER_LAYER + "norms.0.", _LAYER + "self_attn.norm."),
-        (_DECODER_LAYER + "norms.1.", _LAYER + "norms.0."),
-        (_DECODER_LAYER + "norms.2.", _LAYER + "norms.1."),
-        (_DECODER_LAYER + "norms.3.", _LAYER + "norms.2."),
+        *_moved(
+            _DECODER_LAYER,
+            _LAYER,
+            {
+                "attentions.0.attn.": "self_attn.instance_attn.",
+                "attentions.1.attn.": "self_attn.point_attn.",
+                "attentions.2.": "cross_attn.",
+                "ffns.0.": "ffn.",
+                "norms.0.": "self_attn.norm.",
+                "norms.1.": "norms.0.",
+                "norms.2.": "norms.1.",
+                "norms.3.": "norms.2.",
+            },
+        ),
     ),
-    unused=LIFTED_UNUSED,
+    LIFTED_UNUSED,
     markers=(LIFTED_MARKER,),
 )
 
 # The names are those of upstream since 2023-12-12. Before, upstream called the attention among
 # instances "intra" and the one within each "inter", and no key tells the two apart.
-GEOMETRY_MARKER = (
-    _DECODER_LAYER + "attentions.0.inter_",
-    "map_head.decoder.layers.{i}.self_attn.inter.",
-)
-GEOMETRY_RULES = (
-    GEOMETRY_MARKER,
-    (_DECODER_LAYER + "attentions.0.intra_", "map_head.decoder.layers.{i}.self_attn.intra."),
+GEOMETRY_RULES = _moved(
+    _DECODER_LAYER + "attentions.0.",
+    _LAYER + "self_attn.",
+    {"inter_": "inter.", "intra_": "intra."},
 )
 GEMAP = KeyMap(
-    name="gemap",
-    rules=(*GEOMETRY_RULES, *MAPTR.rules),
-    unused={
+    "gemap",
+    (*GEOMETRY_RULES, *MAPTR.rules),
+    {
         **CODE_WEIGHTS,
         # On Argoverse 2, the simple objective is the full one's head with its parts switched off.
-        _HEAD + "tau": UnusedKey("a number that no computation reads", None),
-        _HEAD + "loss_seg.loss_fn.pos_weight": UnusedKey("weight in a loss that is off", None),
-        _HEAD + "loss_pv_seg.loss_fn.pos_weight": UnusedKey("weight in a loss that is off", None),
+        _HEAD + "tau": None,  # a number that no computation reads
+        _HEAD + "loss_seg.loss_fn.pos_weight": None,
+        _HEAD + "loss_pv_seg.loss_fn.pos_weight": None,
     },
-    markers=(GEOMETRY_MARKER,),
+    markers=GEOMETRY_RULES[:1],
 )
 GEMAP_FULL = KeyMap(
-    name="gemap-full",
-    rules=(*GEOMETRY_RULES, *LIFTED_RULES, *DECODER_RULES),
-    unused={
-        **LIFTED_UNUSED,
-        _HEAD + "tau": UnusedKey(
-            "a number that no computation reads", lambda: torch.full((1,), 0.1)
-        ),
-    },
-    markers=(GEOMETRY_MARKER, LIFTED_MARKER),
+    "gemap-full",
+    (*GEOMETRY_RULES, *LIFTED_RULES, *DECODER_RULES),
+    {**LIFTED_UNUSED, _HEAD + "tau": torch.full((1,), 0.1)},
+    markers=(*GEOMETRY_RULES[:1], LIFTED_MARKER),
 )
 
-_MG_ATTENTION = _DECODER_LAYER + "attentions.1."
-_INTERACTION_RULES = tuple(
-    (f"{_MG_ATTENTION}{kind}_attention.{upstream}.", f"{_LAYER}cross_attn.{kind}.{ours}.")
-    for kind in ("p2p", "p2i")
-    for upstream, ours in (
-        ("cross_attn", "attn"),
-        ("linear1", "ffn.layers.0.0"),
-        ("linear2", "ffn.layers.1"),
-        ("norm1", "norms.0"),
-        ("norm3", "norms.1"),
-    )
-)
-_SECOND_PV = _HEAD + "bev_pv_seg_head."
-_DOWN_SAMPLING = (
-    _TRANSFORMER + "bev_downsample.",
-    "map_head.decoder.bev_pyramid.merges.0.",
-)
+_INTERACTION = {
+    "cross_attn.": "attn.",
+    "linear1.": "ffn.layers.0.0.",
+    "linear2.": "ffn.layers.1.",
+    "norm1.": "norms.0.",
+    "norm3.": "norms.1.",
+}
+_SAMPLING = {
+    **{f"p2p_attention.{theirs}": f"p2p.{ours}" for theirs, ours in _INTERACTION.items()},
+    **{f"p2i_attention.{theirs}": f"p2i.{ours}" for theirs, ours in _INTERACTION.items()},
+    "point_pos.": "point_code.",
+    "instance_pos.": "instance_code.",
+    "output_proj_point.": "output_proj.",
+    "point2ins_proj.": "instance_mlp.",
+}
+_DOWN_SAMPLING = (_TRANSFORMER + "bev_downsample.", "map_head.decoder.bev_pyramid.merges.0.")
+_NORM = ("weight", "bias", "running_mean", "running_var")
 MGMAPNET = KeyMap(
-    name="mgmapnet",
-    rules=(
+    "mgmapnet",
+    (
         *LIFTED_RULES,
         (_HEAD + "ins_seg_head.", "map_head.losses.ins_seg.embedding."),
         _DOWN_SAMPLING,
-        *_INTERACTION_RULES,
-        (_MG_ATTENTION + "point_pos.", _LAYER + "cross_attn.point_code."),
-        (_MG_ATTENTION + "instance_pos.", _LAYER + "cross_attn.instance_code."),
-        (_MG_ATTENTION + "output_proj_point.", _LAYER + "cross_attn.output_proj."),
-        (_MG_ATTENTION + "point2ins_proj.", _LAYER + "cross_attn.instance_mlp."),
+        *_moved(_DECODER_LAYER + "attentions.1.", _LAYER + "cross_attn.", _SAMPLING),
         *DECODER_RULES,
         (_TRANSFORMER + "decoder.point_ffn.{i}.", _LAYER + "point_ffn."),
         (_TRANSFORMER + "decoder.point_norm.{i}.", _LAYER + "point_norm."),
         (_TRANSFORMER + "decoder.gen_pos_embed.{i}.", _LAYER + "reference_code."),
     ),
-    unused={
+    {
         **LIFTED_UNUSED,
-        _HEAD + "loss_seg.loss_fn.pos_weight": UnusedKey("a loss that MGMapNet has not", None),
-        **_unused_zeros(
-            "embedding of the points, which MGMapNet's queries do not use",
-            {_HEAD + "pts_embedding.weight": (20, 512)},
-        ),
-        **_unused_zeros(
-            "code of the first layer's reference, which adds the learned position instead",
+        _HEAD + "loss_seg.loss_fn.pos_weight": None,  # a loss that MGMapNet has not
+        # the embedding of the points, which MGMapNet's queries do not use
+        **_zeros(_HEAD, {"pts_embedding.weight": (20, 512)}),
+        # the code of the first layer's reference, which adds the learned position instead
+        **_zeros(
+            _TRANSFORMER + "decoder.gen_pos_embed.0.",
             {
-                _TRANSFORMER + "decoder.gen_pos_embed.0.0.weight": (256, 40),
-                _TRANSFORMER + "decoder.gen_pos_embed.0.0.bias": (256,),
-                _TRANSFORMER + "decoder.gen_pos_embed.0.2.weight": (256, 256),
-                _TRANSFORMER + "decoder.gen_pos_embed.0.2.bias": (256,),
+                "0.weight": (256, 40),
+                "0.bias": (256,),
+                "2.weight": (256, 256),
+                "2.bias": (256,),
             },
         ),
-        **_unused_zeros(
-            "projection of the aggregated instance query, which is never called",
+        # the projection of the aggregated instance query, which is never called
+        **{
+            key: value
+            for layer in range(6)
+            for key, value in _zeros(
+                _DECODER_LAYER.replace(_NUMBER, str(layer)) + "attentions.1.output_proj_instance.",
+                {"weight": (256, 256), "bias": (256,)},
+            ).items()
+        },
+        # the second mask head of the camera view, which is never called
+        **_zeros(
+            _HEAD + "bev_pv_seg_head.",
             {
-                f"{_MG_ATTENTION}output_proj_instance.{leaf}".replace(_NUMBER, str(layer)): shape
-                for layer in range(6)
-                for leaf, shape in (("weight", (256, 256)), ("bias", (256,)))
-            },
-        ),
-        **_unused_zeros(
-            "second mask head of the camera view, which is never called",
-            {
-                **{f"{_SECOND_PV}{i}.weight": (256, 256, 3, 3) for i in (0, 3)},
-                **{
-                    f"{_SECOND_PV}{i}.{leaf}": (256,)
-                    for i in (1, 4)
-                    for leaf in ("weight", "bias", "running_mean", "running_var")
-                },
-                **{f"{_SECOND_PV}{i}.num_batches_tracked": () for i in (1, 4)},
-                _SECOND_PV + "6.weight": (3, 256, 1, 1),
-                _SECOND_PV + "6.bias": (3,),
+                **{f"{i}.weight": (256, 256, 3, 3) for i in (0, 3)},
+                **{f"{i}.{leaf}": (256,) for i in (1, 4) for leaf in _NORM},
+                **{f"{i}.num_batches_tracked": () for i in (1, 4)},
+                "6.weight": (3, 256, 1, 1),
+                "6.bias": (3,),
             },
         ),
     },

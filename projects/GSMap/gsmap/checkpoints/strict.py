@@ -11,19 +11,11 @@ _SHOWN = 20
 
 
 def neutral_keys(model: nn.Module, prefix: str = "") -> set[str]:
-    """Return the state keys that modules declare neutral at the start.
+    """Return the state keys, behind ``prefix``, that modules declare neutral at the start.
 
     A module that extends another one, as GSMap's extend MapTR's, lists the keys that it adds in its
     attribute ``neutral_keys`` (prefixes, relative to the module). The model can then start from a
-    checkpoint
-    without them.
-
-    Args:
-        model: The model.
-        prefix: Prefix of its keys.
-
-    Returns:
-        The full keys.
+    checkpoint without them.
     """
     declared = []
     for name, module in model.named_modules():

@@ -22,16 +22,10 @@ FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 def run_in_threads(kernel: Callable[..., None], count: int, pixels: int, *arguments: Any) -> None:
     """Call ``kernel(*arguments, first, last)`` on slices of ``range(count)``, one a torch thread.
 
-    Each instance is worked on by one thread from start to end, so the result does not depend on
-    the number of threads. Threads live for one call: nothing survives into a forked process, and
-    calls from several Python threads (torch's autograd engine) cannot meet.
-
-    Args:
-        kernel: Releases the GIL; works on instances ``first`` to ``last - 1``.
-        count: Number of instances.
-        pixels: Number of pixels per instance.
-        arguments: Of the kernel; a tensor becomes an array, one that is written to must be
-            contiguous.
+    The kernel works on instances ``first`` to ``last - 1``, each from start to end in one thread,
+    so the result does not depend on the number of threads. A tensor becomes an array; one that is
+    written to must be contiguous. Threads live for one call: nothing survives into a forked
+    process, and calls from several Python threads (torch's autograd engine) cannot meet.
     """
     arrays = [a.contiguous().numpy() if isinstance(a, Tensor) else a for a in arguments]
     workers = min(torch.get_num_threads(), count)

@@ -20,25 +20,19 @@ class SpatialCrossAttention(SamplingAttention):
         num_heads: Number of heads.
         num_points: Samples per head, S; a multiple of ``num_heights``.
         num_heights: Points per pillar, Z.
-        init_cfg: As in mmengine.
 
     Raises:
         ValueError: If ``num_points`` is not a multiple of ``num_heights``.
     """
 
     def __init__(
-        self,
-        embed_dims: int = 256,
-        num_heads: int = 8,
-        num_points: int = 8,
-        num_heights: int = 4,
-        init_cfg: dict | None = None,
+        self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 8, num_heights: int = 4
     ) -> None:
         if num_points % num_heights:
             raise ValueError(
                 f"num_points must be a multiple of num_heights, got {num_points} and {num_heights}."
             )
-        super().__init__(embed_dims, num_heads, num_points, dropout=0.0, init_cfg=init_cfg)
+        super().__init__(embed_dims, num_heads, num_points, dropout=0.0)
         self.num_heights = num_heights
 
     def forward(self, query: Tensor, img_feats: Tensor, projection: PillarProjection) -> Tensor:
@@ -55,8 +49,7 @@ class SpatialCrossAttention(SamplingAttention):
         height, width = img_feats.shape[-2:]
         offsets = self.offsets_in_cells(query) / query.new_tensor([width, height])
         weights = self.weights(query)
-        value = self.value_proj(img_feats.flatten(3).transpose(2, 3)).float()
-        value = value.unflatten(-1, (self.num_heads, -1))  # (B, V, h * w, heads, C)
+        value = self.values(img_feats.flatten(3).transpose(2, 3)).float()  # (B, V, hw, heads, C')
         repeats = self.num_points // self.num_heights
         summed = query.new_zeros(query.shape, dtype=torch.float32)
         for sample, view in torch.cartesian_prod(

@@ -22,30 +22,14 @@ def _conv_bn_relu(
     return nn.Sequential(OrderedDict(parts))
 
 
-class CameraMLP(nn.Module):
-    """Two linear layers that embed a camera's parameter vector.
-
-    Args:
-        in_channels: Length of the vector.
-        channels: Width of the embedding.
-    """
-
-    def __init__(self, in_channels: int, channels: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(in_channels, channels)
-        self.fc2 = nn.Linear(channels, channels)
-
-    def forward(self, vector: Tensor) -> Tensor:
-        """Embed vectors. (n, in_channels) -> (n, channels)"""
-        return self.fc2(F.relu(self.fc1(vector)))
+def _camera_mlp(channels: int) -> nn.Sequential:
+    """Build the embedding of a camera's parameter vector, under MapTRv2's parameter names."""
+    first, second = nn.Linear(CAMERA_VECTOR_SIZE, channels), nn.Linear(channels, channels)
+    return nn.Sequential(OrderedDict(fc1=first, relu=nn.ReLU(), fc2=second))
 
 
 class SEGate(nn.Module):
-    """Squeeze-and-excitation gate: features scaled per channel by a sigmoid of an embedding.
-
-    Args:
-        channels: Number of channels of features and embedding.
-    """
+    """Squeeze-and-excitation gate: features scaled per channel by a sigmoid of an embedding."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -55,27 +39,19 @@ class SEGate(nn.Module):
     def forward(self, feats: Tensor, embedding: Tensor) -> Tensor:
         """Gate ``feats`` (n, C, h, w) by ``embedding`` (n, C)."""
         # linear layers stored as 1x1 convolutions, which are slow on a single pixel
-        hidden = F.relu(self._linear(self.conv_reduce, embedding))
-        return feats * self._linear(self.conv_expand, hidden).sigmoid()[..., None, None]
-
-    @staticmethod
-    def _linear(conv: nn.Conv2d, vectors: Tensor) -> Tensor:
-        """Apply a 1x1 convolution to vectors. (n, C) -> (n, C)"""
-        return F.linear(vectors, conv.weight.flatten(1), conv.bias)
+        reduce, expand = self.conv_reduce, self.conv_expand
+        hidden = F.relu(F.linear(embedding, reduce.weight.flatten(1), reduce.bias))
+        gate = F.linear(hidden, expand.weight.flatten(1), expand.bias).sigmoid()
+        return feats * gate[..., None, None]
 
 
 class ASPP(nn.Module):
     """Atrous spatial pyramid pooling: five branches side by side, then a 1x1 convolution.
 
     The branches are a 1x1, three dilated 3x3 convolutions and a global average.
-
-    Args:
-        channels: Input and output channels.
-        mid_channels: Channels of each branch.
-        dropout: Dropout probability of the output.
     """
 
-    def __init__(self, channels: int, mid_channels: int, dropout: float = 0.5) -> None:
+    def __init__(self, channels: int, mid_channels: int) -> None:
         super().__init__()
         self.aspp1 = _conv_bn_relu(channels, mid_channels, 1)
         self.aspp2 = _conv_bn_relu(channels, mid_channels, 3, dilation=6)
@@ -89,7 +65,7 @@ class ASPP(nn.Module):
         )
         self.conv1 = nn.Conv2d(5 * mid_channels, channels, 1, bias=False)
         self.bn1 = nn.BatchNorm2d(channels)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = nn.Dropout(0.5)
 
     def forward(self, feats: Tensor) -> Tensor:
         """Apply to ``feats``. (n, C, h, w) -> (n, C, h, w)"""
@@ -118,10 +94,10 @@ class CameraAwareDepthNet(nn.Module):
             nn.ReLU(inplace=True),
         )
         self.bn = nn.BatchNorm1d(CAMERA_VECTOR_SIZE)
-        self.context_mlp = CameraMLP(CAMERA_VECTOR_SIZE, in_channels)
+        self.context_mlp = _camera_mlp(in_channels)
         self.context_se = SEGate(in_channels)
         self.context_conv = nn.Conv2d(in_channels, context_channels, 1)
-        self.depth_mlp = CameraMLP(CAMERA_VECTOR_SIZE, in_channels)
+        self.depth_mlp = _camera_mlp(in_channels)
         self.depth_se = SEGate(in_channels)
         self.depth_conv = nn.Sequential(
             *(BasicBlock(in_channels, in_channels) for _ in range(3)),
@@ -134,8 +110,7 @@ class CameraAwareDepthNet(nn.Module):
 
         Args:
             feats: Image features of n cameras. (n, C_in, h, w)
-            camera_vectors: Parameters of each camera, from `geometry.frustum.camera_vector`. (n,
-                22)
+            camera_vectors: Parameters of each camera, from `projection.camera_vector`. (n, 22)
 
         Returns:
             Depth logits (n, D, h, w) and context features (n, C, h, w).
@@ -163,7 +138,5 @@ class PlainDepthNet(nn.Module):
 
     def forward(self, feats: Tensor, camera_vectors: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Predict depth logits (n, D, h, w) and context (n, C, h, w) from the features alone."""
-        depth, context = self.conv(feats).split(
-            [self.depth_channels, self.conv.out_channels - self.depth_channels], 1
-        )
-        return depth, context
+        depth_and_context = self.conv(feats)
+        return depth_and_context.tensor_split([self.depth_channels], 1)

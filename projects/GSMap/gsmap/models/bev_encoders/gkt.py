@@ -2,7 +2,7 @@
 
 import torch
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule, constant_init, xavier_init
+from mmengine.model import constant_init, xavier_init
 from torch import Tensor, nn
 
 from gsmap.models.bev_encoders.projection import PillarProjection
@@ -10,14 +10,7 @@ from gsmap.ops.deformable_sampling import sum_rows
 
 
 def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
-    """Return a kernel's integer offsets (dx, dy) in the order of its weights, dx slow, dy fast.
-
-    Args:
-        kernel_size: Rows and columns of the kernel, both odd.
-
-    Returns:
-        Offsets in feature pixels. (rows * columns, 2)
-    """
+    """Return a kernel's offsets (dx, dy) in pixels, in the order of its weights, dx slow. (S, 2)"""
     rows, cols = kernel_size
     dx = torch.arange(cols) - cols // 2
     dy = torch.arange(rows) - rows // 2
@@ -28,15 +21,7 @@ def kernel_cells(uv: Tensor, offsets: Tensor, shape: tuple[int, int]) -> Tensor:
     """Return the feature pixels under a kernel centred at projected points, borders replicated.
 
     Coordinates are rounded half to even after the offset is added, without a half-pixel shift, as
-    the original does.
-
-    Args:
-        uv: Points, [0, 1] over the image. (..., 2)
-        offsets: Kernel offsets (dx, dy) in feature pixels. (S, 2)
-        shape: Rows and columns of the feature map.
-
-    Returns:
-        Row-major pixel indices. (..., S)
+    the original does. Points in [0, 1] (..., 2), offsets (dx, dy) in pixels (S, 2) -> (..., S)
     """
     height, width = shape
     position = uv * uv.new_tensor([width, height])
@@ -52,7 +37,7 @@ def border_pixels(position: Tensor, shape: tuple[int, int]) -> Tensor:
 
 
 @MODELS.register_module()
-class GeometryKernelAttention(BaseModule):
+class GeometryKernelAttention(nn.Module):
     """Attention from BEV cells to the pixels around their projections, one pillar height per head.
 
     Only pairs of a cell and a camera that sees it are computed. Sums over cameras are divided by
@@ -62,7 +47,6 @@ class GeometryKernelAttention(BaseModule):
         embed_dims: Channels C.
         num_heads: Number of heads; head m looks at pillar height m.
         kernel_size: Rows and columns of the kernel, both odd.
-        init_cfg: As in mmengine.
 
     Raises:
         ValueError: If a kernel size is even or ``embed_dims`` is not divisible by ``num_heads``.
@@ -73,9 +57,8 @@ class GeometryKernelAttention(BaseModule):
         embed_dims: int = 256,
         num_heads: int = 4,
         kernel_size: tuple[int, int] = (3, 5),
-        init_cfg: dict | None = None,
     ) -> None:
-        super().__init__(init_cfg)
+        super().__init__()
         if any(size % 2 == 0 for size in kernel_size):
             raise ValueError(f"kernel_size must be odd, got {tuple(kernel_size)}.")
         if embed_dims % num_heads:

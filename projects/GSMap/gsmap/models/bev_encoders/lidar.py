@@ -67,7 +67,7 @@ class LidarEncoder(BaseModule):
         """
         coors = voxels["coors"]
         if isinstance(self.middle_encoder, SparseEncoder) and not coors.is_cuda:
-            check_sparse_on_cpu(trains=self.training and torch.is_grad_enabled())
+            self._check_sparse_on_cpu()
         points = self.voxel_encoder(voxels["voxels"], voxels["num_points"], coors)
         feats = self.middle_encoder(points, coors, batch_size)
         if self.backbone is not None:
@@ -79,19 +79,18 @@ class LidarEncoder(BaseModule):
             feats = F.interpolate(feats, self.bev_size, mode="bilinear", align_corners=False)
         return feats
 
-
-def check_sparse_on_cpu(trains: bool) -> None:
-    """Raise RuntimeError where sparse convolutions do not work on the CPU."""
-    if trains:
-        raise RuntimeError(
-            "the sparse LiDAR encoder trains on a GPU only (spconv's backward pass needs CUDA): "
-            "on a CPU use a PointPillars config."
-        )
-    if not IS_SPCONV2_AVAILABLE:
-        raise RuntimeError(
-            "the sparse LiDAR encoder needs a GPU or the package spconv (2.x); without them "
-            "use a PointPillars config."
-        )
+    def _check_sparse_on_cpu(self) -> None:
+        """Raise RuntimeError where sparse convolutions do not work on the CPU."""
+        if self.training and torch.is_grad_enabled():
+            raise RuntimeError(
+                "the sparse LiDAR encoder trains on a GPU only (spconv's backward pass needs "
+                "CUDA): on a CPU use a PointPillars config."
+            )
+        if not IS_SPCONV2_AVAILABLE:
+            raise RuntimeError(
+                "the sparse LiDAR encoder needs a GPU or the package spconv (2.x); without them "
+                "use a PointPillars config."
+            )
 
 
 @MODELS.register_module()

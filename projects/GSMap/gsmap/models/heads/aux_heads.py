@@ -11,19 +11,14 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from torch import Tensor, nn
 
-from gsmap.models.layers.mask_heads import bev_mask_head, camera_mask_head
-from gsmap.models.losses.auxiliary import depth_bins, depth_loss
+from gsmap.models.losses.depth import depth_bins, depth_loss
 from gsmap.models.losses.segmentation import class_mask_losses
 
 
-def stack_targets(
+def _stack_targets(
     batch_data_samples: Sequence[Det3DDataSample], name: str, device: torch.device
 ) -> Tensor:
-    """Stack a training target of all samples. (B, ...)
-
-    Raises:
-        ValueError: If a sample does not have it.
-    """
+    """Stack a training target of all samples, which must have it. (B, ...)"""
     for sample in batch_data_samples:
         if name not in sample:
             raise ValueError(
@@ -63,15 +58,19 @@ class BEVMaskHead(nn.Sequential):
 
     @staticmethod
     def layers(embed_dims: int, num_masks: int) -> nn.Sequential:
-        """Return the network. (B, C, H, W) -> (B, num_masks, H, W)"""
-        return bev_mask_head(embed_dims, num_masks)
+        """Return the network: a 3x3 and a 1x1 convolution. (B, C, H, W) -> (B, num_masks, H, W)"""
+        return nn.Sequential(
+            nn.Conv2d(embed_dims, embed_dims, 3, padding=1, bias=False),
+            nn.ReLU(True),
+            nn.Conv2d(embed_dims, num_masks, 1),
+        )
 
     def loss(
         self, bev_outputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
     ) -> Tensor:
         """Return the weighted loss on the encoder's features."""
         feats = bev_outputs[self.feats]
-        target = stack_targets(batch_data_samples, self.target, feats.device)
+        target = _stack_targets(batch_data_samples, self.target, feats.device)
         target = target.reshape(-1, *target.shape[-3:])
         if self.num_masks == 1:
             target = target.amax(1, keepdim=True)
@@ -87,15 +86,7 @@ class BEVMaskHead(nn.Sequential):
 
 @MODELS.register_module()
 class PVMaskHead(BEVMaskHead):
-    """The same in the view of each camera, on the encoder's image features.
-
-    Args:
-        embed_dims: As above.
-        loss_weight: As above.
-        pos_weight: As above.
-        name: As above.
-        kwargs: Further arguments of `BEVMaskHead`.
-    """
+    """The same in the view of each camera, on the encoder's image features."""
 
     feats, target = "img_feats", "gt_pv_seg"  # (B, V, C, h, w) and (B, V, classes or 1, h, w)
 
@@ -116,8 +107,15 @@ class NormedPVMaskHead(PVMaskHead):
 
     @staticmethod
     def layers(embed_dims: int, num_masks: int) -> nn.Sequential:
-        """Return the network. (B, C, h, w) -> (B, num_masks, h, w)"""
-        return camera_mask_head(embed_dims, num_masks)
+        """Return two 3x3 convolutions with BatchNorm and a 1x1."""
+        layers: list[nn.Module] = []
+        for _ in range(2):
+            layers += [
+                nn.Conv2d(embed_dims, embed_dims, 3, padding=1, bias=False),
+                nn.BatchNorm2d(embed_dims),
+                nn.ReLU(True),
+            ]
+        return nn.Sequential(*layers, nn.Conv2d(embed_dims, num_masks, 1))
 
 
 @MODELS.register_module()
@@ -139,6 +137,6 @@ class DepthSupervision(nn.Module):
     ) -> Tensor:
         """Return the loss on ``depth`` (B, V, D, h, w), probabilities of ``depth_range``'s bins."""
         probs, depth_range = bev_outputs["depth"], bev_outputs["depth_range"]
-        target = stack_targets(batch_data_samples, "gt_depth", probs.device)
+        target = _stack_targets(batch_data_samples, "gt_depth", probs.device)
         bins = depth_bins(target, target.shape[-1] // probs.shape[-1], depth_range)
         return self.loss_weight * depth_loss(probs, bins)

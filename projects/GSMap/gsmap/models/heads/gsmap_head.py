@@ -1,7 +1,7 @@
 """GSMap's head: elements as ordered Gaussians, supervised as polylines and as rendered masks."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 from mmdet3d.registry import MODELS
 from torch import Tensor
@@ -31,47 +31,49 @@ class GSMapHead(MapHead):
 
     Args:
         grid: The map's extent.
+        decoder: Config of the decoder, whose layers become guided ones.
         losses: Configs of the losses of the head that this one extends.
         match_costs: Configs of its matching costs.
         loss_raster: Settings of the loss of the rendered masks, or None to train without it; what
             they leave out is as by default.
         iou_cost: The same of the matching cost of the rendered masks.
         masks: Settings of `ElementMasks`.
-        kwargs: Further arguments of `MapHead`; ``reference`` also takes the settings of
-            `GaussianSpace`, whose smallest sigma is half a pixel of the masks by default.
+        reference: Settings of `GaussianReference`; its smallest sigma is half a pixel of the masks
+            by default.
+        kwargs: Further arguments of `MapHead`.
     """
-
-    default_reference = "GaussianReference"
-    default_layer: ClassVar[PARTS] = {"type": "GaussianDecoderLayer"}
-    own_layer: ClassVar[PARTS] = {"guidance": {}}
 
     def __init__(
         self,
         grid: BEVGrid,
+        decoder: PARTS,
         losses: Sequence[PARTS],
         match_costs: Sequence[PARTS],
         loss_raster: PARTS | None = _RASTER_LOSS,
         iou_cost: PARTS | None = _IOU_COST,
         masks: PARTS | None = None,
+        reference: PARTS | None = None,
         **kwargs: Any,
     ) -> None:
-        self._min_scale_m = ElementMasks(grid, **(masks or {})).half_pixel_m
+        guided = MODELS.get(decoder.get("type", "MapDecoder")).guided_layer
+        # Half a pixel of the masks: smaller Gaussians get no gradient. On rasters so coarse that
+        # the usual first Gaussian comes close to that, it grows with it.
+        half_pixel_m = ElementMasks(grid, **(masks or {})).half_pixel_m
+        smallest = (reference or {}).get("min_scale_m", half_pixel_m)
+        gaussian = {
+            "type": "GaussianReference",
+            "min_scale_m": smallest,
+            "init_scales_m": (max(1.0, 3 * smallest), max(0.4, 1.5 * smallest)),
+        }
         super().__init__(
             grid=grid,
+            decoder={**decoder, "layer": {**guided, **decoder.get("layer", {})}},
             losses=[*losses, *_over(_RASTER_LOSS, loss_raster)],
             match_costs=[*match_costs, *_over(_IOU_COST, iou_cost)],
             masks=masks,
+            reference={**gaussian, **(reference or {})},
             **kwargs,
         )
-
-    def reference_settings(self, reference: PARTS) -> PARTS:
-        """Let the smallest Gaussian be half a pixel of the masks: smaller ones get no gradient.
-
-        On rasters so coarse that the usual first Gaussian comes close to that, it grows with it.
-        """
-        smallest = reference.get("min_scale_m", self._min_scale_m)
-        first = (max(1.0, 3 * smallest), max(0.4, 1.5 * smallest))
-        return {"min_scale_m": smallest, "init_scales_m": first, **reference}
 
     def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:
         """Return what says whether the Gaussians live (see `gaussian_statistics`)."""

@@ -1,9 +1,7 @@
 """The map head, composed of parts: queries, predictions of every layer, matching, losses."""
 
-# Over 400 lines: one story from queries to losses; its parts have files of their own.
-
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -15,20 +13,8 @@ from torch import Tensor, nn
 
 from gsmap.models.decoders.map_decoder import MapDecoder
 from gsmap.models.heads.masks import ElementMasks
-from gsmap.models.heads.matched import (
-    AFTER_MATCHING,
-    GT_FIELDS,
-    MapTargets,
-    MatchedPairs,
-    collect_targets,
-)
-from gsmap.models.heads.parts import (
-    by_name,
-    fields_read,
-    refuse_twins,
-    refuse_unknown_classes,
-    refuse_unknown_losses,
-)
+from gsmap.models.heads.matched import MatchedPairs
+from gsmap.models.heads.parts import by_name, check_parts
 from gsmap.models.heads.query_groups import QueryGroup, fit_instance_queries, group_mask
 from gsmap.models.layers.branches import classification_branch
 from gsmap.models.layers.deformable_attention import at_least_float32, init_matrices
@@ -58,7 +44,7 @@ class MapHead(BaseModule):
         match_costs: Configs of the matching costs.
         loss_cls: Config of the classification loss, on logits and one-hot targets.
         query_groups: Settings of each `QueryGroup`; the first one predicts.
-        reference: Config of the reference; its type is ``default_reference`` unless it names one.
+        reference: Config of the reference (`PointReference`).
         masks: Settings of `ElementMasks`, for losses and costs that read masks.
         aux_heads: Configs of heads that only help training.
         coder: Settings of `MapCoder`.
@@ -71,10 +57,6 @@ class MapHead(BaseModule):
         ValueError: If a loss or a cost reads a field that nothing here offers or names a class
             that there is not, or two parts have one name.
     """
-
-    default_reference = "PointReference"
-    default_layer: ClassVar[PARTS] = {"type": "MapDecoderLayer"}
-    own_layer: ClassVar[PARTS] = {}  # for a decoder that knows its layer's type
 
     def __init__(
         self,
@@ -102,68 +84,29 @@ class MapHead(BaseModule):
         self.masks = ElementMasks(grid, **(masks or {}))
         self.query_groups = [QueryGroup(**group) for group in query_groups]
         num_instances = sum(group.num for group in self.query_groups)
-        num_layers = decoder["num_layers"]
-        self.reference = MODELS.build(
-            {
-                "type": self.default_reference,
-                "grid": grid,
-                "embed_dims": embed_dims,
-                "num_layers": num_layers,
-                "num_reg_layers": num_reg_layers,
-                **self.reference_settings(reference or {}),
-            }
+        shared = {"embed_dims": embed_dims, "num_layers": decoder["num_layers"]}
+        point = {"type": "PointReference", "grid": grid, "num_reg_layers": num_reg_layers}
+        self.reference = MODELS.build({**point, **shared, **(reference or {})})
+        handed_on = {"num_points": num_points, "space": getattr(self.reference, "space", None)}
+        self.decoder: MapDecoder = MODELS.build(
+            {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
         )
-        self.decoder: MapDecoder = self.build_decoder(decoder)
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
         self.pts_embedding: nn.Embedding | None = None
         if self.decoder.point_queries:
             self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
         self.cls_branches = nn.ModuleList(
             classification_branch(embed_dims, num_reg_layers, len(self.classes))
-            for _ in range(num_layers)
+            for _ in range(decoder["num_layers"])
         )
         self.loss_cls = MODELS.build(loss_cls)
-        self.losses = nn.ModuleDict(by_name([MODELS.build(loss) for loss in losses]))
-        self.aux_heads = nn.ModuleDict(
-            by_name([MODELS.build({"embed_dims": embed_dims, **head}) for head in aux_heads])
+        self.losses = by_name([MODELS.build(loss) for loss in losses])
+        self.aux_heads = by_name(
+            [MODELS.build({"embed_dims": embed_dims, **head}) for head in aux_heads]
         )
         self.assigner = MapAssigner(match_costs)
         self.coder = MapCoder(grid=grid, **(coder or {}))
-        self._reads = self._check_parts()
-
-    def reference_settings(self, reference: PARTS) -> PARTS:
-        """Return the reference's settings, with what this head knows better than the defaults."""
-        return reference
-
-    def build_decoder(self, decoder: PARTS) -> MapDecoder:
-        """Return the decoder; what the head knows is handed on to its layers."""
-        knows_its_layer = MODELS.get(decoder.get("type", "MapDecoder")).knows_its_layer
-        layer = self.own_layer if knows_its_layer else self.default_layer
-        return MODELS.build(
-            {
-                "type": "MapDecoder",
-                "embed_dims": self.embed_dims,
-                "num_points": self.num_points,
-                "space": getattr(self.reference, "space", None),
-                **decoder,
-                "layer": {**layer, **decoder.get("layer", {})},
-            }
-        )
-
-    def _check_parts(self) -> set[str]:
-        """Refuse parts that do not fit together; return the fields that they read."""
-        pred = {"scores", "instance_states", *self.reference.fields, *self.decoder.fields}
-        offered = {f"pred.{name}" for name in pred} | {f"gt.{name}" for name in GT_FIELDS}
-        offered |= {"bev_feats"}
-        where = f"{type(self.reference).__name__}, the decoder and the ground truth"
-        names = ["cls", *self.losses]
-        refuse_twins([*names, *self.aux_heads], "losses")
-        refuse_twins([group.name for group in self.query_groups], "query groups")
-        refuse_unknown_losses(self.query_groups, names)
-        costs = self.assigner.match_costs
-        refuse_unknown_classes(self.masks, [*self.losses.values(), *costs], self.classes)
-        read = fields_read(costs, offered - AFTER_MATCHING, f"before the matching, {where}")
-        return read | fields_read(self.losses.values(), offered, where)
+        self._reads = check_parts(self)
 
     def init_weights(self) -> None:
         """Initialise the decoder's matrices (Xavier) and let every class start improbable."""
@@ -174,12 +117,9 @@ class MapHead(BaseModule):
         super().init_weights()  # parts that start neutral have the last word
 
     def queries(self) -> tuple[Tensor, Tensor]:
-        """Return position and content of the queries as the decoder takes them.
+        """Return position and content of the queries, 2 x (N * P, C), or (N, C) of instances.
 
-        All groups in training; else the one that predicts.
-
-        Returns:
-            Of the point queries, 2 x (N * P, C), or of the instance queries, 2 x (N, C).
+        They are as the decoder takes them: all groups in training, else the one that predicts.
         """
         both = self.instance_embedding.weight
         if not self.training:
@@ -222,18 +162,18 @@ class MapHead(BaseModule):
             self.attention_mask(),
         )
         by_point = (-1, self.num_points)
-        fields = {name: getattr(decoded, name) for name in self.decoder.fields}
+        fields = {name: decoded[name] for name in self.decoder.fields}
         if "instance_states" not in fields:
-            fields["instance_states"] = decoded.point_states.unflatten(2, by_point).mean(3)
+            fields["instance_states"] = decoded["point_states"].unflatten(2, by_point).mean(3)
         states = fields["instance_states"]  # (L, B, N, C)
         scores = [branch(layer) for branch, layer in zip(self.cls_branches, states, strict=True)]
-        references = decoded.references.unflatten(2, by_point)  # (L, B, N, P, D)
+        references = decoded["references"].unflatten(2, by_point)  # (L, B, N, P, D)
         return {
             "all_cls_scores": at_least_float32(torch.stack(scores)),
             "all_pts_preds": references[..., : self.reference.coords],
             "all_references": references,
             **{f"all_{name}": value for name, value in fields.items()},
-            "states": decoded.point_states,
+            "states": decoded["point_states"],
             "bev_feats": bev_feats,
         }
 
@@ -303,12 +243,11 @@ class MapHead(BaseModule):
         suffix = f"_{group.name}" if group.name else ""
         for layer in range(last + 1):
             predictions = self.layer_predictions(outputs, layer)
-            targets = self.get_targets(predictions, gts, batch_img_metas, group.repeats)
-            values = self.layer_losses(
-                group, predictions, gts, targets, layer == last, outputs.get("bev_feats")
+            pairs = self.match(
+                predictions, gts, batch_img_metas, group.repeats, outputs.get("bev_feats")
             )
             prefix = "" if layer == last else f"d{layer}."
-            for name, value in values.items():
+            for name, value in self.layer_losses(group, pairs, layer == last).items():
                 weight = group.weight if name.startswith("loss_") else 1.0
                 losses[f"{prefix}{name}{suffix}"] = weight * value
         return losses
@@ -316,10 +255,9 @@ class MapHead(BaseModule):
     def prepare_gt(self, gt_instances: InstanceData) -> InstanceData:
         """Return one sample's ground truth as costs and losses read it.
 
-        Returns:
-            ``labels`` (K,), normalised ``pts_shifts`` (K, S, P, 2) and ``first_pts`` (K, P, 2) in
-            the annotated order; where something reads them, ``rasters`` (K, h, w) for matching and
-            ``masks`` (K, H, W) at full resolution.
+        It has ``labels`` (K,), normalised ``pts_shifts`` (K, S, P, 2) and, in the annotated order,
+        ``first_pts`` (K, P, 2); where something reads them, ``rasters`` (K, h, w) for matching and
+        ``masks`` (K, H, W) at full resolution.
         """
         gt = InstanceData(
             labels=gt_instances.labels_3d,
@@ -333,12 +271,11 @@ class MapHead(BaseModule):
         return gt
 
     def layer_predictions(self, outputs: dict[str, Tensor], layer: int) -> list[InstanceData]:
-        """Return a layer's predictions as costs and losses read them.
+        """Return a layer's predictions, per sample, as costs and losses read them.
 
-        Returns:
-            Per sample ``scores`` (N, classes), normalised ``pts`` (N, P, 2), ``references`` (N, P,
-            D), whatever else the decoder gives (``all_<name>``), and ``rasters`` (N, h, w), without
-            gradient, where a cost reads them.
+        They have ``scores`` (N, classes), normalised ``pts`` (N, P, 2), ``references`` (N, P, D),
+        whatever else the decoder gives (``all_<name>``), and, where a cost reads them, ``rasters``
+        (N, h, w) without gradient.
         """
         names = {"all_cls_scores": "scores", "all_pts_preds": "pts", "all_references": "references"}
         fields = {
@@ -352,43 +289,38 @@ class MapHead(BaseModule):
         batch = len(fields["scores"])
         return [InstanceData(**{k: v[i] for k, v in fields.items()}) for i in range(batch)]
 
-    def get_targets(
+    def match(
         self,
         predictions: Sequence[InstanceData],
         gts: Sequence[InstanceData],
         batch_img_metas: Sequence[dict[str, Any]],
         repeats: int = 1,
-    ) -> MapTargets:
-        """Match every sample's predictions with its ground truth and collect the targets."""
+        bev_feats: Tensor | None = None,
+    ) -> MatchedPairs:
+        """Match every sample's predictions with its ground truth."""
         matches = [
             self.assigner.assign(prediction, gt, meta, repeats)
             for prediction, gt, meta in zip(predictions, gts, batch_img_metas, strict=True)
         ]
-        return collect_targets(predictions, gts, matches, len(self.classes))
+        return MatchedPairs(predictions, gts, matches, self.reference, self.masks, bev_feats)
 
     def layer_losses(
-        self,
-        group: QueryGroup,
-        predictions: Sequence[InstanceData],
-        gts: Sequence[InstanceData],
-        targets: MapTargets,
-        is_last: bool,
-        bev_feats: Tensor | None = None,
+        self, group: QueryGroup, pairs: MatchedPairs, is_last: bool
     ) -> dict[str, Tensor]:
         """Return the losses of one layer's predictions."""
         losses: dict[str, Tensor] = {}
         first = group is self.query_groups[0]
         if group.has("cls"):
-            scores = torch.cat([prediction.scores for prediction in predictions])
             # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
-            one_hot = F.one_hot(targets.labels, len(self.classes) + 1)[:, :-1]
-            losses["loss_cls"] = self.loss_cls(scores, one_hot, avg_factor=targets.avg_factor)
-        pairs = MatchedPairs(predictions, gts, targets, self.reference, self.masks, bev_feats)
+            one_hot = F.one_hot(pairs.query_labels() + 1, len(self.classes) + 1)[:, 1:]
+            losses["loss_cls"] = self.loss_cls(
+                pairs.query_scores(), one_hot, avg_factor=pairs.avg_factor
+            )
         for name, loss in self.losses.items():
             late = is_last or not getattr(loss, "last_layer_only", False)
             if late and group.has(name) and (first or not getattr(loss, "first_group_only", False)):
                 values = [pairs[field] for field in cast(Any, loss).reads]
-                losses[f"loss_{name}"] = loss(*values, avg_factor=targets.avg_factor)
+                losses[f"loss_{name}"] = loss(*values, avg_factor=pairs.avg_factor)
         if is_last and first:
             losses.update(self.statistics(pairs))
         return losses

@@ -1,7 +1,6 @@
 """Matched predictions and ground truths of a batch, as the losses read them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -24,42 +23,6 @@ AFTER_MATCHING = frozenset(
 )
 
 
-@dataclass
-class MapTargets:
-    """What the predictions of one decoder layer should be.
-
-    Attributes:
-        matches: Matched pairs of every sample.
-        labels: Class of every query, the number of classes for background. (B * N,)
-        pts: Normalised points of the matched ground truth, in the matched order, samples
-            concatenated. (M, P, 2)
-        avg_factor: Matched elements in the batch, averaged over ranks, at least 1. ()
-    """
-
-    matches: list[MapMatch]
-    labels: Tensor
-    pts: Tensor
-    avg_factor: Tensor
-
-
-def collect_targets(
-    predictions: Sequence[InstanceData],
-    gts: Sequence[InstanceData],
-    matches: list[MapMatch],
-    num_classes: int,
-) -> MapTargets:
-    """Turn the samples' matches into targets of the whole batch."""
-    labels, pts = [], []
-    for prediction, gt, match in zip(predictions, gts, matches, strict=True):
-        sample_labels = gt.labels.new_full((len(prediction.scores),), num_classes)
-        sample_labels[match.query_inds] = gt.labels[match.gt_inds]
-        labels.append(sample_labels)
-        pts.append(gt.pts_shifts[match.gt_inds, match.order_inds])
-    matched = torch.cat(pts)
-    count = reduce_mean(matched.new_tensor(float(len(matched))))
-    return MapTargets(matches, torch.cat(labels), matched, count.clamp(min=1.0))
-
-
 class MatchedPairs:
     """Fields of the M matched pairs of a batch, made when they are first read.
 
@@ -73,36 +36,50 @@ class MatchedPairs:
     Args:
         predictions: Predictions of one layer, per sample.
         gts: Prepared ground truths, per sample.
-        targets: Their matches.
+        matches: Their matches, per sample.
         reference: What the predictions' references mean.
         masks: How masks are made.
         bev_feats: BEV features, for losses that read them. (B, C, H, W)
+
+    Attributes:
+        avg_factor: Matched elements in the batch, averaged over ranks, at least 1. ()
     """
 
     def __init__(
         self,
         predictions: Sequence[InstanceData],
         gts: Sequence[InstanceData],
-        targets: MapTargets,
+        matches: Sequence[MapMatch],
         reference: PointReference,
         masks: ElementMasks,
         bev_feats: Tensor | None = None,
     ) -> None:
+        self.matches = list(matches)
         self._sides = {"pred": list(predictions), "gt": list(gts)}
-        self._targets = targets
         self._reference = reference
         self._masks = masks
-        counts = [len(match.gt_inds) for match in targets.matches]
-        self._made: dict[str, Any] = {
-            "gt.pts": targets.pts,
-            "gt.counts": counts,
-            "bev_feats": bev_feats,
-        }
+        counts = [len(match.gt_inds) for match in matches]
+        self._made: dict[str, Any] = {"gt.counts": counts, "bev_feats": bev_feats}
+        count = predictions[0].scores.new_tensor(float(sum(counts)))
+        self.avg_factor: Tensor = reduce_mean(count).clamp(min=1.0)
 
     def __getitem__(self, field: str) -> Any:
         if field not in self._made:
             self._made[field] = self._make(field)
         return self._made[field]
+
+    def query_scores(self) -> Tensor:
+        """Return the class logits of every query, matched or not. (B * N, classes)"""
+        return torch.cat([prediction.scores for prediction in self._sides["pred"]])
+
+    def query_labels(self) -> Tensor:
+        """Return the class that every query should say, -1 for none. (B * N,)"""
+        labels = []
+        for prediction, gt, match in zip(*self._sides.values(), self.matches, strict=True):
+            sample_labels = gt.labels.new_full((len(prediction.scores),), -1)
+            sample_labels[match.query_inds] = gt.labels[match.gt_inds]
+            labels.append(sample_labels)
+        return torch.cat(labels)
 
     def _make(self, field: str) -> Tensor:
         """Return a field of the matched pairs. (M, ...)"""
@@ -116,10 +93,12 @@ class MatchedPairs:
         if field == "gt.samples":
             counts = torch.tensor(self["gt.counts"])
             samples = torch.arange(len(counts)).repeat_interleave(counts)
-            return samples.to(self._targets.labels.device)
+            return samples.to(self.avg_factor.device)
         if field == "gt.inds":
-            return torch.cat([match.gt_inds for match in self._targets.matches])
+            return torch.cat([match.gt_inds for match in self.matches])
         side, name = field.split(".")
+        pairs = list(zip(self._sides[side], self.matches, strict=True))
+        if field == "gt.pts":
+            return torch.cat([gt.pts_shifts[m.gt_inds, m.order_inds] for gt, m in pairs])
         index = "query_inds" if side == "pred" else "gt_inds"
-        pairs = zip(self._sides[side], self._targets.matches, strict=True)
         return torch.cat([sample[name][getattr(match, index)] for sample, match in pairs])

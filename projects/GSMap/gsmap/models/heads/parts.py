@@ -1,46 +1,62 @@
-"""What a head checks of its parts when it is built: names, classes, the fields that each reads."""
+"""What a head refuses when it is built: parts that do not fit together."""
 
 from collections.abc import Iterable, Sequence, Set
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import nn
 
-from gsmap.models.heads.masks import ElementMasks
-from gsmap.models.heads.query_groups import QueryGroup
+from gsmap.models.heads.matched import AFTER_MATCHING, GT_FIELDS
+
+if TYPE_CHECKING:
+    from gsmap.models.heads.map_head import MapHead
 
 
-def by_name(modules: Sequence[nn.Module]) -> dict[str, nn.Module]:
+def by_name(modules: Sequence[nn.Module]) -> nn.ModuleDict:
     """Return modules by their ``name``.
 
     Raises:
         ValueError: If two have the same.
     """
-    refuse_twins([str(module.name) for module in modules], "parts")
-    return {str(module.name): module for module in modules}
+    _refuse_twins([str(module.name) for module in modules], "parts")
+    return nn.ModuleDict({str(module.name): module for module in modules})
 
 
-def refuse_twins(names: Sequence[str], what: str) -> None:
-    """Refuse two of one name.
+def check_parts(head: "MapHead") -> set[str]:
+    """Return the fields (``pred.<name>``, ``gt.<name>``) that a head's losses and costs read.
 
     Raises:
-        ValueError: If there are.
+        ValueError: If one reads what nobody offers, two losses or query groups have one name, a
+            group names a loss or a part a class that there is not.
     """
+    names = ["cls", *head.losses]
+    _refuse_twins([*names, *head.aux_heads], "losses")
+    _refuse_twins([group.name for group in head.query_groups], "query groups")
+    for group in head.query_groups:
+        unknown = sorted(set(group.losses or ()) - set(names))
+        if unknown:
+            raise ValueError(
+                f"query group {group.name!r} names losses {unknown}; there are {names}."
+            )
+    costs, losses = head.assigner.match_costs, list(head.losses.values())
+    _check_classes(head, [*losses, *costs])
+    pred = {"scores", "instance_states", *head.reference.fields, *head.decoder.fields}
+    offered = (
+        {"bev_feats"} | {f"pred.{name}" for name in pred} | {f"gt.{name}" for name in GT_FIELDS}
+    )
+    where = f"{type(head.reference).__name__}, the decoder and the ground truth"
+    read = _fields_read(costs, offered - AFTER_MATCHING, f"before the matching, {where}")
+    return read | _fields_read(losses, offered, where)
+
+
+def _refuse_twins(names: Sequence[str], what: str) -> None:
+    """Refuse two of one name."""
     twins = sorted({name for name in names if names.count(name) > 1})
     if twins:
         raise ValueError(f"two {what} have one name, {twins[0]!r}; there are {list(names)}.")
 
 
-def fields_read(parts: Iterable[Any], offered: Set[str], where: str) -> set[str]:
-    """Return the fields (``pred.<name>``, ``gt.<name>``) that losses or costs read.
-
-    Args:
-        parts: Losses or costs; each names its fields in ``reads``.
-        offered: What there is to read.
-        where: Who offers it, for the message.
-
-    Raises:
-        ValueError: If a part reads what nobody offers.
-    """
+def _fields_read(parts: Iterable[Any], offered: Set[str], where: str) -> set[str]:
+    """Return the fields that losses or costs read; refuse those that are not offered."""
     read: set[str] = set()
     for part in parts:
         own = set(getattr(part, "reads", ()))
@@ -54,32 +70,13 @@ def fields_read(parts: Iterable[Any], offered: Set[str], where: str) -> set[str]
     return read
 
 
-def refuse_unknown_losses(groups: Sequence[QueryGroup], losses: Sequence[str]) -> None:
-    """Refuse a query group that names a loss which is not there.
-
-    Raises:
-        ValueError: If one does.
-    """
-    for group in groups:
-        unknown = sorted(set(group.losses or ()) - set(losses))
-        if unknown:
-            raise ValueError(
-                f"query group {group.name!r} names losses {unknown}; there are {list(losses)}."
-            )
-
-
-def refuse_unknown_classes(
-    masks: ElementMasks, parts: Iterable[Any], classes: Sequence[str]
-) -> None:
-    """Refuse masks, losses and costs that fill or render as polygons what is no class.
-
-    Raises:
-        ValueError: If an index is beyond the classes.
-    """
-    named = {"masks.filled_classes": masks.filled_classes}
+def _check_classes(head: "MapHead", parts: Iterable[Any]) -> None:
+    """Refuse masks, losses and costs that fill or render as polygons what is no class."""
+    named = {"masks.filled_classes": head.masks.filled_classes}
     for part in parts:
         if hasattr(part, "renderer"):
             named[f"{type(part).__name__}.polygon_classes"] = part.renderer.polygon_classes
+    classes = list(head.classes)
     for name, indices in named.items():
         if any(not 0 <= index < len(classes) for index in indices):
-            raise ValueError(f"{name} must be indices of {list(classes)}, got {tuple(indices)}.")
+            raise ValueError(f"{name} must be indices of {classes}, got {tuple(indices)}.")

@@ -51,16 +51,10 @@ def group_mask(groups: Sequence[QueryGroup], device: torch.device) -> Tensor:
 def fit_instance_queries(
     state: dict[str, Tensor], key: str, own: Tensor, num_predicting: int
 ) -> None:
-    """Fit the instance queries of a checkpoint with another number of further queries.
+    """Fit the instance queries of a checkpoint, in place, to a model's (N, 2 C).
 
-    Those that predict are the first ones and are taken as they are. Surplus further queries are
-    cut off; missing ones keep their initial values. A log line says so.
-
-    Args:
-        state: The checkpoint's state dict; changed in place.
-        key: Key of the instance queries.
-        own: The model's instance queries. (N, 2 C)
-        num_predicting: How many of them predict.
+    The first ones, which predict, are taken as they are. Surplus further queries are cut off;
+    missing ones keep their initial values. A log line says so.
     """
     loaded = state.get(key)
     if loaded is None or len(loaded) < num_predicting or loaded.shape == own.shape:

@@ -1,15 +1,15 @@
 """References: what decoder layers refine, from its first value to points or Gaussians in metres."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from mmdet.models.layers import inverse_sigmoid
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule, constant_init, xavier_init
+from mmengine.model import constant_init, xavier_init
 from torch import Tensor, nn
 
-from gsmap.models.layers.branches import regression_branch
+from gsmap.models.layers import branches
 from gsmap.models.layers.deformable_attention import at_least_float32
 from gsmap.structures.gaussians import Gaussians, GaussianSpace
 from gsmap.structures.grid import BEVGrid
@@ -43,7 +43,7 @@ def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Ten
 
 
 @MODELS.register_module()
-class PointReference(BaseModule):
+class PointReference(nn.Module):
     """A point per query, [0, 1] over the map, refined by each decoder layer (MapTR).
 
     Args:
@@ -53,11 +53,15 @@ class PointReference(BaseModule):
         num_reg_layers: Hidden layers of each layer's branch.
         coords: 2, or 3 for points with height.
         z_range: Lowest and highest z in metres, for points with height.
-        init_cfg: As in mmengine.
 
     Raises:
         ValueError: If ``coords`` is not 2 or 3, a height lacks its range, or that is empty.
+
+    Attributes:
+        fields: Names of what a loss or a cost may read of a prediction.
     """
+
+    fields: ClassVar[frozenset[str]] = frozenset({"pts", "pts_m", "references"})
 
     def __init__(
         self,
@@ -67,9 +71,8 @@ class PointReference(BaseModule):
         num_reg_layers: int = 2,
         coords: int = 2,
         z_range: Sequence[float] | None = None,
-        init_cfg: dict | None = None,
     ) -> None:
-        super().__init__(init_cfg)
+        super().__init__()
         if coords not in (2, 3) or (coords == 3) != (z_range is not None):
             raise ValueError(
                 f"coords must be 2, or 3 with a z_range, got coords={coords}, z_range={z_range}."
@@ -81,13 +84,8 @@ class PointReference(BaseModule):
         self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
         self.initial = nn.Linear(embed_dims, coords)
         self.branches = nn.ModuleList(
-            regression_branch(embed_dims, num_reg_layers, coords) for _ in range(num_layers)
+            branches.mlp(*[embed_dims] * (num_reg_layers + 1), coords) for _ in range(num_layers)
         )
-
-    @property
-    def fields(self) -> frozenset[str]:
-        """Names of what a loss or a cost may read of a prediction."""
-        return frozenset({"pts", "pts_m", "references"})
 
     @property
     def metainfo(self) -> dict[str, float]:
@@ -96,7 +94,6 @@ class PointReference(BaseModule):
 
     def init_weights(self) -> None:
         """Spread the first points over the map."""
-        super().init_weights()
         xavier_init(self.initial, distribution="uniform", bias=0.0)
 
     def start(self, query_pos: Tensor) -> Tensor:
@@ -160,9 +157,9 @@ class GaussianReference(PointReference):
         coords: 2, or 3 for centres with height; the Gaussians lie in the plane.
         z_range: Lowest and highest z in metres, for centres with height.
         space: Settings of `GaussianSpace`: ``min_scale_m`` and so on.
-        init_cfg: As in mmengine.
     """
 
+    fields = PointReference.fields | {"masks", "rasters"}
     neutral_keys = ("gaussian_init.", "gaussian_branches.")
 
     def __init__(
@@ -174,22 +171,16 @@ class GaussianReference(PointReference):
         num_reg_layers: int = 2,
         coords: int = 2,
         z_range: Sequence[float] | None = None,
-        init_cfg: dict | None = None,
         **space: Any,
     ) -> None:
-        super().__init__(grid, embed_dims, num_layers, num_reg_layers, coords, z_range, init_cfg)
+        super().__init__(grid, embed_dims, num_layers, num_reg_layers, coords, z_range)
         self.space = GaussianSpace(grid, **space)
         self.gaussian_init = nn.Linear(embed_dims, 3)
         hidden = num_reg_layers if mlp else 0
         self.gaussian_branches = nn.ModuleList(
-            regression_branch(embed_dims, hidden, 3) for _ in range(num_layers)
+            branches.mlp(*[embed_dims] * (hidden + 1), 3) for _ in range(num_layers)
         )
         self.reset_gaussian_parts()
-
-    @property
-    def fields(self) -> frozenset[str]:
-        """Names of what a loss or a cost may read of a prediction."""
-        return super().fields | {"masks", "rasters"}
 
     @property
     def metainfo(self) -> dict[str, float]:

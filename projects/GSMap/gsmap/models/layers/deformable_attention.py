@@ -123,7 +123,7 @@ class SamplingAttention(nn.Module):
         return logits.unflatten(-1, (self.num_heads, self.num_points)).softmax(-1)
 
     def values(self, tokens: Tensor) -> Tensor:
-        """Return the projected cells of a map by head. (..., cells, C) -> (..., cells, heads, C')"""
+        """Return a map's projected cells by head. (..., cells, C) -> (..., cells, heads, C')"""
         return at_least_float32(self.value_proj(tokens)).unflatten(-1, (self.num_heads, -1))
 
 

@@ -1,8 +1,7 @@
 """Assignment of predictions to annotated map elements."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,8 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 
-@dataclass
-class MapMatch:
+class MapMatch(NamedTuple):
     """Matched pairs of one sample, sorted by query.
 
     Attributes:
@@ -78,16 +76,8 @@ class MapAssigner:
         rows, cols = linear_sum_assignment(np.tile(total.sum(0).numpy(), repeats))
         queries = torch.from_numpy(rows).to(device)
         gts = torch.from_numpy(cols % len(gt_instances)).to(device)
-        return MapMatch(
-            queries,
-            gts,
-            self.closest_orders(pred_instances.pts[queries], gt_instances.pts_shifts[gts]),
-        )
-
-    @staticmethod
-    def closest_orders(pts: Tensor, pts_shifts: Tensor) -> Tensor:
-        """Return each pair's closest order. (M, P, 2), (M, S, P, 2) -> (M,)"""
-        return (pts[:, None] - pts_shifts).abs().sum((-1, -2)).argmin(-1)
+        offsets = pred_instances.pts[queries, None] - gt_instances.pts_shifts[gts]  # (M, S, P, 2)
+        return MapMatch(queries, gts, offsets.abs().sum((-1, -2)).argmin(-1))
 
     @staticmethod
     def _check_finite(values: Tensor, what: str, img_meta: dict[str, Any] | None) -> None:

@@ -17,16 +17,7 @@ from gsmap.ops.backends import register_gradient
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
 def scatter_rows(grads, table, weights, rows, grad_table, grad_weights):
-    """Add each bag's gradient to its rows, and write the gradients of the weights.
-
-    Args:
-        grads: Gradient in the sums. (n, C)
-        table: The table. (R, C)
-        weights: Weights of the rows. (n, S)
-        rows: Row indices. (n, S)
-        grad_table: Added to. (R, C)
-        grad_weights: Written to. (n, S)
-    """
+    """Add each bag's gradient (n, C) to its rows (R, C); write that of the weights (n, S)."""
     for bag in range(rows.shape[0]):
         grad = grads[bag]
         for s in range(rows.shape[1]):

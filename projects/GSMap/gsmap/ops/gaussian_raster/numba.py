@@ -187,14 +187,10 @@ def _is_finite(gaussians):
 
 @njit(nogil=True, cache=True)
 def render_forward(gaussians, frame, masks, first, last):
-    """Render instances ``first`` to ``last - 1``; NaN where a parameter is not finite.
+    """Write the float32 masks (N, H, W) of some instances; NaN where a parameter is not finite.
 
-    Args:
-        gaussians: Mean x, y, scale u, v and rotation, float64. (N, P, 5)
-        frame: Smallest x and y and the pixel's size along x and y, in metres.
-        masks: Written to, float32. (N, H, W)
-        first: First instance.
-        last: One past the last instance.
+    ``gaussians`` are mean x, y, scale u, v and rotation, float64 (N, P, 5); ``frame`` is the
+    smallest x and y and the pixel's size along both, in metres.
     """
     steps = np.arange(masks.shape[2]).astype(np.float32)
     for n in range(first, last):
@@ -208,16 +204,7 @@ def render_forward(gaussians, frame, masks, first, last):
 
 @njit(nogil=True, cache=True)
 def render_backward(gaussians, frame, grads, out, first, last):
-    """Write the gradients of instances ``first`` to ``last - 1``.
-
-    Args:
-        gaussians: As in :func:`render_forward`. (N, P, 5)
-        frame: As in :func:`render_forward`.
-        grads: Gradient in the masks, float32. (N, H, W)
-        out: Gradient in ``gaussians``, written to, float64. (N, P, 5)
-        first: First instance.
-        last: One past the last instance.
-    """
+    """Write the gradient (N, P, 5), float64, in the Gaussians of gradients (N, H, W), float32."""
     steps = np.arange(grads.shape[2]).astype(np.float32)
     trans = np.empty(grads.shape[1:], dtype=np.float32)
     for n in range(first, last):

@@ -47,17 +47,6 @@ MAX_DENSITY = tl.constexpr(1 - 1e-6)
 
 
 @triton.jit
-def _load_gaussian(gaussians, index):
-    """Return one Gaussian's eight numbers."""
-    base = gaussians + index * 8
-    mean_x, mean_y = tl.load(base), tl.load(base + 1)
-    cos, sin = tl.load(base + 2), tl.load(base + 3)
-    inv_u, inv_v = tl.load(base + 4), tl.load(base + 5)
-    half_x, half_y = tl.load(base + 6), tl.load(base + 7)
-    return mean_x, mean_y, cos, sin, inv_u, inv_v, half_x, half_y
-
-
-@triton.jit
 def _tile_pixels(tile, x_min, y_min, step_x, step_y, height, width, TILE: tl.constexpr):
     """Return a tile's pixel centres (1, TILE) and (TILE, 1), flat indices and validity."""
     tiles_x = tl.cdiv(width, TILE)
@@ -69,16 +58,22 @@ def _tile_pixels(tile, x_min, y_min, step_x, step_y, height, width, TILE: tl.con
 
 
 @triton.jit
-def _misses(mean, half, low, high):
-    """Tell whether the range mean +- half lies outside [low, high]; false for NaN."""
-    return (mean + half < low) | (mean - half > high)
+def _touches(gaussian, left, right, low, high):
+    """Tell whether a Gaussian's box meets a tile; true for NaN."""
+    mean_x, mean_y = tl.load(gaussian), tl.load(gaussian + 1)
+    half_x, half_y = tl.load(gaussian + 6), tl.load(gaussian + 7)
+    beside = (mean_x + half_x < left) | (mean_x - half_x > right)
+    return not (beside | (mean_y + half_y < low) | (mean_y - half_y > high))
 
 
 @triton.jit
-def _own_frame(x, y, mean_x, mean_y, cos, sin, inv_u, inv_v):
-    """Return pixels in units of sigma along a Gaussian's own axes. (TILE, TILE) each"""
-    dx, dy = x - mean_x, y - mean_y
-    return (cos * dx + sin * dy) * inv_u, (cos * dy - sin * dx) * inv_v
+def _density(gaussian, x, y):
+    """Return a Gaussian's density at pixels, and these in sigmas along its axes. (TILE, TILE)"""
+    dx, dy = x - tl.load(gaussian), y - tl.load(gaussian + 1)
+    cos, sin = tl.load(gaussian + 2), tl.load(gaussian + 3)
+    u = (cos * dx + sin * dy) * tl.load(gaussian + 4)
+    v = (cos * dy - sin * dx) * tl.load(gaussian + 5)
+    return tl.exp(-0.5 * (u * u + v * v)), u, v
 
 
 @triton.jit
@@ -100,12 +95,9 @@ def forward_kernel(
     left, right, low, high = tl.min(x), tl.max(x), tl.min(y), tl.max(y)
     mask = tl.zeros((TILE, TILE), tl.float32)
     for p in range(count):
-        mean_x, mean_y, cos, sin, inv_u, inv_v, half_x, half_y = _load_gaussian(
-            gaussians, n * count + p
-        )
-        if not (_misses(mean_x, half_x, left, right) | _misses(mean_y, half_y, low, high)):
-            u, v = _own_frame(x, y, mean_x, mean_y, cos, sin, inv_u, inv_v)
-            density = tl.exp(-0.5 * (u * u + v * v))
+        gaussian = gaussians + (n * count + p) * 8
+        if _touches(gaussian, left, right, low, high):
+            density, _, _ = _density(gaussian, x, y)
             density = tl.where(density > MAX_DENSITY, MAX_DENSITY, density)
             mask += density * (1 - mask)
     tl.store(masks + n * height * width + index, mask, mask=valid)
@@ -131,25 +123,16 @@ def backward_kernel(
     left, right, low, high = tl.min(x), tl.max(x), tl.min(y), tl.max(y)
     trans = tl.full((TILE, TILE), 1.0, tl.float32)
     for p in range(count):
-        mean_x, mean_y, cos, sin, inv_u, inv_v, half_x, half_y = _load_gaussian(
-            gaussians, n * count + p
-        )
-        if not (_misses(mean_x, half_x, left, right) | _misses(mean_y, half_y, low, high)):
-            u, v = _own_frame(x, y, mean_x, mean_y, cos, sin, inv_u, inv_v)
-            density = tl.exp(-0.5 * (u * u + v * v))
+        gaussian = gaussians + (n * count + p) * 8
+        if _touches(gaussian, left, right, low, high):
+            density, _, _ = _density(gaussian, x, y)
             trans *= 1 - tl.where(density > MAX_DENSITY, MAX_DENSITY, density)
     grad = tl.load(grads + n * height * width + index, mask=valid, other=0.0) * trans
     out = moments + (n * tl.num_programs(0) + tile) * count * 5
     for p in range(count):
-        mean_x, mean_y, cos, sin, inv_u, inv_v, half_x, half_y = _load_gaussian(
-            gaussians, n * count + p
-        )
-        if _misses(mean_x, half_x, left, right) | _misses(mean_y, half_y, low, high):
-            for i in range(5):
-                tl.store(out + p * 5 + i, 0.0)
-        else:
-            u, v = _own_frame(x, y, mean_x, mean_y, cos, sin, inv_u, inv_v)
-            density = tl.exp(-0.5 * (u * u + v * v))
+        gaussian = gaussians + (n * count + p) * 8
+        if _touches(gaussian, left, right, low, high):
+            density, u, v = _density(gaussian, x, y)
             clamped = density > MAX_DENSITY  # has no gradient
             weight = grad * tl.where(clamped, 0.0, density / tl.where(clamped, 1.0, 1 - density))
             tl.store(out + p * 5, tl.sum(weight * u))
@@ -157,6 +140,9 @@ def backward_kernel(
             tl.store(out + p * 5 + 2, tl.sum(weight * u * u))
             tl.store(out + p * 5 + 3, tl.sum(weight * u * v))
             tl.store(out + p * 5 + 4, tl.sum(weight * v * v))
+        else:
+            for i in range(5):
+                tl.store(out + p * 5 + i, 0.0)
 
 
 def _pack(means: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:

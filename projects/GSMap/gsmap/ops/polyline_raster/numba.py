@@ -114,20 +114,13 @@ def _measure(squared, nearest):
 
 @njit(nogil=True, cache=True)
 def soft_forward(rings, polygons, frame, reach, eps, softness, nearest, masks, first, last):
-    """Render exp(-D / s), or a sigmoid of +-D / s for polygons; NaN for a vertex not finite.
+    """Write exp(-D / s), or a sigmoid of +-D / s for polygons; NaN for a vertex not finite.
 
-    Args:
-        rings: Closed rings in the unit of ``frame``, float32. (N, V, 2)
-        polygons: Which are filled polygons. (N,)
-        frame: Smallest x and y of the raster and the pixel's size along x and y.
-        reach: Distance beyond which a mask is 0 or 1, for lines and polygons.
-        eps: Added to an edge's squared length.
-        softness: s for lines and polygons, in the unit of D.
-        nearest: 0: D is the squared distance to the nearest edge. > 0: D is the distance, or this
-            where it is smaller; there it has no gradient.
-        masks: Written to, float32. (N, H, W)
-        first: First element.
-        last: One past the last element.
+    Closed float32 rings (N, V, 2) are in the unit of ``frame``: smallest x and y, and the pixel's
+    size along both. ``reach``, beyond which a mask is 0 or 1, and ``softness`` s are of lines and
+    polygons; ``eps`` is added to an edge's squared length. With ``nearest`` 0, D is the squared
+    distance to the nearest edge; else D is the distance, or ``nearest`` where it is smaller, and
+    there it has no gradient.
     """
     steps, distances, owners, inside = _buffers(masks.shape[1:])
     for n in range(first, last):
@@ -170,10 +163,7 @@ def _scatter(ring, owner, x, y, eps, weight, out):
 
 @njit(nogil=True, cache=True)
 def soft_backward(rings, polygons, frame, reach, eps, softness, nearest, grads, out, first, last):
-    """Write to ``out`` (N, V, 2), float64, the gradient in the rings of ``grads`` (N, H, W).
-
-    The other arguments are those of :func:`soft_forward`.
-    """
+    """Write to ``out`` (N, V, 2), float64, the gradient in the rings of ``grads`` (N, H, W)."""
     steps, distances, owners, inside = _buffers(grads.shape[1:])
     x_min, y_min, step_x, step_y = frame
     for n in range(first, last):
@@ -203,19 +193,7 @@ def soft_backward(rings, polygons, frame, reach, eps, softness, nearest, grads, 
 
 @njit(nogil=True, cache=True)
 def draw(polylines, filled, frame, half_width, pixel, antialias, masks, first, last):
-    """Draw ground-truth masks: lines of a width, or filled polygons.
-
-    Args:
-        polylines: Vertices in the unit of ``frame``, float32. (K, P, 2)
-        filled: Which are filled as polygons. (K,)
-        frame: As in :func:`soft_forward`.
-        half_width: Half a line's width.
-        pixel: Side of the square that is as large as a pixel.
-        antialias: Whether a pixel takes the share that is covered, or 0 or 1.
-        masks: Written to, float32. (K, H, W)
-        first: First element.
-        last: One past the last element.
-    """
+    """Write masks of lines of a width, or of filled polygons; arguments as of `draw_reference`."""
     steps, distances, owners, inside = _buffers(masks.shape[1:])
     for n in range(first, last):
         ring, kind = polylines[n], filled[n]

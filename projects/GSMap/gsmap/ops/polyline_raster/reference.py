@@ -11,20 +11,11 @@ DISTANCE_EPS = 1e-6  # pixels that are nearer to an edge count as this near
 LENGTH_EPS = 1e-5  # added to an edge's squared length, as in MapVR: an edge may be a single point
 
 
-def edge_distances(pixels: Tensor, starts: Tensor, ends: Tensor, eps: float = 0.0) -> Tensor:
-    """Squared distance of every pixel to the nearest edge.
+def _edge_distances(pixels: Tensor, starts: Tensor, ends: Tensor, eps: float = 0.0) -> Tensor:
+    """Return squared distances to the nearest edge. (H, W, 2), 2 x (K, E, 2) -> (K, H, W)
 
-    The nearest edge is found without gradient, a block of edges at a time, so that memory does not
-    grow with E.
-
-    Args:
-        pixels: Sample positions. (H, W, 2)
-        starts: First end of each edge, in the unit of ``pixels``. (K, E, 2)
-        ends: Second end of each edge. (K, E, 2)
-        eps: Added to an edge's squared length in the projection.
-
-    Returns:
-        Squared distances, differentiable in the ends of the nearest edge. (K, H, W)
+    It is found without gradient, a block of edges at a time, so that memory does not grow with E;
+    distances are differentiable in its ends. ``eps`` is added to an edge's squared length.
     """
     shape = (len(starts), *pixels.shape[:2])
     with torch.no_grad():
@@ -58,16 +49,8 @@ def _segment_distance(pixels: Tensor, start: Tensor, end: Tensor, eps: float) ->
     return (offsets - along[..., None] * edge).square().sum(-1)
 
 
-def inside_polygon(pixels: Tensor, vertices: Tensor) -> Tensor:
-    """Tell which pixels lie inside each polygon by the even-odd rule.
-
-    Args:
-        pixels: Sample positions. (H, W, 2)
-        vertices: Corners, implicitly closed. (K, V, 2)
-
-    Returns:
-        True inside. (K, H, W)
-    """
+def _inside_polygon(pixels: Tensor, vertices: Tensor) -> Tensor:
+    """Tell which pixels lie inside by the even-odd rule. (H, W, 2), (K, V, 2) -> (K, H, W)"""
     shape = (len(vertices), *pixels.shape[:2])
     crossings = torch.zeros(shape, dtype=torch.long, device=vertices.device)
     x, y = pixels.unbind(-1)
@@ -89,24 +72,16 @@ def soft_rasters_reference(
 ) -> Tensor:
     r"""Render closed rings: :math:`\exp(-D / s)`, or :math:`\sigma(\pm D / s)` for polygons.
 
-    Args:
-        rings: Vertices in pixels, sampled at integer positions. (n, V, 2)
-        is_polygon: Which are filled. (n,)
-        height: Rows H.
-        width: Columns W.
-        softness: s for lines and for polygons.
-        plain: D is the distance to the nearest edge; otherwise its square.
-
-    Returns:
-        Masks. (n, H, W)
+    Rings (n, V, 2) are in pixels, sampled at integer positions; ``softness`` is s of lines and of
+    polygons; D is the distance to the nearest edge if ``plain``, else its square. (n, H, W)
     """
     x = torch.arange(width, device=rings.device, dtype=rings.dtype)
     y = torch.arange(height, device=rings.device, dtype=rings.dtype)
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
-    distances = edge_distances(pixels, rings, rings.roll(-1, 1), LENGTH_EPS)
+    distances = _edge_distances(pixels, rings, rings.roll(-1, 1), LENGTH_EPS)
     if plain:  # no gradient at an edge, where the distance has a kink
         distances = distances.clamp(min=DISTANCE_EPS**2).sqrt()
-    signed = torch.where(inside_polygon(pixels, rings.detach()), distances, -distances)
+    signed = torch.where(_inside_polygon(pixels, rings.detach()), distances, -distances)
     lines, polygons = torch.exp(-distances / softness[0]), torch.sigmoid(signed / softness[1])
     return torch.where(is_polygon[:, None, None], polygons, lines)
 
@@ -132,9 +107,9 @@ def draw_reference(
     Returns:
         Masks in [0, 1]. (K, H, W)
     """
-    to_line = edge_distances(pixels, polylines[:, :-1], polylines[:, 1:]).sqrt()
-    to_closing = edge_distances(pixels, polylines[:, -1:], polylines[:, :1]).sqrt()
-    inside = inside_polygon(pixels, polylines)
+    to_line = _edge_distances(pixels, polylines[:, :-1], polylines[:, 1:]).sqrt()
+    to_closing = _edge_distances(pixels, polylines[:, -1:], polylines[:, :1]).sqrt()
+    inside = _inside_polygon(pixels, polylines)
     if not antialias:
         return torch.where(filled[:, None, None], inside, to_line <= half_width).to(pixels.dtype)
     near, far = (to_line + half_width) / pixel, (to_line - half_width) / pixel

@@ -184,17 +184,10 @@ def _buffers(shape, radius):
 
 @njit(nogil=True, cache=True)
 def loss_forward(preds, targets, window, constants, weight, results, first, last):
-    """Write each instance's sums.
+    """Write some instances' sums, those of `raster_loss_sums_reference`, float64 (n, 7).
 
-    Args:
-        preds: Masks, float32. (n, H, W)
-        targets: Masks, float32. (n, H, W)
-        window: SSIM's window along one axis, float32, odd. (size,)
-        constants: SSIM's C1 and C2, and from what mean on a window sees a mask, float32.
-        weight: Weight of a pixel of the ground truth, float32.
-        results: Written to, float64: the sums of `raster_loss_sums_reference`. (n, 7)
-        first: First instance.
-        last: One past the last instance.
+    Masks (n, H, W), the window (size,) and all numbers are float32; ``constants`` are SSIM's C1 and
+    C2, and from what mean on a window sees a mask.
     """
     radius = len(window) // 2
     products, rows, maps, padded, spans = _buffers(preds.shape[1:], radius)
@@ -211,19 +204,7 @@ def loss_forward(preds, targets, window, constants, weight, results, first, last
 
 @njit(nogil=True, cache=True)
 def loss_backward(preds, targets, window, constants, weight, factors, grads, first, last):
-    """Write the gradient of the first three sums of `raster_loss_sums_reference`, each times one.
-
-    Args:
-        preds: As in :func:`loss_forward`. (n, H, W)
-        targets: As in :func:`loss_forward`. (n, H, W)
-        window: As in :func:`loss_forward`. (size,)
-        constants: As in :func:`loss_forward`.
-        weight: As in :func:`loss_forward`.
-        factors: Of the three sums, float32. (n, 3)
-        grads: Gradient in ``preds``, written to, float32. (n, H, W)
-        first: First instance.
-        last: One past the last instance.
-    """
+    """Write the gradient (n, H, W) of the first three sums, each times its factor (n, 3)."""
     radius, width = len(window) // 2, preds.shape[2]
     products, rows, maps, padded, spans = _buffers(preds.shape[1:], radius)
     for n in range(first, last):
@@ -252,17 +233,7 @@ def _settings(window: Tensor, weight: float) -> tuple[Any, Any, Any]:
 
 @torch.library.custom_op("gsmap::raster_loss_sums", mutates_args=(), device_types="cpu")
 def raster_loss_sums(preds: Tensor, targets: Tensor, window: Tensor, weight: float) -> Tensor:
-    """Return the sums of `raster_loss_sums_reference`; the first three are differentiable.
-
-    Args:
-        preds: Masks, float32. (n, H, W)
-        targets: Masks, float32. (n, H, W)
-        window: SSIM's window along one axis. (size,)
-        weight: Weight of a pixel of the ground truth; w = 1 + (weight - 1) t.
-
-    Returns:
-        The sums. (n, 7)
-    """
+    """Return the sums of `raster_loss_sums_reference`; the first three are differentiable."""
     sums = torch.empty(len(preds), SUMS, dtype=torch.float64)
     arguments = preds, targets, *_settings(window, weight), sums
     run_in_threads(loss_forward, len(preds), preds.shape[1:].numel(), *arguments)

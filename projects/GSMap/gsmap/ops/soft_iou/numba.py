@@ -17,14 +17,7 @@ from gsmap.ops._numba import run_in_threads
 
 @njit(nogil=True, cache=True)
 def list_pixels(targets):
-    """List the pixels that are not 0.
-
-    Args:
-        targets: Flat masks, float32. (K, pixels)
-
-    Returns:
-        Where each target's list starts (K + 1,), the pixels' indices and their values.
-    """
+    """Return where each target's list of pixels that are not 0 starts, their indices and values."""
     starts = np.zeros(len(targets) + 1, np.int64)
     for k in range(len(targets)):
         starts[k + 1] = starts[k] + np.count_nonzero(targets[k])
@@ -40,17 +33,7 @@ def list_pixels(targets):
 
 @njit(nogil=True, cache=True)
 def sum_minima(preds, starts, indices, values, out, first, last):
-    """Write the sums of minima of predictions ``first`` to ``last - 1`` with every target.
-
-    Args:
-        preds: Flat masks, float32. (N, pixels)
-        starts: From :func:`list_pixels`. (K + 1,)
-        indices: From :func:`list_pixels`.
-        values: From :func:`list_pixels`.
-        out: Written to, float32. (N, K)
-        first: First prediction.
-        last: One past the last prediction.
-    """
+    """Write the sums of minima (N, K) of predictions (N, pixels) with every listed target."""
     for n in range(first, last):
         pred = preds[n]
         for k in range(len(starts) - 1):

@@ -4,14 +4,21 @@ import numpy as np
 import pytest
 import torch
 
-from gsmap.models.losses.direction import direction_loss, self_direction_loss
-from gsmap.models.losses.point import SamplingLocationLoss, points_l1_loss
+from gsmap.models.losses.points import (
+    DirectionLoss,
+    PointsLoss,
+    SamplingLocationLoss,
+    SelfDirectionLoss,
+)
+
+points_loss, direction_loss = PointsLoss(1.0), DirectionLoss(1.0)
+self_direction_loss = SelfDirectionLoss(1.0)
 
 
 def test_points_loss_by_hand():
     pred = torch.tensor([[[0.0, 0.0], [1.0, 2.0]]])
     target = torch.tensor([[[0.5, 0.0], [1.0, 0.0]]])
-    torch.testing.assert_close(points_l1_loss(pred, target, 2.0), torch.tensor(1.25))
+    assert PointsLoss(loss_weight=4.0)(pred, target, 2.0).item() == 4 * 1.25
 
 
 def test_direction_loss_by_hand():
@@ -26,12 +33,6 @@ def test_direction_loss_by_hand():
     target = torch.tensor([[[0.0, 0.0], [5.0, 0.0]]]).expand(3, -1, -1)
     expected = (1 + (1 - math.sqrt(0.5)) + 2) / 3
     torch.testing.assert_close(direction_loss(pred, target, 3.0), torch.tensor(expected))
-
-
-def test_direction_over_a_longer_interval_ignores_the_points_between():
-    pred = torch.tensor([[[0.0, 0.0], [0.5, 7.0], [1.0, 0.0]]])
-    target = torch.tensor([[[0.0, 0.0], [0.5, -7.0], [1.0, 0.0]]])
-    torch.testing.assert_close(direction_loss(pred, target, 1.0, interval=2), torch.tensor(0.0))
 
 
 def test_self_direction_by_hand():
@@ -51,7 +52,7 @@ def test_self_direction_equals_the_golden_one(golden_dir, case):
     for layer, pred in enumerate(torch.from_numpy(preds)):
         query = golden[f"match_l{layer}"][:, 0]
         points_m = pred[query] * torch.tensor([30.0, 60.0]) - torch.tensor([15.0, 30.0])
-        value = 0.002 * self_direction_loss(points_m, len(query))
+        value = SelfDirectionLoss()(points_m, len(query))
         name = f"loss/d{layer}.loss_dir" if layer < 5 else "loss/loss_dir"
         assert value.item() == pytest.approx(float(golden[name]), rel=1e-4)
 
@@ -60,7 +61,7 @@ def self_loss(pred, _, avg_factor):
     return self_direction_loss(pred, avg_factor)
 
 
-@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss, self_loss])
+@pytest.mark.parametrize("loss", [points_loss, direction_loss, self_loss])
 def test_no_match_gives_a_zero_with_a_gradient(loss):
     pred = torch.zeros(0, 20, 2, requires_grad=True)
     value = loss(pred, torch.zeros(0, 20, 2), 1.0)
@@ -69,7 +70,7 @@ def test_no_match_gives_a_zero_with_a_gradient(loss):
     assert pred.grad.shape == (0, 20, 2)
 
 
-@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss, self_loss])
+@pytest.mark.parametrize("loss", [points_loss, direction_loss, self_loss])
 def test_gradients(loss):
     torch.manual_seed(0)
     pred = torch.randn(2, 4, 2, dtype=torch.float64, requires_grad=True)
@@ -84,12 +85,10 @@ def test_equal_neighbours_do_not_break_the_direction(loss):
     assert torch.isfinite(pred.grad).all()
 
 
-@pytest.mark.parametrize("loss", [points_l1_loss, direction_loss])
+@pytest.mark.parametrize("loss", [points_loss, direction_loss])
 def test_other_shapes_are_refused(loss):
     with pytest.raises(ValueError, match=r"target must have shape \(2, 4, 2\) of pred"):
         loss(torch.rand(2, 4, 2), torch.rand(1, 4, 2), 1.0)
-    with pytest.raises(ValueError, match=r"interval must be in \[1, 4\), got 4"):
-        direction_loss(torch.rand(2, 4, 2), torch.rand(2, 4, 2), 1.0, interval=4)
 
 
 def test_mean_sampling_locations_are_compared_in_the_plane():

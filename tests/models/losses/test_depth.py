@@ -1,11 +1,11 @@
-"""Depth and mask losses, worked by hand."""
+"""Depth bins and the depth loss, worked by hand."""
 
 import math
 
 import pytest
 import torch
 
-from gsmap.models.losses.auxiliary import depth_bins, depth_loss, mask_loss, num_depth_bins
+from gsmap.models.losses.depth import depth_bins, depth_loss, num_depth_bins
 
 RANGE = (1.0, 3.0, 0.5)  # bins 1.0-1.5, 1.5-2.0, 2.0-2.5, 2.5-3.0 m
 
@@ -65,15 +65,3 @@ def test_depth_loss_of_zero_probability_is_finite():
 def test_depth_loss_names_bad_shapes():
     with pytest.raises(ValueError, match="bins must have the shape"):
         depth_loss(torch.rand(3, 2, 2), torch.zeros(2, 3, dtype=torch.long))
-
-
-def test_mask_loss_weighs_the_foreground():
-    logits = torch.tensor([0.0, 0.0])
-    target = torch.tensor([1, 0])
-    assert mask_loss(logits, target).item() == pytest.approx(math.log(2))
-    assert mask_loss(logits, target, pos_weight=4.0).item() == pytest.approx(2.5 * math.log(2))
-
-
-def test_mask_loss_names_bad_shapes():
-    with pytest.raises(ValueError, match="target must have shape"):
-        mask_loss(torch.zeros(2, 3), torch.zeros(3, 2))
