@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import torch
 
 from gsmap.checkpoints.key_map import GEMAP
-from gsmap.models.layers.geometry_attention import GeometryDecoupledAttention
+from gsmap.models.layers.self_attention import GeometryDecoupledAttention
 from gsmap.models.losses.geometry import (
     EuclideanLoss,
     euclidean_relation_loss,

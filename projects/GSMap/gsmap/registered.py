@@ -28,7 +28,6 @@ import gsmap.models.heads.map_head
 import gsmap.models.heads.mapvr_head
 import gsmap.models.heads.mgmapnet_head
 import gsmap.models.heads.references
-import gsmap.models.layers.geometry_attention
 import gsmap.models.layers.grid_mask
 import gsmap.models.layers.multi_granularity
 import gsmap.models.layers.self_attention

@@ -2,8 +2,7 @@ import pytest
 import torch
 from head_cases import HEAD, along_y, bev, build_head, elements, with_layer
 
-from gsmap.models.layers.geometry_attention import GeometryDecoupledAttention
-from gsmap.models.layers.self_attention import DecoupledSelfAttention
+from gsmap.models.layers.self_attention import DecoupledSelfAttention, GeometryDecoupledAttention
 from gsmap.models.losses.geometry import EuclideanLoss
 
 GEMAP = {**HEAD, "type": "GeMapHead"}

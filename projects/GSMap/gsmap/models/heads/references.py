@@ -148,15 +148,10 @@ class GaussianReference(PointReference):
     What it adds to points starts neutral: every query has the same Gaussian, every layer leaves it.
 
     Args:
-        grid: The map's extent.
-        embed_dims: Channels C of the states.
-        num_layers: Decoder layers.
         mlp: Predict sigma and theta by branches like the points' (GSMap Eq. 8) in place of one
             linear layer each.
-        num_reg_layers: Hidden layers of each layer's branch.
-        coords: 2, or 3 for centres with height; the Gaussians lie in the plane.
-        z_range: Lowest and highest z in metres, for centres with height.
-        space: Settings of `GaussianSpace`: ``min_scale_m`` and so on.
+        space: Settings of `GaussianSpace`: ``min_scale_m`` and so on. The other arguments are those
+            of the points, which may have a height; the Gaussians lie in the plane.
     """
 
     fields = PointReference.fields | {"masks", "rasters"}

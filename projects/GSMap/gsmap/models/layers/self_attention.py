@@ -1,23 +1,21 @@
 """Self-attentions of a decoder layer: how the point queries of all instances interact.
 
-Each takes point queries (B, N * P, C), their position, and a mask of instances that may not attend
-to each other (N, N); it returns the queries with its residual, and the layer normalises them.
+Each is made of ``embed_dims`` channels C, ``num_heads``, ``num_points`` per instance P and a
+``dropout``. It takes point queries, instance after instance (B, N * P, C), their position, and a
+mask, True where an instance may not attend to another (N, N) or None; it returns the queries with
+its residual, and the layer normalises them.
 """
 
+import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
+
+from gsmap.models.layers.branches import mlp
 
 
 @MODELS.register_module()
 class PointSelfAttention(nn.MultiheadAttention):
-    """One attention over all points of all instances (MapTR).
-
-    Args:
-        embed_dims: Channels C.
-        num_heads: Number of heads.
-        num_points: Points per instance P.
-        dropout: Dropout of the attention weights and of the output.
-    """
+    """One attention over all points of all instances (MapTR)."""
 
     def __init__(
         self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 20, dropout: float = 0.1
@@ -40,14 +38,7 @@ class PointSelfAttention(nn.MultiheadAttention):
 
 @MODELS.register_module()
 class DecoupledSelfAttention(nn.Module):
-    """Two small attentions: among instances, then among the points of each (MapTRv2).
-
-    Args:
-        embed_dims: Channels C.
-        num_heads: Number of heads.
-        num_points: Points per instance P.
-        dropout: Dropout of the attention weights and of the outputs.
-    """
+    """Two small attentions: among instances, then among the points of each (MapTRv2)."""
 
     def __init__(
         self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 20, dropout: float = 0.1
@@ -60,16 +51,7 @@ class DecoupledSelfAttention(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, query: Tensor, query_pos: Tensor, attn_mask: Tensor | None = None) -> Tensor:
-        """Let point p of all instances attend to each other, then the points of each instance.
-
-        Args:
-            query: Content of the point queries. (B, N * P, C)
-            query_pos: Their position. (B, N * P, C)
-            attn_mask: True where an instance may not attend to another, or None. (N, N)
-
-        Returns:
-            Updated queries. (B, N * P, C)
-        """
+        """Let point p of all instances attend to each other, then the points of each instance."""
         batch = len(query)
         per_instance = [x.unflatten(1, (-1, self.num_points)) for x in (query, query_pos)]
         query, query_pos = (x.transpose(1, 2).flatten(0, 1) for x in per_instance)  # (B * P, N, C)
@@ -86,3 +68,65 @@ class DecoupledSelfAttention(nn.Module):
         key = query + pos
         attended = attention(key, key, query, attn_mask=mask, need_weights=False)[0]
         return query + self.dropout(attended)
+
+
+class _AttentionBlock(nn.Module):
+    """Attention and feed-forward, each normalised *before* its residual is added."""
+
+    def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float) -> None:
+        super().__init__()
+        self.attention = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+        self.norm1 = nn.LayerNorm(embed_dims)
+        self.ffn = mlp(embed_dims, ffn_dims, embed_dims)
+        self.norm2 = nn.LayerNorm(embed_dims)
+
+    def forward(self, query: Tensor, attn_mask: Tensor | None = None) -> Tensor:
+        """Let queries attend to each other but where the mask (Q, Q) is True. (B, Q, C)"""
+        attended = self.attention(query, query, query, attn_mask=attn_mask, need_weights=False)[0]
+        query = self.norm1(attended) + query
+        return self.norm2(self.ffn(query)) + query
+
+
+@MODELS.register_module()
+class GeometryDecoupledAttention(nn.Module):
+    """To all points of other instances, then within each (GeMap, arXiv 2312.03341).
+
+    Differs from the released code in its cost alone: there, the second step is an attention among
+    all N * P points with a mask, here one among P points per instance. ``ffn_dims`` are the hidden
+    channels of both feed-forward networks.
+    """
+
+    def __init__(
+        self,
+        embed_dims: int = 256,
+        num_heads: int = 8,
+        num_points: int = 20,
+        ffn_dims: int = 1024,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.num_points = num_points
+        self.inter = _AttentionBlock(embed_dims, num_heads, ffn_dims, dropout)
+        self.intra = _AttentionBlock(embed_dims, num_heads, ffn_dims, dropout)
+
+    def forward(
+        self, query: Tensor, query_pos: Tensor | None = None, attn_mask: Tensor | None = None
+    ) -> Tensor:
+        """Let points attend to other instances, then within theirs; there is no position.
+
+        Raises:
+            ValueError: If the queries are not two or more instances of P points.
+        """
+        batch, count = query.shape[:2]
+        if count % self.num_points or count < 2 * self.num_points:
+            raise ValueError(
+                f"need two or more instances of num_points {self.num_points} queries each, "
+                f"got {count} queries."
+            )
+        blocked = torch.eye(count // self.num_points, dtype=torch.bool, device=query.device)
+        if attn_mask is not None:
+            blocked = blocked | attn_mask
+        blocked = blocked.repeat_interleave(self.num_points, 0)
+        query = self.inter(query, blocked.repeat_interleave(self.num_points, 1))
+        query = self.intra(query.reshape(-1, self.num_points, query.shape[-1]))  # (B * N, P, C)
+        return query.reshape(batch, count, -1)
