@@ -75,7 +75,7 @@ class ASPP(nn.Module):
 
 
 class CameraAwareDepthNet(nn.Module):
-    """Predict depth logits and context features, both gated by the camera's parameters.
+    """Predict D depth logits and C context features, both gated by the camera's parameters.
 
     Args:
         in_channels: Channels of the image features.
@@ -106,14 +106,9 @@ class CameraAwareDepthNet(nn.Module):
         )
 
     def forward(self, feats: Tensor, camera_vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict depth and context.
+        """Predict depth logits (n, D, h, w) and context features (n, C, h, w) of n cameras.
 
-        Args:
-            feats: Image features of n cameras. (n, C_in, h, w)
-            camera_vectors: Parameters of each camera, from `projection.camera_vector`. (n, 22)
-
-        Returns:
-            Depth logits (n, D, h, w) and context features (n, C, h, w).
+        They come with features (n, C_in, h, w) and `projection.camera_vector` each (n, 22).
         """
         vectors = self.bn(camera_vectors)
         feats = self.reduce_conv(feats)
@@ -123,13 +118,7 @@ class CameraAwareDepthNet(nn.Module):
 
 
 class PlainDepthNet(nn.Module):
-    """A single 1x1 convolution to depth logits and context (MapTR's BEVPool encoder).
-
-    Args:
-        in_channels: Channels of the image features.
-        context_channels: Channels C of the context.
-        depth_channels: Number of depth bins D.
-    """
+    """A single 1x1 convolution to depth logits and context (MapTR's BEVPool encoder)."""
 
     def __init__(self, in_channels: int, context_channels: int, depth_channels: int) -> None:
         super().__init__()

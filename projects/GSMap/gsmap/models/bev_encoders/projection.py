@@ -28,16 +28,10 @@ def stack_matrices(img_metas: Sequence[dict[str, Any]], key: str) -> np.ndarray:
 
 
 class PillarProjection(NamedTuple):
-    """Where the pillar points of every BEV cell fall in every camera.
+    """Where the Z pillar points of all Q cells fall in every camera, and which cells it sees."""
 
-    Attributes:
-        uv: Projected points, [0, 1] over the (padded) image; meaningless behind the camera. (B, V,
-            Q, Z, 2)
-        visible: Whether the camera sees any point of the cell's pillar. (B, V, Q)
-    """
-
-    uv: Tensor
-    visible: Tensor
+    uv: Tensor  # [0, 1] over the (padded) image; meaningless behind the camera (B, V, Q, Z, 2)
+    visible: Tensor  # whether it sees any point of the cell's pillar (B, V, Q)
 
 
 def pillar_points(
@@ -63,15 +57,9 @@ def pillar_points(
 def project_pillars(
     points: Tensor, img_from_frame: Tensor, img_shape: tuple[int, int]
 ) -> PillarProjection:
-    """Project pillar points into every camera.
+    """Project homogeneous points in metres (Q, Z, 4) by matrices to pixels (B, V, 4, 4).
 
-    Args:
-        points: Homogeneous points in metres. (Q, Z, 4)
-        img_from_frame: Projection matrices to pixels of the padded image. (B, V, 4, 4)
-        img_shape: Rows and columns of the padded image.
-
-    Returns:
-        The projections and which cells each camera sees.
+    ``img_shape`` are rows and columns of the padded image.
     """
     with torch.autocast(points.device.type, enabled=False):
         projected = torch.matmul(

@@ -119,7 +119,16 @@ class MapDetector(Base3DDetector):
         """
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         losses = self.map_head.loss(outputs, batch_data_samples)
-        self._check_finite(losses, batch_data_samples)
+        # mmengine reads each loss anyway: no new synchronisation
+        means = torch.stack([loss.detach().float().mean() for loss in losses.values()])
+        finite = torch.isfinite(means).tolist()
+        bad = [name for name, good in zip(losses, finite, strict=True) if not good]
+        if bad:
+            tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
+            raise FloatingPointError(
+                f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
+                "truth, then at the learning rate and at the loss scale of mixed precision."
+            )
         return losses
 
     def predict(
@@ -135,22 +144,6 @@ class MapDetector(Base3DDetector):
     ) -> dict[str, Tensor]:
         """Return the head's raw outputs."""
         return self.map_head(self.extract_feat(batch_inputs, batch_data_samples))
-
-    @staticmethod
-    def _check_finite(
-        losses: dict[str, Tensor], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> None:
-        """Stop at a loss that is not finite (mmengine reads each loss anyway: no new sync)."""
-        finite = torch.isfinite(
-            torch.stack([loss.detach().float().mean() for loss in losses.values()])
-        ).tolist()
-        bad = [name for name, good in zip(losses, finite, strict=True) if not good]
-        if bad:
-            tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
-            raise FloatingPointError(
-                f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
-                "truth, then at the learning rate and at the loss scale of mixed precision."
-            )
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any

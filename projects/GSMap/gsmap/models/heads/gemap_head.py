@@ -6,6 +6,7 @@ from typing import Any
 from mmdet3d.registry import MODELS
 
 from gsmap.models.heads.map_head import PARTS, MapHead
+from gsmap.models.heads.parts import switched
 
 ATTENTION = "GeometryDecoupledAttention"
 
@@ -37,14 +38,12 @@ class GeMapHead(MapHead):
         one_to_many: bool = False,
         **kwargs: Any,
     ) -> None:
-        if loss_euclidean is not None:
-            losses = [*losses, {"type": "EuclideanLoss", **loss_euclidean}]
         layer = decoder.get("layer", {})
         if decoupled and layer.get("self_attn", {}).get("type") != ATTENTION:
             decoder = {**decoder, "layer": {**layer, "self_attn": {"type": ATTENTION}}}
         super().__init__(
             decoder=decoder,
-            losses=losses,
+            losses=[*losses, *switched("EuclideanLoss", loss_euclidean)],
             query_groups=query_groups if one_to_many else query_groups[:1],
             **kwargs,
         )

@@ -10,15 +10,8 @@ from gsmap.models.heads.gaussian_statistics import gaussian_statistics
 from gsmap.models.heads.map_head import PARTS, MapHead
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.matched import MatchedPairs
+from gsmap.models.heads.parts import switched
 from gsmap.structures.grid import BEVGrid
-
-_RASTER_LOSS: PARTS = {"type": "RasterLoss", "loss_weight": 10.0}
-_IOU_COST: PARTS = {"type": "IoUCost", "weight": 2.0}
-
-
-def _over(default: PARTS, settings: PARTS | None) -> list[PARTS]:
-    """Return a part's default with other settings, or nothing if it is switched off."""
-    return [] if settings is None else [{**default, **settings}]
 
 
 @MODELS.register_module()
@@ -49,8 +42,8 @@ class GSMapHead(MapHead):
         decoder: PARTS,
         losses: Sequence[PARTS],
         match_costs: Sequence[PARTS],
-        loss_raster: PARTS | None = _RASTER_LOSS,
-        iou_cost: PARTS | None = _IOU_COST,
+        loss_raster: PARTS | None = {"loss_weight": 10.0},  # noqa: B006
+        iou_cost: PARTS | None = {"weight": 2.0},  # noqa: B006
         masks: PARTS | None = None,
         reference: PARTS | None = None,
         **kwargs: Any,
@@ -68,8 +61,8 @@ class GSMapHead(MapHead):
         super().__init__(
             grid=grid,
             decoder={**decoder, "layer": {**guided, **decoder.get("layer", {})}},
-            losses=[*losses, *_over(_RASTER_LOSS, loss_raster)],
-            match_costs=[*match_costs, *_over(_IOU_COST, iou_cost)],
+            losses=[*losses, *switched("RasterLoss", loss_raster, loss_weight=10.0)],
+            match_costs=[*match_costs, *switched("IoUCost", iou_cost, weight=2.0)],
             masks=masks,
             reference={**gaussian, **(reference or {})},
             **kwargs,

@@ -7,6 +7,7 @@ from mmdet3d.registry import MODELS
 
 from gsmap.models.heads.map_head import PARTS, MapHead
 from gsmap.models.heads.masks import ElementMasks
+from gsmap.models.heads.parts import switched
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 
@@ -62,17 +63,17 @@ class MapVRHead(MapHead):
         masks = {"pixel_m": 60 / 256, "cost_pixel_m": 60 / 128, **(masks or {})}
         rasters = ElementMasks(grid, **masks)
         shared = {"polygon_classes": _indices(polygons, classes), **(rendering or {})}
-        losses = [loss for loss in losses if loss["type"] != "DirectionLoss"]
-        losses = _weighted(losses, "PointsLoss", "loss_weight", points_weight)
-        match_costs = _weighted(match_costs, "OrderedPointsCost", "weight", points_weight)
-        if loss_direction:
-            losses.append(loss_direction)
-        if loss_dice:
-            size = rasters.grid.height, rasters.grid.width
-            losses.append({"type": "RenderedDiceLoss", "size": size, **shared, **loss_dice})
-        if dice_cost:
-            size = rasters.cost_grid.height, rasters.cost_grid.width
-            match_costs.append({"type": "RenderedDiceCost", "size": size, **shared, **dice_cost})
+        size, cost_size = ((g.height, g.width) for g in (rasters.grid, rasters.cost_grid))
+        kept = [loss for loss in losses if loss["type"] != "DirectionLoss"]
+        losses = [
+            *_weighted(kept, "PointsLoss", "loss_weight", points_weight),
+            *switched("SelfDirectionLoss", loss_direction),
+            *switched("RenderedDiceLoss", loss_dice, size=size, **shared),
+        ]
+        match_costs = [
+            *_weighted(match_costs, "OrderedPointsCost", "weight", points_weight),
+            *switched("RenderedDiceCost", dice_cost, size=cost_size, **shared),
+        ]
         super().__init__(
             grid=grid,
             classes=classes,

@@ -7,6 +7,7 @@ from mmdet3d.registry import MODELS
 
 from gsmap.models.heads.map_head import PARTS, MapHead
 from gsmap.models.heads.masks import ElementMasks
+from gsmap.models.heads.parts import switched
 from gsmap.structures.grid import BEVGrid
 
 DECODER = "MGMapNetDecoder"
@@ -43,16 +44,13 @@ class MGMapHead(MapHead):
         embed_dims: int = 256,
         **kwargs: Any,
     ) -> None:
-        if loss_mean_loc is not None:
-            losses = [*losses, {"type": "SamplingLocationLoss", **loss_mean_loc}]
-        if loss_ins_seg is not None:
-            part = {"type": "InstanceMaskLoss", "embed_dims": embed_dims, **loss_ins_seg}
-            losses = [*losses, part]
+        mean_loc = switched("SamplingLocationLoss", loss_mean_loc)
+        ins_seg = switched("InstanceMaskLoss", loss_ins_seg, embed_dims=embed_dims)
         pixel_m = max(ElementMasks(grid, **(masks or {})).grid.pixel_size_m)
         super().__init__(
             grid=grid,
             decoder=_mgmapnet_decoder(decoder),
-            losses=losses,
+            losses=[*losses, *mean_loc, *ins_seg],
             query_groups=query_groups,
             masks={"line_width_m": LINE_PX * pixel_m, **(masks or {})},
             embed_dims=embed_dims,

@@ -21,6 +21,11 @@ def by_name(modules: Sequence[nn.Module]) -> nn.ModuleDict:
     return nn.ModuleDict({str(module.name): module for module in modules})
 
 
+def switched(kind: str, settings: dict[str, Any] | None, **defaults: Any) -> list[dict[str, Any]]:
+    """Return the config of a part that a method brings, or nothing if it is switched off (None)."""
+    return [] if settings is None else [{"type": kind, **defaults, **settings}]
+
+
 def check_parts(head: "MapHead") -> set[str]:
     """Return the fields (``pred.<name>``, ``gt.<name>``) that a head's losses and costs read.
 

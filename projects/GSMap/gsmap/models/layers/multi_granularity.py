@@ -19,34 +19,20 @@ from gsmap.ops.deformable_sampling import deformable_sample
 
 
 class Granularities(NamedTuple):
-    """The queries of all map elements at both granularities, as one layer hands them to the next.
+    """The queries of all map elements at both granularities, handed on by a layer."""
 
-    Attributes:
-        instances: Instance queries. (B, N, C)
-        points: Point queries; None before the first layer. (B, N, P, C)
-        point_code: Position code of the points; None without codes. (B, N, P, C)
-        mean_locations: Mean of each point's sampling locations (x, y), [0, 1] over the map; not
-            clipped. (B, N, P, 2)
-    """
-
-    instances: Tensor
-    points: Tensor | None = None
-    point_code: Tensor | None = None
-    mean_locations: Tensor | None = None
+    instances: Tensor  # (B, N, C)
+    points: Tensor | None = None  # none before the first layer (B, N, P, C)
+    point_code: Tensor | None = None  # position code, none without codes (B, N, P, C)
+    mean_locations: Tensor | None = None  # of each point's samples (B, N, P, 2)
 
 
 class Samples(NamedTuple):
-    """Where an attention looks, and how it weighs what it sees.
+    """Where an attention looks, and how it weighs what it sees: (B, N, P, levels, heads, K) each."""
 
-    Attributes:
-        locations: Sampling points (x, y), [0, 1] over the map. (B, N, P, levels, heads, K, 2)
-        point_weights: Weights of sum one over K. (B, N, P, levels, heads, K)
-        weights: Weights of sum one over P, levels and K. (B, N, P, levels, heads, K)
-    """
-
-    locations: Tensor
-    point_weights: Tensor
-    weights: Tensor
+    locations: Tensor  # sampling points (x, y), [0, 1] over the map (..., 2)
+    point_weights: Tensor  # of sum one over K
+    weights: Tensor  # of sum one over P, levels and K
 
 
 class PerPointSampling(SamplingAttention):

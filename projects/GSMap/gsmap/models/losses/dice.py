@@ -92,16 +92,10 @@ class RenderedDiceLoss(nn.Module):
         gt_labels: Tensor,
         avg_factor: float | Tensor | None = None,
     ) -> Tensor:
-        """Return the weighted loss of matched pairs.
+        """Return the weighted sum over ``avg_factor``, or the mean over the n pairs without it.
 
-        Args:
-            pred_points: Normalised points. (n, P, 2)
-            gt_points: Normalised points, in their first order. (n, P, 2)
-            gt_labels: Class of each ground truth, which decides how both are rendered. (n,)
-            avg_factor: What the sum over pairs is divided by; n without it.
-
-        Returns:
-            The loss; 0 with a gradient of 0 if nothing is matched. ()
+        Normalised points (n, P, 2), the ground truth's in their first order; a pair is rendered as
+        its ground truth's class (n,). 0 with a gradient of 0 if nothing is matched.
         """
         if not len(pred_points):
             return pred_points.float().sum() * 0

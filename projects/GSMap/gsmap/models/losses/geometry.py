@@ -24,14 +24,9 @@ def shape_features(points: Tensor) -> Tensor:
 
 
 def relation_features(points: Tensor, pairs: Tensor) -> Tensor:
-    """Describe pairs of elements: distances of all their points, angles between all their edges.
+    """Return distances between all points of pairs (2, R), and cosine and sine between all edges.
 
-    Args:
-        points: Points of elements. (M, P, 2)
-        pairs: Indices of the first and the second element of each pair. (2, R)
-
-    Returns:
-        Distance, cosine and sine per point (or edge) of the first and of the second. (3, R, P, P)
+    One per point (or edge) of the first and of the second. (M, P, 2) -> (3, R, P, P)
     """
     points = points.movedim(-1, 0)  # sums over a last axis of two would be slow
     edges = _edges(points)
@@ -45,15 +40,8 @@ def relation_features(points: Tensor, pairs: Tensor) -> Tensor:
 def euclidean_shape_loss(pred: Tensor, target: Tensor) -> Tensor:
     """Return the mean L1 distance of shapes: of lengths, of cosines and of sines, added up.
 
-    Args:
-        pred: Points of matched predictions, normalised to [0, 1]. (M, P, 2)
-        target: Points of their ground truth, in the same order. (M, P, 2)
-
-    Returns:
-        The loss; zero without matches. ()
-
-    Raises:
-        ValueError: If the shapes disagree.
+    Normalised points in the same order, 2 x (M, P, 2); zero without matches. ValueError if the
+    shapes disagree.
     """
     check_same_points(pred, target)
     if not len(pred):
@@ -67,16 +55,8 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
     A sample with n matches adds the sum over its pairs of elements, each taken once, divided by
     (n * P)^2: by all pairs of points, also those of an element with itself. Samples add up.
 
-    Args:
-        pred: Points of matched predictions, normalised to [0, 1], sample after sample. (M, P, 2)
-        target: Points of their ground truth, in the same order. (M, P, 2)
-        counts: Number of matches of each sample; they add up to M.
-
-    Returns:
-        The loss; zero where no sample has two matches. ()
-
-    Raises:
-        ValueError: If the shapes disagree or ``counts`` do not add up.
+    Normalised points, sample after sample and in the same order, 2 x (M, P, 2), and the matches of
+    each sample; zero where none has two. ValueError if shapes disagree or counts do not add up.
     """
     check_same_points(pred, target)
     if sum(counts) != len(pred):

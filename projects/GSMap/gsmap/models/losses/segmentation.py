@@ -41,17 +41,8 @@ def instance_mask_losses(
 ) -> tuple[Tensor, Tensor]:
     """Return cross-entropy and dice of matched instances' masks, summed over ``avg_factor``.
 
-    Args:
-        logits: Predicted masks. (M, H, W)
-        targets: Masks of their ground truths in [0, 1], any dtype. (M, H, W)
-        avg_factor: The divisor: the number of matched elements, at least 1.
-
-    Returns:
-        Binary cross-entropy, each instance the mean over its cells (), and dice (); zero without
-        matches.
-
-    Raises:
-        ValueError: If the shapes disagree.
+    Masks in [0, 1], of any dtype, 2 x (M, H, W); an instance's cross-entropy is the mean over its
+    cells; zero without matches. ValueError if the shapes disagree.
     """
     _check_shapes(logits, targets)
     logits, targets = logits.float(), targets.float()

@@ -12,17 +12,11 @@ from torch import Tensor
 
 
 class MapMatch(NamedTuple):
-    """Matched pairs of one sample, sorted by query.
-
-    Attributes:
-        query_inds: Matched queries. (M,)
-        gt_inds: The ground truth of each. (M,)
-        order_inds: The closest equivalent point order of that ground truth. (M,)
-    """
+    """Matched pairs of one sample, sorted by query. (M,) each"""
 
     query_inds: Tensor
-    gt_inds: Tensor
-    order_inds: Tensor
+    gt_inds: Tensor  # the ground truth of each
+    order_inds: Tensor  # the closest equivalent point order of that ground truth
 
 
 class MapAssigner:
