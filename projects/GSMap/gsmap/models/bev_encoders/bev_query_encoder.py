@@ -60,13 +60,7 @@ class BEVSelfAttention(BEVDeformableAttention):
 class BEVEncoderLayer(nn.Module):
     """Self-attention, camera cross-attention and feed-forward, each followed by its LayerNorm.
 
-    Args:
-        cross_attn: Config of the camera cross-attention.
-        embed_dims: Channels C.
-        num_heads: Heads of the self-attention.
-        num_points: Samples per head and queue entry of the self-attention.
-        ffn_dims: Hidden channels of the feed-forward network.
-        dropout: Dropout of every sublayer.
+    ``num_heads`` and ``num_points`` (samples per head and queue entry) are the self-attention's.
     """
 
     def __init__(

@@ -36,15 +36,9 @@ class SpatialCrossAttention(SamplingAttention):
         self.num_heights = num_heights
 
     def forward(self, query: Tensor, img_feats: Tensor, projection: PillarProjection) -> Tensor:
-        """Collect camera features for every BEV cell.
+        """Collect camera features (B, V, C, h, w) for every cell's query, without the residual.
 
-        Args:
-            query: BEV queries. (B, Q, C)
-            img_feats: Image features, camera embedding added. (B, V, C, h, w)
-            projection: Where pillars fall in the cameras; ``num_heights`` points per pillar.
-
-        Returns:
-            Attended features, without the residual. (B, Q, C)
+        The projected pillars have ``num_heights`` points. (B, Q, C) -> (B, Q, C)
         """
         height, width = img_feats.shape[-2:]
         offsets = self.offsets_in_cells(query) / query.new_tensor([width, height])

@@ -80,15 +80,9 @@ class GeometryKernelAttention(nn.Module):
         xavier_init(self.output_proj, distribution="uniform")
 
     def forward(self, query: Tensor, img_feats: Tensor, projection: PillarProjection) -> Tensor:
-        """Collect camera features for every BEV cell.
+        """Collect camera features (B, V, C, h, w) for every cell's query, without the residual.
 
-        Args:
-            query: BEV queries. (B, Q, C)
-            img_feats: Image features, camera embedding added. (B, V, C, h, w)
-            projection: Where pillars fall in the cameras; as many heights as heads.
-
-        Returns:
-            Attended features, without the residual. (B, Q, C)
+        The projected pillars have as many points as there are heads. (B, Q, C) -> (B, Q, C)
         """
         batch, num_queries = query.shape[:2]
         num_views, (height, width) = img_feats.shape[1], img_feats.shape[-2:]

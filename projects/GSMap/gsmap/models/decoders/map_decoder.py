@@ -68,18 +68,7 @@ class MapDecoderLayer(BaseModule):
         bev_feats: Tensor,
         attn_mask: Tensor | None = None,
     ) -> Tensor:
-        """Update the point queries.
-
-        Args:
-            query: Content of the point queries. (B, N * P, C)
-            query_pos: Their learned position. (B, N * P, C)
-            reference: Their reference. (B, N * P, D)
-            bev_feats: BEV features. (B, C, H, W)
-            attn_mask: True where an instance may not attend to another, or None. (N, N)
-
-        Returns:
-            Updated queries. (B, N * P, C)
-        """
+        """Update the point queries; arguments as in `MapDecoder.forward`. -> (B, N * P, C)"""
         frames = None
         if self.guidance is not None:
             query_pos = self.guidance.position(query_pos, reference)

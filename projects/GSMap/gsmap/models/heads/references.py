@@ -18,19 +18,9 @@ from gsmap.structures.grid import BEVGrid
 def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Tensor:
     """Move a reference by predicted offsets.
 
-    The point moves before its sigmoid; further entries (GSMap Eq. 1: sigma, theta before their
-    activation) add up.
-
-    Args:
-        reference: Reference; the first entries are the point in (0, 1). (..., D)
-        offsets: Predicted offsets. (..., D)
-        coords: Coordinates of the point.
-
-    Returns:
-        The refined reference, at least float32. (..., D)
-
-    Raises:
-        ValueError: If the shapes disagree.
+    The point in (0, 1), the first ``coords`` entries, moves before its sigmoid; further entries
+    (GSMap Eq. 1: sigma, theta before their activation) add up. The result is at least float32.
+    ValueError if the shapes disagree. (..., D), (..., D) -> (..., D)
     """
     if reference.shape != offsets.shape:
         raise ValueError(

@@ -19,7 +19,7 @@ from gsmap.ops.deformable_sampling import deformable_sample
 
 
 class Granularities(NamedTuple):
-    """The queries of all map elements at both granularities, handed on by a layer."""
+    """The queries of all map elements at both granularities, as layers hand them on."""
 
     instances: Tensor  # (B, N, C)
     points: Tensor | None = None  # none before the first layer (B, N, P, C)
@@ -28,7 +28,7 @@ class Granularities(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Where an attention looks, and how it weighs what it sees: (B, N, P, levels, heads, K) each."""
+    """Where an attention looks, and how it weighs it: (B, N, P, levels, heads, K) each."""
 
     locations: Tensor  # sampling points (x, y), [0, 1] over the map (..., 2)
     point_weights: Tensor  # of sum one over K
