@@ -5,18 +5,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
+from gsmap.ops.bev_pool import bev_pool, bev_pool_conv3x3, cell_indices
 from gsmap.structures.grid import BEVGrid
 
 GRID = BEVGrid((-2.0, 2.0), (-3.0, 3.0), height=6, width=4)
-
-
-def bev_pool(probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid) -> Tensor:
-    """Pool alone: the convolution's kernel is 1 in the middle, from each channel to itself."""
-    channels = context.shape[2]
-    weight = torch.zeros(channels, channels, 3, 3, dtype=context.dtype)
-    weight[:, :, 1, 1] = torch.eye(channels)
-    return bev_pool_conv3x3(probs, context, cells, grid, weight)
 
 
 def random_case(
@@ -79,6 +71,7 @@ def test_no_point_gives_zeros():
     probs, context, cells = random_case()
     nowhere = torch.full_like(cells, -1)
     weight = torch.randn(4, 7, 3, 3, dtype=torch.float64)
+    assert bev_pool(probs, context, nowhere, GRID).eq(0).all()
     assert bev_pool_conv3x3(probs, context, nowhere, GRID, weight).eq(0).all()
 
 
@@ -95,6 +88,7 @@ def test_gradients():
     cells = cells[:, :2, :3]
     weight = torch.randn(2, 3, 3, 3, dtype=torch.float64, requires_grad=True)
     inputs = (probs.clone().requires_grad_(), context.clone().requires_grad_())
+    assert torch.autograd.gradcheck(lambda p, c: bev_pool(p, c, cells, GRID), inputs)
     assert torch.autograd.gradcheck(
         lambda p, c, w: bev_pool_conv3x3(p, c, cells, GRID, w), (*inputs, weight)
     )

@@ -11,13 +11,8 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.models.bev_encoders.projection import (
-    PillarProjection,
-    pillar_points,
-    project_pillars,
-    stack_matrices,
-)
-from gsmap.models.layers.branches import mlp
+from gsmap.models.bev_encoders.img_metas import stack_matrices
+from gsmap.models.bev_encoders.projection import PillarProjection, pillar_points, project_pillars
 from gsmap.models.layers.deformable_attention import (
     BEVDeformableAttention,
     directional_offsets,
@@ -93,7 +88,8 @@ class BEVEncoderLayer(nn.Module):
         Cell centres (B, Q, 2) are [0, 1] over the grid of ``bev_shape`` rows and columns; image
         features (B, V, C, h, w) have their embeddings; ``projection`` says where pillars fall.
         """
-        # Differs from upstream for batches, where sample b meets the query of sample floor(b / 2).
+        # Differs from upstream for batches: it pairs the query of sample floor(b / 2) with sample b
+        # here.
         pair = torch.cat([query, query + query_pos], -1)  # (B, Q, 2 C)
         bev = query.transpose(1, 2).unflatten(-1, bev_shape)  # (B, C, H, W)
         query = self.norms[0](query + self.self_attn(pair, centres, bev))
@@ -116,7 +112,8 @@ class BEVQueryEncoder(BaseModule):
         num_layers: Number of layers.
         layer_cfg: Further arguments of :class:`BEVEncoderLayer`.
         num_cams: Number of cameras V.
-        num_feature_levels: Rows of the level embedding; only the first is used.
+        num_feature_levels: Rows of the level embedding; only the first is used, as there is one
+            level.
         init_cfg: As in mmengine.
     """
 
@@ -142,7 +139,12 @@ class BEVQueryEncoder(BaseModule):
         )
         self.level_embeds = nn.Parameter(torch.empty(num_feature_levels, embed_dims))
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
-        self.can_bus_mlp = mlp(_NUM_CAN_BUS, embed_dims // 2, embed_dims).append(nn.ReLU(True))
+        self.can_bus_mlp = nn.Sequential(
+            nn.Linear(_NUM_CAN_BUS, embed_dims // 2),
+            nn.ReLU(inplace=True),
+            nn.Linear(embed_dims // 2, embed_dims),
+            nn.ReLU(inplace=True),
+        )
         self.can_bus_mlp.add_module("norm", nn.LayerNorm(embed_dims))
         layer = {"cross_attn": cross_attn, "embed_dims": embed_dims, **(layer_cfg or {})}
         layers = [BEVEncoderLayer(**layer) for _ in range(num_layers)]
@@ -211,7 +213,8 @@ class BEVQueryEncoder(BaseModule):
         self, img_metas: Sequence[dict[str, Any]], device: torch.device
     ) -> PillarProjection:
         """Project every cell's pillar into every camera."""
-        # Differs from upstream for batches: it takes the seen cells of the first sample for all.
+        # Differs from upstream for batches: it takes the set of seen cells from the first sample
+        # for all.
         points = pillar_points(self.grid, self.z_range, self.num_heights, device)
         matrices = torch.as_tensor(
             stack_matrices(img_metas, "lidar2img"), dtype=torch.float32, device=device

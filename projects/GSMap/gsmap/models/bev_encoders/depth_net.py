@@ -108,7 +108,7 @@ class CameraAwareDepthNet(nn.Module):
     def forward(self, feats: Tensor, camera_vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Predict depth logits (n, D, h, w) and context features (n, C, h, w) of n cameras.
 
-        They come with features (n, C_in, h, w) and `projection.camera_vector` each (n, 22).
+        They come with features (n, C_in, h, w) and `frustum.camera_vector` each (n, 22).
         """
         vectors = self.bn(camera_vectors)
         feats = self.reduce_conv(feats)

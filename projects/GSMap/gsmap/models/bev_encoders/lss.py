@@ -10,8 +10,9 @@ from mmengine.model import BaseModule
 from torch import Tensor, nn
 
 from gsmap.models.bev_encoders.depth_net import CameraAwareDepthNet, PlainDepthNet
-from gsmap.models.bev_encoders.projection import camera_vector, frustum_points, stack_matrices
-from gsmap.models.losses.depth import num_depth_bins
+from gsmap.models.bev_encoders.frustum import camera_vector, frustum_points
+from gsmap.models.bev_encoders.img_metas import stack_matrices
+from gsmap.models.losses.auxiliary import num_depth_bins
 from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
 from gsmap.structures.grid import BEVGrid
 

@@ -11,7 +11,7 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from torch import Tensor, nn
 
-from gsmap.models.losses.depth import depth_bins, depth_loss
+from gsmap.models.losses.auxiliary import depth_bins, depth_loss
 from gsmap.models.losses.segmentation import class_mask_losses
 
 

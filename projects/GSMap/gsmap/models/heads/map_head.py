@@ -354,8 +354,8 @@ class MapHead(BaseModule):
         last = zip(outputs["all_cls_scores"][-1], outputs["all_references"][-1], strict=True)
         for scores, references in last:
             fields = self.reference.decode(references)
-            best, labels, queries = self.coder.decode(scores, fields["pts"])
-            chosen = {name: value[queries] for name, value in fields.items()}
-            chosen.update(scores_3d=best, labels_3d=labels)
+            best = self.coder.decode(scores, fields["pts"])
+            chosen = {name: value[best.query_inds] for name, value in fields.items()}
+            chosen.update(scores_3d=best.scores, labels_3d=best.labels)
             results.append(InstanceData(metainfo=self.reference.metainfo, **chosen))
         return results

@@ -1,9 +1,25 @@
 """From class scores and points of all queries to the best detections."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
+
+
+class Detections(NamedTuple):
+    """The best detections of one sample, highest score first.
+
+    Attributes:
+        scores: Confidence in [0, 1]. (M,)
+        labels: Class index. (M,)
+        query_inds: The query of each; one query may appear with several classes. (M,)
+    """
+
+    scores: Tensor
+    labels: Tensor
+    query_inds: Tensor
 
 
 class MapCoder:
@@ -35,7 +51,7 @@ class MapCoder:
         self.margin_m = margin_m
         self.score_threshold = score_threshold
 
-    def decode(self, scores: Tensor, pts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def decode(self, scores: Tensor, pts: Tensor) -> Detections:
         """Select the detections of one sample.
 
         Args:
@@ -43,8 +59,7 @@ class MapCoder:
             pts: Points in metres. (N, P, 2 or 3)
 
         Returns:
-            Of at most ``max_num`` detections, best first, the score in [0, 1], the class index and
-            the query, which may appear with several classes. 3 x (M,)
+            At most ``max_num`` detections; index ``pts`` with their ``query_inds``.
         """
         num_classes = scores.shape[-1]
         flat = scores.float().sigmoid().flatten()
@@ -58,4 +73,4 @@ class MapCoder:
             keep &= (chosen.amax(1) <= high + self.margin_m).all(-1)
         if self.score_threshold is not None:
             keep &= best > self.score_threshold
-        return best[keep], (index % num_classes)[keep], query[keep]
+        return Detections(best[keep], (index % num_classes)[keep], query[keep])

@@ -51,14 +51,36 @@ def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) 
     return torch.where(inside, index[..., 1] * grid.width + index[..., 0], -1)
 
 
+def bev_pool(probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid) -> Tensor:
+    """Sum depth probability times context feature over the points of every cell.
+
+    Args:
+        probs: Probability of each depth bin. (B, V, D, h, w)
+        context: Image features. (B, V, C, h, w)
+        cells: Cell of each point, -1 for none, from `cell_indices`. (B, V, D, h, w)
+        grid: The cells, H rows and W columns.
+
+    Returns:
+        Pooled features, differentiable in ``probs`` and ``context``. (B, C, H, W)
+
+    Raises:
+        ValueError: If the shapes disagree.
+    """
+    _check_shapes(probs, context, cells)
+    points = _sort_by_cell(probs, cells, grid)
+    table = context.permute(0, 1, 3, 4, 2).flatten(0, 3)  # (B*V*h*w, C)
+    pooled = _weighted_bags(table, points.pixels, points.probs, points.counts)
+    return pooled.view(probs.shape[0], grid.height, grid.width, -1).permute(0, 3, 1, 2)
+
+
 def bev_pool_conv3x3(
     probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid, weight: Tensor
 ) -> Tensor:
-    """Sum depth probability times context over each cell's points, then convolve, zero-padded.
+    """Pool as `bev_pool` does and convolve the result with a 3x3 kernel, zero-padded.
 
     Both steps are linear, so the kernel's nine matrices can be applied to the few context vectors
-    instead of the many cells: at MapTRv2's size (2,250 pixels, 80,000 cells) this is 35 times less
-    arithmetic.
+    instead of the many
+    cells: at MapTRv2's size (2,250 pixels, 80,000 cells) this is 35 times less arithmetic.
 
     Args:
         probs: Probability of each depth bin. (B, V, D, h, w)
@@ -68,7 +90,7 @@ def bev_pool_conv3x3(
         weight: Convolution kernel without bias. (O, C, 3, 3)
 
     Returns:
-        ``conv2d(pooled, weight, padding=1)``, differentiable in ``probs``, ``context`` and
+        ``conv2d(bev_pool(...), weight, padding=1)``, differentiable in ``probs``, ``context`` and
         ``weight``. (B, O, H, W)
 
     Raises:

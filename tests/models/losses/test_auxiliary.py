@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gsmap.models.losses.depth import depth_bins, depth_loss, num_depth_bins
+from gsmap.models.losses.auxiliary import depth_bins, depth_loss, num_depth_bins
 
 RANGE = (1.0, 3.0, 0.5)  # bins 1.0-1.5, 1.5-2.0, 2.0-2.5, 2.5-3.0 m
 

@@ -1,4 +1,4 @@
-"""Depth supervision of MapTRv2 (arXiv 2308.05736)."""
+"""Auxiliary supervision of MapTRv2 (arXiv 2308.05736) by depth."""
 
 import torch
 from torch import Tensor
