@@ -35,7 +35,7 @@ class PointsLoss(nn.Module):
         shapes disagree.
         """
         check_same_points(pred, target)
-        return self.loss_weight * (pred - target).abs().sum() / avg_factor
+        return self.loss_weight * ((pred - target).abs().sum() / avg_factor)
 
 
 class SamplingLocationLoss(PointsLoss):
@@ -72,7 +72,7 @@ class DirectionLoss(nn.Module):
         """
         check_same_points(pred, target)
         turns = _sum_of_turns(pred.diff(dim=1), target.diff(dim=1))
-        return self.loss_weight * turns / avg_factor
+        return self.loss_weight * (turns / avg_factor)
 
 
 class SelfDirectionLoss(nn.Module):
@@ -96,7 +96,7 @@ class SelfDirectionLoss(nn.Module):
         """Return the weighted sum over ``avg_factor`` of points in metres. (M, P, 2 or 3) -> ()"""
         # Differs from MapVR Eq. (4), which sums the cosines: their sign would reward folding.
         edges = pred.diff(dim=1)
-        return self.loss_weight * _sum_of_turns(edges[:, :-1], edges[:, 1:]) / avg_factor
+        return self.loss_weight * (_sum_of_turns(edges[:, :-1], edges[:, 1:]) / avg_factor)
 
 
 def _sum_of_turns(first: Tensor, second: Tensor) -> Tensor:
