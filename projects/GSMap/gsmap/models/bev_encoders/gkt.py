@@ -52,6 +52,8 @@ class GeometryKernelAttention(nn.Module):
         ValueError: If a kernel size is even or ``embed_dims`` is not divisible by ``num_heads``.
     """
 
+    offsets: Tensor
+
     def __init__(
         self,
         embed_dims: int = 256,

@@ -139,8 +139,13 @@ class MGMapNetDecoder(MapDecoder):
         num_levels: int = 2,
         **kwargs: Any,
     ) -> None:
-        sizes = {"embed_dims": embed_dims, "num_points": num_points, "num_levels": num_levels}
-        super().__init__({"type": "MGMapNetDecoderLayer", **(layer or {})}, **sizes, **kwargs)
+        super().__init__(
+            {"type": "MGMapNetDecoderLayer", **(layer or {})},
+            embed_dims=embed_dims,
+            num_points=num_points,
+            num_levels=num_levels,
+            **kwargs,
+        )
         self.num_points = num_points
         # Differs from the poster: the released model's first layer adds the learned position.
         self.layers[0].reference_code = None

@@ -56,7 +56,7 @@ class MatchedPairs:
     ) -> None:
         self.matches = list(matches)
         self._sides = {"pred": list(predictions), "gt": list(gts)}
-        self._reference = reference
+        self._reference: Any = reference  # one of Gaussians where masks are read
         self._masks = masks
         counts = [len(match.gt_inds) for match in matches]
         self._made: dict[str, Any] = {"gt.counts": counts, "bev_feats": bev_feats}

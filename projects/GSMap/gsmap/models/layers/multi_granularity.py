@@ -110,8 +110,8 @@ class PerPointSampling(SamplingAttention):
         offsets = self.offsets_in_cells(query).unflatten(-2, self.layout)
         offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6).flatten(2, 3)  # (levels, B, N P, heads, K,2)
         locations = [
-            place_samples(by_level, reference.flatten(1, 2), feat.shape[-2:], frames)
-            for by_level, feat in zip(offsets, feats, strict=True)
+            place_samples(by_level, reference.flatten(1, 2), (height, width), frames)
+            for by_level, (*_, height, width) in zip(offsets, (f.shape for f in feats), strict=True)
         ]
         logits = at_least_float32(self.attention_weights(query))
         logits = logits.unflatten(-1, (self.num_heads, *self.layout))
