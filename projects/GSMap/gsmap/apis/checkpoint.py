@@ -14,6 +14,8 @@ from gsmap.checkpoints.settings import MODEL_SETTINGS, differences, plain
 from gsmap.engine.named_models import find_checkpoint
 
 _SHOWN = 5
+# what torch's reader raises on bytes that make no sense
+_DAMAGE = (RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError)
 
 
 def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | None]:
@@ -39,7 +41,7 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
             f"{path} was not loaded: it is broken, or holds more than tensors and plain data "
             f"({reason}). If you trust its origin, save its state_dict alone and give that file."
         ) from error
-    except (RuntimeError, EOFError, OSError, zipfile.BadZipFile) as error:
+    except (*_DAMAGE, OSError, zipfile.BadZipFile) as error:
         raise ValueError(
             f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); "
             "fetch it again, or use an earlier epoch's."

@@ -1,13 +1,12 @@
 """What a checkpoint of mmengine may hold beside tensors and plain data."""
 
-import codecs
 import pickle
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from mmengine.logging.history_buffer import HistoryBuffer
-from numpy.core import multiarray
+
+from gsmap.utils.numpy_pickle import CHECKED
 
 
 def mmengine_globals() -> list[Any]:
@@ -17,14 +16,13 @@ def mmengine_globals() -> list[Any]:
     numbers, and references to the class's own statistics (``getattr(HistoryBuffer, "mean")``).
     Naming just these keeps torch's protection on for everything else.
 
+    numpy's values are rebuilt by checked functions, as numpy's own give a file memory access.
+
     Returns:
         The list for ``torch.serialization.safe_globals`` or ``add_safe_globals``.
     """
-    kinds = (np.float32, np.float64, np.int64, np.int32, np.uint8, np.bool_)
-    dtypes = [type(np.dtype(kind)) for kind in kinds]
-    rebuild = [multiarray._reconstruct, multiarray.scalar]  # type: ignore[attr-defined]
-    types = [HistoryBuffer, np.ndarray, np.dtype, codecs.encode]
-    return [*types, *rebuild, *dtypes, (_history_statistic, "builtins.getattr")]
+    checked = [(function, name) for name, function in CHECKED.items()]
+    return [HistoryBuffer, *checked, (_history_statistic, "builtins.getattr")]
 
 
 def _history_statistic(owner: type, name: str) -> Callable[..., float]:

@@ -1,0 +1,180 @@
+"""Pickles that would do something when they are read: harmless stand-ins that leave a marker.
+
+``python attacks.py READER FOLDER`` reads one of them in a process of its own.
+"""
+
+import os
+import pickle
+import struct
+import sys
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+MARKER = "marker"
+
+
+class Calls:
+    """Pickles as a call of a function."""
+
+    def __init__(self, function: Any, *arguments: Any, state: Any = None) -> None:
+        self.parts = (function, arguments, state) if state is not None else (function, arguments)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.parts
+
+
+def _named(module: str, name: str) -> bytes:
+    """Return the instruction that looks up a name."""
+    return b"c" + f"{module}\n{name}\n".encode()
+
+
+def _plain(value: Any) -> bytes:
+    """Return the instructions that make a plain value, as torch's reader knows them too."""
+    return pickle.dumps(value, 2)[2:-1]
+
+
+def _dtype(code: str, state: Any) -> bytes:
+    """Return a dtype with a state of its own."""
+    made = _named("numpy", "dtype") + _plain((code, False, True)) + b"R"
+    return made + _plain(state) + b"b"
+
+
+def _array(dtype: bytes, shape: tuple[int, ...], data: bytes) -> bytes:
+    """Return an array with a dtype that is given as instructions."""
+    empty = _named("numpy.core.multiarray", "_reconstruct") + b"(" + _named("numpy", "ndarray")
+    state = b"(K\x01" + _plain(shape) + dtype + b"\x89" + _plain(data) + b"tb"
+    return empty + _plain((0,)) + _plain(b"b") + b"tR" + state
+
+
+def _whole(body: bytes) -> bytes:
+    return b"\x80\x04" + body + b"."
+
+
+def corpus(folder: Path) -> dict[str, bytes]:
+    """Return the attacks by name; the marker of one that succeeds lies in ``folder``."""
+    marker = str(folder / MARKER)
+    touch = f"open({marker!r}, 'w').close()"
+    pointer = struct.pack("<Q", id(marker))
+    object_state = (3, "|", None, None, None, 8, 8, 63)
+    fields = (3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 8, 63)
+    numbers = (3, "<", None, None, None, -1, -1, 0)
+    calls = {
+        "open": Calls(open, marker, "w"),
+        "system": Calls(os.system, f"touch {marker}"),
+        "exec": Calls(exec, touch),
+        "eval": Calls(eval, touch),
+        "getattr": Calls(getattr, np.ndarray, "tofile"),
+        "import": Calls(__import__, "this"),
+        "makedirs": Calls(os.makedirs, marker),
+        "nested": {"infos": [{"cams": {"a": Calls(open, marker, "w")}}]},
+        "key": {("a", 1): Calls(open, marker, "w")},
+        "mapped by numpy": Calls(np.memmap, marker, "u1", "w+", 0, (8,)),
+        "saved by numpy": Calls(np.save, marker, np.zeros(1)),
+        "tofile": Calls(np.ndarray.tofile, np.zeros(2), marker),
+        "object array": np.array([Calls(open, marker, "w")], dtype=object),
+        "record": np.zeros(2, dtype=[("a", "f8"), ("b", "O")]),
+        "ordered": OrderedDict(a=Calls(open, marker, "w")),
+        "state of a dict": Calls(
+            OrderedDict, state=(None, {"__class__": Calls(open, marker, "w")})
+        ),
+    }
+    found = {name: pickle.dumps(value, protocol=2) for name, value in calls.items()}
+    raw = {
+        "dtype of objects": _dtype("O8", (3, "|", None, None, None, -1, -1, 63)),
+        "state of objects": _dtype("i8", object_state),
+        "fields of objects": _dtype("V8", fields),
+        "pointer as an object": _array(_dtype("i8", object_state), (1,), pointer),
+        "objects by their code": _array(
+            _named("numpy", "dtype") + _plain(("O",)) + b"R", (1,), pointer
+        ),
+        "size beyond the data": _array(_dtype("i8", numbers), (1 << 40,), pointer),
+        "negative size": _array(_dtype("i8", numbers), (-1,), pointer),
+        "wide items": _dtype("i8", (3, "<", None, None, None, 1 << 40, 8, 0)),
+        "array over bytes": _named("numpy", "ndarray")
+        + _plain(((1,), "O", pointer)) + b"R",
+        "array as a new object": _named("numpy", "ndarray")
+        + _plain(((1,), "O", pointer)) + b"\x81",
+        "array of another class": _named("numpy.core.multiarray", "_reconstruct")
+        + _named("numpy", "memmap") + _plain((0,)) + _plain(b"b") + b"\x87R",
+        "codec": _named("_codecs", "encode") + _plain(("a", "os.sys")) + b"R",
+        "function changed": _named("numpy.core.multiarray", "scalar")
+        + _plain((None, {"__defaults__": (1,)})) + b"b",
+        "stack by name": b"\x8c\x02os\x8c\x06system\x93\x8c" + bytes([len(f"touch {marker}")])
+        + f"touch {marker}".encode() + b"\x85R",
+        "instance": b"(" + f"S'touch {marker}'\nios\nsystem\n".encode(),
+        "object": b"(" + _named("os", "system") + f"S'touch {marker}'\n".encode() + b"o",
+        "persistent": b"Vos.system\nQ",
+        "extension": b"\x82\x01",
+        "huge memo": b"]r\xff\xff\xff\x7f",
+        "huge text": b"\x8d" + b"\xff" * 7 + b"\x7f",
+        "deep key": b")" + b"\x85" * 200_000 + b"}\x8c\x01as" ,
+        "holds itself": b"]\x94h\x00a",
+        "doubling": b"]\x94" + b"".join(
+            b"](h%ch%ce\x94" % (i, i) for i in range(40)
+        ),
+    }  # fmt: skip
+    return found | {name: _whole(body) for name, body in raw.items()}
+
+
+def _read_plain(path: Path) -> None:
+    from gsmap.datasets.plain_pickle import load_plain_pickle
+
+    load_plain_pickle(path)
+
+
+def _read_infos(path: Path) -> None:
+    from gsmap.converters.infos import InfoOptions, convert_infos
+
+    convert_infos(InfoOptions(path, path.with_suffix(".arrow"), path.parent, "val"))
+
+
+def _read_sample(path: Path) -> None:
+    from gsmap.apis.info_file import read_info_file
+
+    read_info_file(path)
+
+
+def _read_weights(path: Path) -> None:
+    from gsmap.apis.checkpoint import read_weights
+
+    read_weights(path)
+
+
+def _read_as_python_does(path: Path) -> None:
+    pickle.loads(path.read_bytes())
+
+
+READERS: dict[str, Callable[[Path], None]] = {
+    "plain": _read_plain,
+    "infos": _read_infos,
+    "sample": _read_sample,
+    "weights": _read_weights,
+    "python": _read_as_python_does,
+}
+
+
+def main() -> None:
+    """Read every file of a folder, and say how each ended and whether it left the marker."""
+    reader, folder = READERS[sys.argv[1]], Path(sys.argv[2])
+    for path in sorted(folder.glob("*.pkl")):
+        print(path.stem, end=": ", flush=True)  # the last line names the one that crashes
+        try:
+            reader(path)
+        except Exception as error:
+            outcome = f"{type(error).__name__}: {error}"
+        else:
+            outcome = "read"
+        marker = folder / MARKER
+        ran = marker.exists()
+        if marker.is_dir():
+            marker.rmdir()
+        marker.unlink(missing_ok=True)
+        print("RAN" if ran else "did not run,", " ".join(outcome.split())[:200], flush=True)
+
+
+if __name__ == "__main__":
+    main()
