@@ -21,6 +21,7 @@ COMMANDS = {
         "render camera images for real Argoverse 2 logs",
     ),
     "infos": ("gsmap.converters.infos", "convert an info file of MapTR or MapTRv2"),
+    "check": ("gsmap.converters.check", "check annotation files to the bottom"),
     "export": ("gsmap.converters.export", "write an annotation file's vectors as JSON"),
 }
 

@@ -4,11 +4,13 @@ import pickle
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from height_cases import write_raised
 from mmengine.config import Config
+from PIL import Image
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.errors import BrokenSampleError
@@ -259,8 +261,23 @@ def test_missing_truncated_and_foreign_images_are_named(build, copied_root):
     dataset = build(**dataset_config("minicity", "val_dataloader", copied_root))
     path = copied_root / dataset.sample(0).cameras[1].path
     name, token = dataset.sample(0).cameras[1].name, dataset.sample(0).token
-    path.write_bytes(path.read_bytes()[:-3000])
-    with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*truncated"):
+    path.with_name("whole.jpg").write_bytes(content := path.read_bytes())
+    turned = Image.Exif()
+    turned[0x0112] = 3  # upside down, of the same size
+    for damaged in (content[:-3000], content[:-3000] + b"\xff\xd9", content[:-2]):
+        path.write_bytes(damaged)
+        with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*truncated or damaged"):
+            dataset[0]
+    image = cv2.imread(str(path.with_name("whole.jpg")))
+    for damage, message in (
+        (cv2.resize(image, (200, 112)), "has 200 x 112 pixels, its record says"),
+        (cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE), "has 225 x 400 pixels"),
+    ):
+        cv2.imwrite(str(path), damage)
+        with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*{message}"):
+            dataset[0]
+    Image.fromarray(image).save(path, exif=turned)
+    with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*wants it turned, orientation 3"):
         dataset[0]
     path.write_bytes(b"no picture \xff\xd9")
     with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*not an image"):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.file import (
     AnnotationFile,
@@ -20,21 +21,25 @@ from gsmap.datasets.annotations.file import (
     SweepRecord,
     write_annotations,
 )
+from gsmap.datasets.annotations.schema import FIELDS
 
 META = AnnotationMeta("nuscenes", "lidar", "val", options={"centreline": False}, command="make it")
 
 
 def pose(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
     matrix = np.eye(4)
-    matrix[:3] = np.random.default_rng(seed).normal(size=(3, 4))
+    matrix[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    matrix[:3, 3] = rng.normal(size=3)
     return matrix
+
+
+INTRINSICS = np.array([[1266.4, 0, 816.3], [0, 1266.4, 491.5], [0, 0, 1]])
 
 
 def sample(number: int = 0, **changes) -> MapSample:
     cameras = [
-        CameraRecord(
-            name, f"samples/{name}/{number}.jpg", 1600, 900, pose(number)[:3, :3], pose(number + i)
-        )
+        CameraRecord(name, f"samples/{name}/{number}.jpg", 1600, 900, INTRINSICS, pose(number + i))
         for i, name in enumerate(("CAM_FRONT", "CAM_BACK"))
     ]
     lidar = LidarRecord("lidar/0.bin", pose(1), [SweepRecord("lidar/-1.bin", 5, pose(2))])
@@ -120,14 +125,33 @@ def test_pickle_hands_on_the_path_alone(tmp_path: Path):
         ({"instances": [MapInstance(3, np.zeros((2, 2)))]}, "label 3"),
         ({"instances": [MapInstance(0, np.zeros((1, 2)))]}, r"n >= 2, 2"),
         ({"instances": [MapInstance(0, np.full((2, 2), np.nan))]}, "NaN"),
+        ({"instances": [MapInstance(-1, np.zeros((2, 2)))]}, "sample 'token0': label -1 is none"),
+        (
+            {"instances": [MapInstance(0, np.zeros((2, 3)))]},
+            r"points must be numbers \(n >= 2, 2\)",
+        ),
+        ({"instances": [MapInstance(0, [["1", "2"], ["3", "4"]])]}, "points must be numbers"),
+        ({"global_from_frame": np.diag([1, 1, -1, 1])}, "'token0': global_from_frame is no rigid"),
+        ({"ego_from_frame": np.diag([2, 2, 2, 1])}, "ego_from_frame is no rigid"),
+        ({"ego_from_frame": np.full((4, 4), np.inf)}, "ego_from_frame is no rigid"),
+        ({"can_bus": np.full(18, np.nan)}, "can_bus holds NaN"),
+        ({"lidar": LidarRecord("../a.bin", np.eye(4))}, r"LiDAR path must be .*got '../a.bin'"),
+        ({"lidar": LidarRecord("a", np.eye(4), [SweepRecord("/b", 0, np.eye(4))])}, "got '/b'"),
+        ({"timestamp_ns": 2**70}, "'token7' to 'token0'"),
+        ({"scene": 5}, "'token7' to 'token0'"),
+        (
+            {"cameras": [CameraRecord("A", "x", 0, 1, INTRINSICS, np.eye(4))]},
+            "size is not positive",
+        ),
+        ({"cameras": [CameraRecord("A", "x", 1, 1, -INTRINSICS, np.eye(4))]}, "focal lengths > 0"),
         ({"global_from_frame": np.eye(3)}, r"global_from_frame .*\(4, 4\)"),
         ({"can_bus": np.zeros(16)}, r"can_bus .*\(18,\)"),
         (
-            {"cameras": [CameraRecord("A", "/etc/x.jpg", 1, 1, np.eye(3), np.eye(4))]},
+            {"cameras": [CameraRecord("A", "/etc/x.jpg", 1, 1, INTRINSICS, np.eye(4))]},
             "relative to the data root",
         ),
         (
-            {"cameras": [CameraRecord("A", "x.jpg", 1, 1, np.eye(3), np.eye(4))] * 2},
+            {"cameras": [CameraRecord("A", "x.jpg", 1, 1, INTRINSICS, np.eye(4))] * 2},
             "appears twice",
         ),
         ({"token": ""}, "token"),
@@ -190,6 +214,87 @@ def test_half_foreign_and_outdated_files_are_refused(tmp_path: Path):
         AnnotationFile(path)
 
 
+def arrow(path: Path, change) -> None:
+    """Rewrite a file's only batch without its seal, changed."""
+    batch = pa.ipc.open_file(str(path)).get_batch(0)
+    columns = {name: batch.column(name) for name in batch.schema.names}
+    changed = pa.record_batch(list(change(columns).values()), schema=batch.schema)
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, batch.schema) as writer:
+        writer.write_batch(changed)
+
+
+def test_a_file_without_a_checksum_is_read_and_says_so(tmp_path: Path):
+    path = tmp_path / "a.arrow"
+    write_annotations(path, META, [sample(1)])
+    assert AnnotationFile(path).sealed
+    arrow(path, lambda columns: columns)
+    file = AnnotationFile(path)
+    assert not file.sealed
+    assert_same(file[0], sample(1))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"token": pa.array([None], pa.string())}, "token is missing"),
+        ({"cameras": pa.nulls(1, FIELDS["cameras"])}, "cameras is missing"),
+        ({"ego_from_frame": pa.array([[1.0] * 16], pa.list_(pa.float64(), 16))}, "no rigid"),
+        (
+            {"instances": pa.array([[{"label": 3, "points": [0, 0, 1, 1]}]], FIELDS["instances"])},
+            "'token1': label 3 is none of the classes",
+        ),
+        (
+            {"instances": pa.array([[{"label": 0, "points": [0, 0, 1]}]], FIELDS["instances"])},
+            r"points of an element must be \(n >= 2, 2\)",
+        ),
+        (
+            {"instances": pa.array([[{"label": 0, "points": None}]], FIELDS["instances"])},
+            "points is missing",
+        ),
+    ],
+)
+def test_wrong_values_are_refused_on_opening(tmp_path: Path, changes: dict, message: str):
+    path = tmp_path / "a.arrow"
+    write_annotations(path, META, [sample(1)])
+    arrow(path, lambda columns: columns | changes)
+    with pytest.raises(ValueError, match=f"a.arrow is damaged: .*{message}.*`make it`"):
+        AnnotationFile(path)
+
+
+def test_every_damaged_byte_is_noticed_or_of_no_effect(tmp_path: Path):
+    path = tmp_path / "a.arrow"
+    write_annotations(path, META, [sample(i) for i in range(3)])
+    content, noticed = path.read_bytes(), 0
+    rng = np.random.default_rng(0)
+    for place in rng.integers(0, len(content), 300).tolist():
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            file = AnnotationFile(path)
+        except ValueError:
+            noticed += 1
+            continue
+        assert file.sealed
+        for number, found in enumerate(file):
+            assert_same(found, sample(number))
+    assert noticed > 150  # the others hit the footer, which nothing is read from
+
+
+def test_swapped_blocks_are_noticed(tmp_path: Path):
+    path = tmp_path / "a.arrow"
+    write_annotations(path, META, [sample(i) for i in range(600)])
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 4096], content[8192:12288] = (
+        content[8192:12288],
+        content[middle : middle + 4096],
+    )
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"checksum|not a whole"):
+        AnnotationFile(path)
+
+
 def test_meta_refuses_bad_values():
     with pytest.raises(ValueError, match="frame"):
         AnnotationMeta("x", "camera", "val")
@@ -197,6 +302,10 @@ def test_meta_refuses_bad_values():
         AnnotationMeta("x", "ego", "val", x_range=(1, 1))
     with pytest.raises(ValueError, match="classes"):
         AnnotationMeta("x", "ego", "val", classes=("a", "a"))
+    with pytest.raises(ValueError, match="classes must be names"):
+        AnnotationMeta("x", "ego", "val", classes="abc")
+    with pytest.raises(ValueError, match="dataset must be a text"):
+        AnnotationMeta(3, "ego", "val")
 
 
 def test_a_full_disk_leaves_the_old_file_alone(tmp_path: Path):

@@ -83,8 +83,8 @@ class _Machine:
                 self._push(tuple(reversed(parts)))
             elif name != "STOP":
                 raise pickle.UnpicklingError(f"it uses the instruction {name}")
-        if position != len(content) - 1:
-            raise pickle.UnpicklingError(f"{len(content) - 1 - position} bytes follow its end")
+            elif position != len(content) - 1:
+                raise pickle.UnpicklingError(f"{len(content) - 1 - position} bytes follow its end")
         return self._stack.pop()
 
     def _push(self, value: Any) -> None:

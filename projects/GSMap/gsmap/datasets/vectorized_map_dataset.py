@@ -123,6 +123,12 @@ class VectorizedMapDataset(BaseDataset):
         """Open the annotation file, check it, and list its rows."""
         self.annotations = AnnotationFile(self.ann_file)
         self.annotations.require(**self._expected)
+        if not self.annotations.sealed:
+            print_log(
+                f"{self.ann_file} is of an earlier version and has no checksum: damage to it may "
+                f"go unnoticed until you {self.annotations.remedy}",
+                "current",
+            )
         for name in ("classes", "x_range", "y_range", "dataset", "split", "frame"):
             self._metainfo[name] = getattr(self.annotations.meta, name)
         self._metainfo["dim"] = self._dim or self.annotations.meta.dim
@@ -228,12 +234,12 @@ class VectorizedMapDataset(BaseDataset):
         """Return path and calibration of each camera; paths may come from another sample."""
         cameras = {camera.name: camera for camera in sample.cameras}
         names = tuple(cameras) if self.cameras is None else self.cameras
-        paths = {camera.name: camera.path for camera in sample.cameras}
+        images = cameras
         if entry["image_row"] != entry["row"]:
             donor = self.annotations[entry["image_row"]]
-            paths = {camera.name: camera.path for camera in donor.cameras}
+            images = {camera.name: camera for camera in donor.cameras}
         for name in names:
-            if name not in cameras or name not in paths:
+            if name not in cameras or name not in images:
                 raise BrokenSampleError(
                     f"sample {sample.token!r} has no camera {name!r}, only {list(cameras)}: name "
                     "the cameras that all samples have (`cameras=[...]`), or train with "
@@ -241,7 +247,8 @@ class VectorizedMapDataset(BaseDataset):
                 )
         return {
             name: {
-                "img_path": str(Path(self.data_root, paths[name])),
+                "img_path": str(Path(self.data_root, images[name].path)),
+                "size": (images[name].width, images[name].height),
                 "cam2img": _homogeneous(cameras[name].intrinsics),
                 "lidar2cam": cameras[name].cam_from_frame,
             }

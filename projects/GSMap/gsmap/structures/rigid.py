@@ -29,3 +29,28 @@ def invert_rigid(transform: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, matrices[..., :3, 3])
     inverse[..., 3, 3] = 1.0
     return inverse
+
+
+@np.errstate(invalid="ignore", over="ignore")
+def is_rigid(transform: NDArray[np.floating[Any]], tolerance: float = 1e-3) -> NDArray[np.bool_]:
+    """Say which matrices are a proper rotation with a finite translation.
+
+    Args:
+        transform: Matrices. (..., 4, 4)
+        tolerance: How far products of the rotation's rows may be off.
+
+    Returns:
+        Whether each is rigid. (...,)
+    """
+    m = np.moveaxis(transform, (-2, -1), (0, 1)).copy()  # (4, 4, ...): each entry in one piece
+    (x, y, z), shift = m[:3, :3], m[:3, 3]
+    cross = (
+        x[1] * y[2] - x[2] * y[1] - z[0],
+        x[2] * y[0] - x[0] * y[2] - z[1],
+        x[0] * y[1] - x[1] * y[0] - z[2],  # of a mirror these are not zero
+    )
+    errors = ((x * x).sum(0) - 1, (y * y).sum(0) - 1, (x * y).sum(0), *cross)
+    good = np.isfinite(shift.sum(0)) & (m[3, 3] == 1) & ~m[3, :3].any(0)
+    for error in errors:
+        good &= np.abs(error) < tolerance
+    return good

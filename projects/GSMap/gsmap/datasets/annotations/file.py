@@ -1,10 +1,11 @@
 """Annotation files: one memory-mapped Arrow file per split, without pickle.
 
 They are made once by a command and never cached silently; a reader refuses a file made for
-something else.
+something else, and one that is damaged.
 """
 
 import json
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,7 +14,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from gsmap.datasets.annotations.checks import check_batch
 from gsmap.datasets.annotations.record import (
     CLASSES,
     FORMAT_VERSION,
@@ -23,9 +26,8 @@ from gsmap.datasets.annotations.record import (
     MapInstance,
     MapSample,
     SweepRecord,
-    validate_sample,
 )
-from gsmap.datasets.annotations.schema import FIELDS, META_KEY, Batch, row_of, schema_of
+from gsmap.datasets.annotations.schema import FIELDS, META_KEY, Batch, batch_of, row_of, schema_of
 from gsmap.utils.files import atomic_write
 
 __all__ = [
@@ -43,6 +45,10 @@ __all__ = [
 ]
 
 _ROWS_PER_BATCH = 256
+# An Arrow file is a stream of messages between "ARROW1" and a footer that says where each begins.
+_START, _END = b"ARROW1\0\0", b"ARROW1"
+# The last message has no rows; its metadata hold the checksum of all bytes before it.
+SEAL_KEY = b"gsmap_seal"
 
 
 class AnnotationWriter:
@@ -65,8 +71,8 @@ class AnnotationWriter:
         self._tokens: set[str] = set()
 
     def __enter__(self) -> "AnnotationWriter":
-        file = self._opened.enter_context(atomic_write(self.path, "wb"))
-        self._writer = pa.ipc.new_file(file, self._schema)
+        self._file = self._opened.enter_context(atomic_write(self.path, "wb"))
+        self._writer = pa.ipc.new_file(self._file, self._schema)
         return self
 
     def __len__(self) -> int:
@@ -79,23 +85,32 @@ class AnnotationWriter:
             sample: The sample.
 
         Raises:
-            ValueError: If it is malformed (``validate_sample``) or its token was already written.
+            ValueError: If a shape is wrong or its token was already written. A wrong value
+                (``check_batch``) may be noticed some samples later, or when the file is finished.
         """
-        validate_sample(sample, self.meta)
         if sample.token in self._tokens:
             raise ValueError(f"sample {sample.token!r} was already written to {self.path}.")
         self._tokens.add(sample.token)
-        self._rows.append(row_of(sample))
+        self._rows.append(row_of(sample, self.meta.dim))
         if len(self._rows) == _ROWS_PER_BATCH:
             self._flush()
 
     def _flush(self) -> None:
         if self._rows:
-            columns = [
-                pa.array([row[name] for row in self._rows], kind) for name, kind in FIELDS.items()
-            ]
-            self._writer.write_batch(pa.record_batch(columns, schema=self._schema))
+            batch = batch_of(self._rows, self._schema)
+            check_batch(Batch(batch, self.meta.dim), self.meta)
+            self._writer.write_batch(batch)
             self._rows.clear()
+
+    def _finish(self) -> None:
+        self._flush()
+        self._file.flush()
+        content = pa.memory_map(self._file.name).read_buffer()
+        seal = {"rows": len(self), "bytes": content.size, "crc32": zlib.crc32(content)}
+        self._writer.write_batch(
+            batch_of([], self._schema), custom_metadata={SEAL_KEY: json.dumps(seal)}
+        )
+        self._writer.close()
 
     def __exit__(
         self,
@@ -106,8 +121,7 @@ class AnnotationWriter:
         with self._opened:
             if value is not None:
                 raise value
-            self._flush()
-            self._writer.close()
+            self._finish()
 
 
 def write_annotations(path: str | Path, meta: AnnotationMeta, samples: Iterable[MapSample]) -> int:
@@ -131,66 +145,92 @@ def write_annotations(path: str | Path, meta: AnnotationMeta, samples: Iterable[
 
 
 class AnnotationFile(Sequence[MapSample]):
-    """Read a memory-mapped annotation file; opening does not depend on its size.
+    """Read a memory-mapped annotation file, which is checked from end to end when it is opened.
 
-    Pickling hands on the path alone, so that each worker process maps the same pages.
+    Pickling hands on the path alone, so that each worker process maps the same pages; it does not
+    check them again.
 
     Args:
         path: The file.
 
     Raises:
         FileNotFoundError: If it does not exist.
-        ValueError: If it is not a whole annotation file of this format version.
+        ValueError: If it is not a whole annotation file of this format version, its checksum does
+            not fit, or a value is out of its domain (``check_batch``).
     """
+
+    sealed: bool
+    """Whether the file has a checksum; those of earlier versions have none."""
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        self._open()
+        self._open(check=True)
 
-    def _open(self) -> None:
+    def _open(self, check: bool) -> None:
         if not self.path.is_file():
             raise FileNotFoundError(
                 f"no annotation file at {self.path}: make it with tools/create_data.py (see "
                 "docs/data.md)."
             )
         try:
-            self._reader = pa.ipc.open_file(pa.memory_map(str(self.path)))
-        except (pa.ArrowInvalid, OSError) as error:
+            content = pa.memory_map(str(self.path)).read_buffer()
+            schema, batches, seal = _messages(content)
+        except (pa.ArrowException, OSError, ValueError) as error:
             raise ValueError(
                 f"{self.path} is not a whole annotation file ({error}): delete it and run "
                 "tools/create_data.py again."
             ) from error
-        self.meta = self._read_meta()
-        if self._reader.schema.names != list(FIELDS):
+        self.sealed = seal is not None
+        self.meta = self._read_meta(schema)
+        if not schema.equals(pa.schema(FIELDS)):
             raise ValueError(
                 f"{self.path} has other columns than format version {FORMAT_VERSION}: {self.remedy}"
             )
-        self._batches: dict[int, Batch] = {}
-        sizes = [self._reader.get_batch(i).num_rows for i in range(self._reader.num_record_batches)]
-        self._starts = np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)])
+        try:
+            if check and seal is not None:
+                _check_seal(json.loads(seal), content, batches)
+            for batch in batches if check else ():
+                batch.validate(full=True)
+            self._batches = [Batch(batch, self.meta.dim) for batch in batches]
+            for views in self._batches if check else ():
+                check_batch(views, self.meta)
+            if check:
+                _require_different([batch.column["token"] for batch in self._batches])
+        except (pa.ArrowException, ValueError, TypeError, KeyError) as error:
+            text = str(error).rstrip(".")
+            raise ValueError(
+                f"{self.path} is damaged: {text}. Copy it again, or {self.remedy}"
+            ) from error
+        self._starts = np.cumsum([0, *map(len, self._batches)])
 
-    def _read_meta(self) -> AnnotationMeta:
-        stored = (self._reader.schema.metadata or {}).get(META_KEY)
+    def _read_meta(self, schema: pa.Schema) -> AnnotationMeta:
+        stored = (schema.metadata or {}).get(META_KEY)
         if stored is None:
             raise ValueError(
                 f"{self.path} is an Arrow file, but not an annotation file: run "
                 "tools/create_data.py."
             )
-        values = json.loads(stored)
-        if values.get("format_version") != FORMAT_VERSION:
+        try:
+            values = json.loads(stored)
+            found = values.get("format_version")
+            if found == FORMAT_VERSION:
+                return AnnotationMeta(**values)
+        except (ValueError, TypeError, AttributeError) as error:
             raise ValueError(
-                f"{self.path} has format version {values.get('format_version')}, this program "
-                f"reads {FORMAT_VERSION}: make it again with "
-                f"`{values.get('command') or 'tools/create_data.py'}`."
-            )
-        return AnnotationMeta(**values)
+                f"{self.path} has damaged metadata ({error}): delete it and run "
+                "tools/create_data.py again."
+            ) from error
+        raise ValueError(
+            f"{self.path} has format version {found}, this program reads {FORMAT_VERSION}: make it "
+            f"again with `{values.get('command') or 'tools/create_data.py'}`."
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         return {"path": self.path}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.path = state["path"]
-        self._open()
+        self._open(check=False)
 
     @property
     def remedy(self) -> str:
@@ -226,12 +266,16 @@ class AnnotationFile(Sequence[MapSample]):
             raise IndexError(f"sample {index} of {len(self)} in {self.path}.")
         index %= len(self)
         number = int(np.searchsorted(self._starts, index, side="right")) - 1
-        if number not in self._batches:
-            self._batches[number] = Batch(self._reader.get_batch(number), self.meta.dim)
         return self._batches[number].sample(index - int(self._starts[number]))
 
     def __iter__(self) -> Iterator[MapSample]:
         return (self[i] for i in range(len(self)))
+
+    def record_batches(self) -> list[pa.RecordBatch]:
+        """Return the samples as Arrow has them."""
+        return [
+            pa.record_batch(list(batch.column.values()), list(FIELDS)) for batch in self._batches
+        ]
 
     def column(self, name: str) -> list[Any]:
         """Return one plain column of all samples.
@@ -239,17 +283,45 @@ class AnnotationFile(Sequence[MapSample]):
         Args:
             name: ``token``, ``scene``, ``map_name`` or ``timestamp_ns``.
         """
-        return [
-            v
-            for i in range(len(self._starts) - 1)
-            for v in self._reader.get_batch(i).column(name).to_pylist()
-        ]
+        return [value for batch in self._batches for value in batch.column[name].to_pylist()]
 
     def instance_counts(self) -> np.ndarray:
         """Return each sample's number of map elements, -1 if not known. (samples,)."""
-        counts = [np.empty(0, np.int64)]
-        for i in range(len(self._starts) - 1):
-            column = self._reader.get_batch(i).column("instances")
-            known = column.is_valid().to_numpy(zero_copy_only=False)
-            counts.append(np.where(known, np.diff(column.offsets.to_numpy()), -1))
-        return np.concatenate(counts)
+        counts = [
+            np.where(batch.has_instances, np.diff(batch.instance_offsets), -1)
+            for batch in self._batches
+        ]
+        return np.concatenate([np.empty(0, np.int64), *counts])
+
+
+def _messages(content: pa.Buffer) -> tuple[pa.Schema, list[pa.RecordBatch], bytes | None]:
+    """Read a file's messages in their order: schema, batches, and the seal if there is one."""
+    size = content.size
+    if size < len(_START) + 10 or content[: len(_START)].to_pybytes() != _START:
+        raise ValueError("it does not begin as an Arrow file")
+    source = pa.BufferReader(content)
+    source.seek(len(_START))
+    reader = pa.ipc.open_stream(source)
+    found = list(reader.iter_batches_with_custom_metadata())
+    tail = content[source.tell() :].to_pybytes()
+    if tail[-6:] != _END or int.from_bytes(tail[-10:-6], "little") != len(tail) - 10:
+        raise ValueError("it ends too early")
+    seal = (found[-1].custom_metadata or {}).get(SEAL_KEY) if found else None
+    batches = [batch for batch, _ in (found if seal is None else found[:-1])]
+    if not all(map(len, batches)):
+        raise ValueError("it has an empty part")  # as a seal with a damaged name would be
+    return reader.schema, batches, seal
+
+
+def _check_seal(seal: Any, content: pa.Buffer, batches: Sequence[pa.RecordBatch]) -> None:
+    """Raise a ``ValueError`` unless a file's bytes and rows are those that were written."""
+    whole = memoryview(content)[: seal["bytes"]]
+    if zlib.crc32(whole) != seal["crc32"] or sum(map(len, batches)) != seal["rows"]:
+        raise ValueError("its checksum does not fit its content")
+
+
+def _require_different(tokens: list[pa.StringArray]) -> None:
+    """Raise a ``ValueError`` if two samples have one token."""
+    column = pa.chunked_array(tokens, pa.string())
+    if pc.count_distinct(column).as_py() < len(column):
+        raise ValueError("two samples have one token")

@@ -1,6 +1,5 @@
 """What is known about one sample, as plain values: the rows of an annotation file."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -149,104 +148,22 @@ class AnnotationMeta:
     format_version: int = FORMAT_VERSION
 
     def __post_init__(self) -> None:
+        for name in ("dataset", "split", "source_fingerprint", "command"):
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} must be a text, got {getattr(self, name)!r}.")
         if self.frame not in RANGES:
             raise ValueError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
         if self.dim not in (2, 3):
             raise ValueError(f"dim must be 2 or 3, got {self.dim!r}.")
-        if not self.classes or len(set(self.classes)) != len(self.classes):
-            raise ValueError(
-                f"classes must be different names, at least one, got {self.classes!r}."
-            )
-        object.__setattr__(self, "classes", tuple(self.classes))
+        names = self.classes if isinstance(self.classes, (list, tuple)) else ()
+        if not names or not all(isinstance(n, str) and n for n in names):
+            raise ValueError(f"classes must be names, at least one, got {self.classes!r}.")
+        if len(set(names)) != len(names):
+            raise ValueError(f"classes must be different names, got {self.classes!r}.")
+        object.__setattr__(self, "classes", tuple(names))
         for name, usual in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):
             given = getattr(self, name)
             low, high = (float(v) for v in (usual if given is None else given))
-            if not low < high:
+            if not -np.inf < low < high < np.inf:
                 raise ValueError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
             object.__setattr__(self, name, (low, high))
-
-
-def _check_array(value: Any, shape: tuple[int, ...], name: str, token: str) -> None:
-    array = np.asarray(value)
-    if array.shape != shape or not np.issubdtype(array.dtype, np.number):
-        raise ValueError(
-            f"sample {token!r}: {name} must be numbers of shape {shape}, got {array.dtype} "
-            f"{array.shape}."
-        )
-    if not np.isfinite(array).all():
-        raise ValueError(f"sample {token!r}: {name} holds NaN or infinity.")
-
-
-def _check_relative(path: str, name: str, token: str) -> None:
-    if (
-        not isinstance(path, str)
-        or not path
-        or path.startswith("/")
-        or "\\" in path
-        or ".." in path.split("/")
-    ):
-        raise ValueError(
-            f"sample {token!r}: {name} must be relative to the data root, with forward slashes and "
-            f"without '..', got {path!r}."
-        )
-
-
-def _check_cameras(cameras: Sequence[CameraRecord], token: str) -> None:
-    names = [camera.name for camera in cameras]
-    if len(set(names)) != len(names):
-        raise ValueError(f"sample {token!r}: a camera appears twice in {names}.")
-    for camera in cameras:
-        _check_relative(camera.path, f"path of camera {camera.name}", token)
-        _check_array(camera.intrinsics, (3, 3), f"intrinsics of camera {camera.name}", token)
-        _check_array(
-            camera.cam_from_frame, (4, 4), f"cam_from_frame of camera {camera.name}", token
-        )
-        if camera.width < 1 or camera.height < 1:
-            raise ValueError(
-                f"sample {token!r}: camera {camera.name} has size {camera.width} x {camera.height}."
-            )
-
-
-def _check_instances(instances: Sequence[MapInstance], meta: AnnotationMeta, token: str) -> None:
-    for index, instance in enumerate(instances):
-        if not 0 <= instance.label < len(meta.classes):
-            raise ValueError(
-                f"sample {token!r}: instance {index} has label {instance.label}, but the classes "
-                f"are {meta.classes}."
-            )
-        points = np.asarray(instance.points)
-        if points.ndim != 2 or points.shape[0] < 2 or points.shape[1] != meta.dim:
-            raise ValueError(
-                f"sample {token!r}: points of instance {index} must be (n >= 2, {meta.dim}), got "
-                f"{points.shape}."
-            )
-        if not np.isfinite(points).all():
-            raise ValueError(f"sample {token!r}: points of instance {index} hold NaN or infinity.")
-
-
-def validate_sample(sample: MapSample, meta: AnnotationMeta) -> None:
-    """Check one sample's shapes and values.
-
-    Args:
-        sample: The sample.
-        meta: Metadata of the file that it is meant for.
-
-    Raises:
-        ValueError: If a shape, label or path is wrong, or a number is not finite; the message names
-            the sample.
-    """
-    token = sample.token
-    if not isinstance(token, str) or not token:
-        raise ValueError(f"token must be a non-empty string, got {token!r}.")
-    _check_cameras(sample.cameras, token)
-    _check_array(sample.global_from_frame, (4, 4), "global_from_frame", token)
-    _check_array(sample.ego_from_frame, (4, 4), "ego_from_frame", token)
-    if sample.can_bus is not None:
-        _check_array(sample.can_bus, (CAN_BUS_SIZE,), "can_bus", token)
-    if sample.lidar is not None:
-        records: list[LidarRecord | SweepRecord] = [sample.lidar, *sample.lidar.sweeps]
-        for record in records:
-            _check_relative(record.path, "LiDAR path", token)
-            _check_array(record.frame_from_lidar, (4, 4), "frame_from_lidar", token)
-    if sample.instances is not None:
-        _check_instances(sample.instances, meta, token)

@@ -1,0 +1,107 @@
+"""Annotation files checked to the bottom: their own content, and the files that they name."""
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import pyarrow as pa
+from tqdm import tqdm
+
+from gsmap.converters.command_line import add_workers_option
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.errors import BrokenSampleError
+from gsmap.utils.parallel import ordered_map
+
+_SHOWN = 10
+
+
+def check_file(path: Path) -> AnnotationFile:
+    """Open an annotation file, which checks it, and compare what its footer leads to.
+
+    Raises:
+        FileNotFoundError: If it does not exist.
+        ValueError: If it is damaged.
+    """
+    file = AnnotationFile(path)
+    try:
+        reader = pa.ipc.open_file(pa.memory_map(str(path)))
+        for number, batch in enumerate(file.record_batches()):
+            if not reader.get_batch(number).equals(batch):
+                raise ValueError(f"part {number} is another one")
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise ValueError(
+            f"{path}: the footer, by which other programs read the file, is damaged ({error}); "
+            f"{file.remedy}"
+        ) from error
+    return file
+
+
+def broken_files(sample: MapSample, root: Path) -> list[str]:
+    """Read every file that a sample names, and return what is wrong with them."""
+    from gsmap.datasets.transforms.images import read_image
+    from gsmap.datasets.transforms.points import read_points
+
+    where, problems = f"sample {sample.token!r}", []
+    lidar = [] if sample.lidar is None else [sample.lidar, *sample.lidar.sweeps]
+    for record in (*sample.cameras, *lidar):
+        try:
+            path = str(root / record.path)
+            if hasattr(record, "width"):
+                read_image(path, f"{where}, camera {record.name}", (record.width, record.height))
+            else:
+                read_points(path, 5)
+        except BrokenSampleError as error:
+            problems.append(str(error))
+    return problems
+
+
+def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
+    """Check annotation files and, with a data root, the images and sweeps that they name.
+
+    Args:
+        paths: Annotation files.
+        root: Folder that their paths are relative to; None leaves images and sweeps alone.
+        workers: Number of processes that read these.
+
+    Returns:
+        What was found to be right.
+
+    Raises:
+        FileNotFoundError: If an annotation file does not exist.
+        ValueError: If something is wrong; the message names the first few files.
+    """
+    lines = []
+    for path in paths:
+        file = check_file(path)
+        mark = "checksum right" if file.sealed else "no checksum, as it is of an earlier version"
+        lines.append(f"{path}: {len(file)} samples, values right, {mark}")
+        if root is not None:
+            samples = tqdm(file, desc=path.name, unit="sample")
+            found = ordered_map(partial(broken_files, root=root), samples, workers)
+            _require_none(path, [problem for problems in found for problem in problems])
+            lines[-1] += ", images and LiDAR files whole"
+    return "\n".join(lines)
+
+
+def _require_none(path: Path, problems: Sequence[str]) -> None:
+    """Raise a ``ValueError`` that names the first problems."""
+    if problems:
+        more = f", and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+        raise ValueError(f"{path} is right, but: {'; '.join(problems[:_SHOWN])}{more}")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``tools/create_data.py check``."""
+    parser.add_argument("annotations", type=Path, nargs="+", help="annotation files (.arrow)")
+    parser.add_argument(
+        "--data-root", type=Path, help="read every image and LiDAR file below this folder too"
+    )
+    add_workers_option(parser)
+
+
+def run(arguments: argparse.Namespace, command: str) -> str:
+    """Check as the command line asks and say what is right."""
+    del command
+    return check_files(arguments.annotations, arguments.data_root, arguments.workers)
