@@ -65,7 +65,7 @@ def test_height_is_interpolated_where_a_line_is_cut(tmp_path: Path):
 
 
 def test_lidar_and_signals_are_kept(tmp_path: Path):
-    sweep = {"path": "s.bin", "timestamp_ns": 3, "frame_from_lidar": 2 * np.eye(4)}
+    sweep = {"path": "s.bin", "timestamp_ns": 3, "frame_from_lidar": np.diag([-1.0, -1, 1, 1])}
     lidar = {"path": "l.bin", "frame_from_lidar": np.eye(4), "sweeps": [sweep]}
     from_records(tmp_path / "a.arrow", [record(lidar=lidar, can_bus=range(18))], META, tmp_path)
     sample = AnnotationFile(tmp_path / "a.arrow")[0]

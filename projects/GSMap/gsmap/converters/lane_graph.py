@@ -58,13 +58,15 @@ class LanePaths:
         links: Which lanes follow which.
 
     Raises:
-        ValueError: If a polyline has fewer than two points or is not (n, 3).
+        ValueError: If a polyline has fewer than two points, is not (n, 3) or not finite.
     """
 
     def __init__(self, polylines: Sequence[np.ndarray], links: LaneLinks) -> None:
         for i, line in enumerate(polylines):
             if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2:
                 raise ValueError(f"polylines[{i}] must have shape (n >= 2, 3), got {line.shape}.")
+            if not np.isfinite(line).all():
+                raise ValueError(f"polylines[{i}] holds NaN or infinity.")
         self._links = links
         node_of_point: dict[tuple[float, ...], int] = {}
         uses: list[int] = []

@@ -1,14 +1,18 @@
 """The folder of one Argoverse 2 log: poses, calibration, and when each sensor fired."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.geometry.geometry import quat_to_mat
 from av2.utils.io import read_feather
 from av2.utils.synchronization_database import SynchronizationDB
+from pyarrow import feather
 
 # The order of MapTR and MapTRv2: camera embeddings of their checkpoints depend on it.
 RING_CAMERAS = (
@@ -56,16 +60,16 @@ class PoseTable:
         path = log_dir / "city_SE3_egovehicle.feather"
         if not path.is_file():
             raise FileNotFoundError(f"no poses at {path}: download the log again.")
-        try:
+        with damage_named(path):
+            check_feather(path)
             table = read_feather(path)
             table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
             quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
             translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
-        except (OSError, KeyError, ValueError) as error:
-            raise ValueError(f"{path} is damaged ({error}): download the log again.") from error
-        finite = np.isfinite(quaternions).all(1) & np.isfinite(translations).all(1)
-        if not finite.all() or len(table) == 0:
-            raise ValueError(f"{path} holds {int((~finite).sum())} bad of {len(table)} poses.")
+            good = np.abs(np.linalg.norm(quaternions, axis=1) - 1) < 1e-3
+            good &= np.isfinite(translations).all(1)
+            if not good.all() or len(table) == 0:
+                raise ValueError(f"it holds {int((~good).sum())} bad of {len(table)} poses")
         poses = np.tile(np.eye(4), (len(table), 1, 1))
         poses[:, :3, :3] = quat_to_mat(quaternions)
         poses[:, :3, 3] = translations
@@ -77,6 +81,20 @@ class PoseTable:
         if row == len(self.timestamps_ns) or self.timestamps_ns[row] != timestamp_ns:
             return None
         return self.city_from_ego[row]
+
+
+@contextmanager
+def damage_named(path: Path) -> Iterator[None]:
+    """Raise a ``ValueError`` that names the file where reading it fails."""
+    try:
+        yield
+    except (OSError, LookupError, ValueError, TypeError, pa.ArrowException) as error:
+        raise ValueError(f"{path} is damaged ({error}): download the log again.") from error
+
+
+def check_feather(path: Path) -> None:
+    """Raise an ``ArrowException`` if a table is not whole: damaged offsets would end the process."""
+    feather.read_table(path, memory_map=False).validate(full=True)
 
 
 class Argoverse2Log:
@@ -117,15 +135,15 @@ class Argoverse2Log:
         names = ("intrinsics.feather", "egovehicle_SE3_sensor.feather")
         if not all((folder / name).is_file() for name in names):
             return {}
-        try:
+        with damage_named(folder):
+            for name in names:
+                check_feather(folder / name)
             known = set(read_feather(folder / names[0])["sensor_name"])
             return {
                 name: PinholeCamera.from_feather(self.log_dir, name)
                 for name in RING_CAMERAS
                 if name in known
             }
-        except (OSError, KeyError, ValueError) as error:
-            raise ValueError(f"the calibration in {folder} is damaged ({error}).") from error
 
     @cached_property
     def lidar_timestamps_ns(self) -> np.ndarray:

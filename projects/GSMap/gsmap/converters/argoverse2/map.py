@@ -119,8 +119,9 @@ class Argoverse2Map:
         path = find_map(log_dir)
         try:
             return cls(ArgoverseStaticMap.from_json(path))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path} is damaged ({error}): download it again.") from error
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{path} is damaged ({reason}): download it again.") from error
 
     @property
     def invalid_counts(self) -> dict[str, int]:

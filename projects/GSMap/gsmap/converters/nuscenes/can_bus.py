@@ -1,7 +1,6 @@
 """Vehicle signals of the nuScenes CAN bus expansion, in MapTR's layout of 18 numbers."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pyquaternion import Quaternion
@@ -36,18 +35,29 @@ class CanBusReader:
         self.available = (dataroot / "can_bus").is_dir()
         self._dataroot = dataroot
         self._scene = ""
-        self._messages: list[dict[str, Any]] = []
         self._times: np.ndarray = np.empty(0)
+        self._measured: np.ndarray = np.empty((0, 9))
 
     def _open(self, scene: str) -> None:
         from nuscenes.can_bus.can_bus_api import NuScenesCanBus
 
-        self._scene, self._messages = scene, []
-        if (self._dataroot / "can_bus" / f"{scene}_pose.json").is_file():
-            api = NuScenesCanBus(dataroot=str(self._dataroot))
-            if int(scene[-4:]) not in api.can_blacklist:  # scenes whose signals are unreliable
-                self._messages = api.get_messages(scene, "pose", print_warnings=False)
-        self._times = np.array([message["utime"] for message in self._messages])
+        self._scene, messages = scene, []
+        path = self._dataroot / "can_bus" / f"{scene}_pose.json"
+        try:
+            if path.is_file():
+                api = NuScenesCanBus(dataroot=str(self._dataroot))
+                if int(scene[-4:]) not in api.can_blacklist:  # scenes whose signals are unreliable
+                    messages = api.get_messages(scene, "pose", print_warnings=False)
+            self._times = np.array([message["utime"] for message in messages], np.int64)
+            rows = [[*m["accel"], *m["rotation_rate"], *m["vel"]] for m in messages]
+            self._measured = np.array(rows, np.float64).reshape(-1, 9)
+            if not np.isfinite(self._measured).all():
+                raise ValueError("a number is not finite")
+        except (LookupError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{path} is damaged ({type(error).__name__}: {error}): unpack the CAN bus "
+                "expansion again."
+            ) from error
 
     def signals(self, scene: str, timestamp_ns: int, global_from_ego: np.ndarray) -> np.ndarray:
         """Return the vehicle's pose with the latest message; zeros in place of one that is absent.
@@ -59,12 +69,14 @@ class CanBusReader:
 
         Returns:
             The signals, as ``pose_signals`` says. (18,)
+
+        Raises:
+            ValueError: If the scene's file is damaged.
         """
         values = pose_signals(global_from_ego)
         if self.available and scene != self._scene:
             self._open(scene)
         latest = int(np.searchsorted(self._times, timestamp_ns // 1000, side="right")) - 1
-        if self.available and latest >= 0:
-            message = self._messages[latest]
-            values[7:16] = [*message["accel"], *message["rotation_rate"], *message["vel"]]
+        if latest >= 0:
+            values[7:16] = self._measured[latest]
         return values

@@ -207,13 +207,15 @@ class _Conversion:
 
     def _scene_samples(self, scene: dict[str, Any]) -> list[MapSample]:
         """Read a scene's samples without ground truth, counting what is missing."""
+        from gsmap.converters.nuscenes.tables import LIDAR
+
         samples = []
         for record in self.tables.samples_of(scene):
-            try:
-                sample = self.reader.read(record, scene)
-            except (ValueError, KeyError) as error:
-                self.summary.add_problem(f"sample left out: {error}", record["token"])
+            if LIDAR not in record["data"]:  # its frame is not known
+                reason = f"sample left out: no {LIDAR} key frame"
+                self.summary.add_problem(reason, record["token"])
                 continue
+            sample = self.reader.read(record, scene)
             self._count_missing(sample)
             pose = sample.global_from_frame @ invert_rigid(sample.ego_from_frame)
             sample.can_bus = self.can_bus.signals(sample.scene, sample.timestamp_ns, pose)
@@ -292,6 +294,8 @@ def convert_nuscenes(
             writer = AnnotationWriter(options.path_of(options.dataset, split), meta)
             writers[split] = stack.enter_context(writer)
         conversion.run(writers, advance)
+        for writer in writers.values():  # a full disk shows here, before any file appears
+            writer.finish()
     if not conversion.can_bus.available:
         conversion.summary.notes.append(
             "no CAN bus expansion: acceleration, rotation rate and velocity are 0."

@@ -92,10 +92,24 @@ def check_classes(classes: Collection[str]) -> None:
 
 
 def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
-    """Collect the geometries that the classes need from a map under a data root."""
+    """Collect the geometries that the classes need from a map under a data root.
+
+    Raises:
+        ValueError: If the map is damaged.
+    """
     from nuscenes.map_expansion.map_api import NuScenesMap
 
-    return read_layers(NuScenesMap(str(root), name), classes)
+    try:
+        layers = read_layers(NuScenesMap(str(root), name), classes)
+        for geometries in (*layers.lines.values(), *layers.polygons.values()):
+            if not np.isfinite(shapely.get_coordinates(geometries)).all():
+                raise ValueError("a point is not finite")
+    except (LookupError, TypeError, ValueError, AttributeError, AssertionError) as error:
+        raise ValueError(
+            f"{root}/maps/expansion/{name}.json is damaged ({type(error).__name__}: {error}): "
+            "unpack the map expansion pack (v1.3) again."
+        ) from error
+    return layers
 
 
 def read_layers(nusc_map: "NuScenesMap", classes: Collection[str]) -> MapLayers:

@@ -1,8 +1,10 @@
 """The tables of nuScenes-format data, opened with the devkit without what maps do not need."""
 
 import json
+import math
 import re
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,35 +21,92 @@ CAMERAS = (
 )  # fmt: skip
 LIDAR = "LIDAR_TOP"
 _UNUSED = {"sample_annotation", "instance", "image_annotations"}
-_SAMPLE_DATA_FIELDS = (
-    "token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "timestamp", "filename",
-    "is_key_frame", "prev", "next", "width", "height",
-)  # fmt: skip
-_SEPARATOR = re.compile(r"[\s,\[\]]*")
-_CHUNK_CHARACTERS = 1 << 20
+# what is read of each table: fields with their type, or how many numbers they hold
+_POSE = {"translation": 3, "rotation": 4}
+_FIELDS: dict[str, dict[str, type | int]] = {
+    "sensor": {"channel": str, "modality": str},
+    "calibrated_sensor": {"sensor_token": str, "camera_intrinsic": list, **_POSE},
+    "ego_pose": _POSE,
+    "log": {"location": str},
+    "scene": {"name": str, "log_token": str, "first_sample_token": str, "nbr_samples": int},
+    "sample": {"timestamp": int, "next": str},
+    "sample_data": {
+        "sample_token": str, "ego_pose_token": str, "calibrated_sensor_token": str,
+        "timestamp": int, "filename": str, "is_key_frame": bool, "prev": str,
+    },
+    "map": {"log_tokens": list, "filename": str},
+}  # fmt: skip
+_LINKS = {
+    "calibrated_sensor": {"sensor_token": "sensor"},
+    "scene": {"log_token": "log", "first_sample_token": "sample"},
+    "sample_data": {
+        "sample_token": "sample", "ego_pose_token": "ego_pose",
+        "calibrated_sensor_token": "calibrated_sensor",
+    },
+}  # fmt: skip
+_MARK = re.compile(r"\s*([\[\],]?)\s*")
+_CHUNK_CHARACTERS = 1 << 20  # a record is shorter
+
+
+def _refuse_constant(name: str) -> float:
+    """Refuse NaN and infinity, which JSON does not have."""
+    raise ValueError(f"{name} is no number")
 
 
 def iterate_records(path: Path) -> Iterator[dict[str, Any]]:
     """Read the records of a table (a JSON list) one by one; it is never in memory as a whole.
 
     Raises:
-        ValueError: If the file ends inside a record.
+        ValueError: If it is not one whole list of records, from the first sign to the last.
     """
-    decode = json.JSONDecoder().raw_decode
+    decode = json.JSONDecoder(parse_constant=_refuse_constant).raw_decode
     with path.open(encoding="utf-8") as file:
-        text, position = "", 0
-        while chunk := file.read(_CHUNK_CHARACTERS):
-            text, position = text[position:] + chunk, 0
+        text, position, expected = file.read(_CHUNK_CHARACTERS), 0, "["
+        try:
             while True:
-                separator = _SEPARATOR.match(text, position)
-                position = separator.end() if separator else position
-                try:
-                    record, position = decode(text, position)
-                except json.JSONDecodeError:
-                    break  # the record goes on in the next chunk
+                if len(text) - position < _CHUNK_CHARACTERS:
+                    text, position = text[position:] + file.read(_CHUNK_CHARACTERS), 0
+                mark = _MARK.match(text, position)
+                sign, position = (mark[1], mark.end()) if mark else ("", position)
+                if sign == "[" == expected and text[position : position + 1] == "]":
+                    sign, expected, position = "]", ",", position + 1
+                if sign == "]" and expected == ",":
+                    break
+                if sign != expected:
+                    raise ValueError(f"{expected!r} is missing before {text[position:][:40]!r}")
+                record, position = decode(text, position)
+                expected = ","
                 yield record
-        if _SEPARATOR.fullmatch(text, position) is None:
-            raise ValueError(f"table {path} is damaged or incomplete: download it again.")
+            if (text[position:] + file.read()).strip():
+                raise ValueError("something follows the end of the list")
+        except (ValueError, RecursionError) as error:
+            raise ValueError(
+                f"table {path} is damaged or incomplete ({error}): download it again."
+            ) from error
+
+
+def _check_record(record: Any, table: str, path: Path) -> None:
+    """Raise a ``ValueError`` if a record lacks a field that is read, or it is of another type."""
+    token = record.get("token") if isinstance(record, dict) else None
+    fields: dict[str, type | int] = {"token": str, **_FIELDS.get(table, {})}
+    for name, kind in fields.items():
+        value = record.get(name) if isinstance(record, dict) else None
+        good = _are_numbers(value, kind) if isinstance(kind, int) else type(value) is kind
+        if not good:
+            wanted = f"{kind} finite numbers" if isinstance(kind, int) else f"a {kind.__name__}"
+            raise ValueError(
+                f"{path}, record {token!r}: {name} must be {wanted}, got {value!r}; download it "
+                "again."
+            )
+
+
+def _are_numbers(value: Any, count: int) -> bool:
+    """Whether a value is a list of finite numbers; four are a quaternion, which has length 1."""
+    if type(value) is not list or len(value) != count:
+        return False
+    if not all(type(v) in (int, float) and math.isfinite(v) for v in value):
+        return False
+    return count != 4 or abs(math.hypot(*value) - 1) < 1e-3
 
 
 class NuScenesTables(NuScenes):
@@ -61,43 +120,104 @@ class NuScenesTables(NuScenes):
         version: Version folder, such as ``v1.0-trainval``.
         dataroot: Data root.
         with_sweeps: Whether to keep LiDAR sweeps between key frames.
+
+    Raises:
+        ValueError: If a table is damaged or a record points to one that there is not.
     """
 
     def __init__(self, version: str, dataroot: Path, with_sweeps: bool) -> None:
         self._with_sweeps = with_sweeps
         self._kept_data: list[dict[str, Any]] = []
-        super().__init__(version, str(dataroot), verbose=False)
+        try:
+            super().__init__(version, str(dataroot), verbose=False)
+        except (AssertionError, LookupError) as error:
+            raise ValueError(
+                f"the tables in {dataroot / version} do not fit together "
+                f"({type(error).__name__}: {error}): download them again."
+            ) from error
 
     def __load_table__(self, table_name: str) -> list[dict[str, Any]]:
-        path = Path(self.table_root, f"{table_name}.json")
         if table_name in _UNUSED:
             return []
-        if table_name == "ego_pose":  # asked for before sample_data, which says what is needed
-            self._kept_data = self._wanted_sample_data()
-            wanted = {record["ego_pose_token"] for record in self._kept_data}
-            return [pose for pose in iterate_records(path) if pose["token"] in wanted]
         if table_name == "sample_data":
             return self._kept_data
-        return list(iterate_records(path))
+        records = self._records(table_name)
+        if table_name == "ego_pose":  # asked for before sample_data, which says what is needed
+            self._kept_data = list(self._wanted_sample_data())
+            wanted = {record["ego_pose_token"] for record in self._kept_data}
+            records = (pose for pose in records if pose["token"] in wanted)
+        return list(records)
 
-    def _wanted_sample_data(self) -> list[dict[str, Any]]:
-        channels = {sensor["token"]: sensor["channel"] for sensor in self.sensor}
-        channel_of = {c["token"]: channels[c["sensor_token"]] for c in self.calibrated_sensor}
-        kept = []
-        for record in iterate_records(Path(self.table_root, "sample_data.json")):
-            channel = channel_of[record["calibrated_sensor_token"]]
+    def _records(self, table: str) -> Iterator[dict[str, Any]]:
+        """Yield a table's records, checked."""
+        path = Path(self.table_root, f"{table}.json")
+        for record in iterate_records(path):
+            _check_record(record, table, path)
+            yield record
+
+    def _wanted_sample_data(self) -> Iterator[dict[str, Any]]:
+        sensors = {sensor["token"]: sensor["channel"] for sensor in self.sensor}
+        channels = {c["token"]: sensors.get(c["sensor_token"]) for c in self.calibrated_sensor}
+        for record in self._records("sample_data"):
+            token = record["calibrated_sensor_token"]
+            if token not in channels:
+                raise self._broken_link("sample_data", record, "calibrated_sensor_token")
+            channel = channels[token]
             is_sweep = channel == LIDAR and self._with_sweeps
             if is_sweep or (record["is_key_frame"] and (channel == LIDAR or channel in CAMERAS)):
-                kept.append({name: record.get(name) for name in _SAMPLE_DATA_FIELDS})
-        return kept
+                fields = ("token", *_FIELDS["sample_data"], "width", "height")
+                yield {name: record.get(name) for name in fields}
+
+    def __make_reverse_index__(self, verbose: bool) -> None:
+        """Check that every link leads somewhere, and let the devkit follow them."""
+        for table, links in _LINKS.items():
+            for name, target in links.items():
+                known = {record["token"] for record in getattr(self, target)}
+                for record in getattr(self, table):
+                    if record[name] not in known:
+                        raise self._broken_link(table, record, name)
+        super().__make_reverse_index__(verbose)
+
+    def _broken_link(self, table: str, record: dict[str, Any], name: str) -> ValueError:
+        return ValueError(
+            f"{self.table_root}/{table}.json, record {record['token']!r}: {name} {record[name]!r} "
+            "leads nowhere; download the tables again."
+        )
+
+    def chain(
+        self, table: str, token: str, step: str, first: dict[str, Any]
+    ) -> Iterator[dict[str, Any]]:
+        """Yield records that lead from one to the next.
+
+        Args:
+            table: Their table.
+            token: The first one's token; an empty one ends the chain.
+            step: The field that leads on.
+            first: The record that leads to the first one.
+
+        Raises:
+            ValueError: If a link leads nowhere or back.
+        """
+        known, seen, record = self._token2ind[table], set(), first
+        while token:
+            if token not in known:
+                raise ValueError(
+                    f"{self.table_root}/{table}.json has no record {token!r}, to which "
+                    f"{record['token']!r} leads; download the tables again."
+                )
+            if token in seen:
+                raise ValueError(
+                    f"{self.table_root}/{table}.json, record {record['token']!r}: {step} leads "
+                    f"back to {token!r}; download the tables again."
+                )
+            seen.add(token)
+            record = self.get(table, token)
+            yield record
+            token = record[step]
 
     def samples_of(self, scene: dict[str, Any]) -> Iterator[dict[str, Any]]:
         """Yield a scene's samples in order of time."""
-        token = scene["first_sample_token"]
-        while token:
-            sample = self.get("sample", token)
-            yield sample
-            token = sample["next"]
+        return self.chain("sample", scene["first_sample_token"], "next", scene)
 
     def location_of(self, scene: dict[str, Any]) -> str:
         """Return the name of the map that a scene was driven on."""
@@ -127,22 +247,14 @@ class SampleReader:
         return _pose(self._tables.get("ego_pose", data["ego_pose_token"])) @ sensor, sensor
 
     def read(self, sample: dict[str, Any], scene: dict[str, Any]) -> MapSample:
-        """Read a sample in the LIDAR_TOP frame, without instances and cameras that have no record.
-
-        Raises:
-            ValueError: If it has no LIDAR_TOP key frame, so that its frame is unknown.
-        """
-        if LIDAR not in sample["data"]:
-            raise ValueError(f"no {LIDAR} key frame")
+        """Read a sample in the frame of its LiDAR, without instances and absent cameras."""
         lidar = self._tables.get("sample_data", sample["data"][LIDAR])
         global_from_frame, ego_from_frame = self._global_from(lidar)
-        if not np.isfinite(global_from_frame).all():
-            raise ValueError(f"pose of {LIDAR} is not finite")
         return MapSample(
             token=sample["token"],
             scene=scene["name"],
             map_name=self._tables.location_of(scene),
-            timestamp_ns=int(sample["timestamp"]) * 1000,
+            timestamp_ns=sample["timestamp"] * 1000,
             cameras=self._cameras(sample, global_from_frame),
             global_from_frame=global_from_frame,
             lidar=LidarRecord(lidar["filename"], np.eye(4), self._sweeps(lidar, global_from_frame)),
@@ -157,20 +269,22 @@ class SampleReader:
             data = self._tables.get("sample_data", sample["data"][name])
             calibration = self._tables.get("calibrated_sensor", data["calibrated_sensor_token"])
             global_from_cam, _ = self._global_from(data)
-            size = int(data["width"] or 0), int(data["height"] or 0)
-            intrinsics = np.array(calibration["camera_intrinsic"], np.float64)
+            size = data["width"] or 0, data["height"] or 0
             cam_from_frame = invert_rigid(global_from_cam) @ global_from_frame
+            intrinsics = np.array(calibration["camera_intrinsic"])
             cameras.append(CameraRecord(name, data["filename"], *size, intrinsics, cam_from_frame))
         return cameras
 
     def _sweeps(self, lidar: dict[str, Any], global_from_frame: np.ndarray) -> list[SweepRecord]:
         frame_from_global = invert_rigid(global_from_frame)
-        sweeps: list[SweepRecord] = []
-        token = lidar["prev"]
-        while token and len(sweeps) < self._max_sweeps:
-            data = self._tables.get("sample_data", token)
-            frame_from_sweep = frame_from_global @ self._global_from(data)[0]
-            timestamp_ns = int(data["timestamp"]) * 1000
-            sweeps.append(SweepRecord(data["filename"], timestamp_ns, frame_from_sweep))
-            token = data["prev"]
-        return sweeps
+        if not self._max_sweeps:
+            return []
+        earlier = self._tables.chain("sample_data", lidar["prev"], "prev", lidar)
+        return [
+            SweepRecord(
+                data["filename"],
+                data["timestamp"] * 1000,
+                frame_from_global @ self._global_from(data)[0],
+            )
+            for data in islice(earlier, self._max_sweeps)
+        ]

@@ -5,6 +5,7 @@ something else, and one that is damaged.
 """
 
 import json
+import os
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -69,6 +70,7 @@ class AnnotationWriter:
         self._opened = ExitStack()
         self._rows: list[dict[str, Any]] = []
         self._tokens: set[str] = set()
+        self._finished = False
 
     def __enter__(self) -> "AnnotationWriter":
         self._file = self._opened.enter_context(atomic_write(self.path, "wb"))
@@ -102,7 +104,13 @@ class AnnotationWriter:
             self._writer.write_batch(batch)
             self._rows.clear()
 
-    def _finish(self) -> None:
+    def finish(self) -> None:
+        """Write all that is left to the disk, under the provisional name.
+
+        Several files appear together if each is finished before the first block ends.
+        """
+        if self._finished:
+            return
         self._flush()
         self._file.flush()
         content = pa.memory_map(self._file.name).read_buffer()
@@ -111,6 +119,9 @@ class AnnotationWriter:
             batch_of([], self._schema), custom_metadata={SEAL_KEY: json.dumps(seal)}
         )
         self._writer.close()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._finished = True
 
     def __exit__(
         self,
@@ -121,7 +132,7 @@ class AnnotationWriter:
         with self._opened:
             if value is not None:
                 raise value
-            self._finish()
+            self.finish()
 
 
 def write_annotations(path: str | Path, meta: AnnotationMeta, samples: Iterable[MapSample]) -> int:
