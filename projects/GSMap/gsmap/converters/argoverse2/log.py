@@ -93,7 +93,7 @@ def damage_named(path: Path) -> Iterator[None]:
 
 
 def check_feather(path: Path) -> None:
-    """Raise an ``ArrowException`` if a table is not whole: damaged offsets would end the process."""
+    """Raise an ``ArrowException`` if a table is damaged, which might end the process later."""
     feather.read_table(path, memory_map=False).validate(full=True)
 
 

@@ -59,7 +59,8 @@ def _read_feather(path: str, load_dim: int) -> np.ndarray:
         )
     names = FEATHER_COLUMNS[:load_dim]
     try:
-        table = feather.read_table(path, columns=list(names))
+        table = feather.read_table(path, columns=list(names), memory_map=False)
+        table.validate(full=True)
         columns = [table[name].to_numpy().astype(np.float32) for name in names]
     except (pa.ArrowException, OSError, ValueError, TypeError) as error:
         raise BrokenSampleError(

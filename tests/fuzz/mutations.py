@@ -1,0 +1,109 @@
+"""Ways to damage a file: its bytes, or the values that it holds."""
+
+import copy
+import json
+import math
+import pickle
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pyarrow as pa
+
+from gsmap.datasets.annotations.schema import FIELDS
+
+ODD = (
+    None, True, "", "x", "../x", "/etc/x", "1.0", -1, 0, 99, 2**40, 2**70, 1e308, -1e-9, math.nan,
+    math.inf, [], {}, [1, 2], [[0.0] * 4] * 4, {"token": "x"},
+)  # fmt: skip
+
+
+def damaged_bytes(content: bytes, rng: Random) -> bytes:
+    """Flip, cut, repeat, swap, blank or insert bytes."""
+    data = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 8))):
+        start = rng.randrange(len(data) or 1)
+        length = min(rng.choice((1, 2, 4, 8, 64, 512)), len(data) - start)
+        other = rng.randrange(len(data) - length or 1)
+        kind = rng.randrange(8)
+        if kind <= 1 and data:
+            data[start] ^= 1 << rng.randrange(8)
+        elif kind == 2:
+            data[start : start + length] = rng.randbytes(length)
+        elif kind == 3:
+            data[start : start + length] = rng.choice((b"\0", b"\xff")) * length
+        elif kind == 4:
+            block = data[start : start + length]
+            data[start : start + length] = data[other : other + length]
+            data[other : other + length] = block
+        elif kind == 5:
+            data[start:start] = data[other : other + length]
+        elif kind == 6:
+            del data[start : start + length]
+        else:
+            del data[start:]
+    return bytes(data)
+
+
+def damaged_value(value: Any, rng: Random) -> Any:
+    """Return a copy with one part, somewhere inside, replaced, dropped, repeated or scaled."""
+    value = copy.deepcopy(value)
+    holder, place = [value], 0
+    top = holder
+    while isinstance(holder[place], (dict, list)) and holder[place] and rng.random() < 0.9:
+        holder = holder[place]
+        place = rng.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
+    found = holder[place]
+    kind = rng.randrange(6)
+    if kind == 0 and holder is not top:
+        del holder[place]
+    elif kind == 1 and isinstance(holder, list) and holder is not top:
+        holder.insert(place, copy.deepcopy(found))
+    elif kind == 2 and isinstance(found, (int, float)) and not isinstance(found, bool):
+        holder[place] = found * rng.choice((-1, 1e-3, 1e3, 1e300))
+    elif kind == 3 and len(holder) > 1:
+        other = rng.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
+        holder[place], holder[other] = holder[other], holder[place]
+    else:
+        holder[place] = rng.choice(ODD)
+    return top[0]
+
+
+def damaged_json(content: bytes, rng: Random) -> bytes:
+    """Damage a value of a JSON file, or its text."""
+    if rng.random() < 0.3:
+        signs = (b",,", b"}", b"]", b"NaN", b"[" * 3000, b" x", b"-", b'"')
+        place = rng.randrange(len(content) + 1)
+        return content[:place] + rng.choice(signs) + content[place:]
+    return json.dumps(damaged_value(json.loads(content), rng)).encode()
+
+
+def damaged_pickle(content: bytes, rng: Random) -> bytes:
+    """Damage a value of a pickle."""
+    return pickle.dumps(damaged_value(pickle.loads(content), rng), rng.choice((2, 4, 5)))
+
+
+def damaged_rows(content: bytes, rng: Random) -> bytes:
+    """Damage a value of an annotation file, without its checksum."""
+    reader = pa.ipc.open_file(content)
+    rows = [
+        row for i in range(reader.num_record_batches) for row in reader.get_batch(i).to_pylist()
+    ]
+    while True:
+        damaged = rows
+        for _ in range(rng.choice((1, 1, 3))):
+            damaged = damaged_value(damaged, rng)
+        try:
+            columns = [pa.array([r[name] for r in damaged], kind) for name, kind in FIELDS.items()]
+        except (pa.ArrowException, OverflowError, TypeError, KeyError):
+            continue  # Arrow itself does not write this
+        sink = pa.BufferOutputStream()
+        with pa.ipc.new_file(sink, reader.schema) as writer:
+            writer.write_batch(pa.record_batch(columns, schema=reader.schema))
+        return sink.getvalue().to_pybytes()
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file anew, so that one that is mapped into memory keeps what it had."""
+    path.unlink(missing_ok=True)
+    path.write_bytes(content)
