@@ -131,7 +131,7 @@ def test_file_that_is_no_image_is_named(tmp_path):
     [
         ({"images": {}}, "sample 0 has no camera"),
         ({"ego2global": np.eye(3)}, r"sample 0: ego2global must be 4 x 4, got \(3, 3\)"),
-        ({"lidar_points": {}}, "sample 0 lacks 'lidar2ego'"),
+        ({"lidar_points": {}}, "sample 0 cannot be used: it has no 'lidar2ego'; GSMap needs"),
     ],
 )
 def test_incomplete_info_is_named(tmp_path, changes, message):

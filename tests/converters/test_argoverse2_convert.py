@@ -162,7 +162,7 @@ def test_bad_logs_are_left_out_with_their_reason_and_the_rest_goes_on(tmp_path):
     for reason in (
         "no map/log_map_archive_*.json",
         "no poses at",
-        "is damaged",
+        "cannot be used",
         "no calibration of the ring cameras",
     ):
         assert reason in summary

@@ -191,7 +191,10 @@ def test_a_pickle_that_runs_code_is_refused_unrun(content, tmp_path):
     [
         ([], "neither a list `infos`"),
         ({"infos": []}, "no sample"),
-        ({"infos": [{"token": "a"}]}, r"sample 0 has no 'lidar2ego_translation'"),
+        (
+            {"infos": [{"token": "a"}]},
+            r"sample 0 cannot be used: it has no 'lidar2ego_translation'",
+        ),
     ],
 )
 def test_other_pickles_are_refused(content, message, tmp_path):

@@ -77,7 +77,7 @@ def test_lidar_and_signals_are_kept(tmp_path: Path):
     ("bad", "message"),
     [
         (record(gt=[]), r"unknown keys \['gt'\]"),
-        ({"token": "t"}, "record 't' has no 'cameras'"),
+        ({"token": "t"}, "record 't' cannot be used: it has no 'cameras'"),
         (record(instances=[{"label": "tree", "points": [[0, 0], [1, 1]]}]), "'tree' is not among"),
         (record(instances=[{"label": 0, "points": [[0, 0, 0], [1, 1, 1]]}]), r"\(n >= 2, 2\)"),
         (record(instances=[{"label": 0, "points": [[0, np.nan], [1, 1]]}]), "NaN"),

@@ -214,7 +214,9 @@ class Files:
             "split file": lambda: self.json(plan, lambda: read_split_file(plan)),
             "Argoverse 2 poses": lambda: self.of_log("*.feather", byte),
             "Argoverse 2 calibration": lambda: self.of_log("calibration/intr*", byte),
-            "Argoverse 2 map": lambda: self.of_log("map/*.json", byte, mutations.damaged_json),
+            "Argoverse 2 map": lambda: self.of_log(
+                "map/log_map*.json", byte, mutations.damaged_json
+            ),
             "LiDAR sweep": self.points,
             "LiDAR sweep, Argoverse 2": self.feather,
             "checkpoint": self.weights,
@@ -256,7 +258,9 @@ class Files:
         return Reader(path, read, (mutations.damaged_pickle,))
 
     def image(self, suffix: str) -> Reader:
-        content = cv2.imencode(suffix, np.random.default_rng(0).integers(0, 255, (48, 64, 3)))[1]
+        content = cv2.imencode(
+            suffix, np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+        )[1]
         path = self.put(f"image{suffix}", content.tobytes())
         return Reader(
             path, lambda: read_image(str(path), "camera", (64, 48)), (mutations.damaged_bytes,)

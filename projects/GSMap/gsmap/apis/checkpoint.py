@@ -15,7 +15,10 @@ from gsmap.engine.named_models import find_checkpoint
 
 _SHOWN = 5
 # what torch's reader raises on bytes that make no sense
-_DAMAGE = (RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError)
+_DAMAGE = (
+    RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, UnicodeError,
+    ArithmeticError,
+)  # fmt: skip
 
 
 def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | None]:

@@ -7,8 +7,15 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample
+from gsmap.datasets.annotations.file import check_samples
+from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
+from gsmap.datasets.errors import naming
 from gsmap.datasets.plain_pickle import load_plain_pickle
+
+_REMEDY = (
+    "GSMap needs images (img_path, cam2img, lidar2cam), lidar_points (lidar2ego), ego2global and "
+    "timestamp"
+)
 
 
 def read_info_file(
@@ -37,10 +44,13 @@ def read_info_file(
             "MapTRv2 convert with tools/create_data.py infos, older ones of mmdet3d with its "
             "tools/dataset_converters/update_infos_to_v2.py."
         )
-    return [
-        _sample(info, root, f"{path}, sample {i}", allow_missing_cameras)
-        for i, info in enumerate(content["data_list"])
-    ]
+    samples = []
+    for i, info in enumerate(content["data_list"]):
+        where = f"{path}, sample {i}"
+        with naming(where, _REMEDY):
+            samples.append(_sample(info, root, where, allow_missing_cameras))
+            check_samples(samples[-1:], AnnotationMeta("mmdet3d", "lidar", "test"))
+    return samples
 
 
 def _matrix(values: Any, size: int, what: str) -> np.ndarray:
@@ -108,17 +118,11 @@ def _cameras(
 
 def _sample(info: Mapping[str, Any], root: Path, where: str, allow_missing: bool) -> MapSample:
     """Turn one entry of ``data_list`` into a sample."""
-    try:
-        lidar = info["lidar_points"]
-        cameras = _cameras(info["images"], root, where, allow_missing)
-        ego_from_lidar = _matrix(lidar["lidar2ego"], 4, f"{where}: lidar2ego")
-        global_from_ego = _matrix(info["ego2global"], 4, f"{where}: ego2global")
-        timestamp_ns = round(float(info["timestamp"]) * 1e9)
-    except KeyError as error:
-        raise ValueError(
-            f"{where} lacks {error}; GSMap needs images (img_path, cam2img, lidar2cam), "
-            "lidar_points (lidar2ego), ego2global and timestamp."
-        ) from error
+    lidar = info["lidar_points"]
+    cameras = _cameras(info["images"], root, where, allow_missing)
+    ego_from_lidar = _matrix(lidar["lidar2ego"], 4, f"{where}: lidar2ego")
+    global_from_ego = _matrix(info["ego2global"], 4, f"{where}: ego2global")
+    timestamp_ns = round(float(info["timestamp"]) * 1e9)
     record = None
     if lidar.get("lidar_path"):
         path = _locate(lidar["lidar_path"], "LIDAR_TOP", root, f"{where}, LiDAR")

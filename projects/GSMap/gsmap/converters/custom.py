@@ -9,7 +9,7 @@ import shapely
 from PIL import Image, UnidentifiedImageError
 
 from gsmap.converters.local_map import POLYGON
-from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.file import check_samples, write_annotations
 from gsmap.datasets.annotations.record import (
     AnnotationMeta,
     CameraRecord,
@@ -18,6 +18,7 @@ from gsmap.datasets.annotations.record import (
     MapSample,
     SweepRecord,
 )
+from gsmap.datasets.errors import naming
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 
 _RECORD_KEYS = {
@@ -68,17 +69,16 @@ def _samples(
     records: Iterable[Mapping[str, Any]], meta: AnnotationMeta, root: Path
 ) -> Iterator[MapSample]:
     for number, record in enumerate(records):
-        unknown = set(record) - _RECORD_KEYS
-        if unknown:
-            raise ValueError(
-                f"record {number} has unknown keys {sorted(unknown)}; known are "
-                f"{sorted(_RECORD_KEYS)}."
-            )
-        try:
-            yield _sample(record, meta, root)
-        except KeyError as error:
-            name = record.get("token", number)
-            raise ValueError(f"record {name!r} has no {error}.") from error
+        name = record.get("token", number) if isinstance(record, Mapping) else number
+        with naming(f"record {name!r}", "correct it"):
+            unknown = set(record) - _RECORD_KEYS
+            if unknown:
+                raise ValueError(
+                    f"unknown keys {sorted(unknown)}; known are {sorted(_RECORD_KEYS)}."
+                )
+            sample = _sample(record, meta, root)
+            check_samples([sample], meta)
+        yield sample
 
 
 def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:

@@ -22,7 +22,7 @@ from gsmap.converters.command_line import add_range_options, options_from
 from gsmap.converters.nuscenes.can_bus import pose_signals
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.converters.summary import ConversionSummary
-from gsmap.datasets.annotations.file import AnnotationWriter
+from gsmap.datasets.annotations.file import AnnotationWriter, check_samples
 from gsmap.datasets.annotations.record import (
     CLASSES,
     RANGES,
@@ -33,6 +33,7 @@ from gsmap.datasets.annotations.record import (
     MapSample,
     SweepRecord,
 )
+from gsmap.datasets.errors import naming
 from gsmap.datasets.plain_pickle import load_plain_pickle
 
 NUSCENES_IMAGE_SIZE = (1600, 900)
@@ -230,10 +231,9 @@ def _samples(
     local_map = _maps(meta, options.data_root)
     read = partial(_argoverse_sample, dim=meta.dim) if meta.frame == "ego" else _nuscenes_sample
     for number, info in enumerate(entries):
-        try:
+        with naming(f"{options.infos}, sample {number}", "make the file anew"):
             sample = read(info, options)
-        except KeyError as error:
-            raise ValueError(f"{options.infos}: sample {number} has no {error}.") from error
+            check_samples([sample], meta)
         if sample.instances is not None:
             _check_range(sample, meta)
         elif meta.frame == "lidar":
@@ -262,16 +262,15 @@ def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
             )
 
 
-def _dim(entries: Sequence[Mapping[str, Any]], frame: str, classes: Sequence[str]) -> int:
+def _dim(entries: Sequence[Mapping[str, Any]], frame: str, options: InfoOptions) -> int:
     """Return how many coordinates the points of the first element have; nuScenes has 2."""
-    lines = (
-        line
-        for info in entries
-        for name in classes
-        for line in info.get("annotation", {}).get(name, [])
-    )
-    first = None if frame == "lidar" else next(lines, None)
-    return 2 if first is None else min(np.asarray(first).shape[-1], 3)
+    if frame == "lidar":
+        return 2
+    with naming(options.infos, "make it anew"):
+        annotations = [info["annotation"] for info in entries if "annotation" in info]
+        lines = (line for a in annotations for name in options.classes for line in a[name])
+        first = next(lines, None)
+        return 2 if first is None else min(np.asarray(first).shape[-1], 3)
 
 
 def convert_infos(options: InfoOptions) -> ConversionSummary:
@@ -296,7 +295,7 @@ def convert_infos(options: InfoOptions) -> ConversionSummary:
         classes=options.classes,
         x_range=options.x_range or RANGES[frame][0],
         y_range=options.y_range or RANGES[frame][1],
-        dim=_dim(entries, frame, options.classes),
+        dim=_dim(entries, frame, options),
         source_fingerprint=hashlib.sha256(options.infos.read_bytes()).hexdigest()[:16],
         options={"infos": options.infos.name},
         command=options.command,

@@ -23,7 +23,7 @@ def read_split_file(path: Path) -> dict[str, list[str]]:
         raise FileNotFoundError(f"no split file at {path}.")
     try:
         splits = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
+    except ValueError as error:  # of JSON, or of the encoding
         raise ValueError(f"split file {path} is not JSON: {error}.") from error
     if not isinstance(splits, dict) or not all(
         isinstance(scenes, list) and all(isinstance(s, str) for s in scenes)

@@ -1,4 +1,9 @@
-"""What may be wrong with a single sample's files."""
+"""What may be wrong with the files of a data set, said with their names."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pyarrow as pa
 
 
 class BrokenSampleError(ValueError):
@@ -7,3 +12,34 @@ class BrokenSampleError(ValueError):
     The data set raises it on, or skips and counts the sample, as its option ``broken_samples``
     says.
     """
+
+
+_UNEXPECTED = (
+    LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError,
+    RecursionError, pa.ArrowException,
+)  # fmt: skip
+
+
+@contextmanager
+def naming(what: object, remedy: str) -> Iterator[None]:
+    """Say whose content is meant where reading it meets with something unexpected.
+
+    Args:
+        what: The file, or the part of it.
+        remedy: What to do.
+
+    Raises:
+        ValueError: In place of what indexing, arithmetic or a parser raises in the block.
+    """
+    try:
+        yield
+    except Exception as error:
+        expected = isinstance(error, _UNEXPECTED) or type(error) is Exception  # nuScenes' devkit
+        if not expected or str(what) in str(error):
+            raise
+        reason = str(error)
+        if isinstance(error, KeyError):
+            reason = f"it has no {error}"
+        elif not isinstance(error, ValueError) and type(error) is not Exception:
+            reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{what} cannot be used: {reason.rstrip('.')}; {remedy}.") from error

@@ -1,18 +1,17 @@
 """The folder of one Argoverse 2 log: poses, calibration, and when each sensor fired."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.geometry.geometry import quat_to_mat
 from av2.utils.io import read_feather
 from av2.utils.synchronization_database import SynchronizationDB
 from pyarrow import feather
+
+from gsmap.datasets.errors import naming
 
 # The order of MapTR and MapTRv2: camera embeddings of their checkpoints depend on it.
 RING_CAMERAS = (
@@ -60,7 +59,7 @@ class PoseTable:
         path = log_dir / "city_SE3_egovehicle.feather"
         if not path.is_file():
             raise FileNotFoundError(f"no poses at {path}: download the log again.")
-        with damage_named(path):
+        with naming(path, "download the log again"):
             check_feather(path)
             table = read_feather(path)
             table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
@@ -81,15 +80,6 @@ class PoseTable:
         if row == len(self.timestamps_ns) or self.timestamps_ns[row] != timestamp_ns:
             return None
         return self.city_from_ego[row]
-
-
-@contextmanager
-def damage_named(path: Path) -> Iterator[None]:
-    """Raise a ``ValueError`` that names the file where reading it fails."""
-    try:
-        yield
-    except (OSError, LookupError, ValueError, TypeError, pa.ArrowException) as error:
-        raise ValueError(f"{path} is damaged ({error}): download the log again.") from error
 
 
 def check_feather(path: Path) -> None:
@@ -135,7 +125,7 @@ class Argoverse2Log:
         names = ("intrinsics.feather", "egovehicle_SE3_sensor.feather")
         if not all((folder / name).is_file() for name in names):
             return {}
-        with damage_named(folder):
+        with naming(folder, "download the log again"):
             for name in names:
                 check_feather(folder / name)
             known = set(read_feather(folder / names[0])["sensor_name"])

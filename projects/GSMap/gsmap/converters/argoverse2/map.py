@@ -26,6 +26,7 @@ from gsmap.converters.argoverse2.rules import (
 from gsmap.converters.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths
 from gsmap.converters.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 from gsmap.datasets.annotations.record import RANGES
+from gsmap.datasets.errors import naming
 
 COMPAT_MODES = ("maptrv2", "maptr")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
@@ -117,11 +118,8 @@ class Argoverse2Map:
             ValueError: If there are several, or it is damaged.
         """
         path = find_map(log_dir)
-        try:
+        with naming(path, "download it again"):
             return cls(ArgoverseStaticMap.from_json(path))
-        except (LookupError, TypeError, ValueError, AttributeError) as error:
-            reason = f"{type(error).__name__}: {error}"
-            raise ValueError(f"{path} is damaged ({reason}): download it again.") from error
 
     @property
     def invalid_counts(self) -> dict[str, int]:

@@ -6,6 +6,7 @@ import numpy as np
 from pyquaternion import Quaternion
 
 from gsmap.datasets.annotations.record import CAN_BUS_SIZE
+from gsmap.datasets.errors import naming
 
 
 def pose_signals(global_from_ego: np.ndarray) -> np.ndarray:
@@ -43,7 +44,7 @@ class CanBusReader:
 
         self._scene, messages = scene, []
         path = self._dataroot / "can_bus" / f"{scene}_pose.json"
-        try:
+        with naming(path, "unpack the CAN bus expansion again"):
             if path.is_file():
                 api = NuScenesCanBus(dataroot=str(self._dataroot))
                 if int(scene[-4:]) not in api.can_blacklist:  # scenes whose signals are unreliable
@@ -53,11 +54,6 @@ class CanBusReader:
             self._measured = np.array(rows, np.float64).reshape(-1, 9)
             if not np.isfinite(self._measured).all():
                 raise ValueError("a number is not finite")
-        except (LookupError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"{path} is damaged ({type(error).__name__}: {error}): unpack the CAN bus "
-                "expansion again."
-            ) from error
 
     def signals(self, scene: str, timestamp_ns: int, global_from_ego: np.ndarray) -> np.ndarray:
         """Return the vehicle's pose with the latest message; zeros in place of one that is absent.

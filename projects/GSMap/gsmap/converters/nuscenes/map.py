@@ -24,6 +24,7 @@ from gsmap.converters.local_map import (
     vertices_of,
 )
 from gsmap.datasets.annotations.record import RANGES, MapInstance
+from gsmap.datasets.errors import naming
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.polylines import Points
 
@@ -99,16 +100,12 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
     """
     from nuscenes.map_expansion.map_api import NuScenesMap
 
-    try:
+    path = root / f"maps/expansion/{name}.json"
+    with naming(path, "unpack the map expansion pack (v1.3) again"):
         layers = read_layers(NuScenesMap(str(root), name), classes)
         for geometries in (*layers.lines.values(), *layers.polygons.values()):
             if not np.isfinite(shapely.get_coordinates(geometries)).all():
                 raise ValueError("a point is not finite")
-    except (LookupError, TypeError, ValueError, AttributeError, AssertionError) as error:
-        raise ValueError(
-            f"{root}/maps/expansion/{name}.json is damaged ({type(error).__name__}: {error}): "
-            "unpack the map expansion pack (v1.3) again."
-        ) from error
     return layers
 
 

@@ -14,6 +14,7 @@ from nuscenes.utils.geometry_utils import transform_matrix
 from pyquaternion import Quaternion
 
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
+from gsmap.datasets.errors import naming
 from gsmap.structures.rigid import invert_rigid
 
 CAMERAS = (
@@ -61,7 +62,7 @@ def iterate_records(path: Path) -> Iterator[dict[str, Any]]:
     """
     decode = json.JSONDecoder(parse_constant=_refuse_constant).raw_decode
     with path.open(encoding="utf-8") as file:
-        text, position, expected = file.read(_CHUNK_CHARACTERS), 0, "["
+        text, position, expected = "", 0, "["
         try:
             while True:
                 if len(text) - position < _CHUNK_CHARACTERS:
@@ -128,13 +129,8 @@ class NuScenesTables(NuScenes):
     def __init__(self, version: str, dataroot: Path, with_sweeps: bool) -> None:
         self._with_sweeps = with_sweeps
         self._kept_data: list[dict[str, Any]] = []
-        try:
+        with naming(dataroot / version, "download the tables again"):
             super().__init__(version, str(dataroot), verbose=False)
-        except (AssertionError, LookupError) as error:
-            raise ValueError(
-                f"the tables in {dataroot / version} do not fit together "
-                f"({type(error).__name__}: {error}): download them again."
-            ) from error
 
     def __load_table__(self, table_name: str) -> list[dict[str, Any]]:
         if table_name in _UNUSED:

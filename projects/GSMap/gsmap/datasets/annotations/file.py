@@ -42,6 +42,7 @@ __all__ = [
     "MapInstance",
     "MapSample",
     "SweepRecord",
+    "check_samples",
     "write_annotations",
 ]
 
@@ -153,6 +154,16 @@ def write_annotations(path: str | Path, meta: AnnotationMeta, samples: Iterable[
         for sample in samples:
             writer.write(sample)
         return len(writer)
+
+
+def check_samples(samples: Sequence[MapSample], meta: AnnotationMeta) -> None:
+    """Check samples that come from elsewhere as those of an annotation file are.
+
+    Raises:
+        ValueError: If a shape or value is wrong; the message names the sample.
+    """
+    batch = batch_of([row_of(sample, meta.dim) for sample in samples], schema_of(meta))
+    check_batch(Batch(batch, meta.dim), meta)
 
 
 class AnnotationFile(Sequence[MapSample]):

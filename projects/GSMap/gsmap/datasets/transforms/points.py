@@ -40,15 +40,21 @@ def read_points(path: str, load_dim: int) -> np.ndarray:
             f"no LiDAR file at {path}: correct data_root, download it, or take a config without "
             "LiDAR."
         )
-    if file.suffix == ".feather":
-        return _read_feather(path, load_dim)
+    points = _read_feather(path, load_dim) if file.suffix == ".feather" else _read(file, load_dim)
+    if not np.isfinite(points).all():
+        raise BrokenSampleError(f"{path} holds NaN or infinity: copy it again.")
+    return points
+
+
+def _read(file: Path, load_dim: int) -> np.ndarray:
+    """Read a sweep of nuScenes. (n, load_dim)."""
     size = file.stat().st_size
     if size == 0 or size % (4 * load_dim):  # float32 values
         raise BrokenSampleError(
-            f"{path} has {size} bytes, not a multiple of {load_dim} float32 values: copy it again, "
+            f"{file} has {size} bytes, not a multiple of {load_dim} float32 values: copy it again, "
             "or correct load_dim."
         )
-    return np.fromfile(path, np.float32).reshape(-1, load_dim)
+    return np.fromfile(file, np.float32).reshape(-1, load_dim)
 
 
 def _read_feather(path: str, load_dim: int) -> np.ndarray:
