@@ -193,7 +193,7 @@ def test_a_pickle_that_runs_code_is_refused_unrun(content, tmp_path):
         ({"infos": []}, "no sample"),
         (
             {"infos": [{"token": "a"}]},
-            r"sample 0 cannot be used: it has no 'lidar2ego_translation'",
+            "sample 0 cannot be used: it has no 'lidar2ego",
         ),
     ],
 )

@@ -67,7 +67,8 @@ class Reader:
             result = self.read()
         except (ValueError, OSError) as error:
             text = str(error)
-            named = self.path.name in text or str(self.path.parent) in text or "sample '" in text
+            names = self.path.name, str(self.path.parent), "sample '", "record '", "record 0"
+            named = any(name in text for name in names)
             return ("clear" if named else "vague"), f"{type(error).__name__}: {text}"
         except Exception as error:
             return "traceback", f"{type(error).__name__}: {error}"

@@ -35,11 +35,12 @@ def naming(what: object, remedy: str) -> Iterator[None]:
         yield
     except Exception as error:
         expected = isinstance(error, _UNEXPECTED) or type(error) is Exception  # nuScenes' devkit
-        if not expected or str(what) in str(error):
+        of_arrow = isinstance(error, OSError) and error.errno is None
+        if not (expected or of_arrow) or str(what) in str(error):
             raise
         reason = str(error)
         if isinstance(error, KeyError):
             reason = f"it has no {error}"
-        elif not isinstance(error, ValueError) and type(error) is not Exception:
+        elif not isinstance(error, (ValueError, OSError)) and type(error) is not Exception:
             reason = f"{type(error).__name__}: {error}"
         raise ValueError(f"{what} cannot be used: {reason.rstrip('.')}; {remedy}.") from error

@@ -1,6 +1,7 @@
 """Files that are whole or absent, whatever stops their writer."""
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,8 +26,7 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    _remove_stale(path)
-    partial = path.with_name(f"{path.name}.{os.getpid()}{SUFFIX}")
+    partial = partial_path(path)
     try:
         with partial.open(mode, encoding=None if "b" in mode else "utf-8") as file:
             yield file
@@ -49,12 +49,16 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         file.write(content)
 
 
-def _remove_stale(path: Path) -> None:
-    """Remove what killed writers of the same file left behind."""
-    if not Path("/proc/self").exists():
-        return  # no way to tell whether a writer lives
+def partial_path(path: Path) -> Path:
+    """Return where a file or folder is made before it takes its name, free of what is stale.
+
+    What killed writers of the same file or folder left behind is removed.
+    """
     start = f"{path.name}."
-    for name in os.listdir(path.parent):
+    # without /proc there is no way to tell whether a writer lives
+    for name in os.listdir(path.parent) if Path("/proc/self").exists() else ():
         pid = name[len(start) : -len(SUFFIX)]
         if name == f"{start}{pid}{SUFFIX}" and pid.isdigit() and not Path("/proc", pid).exists():
-            (path.parent / name).unlink(missing_ok=True)
+            stale = path.parent / name
+            shutil.rmtree(stale) if stale.is_dir() else stale.unlink(missing_ok=True)
+    return path.with_name(f"{start}{os.getpid()}{SUFFIX}")

@@ -21,6 +21,7 @@ from gsmap.converters.command_line import (
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
+from gsmap.utils.files import SUFFIX as PARTIAL
 from gsmap.utils.parallel import ordered_map
 
 
@@ -102,7 +103,8 @@ def select_logs(split_dir: Path, logs: Sequence[str] = ()) -> list[Path]:
     found = sorted(
         path
         for path in split_dir.iterdir()
-        if (path / "map").is_dir() or (path / "city_SE3_egovehicle.feather").is_file()
+        if path.suffix != PARTIAL
+        and ((path / "map").is_dir() or (path / "city_SE3_egovehicle.feather").is_file())
     )
     for prefix in logs:
         if not any(path.name.startswith(prefix) for path in found):

@@ -28,6 +28,7 @@ from gsmap.converters.command_line import (
     options_from,
     progress_bar,
 )
+from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
 from minicity.camera import Camera
 from minicity.lighting import random_lighting
@@ -177,7 +178,8 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
     if options.max_frames is not None and len(times) > options.max_frames:
         times = times[np.linspace(0, len(times) - 1, options.max_frames).round().astype(int)]
     renderer = LogRenderer(log, source.calibration, times, options.scale)
-    partial_dir = out_dir.with_name(f".{out_dir.name}.{os.getpid()}.partial")
+    out_dir.parent.mkdir(parents=True, exist_ok=True)
+    partial_dir = partial_path(out_dir)
     try:
         _copy_log(log_dir, source, partial_dir, options.scale)
         for timestamp_ns in times.tolist():
