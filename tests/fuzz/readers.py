@@ -67,7 +67,7 @@ class Reader:
             result = self.read()
         except (ValueError, OSError) as error:
             text = str(error)
-            names = self.path.name, str(self.path.parent), "sample '", "record '", "record 0"
+            names = self.path.name, str(self.path.parent), "sample '", "record "
             named = any(name in text for name in names)
             return ("clear" if named else "vague"), f"{type(error).__name__}: {text}"
         except Exception as error:

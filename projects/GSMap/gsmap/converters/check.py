@@ -44,14 +44,15 @@ def broken_files(sample: MapSample, root: Path) -> list[str]:
     from gsmap.datasets.transforms.points import read_points
 
     where, problems = f"sample {sample.token!r}", []
-    lidar = [] if sample.lidar is None else [sample.lidar, *sample.lidar.sweeps]
-    for record in (*sample.cameras, *lidar):
+    lidar = [] if sample.lidar is None else [sample.lidar.path]
+    lidar += [sweep.path for sweep in sample.lidar.sweeps] if sample.lidar else []
+    reads = [
+        partial(read_image, str(root / c.path), f"{where}, camera {c.name}", (c.width, c.height))
+        for c in sample.cameras
+    ]
+    for read in (*reads, *(partial(read_points, str(root / path), 5) for path in lidar)):
         try:
-            path = str(root / record.path)
-            if hasattr(record, "width"):
-                read_image(path, f"{where}, camera {record.name}", (record.width, record.height))
-            else:
-                read_points(path, 5)
+            read()
         except BrokenSampleError as error:
             problems.append(str(error))
     return problems

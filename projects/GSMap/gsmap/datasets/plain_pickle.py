@@ -84,7 +84,7 @@ class _Machine:
             elif name != "STOP":
                 raise pickle.UnpicklingError(f"it uses the instruction {name}")
             elif position != len(content) - 1:
-                raise pickle.UnpicklingError(f"{len(content) - 1 - position} bytes follow its end")
+                raise pickle.UnpicklingError("more follows its end")
         return self._stack.pop()
 
     def _push(self, value: Any) -> None:

@@ -31,6 +31,8 @@ class CheckedDtype:
 
     __slots__ = ("dtype",)
 
+    dtype: np.dtype[Any]
+
     def __new__(cls, code: Any = None, *options: Any) -> "CheckedDtype":
         """Make the dtype; its byte order may follow as state."""
         if not isinstance(code, str) or not _CODE.fullmatch(code):
@@ -85,12 +87,11 @@ class CheckedArray(np.ndarray):
 
 def _check_content(dtype: np.dtype, data: bytes) -> None:
     """Refuse bytes that are no value of the dtype: booleans beyond 1, characters beyond Unicode."""
-    limit = {"b": (np.dtype(np.uint8), 1), "U": (np.dtype("u4"), _LAST_CHARACTER)}.get(dtype.kind)
-    if limit is None or not data:
+    largest = {"b": 1, "U": _LAST_CHARACTER}.get(dtype.kind)
+    if largest is None or not data:
         return
-    unit, largest = limit
     order = ">" if dtype.byteorder == ">" else "<"
-    if np.frombuffer(data, unit.newbyteorder(order)).max() > largest:
+    if np.frombuffer(data, "u1" if dtype.kind == "b" else f"{order}u4").max() > largest:
         raise pickle.UnpicklingError(f"an array holds bytes that are no {dtype}")
 
 

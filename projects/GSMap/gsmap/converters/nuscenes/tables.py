@@ -23,7 +23,7 @@ CAMERAS = (
 LIDAR = "LIDAR_TOP"
 _UNUSED = {"sample_annotation", "instance", "image_annotations"}
 # what is read of each table: fields with their type, or how many numbers they hold
-_POSE = {"translation": 3, "rotation": 4}
+_POSE: dict[str, type | int] = {"translation": 3, "rotation": 4}
 _FIELDS: dict[str, dict[str, type | int]] = {
     "sensor": {"channel": str, "modality": str},
     "calibrated_sensor": {"sensor_token": str, "camera_intrinsic": list, **_POSE},
