@@ -24,7 +24,7 @@ from gsmap.converters.custom import from_records
 from gsmap.converters.infos import InfoOptions, convert_infos
 from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
-from gsmap.converters.nuscenes.tables import NuScenesTables, SampleReader
+from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables, SampleReader
 from gsmap.converters.splits import read_split_file
 from gsmap.datasets.annotations.file import (
     AnnotationFile,
@@ -270,7 +270,8 @@ class Files:
     def tables(self) -> list[MapSample]:
         opened = NuScenesTables(VERSION, self.work, with_sweeps=True)
         read = SampleReader(opened, 3).read
-        found = [read(s, scene) for scene in opened.scene for s in opened.samples_of(scene)]
+        drives = [(s, scene) for scene in opened.scene for s in opened.samples_of(scene)]
+        found = [read(s, scene) for s, scene in drives if LIDAR in s["data"]]
         return self.written(LIDAR_META, found)
 
     def written(self, meta: AnnotationMeta, samples: list[MapSample]) -> list[MapSample]:

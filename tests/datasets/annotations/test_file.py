@@ -68,6 +68,7 @@ def test_every_field_survives_across_batches_and_with_absent_parts(tmp_path: Pat
     samples = [sample(i) for i in range(300)]
     samples[1] = sample(1, lidar=None, can_bus=None, instances=None)
     samples[2] = sample(2, cameras=[], instances=[])
+    samples[299] = sample(299, lidar=None)
     path = tmp_path / "deep" / "val.arrow"
     assert write_annotations(path, META, samples) == 300
     file = AnnotationFile(path)
@@ -78,11 +79,12 @@ def test_every_field_survives_across_batches_and_with_absent_parts(tmp_path: Pat
     assert file[1].can_bus is None
     assert file[1].instances is None
     assert file[2].instances == []
-    last = file[-1]
-    assert last.token == "token299"
+    assert file[-1].lidar is None
+    last = file[-2]
+    assert last.token == "token298"
     np.testing.assert_array_equal(last.can_bus, np.arange(18.0))
     assert [i.label for i in last.instances] == [2, 0]
-    np.testing.assert_array_equal(last.instances[0].points, samples[299].instances[0].points)
+    np.testing.assert_array_equal(last.instances[0].points, samples[298].instances[0].points)
     assert last.instances[1].points.shape == (2, 2)
     assert last.lidar.path == "lidar/0.bin"
     assert (last.lidar.sweeps[0].path, last.lidar.sweeps[0].timestamp_ns) == ("lidar/-1.bin", 5)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pyarrow as pa
+import shapely
 
 
 class BrokenSampleError(ValueError):
@@ -16,7 +17,7 @@ class BrokenSampleError(ValueError):
 
 _UNEXPECTED = (
     LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError,
-    RecursionError, pa.ArrowException,
+    RecursionError, pa.ArrowException, shapely.errors.ShapelyError,
 )  # fmt: skip
 
 

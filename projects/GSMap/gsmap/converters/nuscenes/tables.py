@@ -33,7 +33,8 @@ _FIELDS: dict[str, dict[str, type | int]] = {
     "sample": {"timestamp": int, "next": str},
     "sample_data": {
         "sample_token": str, "ego_pose_token": str, "calibrated_sensor_token": str,
-        "timestamp": int, "filename": str, "is_key_frame": bool, "prev": str,
+        "timestamp": int, "filename": str, "is_key_frame": bool, "prev": str, "width": int,
+        "height": int,
     },
     "map": {"log_tokens": list, "filename": str},
 }  # fmt: skip
@@ -93,6 +94,8 @@ def _check_record(record: Any, table: str, path: Path) -> None:
     for name, kind in fields.items():
         value = record.get(name) if isinstance(record, dict) else None
         good = _are_numbers(value, kind) if isinstance(kind, int) else type(value) is kind
+        if name == "camera_intrinsic" and value:  # a matrix, or nothing for another sensor
+            good = good and len(value) == 3 and all(_are_numbers(row, 3) for row in value)
         if not good:
             wanted = f"{kind} finite numbers" if isinstance(kind, int) else f"a {kind.__name__}"
             raise ValueError(
@@ -161,7 +164,7 @@ class NuScenesTables(NuScenes):
             channel = channels[token]
             is_sweep = channel == LIDAR and self._with_sweeps
             if is_sweep or (record["is_key_frame"] and (channel == LIDAR or channel in CAMERAS)):
-                fields = ("token", *_FIELDS["sample_data"], "width", "height")
+                fields = ("token", *_FIELDS["sample_data"])
                 yield {name: record.get(name) for name in fields}
 
     def __make_reverse_index__(self, verbose: bool) -> None:
@@ -265,7 +268,7 @@ class SampleReader:
             data = self._tables.get("sample_data", sample["data"][name])
             calibration = self._tables.get("calibrated_sensor", data["calibrated_sensor_token"])
             global_from_cam, _ = self._global_from(data)
-            size = data["width"] or 0, data["height"] or 0
+            size = data["width"], data["height"]
             cam_from_frame = invert_rigid(global_from_cam) @ global_from_frame
             intrinsics = np.array(calibration["camera_intrinsic"])
             cameras.append(CameraRecord(name, data["filename"], *size, intrinsics, cam_from_frame))

@@ -34,9 +34,11 @@ def check_batch(batch: Batch, meta: AnnotationMeta) -> None:
         _require(finite, each, batch, "can_bus holds NaN or infinity")
     _check_cameras(batch)
     if batch.has_lidar.any():
-        rigid = is_rigid(batch.frame_from_lidar) | ~batch.has_lidar
-        _require(rigid, each, batch, "frame_from_lidar is no rigid transform")
-        _require_inside(batch.lidar_path, each, batch, "LiDAR path")
+        known = np.cumsum([0, *batch.has_lidar])
+        matrices = batch.frame_from_lidar[batch.has_lidar]
+        _require_rigid(matrices, known, batch, "frame_from_lidar")
+        paths = batch.lidar_path.filter(pa.array(batch.has_lidar))
+        _require_inside(paths, known, batch, "LiDAR path")
         _require_inside(batch.sweep["path"], batch.sweep_offsets, batch, "path of a LiDAR sweep")
         _require_rigid(batch.sweep_from, batch.sweep_offsets, batch, "frame_from_lidar of a sweep")
     _check_instances(batch, meta)
@@ -64,7 +66,7 @@ def _require_inside(paths: pa.StringArray, offsets: np.ndarray, batch: Batch, na
     # a look at the bytes is enough for nearly all files, and much faster than an expression
     if (first != ord("/")).all() and not any(part in text for part in (b"..", b"\\", b"\0")):
         return
-    good = ~pc.match_substring_regex(paths, _OUTSIDE).fill_null(False).to_numpy(False)
+    good = ~pc.match_substring_regex(paths, _OUTSIDE).to_numpy(False)
     wrong = f"{name} must be relative to the data root, with forward slashes and without '..'"
     if not good.all():
         wrong += f", got {paths[int(np.argmin(good))].as_py()!r}"
