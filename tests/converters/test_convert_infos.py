@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pyquaternion import Quaternion
 
-from gsmap.converters.infos import InfoOptions, convert_infos
+from gsmap.converters.infos import convert_infos
 from gsmap.datasets.annotations.file import AnnotationFile, MapSample
 
 
@@ -74,7 +74,7 @@ def known(minicity_annotations: dict[str, Path]) -> AnnotationFile:
 def convert(tmp_path: Path, name: str, content: object, root: Path) -> AnnotationFile:
     (tmp_path / name).write_bytes(pickle.dumps(content, protocol=4))
     target = tmp_path / "out.arrow"
-    convert_infos(InfoOptions(tmp_path / name, target, root, "train", command="make it"))
+    convert_infos(tmp_path / name, target, root, "train", command="make it")
     return AnnotationFile(target)
 
 
@@ -164,8 +164,7 @@ def test_truth_beyond_the_range_is_refused_until_the_range_is_given(known, tmp_p
     with pytest.raises(ValueError, match=r"vertex at \(0.0, -45.0\), outside .* --y-range"):
         convert(tmp_path, name, content, tmp_path)
     ranges = {"x_range": (-25.0, 25.0), "y_range": (-50.0, 50.0)}
-    options = InfoOptions(tmp_path / name, tmp_path / "far.arrow", tmp_path, "train", **ranges)
-    convert_infos(options)
+    convert_infos(tmp_path / name, tmp_path / "far.arrow", tmp_path, "train", **ranges)
     file = AnnotationFile(tmp_path / "far.arrow")
     assert (file.meta.x_range, file.meta.y_range) == ((-25, 25), (-50, 50))
     np.testing.assert_allclose(file[0].instances[0].points, far["divider"][0])

@@ -127,9 +127,9 @@ def _read_plain(path: Path) -> None:
 
 
 def _read_infos(path: Path) -> None:
-    from gsmap.converters.infos import InfoOptions, convert_infos
+    from gsmap.converters.infos import convert_infos
 
-    convert_infos(InfoOptions(path, path.with_suffix(".arrow"), path.parent, "val"))
+    convert_infos(path, path.with_suffix(".arrow"), path.parent, "val")
 
 
 def _read_sample(path: Path) -> None:

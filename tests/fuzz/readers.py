@@ -21,7 +21,7 @@ from gsmap.apis.checkpoint import read_weights
 from gsmap.apis.info_file import read_info_file
 from gsmap.converters.argoverse2.samples import Argoverse2Options, read_log
 from gsmap.converters.custom import from_records
-from gsmap.converters.infos import InfoOptions, convert_infos
+from gsmap.converters.infos import convert_infos
 from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables, SampleReader
@@ -245,7 +245,7 @@ class Files:
         return Reader(path, lambda: read(path), damages)
 
     def infos(self, path: Path) -> list[MapSample]:
-        convert_infos(InfoOptions(path, self.work / "infos.arrow", self.work, "train"))
+        convert_infos(path, self.work / "infos.arrow", self.work, "train")
         return list(AnnotationFile(self.work / "infos.arrow"))
 
     def records(self) -> Reader:

@@ -8,8 +8,7 @@ the ground truth too. The pickles are read without running code from them.
 import argparse
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from PIL import Image
 from pyquaternion import Quaternion
 from tqdm import tqdm
 
-from gsmap.converters.command_line import add_range_options, options_from
+from gsmap.converters.command_line import add_range_options
 from gsmap.converters.nuscenes.can_bus import pose_signals
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.converters.summary import ConversionSummary
@@ -38,31 +37,6 @@ from gsmap.datasets.plain_pickle import load_plain_pickle
 
 NUSCENES_IMAGE_SIZE = (1600, 900)
 _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
-
-
-@dataclass(frozen=True)
-class InfoOptions:
-    """How to convert an info file.
-
-    Args:
-        infos: The pickle.
-        target: Annotation file to write.
-        data_root: Folder that image and LiDAR paths shall be relative to; maps are read from it.
-        split: Name of the split.
-        classes: Class names in label order.
-        x_range: Smallest and largest x of the ground truth in metres; the frame's usual if None.
-        y_range: Smallest and largest y of the ground truth in metres; the frame's usual if None.
-        command: The command line, for messages of readers.
-    """
-
-    infos: Path
-    target: Path
-    data_root: Path
-    split: str
-    classes: tuple[str, ...] = CLASSES
-    x_range: tuple[float, float] | None = None
-    y_range: tuple[float, float] | None = None
-    command: str = ""
 
 
 def _transform(translation: Any, rotation: Any) -> np.ndarray:
@@ -89,19 +63,17 @@ def _relative(path: str, root: Path) -> str:
     raise ValueError(f"path {path!r} does not lie under {root}: give the right --data-root.")
 
 
-def _instances(
-    annotation: Mapping[str, Any], classes: Sequence[str], dim: int
-) -> list[MapInstance]:
+def _instances(annotation: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstance]:
     """Return the elements of the given classes; lines of one point are left out."""
     return [
-        MapInstance(label, np.asarray(points, np.float64)[:, :dim])
-        for label, name in enumerate(classes)
+        MapInstance(label, np.asarray(points, np.float64)[:, : meta.dim])
+        for label, name in enumerate(meta.classes)
         for points in annotation[name]
         if len(points) >= 2
     ]
 
 
-def _nuscenes_sample(info: Mapping[str, Any], options: InfoOptions) -> MapSample:
+def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     """Read one entry of a nuScenes info file, in the LIDAR_TOP frame."""
     ego_from_frame = _transform(info["lidar2ego_translation"], info["lidar2ego_rotation"])
     pose = _transform(info["ego2global_translation"], info["ego2global_rotation"]) @ ego_from_frame
@@ -112,7 +84,7 @@ def _nuscenes_sample(info: Mapping[str, Any], options: InfoOptions) -> MapSample
     cameras = [
         CameraRecord(
             name,
-            _relative(camera["data_path"], options.data_root),
+            _relative(camera["data_path"], root),
             *NUSCENES_IMAGE_SIZE,
             np.asarray(camera["cam_intrinsic"], np.float64)[:3, :3],
             np.linalg.inv(frame_from(camera)),
@@ -121,7 +93,7 @@ def _nuscenes_sample(info: Mapping[str, Any], options: InfoOptions) -> MapSample
     ]
     sweeps = [
         SweepRecord(
-            _relative(sweep["data_path"], options.data_root),
+            _relative(sweep["data_path"], root),
             int(sweep["timestamp"]) * 1000,
             frame_from(sweep),
         )
@@ -137,9 +109,9 @@ def _nuscenes_sample(info: Mapping[str, Any], options: InfoOptions) -> MapSample
         cameras=cameras,
         global_from_frame=pose,
         ego_from_frame=ego_from_frame,
-        lidar=LidarRecord(_relative(info["lidar_path"], options.data_root), np.eye(4), sweeps),
+        lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4), sweeps),
         can_bus=None if can_bus is None else _complete_can_bus(can_bus, info),
-        instances=None if annotation is None else _instances(annotation, options.classes, 2),
+        instances=None if annotation is None else _instances(annotation, meta),
     )
 
 
@@ -153,7 +125,7 @@ def _complete_can_bus(can_bus: Any, info: Mapping[str, Any]) -> np.ndarray:
     return signals
 
 
-def _argoverse_sample(info: Mapping[str, Any], options: InfoOptions, dim: int) -> MapSample:
+def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     """Read one entry of an Argoverse 2 info file, in the vehicle's frame."""
     pose = _transform(info["e2g_translation"], info["e2g_rotation"])
     cameras = []
@@ -161,8 +133,8 @@ def _argoverse_sample(info: Mapping[str, Any], options: InfoOptions, dim: int) -
         then = pose
         if "e2g_translation" in camera:
             then = _transform(camera["e2g_translation"], camera["e2g_rotation"])
-        path = _relative(camera["img_fpath"], options.data_root)
-        width, height = _argoverse_size(name, options.data_root / path)
+        path = _relative(camera["img_fpath"], root)
+        width, height = _argoverse_size(name, root / path)
         cameras.append(
             CameraRecord(
                 name,
@@ -181,8 +153,8 @@ def _argoverse_sample(info: Mapping[str, Any], options: InfoOptions, dim: int) -
         timestamp_ns=int(info["timestamp"]),
         cameras=cameras,
         global_from_frame=pose,
-        lidar=LidarRecord(_relative(info["lidar_path"], options.data_root), np.eye(4)),
-        instances=None if annotation is None else _instances(annotation, options.classes, dim),
+        lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4)),
+        instances=None if annotation is None else _instances(annotation, meta),
     )
 
 
@@ -223,16 +195,17 @@ def _maps(meta: AnnotationMeta, root: Path) -> Callable[[str], NuScenesLocalMap 
 
 def _samples(
     entries: Sequence[Mapping[str, Any]],
-    options: InfoOptions,
     meta: AnnotationMeta,
+    infos: Path,
+    root: Path,
     summary: ConversionSummary,
 ) -> Iterator[MapSample]:
     """Yield the samples of an info file, with ground truth where it is known."""
-    local_map = _maps(meta, options.data_root)
-    read = partial(_argoverse_sample, dim=meta.dim) if meta.frame == "ego" else _nuscenes_sample
+    local_map = _maps(meta, root)
+    read = _argoverse_sample if meta.frame == "ego" else _nuscenes_sample
     for number, info in enumerate(entries):
-        with naming(f"{options.infos}, sample {number}", "make the file anew"):
-            sample = read(info, options)
+        with naming(f"{infos}, sample {number}", "make the file anew"):
+            sample = read(info, meta, root)
             check_samples([sample], meta)
         if sample.instances is not None:
             _check_range(sample, meta)
@@ -243,7 +216,7 @@ def _samples(
             else:
                 reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
                 summary.add_problem(f"{reason} (sample kept without)", sample.token)
-        summary.add_sample(options.split, sample)
+        summary.add_sample(meta.split, sample)
         yield sample
 
 
@@ -262,22 +235,35 @@ def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
             )
 
 
-def _dim(entries: Sequence[Mapping[str, Any]], frame: str, options: InfoOptions) -> int:
-    """Return how many coordinates the points of the first element have; nuScenes has 2."""
-    if frame == "lidar":
-        return 2
-    with naming(options.infos, "make it anew"):
-        annotations = [info["annotation"] for info in entries if "annotation" in info]
-        lines = (line for a in annotations for name in options.classes for line in a[name])
-        first = next(lines, None)
-        return 2 if first is None else min(np.asarray(first).shape[-1], 3)
+def _dim(entries: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> int:
+    """Return how many coordinates the points of the first element have."""
+    annotations = [info["annotation"] for info in entries if "annotation" in info]
+    lines = (line for found in annotations for name in classes for line in found[name])
+    first = next(lines, None)
+    return 2 if first is None else min(np.asarray(first).shape[-1], 3)
 
 
-def convert_infos(options: InfoOptions) -> ConversionSummary:
+def convert_infos(
+    infos: Path,
+    target: Path,
+    data_root: Path,
+    split: str,
+    classes: tuple[str, ...] = CLASSES,
+    x_range: tuple[float, float] | None = None,
+    y_range: tuple[float, float] | None = None,
+    command: str = "",
+) -> ConversionSummary:
     """Convert one info file.
 
     Args:
-        options: What to convert and how.
+        infos: The pickle.
+        target: Annotation file to write.
+        data_root: Folder that image and LiDAR paths shall be relative to; maps are read from it.
+        split: Name of the split.
+        classes: Class names in label order.
+        x_range: Smallest and largest x of the ground truth in metres; the frame's usual if None.
+        y_range: Smallest and largest y of the ground truth in metres; the frame's usual if None.
+        command: The command line, for messages of readers.
 
     Returns:
         What was written and what is missing.
@@ -287,22 +273,24 @@ def convert_infos(options: InfoOptions) -> ConversionSummary:
         ValueError: If it holds more than plain data, is of no known form, or holds ground truth
             outside the range.
     """
-    entries, frame = _entries(load_plain_pickle(options.infos), options.infos)
+    entries, frame = _entries(load_plain_pickle(infos), infos)
+    with naming(infos, "make it anew"):
+        dim = _dim(entries, classes) if frame == "ego" else 2
     meta = AnnotationMeta(
         dataset="nuscenes" if frame == "lidar" else "av2",
         frame=frame,
-        split=options.split,
-        classes=options.classes,
-        x_range=options.x_range or RANGES[frame][0],
-        y_range=options.y_range or RANGES[frame][1],
-        dim=_dim(entries, frame, options),
-        source_fingerprint=hashlib.sha256(options.infos.read_bytes()).hexdigest()[:16],
-        options={"infos": options.infos.name},
-        command=options.command,
+        split=split,
+        classes=classes,
+        x_range=x_range or RANGES[frame][0],
+        y_range=y_range or RANGES[frame][1],
+        dim=dim,
+        source_fingerprint=hashlib.sha256(infos.read_bytes()).hexdigest()[:16],
+        options={"infos": infos.name},
+        command=command,
     )
-    summary = ConversionSummary(options.classes)
-    with AnnotationWriter(options.target, meta) as writer:
-        for sample in _samples(tqdm(entries, unit="sample"), options, meta, summary):
+    summary = ConversionSummary(classes)
+    with AnnotationWriter(target, meta) as writer:
+        for sample in _samples(tqdm(entries, unit="sample"), meta, infos, data_root, summary):
             writer.write(sample)
     return summary
 
@@ -322,4 +310,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, command: str) -> str:
     """Convert as the command line asks and return the summary."""
     split = arguments.split or arguments.infos.stem.rsplit("_", 1)[-1]
-    return convert_infos(options_from(InfoOptions, arguments, command, split=split)).text()
+    names = ("infos", "target", "data_root", "x_range", "y_range")
+    given = {name: getattr(arguments, name) for name in names}
+    classes = tuple(arguments.classes)
+    return convert_infos(split=split, classes=classes, command=command, **given).text()
