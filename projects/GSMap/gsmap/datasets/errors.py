@@ -36,7 +36,7 @@ def naming(what: object, remedy: str) -> Iterator[None]:
         yield
     except Exception as error:
         expected = isinstance(error, _UNEXPECTED) or type(error) is Exception  # nuScenes' devkit
-        of_arrow = isinstance(error, OSError) and error.errno is None
+        of_arrow = type(error) is OSError and error.errno is None
         if not (expected or of_arrow) or str(what) in str(error):
             raise
         reason = str(error)
