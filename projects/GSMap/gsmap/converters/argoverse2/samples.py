@@ -25,6 +25,7 @@ from gsmap.datasets.annotations.record import (
     MapSample,
     SweepRecord,
 )
+from gsmap.datasets.errors import naming
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,8 @@ def read_log(log_dir: Path, options: Argoverse2Options) -> LogSamples:
     builder = _SampleBuilder(log, log_map, log_dir.relative_to(options.root).as_posix(), options)
     for timestamp_ns in times.tolist():
         try:
-            sample = builder.build(timestamp_ns)
+            with naming(log_dir, "download the log again"):
+                sample = builder.build(timestamp_ns)
         except _LeftOut as reason:
             result.left_out[str(reason)] += 1
             continue
