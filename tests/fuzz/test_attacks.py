@@ -6,6 +6,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+
 from fuzz.attacks import corpus
 
 SCRIPT = Path(__file__).with_name("attacks.py")
