@@ -1,0 +1,1 @@
+"""Maps of whole drives: merging of frames, scores against the true map, files for other tools."""

@@ -1,0 +1,57 @@
+"""Rules of merging, and how certain a predicted vertex is."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmap.maps.drive import DriveFrame
+from gsmap.structures.elements import FloatArray
+
+NEAR_SIGMA_M, SIGMA_PER_M = 0.2, 0.02  # where results carry no Gaussians
+
+
+@dataclass(frozen=True)
+class MergeConfig:
+    """Rules of merging.
+
+    Args:
+        gaussians: Weigh by the vertices' Gaussians where the results carry them; otherwise by the
+            distance from the vehicle.
+        reach_m: How far across its line a vertex looks for the same line in another frame.
+        max_turn_deg: Largest angle between two lines that may be the same.
+        step_m: Largest distance between vertices while lines are merged.
+        rounds: How many times vertices move to the mean.
+        min_confidence: Vertices with less are left out (``merge_lines`` defines it).
+        min_length_m: Shorter lines are left out.
+        min_overlap: Rings of different frames are of one area if they share this part of the
+            smaller one.
+    """
+
+    gaussians: bool = True
+    reach_m: float = 1.5
+    max_turn_deg: float = 30.0
+    step_m: float = 1.0
+    rounds: int = 2
+    min_confidence: float = 0.25
+    min_length_m: float = 2.0
+    min_overlap: float = 0.3
+
+    def variances(self, frame: DriveFrame) -> FloatArray:
+        """Return the variance of each predicted vertex across its line, in square metres.
+
+        Args:
+            frame: A frame with its predictions.
+
+        Returns:
+            Of the vertices' Gaussians, or of a deviation that grows with the distance from the
+            vehicle. (M,)
+        """
+        elements = frame.elements
+        if not (self.gaussians and elements.has_gaussians):
+            distance = np.linalg.norm(frame.to_frame(elements.points), axis=1)
+            return (NEAR_SIGMA_M + SIGMA_PER_M * distance) ** 2
+        directions = np.concatenate(
+            [np.zeros((0, 2)), *(np.gradient(line, axis=0) for line in elements.polylines)]
+        )
+        angles = np.arctan2(directions[:, 1], directions[:, 0]) - elements.rotations
+        return (elements.scales**2 * np.stack([np.sin(angles), np.cos(angles)], 1) ** 2).sum(axis=1)

@@ -1,0 +1,124 @@
+"""A drive: the maps of its frames, predicted or annotated, in the global frame's plane."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+
+
+@dataclass(frozen=True, eq=False)
+class DriveFrame:
+    """One sample of a drive.
+
+    Args:
+        sample: Sensors and poses.
+        elements: Its map, (x, y) in metres in the global frame.
+    """
+
+    sample: MapSample
+    elements: MapElements
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Turn by the pose's yaw, from the annotation frame to the global frame. (2, 2)"""
+        cos, sin = self.sample.global_from_frame[:2, 0]
+        return np.array([[cos, -sin], [sin, cos]]) / np.hypot(cos, sin)
+
+    @property
+    def yaw_rad(self) -> float:
+        """Angle of that turn in radians."""
+        return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+
+    def to_global(self, points: FloatArray) -> FloatArray:
+        """Move points from the annotation frame to the global frame, in the plane. (..., 2)"""
+        return points @ self.rotation.T + self.sample.global_from_frame[:2, 3]
+
+    def to_frame(self, points: FloatArray) -> FloatArray:
+        """Move points from the global frame to the annotation frame, in the plane. (..., 2)"""
+        return (points - self.sample.global_from_frame[:2, 3]) @ self.rotation
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """The frames of one scene.
+
+    Args:
+        scene: Name of the scene.
+        classes: Class names in label order.
+        x_range: Smallest and largest x that a frame sees, in its own frame, in metres.
+        y_range: Smallest and largest y, likewise.
+        frames: The frames in the order of time.
+    """
+
+    scene: str
+    classes: tuple[str, ...]
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+    frames: Sequence[DriveFrame]
+
+    def sees(self, frame: DriveFrame, points: FloatArray) -> BoolArray:
+        """Say which points of the global frame, (M, 2) in metres, lie in a frame's range. (M,)"""
+        low, high = np.array([self.x_range, self.y_range]).T
+        local = frame.to_frame(points)
+        return ((local >= low) & (local <= high)).all(axis=1)
+
+    def times_seen(self, points: FloatArray) -> IntArray:
+        """Count the frames that have points, (M, 2) in metres, in their range. (M,)"""
+        return np.sum([self.sees(frame, points) for frame in self.frames], axis=0)
+
+    def footprint(self, frame: DriveFrame) -> shapely.Polygon:
+        """Return a frame's range in the global frame."""
+        (x0, x1), (y0, y1) = self.x_range, self.y_range
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+        return shapely.Polygon(frame.to_global(corners))
+
+
+def to_global(elements: MapElements, sample: MapSample) -> MapElements:
+    """Move a sample's map to the global frame by the position and yaw of its pose.
+
+    Ground truth is cut out of maps in just this way, so that the two are inverse to each other;
+    roll and pitch would move a point 30 m away by centimetres. Heights are dropped.
+
+    Args:
+        elements: The map in the annotation frame.
+        sample: The sample.
+    """
+    frame = DriveFrame(sample, elements)
+    turned = elements.rotations
+    return replace(
+        elements,
+        points=frame.to_global(elements.points[:, :2]),
+        rotations=None if turned is None else turned + frame.yaw_rad,
+    )
+
+
+def read_drive(annotations: AnnotationFile, scene: str, maps: Mapping[str, MapElements]) -> Drive:
+    """Gather the frames of a scene.
+
+    Args:
+        annotations: File with the scene's samples.
+        scene: Name of the scene.
+        maps: Map of each sample in its annotation frame, by token; samples that it lacks are left
+            out.
+
+    Raises:
+        ValueError: If the file has no such scene, or no sample of it has a map.
+    """
+    meta, scenes = annotations.meta, annotations.column("scene")
+    samples = [annotations[i] for i, name in enumerate(scenes) if name == scene]
+    if not samples:
+        raise ValueError(
+            f"{annotations.path} has no scene {scene!r}, but {sorted(set(scenes))[:5]} ..."
+        )
+    samples = sorted((s for s in samples if s.token in maps), key=lambda s: s.timestamp_ns)
+    if not samples:
+        raise ValueError(
+            f"no sample of scene {scene!r} has results: give the results of {annotations.path}."
+        )
+    frames = [DriveFrame(s, to_global(maps[s.token], s)) for s in samples]
+    return Drive(scene, meta.classes, meta.x_range, meta.y_range, frames)

@@ -1,0 +1,83 @@
+"""Where a map's global frame lies on the Earth."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from gsmap.datasets.annotations.record import AnnotationMeta
+from gsmap.structures.elements import FloatArray
+from gsmap.utils.extras import import_extra
+
+
+@dataclass(frozen=True)
+class MapOrigin:
+    """Where the global frame has its origin; its x axis points east and its y axis north.
+
+    Args:
+        latitude_deg: Latitude of the origin on the WGS 84 ellipsoid, in degrees.
+        longitude_deg: Longitude, in degrees.
+        utm_zone: UTM zone whose grid the axes follow; None: true east and north at the origin.
+
+    Raises:
+        ValueError: If the place is not on Earth.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    utm_zone: int | None = None
+
+    def __post_init__(self) -> None:
+        if not (abs(self.latitude_deg) < 90.0 and abs(self.longitude_deg) <= 180.0):
+            raise ValueError(
+                "an origin is a latitude within 90 and a longitude within 180 degrees, got "
+                f"{self.latitude_deg} {self.longitude_deg}."
+            )
+
+    @cached_property
+    def _projection(self) -> Any:
+        place = {"proj": "tmerc", "lat_0": self.latitude_deg, "lon_0": self.longitude_deg}
+        if self.utm_zone is not None:
+            place = {"proj": "utm", "zone": self.utm_zone}
+        return import_extra("pyproj", "maps").Proj(ellps="WGS84", **place)
+
+    def lon_lat(self, points: FloatArray) -> FloatArray:
+        """Return longitude and latitude in degrees.
+
+        Args:
+            points: Points of the global frame in metres. (n, >= 2)
+
+        Returns:
+            Degrees on the WGS 84 ellipsoid. (n, 2)
+        """
+        east, north = self._projection(self.longitude_deg, self.latitude_deg)
+        x, y = np.asarray(points)[:, :2].T
+        return np.stack(self._projection(x + east, y + north, inverse=True), axis=1)
+
+
+def known_origin(meta: AnnotationMeta, map_name: str) -> MapOrigin | None:
+    """Return the origin that a data set's devkit gives for one of its maps.
+
+    nuScenes' devkit takes the south-western corner of a map for both the reference coordinate that
+    it lists and the origin of the poses; Argoverse 2 shifts the UTM grid to the origin of a city.
+
+    Args:
+        meta: Metadata of an annotation file.
+        map_name: Name of the map or city.
+
+    Returns:
+        The origin, or None: other data sets, and maps that the devkit does not list.
+    """
+    if meta.dataset == "nuscenes":
+        from nuscenes.scripts.export_poses import REFERENCE_COORDINATES
+
+        if map_name in REFERENCE_COORDINATES:
+            return MapOrigin(*REFERENCE_COORDINATES[map_name])
+    if meta.dataset == "av2":
+        from av2.geometry.utm import CITY_ORIGIN_LATLONG_DICT, UTM_ZONE_MAP
+
+        for city, place in CITY_ORIGIN_LATLONG_DICT.items():
+            if map_name == city.value:
+                return MapOrigin(*place, utm_zone=UTM_ZONE_MAP[city])
+    return None

@@ -1,0 +1,72 @@
+"""What viewers show of a drive over time, with heights, independent of any viewer's format."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+
+from gsmap.maps.drive import Drive, DriveFrame
+from gsmap.structures.elements import FloatArray, IntArray, MapElements
+from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
+
+COVARIANCE_SIGMAS = 2.0  # ellipses reach so many standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One frame of a drive, as viewers show it.
+
+    Args:
+        frame: Sensors, pose and predictions.
+        lines: Its predictions in the annotation frame, on the ground. each (n, 3)
+        seen: The part of the drive's map that has been in range so far: label and vertices in the
+            global frame. each (int, (n, 3))
+    """
+
+    frame: DriveFrame
+    lines: list[FloatArray]
+    seen: list[tuple[int, FloatArray]]
+
+
+def replay(drive: Drive, elements: MapElements, frame_kind: str) -> Iterator[Moment]:
+    """Go through a drive and let its map grow.
+
+    Args:
+        drive: Frames with their predictions.
+        elements: The drive's map.
+        frame_kind: The annotation frame, a key of ``FRAME_VIEWS``; it says where the ground is.
+
+    Yields:
+        What there is to see at each frame.
+    """
+    view = FRAME_VIEWS[frame_kind]
+    views = [view.tilted(frame.sample.ego_from_frame) for frame in drive.frames]
+    places = cKDTree([f.sample.global_from_frame[:2, 3] for f in drive.frames])
+    lines = [shapely.linestrings(line) for line in elements.polylines]
+    explored = shapely.Polygon()
+    for frame, ground in zip(drive.frames, views, strict=True):
+        explored |= drive.footprint(frame)
+        seen = []
+        for label, line in zip(elements.labels.tolist(), lines, strict=True):
+            for part in shapely.get_parts(shapely.intersection(line, explored)):
+                if part.length:
+                    points = shapely.get_coordinates(part)
+                    nearest = places.query(points)[1]
+                    seen.append((label, _raised(drive, views, points, nearest)))
+        local = [ground.lifted(frame.to_frame(p)) for p in frame.elements.polylines]
+        yield Moment(frame, local, seen)
+
+
+def _raised(
+    drive: Drive, views: list[FrameView], points: FloatArray, nearest: IntArray
+) -> FloatArray:
+    """Put points of the global frame on the ground of the frames that are nearest. (n, 3)"""
+    raised = np.empty((len(points), 3))
+    for number in np.unique(nearest):
+        frame, rows = drive.frames[number], nearest == number
+        local = views[number].lifted(frame.to_frame(points[rows]))
+        pose = frame.sample.global_from_frame
+        raised[rows] = np.column_stack([points[rows], local @ pose[2, :3] + pose[2, 3]])
+    return raised

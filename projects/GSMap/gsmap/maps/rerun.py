@@ -1,0 +1,123 @@
+"""A drive and its map as a recording for the rerun viewer."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.datasets.annotations.record import CameraRecord
+from gsmap.maps.drive import Drive
+from gsmap.maps.replay import COVARIANCE_SIGMAS, Moment, replay
+from gsmap.structures.elements import MapElements
+from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.extras import import_extra
+from gsmap.utils.files import atomic_write
+
+TIMELINE = "time"
+_VEHICLE, _MAP = "world/vehicle", "world/map"
+
+
+def write_rerun(
+    path: str | Path,
+    drive: Drive,
+    elements: MapElements,
+    frame_kind: str,
+    colours: Sequence[str],
+    data_root: Path | None = None,
+) -> None:
+    """Write cameras, predictions, their Gaussians as ellipses, and the growing map.
+
+    Predictions and map stand in space, so that the viewer lays them over the cameras as well.
+
+    Args:
+        path: File to write (``.rrd``).
+        drive: Frames with their predictions.
+        elements: The drive's map.
+        frame_kind: The annotation frame, ``lidar`` or ``ego``.
+        colours: Colour of each class, ``#RRGGBB``.
+        data_root: Folder that the paths of images start from; None leaves the images out.
+
+    Raises:
+        FileNotFoundError: If an image is missing.
+        RuntimeError: If ``rerun-sdk`` is missing.
+    """
+    rr = import_extra("rerun", "viz")
+    recording = rr.RecordingStream("gsmap", recording_id=drive.scene, send_properties=False)
+    stream = recording.binary_stream()
+    cameras = drive.frames[0].sample.cameras
+    recording.send_blueprint(_layout(cameras))
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    with atomic_write(path, "wb") as file:
+        for moment in replay(drive, elements, frame_kind):
+            sample, pose = moment.frame.sample, moment.frame.sample.global_from_frame
+            recording.set_time(TIMELINE, timestamp=np.datetime64(sample.timestamp_ns, "ns"))
+            recording.log(_VEHICLE, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+            for camera in sample.cameras:
+                _log_camera(recording, rr, camera, data_root)
+            _log_predictions(recording, rr, moment, colours)
+            lines, rgb = (
+                [line for _, line in moment.seen],
+                _rgb([k for k, _ in moment.seen], colours),
+            )
+            recording.log(_MAP, rr.LineStrips3D(lines, colors=rgb, radii=0.1))
+            file.write(stream.read(flush=True))
+    recording.disconnect()
+
+
+def _layout(cameras: Sequence[CameraRecord]) -> Any:
+    """Lay out the cameras over the map."""
+    rrb = import_extra("rerun.blueprint", "viz")
+    views = [
+        rrb.Spatial2DView(
+            origin=f"{_VEHICLE}/{camera.name}",
+            name=camera.name,
+            contents=["$origin/**", f"{_VEHICLE}/predictions/lines"],
+        )
+        for camera in cameras
+    ]
+    map_view = rrb.Spatial3DView(origin="world", name="map")
+    return rrb.Blueprint(rrb.Vertical(rrb.Grid(*views), map_view) if views else map_view)
+
+
+def _log_camera(recording: Any, rr: Any, camera: CameraRecord, data_root: Path | None) -> None:
+    """Log where a camera is and what it saw."""
+    entity = f"{_VEHICLE}/{camera.name}"
+    frame_from_cam = invert_rigid(camera.cam_from_frame)
+    recording.log(
+        entity,
+        rr.Transform3D(translation=frame_from_cam[:3, 3], mat3x3=frame_from_cam[:3, :3]),
+        rr.Pinhole(image_from_camera=camera.intrinsics, width=camera.width, height=camera.height),
+    )
+    if data_root is not None:
+        recording.log(entity, rr.EncodedImage(contents=(data_root / camera.path).read_bytes()))
+
+
+def _log_predictions(recording: Any, rr: Any, moment: Moment, colours: Sequence[str]) -> None:
+    """Log one frame's predictions and their Gaussians in the annotation frame."""
+    elements = moment.frame.elements
+    entity = f"{_VEHICLE}/predictions"
+    rgb = _rgb(elements.labels.tolist(), colours)
+    recording.log(f"{entity}/lines", rr.LineStrips3D(moment.lines, colors=rgb, radii=0.05))
+    if not elements.has_gaussians:
+        return
+    half_sizes = np.full((len(elements.points), 3), 0.01)
+    half_sizes[:, :2] = COVARIANCE_SIGMAS * elements.scales
+    half_turns = (elements.rotations - moment.frame.yaw_rad) / 2.0
+    quaternions = np.zeros((len(half_turns), 4))
+    quaternions[:, 2], quaternions[:, 3] = np.sin(half_turns), np.cos(half_turns)
+    recording.log(
+        f"{entity}/gaussians",
+        rr.Ellipsoids3D(
+            centers=np.concatenate([np.zeros((0, 3)), *moment.lines]),
+            half_sizes=half_sizes,
+            quaternions=quaternions,
+            colors=np.repeat(rgb, elements.num_points, axis=0),
+        ),
+    )
+
+
+def _rgb(labels: Sequence[int], colours: Sequence[str]) -> np.ndarray:
+    """Return the colours of classes. (N, 3) uint8"""
+    table = [[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours]
+    return np.array([table[label] for label in labels], np.uint8).reshape(-1, 3)

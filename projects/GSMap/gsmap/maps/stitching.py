@@ -1,0 +1,99 @@
+"""Polylines whose ends meet become one; one that meets itself becomes a ring."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsmap.structures.elements import FloatArray
+from gsmap.structures.polylines import arc_lengths, points_at
+
+JOIN_M = 2.0
+_HEADING_M = 2.0  # an end's direction is that of its last metres
+_DISTANCE_STEP_M = 0.25  # of gaps about as wide, the straightest is closed first
+_RING_M = 10.0  # a shorter line is not closed
+
+
+@dataclass(frozen=True)
+class _Ends:
+    """Both ends of all lines, start and end by turns: positions and outward directions."""
+
+    points: FloatArray
+    headings: FloatArray
+
+    @classmethod
+    def of(cls, lines: Sequence[FloatArray]) -> "_Ends":
+        points, headings = [], []
+        for line in lines:
+            for part in (line[:, :2], line[::-1, :2]):
+                inner = points_at(part, np.array([min(_HEADING_M, arc_lengths(part)[-1])]))[0]
+                points.append(part[0])
+                headings.append((part[0] - inner) / max(np.linalg.norm(part[0] - inner), 1e-9))
+        return cls(np.array(points).reshape(-1, 2), np.array(headings).reshape(-1, 2))
+
+
+def stitch(lines: Sequence[FloatArray], join_m: float = JOIN_M) -> list[FloatArray]:
+    """Join lines at their ends, the narrowest and straightest gaps first.
+
+    Two ends are joined if they are near, the line turns by less than a right angle there, and
+    neither is joined to another.
+
+    Args:
+        lines: Open lines or rings; columns after (x, y) are carried along. each (n, D)
+        join_m: Widest gap in metres.
+
+    Returns:
+        The joined lines; a ring's last vertex equals its first. each (m, D)
+    """
+    ends = _Ends.of(lines)
+    closed = [bool(np.array_equal(line[0, :2], line[-1, :2])) for line in lines]
+    partner: dict[int, int] = {}
+    for a, b in _candidates(ends, join_m):
+        own_ends = a // 2 == b // 2
+        short = own_ends and arc_lengths(lines[a // 2])[-1] < _RING_M
+        if not (a in partner or b in partner or closed[a // 2] or closed[b // 2] or short):
+            partner[a], partner[b] = b, a
+    joined, used = [], [False] * len(lines)
+    for first in range(len(lines)):
+        if not used[first]:
+            joined.append(_chain(lines, partner, first, used))
+    return joined
+
+
+def _candidates(ends: _Ends, join_m: float) -> list[tuple[int, int]]:
+    """Return pairs of ends that may be joined, the best first."""
+    if not len(ends.points):
+        return []
+    pairs = cKDTree(ends.points).query_pairs(join_m, output_type="ndarray")
+    cosine = (ends.headings[pairs[:, 0]] * ends.headings[pairs[:, 1]]).sum(axis=1)
+    gap = np.linalg.norm(ends.points[pairs[:, 0]] - ends.points[pairs[:, 1]], axis=1)
+    steps = np.round(gap / _DISTANCE_STEP_M)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0], cosine.round(6), steps))
+    return [(int(a), int(b)) for a, b in pairs[order[cosine[order] < 0.0]]]
+
+
+def _chain(
+    lines: Sequence[FloatArray], partner: dict[int, int], first: int, used: list[bool]
+) -> FloatArray:
+    """Walk from line to line over joined ends, from an open end or around a ring. (m, D)"""
+    entry = 2 * first
+    seen = {first}
+    while entry in partner and partner[entry] // 2 not in seen:  # back to where the chain starts
+        entry = partner[entry] ^ 1
+        seen.add(entry // 2)
+    start, parts = entry, []
+    while True:
+        used[entry // 2] = True
+        line = lines[entry // 2]
+        parts.append(line if entry % 2 == 0 else line[::-1])
+        following = partner.get(entry ^ 1)
+        if following is None:
+            break
+        if following == start:
+            parts.append(parts[0][:1])
+            break
+        entry = following
+    points = np.concatenate(parts)
+    moved = np.append(True, (points[1:, :2] != points[:-1, :2]).any(axis=1))
+    return points[moved]

@@ -1,0 +1,132 @@
+#!/usr/bin/env python
+"""Merge the predictions of each drive into one map, score it, and write it for other tools.
+
+Examples:
+    python tools/build_map.py results.json --ann data/minicity/gsmap_minicity_val.arrow --out maps
+    python tools/build_map.py results.json --ann annotations.arrow --out maps \
+        --formats geojson osm rrd mcap --origin 48.26 11.67
+"""
+
+import argparse
+import json
+from functools import partial
+from pathlib import Path
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.elements import elements_of_instances
+from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
+from gsmap.maps.config import MergeConfig
+from gsmap.maps.drive import Drive, read_drive
+from gsmap.maps.geodetic import MapOrigin, known_origin
+from gsmap.maps.geojson import write_geojson
+from gsmap.maps.lanelet2 import write_lanelet2
+from gsmap.maps.mcap import write_mcap
+from gsmap.maps.merging import confident, merge, suppress
+from gsmap.maps.rerun import write_rerun
+from gsmap.maps.scoring import figures_table, map_figures
+from gsmap.maps.truth import true_map
+from gsmap.structures.elements import MapElements
+from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.files import write_text
+from gsmap.visualization.style import MapStyle
+
+FORMATS = ("geojson", "osm", "rrd", "mcap")
+
+
+def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
+    parser = CommandParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("results", type=Path, help="results in MapTR's JSON form")
+    parser.add_argument(
+        "--ann", type=Path, required=True, help="annotation file (*.arrow) of the same samples"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder for the maps")
+    parser.add_argument("--formats", nargs="+", default=["geojson"], choices=FORMATS)
+    parser.add_argument("--scene", nargs="+", help="drives to merge; all by default")
+    parser.add_argument("--score-thr", type=float, default=0.3, help="smallest score that counts")
+    parser.add_argument(
+        "--min-confidence",
+        type=float,
+        default=MergeConfig.min_confidence,
+        help="smallest share of frames, weighted by score, that must have found what they see",
+    )
+    parser.add_argument(
+        "--no-gaussians", action="store_true", help="weigh by distance even if there are Gaussians"
+    )
+    parser.add_argument(
+        "--origin",
+        nargs=2,
+        type=float,
+        metavar=("LAT", "LON"),
+        help="latitude and longitude of the global frame's origin (x east, y north), in degrees; "
+        "nuScenes' and Argoverse 2's are known",
+    )
+    parser.add_argument(
+        "--data-root", type=Path, help="folder of the images for rrd and mcap: that of --ann"
+    )
+    return parser.parse_args(argv)
+
+
+def write_map(
+    stem: Path, args: argparse.Namespace, ann: AnnotationFile, drive: Drive, elements: MapElements
+) -> list[str]:
+    """Write a map in all formats; return the files."""
+    classes, name = drive.classes, drive.frames[0].sample.map_name
+    origin = MapOrigin(*args.origin) if args.origin else known_origin(ann.meta, name)
+    if "osm" in args.formats and origin is None:
+        raise ValueError(
+            f"Lanelet2 needs longitude and latitude, and the origin of map {name!r} is not known: "
+            "give --origin LAT LON (any place will do; nodes keep local_x and local_y)."
+        )
+    style, root = MapStyle(classes), args.data_root or args.ann.parent
+    colours = [style.colour(label) for label in range(len(classes))]
+    replayed = {"frame_kind": ann.meta.frame, "colours": colours, "data_root": root}
+    writers = {
+        "geojson": partial(write_geojson, classes=classes, origin=None),
+        "osm": partial(write_lanelet2, classes=classes, origin=origin),
+        "rrd": lambda path, found: write_rerun(path, drive, found, **replayed),
+        "mcap": lambda path, found: write_mcap(path, drive, found, **replayed),
+    }
+    paths = []
+    for key in args.formats:
+        paths.append(f"{stem}.{key}")
+        writers[key](paths[-1], elements)
+    if "geojson" in args.formats and origin is not None:
+        paths.append(f"{stem}_lonlat.geojson")
+        write_geojson(paths[-1], elements, classes, origin)
+    return paths
+
+
+def has_truth(ann: AnnotationFile) -> bool:
+    return bool((ann.instance_counts() >= 0).all())
+
+
+def score(drives: list[Drive], merged: list[MapElements], ann: AnnotationFile, out: Path) -> None:
+    """Compare the merged maps and the plain baseline with the true maps."""
+    instances = {s.token: elements_of_instances(s.instances or []) for s in ann}
+    truths = [true_map(read_drive(ann, drive.scene, instances)) for drive in drives]
+    maps = {"merged": merged, "suppressed": [suppress(drive) for drive in drives]}
+    figures = {way: map_figures(found, truths, drives) for way, found in maps.items()}
+    write_text(out / "scores.json", json.dumps(figures, indent=1) + "\n")
+    print(f"\n{figures_table(figures)}\n\nfigures: {out / 'scores.json'}")
+
+
+def main(argv: list[str] | None = None) -> str:
+    args = parse_args(argv)
+    ann = AnnotationFile(args.ann)
+    results, _ = read_samples(args.results, RESULTS_KEY, ann.meta.classes)
+    config = MergeConfig(gaussians=not args.no_gaussians, min_confidence=args.min_confidence)
+    drives, merged = [], []
+    for scene in args.scene or sorted(set(ann.column("scene"))):
+        drives.append(confident(read_drive(ann, scene, results), args.score_thr))
+        merged.append(merge(drives[-1], config))
+        for path in write_map(args.out / scene, args, ann, drives[-1], merged[-1]):
+            print(f"{len(merged[-1])} elements of {len(drives[-1].frames)} frames: {path}")
+    if has_truth(ann):
+        score(drives, merged, ann, args.out)
+    return f"{len(drives)} drives"
+
+
+if __name__ == "__main__":
+    run_command(main)
