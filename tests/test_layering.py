@@ -26,6 +26,7 @@ ALLOWED = {
     "evaluation": {"datasets", "ops", "structures", "utils"},
     "visualization": {"datasets", "ops", "structures", "utils"},
     "report": {"datasets", "evaluation", "structures", "utils", "visualization"},
+    "maps": {"datasets", "evaluation", "structures", "utils", "visualization"},
     "engine": {"checkpoints", "utils"},
     "apis": {
         "checkpoints",

@@ -7,7 +7,8 @@ import numpy as np
 from gsmap.maps.drive import DriveFrame
 from gsmap.structures.elements import FloatArray
 
-NEAR_SIGMA_M, SIGMA_PER_M = 0.2, 0.02  # where results carry no Gaussians
+NEAR_SIGMA_M = 0.2  # where results carry no Gaussians
+SIGMA_PER_M = 0.02  # of the distance from the vehicle
 
 
 @dataclass(frozen=True)
@@ -15,8 +16,7 @@ class MergeConfig:
     """Rules of merging.
 
     Args:
-        gaussians: Weigh by the vertices' Gaussians where the results carry them; otherwise by the
-            distance from the vehicle.
+        gaussians: Weigh by the vertices' Gaussians where the results carry them.
         reach_m: How far across its line a vertex looks for the same line in another frame.
         max_turn_deg: Largest angle between two lines that may be the same.
         step_m: Largest distance between vertices while lines are merged.
@@ -43,15 +43,17 @@ class MergeConfig:
             frame: A frame with its predictions.
 
         Returns:
-            Of the vertices' Gaussians, or of a deviation that grows with the distance from the
-            vehicle. (M,)
+            That of the vertices' Gaussians, or of a fixed deviation, plus a part that grows with
+            the distance from the vehicle. (M,)
         """
         elements = frame.elements
+        distances = np.linalg.norm(frame.to_frame(elements.points), axis=1)
+        far = (SIGMA_PER_M * distances) ** 2
         if not (self.gaussians and elements.has_gaussians):
-            distance = np.linalg.norm(frame.to_frame(elements.points), axis=1)
-            return (NEAR_SIGMA_M + SIGMA_PER_M * distance) ** 2
+            return NEAR_SIGMA_M**2 + far
         directions = np.concatenate(
             [np.zeros((0, 2)), *(np.gradient(line, axis=0) for line in elements.polylines)]
         )
         angles = np.arctan2(directions[:, 1], directions[:, 0]) - elements.rotations
-        return (elements.scales**2 * np.stack([np.sin(angles), np.cos(angles)], 1) ** 2).sum(axis=1)
+        axes = np.stack([np.sin(angles), np.cos(angles)], axis=1)  # of the line's normal
+        return ((elements.scales * axes) ** 2).sum(axis=1) + far

@@ -79,5 +79,5 @@ def known_origin(meta: AnnotationMeta, map_name: str) -> MapOrigin | None:
 
         for city, place in CITY_ORIGIN_LATLONG_DICT.items():
             if map_name == city.value:
-                return MapOrigin(*place, utm_zone=UTM_ZONE_MAP[city])
+                return MapOrigin(place[0], place[1], UTM_ZONE_MAP[city])
     return None

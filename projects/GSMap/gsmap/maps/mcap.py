@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.maps.drive import Drive
-from gsmap.maps.replay import COVARIANCE_SIGMAS, Moment, replay
+from gsmap.maps.replay import Moment, replay
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
@@ -145,25 +145,19 @@ class _Log:
         m, elements = self._messages, moment.frame.elements
         labels = elements.labels.tolist()
         self.lines("/predictions", _FRAME, list(zip(labels, moment.lines, strict=True)), time_ns)
-        if elements.has_gaussians:
+        if moment.ellipses is not None:
             owners = np.repeat(elements.labels, elements.num_points).tolist()
-            half_turns = (elements.rotations - moment.frame.yaw_rad) / 2.0
+            columns = (values.tolist() for values in moment.ellipses)
             ellipses = [
                 m.SpherePrimitive(
                     pose=m.Pose(
                         position=m.Vector3(x=x, y=y, z=z),
-                        orientation=m.Quaternion(z=np.sin(half), w=np.cos(half)),
+                        orientation=m.Quaternion(z=turn[2], w=turn[3]),
                     ),
                     size=m.Vector3(x=2 * a, y=2 * b, z=0.02),
                     color=self._colours[label],
                 )
-                for (x, y, z), (a, b), half, label in zip(
-                    np.concatenate([np.zeros((0, 3)), *moment.lines]).tolist(),
-                    (COVARIANCE_SIGMAS * elements.scales).tolist(),
-                    half_turns.tolist(),
-                    owners,
-                    strict=True,
-                )
+                for (x, y, z), (a, b), turn, label in zip(*columns, owners, strict=True)
             ]
             self._entity("/gaussians", _FRAME, time_ns, spheres=ellipses)
 

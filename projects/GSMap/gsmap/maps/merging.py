@@ -1,6 +1,7 @@
 """One map out of the predictions of a drive's frames: merged, or merely thinned out."""
 
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 import shapely
@@ -79,4 +80,4 @@ def suppress(
         near = [j for j in tree.query(lines[i]) if kept[j] and rows[j][1] == label]
         along = shapely.length(shapely.intersection(lines[i], strips[near]))
         kept[i] = lines[i].length > 0.0 and not (along > share * lines[i].length).any()
-    return drive_map((label, line, score) for (score, label, line), k in zip(rows, kept) if k)
+    return drive_map((label, line, score) for score, label, line in compress(rows, kept))

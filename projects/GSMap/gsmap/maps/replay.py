@@ -11,7 +11,7 @@ from gsmap.maps.drive import Drive, DriveFrame
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
 
-COVARIANCE_SIGMAS = 2.0  # ellipses reach so many standard deviations
+SHOWN_SIGMAS = 2.0  # ellipses reach so many standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +28,21 @@ class Moment:
     frame: DriveFrame
     lines: list[FloatArray]
     seen: list[tuple[int, FloatArray]]
+
+    @property
+    def ellipses(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Gaussians of the vertices: centres, half axes in metres, quaternions (x, y, z, w).
+
+        (M, 3), (M, 2) and (M, 4); None if the results carry no Gaussians.
+        """
+        elements = self.frame.elements
+        if elements.scales is None or elements.rotations is None:
+            return None
+        half_turns = (elements.rotations - self.frame.yaw_rad) / 2.0
+        quaternions = np.zeros((len(half_turns), 4))
+        quaternions[:, 2], quaternions[:, 3] = np.sin(half_turns), np.cos(half_turns)
+        centres = np.concatenate([np.zeros((0, 3)), *self.lines])
+        return centres, SHOWN_SIGMAS * elements.scales, quaternions
 
 
 def replay(drive: Drive, elements: MapElements, frame_kind: str) -> Iterator[Moment]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.maps.drive import Drive
-from gsmap.maps.replay import COVARIANCE_SIGMAS, Moment, replay
+from gsmap.maps.replay import Moment, replay
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
@@ -99,22 +99,17 @@ def _log_predictions(recording: Any, rr: Any, moment: Moment, colours: Sequence[
     entity = f"{_VEHICLE}/predictions"
     rgb = _rgb(elements.labels.tolist(), colours)
     recording.log(f"{entity}/lines", rr.LineStrips3D(moment.lines, colors=rgb, radii=0.05))
-    if not elements.has_gaussians:
-        return
-    half_sizes = np.full((len(elements.points), 3), 0.01)
-    half_sizes[:, :2] = COVARIANCE_SIGMAS * elements.scales
-    half_turns = (elements.rotations - moment.frame.yaw_rad) / 2.0
-    quaternions = np.zeros((len(half_turns), 4))
-    quaternions[:, 2], quaternions[:, 3] = np.sin(half_turns), np.cos(half_turns)
-    recording.log(
-        f"{entity}/gaussians",
-        rr.Ellipsoids3D(
-            centers=np.concatenate([np.zeros((0, 3)), *moment.lines]),
-            half_sizes=half_sizes,
-            quaternions=quaternions,
-            colors=np.repeat(rgb, elements.num_points, axis=0),
-        ),
-    )
+    if moment.ellipses is not None:
+        centres, half_axes, quaternions = moment.ellipses
+        recording.log(
+            f"{entity}/gaussians",
+            rr.Ellipsoids3D(
+                centers=centres,
+                half_sizes=np.column_stack([half_axes, np.full(len(centres), 0.01)]),
+                quaternions=quaternions,
+                colors=np.repeat(rgb, elements.num_points, axis=0),
+            ),
+        )
 
 
 def _rgb(labels: Sequence[int], colours: Sequence[str]) -> np.ndarray:

@@ -72,7 +72,7 @@ def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapE
     """
     (x0, x1), (y0, y1) = drive.x_range, drive.y_range
     box = shapely.box(x0, y0, x1, y1)
-    scores = None if elements.scores is None else []
+    scores: list[float] = []
     lines, labels = [], []
     for line, label, score in zip(
         elements.polylines, elements.labels.tolist(), elements.confidence.tolist(), strict=True
@@ -86,8 +86,7 @@ def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapE
             pieces = clip_to_box(local, drive.x_range, drive.y_range)
         lines += pieces
         labels += [label] * len(pieces)
-        if scores is not None:
-            scores += [score] * len(pieces)
+        scores += [score] * len(pieces)
     return MapElements.from_polylines(lines, labels, scores)
 
 
@@ -107,10 +106,11 @@ def map_figures(
         length of all drives.
     """
     classes = drives[0].classes
-    whole = [(drive.scene, *pair) for drive, *pair in zip(drives, maps, truths, strict=True)]
+    triples = list(zip(drives, maps, truths, strict=True))
+    whole = [(drive.scene, found, true) for drive, found, true in triples]
     cut = [
         (f.sample.token, cut_to_frame(found, drive, f), cut_to_frame(true, drive, f))
-        for drive, found, true in zip(drives, maps, truths, strict=True)
+        for drive, found, true in triples
         for f in drive.frames
     ]
     figures = {
