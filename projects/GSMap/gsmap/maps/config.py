@@ -31,7 +31,7 @@ class MergeConfig:
     reach_m: float = 1.5
     max_turn_deg: float = 30.0
     step_m: float = 1.0
-    rounds: int = 2
+    rounds: int = 3
     min_confidence: float = 0.25
     min_length_m: float = 2.0
     min_overlap: float = 0.3

@@ -24,8 +24,7 @@ def write_lanelet2(
 ) -> None:
     """Write a map that the ``lanelet2`` package loads.
 
-    A ring's way ends at the node that it starts at; rings of areas are marked as such. Each node
-    also carries ``local_x`` and ``local_y``, the metres of the global frame.
+    Areas become polygons, other rings end at the node that they start at. Each node also carries ``local_x`` and ``local_y``, the metres of the global frame.
 
     Args:
         path: File to write.
@@ -53,8 +52,10 @@ def write_lanelet2(
         name = classes[label]
         tags = {"type": TYPES.get(name, name), "class": name}
         if ring and name in AREA_CLASSES:
-            tags["area"] = "yes"
-        ways.append((nodes + nodes[:1] if ring else nodes, tags))
+            tags["area"] = "yes"  # Lanelet2's polygons do not repeat their first node
+        elif ring:
+            nodes.append(nodes[0])
+        ways.append((nodes, tags))
     for nodes, tags in ways:
         identity += 1
         way = ElementTree.SubElement(root, "way", id=str(identity), version="1")

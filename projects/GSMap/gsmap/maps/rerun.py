@@ -1,6 +1,7 @@
 """A drive and its map as a recording for the rerun viewer."""
 
 from collections.abc import Sequence
+from mimetypes import guess_type
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def write_rerun(
         RuntimeError: If ``rerun-sdk`` is missing.
     """
     rr = import_extra("rerun", "viz")
-    recording = rr.RecordingStream("gsmap", recording_id=drive.scene, send_properties=False)
+    recording = rr.RecordingStream("gsmap", recording_id=drive.scene)
     stream = recording.binary_stream()
     cameras = drive.frames[0].sample.cameras
     recording.send_blueprint(_layout(cameras))
@@ -90,7 +91,9 @@ def _log_camera(recording: Any, rr: Any, camera: CameraRecord, data_root: Path |
         rr.Pinhole(image_from_camera=camera.intrinsics, width=camera.width, height=camera.height),
     )
     if data_root is not None:
-        recording.log(entity, rr.EncodedImage(contents=(data_root / camera.path).read_bytes()))
+        file = data_root / camera.path
+        kind, _ = guess_type(file.name)
+        recording.log(entity, rr.EncodedImage(contents=file.read_bytes(), media_type=kind))
 
 
 def _log_predictions(recording: Any, rr: Any, moment: Moment, colours: Sequence[str]) -> None:

@@ -80,8 +80,7 @@ def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapE
         local = frame.to_frame(line)
         if drive.classes[label] in AREA_CLASSES and len(local) > 3:
             areas = shapely.get_parts(shapely.make_valid(shapely.Polygon(local)) & box)
-            polygons = areas[shapely.get_type_id(areas) == shapely.GeometryType.POLYGON]
-            pieces = [shapely.get_coordinates(area.exterior) for area in polygons]
+            pieces = [shapely.get_coordinates(a.exterior) for a in areas if a.area > 0.0]
         else:
             pieces = clip_to_box(local, drive.x_range, drive.y_range)
         lines += pieces
