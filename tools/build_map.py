@@ -115,7 +115,7 @@ def score(drives: list[Drive], merged: list[MapElements], ann: AnnotationFile, o
 def main(argv: list[str] | None = None) -> str:
     args = parse_args(argv)
     ann = AnnotationFile(args.ann)
-    results, _ = read_samples(args.results, RESULTS_KEY, ann.meta.classes)
+    results, _ = read_samples(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
     config = MergeConfig(gaussians=not args.no_gaussians, min_confidence=args.min_confidence)
     drives, merged = [], []
     for scene in args.scene or sorted(set(ann.column("scene"))):

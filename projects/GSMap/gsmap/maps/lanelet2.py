@@ -24,7 +24,8 @@ def write_lanelet2(
 ) -> None:
     """Write a map that the ``lanelet2`` package loads.
 
-    Areas become polygons, other rings end at the node that they start at. Each node also carries ``local_x`` and ``local_y``, the metres of the global frame.
+    Areas become polygons, other rings end at the node that they start at. Each node also carries
+    ``local_x`` and ``local_y``, the metres of the global frame.
 
     Args:
         path: File to write.

@@ -6,7 +6,8 @@ import numpy as np
 import shapely
 
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.evaluator import EvaluationConfig, MapEvaluator, flat_metrics
+from gsmap.evaluation.evaluator import MapEvaluator
+from gsmap.evaluation.report import flat_metrics
 from gsmap.maps.drive import Drive, DriveFrame
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
@@ -25,12 +26,9 @@ def chamfer_ap(
         classes: Names of the classes.
         num_points: Points that each line is resampled to.
     """
-    evaluator = MapEvaluator(
-        EvaluationConfig(ChamferConfig(tuple(classes), num_points=num_points), None)
-    )
-    for pair in pairs:
-        evaluator.update(*pair)
-    figures = flat_metrics(evaluator.compute())
+    config = ChamferConfig(tuple(classes), num_points=num_points)
+    evaluator = MapEvaluator(config, None)
+    figures = flat_metrics(evaluator.reports([evaluator.match(*pair) for pair in pairs]))
     there = [name for name in classes if figures[f"chamfer/{name}/num_gts"]]
     found = {name: figures[f"chamfer/{name}/AP"] for name in there}
     return found | {"mean": float(np.mean(list(found.values()))) if there else np.nan}
