@@ -52,6 +52,12 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="smallest share of frames, weighted by score, that must have found what they see",
     )
     parser.add_argument(
+        "--min-area-confidence",
+        type=float,
+        default=MergeConfig.min_area_confidence,
+        help="the same for areas, such as crossings",
+    )
+    parser.add_argument(
         "--no-gaussians", action="store_true", help="weigh by distance even if there are Gaussians"
     )
     parser.add_argument(
@@ -116,7 +122,11 @@ def main(argv: list[str] | None = None) -> str:
     args = parse_args(argv)
     ann = AnnotationFile(args.ann)
     results, _ = read_samples(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
-    config = MergeConfig(gaussians=not args.no_gaussians, min_confidence=args.min_confidence)
+    config = MergeConfig(
+        gaussians=not args.no_gaussians,
+        min_confidence=args.min_confidence,
+        min_area_confidence=args.min_area_confidence,
+    )
     drives, merged = [], []
     for scene in args.scene or sorted(set(ann.column("scene"))):
         drives.append(confident(read_drive(ann, scene, results), args.score_thr))

@@ -50,7 +50,7 @@ def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
             np.array([scores[i] for i in group]),
             np.array([weights[i] for i in group]),
         )
-    return [(ring, score) for ring, score in merged if score >= config.min_confidence]
+    return [(ring, score) for ring, score in merged if score >= config.min_area_confidence]
 
 
 def _groups(

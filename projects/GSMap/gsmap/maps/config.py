@@ -21,7 +21,8 @@ class MergeConfig:
         max_turn_deg: Largest angle between two lines that may be the same.
         step_m: Largest distance between vertices while lines are merged.
         rounds: How many times vertices move to the mean.
-        min_confidence: Vertices with less are left out (``merge_lines`` defines it).
+        min_confidence: Vertices of lines with less are left out (``merge_lines`` defines it).
+        min_area_confidence: Areas with less are left out; models find them from nearby only.
         min_length_m: Shorter lines are left out.
         min_overlap: Rings of different frames are of one area if they share this part of the
             smaller one.
@@ -33,6 +34,7 @@ class MergeConfig:
     step_m: float = 1.0
     rounds: int = 3
     min_confidence: float = 0.25
+    min_area_confidence: float = 0.1
     min_length_m: float = 2.0
     min_overlap: float = 0.3
 

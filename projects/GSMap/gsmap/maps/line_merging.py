@@ -15,7 +15,7 @@ from gsmap.maps.config import MergeConfig
 from gsmap.maps.drive import Drive
 from gsmap.maps.stitching import JOIN_M, stitch
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
-from gsmap.structures.polylines import arc_lengths, points_at
+from gsmap.structures.polylines import arc_lengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,8 @@ def _strands(drive: Drive, label: int, config: MergeConfig) -> _Strands:
             along = arc_lengths(line)
             if along[-1] == 0.0:
                 continue
-            dense = points_at(line, np.union1d(along, np.arange(0.0, along[-1], config.step_m)))
+            stops = np.union1d(along, np.arange(0.0, along[-1], config.step_m))
+            dense = np.stack([np.interp(stops, along, column) for column in line.T], axis=1)
             score = np.full(len(dense), elements.confidence[i])
             rows.append(np.column_stack([dense, np.full(len(dense), number), score]))
             counts.append(len(dense))

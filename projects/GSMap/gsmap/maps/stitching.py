@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from scipy.spatial import cKDTree
 
 from gsmap.structures.elements import FloatArray
-from gsmap.structures.polylines import arc_lengths, points_at
+from gsmap.structures.polylines import arc_lengths
 
 JOIN_M = 2.0
 _HEADING_M = 2.0  # an end's direction is that of its last metres
@@ -27,7 +28,8 @@ class _Ends:
         points, headings = [], []
         for line in lines:
             for part in (line[:, :2], line[::-1, :2]):
-                inner = points_at(part, np.array([min(_HEADING_M, arc_lengths(part)[-1])]))[0]
+                within = shapely.line_interpolate_point(shapely.LineString(part), _HEADING_M)
+                inner = shapely.get_coordinates(within)[0]
                 points.append(part[0])
                 headings.append((part[0] - inner) / max(np.linalg.norm(part[0] - inner), 1e-9))
         return cls(np.array(points).reshape(-1, 2), np.array(headings).reshape(-1, 2))
