@@ -1,0 +1,59 @@
+"""The command on a drive whose ground truth is fed as predictions."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from drive_cases import CLASSES, drive_of
+
+from gsmap.datasets.annotations.file import AnnotationMeta, MapInstance, write_annotations
+from gsmap.datasets.elements import elements_of_instances
+from gsmap.evaluation.results_json import vectors_of, write_results
+from tools.build_map import main
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Results and annotation file of the same samples."""
+    folder, samples, results = tmp_path_factory.mktemp("drive"), [], []
+    for frame in drive_of().frames:
+        rows = zip(frame.elements.polylines, frame.elements.labels, strict=True)
+        instances = [MapInstance(int(k), frame.to_frame(line)) for line, k in rows]
+        samples.append(replace(frame.sample, instances=instances))
+        vectors = vectors_of(elements_of_instances(instances), CLASSES)
+        results.append((frame.sample.token, vectors))
+    ann = folder / "annotations.arrow"
+    write_annotations(ann, AnnotationMeta("own", "lidar", "val"), samples)
+    write_results(folder / "results.json", results)
+    return folder / "results.json", ann
+
+
+def test_ground_truth_as_predictions_scores_1(files, tmp_path, capsys):
+    results, ann = files
+    assert main([str(results), "--ann", str(ann), "--out", str(tmp_path)]) == "1 drives"
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert scores["merged"]["AP"]["mean"] == pytest.approx(1.0)
+    assert scores["merged"]["completeness@0.5"]["mean"] > 0.99
+    assert scores["merged"]["accuracy@0.5"]["mean"] > 0.99
+    assert len(json.loads((tmp_path / "scene.geojson").read_text())["features"]) == 6
+    assert "| AP | suppressed |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--scene", "elsewhere"], "has no scene 'elsewhere'"),
+        (["--formats", "osm"], "give --origin LAT LON"),
+        (["--formats", "osm", "--origin", "100", "0"], "latitude within 90"),
+    ],
+)
+def test_what_a_user_can_get_wrong_is_said(files, tmp_path, options, message):
+    results, ann = files
+    with pytest.raises(ValueError, match=message):
+        main([str(results), "--ann", str(ann), "--out", str(tmp_path), *options])
+
+
+def test_results_of_other_samples_are_refused(files, tmp_path):
+    write_results(tmp_path / "other.json", [("somewhere", [])])
+    with pytest.raises(ValueError, match=r"no sample of scene 'scene' has results"):
+        main([str(tmp_path / "other.json"), "--ann", str(files[1]), "--out", str(tmp_path)])
