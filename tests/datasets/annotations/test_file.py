@@ -268,7 +268,7 @@ def test_every_damaged_byte_is_noticed_or_of_no_effect(tmp_path: Path):
     write_annotations(path, META, [sample(i) for i in range(3)])
     content, noticed = path.read_bytes(), 0
     rng = np.random.default_rng(0)
-    for place in rng.integers(0, len(content), 300).tolist():
+    for place in rng.integers(0, len(content), 120).tolist():
         damaged = bytearray(content)
         damaged[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(damaged)
@@ -280,12 +280,12 @@ def test_every_damaged_byte_is_noticed_or_of_no_effect(tmp_path: Path):
         assert file.sealed
         for number, found in enumerate(file):
             assert_same(found, sample(number))
-    assert noticed > 150  # the others hit the footer, which nothing is read from
+    assert noticed > 60  # the others hit the footer, which nothing is read from
 
 
 def test_swapped_blocks_are_noticed(tmp_path: Path):
     path = tmp_path / "a.arrow"
-    write_annotations(path, META, [sample(i) for i in range(600)])
+    write_annotations(path, META, [sample(i) for i in range(300)])
     content = bytearray(path.read_bytes())
     middle = len(content) // 2
     content[middle : middle + 4096], content[8192:12288] = (

@@ -171,6 +171,10 @@ def test_no_depth_is_set_in_padding(road):
     low = cv2.imencode(".jpg", np.full((900, 1600, 3), 90, np.uint8))[1].tobytes()
     for path in (road / "val/log-a/sensors/cameras" / RING_CAMERAS[1]).iterdir():
         path.write_bytes(low)
+    intrinsics = road / "val/log-a/calibration/intrinsics.feather"
+    table = feather.read_feather(intrinsics)
+    table.loc[table["sensor_name"] == RING_CAMERAS[1], "height_px"] = 900
+    feather.write_feather(table, intrinsics)
     depth = depth_data(road, at="cameras")[0]["data_samples"].gt_depth
     assert [int(torch.nonzero(view)[:, 0].max()) for view in depth[:2]] == [295, 259]
 

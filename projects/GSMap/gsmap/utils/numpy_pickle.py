@@ -43,9 +43,9 @@ class CheckedDtype:
 
     def __setstate__(self, state: Any) -> None:
         plain = isinstance(state, tuple) and {type(part) for part in state} <= _STATE_PARTS
-        for order in "<>" if plain else "":
-            candidate = self.dtype.newbyteorder(order)
-            if state == candidate.__reduce__()[2]:  # just what numpy writes for this type
+        for candidate in (self.dtype.newbyteorder("<"), self.dtype.newbyteorder(">")):
+            # just what numpy writes for this type
+            if plain and state == candidate.__reduce__()[2]:
                 self.dtype = candidate
                 return
         raise pickle.UnpicklingError(f"it changes the dtype {self.dtype} in a way of its own")
