@@ -144,7 +144,8 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     model, meta = golden.model(CONFIG, STATE), golden.meta(size)
     feats = model.extract_img_feats(golden.images(size))
     yield Row(name, "FPN", largest_difference(feats[0][0, :, ::16], data["fpn_feat_sub"]), 1e-4)
-    projection = model.bev_encoder.project([meta], feats[0].device)
+    matrices = torch.as_tensor(meta["lidar2img"], dtype=torch.float32)[None]
+    projection = model.bev_encoder.project(matrices, meta["batch_input_shape"])
     seen = np.packbits(projection.visible[0].numpy(), axis=-1)
     differing = np.unpackbits(seen ^ data["cam_hit"]).mean()
     yield Row(name, "cells seen by each camera", float(differing), 1e-4)

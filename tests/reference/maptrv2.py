@@ -15,6 +15,9 @@ from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakeBEVMask, MakePVMask
 from gsmap.models.heads.map_head import MapHead
 from gsmap.models.losses.auxiliary import depth_bins
+from gsmap.models.bev_encoders.frustum import camera_vector
+from gsmap.models.bev_encoders.img_metas import stack_calibration
+from gsmap.models.bev_encoders.lss import CAMERA_MATRICES
 from gsmap.ops.bev_pool import cell_indices
 from reference.golden import NUM_CAMS, Golden
 from reference.maptr import bev_rows, decoded_rows, head_rows, state_rows
@@ -88,9 +91,11 @@ def lifting_rows(
     """Compare image features, the cameras' vectors, lifted points, their cells, and depth."""
     encoder, feats = model.bev_encoder, bev_outputs["img_feats"]
     yield Row(name, "FPN", largest_difference(feats[0, :, ::16], data["fpn_feat_sub"]), 1e-4)
-    vectors = encoder.camera_vectors([meta], feats)
+    calibration = stack_calibration([meta], encoder.calibration, feats.device)
+    vectors = camera_vector(*(calibration[key] for key in CAMERA_MATRICES)).flatten(0, 1)
     yield Row(name, "mlp_input", largest_difference(vectors[None], data["mlp_input"]), 1e-3)
-    points = encoder.points([meta], feats)[0]
+    frame_from_img = calibration["frame_from_img"]
+    points = encoder.points(frame_from_img, meta["batch_input_shape"], feats)[0]
     subset = points[:, ::16, ::3, ::5]
     reference = data["frustum_geom_sub"]
     yield Row(name, "frustum points (m)", largest_difference(subset, reference), 1e-4)

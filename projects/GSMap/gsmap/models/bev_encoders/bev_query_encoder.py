@@ -1,9 +1,8 @@
 """BEV encoder with one learned query per cell that attends to the BEV and to the cameras."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from mmcv.cnn.bricks.transformer import FFN
 from mmdet.models.layers import LearnedPositionalEncoding
@@ -11,16 +10,15 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.models.bev_encoders.img_metas import stack_matrices
+from gsmap.models.bev_encoders.img_metas import stack_calibration
 from gsmap.models.bev_encoders.projection import PillarProjection, pillar_points, project_pillars
 from gsmap.models.layers.deformable_attention import (
     BEVDeformableAttention,
     directional_offsets,
     init_matrices,
 )
+from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.structures.grid import BEVGrid
-
-_NUM_CAN_BUS = 18
 
 
 class BEVSelfAttention(BEVDeformableAttention):
@@ -115,7 +113,12 @@ class BEVQueryEncoder(BaseModule):
         num_feature_levels: Rows of the level embedding; only the first is used, as there is one
             level.
         init_cfg: As in mmengine.
+
+    Attributes:
+        calibration: What it reads of a sample, names of `calibration_arrays`.
     """
+
+    calibration = ("img_from_frame", "can_bus")
 
     def __init__(
         self,
@@ -140,7 +143,7 @@ class BEVQueryEncoder(BaseModule):
         self.level_embeds = nn.Parameter(torch.empty(num_feature_levels, embed_dims))
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
         self.can_bus_mlp = nn.Sequential(
-            nn.Linear(_NUM_CAN_BUS, embed_dims // 2),
+            nn.Linear(NUM_CAN_BUS, embed_dims // 2),
             nn.ReLU(inplace=True),
             nn.Linear(embed_dims // 2, embed_dims),
             nn.ReLU(inplace=True),
@@ -177,13 +180,32 @@ class BEVQueryEncoder(BaseModule):
                 matrices.
         """
         feats = mlvl_feats[0]
+        calibration = stack_calibration(img_metas, self.calibration, feats.device)
+        return self.encode(feats, calibration, img_metas[0]["batch_input_shape"])
+
+    def encode(
+        self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
+    ) -> dict[str, Tensor]:
+        """Encode camera features, with the calibration as tensors.
+
+        Args:
+            feats: Image features. (B, V, C, h, w)
+            calibration: ``img_from_frame`` (B, V, 4, 4) and ``can_bus`` (B, 18).
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            As `forward`.
+
+        Raises:
+            ValueError: If the number of cameras is not the configured one.
+        """
         if feats.shape[1] != len(self.cams_embeds):
             raise ValueError(
                 f"the encoder is built for {len(self.cams_embeds)} cameras, got {feats.shape[1]}."
             )
         feats = feats + (self.cams_embeds + self.level_embeds[0])[:, :, None, None].to(feats.dtype)
-        query, query_pos = self.initial_queries(img_metas, feats)
-        projection = self.project(img_metas, feats.device)
+        query, query_pos = self.initial_queries(calibration["can_bus"], feats)
+        projection = self.project(calibration["img_from_frame"], img_shape)
         centres = self.grid.norm_from_metres(self.grid.pixel_centres(feats.device)).view(1, -1, 2)
         bev_shape = (self.grid.height, self.grid.width)
         for layer in self.layers:
@@ -192,31 +214,17 @@ class BEVQueryEncoder(BaseModule):
             )
         return {"bev_feats": query.transpose(1, 2).unflatten(-1, bev_shape)}
 
-    def initial_queries(
-        self, img_metas: Sequence[dict[str, Any]], feats: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def initial_queries(self, can_bus: Tensor, feats: Tensor) -> tuple[Tensor, Tensor]:
         """Return the cells' queries, the vehicle's motion added, and positions. 2 x (B, Q, C)"""
-        zeros = np.zeros(_NUM_CAN_BUS)
-        can_bus = [
-            zeros if meta.get("can_bus") is None else np.asarray(meta["can_bus"])
-            for meta in img_metas
-        ]
-        motion = self.can_bus_mlp(
-            torch.as_tensor(np.stack(can_bus), dtype=torch.float32, device=feats.device)
-        )
-        query = self.bev_embedding.weight[None] + motion[:, None]
+        query = self.bev_embedding.weight[None] + self.can_bus_mlp(can_bus)[:, None]
         mask = feats.new_zeros(1, self.grid.height, self.grid.width)
         query_pos = self.positional_encoding(mask).flatten(2).transpose(1, 2)  # (1, Q, C)
         return query, query_pos
 
-    def project(
-        self, img_metas: Sequence[dict[str, Any]], device: torch.device
-    ) -> PillarProjection:
+    def project(self, img_from_frame: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
         """Project every cell's pillar into every camera."""
         # Differs from upstream for batches: it takes the set of seen cells from the first sample
         # for all.
+        device = img_from_frame.device
         points = pillar_points(self.grid, self.z_range, self.num_heights, device)
-        matrices = torch.as_tensor(
-            stack_matrices(img_metas, "lidar2img"), dtype=torch.float32, device=device
-        )
-        return project_pillars(points, matrices, img_metas[0]["batch_input_shape"])
+        return project_pillars(points, img_from_frame, img_shape)

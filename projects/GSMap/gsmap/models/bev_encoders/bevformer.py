@@ -1,5 +1,7 @@
 """BEVFormer's spatial cross-attention: deformable sampling around projected BEV pillars."""
 
+from itertools import product
+
 import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
@@ -46,9 +48,7 @@ class SpatialCrossAttention(SamplingAttention):
         value = self.values(img_feats.flatten(3).transpose(2, 3)).float()  # (B, V, hw, heads, C')
         repeats = self.num_points // self.num_heights
         summed = query.new_zeros(query.shape, dtype=torch.float32)
-        for sample, view in torch.cartesian_prod(
-            *(torch.arange(n) for n in img_feats.shape[:2])
-        ).tolist():
+        for sample, view in product(*(range(n) for n in img_feats.shape[:2])):
             cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
             centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
             locations = centres[:, None] + offsets[sample, cell]  # (T, heads, S, 2)

@@ -4,18 +4,22 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
+
+from gsmap.structures.calibration import calibration_arrays
 
 
-def stack_matrices(img_metas: Sequence[dict[str, Any]], key: str) -> np.ndarray:
-    """Stack one matrix field of the samples' metainfo, in float64. (B, ..., 4, 4)
+def stack_calibration(
+    img_metas: Sequence[dict[str, Any]], names: Sequence[str], device: torch.device
+) -> dict[str, Tensor]:
+    """Stack what an encoder reads of the samples, see `calibration_arrays`. (B, ...) each
 
     Raises:
-        ValueError: If a sample lacks the field.
+        ValueError: If a sample lacks a field.
     """
-    for meta in img_metas:
-        if key not in meta:
-            raise ValueError(
-                f"sample {meta.get('token')!r} has no {key!r} in its metainfo: "
-                "pack it in the pipeline."
-            )
-    return np.stack([np.asarray(meta[key], dtype=np.float64) for meta in img_metas])
+    arrays = [calibration_arrays(meta, names) for meta in img_metas]
+    return {
+        name: torch.as_tensor(np.stack([each[name] for each in arrays]), device=device)
+        for name in names
+    }

@@ -1,9 +1,8 @@
 """BEV encoder that lifts image features along predicted depth (Lift, Splat, Shoot; MapTRv2)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
-import numpy as np
 import torch
 from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
@@ -11,10 +10,12 @@ from torch import Tensor, nn
 
 from gsmap.models.bev_encoders.depth_net import CameraAwareDepthNet, PlainDepthNet
 from gsmap.models.bev_encoders.frustum import camera_vector, frustum_points
-from gsmap.models.bev_encoders.img_metas import stack_matrices
+from gsmap.models.bev_encoders.img_metas import stack_calibration
 from gsmap.models.losses.auxiliary import num_depth_bins
 from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
 from gsmap.structures.grid import BEVGrid
+
+CAMERA_MATRICES = ("cam2img", "img_aug_matrix", "ego_from_cam")
 
 
 @MODELS.register_module()
@@ -34,6 +35,9 @@ class LSSEncoder(BaseModule):
             convolution (the BEVPool variant of MapTR).
         aspp_channels: Channels of each branch of the camera-aware depth head's pyramid.
         init_cfg: As in mmengine.
+
+    Attributes:
+        calibration: What it reads of a sample, names of `calibration_arrays`.
 
     Raises:
         ValueError: If ``depth_range`` holds no bin.
@@ -58,6 +62,7 @@ class LSSEncoder(BaseModule):
         self.depth_range = (low, high, step)
         self.num_bins = num_depth_bins(self.depth_range)
         self.camera_aware = camera_aware
+        self.calibration = ("frame_from_img", *(CAMERA_MATRICES if camera_aware else ()))
         sizes = (embed_dims, embed_dims, self.num_bins)
         self.depth_net = (
             CameraAwareDepthNet(*sizes, aspp_channels) if camera_aware else PlainDepthNet(*sizes)
@@ -95,11 +100,30 @@ class LSSEncoder(BaseModule):
             ValueError: If a sample lacks a matrix.
         """
         feats = mlvl_feats[0]
-        vectors = self.camera_vectors(img_metas, feats) if self.camera_aware else None
+        calibration = stack_calibration(img_metas, self.calibration, feats.device)
+        return self.encode(feats, calibration, img_metas[0]["batch_input_shape"])
+
+    def encode(
+        self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
+    ) -> dict[str, Any]:
+        """Encode camera features, with the calibration as tensors.
+
+        Args:
+            feats: Image features. (B, V, C, h, w)
+            calibration: ``frame_from_img``, and camera-aware also ``cam2img``, ``img_aug_matrix``
+                and ``ego_from_cam``. (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+
+        Returns:
+            As `forward`.
+        """
+        vectors = None
+        if self.camera_aware:
+            vectors = camera_vector(*(calibration[name] for name in CAMERA_MATRICES)).flatten(0, 1)
         logits, context = self.depth_net(feats.flatten(0, 1), vectors)
         depth = logits.float().softmax(1).unflatten(0, feats.shape[:2])  # (B, V, D, h, w)
         context = context.float().unflatten(0, feats.shape[:2])  # (B, V, C, h, w)
-        points = self.points(img_metas, feats)
+        points = self.points(calibration["frame_from_img"], img_shape, feats)
         indices = cell_indices(points, self.cells, self.z_range)  # (B, V, D, h, w)
         with torch.autocast(feats.device.type, enabled=False):
             kernel = cast(Tensor, self.downsample[0].weight)
@@ -111,24 +135,8 @@ class LSSEncoder(BaseModule):
             "img_feats": feats,
         }
 
-    def points(self, img_metas: Sequence[dict[str, Any]], feats: Tensor) -> Tensor:
+    def points(self, frame_from_img: Tensor, img_shape: tuple[int, int], feats: Tensor) -> Tensor:
         """Return every feature pixel at every depth, in metres. (B, V, D, h, w, 3)"""
-        # inverted in float64, so that the points are as exact as float32 can hold them
-        inverse = np.linalg.inv(stack_matrices(img_metas, "lidar2img"))
-        frame_from_img = torch.as_tensor(inverse, dtype=torch.float32, device=feats.device)
         depths = torch.arange(*self.depth_range, device=feats.device)
-        rows, cols = img_metas[0]["batch_input_shape"]
         height, width = feats.shape[-2:]
-        return frustum_points(frame_from_img, (rows, cols), (height, width), depths)
-
-    def camera_vectors(self, img_metas: Sequence[dict[str, Any]], feats: Tensor) -> Tensor:
-        """Return each camera's parameters as a vector. (B * V, 22)"""
-        ego_from_frame = stack_matrices(img_metas, "lidar2ego")[:, None]  # (B, 1, 4, 4)
-        ego_from_cam = ego_from_frame @ np.linalg.inv(stack_matrices(img_metas, "lidar2cam"))
-        matrices = (
-            stack_matrices(img_metas, "cam2img"),
-            stack_matrices(img_metas, "img_aug_matrix"),
-            ego_from_cam,
-        )
-        vectors = camera_vector(*(torch.as_tensor(m, dtype=torch.float32) for m in matrices))
-        return vectors.flatten(0, 1).to(feats.device)
+        return frustum_points(frame_from_img, img_shape, (height, width), depths)

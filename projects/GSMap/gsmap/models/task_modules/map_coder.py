@@ -61,10 +61,7 @@ class MapCoder:
         Returns:
             At most ``max_num`` detections; index ``pts`` with their ``query_inds``.
         """
-        num_classes = scores.shape[-1]
-        flat = scores.float().sigmoid().flatten()
-        best, index = flat.topk(min(self.max_num, len(flat)))
-        query = torch.div(index, num_classes, rounding_mode="floor")
+        best, labels, query = self.best(scores)
         keep = torch.ones_like(best, dtype=torch.bool)
         if self.margin_m is not None:
             low, high = pts.new_tensor([self.grid.x_range, self.grid.y_range]).T
@@ -73,4 +70,12 @@ class MapCoder:
             keep &= (chosen.amax(1) <= high + self.margin_m).all(-1)
         if self.score_threshold is not None:
             keep &= best > self.score_threshold
-        return Detections(best[keep], (index % num_classes)[keep], query[keep])
+        return Detections(best[keep], labels[keep], query[keep])
+
+    def best(self, scores: Tensor) -> Detections:
+        """Return the best pairs of query and class, wherever they lie. (N, classes)"""
+        num_classes = scores.shape[-1]
+        flat = scores.float().sigmoid().flatten()
+        best, index = flat.topk(min(self.max_num, len(flat)))
+        query = torch.div(index, num_classes, rounding_mode="floor")
+        return Detections(best, index % num_classes, query)

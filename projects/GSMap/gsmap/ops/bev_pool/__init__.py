@@ -1,8 +1,9 @@
 """Pooling of lifted image features into bird's-eye-view cells (Lift, Splat, Shoot), in plain torch.
 
 A lifted point is one (pixel, depth) pair; its feature is the depth's probability times the pixel's
-context vector. The points are never formed: each cell is a weighted bag of context vectors, so that
-memory stays at pixels + cells. The forward pass is deterministic on every device.
+context vector. `bev_pool` forms the points and says what is right; `bev_pool_conv3x3` never does:
+each cell is a weighted bag of context vectors, so that memory stays at pixels + cells, and its
+forward pass is deterministic on every device.
 """
 
 from typing import NamedTuple
@@ -67,10 +68,11 @@ def bev_pool(probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid) -> Te
         ValueError: If the shapes disagree.
     """
     _check_shapes(probs, context, cells)
-    points = _sort_by_cell(probs, cells, grid)
-    table = context.permute(0, 1, 3, 4, 2).flatten(0, 3)  # (B*V*h*w, C)
-    pooled = _weighted_bags(table, points.pixels, points.probs, points.counts)
-    return pooled.view(probs.shape[0], grid.height, grid.width, -1).permute(0, 3, 1, 2)
+    points = probs[..., None] * context.permute(0, 1, 3, 4, 2)[:, :, None]  # (B, V, D, h, w, C)
+    keys = _bag_numbers(cells, grid, outside=len(cells) * grid.height * grid.width)
+    pooled = context.new_zeros(len(cells) * grid.height * grid.width + 1, context.shape[2])
+    pooled = pooled.index_add(0, keys, points.flatten(0, 4))[:-1]
+    return pooled.view(len(cells), grid.height, grid.width, -1).permute(0, 3, 1, 2)
 
 
 def bev_pool_conv3x3(
@@ -102,6 +104,8 @@ def bev_pool_conv3x3(
             f"weight must have shape (O, {context.shape[2]}, 3, 3) to match context, "
             f"got {tuple(weight.shape)}."
         )
+    if torch.compiler.is_exporting():  # ONNX can scatter sums, and has no bags of many sizes
+        return F.conv2d(bev_pool(probs, context, cells, grid), weight, padding=1)
     points = _sort_by_cell(probs, cells, grid)
     taps = weight.permute(1, 2, 3, 0).flatten(1)  # (C, 9*O)
     table = context.permute(0, 1, 3, 4, 2).flatten(0, 3) @ taps  # (B*V*h*w, 9*O)
@@ -137,12 +141,18 @@ def _check_shapes(probs: Tensor, context: Tensor, cells: Tensor) -> None:
         )
 
 
+def _bag_numbers(cells: Tensor, grid: BEVGrid, outside: int) -> Tensor:
+    """Number the cells of all samples, one number a point. (B, V, D, h, w) -> (B*V*D*h*w,)"""
+    first = torch.arange(len(cells), device=cells.device).view(-1, 1, 1, 1, 1)
+    bags = cells + first * (grid.height * grid.width)
+    return torch.where(cells >= 0, bags, outside).flatten()
+
+
 def _sort_by_cell(probs: Tensor, cells: Tensor, grid: BEVGrid) -> _SortedPoints:
     """Keep the points inside the grid and bring each cell's points together, in order."""
     batch, views, _, height, width = probs.shape
     num_cells = grid.height * grid.width
-    first = torch.arange(batch, device=cells.device).view(-1, 1, 1, 1, 1)
-    keys = torch.where(cells >= 0, cells + first * num_cells, -1).flatten()
+    keys = _bag_numbers(cells, grid, outside=-1)
     kept = (keys >= 0).nonzero().squeeze(1)
     keys, order = keys[kept].sort(stable=True)
     pixels = torch.arange(batch * views * height * width, device=cells.device)

@@ -1,0 +1,176 @@
+"""A trained model as one ONNX file: images and calibration in, map elements out."""
+
+import json
+import logging
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from gsmap.apis.onnx_inferencer import FORMAT, METADATA_KEY, MISSING_EXTRA, OnnxInferencer
+from gsmap.structures.calibration import calibration_arrays
+from gsmap.structures.elements import MapElements
+from gsmap.utils.files import atomic_write
+
+OPSET = 18
+_PER_SAMPLE_WEIGHTS = 3  # position in torch's embedding_bag, after table, rows and offsets
+PRECISIONS = ("fp32", "fp16", "int8")
+
+
+class ExportedDetector(nn.Module):
+    """A `MapDetector` of cameras as a function of tensors alone, for one sample.
+
+    Args:
+        model: The detector.
+        half: Whether convolutions and matrix products work in half precision, as under AMP.
+
+    Raises:
+        ValueError: If the model reads LiDAR.
+    """
+
+    def __init__(self, model: Any, half: bool = False) -> None:
+        super().__init__()
+        if model.lidar_encoder is not None:
+            raise ValueError(
+                "only models of cameras can be exported: voxels of LiDAR have no ONNX operator. "
+                "Give a config without lidar_encoder."
+            )
+        self.model = model
+        self.half_precision = half
+        self.input_names = ("images", *model.bev_encoder.calibration)
+        shapes = ("scales", "rotations") if hasattr(model.map_head.reference, "space") else ()
+        self.output_names = ("scores", "labels", "points", *shapes)
+
+    def forward(self, images: Tensor, *calibration: Tensor) -> tuple[Tensor, ...]:
+        """Find the best map elements, wherever they lie.
+
+        Args:
+            images: Pixel values as the data pipeline leaves them: 0 to 255, not normalised, not
+                padded. (V, 3, H, W)
+            calibration: What the BEV encoder reads, ``input_names[1:]``. (V, 4, 4) or (18,)
+
+        Returns:
+            Scores (M,), labels (M,), points in metres (M, P, 2 or 3), and with Gaussians scales in
+            metres (M, P, 2) and rotations in radians (M, P); best first.
+        """
+        # a tensor of four axes is normalised and padded image by image
+        images = self.model.data_preprocessor({"inputs": {"img": images}})["inputs"]["imgs"]
+        with torch.autocast(images.device.type, torch.float16, enabled=self.half_precision):
+            (feats, *_) = self.model.extract_img_feats(images[None])
+            named = dict(zip(self.input_names[1:], (x[None] for x in calibration), strict=True))
+            bev = self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:]))
+            head = self.model.map_head
+            outputs = head(bev)
+        fields = head.reference.decode(outputs["all_references"][-1][0])
+        best = head.coder.best(outputs["all_cls_scores"][-1][0])
+        names = ("pts", *self.output_names[3:])
+        return (best.scores, best.labels, *(fields[name][best.query_inds] for name in names))
+
+    def example_inputs(self, num_cams: int, image_size: tuple[int, int]) -> tuple[Tensor, ...]:
+        """Return inputs of the right shapes: black images of cameras at the origin."""
+        eyes = torch.eye(4).repeat(num_cams, 1, 1)
+        calibration = (torch.zeros(18) if n == "can_bus" else eyes for n in self.input_names[1:])
+        return torch.zeros(num_cams, 3, *image_size), *calibration
+
+
+def export_onnx(
+    model: Any,
+    out: str | Path,
+    cameras: Sequence[str],
+    image_size: tuple[int, int],
+    frame: str = "lidar",
+    half: bool = False,
+) -> None:
+    """Write a model as an ONNX file that holds standard operators only.
+
+    Args:
+        model: A `MapDetector` with its weights, on the CPU.
+        out: File to write.
+        cameras: Names of the cameras, in the order of the images.
+        image_size: Rows and columns of the images as the data pipeline leaves them.
+        frame: Frame of the annotations, for whoever uses the file.
+        half: Whether convolutions and matrix products work in half precision.
+
+    Raises:
+        ImportError: If the packages of the extra ``onnx`` are not installed.
+        ValueError: If the model reads LiDAR, has another number of cameras, or does something for
+            which ONNX has no operator.
+    """
+    try:
+        import onnx
+        import onnxscript  # noqa: F401 - what torch's exporter is written with
+    except ImportError as error:
+        raise ImportError(MISSING_EXTRA.format(package=error.name)) from error
+    exported = ExportedDetector(model, half).eval()
+    inputs = exported.example_inputs(len(cameras), image_size)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of torchvision's absence
+    try:
+        with torch.no_grad():
+            program = torch.onnx.export(
+                exported,
+                inputs,
+                dynamo=True,
+                opset_version=OPSET,
+                input_names=exported.input_names,
+                output_names=exported.output_names,
+                custom_translation_table=_translations(),
+                verbose=False,
+            )
+    except torch.onnx.errors.OnnxExporterError as error:
+        raise ValueError(_reason(error)) from error
+    proto = program.model_proto
+    for part in (proto.graph, *proto.graph.node):  # stack traces of the machine that exported
+        del part.metadata_props[:]
+    metadata = {
+        "format": FORMAT,
+        "image_size": list(image_size),
+        **_metadata(exported, cameras, frame),
+    }
+    onnx.helper.set_model_props(proto, {METADATA_KEY: json.dumps(metadata)})
+    onnx.checker.check_model(proto)
+    with atomic_write(out, "wb") as file:
+        file.write(proto.SerializeToString())
+
+
+def _translations() -> dict[Any, Any]:
+    """Say how torch's operators are written in ONNX where the exporter knows no good way."""
+    from onnxscript import opset18 as op
+
+    def embedding_bag(table: Any, rows: Any, offsets: Any, *options: Any) -> Any:
+        """Sum weighted rows in bags of one size, as `sum_rows` does; torch's takes one at a time."""
+        one = op.Constant(value_ints=[1])
+        bags = op.Concat(op.Shape(offsets), op.Constant(value_ints=[-1]), axis=0)
+        weights = op.Unsqueeze(op.Reshape(options[_PER_SAMPLE_WEIGHTS], bags), one)
+        sums = op.MatMul(weights, op.Gather(table, op.Reshape(rows, bags)))
+        return op.Squeeze(sums, one), offsets, offsets, offsets
+
+    return {torch.ops.aten.embedding_bag.padding_idx: embedding_bag}
+
+
+def _metadata(exported: ExportedDetector, cameras: Sequence[str], frame: str) -> dict[str, Any]:
+    """Return what a file says of itself, for `OnnxInferencer`."""
+    head = exported.model.map_head
+    return {
+        "classes": list(head.classes),
+        "x_range": list(head.grid.x_range),
+        "y_range": list(head.grid.y_range),
+        "frame": frame,
+        "cameras": list(cameras),
+        "margin_m": head.coder.margin_m,
+        "score_threshold": head.coder.score_threshold,
+    }
+
+
+def _reason(error: BaseException) -> str:
+    """Say in one sentence what could not be exported."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return (
+        f"the model cannot be written in ONNX's operators ({str(error):.300}): say how in "
+        "_translations() of gsmap/apis/export.py, or replace that part of the model."
+    )

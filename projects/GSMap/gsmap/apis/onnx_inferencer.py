@@ -1,0 +1,155 @@
+"""An exported model on a vehicle's images: numpy and onnxruntime alone, neither torch nor mmcv."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsmap.evaluation.results_json import vectors_of
+from gsmap.structures.calibration import calibration_arrays
+from gsmap.structures.elements import MapElements
+
+METADATA_KEY = "gsmap"
+FORMAT = 1
+MISSING_EXTRA = "{package} is not installed: `pip install -e .[onnx]` brings what ONNX files need."
+
+
+class OnnxInferencer:
+    """Runs an ONNX file that ``tools/export.py`` wrote.
+
+    Args:
+        path: The file.
+        providers: Execution providers of ONNX Runtime, by preference.
+        num_threads: Threads of one operator; 0 for one a core.
+
+    Attributes:
+        classes: Names of the classes.
+        cameras: Names of the cameras, in the order in which images and matrices are given.
+        image_size: Rows and columns of the images.
+        metadata: All that the file says of itself.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ImportError: If onnxruntime is not installed.
+        ValueError: If the file is not an exported model, or of another version.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        providers: Sequence[str] = ("CPUExecutionProvider",),
+        num_threads: int = 0,
+    ) -> None:
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise ImportError(MISSING_EXTRA.format(package=error.name)) from error
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise FileNotFoundError(f"There is no ONNX file {path}; tools/export.py writes one.")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = num_threads
+        try:
+            self.session = onnxruntime.InferenceSession(
+                str(path), options, providers=list(providers)
+            )
+        except Exception as error:  # onnxruntime's errors have no common class of their own
+            raise ValueError(
+                f"{path} cannot be run by ONNX Runtime {onnxruntime.__version__} "
+                f"({str(error):.300}): export it again, or install a newer onnxruntime."
+            ) from error
+        found = self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        self.metadata: dict[str, Any] = json.loads(found or "{}")
+        if self.metadata.get("format") != FORMAT:
+            raise ValueError(
+                f"{path} does not say that tools/export.py of this version wrote it: export the "
+                "model again."
+            )
+        self.classes: tuple[str, ...] = tuple(self.metadata["classes"])
+        self.cameras: tuple[str, ...] = tuple(self.metadata["cameras"])
+        self.image_size: tuple[int, int] = tuple(self.metadata["image_size"])
+        self._calibration = [value.name for value in self.session.get_inputs()[1:]]
+        self._outputs = [value.name for value in self.session.get_outputs()]
+
+    def __call__(
+        self, images: Sequence[NDArray[Any]] | NDArray[Any], meta: Mapping[str, Any]
+    ) -> MapElements:
+        """Find the map elements of one sample.
+
+        Args:
+            images: One image of each of ``cameras``, in their order: BGR as OpenCV reads them,
+                values 0 to 255, scaled to ``image_size``. V x (H, W, 3)
+            meta: ``lidar2img`` (V, 4, 4): from metres in the annotation frame to (u * d, v * d, d,
+                1) in pixels of these images. Depth-aware models (MapTRv2) also read ``lidar2cam``,
+                ``cam2img`` of the original images, ``img_aug_matrix`` (V, 4, 4) from those to
+                these, and ``lidar2ego`` (4, 4). ``can_bus`` (18,) is zero unless it is given.
+
+        Returns:
+            The elements, best first, with their scores and, if the model has them, Gaussians.
+
+        Raises:
+            ValueError: If images or matrices are not those of the file's cameras, or a matrix is
+                missing.
+        """
+        return self.elements(self.run(self.prepare(images, meta)))
+
+    def prepare(
+        self, images: Sequence[NDArray[Any]] | NDArray[Any], meta: Mapping[str, Any]
+    ) -> dict[str, NDArray[np.float32]]:
+        """Return the inputs of the graph; arguments and errors as of a call."""
+        self._check_images(images)
+        inputs = calibration_arrays(meta, self._calibration)
+        for name, array in inputs.items():
+            if name != "can_bus" and array.shape != (len(self.cameras), 4, 4):
+                raise ValueError(
+                    f"{name} of {self.path.name} needs one 4 x 4 matrix for each of its "
+                    f"{len(self.cameras)} cameras {', '.join(self.cameras)}, got shape "
+                    f"{array.shape}."
+                )
+        stacked = np.stack([np.asarray(image) for image in images])
+        pixels = np.ascontiguousarray(stacked.transpose(0, 3, 1, 2), dtype=np.float32)
+        return {"images": pixels, **inputs}
+
+    def _check_images(self, images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
+        """Raise if the images are not those of the file's cameras."""
+        if len(images) != len(self.cameras):
+            raise ValueError(
+                f"{self.path.name} takes {len(self.cameras)} cameras, {', '.join(self.cameras)}, "
+                f"got {len(images)} images: give one of each, or export for other cameras."
+            )
+        rows, columns = self.image_size
+        for camera, image in zip(self.cameras, images, strict=True):
+            if np.shape(image) != (rows, columns, 3):
+                raise ValueError(
+                    f"{self.path.name} takes images of {rows} x {columns} (rows x columns, three "
+                    f"channels), that of {camera} has shape {np.shape(image)}: scale it and "
+                    f"lidar2img alike, or export with --size."
+                )
+
+    def run(self, inputs: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[Any]]:
+        """Return the outputs of the graph by name, wherever the elements lie."""
+        return dict(zip(self._outputs, self.session.run(self._outputs, inputs), strict=True))
+
+    def elements(self, outputs: Mapping[str, NDArray[Any]]) -> MapElements:
+        """Keep the elements that lie on the map or close to it and score enough."""
+        margin, threshold = self.metadata["margin_m"], self.metadata["score_threshold"]
+        keep = np.ones(len(outputs["scores"]), dtype=bool)
+        if margin is not None:
+            low, high = np.array([self.metadata["x_range"], self.metadata["y_range"]]).T
+            points = outputs["points"][..., :2]
+            keep = ((points >= low - margin) & (points <= high + margin)).all((1, 2))
+        if threshold is not None:
+            keep &= outputs["scores"] > threshold
+        gaussians = {
+            name: outputs[name][keep] for name in ("scales", "rotations") if name in outputs
+        }
+        return MapElements.from_polylines(
+            outputs["points"][keep], outputs["labels"][keep], outputs["scores"][keep], **gaussians
+        )
+
+    def record(self, token: str, elements: MapElements) -> dict[str, Any]:
+        """Return a sample as an entry of ``results`` in the results JSON."""
+        return {"sample_token": token, "vectors": vectors_of(elements, self.classes)}
