@@ -9,6 +9,7 @@ from mmdet3d.structures import Det3DDataSample
 import gsmap.registered  # noqa: F401
 from gsmap.models.bev_encoders.lss import LSSEncoder
 from gsmap.models.heads.aux_heads import DepthSupervision
+from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import BEVGrid
 
 GRID = BEVGrid((-4, 4), (-8, 8))
@@ -66,7 +67,8 @@ def test_shapes():
 
 
 def test_points_of_the_middle_pixel_lie_on_the_optical_axis():
-    points = encoder().points([meta()], feats())
+    matrices = calibration_arrays(meta(), ["frame_from_img"])["frame_from_img"]
+    points = encoder().points(torch.as_tensor(matrices)[None], (33, 65), feats())
     assert points.shape == (1, 1, 6, 3, 5, 3)
     expected = torch.tensor([[0.0, d, 0.0] for d in range(1, 7)])
     torch.testing.assert_close(points[0, 0, :, 1, 2], expected)

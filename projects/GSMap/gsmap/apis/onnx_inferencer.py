@@ -59,7 +59,7 @@ class OnnxInferencer:
         except Exception as error:  # onnxruntime's errors have no common class of their own
             raise ValueError(
                 f"{path} cannot be run by ONNX Runtime {onnxruntime.__version__} "
-                f"({str(error):.300}): export it again, or install a newer onnxruntime."
+                f"({error!s:.300}): export it again, or install a newer onnxruntime."
             ) from error
         found = self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
         self.metadata: dict[str, Any] = json.loads(found or "{}")
