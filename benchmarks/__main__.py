@@ -9,6 +9,7 @@ from gsmap.utils.cli import CommandParser, run_command
 COMMANDS = {
     "data": "data_commands",
     "eval": "evaluation",
+    "export": "export",
     "fps": "fps",
     "heads": "heads",
     "masks": "masks",

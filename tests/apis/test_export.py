@@ -1,5 +1,6 @@
 """Exported models in ONNX Runtime: the same map elements as in torch."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from model_cases import build_small, ring_of_cameras
 
 from gsmap.apis.export import (
     ExportedDetector,
@@ -18,7 +20,7 @@ from gsmap.apis.export import (
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
-from gsmap.evaluation.results_json import vectors_of
+from gsmap.structures.elements import MapElements
 
 for _package in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(_package, reason=f"{_package} is not installed: pip install -e .[onnx]")
@@ -78,9 +80,7 @@ def compare(inferencer, dataset, exported, indices=(0, 1)):
     """Return the largest differences of scores and metres, and the elements of the last sample."""
     in_torch = inferencer.predict(dataset, indices)
     differences = []
-    for sample, (_, inputs) in zip(
-        in_torch, graph_inputs(exported, dataset, indices), strict=True
-    ):
+    for sample, (_, inputs) in zip(in_torch, graph_inputs(exported, dataset, indices), strict=True):
         expected = elements_of_predictions(sample.pred_instances_3d)
         found = exported.elements(exported.run(inputs))
         differences.append(largest_differences(found, expected))
@@ -146,11 +146,10 @@ def test_the_runner_needs_numpy_and_onnxruntime_alone(shipped, tmp_path):
 import sys
 import numpy as np
 from gsmap.apis.onnx_inferencer import OnnxInferencer
-from gsmap.evaluation.results_json import write_results
 data = np.load("in.npz")
 model = OnnxInferencer(sys.argv[1])
 elements = model(list(data["images"]), {"lidar2img": data["lidar2img"]})
-write_results("out.json", [model.record("a", elements)])
+model.write("out.json", [("a", elements)])
 others = {"torch", "mmengine", "mmcv", "mmdet", "mmdet3d", "cv2", "onnx", "pyarrow", "shapely"}
 print(sorted(others & set(sys.modules)))
 """
@@ -163,3 +162,132 @@ print(sorted(others & set(sys.modules)))
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "[]"
+    (expected,) = inferencer.predict(dataset, [0])
+    inferencer.write(tmp_path / "torch.json", [expected])
+    (found,), (expected,) = (
+        json.loads((tmp_path / name).read_text())["results"] for name in ("out.json", "torch.json")
+    )
+    assert found["sample_token"] == "a"
+    assert len(found["vectors"]) == len(expected["vectors"]) > 0
+    for mine, theirs in zip(found["vectors"], expected["vectors"], strict=True):
+        assert mine.keys() == theirs.keys()
+        assert mine["cls_name"] == theirs["cls_name"]
+        np.testing.assert_allclose(mine["pts"], theirs["pts"], atol=POINTS_M)
+
+
+def test_wrong_images_and_matrices_are_named(shipped):
+    exported = shipped[2]
+    rows, columns = exported.image_size
+    images, matrices = [np.zeros((rows, columns, 3), np.uint8)] * 6, np.stack([np.eye(4)] * 6)
+    with pytest.raises(ValueError, match=r"takes 6 cameras, CAM_FRONT, .* got 5 images: give one"):
+        exported(images[:5], {"lidar2img": matrices})
+    with pytest.raises(ValueError, match=r"of CAM_FRONT_RIGHT has shape \(4, 8, 3\): scale it"):
+        exported([images[0], np.zeros((4, 8, 3)), *images[2:]], {"lidar2img": matrices})
+    with pytest.raises(ValueError, match=r"img_from_frame .* each of its 6 cameras .*\(5, 4, 4\)"):
+        exported(images, {"lidar2img": matrices[:5]})
+    with pytest.raises(ValueError, match="has no 'lidar2img'"):
+        exported(images, {})
+
+
+def test_other_files_and_an_absent_package_are_named(tmp_path, monkeypatch):
+    import onnx
+    from onnx import TensorProto, helper
+
+    with pytest.raises(FileNotFoundError, match=r"no ONNX file .*gone.onnx"):
+        OnnxInferencer(tmp_path / "gone.onnx")
+    value = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1])
+    graph = helper.make_graph([helper.make_node("Relu", ["x"], ["y"])], "other", [value], [value])
+    graph.output[0].name = "y"
+    path = tmp_path / "other.onnx"
+    onnx.save(helper.make_model(graph, ir_version=8), path)
+    with pytest.raises(ValueError, match=r"other.onnx does not say .* export the model again"):
+        OnnxInferencer(path)
+    path.write_bytes(b"no model")
+    with pytest.raises(ValueError, match=r"other.onnx cannot be run by ONNX Runtime"):
+        OnnxInferencer(path)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ImportError, match=r"onnxruntime is not installed: .*\[onnx\]"):
+        OnnxInferencer(path)
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ImportError, match=r"onnx is not installed: .*\[onnx\]"):
+        export_onnx(build_small(), path, ["a"], (32, 32))
+
+
+def test_an_operator_that_onnx_lacks_is_named(tmp_path):
+    model = build_small()
+
+    class Unknown(torch.nn.Module):
+        def forward(self, feats):
+            return [torch.special.bessel_j0(feats[0])]
+
+    model.img_neck = Unknown()
+    with pytest.raises(ValueError, match=r"cannot be written .*bessel_j0.* say how"):
+        export_onnx(model, tmp_path / "model.onnx", ["a"] * 6, (64, 96))
+    assert not list(tmp_path.iterdir())
+
+
+def test_models_of_lidar_are_refused():
+    model = build_small()
+    model.lidar_encoder = torch.nn.Identity()
+    with pytest.raises(ValueError, match="only models of cameras"):
+        ExportedDetector(model)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A tiny model in single precision."""
+    path = tmp_path_factory.mktemp("small") / "fp32.onnx"
+    model = build_small()
+    export_onnx(model, path, [f"camera {i}" for i in range(6)], (64, 96))
+    return model, OnnxInferencer(path)
+
+
+def small_inputs(exported, count=2):
+    """Return random images of a ring of cameras."""
+    generator = np.random.default_rng(0)
+    images = generator.integers(0, 255, (count, 6, 64, 96, 3), dtype=np.uint8)
+    return [exported.prepare(each, {"lidar2img": ring_of_cameras()}) for each in images]
+
+
+def test_half_precision_and_8_bits_stay_close(small, tmp_path):
+    import onnx
+
+    model, exported = small
+    inputs = small_inputs(exported)
+    export_onnx(model, tmp_path / "fp16.onnx", exported.cameras, exported.image_size, half=True)
+    quantize_onnx(exported.path, tmp_path / "int8.onnx", inputs)
+    expected = exported.elements(exported.run(inputs[0]))
+    for name, operator, tolerance in (("fp16", "Cast", 0.01), ("int8", "QuantizeLinear", 0.1)):
+        other = OnnxInferencer(tmp_path / f"{name}.onnx")
+        assert other.metadata == exported.metadata
+        found = other.elements(other.run(inputs[0]))
+        assert np.abs(np.sort(found.scores) - np.sort(expected.scores)).max() < tolerance
+        graph = onnx.load(other.path).graph
+        assert operator in {node.op_type for node in graph.node}
+        assert {node.domain for node in graph.node} == {""}
+
+
+def test_elements_beyond_the_margin_or_below_the_threshold_are_dropped(small):
+    exported = OnnxInferencer(small[1].path)
+    points = np.zeros((3, 4, 2))
+    points[1, 0] = 15.0 + 5.1, 0  # the map ends at 15 m, its margin at 20
+    outputs = {
+        "scores": np.array([0.9, 0.8, 0.2]),
+        "labels": np.array([0, 1, 2]),
+        "points": points,
+    }
+    assert exported.elements(outputs).labels.tolist() == [0, 2]
+    exported.metadata["score_threshold"] = 0.5
+    assert exported.elements(outputs).labels.tolist() == [0]
+    exported.metadata["margin_m"] = None
+    assert exported.elements(outputs).labels.tolist() == [0, 1]
+
+
+def test_differences_are_of_the_nearest_element_of_a_class():
+    def elements(xs, labels, scores):
+        return MapElements.from_polylines([[(x, 0), (x, 1)] for x in xs], labels, scores)
+
+    a = elements([0, 5, 9], [0, 0, 1], [0.5, 0.5, 0.4])
+    b = elements([5.25, 0, 9], [0, 0, 1], [0.5, 0.5, 0.375])
+    assert largest_differences(a, b) == (0.025, 0.25)
+    assert largest_differences(a, elements([0], [0], [0.5])) == (np.inf, np.inf)

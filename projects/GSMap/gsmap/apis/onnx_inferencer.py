@@ -1,14 +1,14 @@
 """An exported model on a vehicle's images: numpy and onnxruntime alone, neither torch nor mmcv."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmap.evaluation.results_json import vectors_of
+from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.elements import MapElements
 
@@ -150,6 +150,12 @@ class OnnxInferencer:
             outputs["points"][keep], outputs["labels"][keep], outputs["scores"][keep], **gaussians
         )
 
-    def record(self, token: str, elements: MapElements) -> dict[str, Any]:
-        """Return a sample as an entry of ``results`` in the results JSON."""
-        return {"sample_token": token, "vectors": vectors_of(elements, self.classes)}
+    def write(self, path: str | Path, samples: Iterable[tuple[str, MapElements]]) -> None:
+        """Write predictions as JSON, in the form that ``tools/test.py --out`` writes.
+
+        Args:
+            path: File to write.
+            samples: Token and elements of each sample.
+        """
+        vectors = ((token, vectors_of(found, self.classes)) for token, found in samples)
+        write_results(path, vectors, {"classes": list(self.classes)})

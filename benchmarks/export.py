@@ -1,0 +1,66 @@
+"""Exported models in ONNX Runtime against torch, batch 1, on the CPU."""
+
+import argparse
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from benchmarks.fps import predict_once
+from benchmarks.measure import Cost, measure
+from benchmarks.model import add_model_arguments, build, in_fresh_processes, random_batch, report
+from gsmap.apis.export import export_onnx
+from gsmap.apis.onnx_inferencer import OnnxInferencer
+from gsmap.structures.calibration import calibration_arrays
+
+
+def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the subcommand ``export``."""
+    parser = subparsers.add_parser("export", help=__doc__)
+    add_model_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure and print both ways' time of every config.
+
+    Raises:
+        ValueError: If another device than the CPU is asked for.
+    """
+    if args.device != "cpu":
+        raise ValueError(f"benchmarks export measures on the CPU, got --device {args.device}.")
+    jobs = [(path, args) for path in args.configs]
+    in_torch, in_onnx = (in_fresh_processes(task, jobs) for task in (torch_cost, onnx_cost))
+    report(
+        args,
+        ["model", "torch, s", "ONNX Runtime, s", "ratio", "torch, wall s", "ONNX Runtime, wall s"],
+        [
+            [
+                *(Path(path).stem, f"{a.cpu_s:.3f}", f"{b.cpu_s:.3f}", f"{b.cpu_s / a.cpu_s:.2f}"),
+                *(f"{a.wall_s:.3f}", f"{b.wall_s:.3f}"),
+            ]
+            for (path, a), (_, b) in zip(in_torch, in_onnx, strict=True)
+        ],
+    )
+
+
+def torch_cost(path: str, args: argparse.Namespace) -> Cost:
+    """Measure a config's way from images to decoded elements in torch."""
+    model = build(path, args).eval()
+    inputs, samples = random_batch(model, 1, tuple(args.size), "cpu")
+    predict = partial(predict_once, model, inputs, samples, args)
+    return measure(predict, torch.device("cpu"), args.repeats)
+
+
+def onnx_cost(path: str, args: argparse.Namespace) -> Cost:
+    """Measure the same way in ONNX Runtime; the file's own reading is not counted."""
+    model = build(path, args).eval()
+    inputs, samples = random_batch(model, 1, tuple(args.size), "cpu")
+    arrays = calibration_arrays(samples[0].metainfo, model.bev_encoder.calibration)
+    arrays["images"] = inputs["imgs"][0].numpy()
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "model.onnx")
+        export_onnx(model, file, [f"camera {i}" for i in range(6)], args.size, half=args.fp16)
+        exported = OnnxInferencer(file, num_threads=args.threads)
+    return measure(partial(exported.run, arrays), torch.device("cpu"), args.repeats)

@@ -1,0 +1,135 @@
+#!/usr/bin/env python
+"""Write a trained model as one ONNX file of standard operators, and compare it with torch.
+
+Examples:
+    python tools/export.py CONFIG CHECKPOINT --out model.onnx --check 5
+    python tools/export.py CONFIG CHECKPOINT --out model_int8.onnx --int8 --calibration train.arrow
+
+Cameras are those of the config, the image size is that of the config's test samples or ``--size``.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.apis.export import export_onnx, graph_inputs, largest_differences, quantize_onnx
+from gsmap.apis.map_inferencer import MapInferencer, select_samples
+from gsmap.apis.onnx_inferencer import OnnxInferencer
+from gsmap.datasets.elements import elements_of_predictions
+from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+from gsmap.engine.launch import add_config_options
+from gsmap.utils.cli import CommandParser, run_command
+
+
+def parse_args() -> argparse.Namespace:
+    parser = CommandParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("config", help="config file of the model")
+    parser.add_argument("checkpoint", help="its checkpoint")
+    parser.add_argument("--out", type=Path, required=True, help="ONNX file to write")
+    parser.add_argument(
+        "--size",
+        type=int,
+        nargs=2,
+        metavar=("H", "W"),
+        help="rows and columns of the images after the data pipeline; the test samples' by default",
+    )
+    precision = parser.add_mutually_exclusive_group()
+    precision.add_argument("--fp16", action="store_true", help="half precision, as under AMP")
+    precision.add_argument("--int8", action="store_true", help="convolutions in 8 bits")
+    parser.add_argument(
+        "--calibration", type=Path, help="samples for --int8; the config's training set by default"
+    )
+    parser.add_argument(
+        "--calibration-samples", type=int, default=32, help="how many of them, evenly spread"
+    )
+    parser.add_argument(
+        "--samples", type=Path, help="samples to compare on; the config's test set by default"
+    )
+    parser.add_argument("--data-root", type=Path, help="folder that the paths of images start from")
+    parser.add_argument(
+        "--check", type=int, metavar="N", help="compare with torch on N samples, evenly spread"
+    )
+    parser.add_argument("--results", type=Path, help="JSON file for what ONNX Runtime found there")
+    add_config_options(parser)
+    args = parser.parse_args()
+    if args.results and not args.check:
+        parser.error("--results needs --check N")
+    return args
+
+
+def open_samples(
+    inferencer: MapInferencer, args: argparse.Namespace, source: Path | None, split: str
+) -> VectorizedMapDataset:
+    """Open an annotation file, by default that of the config's split."""
+    options = inferencer.cfg[f"{split}_dataloader"].dataset
+    if source is None:
+        source = Path(args.data_root or options.data_root, options.ann_file)
+        if not source.is_file():
+            raise FileNotFoundError(
+                f"There is no {source}, the config's {split} samples: name others (--samples, "
+                "--calibration, --data-root), or give --size if only the image size is missing."
+            )
+    return inferencer.dataset(source, args.data_root)
+
+
+def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInferencer:
+    """Export in the precision that is asked for."""
+    options = inferencer.cfg.test_dataloader.dataset
+    if not options.get("cameras"):
+        raise ValueError(f"{args.config} lists no cameras: set test_dataloader.dataset.cameras.")
+    size = args.size
+    if size is None:
+        size = open_samples(inferencer, args, args.samples, "test")[0]["inputs"]["img"].shape[-2:]
+    settings = (options.cameras, tuple(size), options.get("frame", "lidar"))
+    if not args.int8:
+        export_onnx(inferencer.model, args.out, *settings, half=args.fp16)
+        return OnnxInferencer(args.out)
+    dataset = open_samples(inferencer, args, args.calibration, "train")
+    chosen = select_samples(dataset.annotations.column("token"), None, args.calibration_samples)
+    with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
+        single = Path(folder, "fp32.onnx")
+        export_onnx(inferencer.model, single, *settings)
+        samples = graph_inputs(OnnxInferencer(single), dataset, chosen)
+        quantize_onnx(single, args.out, (inputs for _, inputs in samples))
+    return OnnxInferencer(args.out)
+
+
+def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Namespace) -> str:
+    """Compare with torch; return what to print."""
+    dataset = open_samples(inferencer, args, args.samples, "test")
+    chosen = select_samples(dataset.annotations.column("token"), None, args.check)
+    differences, predictions = [], []
+    in_torch = inferencer.predict(dataset, chosen)
+    samples = graph_inputs(exported, dataset, chosen)
+    for expected, (token, inputs) in zip(in_torch, samples, strict=True):
+        found = exported.elements(exported.run(inputs))
+        truth = elements_of_predictions(expected.pred_instances_3d)
+        differences.append(largest_differences(found, truth))
+        predictions.append((token, found))
+    if args.results:
+        exported.write(args.results, predictions)
+    scores, metres = np.max(differences, 0)
+    return (
+        f"{len(chosen)} samples in ONNX Runtime and in torch differ by at most {scores:.1e} in "
+        f"score and {metres:.1e} m in the nearest element of a class"
+    )
+
+
+def main() -> str:
+    args = parse_args()
+    inferencer = MapInferencer(args.config, args.checkpoint, "cpu", args.cfg_options)
+    exported = write_model(inferencer, args)
+    rows, columns = exported.image_size
+    print(
+        f"{args.out}: {len(exported.cameras)} cameras of {rows} x {columns}, "
+        f"{args.out.stat().st_size / 2**20:.1f} MiB"
+    )
+    return check(inferencer, exported, args) if args.check else "not compared: give --check N"
+
+
+if __name__ == "__main__":
+    run_command(main)
