@@ -9,6 +9,7 @@ Cameras are those of the config, the image size is that of the config's test sam
 """
 
 import argparse
+import logging
 import tempfile
 from pathlib import Path
 
@@ -121,6 +122,8 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
 
 def main() -> str:
     args = parse_args()
+    for name in ("torch.onnx", "onnxscript"):  # they tell of what they need not do
+        logging.getLogger(name).setLevel(logging.ERROR)
     inferencer = MapInferencer(args.config, args.checkpoint, "cpu", args.cfg_options)
     exported = write_model(inferencer, args)
     rows, columns = exported.image_size

@@ -226,6 +226,11 @@ def test_an_operator_that_onnx_lacks_is_named(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_another_number_of_cameras_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"^the encoder is built for 6 cameras, got 5\.$"):
+        export_onnx(build_small(), tmp_path / "model.onnx", ["a"] * 5, (64, 96))
+
+
 def test_models_of_lidar_are_refused():
     model = build_small()
     model.lidar_encoder = torch.nn.Identity()

@@ -1,7 +1,6 @@
 """A trained model as one ONNX file: images and calibration in, map elements out."""
 
 import json
-import logging
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -17,8 +16,6 @@ from gsmap.structures.elements import MapElements
 from gsmap.utils.files import write_bytes
 
 OPSET = 18
-_PER_SAMPLE_WEIGHTS = 3  # position in torch's embedding_bag, after table, rows and offsets
-PRECISIONS = ("fp32", "fp16", "int8")
 
 
 class ExportedDetector(nn.Module):
@@ -88,7 +85,7 @@ def export_onnx(
     """Write a model as an ONNX file that holds standard operators only.
 
     Args:
-        model: A `MapDetector` with its weights, on the CPU.
+        model: A `MapDetector` with its weights, on the CPU; it is left in evaluation mode.
         out: File to write.
         cameras: Names of the cameras, in the order of the images.
         image_size: Rows and columns of the images as the data pipeline leaves them.
@@ -107,7 +104,6 @@ def export_onnx(
         raise ImportError(MISSING_EXTRA.format(package=error.name)) from error
     exported = ExportedDetector(model, half).eval()
     inputs = exported.example_inputs(len(cameras), image_size)
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of torchvision's absence
     try:
         with torch.no_grad():
             program = torch.onnx.export(
@@ -218,11 +214,23 @@ def _translations() -> dict[Any, Any]:
     """Say how torch's operators are written in ONNX where the exporter knows no good way."""
     from onnxscript import opset18 as op
 
-    def embedding_bag(table: Any, rows: Any, offsets: Any, *options: Any) -> Any:
+    def embedding_bag(
+        table: Any,
+        rows: Any,
+        offsets: Any,
+        _scale_grad: bool,
+        mode: int,
+        _sparse: bool,
+        weights: Any,
+        include_last_offset: bool,
+        _padding_idx: int | None,
+    ) -> Any:
         """Sum weighted rows in bags of one size, as `sum_rows` does, without a loop."""
+        if mode != 0 or weights is None or include_last_offset:
+            raise NotImplementedError("embedding_bag other than weighted sums in bags of one size")
         one = op.Constant(value_ints=[1])
         bags = op.Concat(op.Shape(offsets), op.Constant(value_ints=[-1]), axis=0)
-        weights = op.Unsqueeze(op.Reshape(options[_PER_SAMPLE_WEIGHTS], bags), one)
+        weights = op.Unsqueeze(op.Reshape(weights, bags), one)
         sums = op.MatMul(weights, op.Gather(table, op.Reshape(rows, bags)))
         return op.Squeeze(sums, one), offsets, offsets, offsets
 
@@ -244,9 +252,11 @@ def _metadata(exported: ExportedDetector, cameras: Sequence[str], frame: str) ->
 
 
 def _reason(error: BaseException) -> str:
-    """Say in one sentence what could not be exported."""
+    """Say what could not be exported."""
     while error.__cause__ is not None:
         error = error.__cause__
+    if type(error) is ValueError:  # the model's own word, for instance of a number of cameras
+        return str(error)
     return (
         f"the model cannot be written in ONNX's operators ({error!s:.300}): say how in "
         "_translations() of gsmap/apis/export.py, or replace that part of the model."
