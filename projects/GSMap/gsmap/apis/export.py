@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from gsmap.apis.onnx_inferencer import FORMAT, METADATA_KEY, MISSING_EXTRA, OnnxInferencer
+from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.structures.elements import MapElements
 from gsmap.utils.files import write_bytes
 
@@ -69,8 +70,10 @@ class ExportedDetector(nn.Module):
 
     def example_inputs(self, num_cams: int, image_size: tuple[int, int]) -> tuple[Tensor, ...]:
         """Return inputs of the right shapes: black images of cameras at the origin."""
-        eyes = torch.eye(4).repeat(num_cams, 1, 1)
-        calibration = (torch.zeros(18) if n == "can_bus" else eyes for n in self.input_names[1:])
+        calibration = (  # a tensor of its own for each: torch takes one tensor for one input
+            torch.zeros(NUM_CAN_BUS) if name == "can_bus" else torch.eye(4).repeat(num_cams, 1, 1)
+            for name in self.input_names[1:]
+        )
         return torch.zeros(num_cams, 3, *image_size), *calibration
 
 
