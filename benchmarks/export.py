@@ -26,10 +26,10 @@ def run(args: argparse.Namespace) -> None:
     """Measure and print both ways' time of every config.
 
     Raises:
-        ValueError: If another device than the CPU is asked for.
+        ValueError: If another device or precision is asked for.
     """
-    if args.device != "cpu":
-        raise ValueError(f"benchmarks export measures on the CPU, got --device {args.device}.")
+    if args.device != "cpu" or args.fp16:
+        raise ValueError("benchmarks export measures single precision on the CPU.")
     jobs = [(path, args) for path in args.configs]
     in_torch, in_onnx = (in_fresh_processes(task, jobs) for task in (torch_cost, onnx_cost))
     report(
@@ -61,6 +61,6 @@ def onnx_cost(path: str, args: argparse.Namespace) -> Cost:
     arrays["images"] = inputs["imgs"][0].numpy()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "model.onnx")
-        export_onnx(model, file, [f"camera {i}" for i in range(6)], args.size, half=args.fp16)
+        export_onnx(model, file, [f"camera {i}" for i in range(6)], args.size)
         exported = OnnxInferencer(file, num_threads=args.threads)
     return measure(partial(exported.run, arrays), torch.device("cpu"), args.repeats)

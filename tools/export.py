@@ -11,11 +11,19 @@ Cameras are those of the config, the image size is that of the config's test sam
 import argparse
 import logging
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gsmap.apis.export import export_onnx, graph_inputs, largest_differences, quantize_onnx
+from gsmap.apis.export import (
+    export_onnx,
+    graph_inputs,
+    halve_onnx,
+    largest_differences,
+    quantize_onnx,
+)
 from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
@@ -39,7 +47,7 @@ def parse_args() -> argparse.Namespace:
         help="rows and columns of the images after the data pipeline; the test samples' by default",
     )
     precision = parser.add_mutually_exclusive_group()
-    precision.add_argument("--fp16", action="store_true", help="half precision, as under AMP")
+    precision.add_argument("--fp16", action="store_true", help="convolutions in half precision")
     precision.add_argument("--int8", action="store_true", help="convolutions in 8 bits")
     parser.add_argument(
         "--calibration", type=Path, help="samples for --int8; the config's training set by default"
@@ -86,17 +94,28 @@ def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInfe
     if size is None:
         size = open_samples(inferencer, args, args.samples, "test")[0]["inputs"]["img"].shape[-2:]
     settings = (options.cameras, tuple(size), options.get("frame", "lidar"))
-    if not args.int8:
-        export_onnx(inferencer.model, args.out, *settings, half=args.fp16)
+    if not (args.fp16 or args.int8):
+        export_onnx(inferencer.model, args.out, *settings)
         return OnnxInferencer(args.out)
-    dataset = open_samples(inferencer, args, args.calibration, "train")
-    chosen = select_samples(dataset.annotations.column("token"), None, args.calibration_samples)
     with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
         single = Path(folder, "fp32.onnx")
         export_onnx(inferencer.model, single, *settings)
-        samples = graph_inputs(OnnxInferencer(single), dataset, chosen)
-        quantize_onnx(single, args.out, (inputs for _, inputs in samples))
+        if args.fp16:
+            halve_onnx(single, args.out)
+        else:
+            samples = calibration_samples(inferencer, OnnxInferencer(single), args)
+            quantize_onnx(single, args.out, samples)
     return OnnxInferencer(args.out)
+
+
+def calibration_samples(
+    inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Namespace
+) -> Iterator[dict[str, NDArray[np.float32]]]:
+    """Yield what --int8 is calibrated on."""
+    dataset = open_samples(inferencer, args, args.calibration, "train")
+    chosen = select_samples(dataset.annotations.column("token"), None, args.calibration_samples)
+    for _, inputs in graph_inputs(exported, dataset, chosen):
+        yield inputs
 
 
 def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Namespace) -> str:

@@ -14,6 +14,7 @@ from gsmap.apis.export import (
     ExportedDetector,
     export_onnx,
     graph_inputs,
+    halve_onnx,
     largest_differences,
     quantize_onnx,
 )
@@ -73,10 +74,10 @@ def annotations(minicity_annotations):
     return minicity_annotations["val"]
 
 
-def export(inferencer, dataset, path, **options):
+def export(inferencer, dataset, path):
     cameras = inferencer.cfg.test_dataloader.dataset.cameras
     size = tuple(dataset[0]["inputs"]["img"].shape[-2:])
-    export_onnx(inferencer.model, path, cameras, size, **options)
+    export_onnx(inferencer.model, path, cameras, size)
     return OnnxInferencer(path, num_threads=1)
 
 
@@ -250,7 +251,7 @@ def small(tmp_path_factory):
     path = tmp_path_factory.mktemp("small") / "fp32.onnx"
     model = build_small()
     export_onnx(model, path, [f"camera {i}" for i in range(6)], (64, 96))
-    return model, OnnxInferencer(path)
+    return OnnxInferencer(path)
 
 
 def small_inputs(exported, count=2):
@@ -263,9 +264,9 @@ def small_inputs(exported, count=2):
 def test_half_precision_and_8_bits_stay_close(small, tmp_path):
     import onnx
 
-    model, exported = small
+    exported = small
     inputs = small_inputs(exported)
-    export_onnx(model, tmp_path / "fp16.onnx", exported.cameras, exported.image_size, half=True)
+    halve_onnx(exported.path, tmp_path / "fp16.onnx")
     quantize_onnx(exported.path, tmp_path / "int8.onnx", inputs)
     expected = exported.elements(exported.run(inputs[0]))
     for name, operator, tolerance in (("fp16", "Cast", 0.01), ("int8", "QuantizeLinear", 0.1)):
@@ -279,7 +280,7 @@ def test_half_precision_and_8_bits_stay_close(small, tmp_path):
 
 
 def test_elements_beyond_the_margin_or_below_the_threshold_are_dropped(small):
-    exported = OnnxInferencer(small[1].path)
+    exported = OnnxInferencer(small.path)
     points = np.zeros((3, 4, 2))
     points[1, 0] = 15.0 + 5.1, 0  # the map ends at 15 m, its margin at 20
     outputs = {

@@ -24,13 +24,12 @@ class ExportedDetector(nn.Module):
 
     Args:
         model: The detector.
-        half: Whether convolutions and matrix products work in half precision, as under AMP.
 
     Raises:
         ValueError: If the model reads LiDAR.
     """
 
-    def __init__(self, model: Any, half: bool = False) -> None:
+    def __init__(self, model: Any) -> None:
         super().__init__()
         if model.lidar_encoder is not None:
             raise ValueError(
@@ -38,7 +37,6 @@ class ExportedDetector(nn.Module):
                 "Give a config without lidar_encoder."
             )
         self.model = model
-        self.half_precision = half
         self.input_names = ("images", *model.bev_encoder.calibration)
         shapes = ("scales", "rotations") if hasattr(model.map_head.reference, "space") else ()
         self.output_names = ("scores", "labels", "points", *shapes)
@@ -57,12 +55,10 @@ class ExportedDetector(nn.Module):
         """
         # a tensor of four axes is normalised and padded image by image
         images = self.model.data_preprocessor({"inputs": {"img": images}})["inputs"]["imgs"]
-        with torch.autocast(images.device.type, torch.float16, enabled=self.half_precision):
-            (feats, *_) = self.model.extract_img_feats(images[None])
-            named = dict(zip(self.input_names[1:], (x[None] for x in calibration), strict=True))
-            bev = self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:]))
-            head = self.model.map_head
-            outputs = head(bev)
+        (feats, *_) = self.model.extract_img_feats(images[None])
+        named = dict(zip(self.input_names[1:], (x[None] for x in calibration), strict=True))
+        head = self.model.map_head
+        outputs = head(self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:])))
         fields = head.reference.decode(outputs["all_references"][-1][0])
         best = head.coder.best(outputs["all_cls_scores"][-1][0])
         names = ("pts", *self.output_names[3:])
@@ -83,7 +79,6 @@ def export_onnx(
     cameras: Sequence[str],
     image_size: tuple[int, int],
     frame: str = "lidar",
-    half: bool = False,
 ) -> None:
     """Write a model as an ONNX file that holds standard operators only.
 
@@ -93,7 +88,6 @@ def export_onnx(
         cameras: Names of the cameras, in the order of the images.
         image_size: Rows and columns of the images as the data pipeline leaves them.
         frame: Frame of the annotations, for whoever uses the file.
-        half: Whether convolutions and matrix products work in half precision.
 
     Raises:
         ImportError: If the packages of the extra ``onnx`` are not installed.
@@ -105,7 +99,7 @@ def export_onnx(
         import onnxscript  # noqa: F401 - what torch's exporter is written with
     except ImportError as error:
         raise ImportError(MISSING_EXTRA.format(package=error.name)) from error
-    exported = ExportedDetector(model, half).eval()
+    exported = ExportedDetector(model).eval()
     inputs = exported.example_inputs(len(cameras), image_size)
     try:
         with torch.no_grad():
@@ -134,15 +128,46 @@ def export_onnx(
     write_bytes(out, proto.SerializeToString())
 
 
+def halve_onnx(path: str | Path, out: str | Path) -> None:
+    """Write an ONNX file whose convolutions work in half precision.
+
+    They are nearly all of the arithmetic. What places and scores elements stays in float32.
+
+    Args:
+        path: File of `export_onnx`.
+        out: File to write.
+    """
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    model = onnx.load(path)
+    weights = {tensor.name: tensor for tensor in model.graph.initializer}
+    nodes = list(model.graph.node)
+    del model.graph.node[:]
+    for node in nodes:
+        if node.op_type not in ("Conv", "ConvTranspose"):
+            model.graph.node.append(node)
+            continue
+        for name in node.input[1:]:
+            half = numpy_helper.to_array(weights[name]).astype(np.float16)
+            weights[name].CopyFrom(numpy_helper.from_array(half, name))
+        (image, *parameters), (result,) = node.input, node.output
+        names = f"{result}_half_in", f"{result}_half_out"
+        node.input[:], node.output[:] = [names[0], *parameters], [names[1]]
+        before = helper.make_node("Cast", [image], [names[0]], to=TensorProto.FLOAT16)
+        after = helper.make_node("Cast", [names[1]], [result], to=TensorProto.FLOAT)
+        model.graph.node.extend([before, node, after])
+    onnx.checker.check_model(model)
+    write_bytes(out, model.SerializeToString())
+
+
 def quantize_onnx(
     path: str | Path, out: str | Path, inputs: Iterable[dict[str, NDArray[np.float32]]]
 ) -> None:
     """Write an ONNX file whose convolutions work in 8 bits, calibrated on samples.
 
-    They are nearly all of the arithmetic. What places and scores elements stays in float32.
-
     Args:
-        path: File of `export_onnx`, in single precision.
+        path: File of `export_onnx`.
         out: File to write.
         inputs: Inputs of the graph for some samples, as `OnnxInferencer.prepare` returns them.
 
