@@ -36,8 +36,8 @@ def parse_args() -> argparse.Namespace:
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("config", help="config file of the model")
-    parser.add_argument("checkpoint", help="its checkpoint")
+    parser.add_argument("config", help="config file of the model, or the name of one that ships")
+    parser.add_argument("checkpoint", nargs="?", help="its checkpoint; not needed with a name")
     parser.add_argument("--out", type=Path, required=True, help="ONNX file to write")
     parser.add_argument(
         "--size",
