@@ -109,7 +109,7 @@ def check_state(golden: Golden, name: str) -> Iterator[Row]:
     """Compare MGMapNet's state with ours."""
     yield from state_rows(golden, name, CONFIG)
     shapes = golden.state_shapes(name)
-    made = {key: unused.value() for key, unused in MGMAPNET.unused.items() if unused.value}
+    made = {key: value for key, value in MGMAPNET.unused.items() if value is not None}
     wrong = [key for key, value in made.items() if tuple(value.shape) != shapes.get(key)]
     yield Row(name, "unused keys of another shape", len(wrong), 0)
 
