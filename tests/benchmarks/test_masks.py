@@ -18,3 +18,8 @@ def test_the_command_writes_a_table_per_reduction_and_band_and_one_of_misses(tmp
     assert (
         f"| both | 0.75 m | 128 x 64 | {masks.miss('both', 0.75, 10.0, (128, 64)):.3f} |" in report
     )
+
+
+def test_a_filled_mask_draws_the_centres_off_the_outline():
+    assert masks.fitted_crossing(filled=False, iterations=200) > 0.9
+    assert masks.fitted_crossing(filled=True, iterations=200) < 0.5
