@@ -239,8 +239,9 @@ run_command(command, heed_kill={heed_kill})
 def test_ctrl_c_is_one_line_with_forked_workers_and_none_from_other_ranks(tmp_path):
     """A terminal sends it to the whole group: workers of a data loader, all ranks of a machine."""
     program = """
-import os, time
+import os, signal, time
 from gsmap.utils.cli import run_command
+signal.signal(signal.SIGINT, signal.default_int_handler)  # these tests may run in the background
 def command():
     if os.fork() == 0:
         print("ready", flush=True)
