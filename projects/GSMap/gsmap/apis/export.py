@@ -115,6 +115,7 @@ def export_onnx(
             )
     except torch.onnx.errors.OnnxExporterError as error:
         raise ValueError(_reason(error)) from error
+    assert program is not None  # it is None only where torch writes the file itself
     proto = program.model_proto
     for part in (proto.graph, *proto.graph.node):  # stack traces of the machine that exported
         del part.metadata_props[:]
@@ -240,7 +241,9 @@ def largest_differences(found: MapElements, expected: MapElements) -> tuple[floa
 
 def _translations() -> dict[Any, Any]:
     """Say how torch's operators are written in ONNX where the exporter knows no good way."""
-    from onnxscript import opset18 as op
+    from onnxscript import opset18
+
+    op: Any = opset18  # its types know tensors by element type, which no value here has yet
 
     def embedding_bag(
         table: Any,

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array64 = NDArray[np.float64]
+FloatArray = NDArray[np.floating[Any]]
 NUM_CAN_BUS = 18
 
 
-def _field(meta: Mapping[str, Any], key: str) -> Array64:
+def _field(meta: Mapping[str, Any], key: str) -> FloatArray:
     """Return one field of a sample's metainfo in float64."""
     if key not in meta:
         raise ValueError(
@@ -19,18 +19,18 @@ def _field(meta: Mapping[str, Any], key: str) -> Array64:
     return np.asarray(meta[key], dtype=np.float64)
 
 
-def _can_bus(meta: Mapping[str, Any]) -> Array64:
+def _can_bus(meta: Mapping[str, Any]) -> FloatArray:
     """Return the vehicle's motion; zeros where it is not known. (18,)"""
     return np.zeros(NUM_CAN_BUS) if meta.get("can_bus") is None else _field(meta, "can_bus")
 
 
-def _ego_from_cam(meta: Mapping[str, Any]) -> Array64:
+def _ego_from_cam(meta: Mapping[str, Any]) -> FloatArray:
     """Return the cameras' poses in the vehicle. (V, 4, 4)"""
     return _field(meta, "lidar2ego") @ np.linalg.inv(_field(meta, "lidar2cam"))
 
 
 # Inverses are taken in float64, so that they are as exact as float32 can hold them.
-_READERS: dict[str, Callable[[Mapping[str, Any]], Array64]] = {
+_READERS: dict[str, Callable[[Mapping[str, Any]], FloatArray]] = {
     "img_from_frame": lambda meta: _field(meta, "lidar2img"),
     "frame_from_img": lambda meta: np.linalg.inv(_field(meta, "lidar2img")),
     "cam2img": lambda meta: _field(meta, "cam2img"),
