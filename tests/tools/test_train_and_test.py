@@ -107,10 +107,10 @@ def test_the_data_set_and_what_a_model_finds_are_drawn(
     assert len(list(browsed.glob("*.png"))) == 1
 
 
-def test_a_data_set_is_browsed_as_a_page(config, tmp_path):
+def test_a_data_set_is_browsed_as_a_page(tiny_config, tmp_path):
     page = tmp_path / "page.html"
     done = run(
-        sys.executable, "tools/browse_dataset.py", config, "--num", "1", "--split", "val",
+        sys.executable, "tools/browse_dataset.py", tiny_config, "--num", "1", "--split", "val",
         "--web", page,
     )  # fmt: skip
     assert done.splitlines()[-1].startswith("1 frames, ")
