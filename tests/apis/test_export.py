@@ -215,10 +215,10 @@ def test_other_files_and_an_absent_package_are_named(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"other.onnx cannot be run by ONNX Runtime"):
         OnnxInferencer(path)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ImportError, match=r"onnxruntime is not installed: .*\[onnx\]"):
+    with pytest.raises(RuntimeError, match=r"onnxruntime is not installed: .*\[onnx\]"):
         OnnxInferencer(path)
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ImportError, match=r"onnx is not installed: .*\[onnx\]"):
+    with pytest.raises(RuntimeError, match=r"onnx is not installed: .*\[onnx\]"):
         export_onnx(build_small(), path, ["a"], (32, 32))
 
 

@@ -11,9 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from gsmap.apis.onnx_inferencer import FORMAT, METADATA_KEY, MISSING_EXTRA, OnnxInferencer
+from gsmap.apis.onnx_inferencer import FORMAT, METADATA_KEY, OnnxInferencer
 from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.structures.elements import MapElements
+from gsmap.utils.extras import import_extra
 from gsmap.utils.files import write_bytes
 
 OPSET = 18
@@ -90,15 +91,12 @@ def export_onnx(
         frame: Frame of the annotations, for whoever uses the file.
 
     Raises:
-        ImportError: If the packages of the extra ``onnx`` are not installed.
+        RuntimeError: If the packages of the extra ``onnx`` are not installed.
         ValueError: If the model reads LiDAR, has another number of cameras, or does something for
             which ONNX has no operator.
     """
-    try:
-        import onnx
-        import onnxscript  # noqa: F401 - what torch's exporter is written with
-    except ImportError as error:
-        raise ImportError(MISSING_EXTRA.format(package=error.name)) from error
+    onnx = import_extra("onnx", "onnx")
+    import_extra("onnxscript", "onnx")  # what torch's exporter is written with
     exported = ExportedDetector(model).eval()
     inputs = exported.example_inputs(len(cameras), image_size)
     try:

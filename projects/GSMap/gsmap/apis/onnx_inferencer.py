@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.elements import MapElements
+from gsmap.utils.extras import import_extra
 
 METADATA_KEY = "gsmap"
 FORMAT = 1
-MISSING_EXTRA = "{package} is not installed: `pip install -e .[onnx]` brings what ONNX files need."
 
 
 class OnnxInferencer:
@@ -33,7 +33,7 @@ class OnnxInferencer:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ImportError: If onnxruntime is not installed.
+        RuntimeError: If onnxruntime is not installed.
         ValueError: If the file is not an exported model, or of another version.
     """
 
@@ -43,10 +43,7 @@ class OnnxInferencer:
         providers: Sequence[str] = ("CPUExecutionProvider",),
         num_threads: int = 0,
     ) -> None:
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise ImportError(MISSING_EXTRA.format(package=error.name)) from error
+        onnxruntime = import_extra("onnxruntime", "onnx")
         self.path = Path(path)
         if not self.path.is_file():
             raise FileNotFoundError(f"There is no ONNX file {path}; tools/export.py writes one.")

@@ -117,7 +117,7 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
             sys.stderr.flush()
             os._exit(128 + signal.SIGINT)  # the interpreter's own end would wait for other ranks
         sys.exit(128 + signal.SIGINT)
-    except (OSError, ImportError, ValueError, TypeError, KeyError, RuntimeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
         if not _is_for_the_user(error):
             raise
         # a KeyError's own text is its message in quotes
