@@ -26,6 +26,7 @@ from gsmap.engine.launch import parse_options, read_config
 from gsmap.utils.files import atomic_write
 
 METRIC_NAMES = ("chamfer", "raster")
+_DECIDING = ("config", "checkpoint", "data_root", "iterations", "batch", "lr")
 
 
 @dataclass(frozen=True)
@@ -57,16 +58,19 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def run(args: argparse.Namespace) -> None:
     """Store the features, train and test every variant, print a table."""
-    args.out.mkdir(parents=True, exist_ok=True)
+    variants: dict[str, str] = json.loads(args.variants.read_text())
+    settings = {key: str(getattr(args, key)) for key in _DECIDING}
+    for name, text in variants.items():
+        refuse_others(args.out / f"{name}.settings.json", {**settings, "variant": text})
     options = {f"{part}_dataloader.dataset.data_root": args.data_root for part in ("train", "val")}
     features = {part: args.out / f"{part}.pt" for part in ("train", "val")}
     for part, path in features.items():
         if not path.exists():
             store_features(read_config(args.config, options), args.checkpoint, part, path)
     tasks = {}
-    for name, text in json.loads(args.variants.read_text()).items():
-        config, *settings = shlex.split(text)
-        changed = parse_options(settings) if settings else {}
+    for name, text in variants.items():
+        config, *overrides = shlex.split(text)
+        changed = parse_options(overrides) if overrides else {}
         for seed in range(args.seeds):
             tasks[name, seed] = Task(Path(config), changed, seed)
     figures: dict[tuple[str, int], dict[str, float]] = {}
@@ -83,11 +87,19 @@ def run(args: argparse.Namespace) -> None:
             figures[key] = future.result()
             with atomic_write(path) as file:
                 json.dump(figures[key], file, indent=1)
-            print(f"{key[0]}, seed {key[1]}: {cells(figures[key])}", flush=True)
+            print(f"{key[0]}, seed {key[1]}: {', '.join(cells(figures[key]))}", flush=True)
     table = [[name, str(seed), *cells(found)] for (name, seed), found in figures.items()]
     header = ["head", "seed", "divider", "ped_crossing", "boundary", "mean"]
     print(f"\n{args.iterations} iterations of {args.batch}, AP_chamfer / AP_raster\n")
     print(markdown_table(header, table))
+
+
+def refuse_others(path: Path, settings: dict[str, str]) -> None:
+    """Note what a variant's figures come from, or raise an error if those there are of others."""
+    if path.exists() and json.loads(path.read_text()) != settings:
+        raise ValueError(f"{path.parent} holds figures of other settings: give another --out.")
+    with atomic_write(path) as file:
+        json.dump(settings, file, indent=1)
 
 
 def cells(figures: dict[str, float]) -> list[str]:

@@ -35,8 +35,11 @@ def test_variants_of_a_head_are_trained_on_stored_features(
     for part in ("train", "val"):
         (tmp_path / f"{part}.pt").rename(args.out / f"{part}.pt")
     heads.run(args)
-    first = {path.name: path.stat().st_mtime_ns for path in args.out.glob("*.json")}
+    first = {path.name: path.stat().st_mtime_ns for path in args.out.glob("*-0.json")}
     assert len(first) == 3
     heads.run(args)  # what is there is not run again
-    assert first == {path.name: path.stat().st_mtime_ns for path in args.out.glob("*.json")}
+    assert first == {path.name: path.stat().st_mtime_ns for path in args.out.glob("*-0.json")}
     assert "3 iterations of 2" in capsys.readouterr().out
+    args.iterations = 4
+    with pytest.raises(ValueError, match="figures of other settings: give another --out"):
+        heads.run(args)
