@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_rgba
 from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.record import CameraRecord
@@ -70,10 +71,8 @@ class _Log:
         self._kinds = import_extra("foxglove.channels", "viz")
         self._channels: dict[str, Any] = {}
         self._colours = [
-            self._messages.Color(
-                **{k: int(c[i : i + 2], 16) / 255 for k, i in (("r", 1), ("g", 3), ("b", 5))}, a=1.0
-            )
-            for c in colours
+            self._messages.Color(**dict(zip("rgba", to_rgba(colour), strict=True)))
+            for colour in colours
         ]
 
     def _send(self, topic: str, message: Any, time_ns: int) -> None:

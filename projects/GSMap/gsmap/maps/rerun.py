@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_rgba_array
 
 from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.maps.drive import Drive
@@ -117,5 +118,5 @@ def _log_predictions(recording: Any, rr: Any, moment: Moment, colours: Sequence[
 
 def _rgb(labels: Sequence[int], colours: Sequence[str]) -> np.ndarray:
     """Return the colours of classes. (N, 3) uint8"""
-    table = [[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours]
-    return np.array([table[label] for label in labels], np.uint8).reshape(-1, 3)
+    table = np.round(255 * to_rgba_array(colours)[:, :3]).astype(np.uint8)
+    return table[np.asarray(labels, int)]
