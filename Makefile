@@ -1,4 +1,4 @@
-.PHONY: help setup test lint format demo clean
+.PHONY: help setup test lint format demo docs clean
 
 VENV ?= .venv
 PY := $(VENV)/bin/python
@@ -8,7 +8,8 @@ help:
 	@echo "make test    set up if needed, then run every test"
 	@echo "make demo    set up if needed, then a trained GSMap drawn on MiniCity, and one trained from scratch beside it"
 	@echo "make lint    ruff, ruff format, codespell, mypy"
-	@echo "make format  let ruff mend what it can"
+	@echo "make format  let ruff fix what it can"
+	@echo "make docs    the documentation as a site, in site/"
 
 setup:
 	@tools/setup_env.sh $(VENV)
@@ -30,5 +31,9 @@ format: setup
 demo: setup
 	$(PY) tools/demo.py $(ARGS)
 
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
+	@echo "Open site/index.html, or for the search: $(PY) -m http.server -d site"
+
 clean:
-	rm -rf demo work_dirs .pytest_cache .mypy_cache .ruff_cache
+	rm -rf demo site work_dirs .pytest_cache .mypy_cache .ruff_cache

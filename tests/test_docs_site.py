@@ -1,0 +1,51 @@
+"""The documentation builds as a site, whole and without network."""
+
+import re
+from pathlib import Path
+
+import pytest
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
+
+REPO = Path(__file__).resolve().parents[1]
+LOADED = re.compile(
+    r"""<(?:script|img|iframe)[^>]*\bsrc=["']?(?:https?:)?//|<link[^>]*\bhref=["']?(?:https?:)?//|"""
+    r"""@import|url\(["']?(?:https?:)?//"""
+)
+CLASS = re.compile(r"register_module\([^)]*\)\nclass (\w+)")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    config = load_config(str(REPO / "mkdocs.yml"), site_dir=str(folder), strict=True)
+    config.plugins.on_startup(command="build", dirty=False)
+    build(config)  # a broken link, a missing page or a wrong anchor ends it: strict
+    return folder
+
+
+def test_nothing_is_loaded_from_the_network(site: Path):
+    pages = [*site.rglob("*.html"), *site.rglob("*.css")]
+    assert len(pages) > 50
+    assert [page for page in pages if LOADED.search(page.read_text(encoding="utf-8"))] == []
+
+
+def test_no_table_or_list_is_left_as_text(site: Path):
+    """MkDocs wants an empty line before each, where the code host does not."""
+    left = re.compile(r"<p>[^<]*\| -|<p>(?:(?!</p>).)*\n(?:[*-]|1\.) ", re.DOTALL)
+    pages = {page: page.read_text(encoding="utf-8") for page in site.rglob("*.html")}
+    assert [page for page, text in pages.items() if left.search(text)] == []
+
+
+def test_the_reference_has_every_registered_name(site: Path):
+    sources = (REPO / "projects/GSMap/gsmap").rglob("*.py")
+    names = {name for path in sources for name in CLASS.findall(path.read_text(encoding="utf-8"))}
+    listed = re.search(
+        r"LOSSES = \((.*?)\)", (REPO / "projects/GSMap/gsmap/registered.py").read_text(), re.DOTALL
+    )
+    names |= set(re.findall(r"\w+", listed[1]))
+    assert len(names) > 50
+    shown = "".join(page.read_text(encoding="utf-8") for page in (site / "api").glob("*.html"))
+    assert {name for name in names if not re.search(rf'id="gsmap\.[\w.]+\.{name}"', shown)} == set()
+    assert ":math:" not in shown
+    assert "<math" in shown
