@@ -105,6 +105,19 @@ def test_annotation_file_and_samples_give_the_same(inferencer, tmp_path):
     assert (pts[0] - pts[1]).abs().max() > 1e-3  # the images matter
 
 
+def test_a_files_own_folder_is_where_its_images_are_looked_for(inferencer, tmp_path):
+    """By default; the config's root serves a file that lies apart from its images."""
+    images = tmp_path / "images"
+    images.mkdir()
+    samples = make_samples(images, 1)
+    for folder in (images, tmp_path):
+        write_annotations(folder / "own.arrow", AnnotationMeta("own", "lidar", "any"), samples)
+    beside = inferencer.dataset(images / "own.arrow")
+    assert [s.metainfo["token"] for s in inferencer.predict(beside)] == ["t0"]
+    assert inferencer.dataset(tmp_path / "own.arrow").data_root == ""  # the config's
+    assert inferencer.dataset(images / "own.arrow", tmp_path).data_root == str(tmp_path)
+
+
 def test_chosen_samples_come_in_their_order(inferencer, tmp_path):
     dataset = inferencer.dataset(make_samples(tmp_path), tmp_path)
     assert [s.metainfo["token"] for s in inferencer.predict(dataset, [2, 0])] == ["t2", "t0"]

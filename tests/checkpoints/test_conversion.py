@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from mmdet3d.registry import MODELS
+from mmengine.config import Config
 from mmengine.runner.checkpoint import load_checkpoint
 from model_cases import (
     build_small,
@@ -15,6 +17,7 @@ from model_cases import (
 )
 from torch import nn
 
+from gsmap.apis.checkpoint import load_weights, read_weights
 from gsmap.checkpoints.convert import (
     convert_state,
     ours_from_upstream,
@@ -147,6 +150,20 @@ def test_a_file_of_something_else_is_refused(tmp_path):
     torch.save({"state_dict": {"epoch": 3}}, path)
     with pytest.raises(ValueError, match="holds no state dict of tensors"):
         read_checkpoint(path)
+
+
+def test_a_training_checkpoint_converts_without_its_auxiliary_heads(tmp_path):
+    """The masks that teach MiniCity's small MapTR to see have no place in upstream's."""
+    cfg = Config.fromfile(REPO / "configs/maptr/maptr_r18_minicity.py")
+    state = read_weights("maptr_r18_minicity")
+    assert "map_head.aux_heads.seg.0.weight" in state
+    upstream, done = convert_state(state)
+    assert "without the 3 weights of auxiliary heads" in done
+    torch.save(upstream, tmp_path / "upstream.pth")
+    cfg.model.map_head.aux_heads = []
+    model = MODELS.build(cfg.model)
+    load_weights(model, tmp_path / "upstream.pth")
+    assert all(torch.equal(value, state[key]) for key, value in model.state_dict().items())
 
 
 def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch, capsys):

@@ -8,6 +8,7 @@ import pytest
 
 from gsmap.converters.custom import from_records
 from gsmap.datasets.annotations.file import AnnotationFile, AnnotationMeta
+from gsmap.visualization.frame_view import FRAME_VIEWS
 
 DOC = Path(__file__).resolve().parents[2] / "docs/custom_data.md"
 META = AnnotationMeta("mine", "ego", "train", x_range=(-30, 30), y_range=(-15, 15))
@@ -62,6 +63,27 @@ def test_height_is_interpolated_where_a_line_is_cut(tmp_path: Path):
     meta = AnnotationMeta("mine", "ego", "train", x_range=(-30, 30), y_range=(-15, 15), dim=3)
     (line,) = elements(tmp_path, {"label": 0, "points": [[20, 0, 0], [40, 0, 2]]}, meta=meta)
     np.testing.assert_allclose(line.points, [[20, 0, 0], [30, 0, 1]])
+
+
+@pytest.mark.parametrize("frame", ["ego", "lidar"])
+def test_an_unknown_mounting_is_not_the_identity(frame: str, tmp_path: Path, caplog):
+    """Lines must lie on the road: 1.84 m below a LiDAR by default, not at its own height."""
+    meta = AnnotationMeta("mine", frame, "train")
+    mounted = np.eye(4)
+    mounted[2, 3] = 1.5
+    records = [
+        record(),
+        {**record(ego_from_frame=mounted), "token": "u"},
+        {**record(), "token": "v"},
+    ]
+    from_records(tmp_path / "a.arrow", records, meta, tmp_path)
+    file = AnnotationFile(tmp_path / "a.arrow")
+    heights = [FRAME_VIEWS[frame].tilted(sample.ego_from_frame).ground for sample in file]
+    usual = FRAME_VIEWS[frame].ground
+    assert heights == [usual, (0, 0, FRAME_VIEWS[frame].ego_ground_z_m - 1.5), usual]
+    unknown = [sample.ego_from_frame is None for sample in file]
+    assert unknown == ([True, False, True] if frame == "lidar" else [False] * 3)
+    assert caplog.text.count("has no ego_from_frame") == (frame == "lidar")
 
 
 def test_lidar_and_signals_are_kept(tmp_path: Path):

@@ -94,7 +94,8 @@ def implausible(result: Any) -> str:
 
 
 def _implausible_sample(sample: MapSample) -> str:
-    poses = [sample.global_from_frame, sample.ego_from_frame]
+    poses = [sample.global_from_frame]
+    poses += [] if sample.ego_from_frame is None else [sample.ego_from_frame]
     poses += [camera.cam_from_frame for camera in sample.cameras]
     paths = [camera.path for camera in sample.cameras]
     for record in [] if sample.lidar is None else [sample.lidar, *sample.lidar.sweeps]:

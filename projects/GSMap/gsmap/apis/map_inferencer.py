@@ -100,6 +100,12 @@ def spread_evenly(count: int, max_num: int | None = None) -> list[int]:
     return np.linspace(0, count - 1, max_num).round().astype(int).tolist()
 
 
+def _lies_with_its_images(path: Path, dataset: VectorizedMapDataset) -> bool:
+    """Whether the first image of an annotation file is found from the file's own folder."""
+    cameras = dataset.sample(0).cameras
+    return bool(cameras) and (path.parent / cameras[0].path).is_file()
+
+
 class MapInferencer:
     """Runs a trained model on samples, through the pipeline that the config tests with.
 
@@ -158,8 +164,8 @@ class MapInferencer:
         Args:
             source: An annotation file, an info file of mmdet3d, a folder with one of them, or
                 samples in the frame of the config.
-            data_root: Folder that image paths start from; that of an info file, or else the
-                config's, by default.
+            data_root: Folder that image paths start from; by default that of the file, or the
+                config's where an annotation file lies apart from its images.
             allow_missing_cameras: Whether an info file may name images that do not exist.
 
         Returns:
@@ -183,6 +189,8 @@ class MapInferencer:
         if data_root is not None:
             options["data_root"] = str(Path(data_root).resolve())
         dataset = DATASETS.build(options)
+        if data_root is None and _lies_with_its_images(path, dataset):
+            dataset.data_root = str(path.resolve().parent)
         self.visualizer.dataset_meta = dataset.metainfo
         return dataset
 

@@ -37,20 +37,27 @@ def upstream_from_ours(
 ) -> dict[str, Tensor]:
     """Rename our state to upstream's keys and add the ones that only upstream has.
 
+    Auxiliary heads, which serve training alone, are left out where upstream has none.
+
     Raises:
-        ValueError: If a key is not in the table (``key_map``, or the one that the keys tell).
+        ValueError: If another key is not in the table (``key_map``, or the one that the keys tell).
     """
     key_map = key_map or find_key_map(state)
     names = {key: key_map.to_upstream(key) for key in state}
-    unknown = [key for key, name in names.items() if name is None]
+    unknown = [key for key, name in names.items() if name is None and not _serves_training(key)]
     if unknown:
         raise ValueError(
-            f"keys that upstream's {key_map.name} does not have: {', '.join(unknown)}."
+            f"keys that upstream's {key_map.name} does not have: {', '.join(unknown)}. Without "
+            "them the model would find something else: it stays in our format."
         )
     renamed = {name: state[key] for key, name in names.items() if name is not None}
     extra = {key: value for key, value in key_map.unused.items() if value is not None}
     copies = {k: v.clone(memory_format=torch.contiguous_format) for k, v in extra.items()}
     return {**renamed, **copies}
+
+
+def _serves_training(key: str) -> bool:
+    return key.startswith("map_head.aux_heads.")
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -82,4 +89,8 @@ def convert_state(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     key_map = find_key_map(state)
     if is_upstream(state):
         return ours_from_upstream(state, key_map), f"{key_map.name}: upstream to gsmap"
-    return upstream_from_ours(state, key_map), f"{key_map.name}: gsmap to upstream"
+    done = f"{key_map.name}: gsmap to upstream"
+    left_out = sum(_serves_training(key) and key_map.to_upstream(key) is None for key in state)
+    if left_out:
+        done += f" without the {left_out} weights of auxiliary heads, which serve training alone"
+    return upstream_from_ours(state, key_map), done

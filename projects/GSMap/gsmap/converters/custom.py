@@ -1,5 +1,6 @@
 """Annotation files of your own data, from plain records: any cameras, ground truth or not."""
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,11 @@ from gsmap.datasets.annotations.record import (
 from gsmap.datasets.errors import naming
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 
+_LOGGER = logging.getLogger(__name__)
+_UNMOUNTED = (
+    "record %r has no ego_from_frame: pictures will take the road to be level, 1.84 m below the "
+    "sensor (nuScenes' height), and models that lift images (MapTRv2) cannot use it."
+)
 _RECORD_KEYS = {
     "token", "cameras", "instances", "global_from_frame", "ego_from_frame", "timestamp_ns", "scene",
     "map_name", "lidar", "can_bus",
@@ -46,8 +52,9 @@ def from_records(
       range of ``meta`` is cut off; rings stay rings;
     - ``lidar``: mapping with ``path``, ``frame_from_lidar`` (4, 4) and ``sweeps``, mappings with
       ``path``, ``timestamp_ns``, ``frame_from_lidar``;
-    - ``scene``, ``map_name``, ``timestamp_ns``, ``global_from_frame``, ``ego_from_frame``,
-      ``can_bus``.
+    - ``ego_from_frame`` (4, 4): where the frame ``lidar`` stands on the vehicle, whose z = 0 is the
+      road; absent: not known, and one warning says what that means;
+    - ``scene``, ``map_name``, ``timestamp_ns``, ``global_from_frame``, ``can_bus``.
 
     Args:
         path: Annotation file to write.
@@ -68,6 +75,7 @@ def from_records(
 def _samples(
     records: Iterable[Mapping[str, Any]], meta: AnnotationMeta, root: Path
 ) -> Iterator[MapSample]:
+    warned = False
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
         with naming(f"record {name!r}", "correct it"):
@@ -78,12 +86,17 @@ def _samples(
                 )
             sample = _sample(record, meta, root)
             check_samples([sample], meta)
+        if sample.ego_from_frame is None and meta.frame == "lidar" and not warned:
+            warned = True
+            _LOGGER.warning(_UNMOUNTED, sample.token)
         yield sample
 
 
 def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     token = record["token"]
-    can_bus, instances, lidar = (record.get(key) for key in ("can_bus", "instances", "lidar"))
+    can_bus, instances, lidar, mounting = (
+        record.get(key) for key in ("can_bus", "instances", "lidar", "ego_from_frame")
+    )
     return MapSample(
         token=token,
         scene=record.get("scene", ""),
@@ -91,7 +104,7 @@ def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapS
         timestamp_ns=int(record.get("timestamp_ns", 0)),
         cameras=[_camera(camera, token, root) for camera in record["cameras"]],
         global_from_frame=_matrix(record.get("global_from_frame")),
-        ego_from_frame=_matrix(record.get("ego_from_frame")),
+        ego_from_frame=None if mounting is None else _matrix(mounting),
         lidar=None if lidar is None else _lidar(lidar),
         can_bus=None if can_bus is None else np.asarray(can_bus, np.float64),
         instances=None if instances is None else _instances(instances, meta, token),

@@ -12,9 +12,10 @@ NUM_CAN_BUS = 18
 
 def _field(meta: Mapping[str, Any], key: str) -> FloatArray:
     """Return one field of a sample's metainfo in float64."""
-    if key not in meta:
+    if meta.get(key) is None:
         raise ValueError(
-            f"sample {meta.get('token')!r} has no {key!r} in its metainfo: pack it in the pipeline."
+            f"sample {meta.get('token')!r} has no {key!r} in its metainfo: pack it in the "
+            "pipeline; lidar2ego is a record's ego_from_frame (docs/custom_data.md)."
         )
     return np.asarray(meta[key], dtype=np.float64)
 

@@ -23,15 +23,18 @@ class FrameView:
     vehicle_m: tuple[float, float, float]
     ego_ground_z_m: float = 0.0
 
-    def tilted(self, ego_from_frame: np.ndarray) -> "FrameView":
+    def tilted(self, ego_from_frame: np.ndarray | None) -> "FrameView":
         """Return the view with the ground plane that the sensor's mounting implies.
 
         A roof LiDAR is mounted with a tilt of a degree or two, which at 20 m moves the ground by
         half a metre.
 
         Args:
-            ego_from_frame: Transform from the annotation frame to the vehicle. (4, 4)
+            ego_from_frame: Transform from the annotation frame to the vehicle; None leaves the
+                frame's usual level ground. (4, 4)
         """
+        if ego_from_frame is None:
+            return self
         a, b, c, height = (float(v) for v in np.asarray(ego_from_frame)[2])
         return replace(self, ground=(-a / c, -b / c, (self.ego_ground_z_m - height) / c))
 

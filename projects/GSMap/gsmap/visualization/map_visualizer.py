@@ -165,8 +165,7 @@ class MapVisualizer(Visualizer):
         view = FRAME_VIEWS[frame]
         if self.ground_z_m is not None:
             return replace(view, ground=(0.0, 0.0, self.ground_z_m))
-        mounting = metainfo.get("lidar2ego")
-        return view if mounting is None else view.tilted(np.asarray(mounting))
+        return view.tilted(metainfo.get("lidar2ego"))
 
     def cameras(
         self, metainfo: dict, images: Sequence[np.ndarray] | None = None

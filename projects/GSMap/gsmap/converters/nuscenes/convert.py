@@ -217,6 +217,7 @@ class _Conversion:
                 continue
             sample = self.reader.read(record, scene)
             self._count_missing(sample)
+            assert sample.ego_from_frame is not None  # nuScenes calibrates every sensor
             pose = sample.global_from_frame @ invert_rigid(sample.ego_from_frame)
             sample.can_bus = self.can_bus.signals(sample.scene, sample.timestamp_ns, pose)
             samples.append(sample)

@@ -27,8 +27,11 @@ def check_batch(batch: Batch, meta: AnnotationMeta) -> None:
     each = np.arange(len(batch) + 1)
     if pc.any(pc.equal(batch.column["token"], "")).as_py():
         raise ValueError("a sample has an empty token.")
-    for name in ("global_from_frame", "ego_from_frame"):
-        _require_rigid(getattr(batch, name), each, batch, name)
+    _require_rigid(batch.global_from_frame, each, batch, "global_from_frame")
+    if batch.has_mounting.any():
+        known = np.cumsum([0, *batch.has_mounting])
+        mountings = batch.ego_from_frame[batch.has_mounting]
+        _require_rigid(mountings, known, batch, "ego_from_frame")
     if batch.has_can_bus.any():
         finite = np.isfinite(batch.can_bus).all(-1) | ~batch.has_can_bus
         _require(finite, each, batch, "can_bus holds NaN or infinity")

@@ -94,7 +94,7 @@ class AnnotationWriter:
         if sample.token in self._tokens:
             raise ValueError(f"sample {sample.token!r} was already written to {self.path}.")
         self._tokens.add(sample.token)
-        self._rows.append(row_of(sample, self.meta.dim))
+        self._rows.append(row_of(sample, self.meta))
         if len(self._rows) == _ROWS_PER_BATCH:
             self._flush()
 
@@ -162,7 +162,7 @@ def check_samples(samples: Sequence[MapSample], meta: AnnotationMeta) -> None:
     Raises:
         ValueError: If a shape or value is wrong; the message names the sample.
     """
-    batch = batch_of([row_of(sample, meta.dim) for sample in samples], schema_of(meta))
+    batch = batch_of([row_of(sample, meta) for sample in samples], schema_of(meta))
     check_batch(Batch(batch, meta.dim), meta)
 
 

@@ -95,8 +95,8 @@ class MapSample:
         can_bus: Vehicle signals in MapTR's layout, or None. (18,)
         instances: Map elements; None where no ground truth is known (an empty list says that
             nothing is there).
-        ego_from_frame: Transform from the annotation frame to the vehicle; identity where the frame
-            is the vehicle. (4, 4)
+        ego_from_frame: Transform from the annotation frame to the vehicle; None where it is not
+            known, which in the frame ``ego`` means the identity. (4, 4)
     """
 
     token: str
@@ -108,7 +108,7 @@ class MapSample:
     lidar: LidarRecord | None = None
     can_bus: np.ndarray | None = None
     instances: list[MapInstance] | None = None
-    ego_from_frame: np.ndarray = field(default_factory=lambda: np.eye(4))
+    ego_from_frame: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

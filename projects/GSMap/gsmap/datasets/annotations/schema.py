@@ -106,12 +106,12 @@ def _sensors(sample: MapSample, where: str) -> dict[str, Any]:
     return {"cameras": cameras, "lidar": lidar}
 
 
-def row_of(sample: MapSample, dim: int) -> dict[str, Any]:
+def row_of(sample: MapSample, meta: AnnotationMeta) -> dict[str, Any]:
     """Return a sample as the nested values of one Arrow row, by column.
 
     Args:
         sample: The sample.
-        dim: Coordinates per point.
+        meta: Metadata of the file: its frame, and coordinates per point.
 
     Raises:
         ValueError: If a matrix or an element has another shape, or holds no numbers.
@@ -120,17 +120,21 @@ def row_of(sample: MapSample, dim: int) -> dict[str, Any]:
     instances = None
     if sample.instances is not None:
         instances = [
-            {"label": int(item.label), "points": _points(item.points, dim, f"{where}points")}
+            {"label": int(item.label), "points": _points(item.points, meta.dim, f"{where}points")}
             for item in sample.instances
         ]
-    can_bus = sample.can_bus
+    can_bus, mounting = sample.can_bus, sample.ego_from_frame
+    if mounting is None and meta.frame == "ego":
+        mounting = np.eye(4)  # the frame is the vehicle
+    if mounting is not None:
+        mounting = _flat(mounting, (4, 4), f"{where}ego_from_frame")
     return {
         "token": sample.token,
         "scene": sample.scene,
         "map_name": sample.map_name,
         "timestamp_ns": int(sample.timestamp_ns),
         "global_from_frame": _flat(sample.global_from_frame, (4, 4), f"{where}global_from_frame"),
-        "ego_from_frame": _flat(sample.ego_from_frame, (4, 4), f"{where}ego_from_frame"),
+        "ego_from_frame": mounting,
         **_sensors(sample, where),
         "can_bus": None if can_bus is None else _flat(can_bus, (CAN_BUS_SIZE,), f"{where}can_bus"),
         "instances": instances,
@@ -197,6 +201,7 @@ class Batch:
         self.column = column
         self.has_lidar, self.has_can_bus = _valid(lidar), _valid(column["can_bus"])
         self.has_instances = _valid(instances)
+        self.has_mounting = _valid(column["ego_from_frame"])
         self.global_from_frame = _matrices(column["global_from_frame"], 4, 4)
         self.ego_from_frame = _matrices(column["ego_from_frame"], 4, 4)
         self.can_bus = _matrices(column["can_bus"], CAN_BUS_SIZE)
@@ -227,7 +232,7 @@ class Batch:
         parts |= {"label": elements.field("label"), "points": elements.field("points")}
         parts["coordinate"] = parts["points"].values
         parts["sweep"] = self.column["lidar"].field("sweeps").values
-        optional = ("lidar", "can_bus", "instances")
+        optional = ("lidar", "can_bus", "instances", "ego_from_frame")
         parts |= {name: array for name, array in self.column.items() if name not in optional}
         for what, array in parts.items():
             _require_known(not array.null_count, what)
@@ -284,7 +289,7 @@ class Batch:
             **scalars,
             cameras=self._cameras(row),
             global_from_frame=self.global_from_frame[row].copy(),
-            ego_from_frame=self.ego_from_frame[row].copy(),
+            ego_from_frame=self.ego_from_frame[row].copy() if self.has_mounting[row] else None,
             lidar=self._lidar(row),
             can_bus=self.can_bus[row].copy() if self.has_can_bus[row] else None,
             instances=self._instances(row),
