@@ -5,10 +5,7 @@ _base_ = [
     '../_base_/schedules/cosine_6e.py',
     '../_base_/default_runtime.py',
 ]
-model = dict(
-    grid=_base_.grid,
-    classes=_base_.classes,
-    map_head=dict(aux_heads=_base_.model.map_head.aux_heads[:2]))  # no depth
+model = dict(grid=_base_.grid, classes=_base_.classes)
 train_dataloader = dict(batch_size=2)
 optim_wrapper = dict(optimizer=dict(lr=4e-4))
 auto_scale_lr = dict(base_batch_size=16)
