@@ -11,6 +11,7 @@ import shlex
 import sys
 
 from gsmap.utils.cli import run_command
+from gsmap.utils.shards import without_options
 
 COMMANDS = {
     "minicity": ("minicity.cli", "generate the MiniCity data set"),
@@ -39,7 +40,8 @@ def make() -> str | None:
             importlib.import_module(module).add_arguments(subparser)
     arguments = parser.parse_args()
     module, _ = COMMANDS[arguments.command]
-    return importlib.import_module(module).run(arguments, shlex.join(["python", *sys.argv]))
+    words = without_options(sys.argv, "--shard")  # the whole is made by the same command
+    return importlib.import_module(module).run(arguments, shlex.join(["python", *words]))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
 import os
+import platform
 import signal
 import stat
 import subprocess
@@ -68,9 +69,15 @@ def test_what_a_killed_writer_left_goes_with_the_next_write_and_nothing_else(tmp
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as writer:
         assert writer.stdout.readline() == b"ready\n"
         write_text(path, "beside a living writer")
-        assert (tmp_path / f"a.{writer.pid}.partial").exists()
+        assert (tmp_path / f"a.{writer.pid}.{platform.node()}.partial").exists()
         writer.send_signal(signal.SIGKILL)
-    others = {"b.1.partial", "a.partial", "a.x.partial"}
+    here = platform.node()
+    others = {
+        f"b.1.{here}.partial",
+        "a.partial",
+        f"a.x.{here}.partial",
+        "a.999999999.there.partial",
+    }
     for name in others:
         (tmp_path / name).touch()
     write_text(path, "whole")

@@ -1,6 +1,7 @@
 """Annotation files: what is written comes back, and a wrong or half file is refused."""
 
 import pickle
+import platform
 import resource
 from dataclasses import replace
 from pathlib import Path
@@ -176,7 +177,7 @@ def test_a_failed_rewrite_keeps_the_old_file(tmp_path: Path):
 
 
 def test_leftovers_of_a_killed_writer_are_removed(tmp_path: Path):
-    (tmp_path / "a.arrow.999999999.partial").write_bytes(b"half")
+    (tmp_path / f"a.arrow.999999999.{platform.node()}.partial").write_bytes(b"half")
     with AnnotationWriter(tmp_path / "a.arrow", META) as writer:
         writer.write(sample())
     assert [p.name for p in tmp_path.iterdir()] == ["a.arrow"]

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from gsmap.datasets.annotations.record import CLASSES, RANGES, AnnotationMeta
 from gsmap.utils.parallel import default_workers
+from gsmap.utils.shards import WHOLE, Shard, add_shard_option
 
 Options = TypeVar("Options")
 
@@ -28,6 +29,7 @@ class FileOptions:
         out_dir: Folder of the annotation files; the data root if None.
         tag: Appended to the file names.
         workers: Number of processes.
+        shard: Which part of the scenes or logs to convert.
         command: The command line, for messages of readers.
     """
 
@@ -40,6 +42,7 @@ class FileOptions:
     out_dir: Path | None = None
     tag: str = ""
     workers: int = 1
+    shard: Shard = WHOLE
     command: str = ""
 
     def meta(self, dataset: str, frame: str, split: str, **more: Any) -> AnnotationMeta:
@@ -72,6 +75,7 @@ def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: in
     )
     parser.add_argument("--tag", default="", help="appended to the file names, such as _extended")
     add_workers_option(parser)
+    add_shard_option(parser)
 
 
 def add_range_options(

@@ -1,5 +1,6 @@
 """Annotation files of your own data, from plain records: any cameras, ground truth or not."""
 
+import hashlib
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.errors import naming
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
+from gsmap.utils.shards import WHOLE, Shard
 
 _LOGGER = logging.getLogger(__name__)
 _UNMOUNTED = (
@@ -38,6 +40,7 @@ def from_records(
     records: Iterable[Mapping[str, Any]],
     meta: AnnotationMeta,
     data_root: str | Path,
+    shard: Shard = WHOLE,
 ) -> int:
     """Write an annotation file from plain records.
 
@@ -61,6 +64,7 @@ def from_records(
         records: The records.
         meta: Frame, classes and range of the data.
         data_root: Folder that image and LiDAR paths are relative to.
+        shard: Which part of the records to take, such as ``Shard.parse("3/16")``.
 
     Returns:
         How many samples were written.
@@ -69,7 +73,14 @@ def from_records(
         FileNotFoundError: If an image is missing whose size is not given.
         ValueError: If a record is malformed; the message names its token. No file is left then.
     """
-    return write_annotations(path, meta, _samples(records, meta, Path(data_root)))
+    source = ""
+    if shard.count:
+        records = list(records)
+        tokens = "\n".join(str(r.get("token") if isinstance(r, Mapping) else r) for r in records)
+        source = hashlib.sha256(tokens.encode()).hexdigest()
+        records = shard.part(records)
+    samples = _samples(records, meta, Path(data_root))
+    return write_annotations(path, meta, samples, shard, source)
 
 
 def _samples(

@@ -7,7 +7,7 @@ the ground truth too. The pickles are read without running code from them.
 
 import argparse
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.errors import naming
 from gsmap.datasets.plain_pickle import load_plain_pickle
+from gsmap.utils.shards import WHOLE, Shard, add_shard_option
 
 NUSCENES_IMAGE_SIZE = (1600, 900)
 _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
@@ -194,7 +195,7 @@ def _maps(meta: AnnotationMeta, root: Path) -> Callable[[str], NuScenesLocalMap 
 
 
 def _samples(
-    entries: Sequence[Mapping[str, Any]],
+    entries: Iterable[tuple[int, Mapping[str, Any]]],
     meta: AnnotationMeta,
     infos: Path,
     root: Path,
@@ -203,7 +204,7 @@ def _samples(
     """Yield the samples of an info file, with ground truth where it is known."""
     local_map = _maps(meta, root)
     read = _argoverse_sample if meta.frame == "ego" else _nuscenes_sample
-    for number, info in enumerate(entries):
+    for number, info in entries:
         with naming(f"{infos}, sample {number}", "make the file anew"):
             sample = read(info, meta, root)
             check_samples([sample], meta)
@@ -252,6 +253,7 @@ def convert_infos(
     x_range: tuple[float, float] | None = None,
     y_range: tuple[float, float] | None = None,
     command: str = "",
+    shard: Shard = WHOLE,
 ) -> ConversionSummary:
     """Convert one info file.
 
@@ -264,6 +266,7 @@ def convert_infos(
         x_range: Smallest and largest x of the ground truth in metres; the frame's usual if None.
         y_range: Smallest and largest y of the ground truth in metres; the frame's usual if None.
         command: The command line, for messages of readers.
+        shard: Which part of the samples to convert.
 
     Returns:
         What was written and what is missing.
@@ -289,8 +292,9 @@ def convert_infos(
         command=command,
     )
     summary = ConversionSummary(classes)
-    with AnnotationWriter(target, meta) as writer:
-        for sample in _samples(tqdm(entries, unit="sample"), meta, infos, data_root, summary):
+    numbered = tqdm(shard.part(list(enumerate(entries))), unit="sample")
+    with AnnotationWriter(target, meta, shard) as writer:
+        for sample in _samples(numbered, meta, infos, data_root, summary):
             writer.write(sample)
     return summary
 
@@ -305,12 +309,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--split", help="name of the split (default: what the file's name ends in)")
     parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="CLASS")
     add_range_options(parser, None)
+    add_shard_option(parser)
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:
     """Convert as the command line asks and return the summary."""
     split = arguments.split or arguments.infos.stem.rsplit("_", 1)[-1]
-    names = ("infos", "target", "data_root", "x_range", "y_range")
+    names = ("infos", "target", "data_root", "x_range", "y_range", "shard")
     given = {name: getattr(arguments, name) for name in names}
     classes = tuple(arguments.classes)
     return convert_infos(split=split, classes=classes, command=command, **given).text()

@@ -1,6 +1,7 @@
 """Files that are whole or absent, whatever stops their writer."""
 
 import os
+import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,14 +9,16 @@ from pathlib import Path
 from typing import IO, Any, Literal
 
 SUFFIX = ".partial"
+_END = f".{platform.node()}{SUFFIX}"  # another machine's writers on a shared disk cannot be judged
 
 
 @contextmanager
 def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
     """Open a file that takes its name only when the block ends well.
 
-    Until then it is ``PATH.<pid>.partial``, which any exception removes. One that a killed writer
-    left behind goes when the same file is written again. A reader sees the old file or the new one.
+    Until then it is ``PATH.<pid>.<host>.partial``, which any exception removes. One that a killed
+    writer left behind goes when the same machine writes the same file again. A reader sees the old
+    file or the new one.
 
     Args:
         path: File to write; parent folders are made.
@@ -52,13 +55,13 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def partial_path(path: Path) -> Path:
     """Return where a file or folder is made before it takes its name, free of what is stale.
 
-    What killed writers of the same file or folder left behind is removed.
+    What killed writers of the same file or folder left behind on this machine is removed.
     """
     start = f"{path.name}."
     # without /proc there is no way to tell whether a writer lives
     for name in os.listdir(path.parent) if Path("/proc/self").exists() else ():
-        pid = name[len(start) : -len(SUFFIX)]
-        if name == f"{start}{pid}{SUFFIX}" and pid.isdigit() and not Path("/proc", pid).exists():
+        pid = name[len(start) : -len(_END)]
+        if name == f"{start}{pid}{_END}" and pid.isdigit() and not Path("/proc", pid).exists():
             stale = path.parent / name
             shutil.rmtree(stale) if stale.is_dir() else stale.unlink(missing_ok=True)
-    return path.with_name(f"{start}{os.getpid()}{SUFFIX}")
+    return path.with_name(f"{start}{os.getpid()}{_END}")

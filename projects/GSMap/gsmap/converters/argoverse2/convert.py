@@ -41,7 +41,8 @@ def convert_argoverse2(
 
     Raises:
         FileNotFoundError: If the split or a log asked for is missing.
-        RuntimeError: If no sample is left, or a worker process dies; then nothing is written.
+        RuntimeError: If no sample is left (a shard may have none), or a worker process dies; then
+            nothing is written.
         OSError: If the file cannot be written, for example on a full disk; nothing is left behind.
     """
     summary = ConversionSummary(options.classes)
@@ -50,8 +51,9 @@ def convert_argoverse2(
     log_dirs = _drop_listed(log_dirs, options.keep_map_changes, summary)
     read = partial(_try_log, options=options)
     sweep_offsets_ns: list[int] = []
+    meta, log_dirs = _meta(options, log_dirs), options.shard.part(log_dirs)
     advance(0, len(log_dirs))
-    with AnnotationWriter(target, _meta(options, log_dirs)) as writer:
+    with AnnotationWriter(target, meta, options.shard) as writer:
         results = ordered_map(read, log_dirs, min(options.workers, max(len(log_dirs), 1)))
         for done, (log_dir, result) in enumerate(zip(log_dirs, results, strict=True), 1):
             if isinstance(result, str):
@@ -60,10 +62,10 @@ def convert_argoverse2(
                 _write_log(writer, result, log_dir.name, summary)
                 sweep_offsets_ns += result.sweep_offsets_ns
             advance(done, len(log_dirs))
-        if not len(writer):
+        if not len(writer) and not options.shard.count:
             raise RuntimeError(f"no sample is left for {target}:\n{summary.text()}")
         summary.notes.append(_lidar_note(sweep_offsets_ns, len(writer)))
-    summary.notes.append(f"written to {target}")
+    summary.notes.append(f"written to {writer.path}")
     return summary
 
 

@@ -30,6 +30,7 @@ from gsmap.converters.command_line import (
 )
 from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
+from gsmap.utils.shards import add_shard_option
 from minicity.camera import Camera
 from minicity.lighting import random_lighting
 from minicity.renderer import SceneRenderer
@@ -267,6 +268,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--max-frames", type=int, help="moments per log, evenly spread")
     add_workers_option(parser)
+    add_shard_option(parser)
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:
@@ -276,7 +278,7 @@ def run(arguments: argparse.Namespace, command: str) -> str:
     if log:
         calibration = select_logs(split_dir, [log])[0]
     options = options_from(RenderOptions, arguments, command, calibration=calibration)
-    log_dirs = select_logs(split_dir, arguments.logs)
+    log_dirs = arguments.shard.part(select_logs(split_dir, arguments.logs))
     out = arguments.out / (arguments.out_split or arguments.split)
     with progress_bar("av2-render", "log") as advance:
         return render_logs(log_dirs, out, options, arguments.workers, advance)

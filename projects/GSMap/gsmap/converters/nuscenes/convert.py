@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from importlib.metadata import version
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -166,11 +167,11 @@ class _Conversion:
     ) -> None:
         """Convert map by map, so that one map at a time is in memory."""
         scenes = [scene for scene in self.tables.scene if scene["name"] in self.split_of]
+        scenes = self.options.shard.part(sorted(scenes, key=self.tables.location_of))
         done, total = 0, sum(scene["nbr_samples"] for scene in scenes)
         advance(done, total)
-        for location in sorted({self.tables.location_of(scene) for scene in scenes}):
-            local = [scene for scene in scenes if self.tables.location_of(scene) == location]
-            for sample, instances in self._with_instances(location, local):
+        for location, local in groupby(scenes, key=self.tables.location_of):
+            for sample, instances in self._with_instances(location, list(local)):
                 self._write(writers[self.split_of[sample.scene]], sample, instances)
                 advance(done := done + 1, total)
 
@@ -292,7 +293,7 @@ def convert_nuscenes(
         writers = {}
         for split in (split for split, scenes in conversion.splits.items() if scenes):
             meta = options.meta(options.dataset, "lidar", split, **made_from)
-            writer = AnnotationWriter(options.path_of(options.dataset, split), meta)
+            writer = AnnotationWriter(options.path_of(options.dataset, split), meta, options.shard)
             writers[split] = stack.enter_context(writer)
         conversion.run(writers, advance)
         for writer in writers.values():  # a full disk shows here, before any file appears
@@ -301,7 +302,8 @@ def convert_nuscenes(
         conversion.summary.notes.append(
             "no CAN bus expansion: acceleration, rotation rate and velocity are 0."
         )
-    conversion.note_overlap()
+    if not options.shard.count:
+        conversion.note_overlap()
     return conversion.summary
 
 

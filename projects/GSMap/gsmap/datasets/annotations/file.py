@@ -9,6 +9,9 @@ import os
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import asdict
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -30,6 +33,7 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.annotations.schema import FIELDS, META_KEY, Batch, batch_of, row_of, schema_of
 from gsmap.utils.files import atomic_write
+from gsmap.utils.shards import WHOLE, Shard, ShardFile
 
 __all__ = [
     "CLASSES",
@@ -43,9 +47,11 @@ __all__ = [
     "MapSample",
     "SweepRecord",
     "check_samples",
+    "merge_annotations",
     "write_annotations",
 ]
 
+SHARD_KIND = "annotations"
 _ROWS_PER_BATCH = 256
 # An Arrow file is a stream of messages between "ARROW1" and a footer that says where each begins.
 _START, _END = b"ARROW1\0\0", b"ARROW1"
@@ -62,11 +68,19 @@ class AnnotationWriter:
     Args:
         path: File to write; parent folders are made.
         meta: What holds for the whole file.
+        shard: Part of the file to write; it gets a manifest.
+        source: Digest of what the whole is made from, for the manifest; by default that of
+            ``meta``.
     """
 
-    def __init__(self, path: str | Path, meta: AnnotationMeta):
-        self.path = Path(path)
+    def __init__(
+        self, path: str | Path, meta: AnnotationMeta, shard: Shard = WHOLE, source: str = ""
+    ):
+        self.path = shard.path_of(Path(path))
         self.meta = meta
+        self._seal = partial(
+            shard.seal, Path(path), SHARD_KIND, source or meta.source_fingerprint, asdict(meta)
+        )
         self._schema = schema_of(meta)
         self._opened = ExitStack()
         self._rows: list[dict[str, Any]] = []
@@ -134,15 +148,24 @@ class AnnotationWriter:
             if value is not None:
                 raise value
             self.finish()
+        self._seal(len(self))
 
 
-def write_annotations(path: str | Path, meta: AnnotationMeta, samples: Iterable[MapSample]) -> int:
+def write_annotations(
+    path: str | Path,
+    meta: AnnotationMeta,
+    samples: Iterable[MapSample],
+    shard: Shard = WHOLE,
+    source: str = "",
+) -> int:
     """Write an annotation file from samples.
 
     Args:
         path: File to write.
         meta: What holds for the whole file.
         samples: Samples with different tokens.
+        shard: Part of the file that the samples are.
+        source: As ``AnnotationWriter`` takes it.
 
     Returns:
         How many were written.
@@ -150,10 +173,29 @@ def write_annotations(path: str | Path, meta: AnnotationMeta, samples: Iterable[
     Raises:
         ValueError: If a sample is malformed; then no file is left behind.
     """
-    with AnnotationWriter(path, meta) as writer:
+    with AnnotationWriter(path, meta, shard, source) as writer:
         for sample in samples:
             writer.write(sample)
         return len(writer)
+
+
+def merge_annotations(path: Path, shards: Sequence[ShardFile]) -> int:
+    """Write an annotation file from its shards: byte for byte as if it had been made at once.
+
+    Args:
+        path: File to write.
+        shards: All of its shards, from ``find_shards``.
+
+    Returns:
+        How many samples it has.
+
+    Raises:
+        ValueError: If it has no sample, or one twice.
+    """
+    files = [AnnotationFile(shard.path) for shard in shards]
+    if not any(map(len, files)):
+        raise ValueError(f"no shard of {path} has a sample: give the command other data.")
+    return write_annotations(path, files[0].meta, chain.from_iterable(files))
 
 
 def check_samples(samples: Sequence[MapSample], meta: AnnotationMeta) -> None:
