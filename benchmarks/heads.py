@@ -22,7 +22,7 @@ from mmengine.logging import MMLogger
 
 from benchmarks.measure import markdown_table
 from gsmap.apis.checkpoint import load_weights
-from gsmap.engine.launch import parse_options, read_config
+from gsmap.engine.launch import data_root_options, parse_options, read_config
 from gsmap.utils.files import atomic_write
 
 METRIC_NAMES = ("chamfer", "raster")
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> None:
     settings = {key: str(getattr(args, key)) for key in _DECIDING}
     for name, text in variants.items():
         refuse_others(args.out / f"{name}.settings.json", {**settings, "variant": text})
-    options = {f"{part}_dataloader.dataset.data_root": args.data_root for part in ("train", "val")}
+    options = data_root_options(args.data_root)
     features = {part: args.out / f"{part}.pt" for part in ("train", "val")}
     for part, path in features.items():
         if not path.exists():

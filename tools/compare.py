@@ -36,6 +36,7 @@ from gsmap.apis.comparison_report import (
     plot_precision_recall,
     read_result,
 )
+from gsmap.engine.launch import data_root_options
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.visualization.figure import save_figure
@@ -65,6 +66,7 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("--only", metavar="NAME/seed_N", help="this run alone, and no tables")
     parser.add_argument("--slurm", metavar="PARTITION", help="print a Slurm command for each run")
+    parser.add_argument("--data-root", metavar="DIR", help="folder of the data set of all configs")
     parser.add_argument(
         "--cfg-options", nargs="+", default=[], metavar="KEY=VALUE", help="overrides of all configs"
     )
@@ -187,8 +189,9 @@ def main() -> str:
         return "\n".join(lines(read_tables(args.tables)))
     runs: list[Run] = []
     if args.configs:
-        options = tuple(args.cfg_options)
-        rest = (args.out, args.batch, args.init, options)
+        placed = data_root_options(args.data_root) if args.data_root else {}
+        options = [f"{key}={value}" for key, value in placed.items()]
+        rest = (args.out, args.batch, args.init, (*options, *args.cfg_options))
         runs = plan(
             [parse_entry(text) for text in args.configs], Protocol(args.seeds, args.budget, *rest)
         )

@@ -147,11 +147,12 @@ def prior_step(folder: Path, budget: Budget) -> Step:
 
 def options_of(folder: Path, budget: Budget) -> list[str]:
     """Return the overrides that all commands of models share."""
-    train, val = (f"{data_root(folder, budget, split)}/" for split in ("train", "val"))
+    train, val = (str(data_root(folder, budget, split)) for split in ("train", "val"))
     return [
+        "--data-root",
+        val,
         "--cfg-options",
         f"train_dataloader.dataset.data_root={train}",
-        *(f"{part}_dataloader.dataset.data_root={val}" for part in ("val", "test")),
         f"train_cfg.max_epochs={budget.epochs}",
         f"train_cfg.val_interval={budget.epochs}",
         f"param_scheduler.1.T_max={budget.epochs}",

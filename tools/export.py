@@ -58,7 +58,6 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--samples", type=Path, help="samples to compare on; the config's test set by default"
     )
-    parser.add_argument("--data-root", type=Path, help="folder that the paths of images start from")
     parser.add_argument(
         "--check", type=int, metavar="N", help="compare with torch on N samples, evenly spread"
     )

@@ -48,7 +48,6 @@ part "A training step by raster" "$python" -m benchmarks step "${memory[@]}"
 part "MiniCity" "$python" tools/create_data.py minicity --root "$work/minicity" --seed 0 "${data[@]}"
 part "Annotations" "$python" tools/create_data.py nuscenes --root "$work/minicity" --dataset minicity
 part "Protocol S" "$python" tools/compare.py "${compared[@]}" --seeds 1 --budget "$budget" --batch "$batch" --out "$work/protocol_s" \
-    --cfg-options "train_dataloader.dataset.data_root=$work/minicity/" "val_dataloader.dataset.data_root=$work/minicity/" \
-    "test_dataloader.dataset.data_root=$work/minicity/"
+    --data-root "$work/minicity"
 [ ${#failed[@]} -eq 0 ] || { printf 'failed: %s\n' "${failed[@]}" | tee -a "$results"; exit 1; }
 echo "all parts ended well after $SECONDS s: $results"

@@ -23,7 +23,6 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--sample", type=Path, required=True, help="annotation file, info file or folder"
     )
-    parser.add_argument("--data-root", type=Path, help="folder that the paths of images start from")
     parser.add_argument(
         "--allow-missing-cameras", action="store_true", help="leave absent cameras blank"
     )

@@ -1,4 +1,5 @@
 import argparse
+from pathlib import Path
 
 import pytest
 import torch
@@ -26,6 +27,17 @@ def test_options_override_and_the_work_folder_takes_the_config_name(tmp_path):
     assert cfg.train_dataloader.batch_size == 1
     assert cfg.work_dir == "work_dirs/tiny"
     assert load_config(parse(str(path), "--work-dir", "elsewhere")).work_dir == "elsewhere"
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_one_folder_serves_every_split_unless_an_override_says_otherwise(swapped):
+    here, there = "--cfg-options val_dataloader.dataset.data_root=here", "--data-root there"
+    words = f"{there} {here}" if swapped else f"{here} {there}"
+    args = parse("maptr_r18_minicity", *words.split())
+    cfg = load_config(args)
+    roots = [cfg[f"{split}_dataloader"].dataset.data_root for split in ("train", "val", "test")]
+    assert roots == ["there", "here", "there"]
+    assert args.data_root == Path("there")
 
 
 def test_a_missing_config_is_named():

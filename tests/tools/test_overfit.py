@@ -14,13 +14,14 @@ def test_the_demos_model_learns_one_sample_by_heart(
     minicity_root, minicity_annotations, tmp_path
 ) -> None:
     """Points, masks and the score of its two boundaries; its third element takes longer."""
-    options = [f"{part}_dataloader.dataset.data_root={minicity_root}/" for part in ("train", "val")]
+    options = []
     for part in ("train", "val"):
         options += [f"{part}_dataloader.{key}" for key in ("dataset.indices=1", "num_workers=0")]
         options.append(f"{part}_dataloader.persistent_workers=False")
     command = [
         *(sys.executable, "tools/train.py", "projects/GSMap/configs/gsmap_maptr_r18_overfit.py"),
-        *("--work-dir", str(tmp_path), "--cfg-options", *options),
+        *("--work-dir", str(tmp_path), "--data-root", str(minicity_root)),
+        *("--cfg-options", *options),
         *("randomness.seed=0", "train_dataloader.batch_size=1", "optim_wrapper.optimizer.lr=2e-3"),
         *(f"train_cfg.max_epochs={ITERATIONS}", f"train_cfg.val_interval={ITERATIONS // 3}"),
         *(f"param_scheduler.1.T_max={ITERATIONS}", "default_hooks.checkpoint.interval=1000"),

@@ -32,7 +32,7 @@ def test_a_shipped_model_scores_its_figures(name, towns, tmp_path):
     metrics = tmp_path / "metrics.json"
     done = subprocess.run(
         [sys.executable, "tools/test.py", name, "--work-dir", str(tmp_path), "--metrics-out",
-         str(metrics), "--cfg-options", f"test_dataloader.dataset.data_root={towns}/"],
+         str(metrics), "--data-root", str(towns)],
         cwd=REPO, env={**os.environ, "OMP_NUM_THREADS": "1"}, text=True, capture_output=True,
         check=False,
     )  # fmt: skip

@@ -60,8 +60,32 @@ KNOWN_KEYS = frozenset(
 )
 
 
+def data_root_options(data_root: str | Path) -> dict[str, str]:
+    """Return the overrides, by dotted name, that take every split from one folder."""
+    splits = ("train", "val", "test")
+    return {f"{split}_dataloader.dataset.data_root": str(data_root) for split in splits}
+
+
+class _DataRootAction(argparse.Action):
+    """Turns ``--data-root DIR`` into overrides, which those of ``--cfg-options`` outdo."""
+
+    def __call__(
+        self, parser: object, namespace: argparse.Namespace, values: Any, option: object = None
+    ) -> None:
+        namespace.data_root = values
+        given = getattr(namespace, "cfg_options", None) or {}
+        namespace.cfg_options = {**data_root_options(values), **given}
+
+
 def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--cfg-options``, for the second argument of `read_config`."""
+    """Add ``--data-root`` and ``--cfg-options``; both go to `read_config` as ``cfg_options``."""
+    parser.add_argument(
+        "--data-root",
+        type=Path,
+        metavar="DIR",
+        action=_DataRootAction,
+        help="folder of the data set: annotation files, and what their paths start from",
+    )
     parser.add_argument(
         "--cfg-options",
         nargs="+",
