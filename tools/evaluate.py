@@ -14,7 +14,6 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # idle threads would only stand in the workers' way
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -26,14 +25,15 @@ from gsmap.evaluation.chamfer_ap import (
     ChamferConfig,
 )
 from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
-from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files
+from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files, match_files
+from gsmap.evaluation.match_files import write_matches
 from gsmap.evaluation.prior import evaluate_prior
 from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.report import flat_metrics, format_table
+from gsmap.evaluation.report import format_table, write_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, run_command
-from gsmap.utils.files import write_text
+from gsmap.utils.shards import add_shard_option, digest, digest_of_common, read_shard
 
 DEFAULT_CLASSES = ("divider", "ped_crossing", "boundary")
 DEFAULT_RANGE = (-15.0, -30.0, 15.0, 30.0)
@@ -102,11 +102,14 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=1, help="number of processes")
     parser.add_argument("--out", type=Path, help="write all figures as flat JSON")
     parser.add_argument("--pr-curves", type=Path, help="draw PR curves and calibration")
+    add_shard_option(parser)
     args = parser.parse_args(argv)
     if (args.results is None) == (args.prior is None):
         parser.error("name either a result file or --prior")
     if args.hard and args.thresholds:
         parser.error("--hard and --thresholds exclude each other")
+    if args.shard.count and (not args.out or args.prior or args.pr_curves):
+        parser.error("--shard needs --out, and can neither fit a --prior nor draw --pr-curves")
     return args
 
 
@@ -148,7 +151,7 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     for note in notes:
         print(f"note: {note}")
     if args.out:
-        write_text(args.out, json.dumps(flat_metrics(reports), indent=1) + "\n")
+        write_figures(args.out, reports)
         print(f"figures: {args.out}")
     if args.pr_curves:
         from gsmap.evaluation.curves import draw_curves
@@ -157,10 +160,26 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         print(f"curves: {args.pr_curves}")
 
 
+def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
+    """Match a part of the samples and keep the matches; return what was done."""
+    results = args.shard.path_of(args.results)
+    if args.results.exists() or not results.exists():
+        results, source = args.results, digest(args.results)
+    else:  # of results in shards, too, the same one is enough
+        source = digest_of_common(read_shard(results))
+    rules = evaluator, args.workers, args.allow_mismatch, show_progress, args.shard
+    matches, notes = match_files(results, args.ground_truth, *rules)
+    source += digest(args.ground_truth)
+    path = write_matches(args.out, args.shard, matches, notes, evaluator, source)
+    return f"{len(matches)} samples matched: {path}"
+
+
 def main(argv: list[str] | None = None) -> str:
     args = parse_args(argv)
     start = time.perf_counter()
     evaluator = evaluator_from(args)
+    if args.shard.count:
+        return match_shard(args, evaluator)
     if args.prior:
         outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, args.prior_elements)
     else:

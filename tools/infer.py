@@ -12,7 +12,9 @@ from pathlib import Path
 from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.engine.launch import add_config_options
 from gsmap.engine.named_models import checkpoint_for
+from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.shards import add_shard_option, digest
 from gsmap.visualization.figure import FORMATS, picture_name, save_figure
 
 
@@ -40,6 +42,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--lidar", action="store_true", help="draw the LiDAR sweep faintly")
     parser.add_argument("--device", help="cpu, cuda, cuda:1, ...; a GPU by default if there is one")
     add_config_options(parser)
+    add_shard_option(parser)
     return parser.parse_args()
 
 
@@ -55,6 +58,7 @@ def main() -> None:
     visualizer.width_px = args.width or visualizer.width_px
     dataset = inferencer.dataset(args.sample, args.data_root, args.allow_missing_cameras)
     chosen = select_samples(dataset.annotations.column("token"), args.token, args.max_samples)
+    chosen = args.shard.part(chosen)
     found = inferencer.predict(dataset, chosen, allow_missing_cameras=args.allow_missing_cameras)
     samples = []
     for index, sample in zip(chosen, found, strict=True):
@@ -66,8 +70,14 @@ def main() -> None:
             path = save_figure(figure, args.show_dir / name)
             print(f"[{len(samples)}/{len(chosen)}] {path}")
     if args.out:
-        inferencer.write(args.out, samples)
-        print(f"predictions of {len(samples)} samples: {args.out}")
+        out = args.shard.path_of(args.out)
+        inferencer.write(out, samples)
+        settings = {"model": args.config, "checkpoint": digest(checkpoint)}
+        for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras"):
+            settings[name] = str(getattr(args, name))
+        source = digest(dataset.annotations.path)
+        args.shard.seal(args.out, RESULTS, source, settings, len(samples))
+        print(f"predictions of {len(samples)} samples: {out}")
 
 
 if __name__ == "__main__":

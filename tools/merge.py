@@ -9,10 +9,27 @@ from pathlib import Path
 
 from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
 from gsmap.datasets.annotations.file import merge_annotations
+from gsmap.evaluation.match_files import SHARD_KIND as MATCHES
+from gsmap.evaluation.match_files import report_shards
+from gsmap.evaluation.report import format_table, write_figures
+from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
+from gsmap.evaluation.results_json import merge_results
 from gsmap.utils.cli import CommandParser, run_command
-from gsmap.utils.shards import find_shards
+from gsmap.utils.shards import ShardFile, find_shards
 
-MERGE = {ANNOTATIONS: merge_annotations}
+
+def merge_matches(path: Path, shards: list[ShardFile]) -> int:
+    """Write and print the figures of all shards; return the number of samples."""
+    reports, notes = report_shards(shards)
+    for found in reports:
+        print(format_table(found) + "\n")
+    for note in notes:
+        print(f"note: {note}")
+    write_figures(path, reports)
+    return sum(shard.manifest["samples"] for shard in shards)
+
+
+MERGE = {ANNOTATIONS: merge_annotations, RESULTS: merge_results, MATCHES: merge_matches}
 
 
 def main(argv: list[str] | None = None) -> str:

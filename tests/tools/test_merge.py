@@ -1,37 +1,50 @@
 """What shards are joined to is, byte for byte, what the command makes without ``--shard``."""
 
+import json
 import pickle
+import re
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from argoverse2_road import write_log
+from mmdet3d.registry import MODELS
 
 from gsmap.converters.custom import from_records
 from gsmap.datasets.annotations.file import CLASSES, AnnotationFile, AnnotationMeta
+from gsmap.engine.launch import read_config
+from gsmap.evaluation.results_json import read_samples, vectors_of, write_results
+from gsmap.structures.elements import MapElements
 from gsmap.utils.shards import WHOLE, Shard
-from tools import create_data
+from tools import create_data, infer
+from tools.evaluate import main as evaluate
 from tools.merge import main as merge
 
 
-def run(monkeypatch, *words: str | Path) -> None:
+def run(monkeypatch, *words: str | Path, command=create_data.make) -> None:
     monkeypatch.setattr(sys, "argv", ["tools/create_data.py", *map(str, words)])
-    create_data.make()
+    command()
 
 
-def assert_joined(make: Callable[[Shard], object], target: Path, count: int) -> list[int]:
-    """Make a file at once and from shards, and return how many samples each shard has."""
+def assert_same_file(make: Callable[[Shard], object], target: Path, count: int) -> None:
+    """Make any file at once and from shards."""
     make(WHOLE)
     whole = target.read_bytes()
     target.unlink()
     for index in reversed(range(count)):
         make(Shard(index, count))
-    parts = [AnnotationFile(Shard(i, count).path_of(target)) for i in range(count)]
-    assert merge([str(target)]) == f"{target}: {sum(map(len, parts))} samples of {count} shards"
+    merge([str(target)])
     assert target.read_bytes() == whole
-    return list(map(len, parts))
+
+
+def assert_joined(make: Callable[[Shard], object], target: Path, count: int) -> list[int]:
+    """Make an annotation file at once and from shards; return how many samples each shard has."""
+    assert_same_file(make, target, count)
+    return [len(AnnotationFile(Shard(i, count).path_of(target))) for i in range(count)]
 
 
 def words_of(shard: Shard) -> list[str]:
@@ -99,3 +112,103 @@ def test_shards_without_any_sample_are_no_file(tmp_path):
         from_records(tmp_path / "a.arrow", [], meta, tmp_path, Shard(index, 2))
     with pytest.raises(ValueError, match=r"no shard of .* has a sample"):
         merge([str(tmp_path / "a.arrow")])
+
+
+@pytest.fixture(scope="module")
+def predictions(tiny_config, minicity_annotations, tmp_path_factory):
+    """Result file of a tiny model on two samples, made at once and from three shards."""
+    folder = tmp_path_factory.mktemp("predictions")
+    model, target = folder / "tiny.pth", folder / "map.json"
+    torch.save(MODELS.build(read_config(tiny_config).model).state_dict(), model)
+
+    def make(shard: Shard) -> None:
+        words = (tiny_config, model, "--sample", minicity_annotations["val"], "--device", "cpu")
+        words += ("--out", target, *words_of(shard))
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            run(monkeypatch, *words, command=infer.main)
+
+    assert_same_file(make, target, 3)
+    return target
+
+
+def test_predictions_have_all_samples(predictions, minicity_annotations):
+    tokens = AnnotationFile(minicity_annotations["val"]).column("token")
+    assert sorted(tokens) == list(read_samples(predictions, "results", ())[0])
+
+
+def test_predictions_of_another_model_are_refused(predictions, tmp_path):
+    for path in predictions.parent.glob("map.*"):
+        shutil.copy(path, tmp_path)
+    odd = tmp_path / "map.00001-of-00003.json.manifest"
+    found = json.loads(odd.read_text())
+    found["options"]["checkpoint"] = "another"
+    odd.write_text(json.dumps(found))
+    before = (tmp_path / "map.json").read_bytes()
+    with pytest.raises(ValueError, match="shards of different work, by checkpoint"):
+        merge([str(tmp_path / "map.json")])
+    assert (tmp_path / "map.json").read_bytes() == before
+
+
+def test_a_sample_in_two_shards_is_refused(tmp_path):
+    target = tmp_path / "map.json"
+    for index in (0, 1):
+        write_results(Shard(index, 2).path_of(target), [("a", []), (f"b{index}", [])])
+        Shard(index, 2).seal(target, "results", "", {}, 2)
+    with pytest.raises(ValueError, match="sample 'a' twice"):
+        merge([str(target)])
+    assert not target.exists()
+
+
+def line_and_ring(shift: float, *scores: float) -> list[dict]:
+    line, ring = [[shift, -20.0], [shift, 20.0]], [[2, 2], [6, 2], [6, 8 + shift], [2, 2]]
+    elements = MapElements.from_polylines([line, ring], [0, 1], scores or None)
+    return vectors_of(elements, CLASSES)
+
+
+@pytest.fixture
+def scored(tmp_path) -> tuple[Path, Path]:
+    """Results and ground truth of ten samples; every third has no prediction."""
+    results, truth = tmp_path / "map.json", tmp_path / "truth.json"
+    found = [(f"t{i}", line_and_ring(i / 9, i / 10, 0.5) if i % 3 else []) for i in range(10)]
+    write_results(results, found)
+    write_results(truth, [(f"t{i}", line_and_ring(0.0)) for i in reversed(range(10))], key="GTs")
+    return results, truth
+
+
+@pytest.mark.parametrize("metrics", [["chamfer"], ["chamfer", "raster"]])
+def test_figures(scored, tmp_path, metrics, capsys):
+    target = tmp_path / "metrics.json"
+
+    def make(shard: Shard) -> None:
+        words = [*map(str, scored), "--eval", *metrics, "--out", str(target), *words_of(shard)]
+        evaluate(words)
+
+    assert_same_file(make, target, 4)
+    assert 0 < json.loads(target.read_text())["chamfer/mAP"] < 1
+    tables = re.findall("^mAP_chamfer = .*", capsys.readouterr().out, re.MULTILINE)
+    assert len(tables) == 2
+    assert len(set(tables)) == 1
+
+
+def test_figures_of_results_that_lie_in_shards(predictions, minicity_annotations, tmp_path):
+    for path in predictions.parent.glob("map.*-of-*"):
+        shutil.copy(path, tmp_path)
+    target, truth = tmp_path / "metrics.json", str(minicity_annotations["val"])
+    evaluate([str(predictions), truth, "--out", str(target)])
+    whole = target.read_bytes()
+    words = [str(tmp_path / "map.json"), truth, "--out", str(target)]
+    for index in range(3):
+        evaluate([*words, "--shard", f"{index}/3"])
+    merge([str(target)])
+    assert target.read_bytes() == whole
+
+
+def test_what_a_shard_s_part_lacks_or_nobody_knows_is_an_error(scored, tmp_path):
+    results, truth = scored
+    words = [str(results), str(truth), "--out", str(tmp_path / "m.json"), "--shard", "1/2"]
+    write_results(results, [(f"t{i}", []) for i in range(9)] + [("x", [])])
+    with pytest.raises(ValueError, match=r"^1 results have no ground truth, such as 'x'"):
+        evaluate(words)
+    write_results(results, [(f"t{i}", []) for i in range(4)])
+    with pytest.raises(ValueError, match=r"^1 samples have no results, such as 't4'"):
+        evaluate(words)

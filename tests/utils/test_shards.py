@@ -68,7 +68,7 @@ def change(target: Path, **entries) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda t: part(t, 1, ".manifest").unlink(), r"1 are missing: 1; .*--shard 1/3"),
+        (lambda t: part(t, 1, ".manifest").unlink(), r"lacks 1 of its 3 shards: 1; .*--shard 1/3"),
         (lambda t: part(t, 1).unlink(), "is missing, or not what its manifest"),
         (lambda t: part(t, 1).write_text("part 7"), "is missing, or not what its manifest"),
         (lambda t: part(t, 1, ".manifest").write_text("{"), r"manifest is damaged"),

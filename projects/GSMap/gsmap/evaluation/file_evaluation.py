@@ -15,6 +15,7 @@ from gsmap.evaluation.report import MetricReport
 from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, read_samples
 from gsmap.structures.elements import MapElements
 from gsmap.utils.parallel import ordered_map
+from gsmap.utils.shards import WHOLE, Shard
 
 CHUNK = 64  # samples per task: large enough to hide the hand-over, small enough to share evenly
 Samples = Mapping[str, MapElements]
@@ -26,13 +27,14 @@ Evaluation = tuple[list[MetricReport], list[str]]
 
 
 def read_ground_truth(
-    path: str | Path, classes: Sequence[str]
+    path: str | Path, classes: Sequence[str], shard: Shard = WHOLE
 ) -> tuple[dict[str, MapElements], Counter[str]]:
     """Read ground truth: our annotation file, or MapTR's and MapVR's JSON (``*.json``).
 
     Args:
         path: The file.
         classes: Names of the classes to score.
+        shard: Which part of its samples to read.
 
     Returns:
         As ``read_samples``.
@@ -42,7 +44,8 @@ def read_ground_truth(
             or as ``read_samples``.
     """
     if Path(path).suffix.lower() == ".json":
-        return read_samples(path, GROUND_TRUTH_KEY, classes)
+        everything, ignored = read_samples(path, GROUND_TRUTH_KEY, classes)
+        return {token: everything[token] for token in shard.part(list(everything))}, ignored
     file = AnnotationFile(path)
     names = file.meta.classes
     missing = [name for name in classes if name not in names]
@@ -51,7 +54,7 @@ def read_ground_truth(
     labels = np.array([classes.index(name) if name in classes else -1 for name in names])
     samples: dict[str, MapElements] = {}
     ignored = Counter({THREE_D: len(file) * (file.meta.dim == 3)})
-    for sample in file:
+    for sample in map(file.__getitem__, shard.part(range(len(file)))):
         if sample.instances is None:
             raise ValueError(
                 f"{path}, sample {sample.token!r} has no ground truth: it cannot be scored."
@@ -100,7 +103,23 @@ def evaluate_files(
     allow_mismatch: bool = False,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Score a result file.
+    """Score a result file; arguments as of ``match_files``."""
+    matches, notes = match_files(
+        results_path, truth_path, evaluator, num_workers, allow_mismatch, progress
+    )
+    return evaluator.reports(matches), notes
+
+
+def match_files(
+    results_path: str | Path,
+    truth_path: str | Path,
+    evaluator: MapEvaluator,
+    num_workers: int = 1,
+    allow_mismatch: bool = False,
+    progress: Progress | None = None,
+    shard: Shard = WHOLE,
+) -> tuple[list[SampleMatches], list[str]]:
+    """Match the samples of a result file.
 
     Args:
         results_path: Results in MapTR's JSON form.
@@ -110,13 +129,20 @@ def evaluate_files(
         allow_mismatch: A sample without results counts as without predictions, and results without
             ground truth are left out; otherwise both are errors.
         progress: Called with the number of samples done and in all.
+        shard: Which part of the ground truth's samples to match.
+
+    Returns:
+        The matches, and notes: elements left out, z ignored, samples without results.
 
     Raises:
         FileNotFoundError: If a file does not exist.
         ValueError: If a file is malformed or the samples differ.
     """
     results, other_results = read_samples(results_path, RESULTS_KEY, evaluator.classes)
-    truth, other_truth = read_ground_truth(truth_path, evaluator.classes)
+    truth, other_truth = read_ground_truth(truth_path, evaluator.classes, shard)
+    if shard.count:  # what belongs to other shards is theirs
+        elsewhere = _tokens(truth_path) - set(truth)
+        results = {token: found for token, found in results.items() if token not in elsewhere}
     notes = mismatch_notes(results, truth, allow_mismatch)
     with_height = other_results.pop(THREE_D, 0) + other_truth.pop(THREE_D, 0)
     if with_height and not (evaluator.chamfer and evaluator.chamfer.dim == 3):
@@ -128,17 +154,29 @@ def evaluate_files(
         )
     for what, counts in (("predictions", other_results), ("ground truths", other_truth)):
         notes += [f"{n} {what} of class {c!r} are not scored" for c, n in sorted(counts.items())]
-    return score(results, truth, evaluator, num_workers, progress), notes
+    return match_samples(results, truth, evaluator, num_workers, progress), notes
 
 
-def score(
+def _tokens(path: str | Path) -> set[str]:
+    """Return the tokens of all samples of a ground-truth file."""
+    if Path(path).suffix.lower() == ".json":
+        return set(read_samples(path, GROUND_TRUTH_KEY, ())[0])
+    return set(AnnotationFile(path).column("token"))
+
+
+def score(results: Samples, truth: Samples, evaluator: MapEvaluator) -> list[MetricReport]:
+    """Match all samples of the ground truth and compute the metrics; as ``match_samples``."""
+    return evaluator.reports(match_samples(results, truth, evaluator))
+
+
+def match_samples(
     results: Samples,
     truth: Samples,
     evaluator: MapEvaluator,
     num_workers: int = 1,
     progress: Progress | None = None,
-) -> list[MetricReport]:
-    """Match all samples of the ground truth and compute the metrics.
+) -> list[SampleMatches]:
+    """Match all samples of the ground truth.
 
     Args:
         results: Predictions by token; those of samples without ground truth are left out.
@@ -155,7 +193,7 @@ def score(
         matches += found
         if progress is not None:
             progress(len(matches), len(pairs))
-    return evaluator.reports(matches)
+    return matches
 
 
 def _match_all(

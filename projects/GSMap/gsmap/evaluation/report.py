@@ -1,13 +1,16 @@
 """The outcome of a metric: flat figures, the ranked predictions, and one table to read."""
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from gsmap.evaluation.average_precision import calibration_error
 from gsmap.evaluation.matches import ClassDetections
 from gsmap.structures.elements import BoolArray
+from gsmap.utils.files import write_text
 
 UNDEFINED = -1.0  # as in COCO: the figure does not exist (a class without ground truth, no match)
 
@@ -33,6 +36,11 @@ class MetricReport:
 def flat_metrics(reports: Iterable[MetricReport]) -> dict[str, float]:
     """Join the figures of several metrics under their flat keys."""
     return {key: value for report in reports for key, value in report.metrics.items()}
+
+
+def write_figures(path: Path, reports: Iterable[MetricReport]) -> None:
+    """Write the figures of several metrics as flat JSON."""
+    write_text(path, json.dumps(flat_metrics(reports), indent=1) + "\n")
 
 
 def class_figures(

@@ -4,17 +4,22 @@ Results: ``{"meta": ..., "results": [{"sample_token", "vectors": [{"pts", "pts_n
 "type", "confidence_level"}]}]}``; ground truth: ``{"GTs": [...]}`` without confidence.
 """
 
+import heapq
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from gsmap.structures.elements import MapElements
 from gsmap.utils.files import atomic_write
+from gsmap.utils.shards import ShardFile
 
 RESULTS_KEY, GROUND_TRUTH_KEY = "results", "GTs"
 THREE_D = "3D"
+SHARD_KIND = "results"
+_LAST_LINE = "]}\n"
 
 
 def _elements(
@@ -143,4 +148,42 @@ def write_results(
             sample = {"sample_token": token, "vectors": vectors}
             file.write(",\n" if number else "\n")
             file.write(json.dumps(sample, separators=(",", ":")))
-        file.write("\n]}\n")
+        file.write("\n" + _LAST_LINE)
+
+
+def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
+    """Write a result file from its shards, whose samples are in the order of their tokens.
+
+    Args:
+        path: File to write.
+        shards: All of its shards, from ``find_shards``.
+
+    Returns:
+        How many samples it has.
+
+    Raises:
+        ValueError: If the shards say other things about themselves, or a sample occurs twice.
+    """
+    with ExitStack() as stack, atomic_write(path) as out:
+        files = [stack.enter_context(s.path.open(encoding="utf-8")) for s in shards]
+        head, *others = [file.readline() for file in files]
+        if set(others) - {head}:
+            raise ValueError(f"the shards of {path} have different first lines: make them anew.")
+        out.write(head.removesuffix("\n"))
+        count, last = 0, None
+        for token, line in heapq.merge(*map(_lines_by_token, files)):
+            if last is not None and token <= last:
+                raise ValueError(f"shards of {path} hold sample {token!r} twice or out of order.")
+            out.write(",\n" if count else "\n")
+            out.write(line)
+            count, last = count + 1, token
+        out.write("\n" + _LAST_LINE)
+    return count
+
+
+def _lines_by_token(file: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Yield token and text of the samples in the lines that ``write_results`` writes."""
+    decoder, start = json.JSONDecoder(), len('{"sample_token":')
+    for line in file:
+        if line != _LAST_LINE:
+            yield decoder.raw_decode(line, start)[0], line.rstrip(",\n")

@@ -183,8 +183,8 @@ def find_shards(target: Path) -> list[ShardFile]:
     if missing:
         some = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
         raise FileNotFoundError(
-            f"of the {count} shards of {target} {len(missing)} are missing: {some}; run the "
-            f"command again with --shard {missing[0]}/{count}."
+            f"{target} lacks {len(missing)} of its {count} shards: {some}; run the command again "
+            f"with --shard {missing[0]}/{count}."
         )
     return found
 

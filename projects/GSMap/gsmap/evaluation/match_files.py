@@ -1,0 +1,114 @@
+"""Matches of a part of the samples in a file, and the figures of all parts."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.evaluator import MapEvaluator, SampleMatches
+from gsmap.evaluation.matches import FrameMatches
+from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.report import MetricReport
+from gsmap.structures.grid import BEVGrid
+from gsmap.utils.files import atomic_write
+from gsmap.utils.shards import Shard, ShardFile
+
+SHARD_KIND = "matches"
+_FIELDS = [field.name for field in fields(FrameMatches) if field.name != "token"]
+
+
+def write_matches(
+    target: Path,
+    shard: Shard,
+    matches: Sequence[SampleMatches],
+    notes: Sequence[str],
+    evaluator: MapEvaluator,
+    source: str,
+) -> Path:
+    """Write the matches of a shard, and its manifest.
+
+    Args:
+        target: File for the figures of all shards.
+        shard: Which shard.
+        matches: Its matches, one a sample.
+        notes: What to say besides.
+        evaluator: Metrics and their rules.
+        source: Digest of results and ground truth.
+
+    Returns:
+        The shard's file.
+    """
+    arrays = {"notes": np.array(notes, str)}
+    for metric in matches[0] if matches else ():
+        records = [sample[metric] for sample in matches]
+        arrays[f"{metric}/token"] = np.array([record.token for record in records])
+        arrays[f"{metric}/length"] = np.array([len(record.labels) for record in records])
+        for name in _FIELDS:
+            values = [getattr(record, name) for record in records]
+            if values[0] is not None:
+                arrays[f"{metric}/{name}"] = np.concatenate(values)
+    with atomic_write(shard.path_of(target), "wb") as file:
+        np.savez_compressed(file, **arrays)
+    shard.seal(target, SHARD_KIND, source, {"evaluator": asdict(evaluator)}, len(matches))
+    return shard.path_of(target)
+
+
+def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list[str]]:
+    """Compute the metrics from all shards: the figures are those of a run without shards.
+
+    Args:
+        shards: From ``find_shards``.
+
+    Returns:
+        A report per metric, and what the shards have to say, once each.
+    """
+    evaluator = _evaluator(shards[0].manifest["options"]["evaluator"])
+    matches: list[SampleMatches] = []
+    notes: list[str] = []
+    for shard in shards:
+        with np.load(shard.path) as file:
+            notes += file["notes"].tolist()
+            found = {name: file[name] for name in file.files}
+        metrics = [name.split("/")[0] for name in found if name.endswith("/token")]
+        matches += _samples({metric: list(_records(found, metric)) for metric in metrics})
+    return evaluator.reports(matches), list(dict.fromkeys(notes))
+
+
+def _samples(by_metric: dict[str, list[FrameMatches]]) -> Iterator[SampleMatches]:
+    """Turn each metric's samples into each sample's metrics."""
+    for records in zip(*by_metric.values(), strict=True):
+        yield dict(zip(by_metric, records, strict=True))
+
+
+def _records(arrays: dict[str, Any], metric: str) -> Iterator[FrameMatches]:
+    """Cut the arrays of one metric into samples."""
+    tokens, ends = arrays[f"{metric}/token"], np.cumsum(arrays[f"{metric}/length"])[:-1]
+    columns = {}
+    for name in _FIELDS:
+        values = arrays.get(f"{metric}/{name}")
+        per_class = name in ("num_gts", "class_iou")
+        cuts = len(tokens) if per_class else ends
+        columns[name] = [None] * len(tokens) if values is None else np.split(values, cuts)
+    for token, *values in zip(tokens.tolist(), *columns.values(), strict=True):
+        yield FrameMatches(token, **dict(zip(_FIELDS, values, strict=True)))
+
+
+def _evaluator(options: dict[str, Any]) -> MapEvaluator:
+    """Make the evaluator whose rules a manifest tells."""
+
+    def rules(kind: Any, name: str, **changes: Any) -> Any:
+        values = options[name]
+        if values is None:
+            return None
+        lists = {key: tuple(v) for key, v in values.items() if isinstance(v, list)}
+        return kind(**(values | lists | changes))
+
+    grid = options["raster"] and BEVGrid(**options["raster"]["grid"])
+    return MapEvaluator(
+        rules(ChamferConfig, "chamfer"),
+        rules(RasterConfig, "raster", **({"grid": grid} if grid else {})),
+        options["ground_truth_points"],
+    )
