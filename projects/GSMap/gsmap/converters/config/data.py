@@ -4,33 +4,33 @@ from typing import Any
 
 from gsmap.converters.config.fields import Fields
 
-DATASETS = {
-    "CustomNuScenesLocalMapDataset": "nuscenes",
-    "CustomNuScenesOfflineLocalMapDataset": "nuscenes",
-    "CustomAV2LocalMapDataset": "av2",
-    "CustomAV2OfflineLocalMapDataset": "av2",
-}
-PARTS = ("train", "val", "test")
+DATASETS = (
+    "CustomNuScenesLocalMapDataset", "CustomNuScenesOfflineLocalMapDataset",
+    "CustomAV2LocalMapDataset", "CustomAV2OfflineLocalMapDataset",
+)  # fmt: skip
 # steps that ours does elsewhere (migration.md), or that only concern 3D boxes
 KNOWN_STEPS = {
-    "LoadMultiViewImageFromFiles",
-    "CustomLoadMultiViewImageFromFiles",
-    "PhotoMetricDistortionMultiViewImage",
-    "LoadAnnotations3D",
-    "ObjectRangeFilter",
-    "ObjectNameFilter",
-    "PadMultiViewImage",
-    "PadMultiViewImageDepth",
-    "DefaultFormatBundle3D",
-    "LoadPointsFromFile",
-    "CustomPointToMultiViewDepth",
-}
+    "LoadMultiViewImageFromFiles", "CustomLoadMultiViewImageFromFiles",
+    "PhotoMetricDistortionMultiViewImage", "LoadAnnotations3D", "ObjectRangeFilter",
+    "ObjectNameFilter", "PadMultiViewImage", "PadMultiViewImageDepth", "DefaultFormatBundle3D",
+    "LoadPointsFromFile", "CustomPointToMultiViewDepth",
+}  # fmt: skip
 # what a converter's annotation file holds, or what only concerns history and 3D boxes
 OF_THE_FILE = (
-    "type", "ann_file", "map_ann_file", "classes", "modality", "test_mode", "use_valid_flag",
-    "bev_size", "eval_use_same_gt_sample_num_flag", "padding_value", "queue_length", "box_type_3d",
-    "samples_per_gpu", "load_interval", "aux_seg",
-)  # fmt: skip
+    "type ann_file map_ann_file classes modality test_mode use_valid_flag bev_size "
+    "eval_use_same_gt_sample_num_flag padding_value queue_length box_type_3d samples_per_gpu "
+    "load_interval aux_seg fixed_ptsnum_per_line"
+)
+SCHEDULE = {
+    "lr_config.warmup_iters": "param_scheduler.0.end",
+    "lr_config.warmup_ratio": "param_scheduler.0.start_factor",
+    "lr_config.min_lr_ratio": "param_scheduler.1.eta_min_ratio",
+    "evaluation.interval": "train_cfg.val_interval",
+    "checkpoint_config.interval": "default_hooks.checkpoint.interval",
+    "checkpoint_config.max_keep_ckpts": "default_hooks.checkpoint.max_keep_ckpts",
+    "log_config.interval": "default_hooks.logger.interval",
+    "load_from": "load_from",
+}
 
 
 def data_settings(fields: Fields) -> dict[str, Any]:
@@ -41,93 +41,81 @@ def data_settings(fields: Fields) -> dict[str, Any]:
     Raises:
         ValueError: If the data set is unknown.
     """
-    data = fields.section("data")
-    train = data.section("train")
-    kind = train.rest.get("type")
-    if kind not in DATASETS:
-        raise ValueError(f"data.train.type must be one of {sorted(DATASETS)}, got {kind!r}.")
-    low_high = train.rest["pc_range"]
-    grid = {"x_range": [low_high[0], low_high[3]], "y_range": [low_high[1], low_high[4]]}
-    classes = list(train.rest["map_classes"])
-    settings: dict[str, Any] = {
-        "grid": grid,
+    train = dict(fields.section("data.train"))
+    if train.get("type") not in DATASETS:
+        raise ValueError(
+            f"data.train.type must be one of {sorted(DATASETS)}, got {train.get('type')!r}."
+        )
+    low_high, classes, root = train["pc_range"], list(train["map_classes"]), train.get("data_root")
+    shared = {
+        "grid": {"x_range": [low_high[0], low_high[3]], "y_range": [low_high[1], low_high[4]]},
         "classes": classes,
-        "model.grid": grid,
-        "model.classes": classes,
-        "train_dataloader.batch_size": data.take("samples_per_gpu"),
-        "train_dataloader.num_workers": data.take("workers_per_gpu"),
+    }
+    settings: dict[str, Any] = {
+        **shared,
+        **{f"model.{name}": value for name, value in shared.items()},
+        "train_dataloader.batch_size": fields.take("data.samples_per_gpu"),
+        "train_dataloader.num_workers": fields.take("data.workers_per_gpu"),
+        "data_root": root,
         "z_range": [low_high[2], low_high[5]],
-        "steps": {"FormatMapTargets": {"num_points": train.rest["fixed_ptsnum_per_line"]}},
+        "steps": {"FormatMapTargets": {"num_points": train["fixed_ptsnum_per_line"]}},
         "with_depth": False,
     }
-    data.drop("shuffler_sampler", "nonshuffler_sampler")
-    for part in PARTS:
-        own = data.section(part)
-        name = f"{part}_dataloader.dataset."
-        settings[name + "data_root"] = own.take("data_root", train.rest.get("data_root"))
-        settings |= {name + "grid": grid, name + "classes": classes}
-        own.only(pc_range=low_high, map_classes=classes)
-        own.drop(*OF_THE_FILE, "fixed_ptsnum_per_line")
-        for step in own.items("pipeline") if "pipeline" in own.rest else []:
-            _place_step(step, settings)
-    settings["data_root"] = settings["train_dataloader.dataset.data_root"]
+    fields.drop("data", "shuffler_sampler nonshuffler_sampler")
+    for part in ("train", "val", "test"):
+        own, dataset = f"data.{part}", f"{part}_dataloader.dataset."
+        settings |= {dataset + name: value for name, value in shared.items()}
+        settings[dataset + "data_root"] = fields.take(own + ".data_root", root)
+        fields.only(own, {"pc_range": low_high, "map_classes": classes})
+        fields.drop(own, OF_THE_FILE)
+        for step in fields.items(own + ".pipeline") if "pipeline" in fields.section(own) else []:
+            _place_step(fields, step, settings)
     return settings
 
 
-def _place_step(step: Fields, settings: dict[str, Any]) -> None:
+def _place_step(fields: Fields, name: str, settings: dict[str, Any]) -> None:
     """Place a step of a pipeline; one that is unknown stays."""
-    kind = step.rest.get("type")
-    if kind == "MultiScaleFlipAug3D" and not step.rest.get("flip"):
-        for inner in step.items("transforms"):
-            _place_step(inner, settings)
-        step.drop("type", "flip", "img_scale", "pts_scale_ratio")
-    elif kind == "RandomScaleImageMultiViewImage" and len(step.rest["scales"]) == 1:
-        settings["steps"]["ScaleImages"] = {"scale": step.rest["scales"][0]}
-        step.rest.clear()
+    step = fields.section(name)
+    kind = step.get("type")
+    if kind == "MultiScaleFlipAug3D" and not step.get("flip"):
+        for inner in fields.items(name + ".transforms"):
+            _place_step(fields, inner, settings)
+        fields.drop(name, "type flip img_scale pts_scale_ratio")
+    elif kind == "RandomScaleImageMultiViewImage" and len(step["scales"]) == 1:
+        settings["steps"]["ScaleImages"] = {"scale": step["scales"][0]}
+        step.clear()
     elif kind == "NormalizeMultiviewImage":
-        name = "model.data_preprocessor."
-        settings[name + "bgr_to_rgb"] = step.take("to_rgb")
-        settings |= {name + key: step.take(key) for key in ("mean", "std")}
-        step.drop("type")
+        ours = {"to_rgb": "bgr_to_rgb", "mean": "mean", "std": "std"}
+        settings |= fields.move(
+            {f"{name}.{key}": f"model.data_preprocessor.{new}" for key, new in ours.items()}
+        )
+        fields.drop(name, "type")
     elif kind == "CustomCollect3D":
-        settings["with_depth"] |= "gt_depth" in step.rest["keys"]
-        step.rest.clear()
+        settings["with_depth"] |= "gt_depth" in step["keys"]
+        step.clear()
     elif kind in KNOWN_STEPS:
-        step.rest.clear()
+        step.clear()
 
 
 def schedule_settings(fields: Fields) -> dict[str, Any]:
     """Return the settings of optimizer, learning rate, epochs and checkpoints."""
-    settings: dict[str, Any] = {}
     optimizer = fields.take("optimizer", {})
+    settings = {
+        "optim_wrapper.optimizer": optimizer,
+        "optim_wrapper.clip_grad": fields.take("optimizer_config.grad_clip", None),
+        **fields.move(SCHEDULE, required=False),
+    }
     if "paramwise_cfg" in optimizer:
         settings["optim_wrapper.paramwise_cfg"] = optimizer.pop("paramwise_cfg")
-    settings["optim_wrapper.optimizer"] = optimizer
-    settings["optim_wrapper.clip_grad"] = fields.section("optimizer_config").take("grad_clip", None)
-    rate = fields.section("lr_config")
-    rate.only(policy="CosineAnnealing", warmup="linear")
     epochs = fields.take("total_epochs", None)
-    runner = fields.section("runner")
-    runner.only(type="EpochBasedRunner")
-    epochs = runner.take("max_epochs", epochs)
-    evaluation = fields.section("evaluation")
-    evaluation.drop("pipeline", "metric", "save_best", "rule")
-    checkpoints, log = fields.section("checkpoint_config"), fields.section("log_config")
-    log.drop("hooks")
-    found = {
-        "param_scheduler.0.end": rate.take("warmup_iters", None),
-        "param_scheduler.0.start_factor": rate.take("warmup_ratio", None),
-        "param_scheduler.1.eta_min_ratio": rate.take("min_lr_ratio", None),
-        "param_scheduler.1.T_max": epochs,
-        "train_cfg.max_epochs": epochs,
-        "train_cfg.val_interval": evaluation.take("interval", None),
-        "default_hooks.checkpoint.interval": checkpoints.take("interval", None),
-        "default_hooks.checkpoint.max_keep_ckpts": checkpoints.take("max_keep_ckpts", None),
-        "default_hooks.logger.interval": log.take("interval", None),
-        "load_from": fields.take("load_from", None),
-    }
-    settings |= {name: value for name, value in found.items() if value is not None}
-    scale = fields.section("fp16").take("loss_scale", None)
+    epochs = fields.take("runner.max_epochs", epochs)
+    if epochs is not None:
+        settings |= {"param_scheduler.1.T_max": epochs, "train_cfg.max_epochs": epochs}
+    scale = fields.take("fp16.loss_scale", None)
     if scale is not None:
         settings |= {"optim_wrapper.type": "AmpOptimWrapper", "optim_wrapper.loss_scale": scale}
+    fields.only("lr_config", {"policy": "CosineAnnealing", "warmup": "linear"})
+    fields.only("runner", {"type": "EpochBasedRunner"})
+    fields.drop("evaluation", "pipeline metric save_best rule")
+    fields.drop("log_config", "hooks")
     return settings
