@@ -77,6 +77,7 @@ def test_a_ring_that_leaves_the_range_stays_a_ring(tmp_path: Path):
     np.testing.assert_array_equal(ring.points[0], ring.points[-1])
     assert ring.points[:, 0].max() == 30
     assert elements(tmp_path, {"label": 0, "points": [[40, 0], [50, 0]]}) == []
+    assert elements(tmp_path, {"label": 1, "points": [[40, 0], [50, 0], [50, 5], [40, 0]]}) == []
 
 
 def test_height_is_interpolated_where_a_line_is_cut(tmp_path: Path):

@@ -2,15 +2,16 @@
 
 import hashlib
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import shapely
 from PIL import Image, UnidentifiedImageError
 
-from gsmap.converters.local_map import POLYGON
+from gsmap.converters.local_map import POLYGON, vertices_of
 from gsmap.datasets.annotations.file import check_samples, write_annotations
 from gsmap.datasets.annotations.record import (
     AnnotationMeta,
@@ -29,10 +30,8 @@ _UNMOUNTED = (
     "record %r has no ego_from_frame: pictures will take the road to be level, 1.84 m below the "
     "sensor (nuScenes' height), and models that lift images (MapTRv2) cannot use it."
 )
-_RECORD_KEYS = {
-    "token", "cameras", "instances", "global_from_frame", "ego_from_frame", "timestamp_ns", "scene",
-    "map_name", "lidar", "can_bus",
-}  # fmt: skip
+_RECORD_KEYS = {field.name for field in fields(MapSample)}
+Record = TypeVar("Record")
 
 
 def from_records(
@@ -97,6 +96,12 @@ def _samples(
                 )
             sample = _sample(record, meta, root)
             check_samples([sample], meta)
+            if sample.instances is not None:
+                sample.instances = [
+                    MapInstance(item.label, piece)
+                    for item in sample.instances
+                    for piece in _clipped(np.asarray(item.points, np.float64), meta)
+                ]
         if sample.ego_from_frame is None and meta.frame == "lidar" and not warned:
             warned = True
             _LOGGER.warning(_UNMOUNTED, sample.token)
@@ -104,100 +109,76 @@ def _samples(
 
 
 def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
+    """Return a record as a sample; what it holds is still to be checked."""
     token = record["token"]
-    can_bus, instances, lidar, mounting = (
-        record.get(key) for key in ("can_bus", "instances", "lidar", "ego_from_frame")
-    )
-    return MapSample(
-        token=token,
-        scene=record.get("scene", ""),
-        map_name=record.get("map_name", ""),
-        timestamp_ns=int(record.get("timestamp_ns", 0)),
-        cameras=[_camera(camera, token, root) for camera in record["cameras"]],
-        global_from_frame=_matrix(record.get("global_from_frame")),
-        ego_from_frame=None if mounting is None else _matrix(mounting),
-        lidar=None if lidar is None else _lidar(lidar),
-        can_bus=None if can_bus is None else np.asarray(can_bus, np.float64),
-        instances=None if instances is None else _instances(instances, meta, token),
-    )
+    given = {name: value for name, value in record.items() if value is not None}
+    given["cameras"] = [_camera(camera, token, root) for camera in record["cameras"]]
+    if "lidar" in given:
+        lidar = given["lidar"]
+        sweeps = [_record(SweepRecord, sweep) for sweep in lidar.get("sweeps", [])]
+        matrix = lidar.get("frame_from_lidar")
+        matrix = np.eye(4) if matrix is None else matrix
+        given["lidar"] = LidarRecord(lidar["path"], matrix, sweeps)
+    if "instances" in given:
+        given["instances"] = [
+            MapInstance(_label(instance["label"], meta), instance["points"])
+            for instance in given["instances"]
+        ]
+    absent = {"scene": "", "map_name": "", "timestamp_ns": 0, "global_from_frame": np.eye(4)}
+    return MapSample(**{**absent, **given})
 
 
-def _matrix(values: Any) -> np.ndarray:
-    """Return a transform; the identity if none is given. (4, 4)."""
-    return np.eye(4) if values is None else np.asarray(values, np.float64)
+def _record(kind: type[Record], values: Mapping[str, Any]) -> Record:
+    """Return a mapping as a record of its kind; other keys are left alone."""
+    return kind(**{field.name: values[field.name] for field in fields(kind)})  # type: ignore[arg-type]
 
 
 def _camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
-    width, height = camera.get("width"), camera.get("height")
-    if width is None or height is None:
-        file = root / camera["path"]
-        if not file.is_file():
-            raise FileNotFoundError(
-                f"sample {token!r}, camera {camera['name']!r}: no image at {file}; paths are "
-                "relative to data_root."
-            )
-        try:
-            with Image.open(file) as image:
-                width, height = image.size
-        except UnidentifiedImageError as error:
-            raise ValueError(
-                f"sample {token!r}: {file} is not an image; fetch it again."
-            ) from error
-    return CameraRecord(
-        camera["name"],
-        camera["path"],
-        int(width),
-        int(height),
-        np.asarray(camera["intrinsics"], np.float64),
-        np.asarray(camera["cam_from_frame"], np.float64),
-    )
+    if camera.get("width") is None or camera.get("height") is None:
+        width, height = image_size(
+            root / camera["path"], f"sample {token!r}, camera {camera['name']!r}"
+        )
+        camera = {**camera, "width": width, "height": height}
+    return _record(CameraRecord, camera)
 
 
-def _lidar(lidar: Mapping[str, Any]) -> LidarRecord:
-    sweeps = [
-        SweepRecord(sweep["path"], int(sweep["timestamp_ns"]), _matrix(sweep["frame_from_lidar"]))
-        for sweep in lidar.get("sweeps", [])
-    ]
-    return LidarRecord(lidar["path"], _matrix(lidar.get("frame_from_lidar")), sweeps)
+def image_size(file: Path, where: str) -> tuple[int, int]:
+    """Return an image's width and height.
+
+    Raises:
+        FileNotFoundError: If it is missing.
+        ValueError: If it is not an image.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"{where}: no image at {file}; paths are relative to data_root.")
+    try:
+        with Image.open(file) as image:
+            return image.size
+    except UnidentifiedImageError as error:
+        raise ValueError(f"{where}: {file} is not an image; fetch it again.") from error
 
 
-def _instances(
-    instances: Sequence[Mapping[str, Any]], meta: AnnotationMeta, token: str
-) -> list[MapInstance]:
-    found = []
-    for instance in instances:
-        label, points = instance["label"], np.asarray(instance["points"], np.float64)
-        if isinstance(label, str):
-            if label not in meta.classes:
-                raise ValueError(f"sample {token!r}: label {label!r} is not among {meta.classes}.")
-            label = meta.classes.index(label)
-        if points.ndim != 2 or len(points) < 2 or points.shape[1] != meta.dim:
-            raise ValueError(
-                f"sample {token!r}: points must be (n >= 2, {meta.dim}), got {points.shape}."
-            )
-        if not np.isfinite(points).all():
-            raise ValueError(f"sample {token!r}: points hold NaN or infinity.")
-        found += [MapInstance(int(label), piece) for piece in _clipped(points, meta, token)]
-    return found
+def _label(label: Any, meta: AnnotationMeta) -> int:
+    """Return a class's index, given by its name or itself."""
+    if isinstance(label, str):
+        if label not in meta.classes:
+            raise ValueError(f"label {label!r} is not among {meta.classes}.")
+        return meta.classes.index(label)
+    return int(label)
 
 
-def _clipped(points: Points, meta: AnnotationMeta, token: str) -> list[Points]:
+def _clipped(points: Points, meta: AnnotationMeta) -> list[Points]:
     """Return what of an element lies in the range; rings stay rings. each (n, dim)."""
-    (x0, x1), (y0, y1) = meta.x_range, meta.y_range
-    low, high = points[:, :2].min(0), points[:, :2].max(0)
-    if (low >= (x0, y0)).all() and (high <= (x1, y1)).all():
+    low, high = np.array([meta.x_range, meta.y_range]).T
+    if ((points[:, :2] >= low) & (points[:, :2] <= high)).all():
         return [points]
     if not is_closed(points):
         return list(clip_to_box(points, meta.x_range, meta.y_range))
     polygon = shapely.Polygon(points)
     if not polygon.is_valid:
         raise ValueError(
-            f"sample {token!r}: a ring that leaves the range crosses itself, so it cannot be cut: "
-            "mend it."
+            "a ring that leaves the range crosses itself, so it cannot be cut: mend it."
         )
-    parts = shapely.get_parts(shapely.intersection(polygon, shapely.box(x0, y0, x1, y1)))
-    return [
-        shapely.get_coordinates(part.exterior, include_z=meta.dim == 3)
-        for part in parts
-        if shapely.get_type_id(part) == POLYGON
-    ]
+    parts = shapely.get_parts(shapely.intersection(polygon, shapely.box(*low, *high)))
+    areas = parts[(shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)]
+    return vertices_of(shapely.get_exterior_ring(areas), meta.dim)

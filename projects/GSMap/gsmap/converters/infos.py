@@ -7,17 +7,17 @@ the ground truth too. The pickles are read without running code from them.
 
 import argparse
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 from pyquaternion import Quaternion
 from tqdm import tqdm
 
 from gsmap.converters.command_line import add_range_options
+from gsmap.converters.custom import image_size
 from gsmap.converters.nuscenes.can_bus import pose_signals
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.converters.summary import ConversionSummary
@@ -40,12 +40,12 @@ NUSCENES_IMAGE_SIZE = (1600, 900)
 _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
 
 
-def _transform(translation: Any, rotation: Any) -> np.ndarray:
-    """Return a transform from a translation and a quaternion (w, x, y, z) or matrix. (4, 4)."""
+def _transform_of(info: Mapping[str, Any], name: str) -> np.ndarray:
+    """Return a transform from its translation and its quaternion (w, x, y, z) or matrix. (4, 4)."""
     matrix = np.eye(4)
-    turned = np.asarray(rotation, np.float64)
+    turned = np.asarray(info[f"{name}_rotation"], np.float64)
     matrix[:3, :3] = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
-    matrix[:3, 3] = np.asarray(translation, np.float64).reshape(3)
+    matrix[:3, 3] = np.asarray(info[f"{name}_translation"], np.float64).reshape(3)
     return matrix
 
 
@@ -64,8 +64,11 @@ def _relative(path: str, root: Path) -> str:
     raise ValueError(f"path {path!r} does not lie under {root}: give the right --data-root.")
 
 
-def _instances(annotation: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstance]:
-    """Return the elements of the given classes; lines of one point are left out."""
+def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstance] | None:
+    """Return the elements of the given classes, if known; lines of one point are left out."""
+    annotation = info.get("annotation")
+    if annotation is None:
+        return None
     return [
         MapInstance(label, np.asarray(points, np.float64)[:, : meta.dim])
         for label, name in enumerate(meta.classes)
@@ -76,19 +79,15 @@ def _instances(annotation: Mapping[str, Any], meta: AnnotationMeta) -> list[MapI
 
 def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     """Read one entry of a nuScenes info file, in the LIDAR_TOP frame."""
-    ego_from_frame = _transform(info["lidar2ego_translation"], info["lidar2ego_rotation"])
-    pose = _transform(info["ego2global_translation"], info["ego2global_rotation"]) @ ego_from_frame
-
-    def frame_from(sensor: Mapping[str, Any]) -> np.ndarray:
-        return _transform(sensor["sensor2lidar_translation"], sensor["sensor2lidar_rotation"])
-
+    ego_from_frame = _transform_of(info, "lidar2ego")
+    global_from_ego = _transform_of(info, "ego2global")
     cameras = [
         CameraRecord(
             name,
             _relative(camera["data_path"], root),
             *NUSCENES_IMAGE_SIZE,
             np.asarray(camera["cam_intrinsic"], np.float64)[:3, :3],
-            np.linalg.inv(frame_from(camera)),
+            np.linalg.inv(_transform_of(camera, "sensor2lidar")),
         )
         for name, camera in info["cams"].items()
     ]
@@ -96,57 +95,43 @@ def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
         SweepRecord(
             _relative(sweep["data_path"], root),
             int(sweep["timestamp"]) * 1000,
-            frame_from(sweep),
+            _transform_of(sweep, "sensor2lidar"),
         )
         for sweep in info.get("sweeps", [])
     ]
     can_bus = info.get("can_bus")
-    annotation = info.get("annotation")
+    if can_bus is not None:  # the pose belongs into it, as MapTR puts it there on loading
+        measured = np.asarray(can_bus, np.float64)[7:16]
+        can_bus = pose_signals(global_from_ego)
+        can_bus[3:7] = np.asarray(info["ego2global_rotation"])
+        can_bus[7 : 7 + len(measured)] = measured
     return MapSample(
         token=info["token"],
         scene=info.get("scene_token", ""),
         map_name=info.get("map_location", ""),
         timestamp_ns=int(info["timestamp"]) * 1000,
         cameras=cameras,
-        global_from_frame=pose,
+        global_from_frame=global_from_ego @ ego_from_frame,
         ego_from_frame=ego_from_frame,
         lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4), sweeps),
-        can_bus=None if can_bus is None else _complete_can_bus(can_bus, info),
-        instances=None if annotation is None else _instances(annotation, meta),
+        can_bus=can_bus,
+        instances=_instances(info, meta),
     )
-
-
-def _complete_can_bus(can_bus: Any, info: Mapping[str, Any]) -> np.ndarray:
-    """Put the vehicle's pose into the signals, as MapTR does when it loads them. (18,)."""
-    pose = _transform(info["ego2global_translation"], info["ego2global_rotation"])
-    signals = pose_signals(pose)
-    signals[3:7] = np.asarray(info["ego2global_rotation"])
-    measured = np.asarray(can_bus, np.float64)[7:16]
-    signals[7 : 7 + len(measured)] = measured
-    return signals
 
 
 def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     """Read one entry of an Argoverse 2 info file, in the vehicle's frame."""
-    pose = _transform(info["e2g_translation"], info["e2g_rotation"])
+    pose = _transform_of(info, "e2g")
     cameras = []
     for name, camera in info["cams"].items():
-        then = pose
-        if "e2g_translation" in camera:
-            then = _transform(camera["e2g_translation"], camera["e2g_rotation"])
+        then = _transform_of(camera, "e2g") if "e2g_translation" in camera else pose
         path = _relative(camera["img_fpath"], root)
-        width, height = _argoverse_size(name, root / path)
-        cameras.append(
-            CameraRecord(
-                name,
-                path,
-                width,
-                height,
-                np.asarray(camera["intrinsics"], np.float64)[:3, :3],
-                np.asarray(camera["extrinsics"], np.float64) @ np.linalg.inv(then) @ pose,
-            )
-        )
-    annotation = info.get("annotation")
+        size = (1550, 2048) if name == "ring_front_center" else (2048, 1550)
+        if (root / path).is_file():
+            size = image_size(root / path, f"camera {name}")
+        intrinsics = np.asarray(camera["intrinsics"], np.float64)[:3, :3]
+        cam_from_frame = np.asarray(camera["extrinsics"], np.float64) @ np.linalg.inv(then) @ pose
+        cameras.append(CameraRecord(name, path, *size, intrinsics, cam_from_frame))
     return MapSample(
         token=str(info["token"]),
         scene=info["log_id"],
@@ -155,16 +140,8 @@ def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path)
         cameras=cameras,
         global_from_frame=pose,
         lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4)),
-        instances=None if annotation is None else _instances(annotation, meta),
+        instances=_instances(info, meta),
     )
-
-
-def _argoverse_size(name: str, path: Path) -> tuple[int, int]:
-    """Return an image's width and height, from its file or else from the camera's name."""
-    if path.is_file():
-        with Image.open(path) as image:
-            return image.size
-    return (1550, 2048) if name == "ring_front_center" else (2048, 1550)
 
 
 def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
@@ -181,19 +158,6 @@ def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
     )
 
 
-def _maps(meta: AnnotationMeta, root: Path) -> Callable[[str], NuScenesLocalMap | None]:
-    """Return what opens a map by its name, once; None where the expansion does not have it."""
-
-    @cache
-    def open_map(name: str) -> NuScenesLocalMap | None:
-        if not name or not (root / f"maps/expansion/{name}.json").is_file():
-            return None
-        layers = open_layers(root, name, meta.classes)
-        return NuScenesLocalMap(layers, meta.classes, meta.x_range, meta.y_range)
-
-    return open_map
-
-
 def _samples(
     entries: Iterable[tuple[int, Mapping[str, Any]]],
     meta: AnnotationMeta,
@@ -202,7 +166,14 @@ def _samples(
     summary: ConversionSummary,
 ) -> Iterator[MapSample]:
     """Yield the samples of an info file, with ground truth where it is known."""
-    local_map = _maps(meta, root)
+
+    @cache
+    def map_of(name: str) -> NuScenesLocalMap | None:
+        if not name or not (root / f"maps/expansion/{name}.json").is_file():
+            return None
+        layers = open_layers(root, name, meta.classes)
+        return NuScenesLocalMap(layers, meta.classes, meta.x_range, meta.y_range)
+
     read = _argoverse_sample if meta.frame == "ego" else _nuscenes_sample
     for number, info in entries:
         with naming(f"{infos}, sample {number}", "make the file anew"):
@@ -211,7 +182,7 @@ def _samples(
         if sample.instances is not None:
             _check_range(sample, meta)
         elif meta.frame == "lidar":
-            town = local_map(sample.map_name)
+            town = map_of(sample.map_name)
             if town is not None:
                 sample.instances = town.instances(sample.global_from_frame)
             else:
@@ -224,16 +195,15 @@ def _samples(
 def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
     """Raise a ``ValueError`` if ground truth lies outside the range that the file will name."""
     low, high = np.array([meta.x_range, meta.y_range]).T
-    for instance in sample.instances or []:
-        points = instance.points[:, :2]
-        outside = (points < low - _BEYOND_M) | (points > high + _BEYOND_M)
-        if outside.any():
-            x, y = points[outside.any(1)][0]
-            raise ValueError(
-                f"sample {sample.token!r} has a vertex at ({x:.1f}, {y:.1f}), outside x "
-                f"{meta.x_range} and y {meta.y_range}: give the range that the info file was made "
-                "for with --x-range and --y-range."
-            )
+    points = np.concatenate([np.empty((0, 2)), *(i.points[:, :2] for i in sample.instances or [])])
+    outside = ((points < low - _BEYOND_M) | (points > high + _BEYOND_M)).any(1)
+    if outside.any():
+        x, y = points[outside][0]
+        raise ValueError(
+            f"sample {sample.token!r} has a vertex at ({x:.1f}, {y:.1f}), outside x "
+            f"{meta.x_range} and y {meta.y_range}: give the range that the info file was made "
+            "for with --x-range and --y-range."
+        )
 
 
 def _dim(entries: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> int:
@@ -315,7 +285,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, command: str) -> str:
     """Convert as the command line asks and return the summary."""
     split = arguments.split or arguments.infos.stem.rsplit("_", 1)[-1]
-    names = ("infos", "target", "data_root", "x_range", "y_range", "shard")
-    given = {name: getattr(arguments, name) for name in names}
-    classes = tuple(arguments.classes)
-    return convert_infos(split=split, classes=classes, command=command, **given).text()
+    more = {"split": split, "classes": tuple(arguments.classes), "command": command}
+    return convert_infos(**vars(arguments) | more).text()
