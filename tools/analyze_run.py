@@ -8,7 +8,7 @@ Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out cur
 import argparse
 from pathlib import Path
 
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_text
 from gsmap.visualization.figure import save_figure
 from gsmap.visualization.run_curves import plot_runs, plot_series, read_run, summary_table
@@ -20,25 +20,29 @@ def parse_args() -> argparse.Namespace:
         "runs", nargs="+", type=Path, help="work folders of runs, or scalars.json files"
     )
     parser.add_argument("--names", nargs="+", help="a name for each run, for the legend")
-    parser.add_argument("--out", type=Path, help="picture to write: .png, .jpg, .pdf or .svg")
+    parser.add_argument(
+        "--out", type=output_file, help="picture to write: .png, .jpg, .pdf or .svg"
+    )
     parser.add_argument("--keys", nargs="+", help="logged figures to draw in place of the losses")
-    parser.add_argument("--table", type=Path, help="also write the Markdown table to this file")
+    parser.add_argument(
+        "--table", type=output_file, help="also write the Markdown table to this file"
+    )
     return parser.parse_args()
 
 
-def main() -> str:
+def main() -> None:
     args = parse_args()
     names = args.names or [None] * len(args.runs)
     if len(names) != len(args.runs):
         raise ValueError(f"--names gives {len(names)} names for {len(args.runs)} runs.")
     runs = [read_run(path, name) for path, name in zip(args.runs, names, strict=True)]
     report = summary_table(runs)
+    print(report)  # before anything is written: a disk may be full
     if args.table:
         write_text(args.table, report + "\n")
     if args.out:
         figure = plot_series(runs, args.keys) if args.keys else plot_runs(runs)
-        report += f"\ncurves: {save_figure(figure, args.out)}"
-    return report
+        print(f"curves: {save_figure(figure, args.out)}")
 
 
 if __name__ == "__main__":

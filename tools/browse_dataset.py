@@ -14,7 +14,7 @@ from mmengine.utils import track_iter_progress
 from gsmap.apis.map_inferencer import spread_evenly
 from gsmap.engine.launch import add_config_options, read_config
 from gsmap.report.page import ReportOptions, report_data, write_page
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.visualization.figure import FORMATS, picture_name, save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
 
@@ -32,7 +32,9 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--original", action="store_true", help="draw the image files, not the inputs"
     )
-    parser.add_argument("--web", type=Path, metavar="PAGE", help="write an HTML page instead")
+    parser.add_argument(
+        "--web", type=output_file, metavar="PAGE", help="write an HTML page instead"
+    )
     add_config_options(parser)
     return parser.parse_args()
 

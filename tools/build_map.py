@@ -114,8 +114,9 @@ def score(drives: list[Drive], merged: list[MapElements], ann: AnnotationFile, o
     truths = [true_map(read_drive(ann, drive.scene, instances)) for drive in drives]
     maps = {"merged": merged, "suppressed": [suppress(drive) for drive in drives]}
     figures = {way: map_figures(found, truths, drives) for way, found in maps.items()}
+    print(f"\n{figures_table(figures)}\n")
     write_text(out / "scores.json", json.dumps(figures, indent=1) + "\n")
-    print(f"\n{figures_table(figures)}\n\nfigures: {out / 'scores.json'}")
+    print(f"figures: {out / 'scores.json'}")
 
 
 def main(argv: list[str] | None = None) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gsmap.converters.config.reader import read_assignments
 from gsmap.converters.config.upstream import convert_upstream, merge
-from gsmap.utils.cli import run_command
+from gsmap.utils.cli import output_file, run_command
 from gsmap.utils.files import write_text
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -21,13 +21,17 @@ def parse_args() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("source", type=Path, help="config of an original repository")
-    parser.add_argument("target", type=Path, help="config to write")
+    parser.add_argument("target", type=output_file, help="config to write")
     return parser.parse_args()
 
 
 def convert(source: Path, target: Path) -> str:
     """Write the converted config and return what to say of it."""
-    conversion = convert_upstream(read_assignments(source))
+    settings = read_assignments(source)
+    try:
+        conversion = convert_upstream(settings)
+    except (ValueError, TypeError, LookupError) as error:
+        raise ValueError(f"{source} cannot be converted: {error}") from error
     write_text(target, merge(conversion, CONFIGS).pretty_text)
     lines = [f"{target} is written: configs/{conversion.base} with the settings of {source}"]
     if conversion.unplaced:
@@ -36,10 +40,10 @@ def convert(source: Path, target: Path) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
+def main() -> str:
     args = parse_args()
-    run_command(lambda: convert(args.source, args.target))
+    return convert(args.source, args.target)
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

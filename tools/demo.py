@@ -252,8 +252,8 @@ def main() -> None:
                 print(f"\n{minutes:.1f} min: what the {name} that ships sees:")
                 print(f"{first_picture(work)}\n{work / 'report.html'}\n", flush=True)
     summary = table(folder, args.models)
-    write_text(folder / "summary.md", summary + "\n")
     print(f"\nAP in percent on MiniCity's validation towns, {budget.epochs} epochs\n\n{summary}\n")
+    write_text(folder / "summary.md", summary + "\n")
     for name in args.models:
         print(f"{name} from scratch: {first_picture(folder / f'{name.lower()}_test')}")
     print(f"{(time.monotonic() - started) / 60:.1f} minutes. Figures: {folder / 'summary.md'}")

@@ -32,7 +32,8 @@ from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import format_table, write_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.faults import nearest
 from gsmap.utils.shards import add_shard_option, digest, digest_of_common, read_shard
 
 DEFAULT_CLASSES = ("divider", "ped_crossing", "boundary")
@@ -100,8 +101,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="samples without results count as empty, results without ground truth are left out",
     )
     parser.add_argument("--workers", type=int, default=1, help="number of processes")
-    parser.add_argument("--out", type=Path, help="write all figures as flat JSON")
-    parser.add_argument("--pr-curves", type=Path, help="draw PR curves and calibration")
+    parser.add_argument("--out", type=output_file, help="write all figures as flat JSON")
+    parser.add_argument("--pr-curves", type=output_file, help="draw PR curves and calibration")
     add_shard_option(parser)
     args = parser.parse_args(argv)
     if (args.results is None) == (args.prior is None):
@@ -122,6 +123,8 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
         classes = classes or meta.classes
         extent = extent or (x0, y0, x1, y1)
     classes = tuple(classes or DEFAULT_CLASSES)
+    for name in set(args.polygon_classes) - {*classes, *AREA_CLASSES}:
+        raise ValueError(f"--polygon-classes: there is no class {name!r}{nearest(name, classes)}")
     x0, y0, x1, y1 = extent or DEFAULT_RANGE
     chamfer = raster = None
     if "chamfer" in args.eval:

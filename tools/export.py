@@ -29,7 +29,7 @@ from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.launch import add_config_options
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 
 
 def parse_args() -> argparse.Namespace:
@@ -38,7 +38,7 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("config", help="config file of the model, or the name of one that ships")
     parser.add_argument("checkpoint", nargs="?", help="its checkpoint; not needed with a name")
-    parser.add_argument("--out", type=Path, required=True, help="ONNX file to write")
+    parser.add_argument("--out", type=output_file, required=True, help="ONNX file to write")
     parser.add_argument(
         "--size",
         type=int,
@@ -61,7 +61,9 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--check", type=int, metavar="N", help="compare with torch on N samples, evenly spread"
     )
-    parser.add_argument("--results", type=Path, help="JSON file for what ONNX Runtime found there")
+    parser.add_argument(
+        "--results", type=output_file, help="JSON file for what ONNX Runtime found there"
+    )
     add_config_options(parser)
     args = parser.parse_args()
     if args.results and not args.check:

@@ -13,7 +13,7 @@ from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.engine.launch import add_config_options
 from gsmap.engine.named_models import checkpoint_for
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.shards import add_shard_option, digest
 from gsmap.visualization.figure import FORMATS, picture_name, save_figure
 
@@ -30,7 +30,7 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
     parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
-    parser.add_argument("--out", type=Path, help="JSON file for the predictions")
+    parser.add_argument("--out", type=output_file, help="JSON file for the predictions")
     parser.add_argument("--show-dir", type=Path, help="folder for pictures")
     parser.add_argument("--format", default="png", choices=FORMATS)
     parser.add_argument("--order", action="store_true", help="mark start and direction of elements")
@@ -50,6 +50,8 @@ def main() -> None:
     args = parse_args()
     if not args.out and not args.show_dir:
         raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
+    if args.width is not None and args.width < 1:
+        raise ValueError(f"--width must be >= 1 pixel, got {args.width}.")
     checkpoint = checkpoint_for(args.config, args.checkpoint)
     inferencer = MapInferencer(args.config, checkpoint, args.device, args.cfg_options)
     visualizer = inferencer.visualizer

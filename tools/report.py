@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 from gsmap.report.page import ReportOptions, report_data, write_page
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 
 
 def parse_args() -> argparse.Namespace:
@@ -19,7 +19,9 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("results", type=Path, help="results in MapTR's JSON form")
     parser.add_argument("--ann", type=Path, required=True, help="annotation file (*.arrow)")
-    parser.add_argument("--out", type=Path, default=Path("report.html"), help="page to write")
+    parser.add_argument(
+        "--out", type=output_file, default=Path("report.html"), help="page to write"
+    )
     parser.add_argument("--compare", type=Path, metavar="RESULTS", help="other results beside them")
     parser.add_argument("--names", nargs="+", help="a name for each result file")
     parser.add_argument(

@@ -14,7 +14,7 @@ from mmengine.runner import Runner
 from gsmap.apis.checkpoint import adopt_settings
 from gsmap.engine.launch import add_common_arguments, load_config
 from gsmap.engine.named_models import checkpoint_for
-from gsmap.utils.cli import CommandParser, is_first_rank, run_command
+from gsmap.utils.cli import CommandParser, is_first_rank, output_file, run_command
 from gsmap.utils.files import write_text
 
 
@@ -31,8 +31,12 @@ def parse_args() -> argparse.Namespace:
         default=["chamfer", "raster"],
         help="metrics; none at all with --out only writes the predictions",
     )
-    parser.add_argument("--out", metavar="FILE.json", help="write the predictions (MapTR's form)")
-    parser.add_argument("--metrics-out", metavar="FILE.json", help="write the figures")
+    parser.add_argument(
+        "--out", type=output_file, metavar="FILE.json", help="write the predictions (MapTR's form)"
+    )
+    parser.add_argument(
+        "--metrics-out", type=output_file, metavar="FILE.json", help="write the figures"
+    )
     parser.add_argument("--show-dir", metavar="DIR", help="draw the samples into this folder")
     parser.add_argument(
         "--show-interval", type=int, default=1, metavar="N", help="draw every N-th sample"
@@ -54,7 +58,7 @@ def apply_options(cfg: Config, args: argparse.Namespace) -> None:
         "type": "MapMetric",
         **(cfg.get("test_evaluator") or {}),
         "eval": args.eval,
-        "out_file": args.out,
+        "out_file": args.out and str(args.out),
     }
     cfg.test_evaluator = [cfg.test_evaluator, {"type": "GaussianMetric"}]
     if args.show_dir:

@@ -46,7 +46,7 @@ def test_a_missing_config_is_named():
 
 
 def test_a_misspelt_key_is_refused_with_the_right_one():
-    with pytest.raises(ValueError, match=r"'optim_wraper'.*Did you mean 'optim_wrapper'"):
+    with pytest.raises(ValueError, match=r"'optim_wraper'; did you mean 'optim_wrapper'\?"):
         check_config(Config({"optim_wraper": {}}))
 
 

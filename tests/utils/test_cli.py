@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import atomic_write
 
 
@@ -111,8 +112,14 @@ def fail(error: Exception) -> None:
         (KeyError("Foo is not in the registry"), "Foo is not in the registry"),
         (RuntimeError("a worker\n  died"), "a worker died"),
         (DamagedError("sample 'a': damaged"), "sample 'a': damaged"),
-        (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
-        (PermissionError(13, "Permission denied", "a"), "[Errno 13] Permission denied: 'a'"),
+        (
+            OSError(28, "No space left on device"),
+            "[Errno 28] No space left on device; free some space there, or write elsewhere.",
+        ),
+        (
+            PermissionError(13, "Permission denied", "a"),
+            "[Errno 13] Permission denied: 'a'; choose a place that you may read and write.",
+        ),
     ],
 )
 def test_what_a_check_says_is_one_line_and_2(error, line, capsys):
@@ -135,8 +142,8 @@ def test_files_of_the_user_end_in_words(tmp_path, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(":")[0] for line in lines] == ["error"] * 3
     assert "Expecting property name" in lines[0]
-    assert "can't decode byte" in lines[1]
-    assert "c.txt" in lines[2]
+    assert "b.txt cannot be read: 'utf-8' codec can't decode byte" in lines[1]
+    assert "c.txt'; check the path." in lines[2]
 
 
 def full_disk() -> None:
@@ -148,7 +155,9 @@ def full_disk() -> None:
 def test_a_full_disk_is_one_line(capsys):
     with pytest.raises(SystemExit):
         run_command(full_disk)
-    assert capsys.readouterr().err == "error: [Errno 28] No space left on device\n"
+    assert capsys.readouterr().err == (
+        "error: [Errno 28] No space left on device; free some space there, or write elsewhere.\n"
+    )
 
 
 def bad_check(text: str) -> None:
@@ -196,6 +205,22 @@ def in_worker(function, argument) -> None:
         pool.submit(function, argument).result()
 
 
+def test_every_traceback_can_be_had(monkeypatch):
+    monkeypatch.setenv("GSMAP_TRACEBACK", "1")
+    with pytest.raises(ValueError, match="no such split"):
+        run_command(lambda: fail(ValueError("no such split")))
+
+
+def test_where_a_command_is_to_write_is_checked_before_its_work(tmp_path):
+    (tmp_path / "file").touch()
+    assert output_file(str(tmp_path / "new/a.json")) == tmp_path / "new/a.json"
+    assert output_file("/dev/null") == Path("/dev/null")
+    with pytest.raises(IsADirectoryError, match=re.escape(repr(str(tmp_path)))):
+        output_file(str(tmp_path))
+    with pytest.raises(NotADirectoryError, match="/file'"):
+        output_file(str(tmp_path / "file/a.json"))
+
+
 def test_errors_of_workers_are_told_apart_too(capsys):
     with pytest.raises(SystemExit):
         run_command(lambda: in_worker(bad_check, "x"))
@@ -214,11 +239,43 @@ def test_ctrl_c_is_one_line_and_130(capsys):
     assert capsys.readouterr().err == "interrupted: nothing half-written is left\n"
 
 
+def test_impatience_does_not_cut_the_clean_up_off(tmp_path):
+    """Ctrl-C, five times: the half-written file goes all the same, and there is one line."""
+    program = f"""
+import os, signal, time
+from gsmap.utils.cli import run_command
+from gsmap.utils.files import atomic_write
+signal.signal(signal.SIGINT, signal.default_int_handler)  # these tests may run in the background
+unlink = os.unlink
+def slowly(path):
+    print("cleaning", flush=True)
+    time.sleep(0.5)
+    unlink(path)
+os.unlink = slowly
+def command():
+    with atomic_write({str(tmp_path / "a")!r}):
+        print("ready", flush=True)
+        time.sleep(60)
+run_command(command)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout.readline() == b"ready\n"
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == b"cleaning\n"
+        for _ in range(4):
+            process.send_signal(signal.SIGINT)
+        assert process.wait() == 130
+        assert process.stderr.read() == b"interrupted: nothing half-written is left\n"
+    assert os.listdir(tmp_path) == []
+
+
 @pytest.mark.parametrize(("heed_kill", "code", "left"), [(True, 143, 0), (False, -15, 1)])
 def test_kill_runs_the_clean_up_where_that_is_wanted(heed_kill, code, left, tmp_path):
     program = f"""
 import time
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import atomic_write
 def command():
     with atomic_write({str(tmp_path / "a")!r}):

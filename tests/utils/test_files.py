@@ -1,3 +1,4 @@
+import errno
 import os
 import platform
 import signal
@@ -66,19 +67,45 @@ def test_what_a_killed_writer_left_goes_with_the_next_write_and_nothing_else(tmp
             time.sleep(60)
         """
     )
+    host = platform.node()
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as writer:
         assert writer.stdout.readline() == b"ready\n"
         write_text(path, "beside a living writer")
-        assert (tmp_path / f"a.{writer.pid}.{platform.node()}.partial").exists()
+        assert (tmp_path / f"a.{writer.pid}.{host}.partial").exists()
         writer.send_signal(signal.SIGKILL)
-    here = platform.node()
+    (tmp_path / f"folder.{writer.pid}.{host}.partial").mkdir()
+    (old := tmp_path / "e.999999999.there.partial").touch()
+    os.utime(old, (0, 0))
     others = {
-        f"b.1.{here}.partial",
+        f"b.1.{host}.partial",
         "a.partial",
-        f"a.x.{here}.partial",
+        f"a.x.{host}.partial",
         "a.999999999.there.partial",
     }
     for name in others:
         (tmp_path / name).touch()
-    write_text(path, "whole")
-    assert set(os.listdir(tmp_path)) == {"a", *others}
+    write_text(tmp_path / "d", "whole")  # any file of that folder
+    assert set(os.listdir(tmp_path)) == {"a", "d", *others}
+
+
+def test_a_device_or_a_pipe_is_written_to_and_stays_what_it_is(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    write_text(tmp_path / "pipe", "figures")
+    assert os.read(reader, 100) == b"figures"
+    os.close(reader)
+    write_text("/dev/null", "figures")
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+def test_what_stops_a_writer_is_said_of_the_file_that_was_asked_for(tmp_path, monkeypatch):
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"Is a directory: '.*/folder'$"):
+        write_text(tmp_path / "folder", "")
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*/a'$"):
+        write_text(tmp_path / "a", "")
+    assert os.listdir(tmp_path) == ["folder"]

@@ -37,8 +37,14 @@ def run(arguments: argparse.Namespace, _command: str = "") -> str:
         A line for the user.
 
     Raises:
+        FileNotFoundError: If there is no data set.
         ValueError: If there is no such key frame.
     """
+    if not Path(arguments.root, VERSION).is_dir():
+        raise FileNotFoundError(
+            f"no MiniCity at {arguments.root}: make it with python -m minicity generate --root "
+            f"{arguments.root} --scenes 10"
+        )
     from nuscenes import NuScenes
     from nuscenes.map_expansion.map_api import NuScenesMap
 

@@ -9,11 +9,10 @@ from typing import Any
 from mmengine.config import Config
 from torch import Tensor, nn
 
-from gsmap.checkpoints.convert import read_checkpoint
+from gsmap.checkpoints.convert import listed, read_checkpoint
 from gsmap.checkpoints.settings import MODEL_SETTINGS, differences, plain
 from gsmap.engine.named_models import find_checkpoint
 
-_SHOWN = 5
 # what torch's reader raises on bytes that make no sense
 _DAMAGE = (
     RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, UnicodeError,
@@ -52,7 +51,7 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
     broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
     if broken:
         raise ValueError(
-            f"{path} holds NaN or infinite weights ({_listed(broken)}): the training that wrote it "
+            f"{path} holds NaN or infinite weights ({listed(broken)}): the training that wrote it "
             "had failed; use an earlier epoch's."
         )
     return state, settings
@@ -117,15 +116,7 @@ def load_weights(model: nn.Module, path: str | Path) -> None:
     missing = [key for key in result.missing_keys if key not in counters]
     if missing or result.unexpected_keys:
         raise ValueError(
-            f"{path} does not belong to this config: it lacks {_listed(missing)} and has "
-            f"{_listed(result.unexpected_keys)} too many. Give the config that it was trained with "
+            f"{path} does not belong to this config: it lacks {listed(missing)} and has "
+            f"{listed(result.unexpected_keys)} too many. Give the config that it was trained with "
             "(a copy lies beside it in the work folder)."
         )
-
-
-def _listed(keys: list[str]) -> str:
-    """Name the first keys and count the rest."""
-    if not keys:
-        return "nothing"
-    rest = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
-    return ", ".join(keys[:_SHOWN]) + rest

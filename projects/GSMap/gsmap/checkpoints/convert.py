@@ -1,6 +1,6 @@
 """Conversion of state dicts between the format of the earlier systems and ours."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,12 @@ from torch import Tensor
 
 from gsmap.checkpoints.key_map import KeyMap, find_key_map, is_upstream
 from gsmap.checkpoints.safe_globals import mmengine_globals
+
+
+def listed(keys: Sequence[str], shown: int = 3) -> str:
+    """Name the first keys and count the rest."""
+    rest = f" and {len(keys) - shown} more" if len(keys) > shown else ""
+    return ", ".join(keys[:shown]) + rest or "nothing"
 
 
 def ours_from_upstream(
@@ -28,7 +34,7 @@ def ours_from_upstream(
         elif key not in key_map.unused:
             unknown.append(key)
     if unknown:
-        raise ValueError(f"keys that no {key_map.name} model has: {', '.join(unknown)}.")
+        raise ValueError(f"keys that no {key_map.name} model has: {listed(unknown)}.")
     return renamed
 
 
@@ -47,7 +53,7 @@ def upstream_from_ours(
     unknown = [key for key, name in names.items() if name is None and not _serves_training(key)]
     if unknown:
         raise ValueError(
-            f"keys that upstream's {key_map.name} does not have: {', '.join(unknown)}. Without "
+            f"keys that upstream's {key_map.name} does not have: {listed(unknown)}. Without "
             "them the model would find something else: it stays in our format."
         )
     renamed = {name: state[key] for key, name in names.items() if name is not None}

@@ -4,10 +4,8 @@ from collections.abc import Callable, Mapping
 
 from torch import Tensor, nn
 
-from gsmap.checkpoints.convert import ours_from_upstream
+from gsmap.checkpoints.convert import listed, ours_from_upstream
 from gsmap.checkpoints.key_map import is_upstream
-
-_SHOWN = 20
 
 
 def neutral_keys(model: nn.Module, prefix: str = "") -> set[str]:
@@ -65,7 +63,7 @@ def adapt_state(
         if key in expected and value.shape != expected[key].shape
     ]
     problems = [
-        f"{what}: {_listed(keys)}"
+        f"{what}: {listed(keys)}"
         for what, keys in (
             ("missing", sorted(missing)),
             ("left over", left_over),
@@ -80,9 +78,3 @@ def adapt_state(
             + ". Load it with the config it was trained with; docs/migration.md lists the "
             "architectures that load."
         )
-
-
-def _listed(keys: list[str]) -> str:
-    """Join the first keys and count the rest."""
-    rest = f" and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
-    return ", ".join(keys[:_SHOWN]) + rest

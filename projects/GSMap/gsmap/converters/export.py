@@ -13,6 +13,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
+from gsmap.utils.cli import output_file
 from gsmap.utils.files import atomic_write
 
 _DECIMALS = 6
@@ -100,7 +101,7 @@ def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py export``."""
     parser.add_argument("annotations", type=Path, nargs="+", help="annotation files (.arrow)")
-    parser.add_argument("target", type=Path, help="JSON file to write")
+    parser.add_argument("target", type=output_file, help="JSON file to write")
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:

@@ -34,6 +34,7 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.errors import naming
 from gsmap.datasets.plain_pickle import load_plain_pickle
+from gsmap.utils.cli import output_file
 from gsmap.utils.shards import WHOLE, Shard, add_shard_option
 
 NUSCENES_IMAGE_SIZE = (1600, 900)
@@ -272,7 +273,7 @@ def convert_infos(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py infos``."""
     parser.add_argument("infos", type=Path, help="info file of MapTR or MapTRv2 (.pkl)")
-    parser.add_argument("target", type=Path, help="annotation file to write (.arrow)")
+    parser.add_argument("target", type=output_file, help="annotation file to write (.arrow)")
     parser.add_argument(
         "--data-root", type=Path, required=True, help="what paths shall be relative to"
     )

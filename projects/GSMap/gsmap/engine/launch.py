@@ -1,22 +1,26 @@
 """What the tools share: reading a config, changing it, checking it, the work folder."""
 
 import argparse
-import difflib
 import logging
 import os
 import re
+import traceback
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import mmengine.optim
 import torch
+from mmdet3d.registry import OPTIMIZERS
 from mmengine.config import Config, DictAction
 from mmengine.logging import print_log
 from mmengine.registry import init_default_scope
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.engine.named_models import find_config
+from gsmap.utils.faults import nearest
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 KNOWN_KEYS = frozenset(
@@ -122,15 +126,37 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
 
     Raises:
         FileNotFoundError: If there is no such file or model.
+        ValueError: If it cannot be read, has an unknown top-level key, or an override does not fit.
     """
     if isinstance(config, Config):
         cfg = Config(config.to_dict())
     else:
-        cfg = Config.fromfile(find_config(config))
-    cfg.merge_from_dict(cfg_options or {})
-    import_modules_from_strings(**cfg.get("custom_imports", {"imports": ["gsmap.registered"]}))
+        path = find_config(config)
+        with _naming(path):
+            cfg = Config.fromfile(path, import_custom_modules=False)
+    with _naming(f"--cfg-options of {cfg.filename or 'a config'}"):
+        cfg.merge_from_dict(cfg_options or {})
+    _check_keys(cfg)
+    with _naming(f"custom_imports of {cfg.filename or 'a config'}"):
+        import_modules_from_strings(**cfg.get("custom_imports", {"imports": ["gsmap.registered"]}))
     init_default_scope(cfg.get("default_scope", "mmdet3d"))
     return cfg
+
+
+@contextmanager
+def _naming(what: object) -> Iterator[None]:
+    """Say whose fault it is where a config, which is Python, ends with whatever it likes."""
+    try:
+        yield
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [f.lineno for f in frames if f.filename == str(Path(str(what)).absolute())]
+        place = f", line {lines[-1]}," if lines else ""
+        reason = error.__context__ if isinstance(error, ImportError) else None
+        reason = reason or error  # mmengine's own does not say why an import failed
+        raise ValueError(
+            f"{what}{place} cannot be used: {type(reason).__name__}: {reason}."
+        ) from error
 
 
 def load_config(args: argparse.Namespace) -> Config:
@@ -209,17 +235,20 @@ def check_config(cfg: Config) -> None:
         ValueError: If a top-level key is unknown (names of a config's own values must start with an
             underscore), or a learning-rate schedule ends at another epoch than the training.
     """
+    _check_keys(cfg)
+    _check_schedule(cfg)
+    kind = ((cfg.get("optim_wrapper") or {}).get("optimizer") or {}).get("type")
+    if isinstance(kind, str) and OPTIMIZERS.get(kind) is None:  # mmengine goes on without one
+        close = nearest(kind, mmengine.registry.OPTIMIZERS.module_dict)
+        raise ValueError(f"{cfg.filename}: there is no optimizer of type {kind!r}{close or '.'}")
+
+
+def _check_keys(cfg: Config) -> None:
     for key in cfg:
         if key in KNOWN_KEYS or key.startswith("_"):
             continue
-        close = difflib.get_close_matches(key, KNOWN_KEYS, n=1)
-        hint = (
-            f" Did you mean {close[0]!r}?"
-            if close
-            else " Names of a config's own values start with '_'."
-        )
-        raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}.{hint}")
-    _check_schedule(cfg)
+        hint = nearest(key, KNOWN_KEYS) or "; names of a config's own values start with '_'."
+        raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")
 
 
 def _check_schedule(cfg: Config) -> None:

@@ -7,6 +7,7 @@ heights the distances are those in space, as in MapTRv2's; lines are resampled a
 the plane.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -57,7 +58,7 @@ class ChamferConfig:
     def __post_init__(self) -> None:
         thresholds = tuple(sorted(round(float(t), 6) for t in self.thresholds))
         object.__setattr__(self, "thresholds", thresholds)
-        if not self.classes or not thresholds or thresholds[0] <= 0:
+        if not (self.classes and thresholds and all(0 < t < math.inf for t in thresholds)):
             raise ValueError(
                 "classes and thresholds must not be empty and thresholds must be > 0 m, got "
                 f"{self.classes} and {thresholds}."

@@ -127,15 +127,15 @@ class MapMetric(BaseMetric):
                 "current",
                 level=30,
             )
-        if self.out_file is not None:
+        reports = []
+        if self.evaluator is not None:
+            reports = self.evaluator.reports(record["matches"] for record in records)
+        for report in reports:
+            MMLogger.get_current_instance().info("\n%s", format_table(report))
+        if self.out_file is not None:  # after the figures: a disk may be full
             samples = ((record["token"], record["vectors"]) for record in records)
             write_results(self.out_file, samples, {"classes": list(self._meta("classes"))})
             print_log(f"Results of {len(records)} samples written to {self.out_file}", "current")
-        if self.evaluator is None:
-            return {}
-        reports = self.evaluator.reports(record["matches"] for record in records)
-        for report in reports:
-            MMLogger.get_current_instance().info("\n%s", format_table(report))
         return flat_metrics(reports)
 
 

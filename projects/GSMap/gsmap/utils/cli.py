@@ -1,17 +1,24 @@
 """What every command shares: how its words are read, and how it ends."""
 
 import argparse
+import errno
+import logging
+import math
 import os
 import re
 import signal
 import sys
-import traceback
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain, takewhile
+from pathlib import Path
 from typing import Any
 
+from gsmap.utils.faults import in_words
+
 BAD_INPUT = 2  # exit code, as argparse's for bad arguments
+CLEAN_UP_S = 5.0  # how long further Ctrl-C are not answered
 _LISTS = ("?", "*", "+")
 
 
@@ -93,8 +100,9 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     """Run a command, print what it reports, and leave in words whatever a user can cause.
 
     A file that cannot be read, understood or written, and whatever a ``raise`` statement says, end
-    with ``error: ...`` and exit code 2; Ctrl-C with one line and 130; ``kill`` with 143; each after
-    the clean-up of half-written files. A slip in the code keeps its traceback.
+    with ``error: ...`` and exit code 2 (`faults.in_words`); Ctrl-C with one line and 130; ``kill``
+    with 143; each after the clean-up of half-written files. A slip in the code keeps its traceback,
+    and with the environment variable ``GSMAP_TRACEBACK`` every error does.
 
     Args:
         command: Returns what to print, or None.
@@ -104,12 +112,17 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     Raises:
         SystemExit: If the command fails or is interrupted.
     """
+    logging.raiseExceptions = False  # a log file on a full disk is no reason for tracebacks
+    end = _End()
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background
-        signal.signal(signal.SIGINT, partial(_interrupt, os.getpid()))
+        signal.signal(signal.SIGINT, end)
     if heed_kill:
-        signal.signal(signal.SIGTERM, _leave)
+        signal.signal(signal.SIGTERM, end)
     try:
         report = command()
+        if report is not None:
+            sys.stdout.write(f"{report}\n")
+        sys.stdout.flush()
     except KeyboardInterrupt:
         if is_first_rank():
             sys.stderr.write("interrupted: nothing half-written is left\n")
@@ -117,34 +130,56 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
             sys.stderr.flush()
             os._exit(128 + signal.SIGINT)  # the interpreter's own end would wait for other ranks
         sys.exit(128 + signal.SIGINT)
-    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
-        if not _is_for_the_user(error):
+    except Exception as error:
+        text = None if os.environ.get("GSMAP_TRACEBACK") else in_words(error)
+        if text is None:
             raise
-        # a KeyError's own text is its message in quotes
-        text = error.args[0] if type(error) is KeyError else error
-        sys.stderr.write(f"error: {' '.join(str(text).split())}\n")
+        sys.stderr.write(f"error: {' '.join(text.split())}\n")
         sys.exit(BAD_INPUT)
-    if report is not None:
-        sys.stdout.write(f"{report}\n")
 
 
-def _interrupt(main: int, _number: int, _frame: object) -> None:
-    """Answer Ctrl-C in the command's own process; forked workers inherit this, and end with it."""
-    if os.getpid() == main:
-        raise KeyboardInterrupt
+class _End:
+    """Answers Ctrl-C and ``kill`` once, so that impatience does not cut a clean-up off.
+
+    Forked workers inherit it, and leave Ctrl-C to the command's own process.
+    """
+
+    def __init__(self) -> None:
+        self._main = os.getpid()
+        self._answered_s = -math.inf
+
+    def __call__(self, number: int, _frame: object) -> None:
+        if number == signal.SIGINT and os.getpid() != self._main:
+            return
+        now_s = time.monotonic()
+        if now_s - self._answered_s < CLEAN_UP_S:
+            return
+        self._answered_s = now_s
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        sys.exit(128 + number)
 
 
-def _leave(number: int, _frame: object) -> None:
-    """Leave through the clean-up of half-written files, as Ctrl-C does."""
-    sys.exit(128 + number)
+def output_file(text: str) -> Path:
+    """Read an argument that names what a command writes, before it begins to work.
 
+    Args:
+        text: The word.
 
-def _is_for_the_user(error: Exception) -> bool:
-    """Whether the system, a parser or a ``raise`` statement speaks, and not Python of a slip."""
-    parsing = isinstance(error, ValueError) and type(error) is not ValueError
-    if parsing or isinstance(error, OSError):
-        return True
-    in_worker = type(error.__cause__).__name__ == "_RemoteTraceback"
-    frames = [str(error.__cause__)] if in_worker else traceback.format_tb(error.__traceback__)
-    statements = re.findall(r'^  File ".*\n    (.*)', "".join(frames), re.MULTILINE)
-    return bool(statements) and statements[-1].startswith("raise ")
+    Returns:
+        The path.
+
+    Raises:
+        OSError: If it is a folder, or no file can be made there.
+    """
+    path = Path(text)
+    place = next(parent for parent in path.absolute().parents if parent.exists())
+    if path.is_dir():
+        number, at = errno.EISDIR, path
+    elif not place.is_dir():
+        number, at = errno.ENOTDIR, place
+    elif not os.access(path if path.exists() else place, os.W_OK):
+        number, at = errno.EACCES, place
+    else:
+        return path
+    raise OSError(number, os.strerror(number), str(at))

@@ -2,7 +2,9 @@
 
 import os
 import platform
+import re
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,15 +12,17 @@ from typing import IO, Any, Literal
 
 SUFFIX = ".partial"
 _END = f".{platform.node()}{SUFFIX}"  # another machine's writers on a shared disk cannot be judged
+_DAY_S = 24 * 3600.0
+_DEVICES = Path("/dev")
 
 
 @contextmanager
 def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
     """Open a file that takes its name only when the block ends well.
 
-    Until then it is ``PATH.<pid>.<host>.partial``, which any exception removes. One that a killed
-    writer left behind goes when the same machine writes the same file again. A reader sees the old
-    file or the new one.
+    Until then it is ``PATH.<pid>.<host>.partial``, which any exception removes. What a killed
+    writer left behind goes when anything is written to the same folder. A reader sees the old file
+    or the new one. A device or a pipe, such as ``/dev/null``, is written to as it is.
 
     Args:
         path: File to write; parent folders are made.
@@ -28,14 +32,23 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
         The open file.
     """
     path = Path(path)
+    encoding = None if "b" in mode else "utf-8"
+    if _is_special(path):
+        with path.open(mode, encoding=encoding) as file:
+            yield file
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = partial_path(path)
     try:
-        with partial.open(mode, encoding=None if "b" in mode else "utf-8") as file:
+        with partial.open(mode, encoding=encoding) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
+    except OSError as error:
+        if error.errno and str(error.filename or partial) == str(partial):
+            raise type(error)(error.errno, error.strerror, str(path)) from error
+        raise
     finally:
         partial.unlink(missing_ok=True)
 
@@ -53,15 +66,31 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def partial_path(path: Path) -> Path:
-    """Return where a file or folder is made before it takes its name, free of what is stale.
+    """Return where a file or folder is made before it takes its name.
 
-    What killed writers of the same file or folder left behind on this machine is removed.
+    What killed writers left in that folder is removed.
     """
-    start = f"{path.name}."
-    # without /proc there is no way to tell whether a writer lives
-    for name in os.listdir(path.parent) if Path("/proc/self").exists() else ():
-        pid = name[len(start) : -len(_END)]
-        if name == f"{start}{pid}{_END}" and pid.isdigit() and not Path("/proc", pid).exists():
-            stale = path.parent / name
-            shutil.rmtree(stale) if stale.is_dir() else stale.unlink(missing_ok=True)
-    return path.with_name(f"{start}{os.getpid()}{_END}")
+    for name in os.listdir(path.parent):
+        stale = path.parent / name
+        if name.endswith(SUFFIX) and _is_stale(stale):
+            shutil.rmtree(stale, True) if stale.is_dir() else stale.unlink(missing_ok=True)
+    return path.with_name(f"{path.name}.{os.getpid()}{_END}")
+
+
+def _is_stale(partial: Path) -> bool:
+    """Whether a writer is dead: its process is none here, or on another machine it rested a day."""
+    name, own = partial.name, partial.name.endswith(_END)
+    found = re.fullmatch(r".+\.(\d+)", name[: -len(_END)]) if own else None
+    if found and Path("/proc/self").exists():  # without /proc there is no way to tell
+        return not Path("/proc", found[1]).exists()
+    if own or not re.fullmatch(rf".+\.\d+\..+{re.escape(SUFFIX)}", name):
+        return False
+    try:
+        return time.time() - partial.stat().st_mtime > _DAY_S
+    except FileNotFoundError:
+        return False
+
+
+def _is_special(path: Path) -> bool:
+    """Whether a path is a device, a pipe or the like, which must not be replaced by a file."""
+    return path.exists() and not path.is_dir() and (not path.is_file() or path.parent == _DEVICES)

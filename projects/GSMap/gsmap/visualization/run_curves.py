@@ -50,11 +50,13 @@ def _records(path: Path) -> list[dict[str, float]]:
     for number, line in enumerate(lines, start=1):
         try:
             record = json.loads(line)
-        except json.JSONDecodeError as error:
+            if not isinstance(record, dict):
+                raise ValueError("it is no object")
+            records.append({k: float(v) for k, v in record.items() if isinstance(v, int | float)})
+        except (ValueError, OverflowError) as error:
             if number == len(lines):
                 break
             raise ValueError(f"{path}, line {number} is not JSON: {error}.") from error
-        records.append({k: float(v) for k, v in record.items() if isinstance(v, int | float)})
     return [record for record in records if "step" in record]
 
 
@@ -70,7 +72,7 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
 
     Raises:
         FileNotFoundError: If there is no log.
-        ValueError: If a line is not JSON.
+        ValueError: If a line is not JSON, or there is no record.
     """
     path = Path(path)
     found = [*path.glob("*/vis_data/scalars.json"), *path.glob("vis_data/scalars.json")]
@@ -85,6 +87,8 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
     for file in files:  # oldest first: one per start
         for record in _records(file):
             (train if "loss" in record else val)[record["step"]] = record
+    if not (train or val):
+        raise ValueError(f"{files[0]} holds no record of training: give a run's scalars.json.")
     ordered = [[part[step] for step in sorted(part)] for part in (train, val)]
     return RunLog(name or path.resolve().name, *ordered)
 
@@ -137,7 +141,8 @@ def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
 
 def _finish(ax: Axes, title: str, x_label: str) -> None:
     """Set what all plots share; the y axis is logarithmic if the values span a decade."""
-    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.lines])
+    lines = [np.asarray(line.get_ydata(), dtype=float) for line in ax.lines]
+    values = np.concatenate([np.empty(0), *lines])
     if len(values) and values.min() > 0 and values.max() > 10 * values.min():
         ax.set_yscale("log")
         ax.yaxis.set_major_formatter("{x:g}")

@@ -1,0 +1,106 @@
+"""What exceptions say to a user: the machine's, a file's, a config's, a data loader's worker's."""
+
+import pytest
+import torch
+from mmengine import Registry
+from torch.utils.data import DataLoader
+
+from gsmap.utils.faults import in_words
+
+PARTS = Registry("part")
+
+
+@PARTS.register_module()
+class Wheel:
+    """A part with one setting of its own and one of its base."""
+
+    def __init__(self, radius_m: float = 0.5, axle: dict | None = None):
+        if radius_m <= 0:
+            raise ValueError(f"radius_m must be > 0, got {radius_m}.")
+        self.area = radius_m**2
+        self.axle = axle and PARTS.build(axle)
+
+
+@PARTS.register_module()
+class Tyre(Wheel):
+    def __init__(self, width_m: float = 0.2, **kwargs):
+        super().__init__(**kwargs)
+
+
+def said(command) -> str | None:
+    """Return what a command that fails says."""
+    try:
+        command()
+    except Exception as error:
+        return in_words(error)
+    raise AssertionError("nothing failed")
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"type": "Tire"}, "there is no part of type 'Tire'; did you mean 'Tyre'?"),
+        ({"type": "Zzz"}, "there is no part of type 'Zzz'."),
+        ({"type": "Tyre", "with_m": 1}, "has no setting 'with_m'; did you mean 'width_m'?"),
+        ({"type": "Tyre", "radus_m": 1}, "has no setting 'radus_m'; did you mean 'radius_m'?"),
+        ({"type": "Wheel", "radius_m": -1}, "radius_m must be > 0, got -1."),
+        (
+            {"type": "Wheel", "axle": {"type": "Wheel", "radius_m": []}},
+            "Wheel of Wheel cannot be made from these settings: TypeError: '<=' not supported "
+            "between instances of 'list' and 'int' (GSMAP_TRACEBACK=1 shows where).",
+        ),
+    ],
+)
+def test_settings_that_nothing_can_be_made_of(settings, text):
+    assert said(lambda: PARTS.build(settings)).endswith(text)
+
+
+@pytest.mark.parametrize("kind", [MemoryError, RuntimeError, torch.OutOfMemoryError])
+def test_want_of_memory_says_what_to_lower(kind):
+    def work() -> None:
+        raise kind("CUDA out of memory. Tried to allocate 2 GiB\nand much more")
+
+    assert said(work) == (
+        "out of memory (CUDA out of memory. Tried to allocate 2 GiB): take a smaller batch "
+        "(train_dataloader.batch_size=1), fewer processes (num_workers, --workers) or smaller "
+        "images."
+    )
+
+
+def test_more_memory_than_there_is():
+    assert said(lambda: torch.empty(1 << 50)).startswith("out of memory (")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+@pytest.mark.parametrize("device", ["cuda", "cuda:7"])
+def test_a_device_that_is_not_there(device):
+    text = said(lambda: torch.zeros(1).to(device))
+    assert text.startswith("this machine does not have the device that was asked for (")
+    assert text.endswith("): give cpu.")
+
+
+class Broken(torch.utils.data.Dataset):
+    """A data set whose samples end as it is told."""
+
+    def __init__(self, error: Exception | None):
+        self.error = error
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, index: int) -> int:
+        if self.error is None:
+            return {}[index]
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (ValueError("sample 'a': no image at b.jpg"), "sample 'a': no image at b.jpg"),
+        (FileNotFoundError("no file c.jpg"), "no file c.jpg"),
+        (None, None),
+    ],
+)
+def test_a_worker_of_a_data_loader_says_what_it_met(error, text):
+    assert said(lambda: next(iter(DataLoader(Broken(error), num_workers=1)))) == text
