@@ -141,6 +141,7 @@ export: C K --out . | Is a directory
 export: C nowhere.pth --out m.onnx | There is no checkpoint nowhere.pth
 export: C K --out m.onnx --samples nowhere | nowhere
 export: C K --out m.onnx --size 0 0 | size
+merge: nowhere.arrow | nowhere.arrow
 demo: --dir plain.txt --budget tiny | generate the towns of val ended with 2
 benchmarks: parameters nowhere.py | There is no config file nowhere.py
 benchmarks: parameters C --depth x | invalid int value
