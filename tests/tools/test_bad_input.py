@@ -58,12 +58,12 @@ infer: C K --sample VAL --out out.json --max-samples 0 | must be >= 1, got 0
 infer: C K --sample VAL --out out.json --data-root . | no image at
 infer: C K --sample VAL --show-dir out --width -5 | --width must be >= 1 pixel, got -5
 infer: C K --sample VAL --out out.json --device tpu | the device that was asked for
-infer: C K --sample VAL --out out.json --cfg-options modle.x=1 | 'modle'; did you mean 'model'?
+infer: C K --sample VAL --out out.json --cfg-options modl.x=1 | 'modl'; did you mean 'model'?
 infer: C K --sample VAL --out out.json --cfg-options model.map_hed.num=3 | MapDetector has no setting 'map_hed'; did you mean 'map_head'?
 infer: C K --sample VAL --out out.json --cfg-options model.map_head.type=GSMapHed | there is no model of type 'GSMapHed'; did you mean 'GSMapHead'?
 infer: C K --sample VAL --out out.json --cfg-options model.map_head.embed_dims=abc | tiny.py: GaussianReference of GSMapHead of MapDetector cannot be made
 infer: C K --sample VAL --out out.json --cfg-options model.classes=[a] | K does not belong to this config
-infer: C K --sample VAL --out out.json --cfg-options test_dataloader.dataset.clases=[a] | VectorizedMapDataset has no setting 'clases'; did you mean 'classes'?
+infer: C K --sample VAL --out out.json --cfg-options test_dataloader.dataset.classs=[a] | VectorizedMapDataset has no setting 'classs'; did you mean 'classes'?
 infer: C K --sample VAL --out out.json --cfg-options test_dataloader.dataset.classes=[a] | VAL was made with classes
 infer: C K --sample VAL --out out.json --cfg-options test_dataloader.dataset.pipeline.9.type=x | --cfg-options of C cannot be used
 infer: C K --sample VAL --out out.json --cfg-options custom_imports.imports=[nothing] | custom_imports of C cannot be used
@@ -74,7 +74,7 @@ train: C --work-dir w --cfg-options load_from=nowhere.pth | There is no checkpoi
 train: C --work-dir w --resume nowhere.pth | There is no checkpoint nowhere.pth
 train: C --work-dir w --cfg-options train_dataloader.batch_sise=2 | has no setting 'batch_sise'; did you mean 'batch_size'?
 train: C --work-dir w --cfg-options train_cfg.max_epoch=2 | has no setting 'max_epoch'; did you mean 'max_epochs'?
-train: C --work-dir w --cfg-options default_hooks.logger.intervall=2 | has no setting 'intervall'; did you mean 'interval'?
+train: C --work-dir w --cfg-options default_hooks.logger.intervl=2 | has no setting 'intervl'; did you mean 'interval'?
 train: C --work-dir w --cfg-options optim_wrapper.optimizer.type=AdmW | there is no optimizer of type 'AdmW'; did you mean 'AdamW'?
 train: C --work-dir w --cfg-options randomness.sede=2 | has no setting 'sede'; did you mean 'seed'?
 train: C --work-dir w --cfg-options train_dataloader.dataset.data_root=nowhere | no annotation file at nowhere
