@@ -115,7 +115,7 @@ def _of_a_config(
     if "/mmengine/config/" in source and isinstance(error, (KeyError, AttributeError)):
         return f"{where}a setting is missing: {text}."
     if (unknown := _UNEXPECTED.search(text)) and (built or "/mmengine/" in source or "**" in line):
-        return where + _unknown_setting(*unknown.groups(), built, frames)
+        return where + _unknown_setting(unknown[1], unknown[2], built, frames)
     if not built or not isinstance(error, _SLIPS):
         return None
     registry, absent = (
