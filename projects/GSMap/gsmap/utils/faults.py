@@ -118,11 +118,8 @@ def _of_a_config(
         return where + _unknown_setting(unknown[1], unknown[2], built, frames)
     if not built or not isinstance(error, _SLIPS):
         return None
-    registry, absent = (
-        built[-1].get("registry"),
-        re.match(r"(\S+) is not in the \S+ registry", text),
-    )
-    if absent:
+    if absent := re.match(r"(\S+) is not in the \S+ registry", text):
+        registry = built[-1]["registry"]
         close = nearest(absent[1], _registered(registry))
         return f"{where}there is no {registry.name} of type {absent[1]!r}{close or '.'}"
     if raised and isinstance(error, _CHECKS):
