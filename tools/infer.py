@@ -1,85 +1,221 @@
 #!/usr/bin/env python
-"""Run a trained model on samples without ground truth, and draw what it finds.
+"""Run a trained model on recordings without ground truth, and write and draw what it finds.
 
-Example: ``python tools/infer.py gsmap_r18_minicity --sample FOLDER --out map.json --show-dir
-pictures``, or ``CONFIG CHECKPOINT`` in place of the name. ``--sample`` takes an annotation file
-(.arrow), an info file of mmdet3d (.pkl), or a folder with one.
+Example: ``python tools/infer.py INPUT --model gsmap_r18_minicity --out map.json --show-dir
+pictures``, or ``--model CONFIG CHECKPOINT``. INPUT is an annotation file (.arrow), an info file of
+mmdet3d (.pkl), a nuScenes-format root, an Argoverse 2 log or a folder of some, or a folder of
+images with calibration.yaml (docs/inference.md).
 """
 
 import argparse
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 
+from mmdet3d.structures import Det3DDataSample
+from tqdm import tqdm
+
+from gsmap.apis.frame_loader import BrokenFrame
 from gsmap.apis.map_inferencer import MapInferencer, select_samples
+from gsmap.apis.result_log import ResultLog
+from gsmap.converters.command_line import parse_rate
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.launch import add_config_options
 from gsmap.engine.named_models import checkpoint_for
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
+from gsmap.inputs.source import InputOptions, Source, open_input
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.files import write_bytes
 from gsmap.utils.shards import add_shard_option, digest
 from gsmap.visualization.figure import FORMATS, picture_name, save_figure
 
+SKIPPED = 1  # exit code when frames were broken
 
-def parse_args() -> argparse.Namespace:
+
+def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser = CommandParser(description=__doc__)
-    parser.add_argument("config", help="config file of the model, or the name of one that ships")
-    parser.add_argument("checkpoint", nargs="?", help="its checkpoint; not needed with a name")
+    parser.add_argument("input", type=Path, help="recording to run on")
     parser.add_argument(
-        "--sample", type=Path, required=True, help="annotation file, info file or folder"
+        "--model",
+        nargs="+",
+        required=True,
+        metavar=("NAME_OR_CONFIG", "CHECKPOINT"),
+        help="name of a model that ships, or config file and checkpoint",
     )
-    parser.add_argument(
-        "--allow-missing-cameras", action="store_true", help="leave absent cameras blank"
-    )
-    parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
-    parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
     parser.add_argument("--out", type=output_file, help="JSON file for the predictions")
     parser.add_argument("--show-dir", type=Path, help="folder for pictures")
-    parser.add_argument("--format", default="png", choices=FORMATS)
-    parser.add_argument("--order", action="store_true", help="mark start and direction of elements")
-    parser.add_argument("--score-thr", type=float, help="smallest drawn score")
-    parser.add_argument(
+    parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
+    parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
+    group = parser.add_argument_group("input")
+    group.add_argument("--version", help="version folder of a nuScenes-format root")
+    group.add_argument(
+        "--rate",
+        type=parse_rate,
+        default=2.0,
+        help="samples per second of Argoverse 2 logs, or all (default: %(default)s)",
+    )
+    group.add_argument(
+        "--allow-missing-cameras", action="store_true", help="leave absent cameras blank"
+    )
+    group = parser.add_argument_group("running")
+    group.add_argument(
+        "--device",
+        nargs="+",
+        help="cpu, cuda, or several, cuda:0 cuda:1; a GPU by default if there is one",
+    )
+    group.add_argument("--batch-size", type=int, default=1, help="samples per forward pass")
+    group.add_argument("--workers", type=int, default=0, help="processes that read images")
+    group.add_argument("--amp", action="store_true", help="mixed precision")
+    add_config_options(group)
+    add_shard_option(group)
+    group = parser.add_argument_group("pictures")
+    group.add_argument("--format", default="png", choices=FORMATS)
+    group.add_argument("--order", action="store_true", help="mark start and direction of elements")
+    group.add_argument("--score-thr", type=float, help="smallest drawn score")
+    group.add_argument(
         "--ground-z", type=float, help="height of a level ground in the frame, in metres"
     )
-    parser.add_argument("--width", type=int, help="width of the pictures in pixels")
-    parser.add_argument("--lidar", action="store_true", help="draw the LiDAR sweep faintly")
-    parser.add_argument("--device", help="cpu, cuda, cuda:1, ...; a GPU by default if there is one")
-    add_config_options(parser)
-    add_shard_option(parser)
-    return parser.parse_args()
+    group.add_argument("--width", type=int, help="width of the pictures in pixels")
+    group.add_argument("--lidar", action="store_true", help="draw the LiDAR sweep faintly")
+    args = parser.parse_args(argv)
+    if len(args.model) > 2:
+        parser.error(f"--model takes a name, or a config and a checkpoint, got {args.model}")
+    return args
 
 
-def main() -> None:
-    args = parse_args()
-    if not args.out and not args.show_dir:
-        raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
-    if args.width is not None and args.width < 1:
-        raise ValueError(f"--width must be >= 1 pixel, got {args.width}.")
-    checkpoint = checkpoint_for(args.config, args.checkpoint)
-    inferencer = MapInferencer(args.config, checkpoint, args.device, args.cfg_options)
+def read_input(args: argparse.Namespace) -> Source:
+    """Open the input and say what its reader has to say."""
+    place = args.out.with_suffix("") if args.out else args.show_dir / "input"
+    options = InputOptions(
+        data_root=args.data_root,
+        allow_missing_cameras=args.allow_missing_cameras,
+        version=args.version,
+        rate_hz=args.rate,
+        frames_dir=place.with_name(f"{place.name}_frames"),
+    )
+    source = open_input(args.input, options)
+    for note in source.notes:
+        print(note)
+    if not source.has_poses:
+        print("no pose is known: single frames only, no map of the drive")
+    return source
+
+
+def open_model(args: argparse.Namespace) -> MapInferencer:
+    """Load the model, with the options of its pictures."""
+    config, checkpoint = args.model[0], args.model[1] if len(args.model) > 1 else None
+    inferencer = MapInferencer(
+        config, checkpoint_for(config, checkpoint), args.device, args.cfg_options, args.amp
+    )
     visualizer = inferencer.visualizer
     visualizer.show_order = args.order
     visualizer.ground_z_m = args.ground_z if args.ground_z is not None else visualizer.ground_z_m
     visualizer.width_px = args.width or visualizer.width_px
-    dataset = inferencer.dataset(args.sample, args.data_root, args.allow_missing_cameras)
-    chosen = select_samples(dataset.annotations.column("token"), args.token, args.max_samples)
-    chosen = args.shard.part(chosen)
-    found = inferencer.predict(dataset, chosen, allow_missing_cameras=args.allow_missing_cameras)
-    samples = []
-    for index, sample in zip(chosen, found, strict=True):
-        samples.append(sample)
-        if args.show_dir:
-            points = inferencer.lidar_points(dataset, index) if args.lidar else None
-            figure = inferencer.draw(sample, score_thr=args.score_thr, points=points)
-            name = picture_name(sample.metainfo["token"], f".{args.format}")
-            path = save_figure(figure, args.show_dir / name)
-            print(f"[{len(samples)}/{len(chosen)}] {path}")
-    if args.out:
-        out = args.shard.path_of(args.out)
-        inferencer.write(out, samples)
-        settings = {"model": args.config, "checkpoint": digest(checkpoint)}
-        for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras"):
-            settings[name] = str(getattr(args, name))
-        source = digest(dataset.annotations.path)
-        args.shard.seal(args.out, RESULTS, source, settings, len(samples))
-        print(f"predictions of {len(samples)} samples: {out}")
+    return inferencer
+
+
+def run_settings(args: argparse.Namespace) -> dict[str, str]:
+    """Return what decides the predictions of a run, besides its samples."""
+    checkpoint = checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
+    settings = {"model": args.model[0], "checkpoint": digest(checkpoint)}
+    for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp"):
+        settings[name] = str(getattr(args, name))
+    return settings
+
+
+def predict(
+    args: argparse.Namespace,
+    inferencer: MapInferencer,
+    dataset: VectorizedMapDataset,
+    chosen: list[int],
+    results: ResultLog | None,
+) -> dict[str, str]:
+    """Predict samples, draw them and keep what was found; return the broken ones' reasons."""
+    tokens, broken = dataset.annotations.column("token"), {}
+    with tqdm(total=len(chosen), unit="sample", smoothing=0.05) as bar:
+        if results and results.done:
+            bar.write(f"going on after {len(results.done)} of {len(chosen)} samples")
+            broken.update(results.broken)
+            bar.update(len(results.done))
+            chosen = [index for index in chosen if tokens[index] not in results.done]
+
+        def skip(frame: BrokenFrame) -> None:
+            broken[frame.token] = frame.reason
+            bar.write(f"broken frame skipped: {frame.reason}")
+            bar.update()
+            if results:
+                results.add_broken(frame.token, frame.reason)
+
+        for sample in inferencer.predict(
+            dataset, chosen, args.batch_size, args.workers, args.allow_missing_cameras, skip
+        ):
+            token = str(sample.metainfo["token"])
+            if args.show_dir:
+                draw(args, inferencer, dataset, sample)
+            if results:
+                results.add(token, inferencer.vectors(sample))
+            bar.update()
+    return broken
+
+
+def draw(
+    args: argparse.Namespace,
+    inferencer: MapInferencer,
+    dataset: VectorizedMapDataset,
+    sample: Det3DDataSample,
+) -> None:
+    """Draw a predicted sample into the folder of pictures."""
+    token, points = str(sample.metainfo["token"]), None
+    if args.lidar:
+        index = dataset.annotations.column("token").index(token)
+        points = inferencer.lidar_points(dataset, index)
+    figure = inferencer.draw(sample, score_thr=args.score_thr, points=points)
+    save_figure(figure, args.show_dir / picture_name(token, f".{args.format}"))
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = parse_args(argv)
+    if not args.out and not args.show_dir:
+        raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
+    if args.width is not None and args.width < 1:
+        raise ValueError(f"--width must be >= 1 pixel, got {args.width}.")
+    source = read_input(args)
+    inferencer = open_model(args)
+    dataset = inferencer.dataset(source)
+    tokens = dataset.annotations.column("token")
+    chosen = args.shard.part(select_samples(tokens, args.token, args.max_samples))
+    settings, made_from = run_settings(args), digest(dataset.annotations.path)
+    run = {**settings, "input": str(args.input.resolve()), "samples": made_from}
+    log = ResultLog(args.shard.path_of(args.out), run) if args.out else nullcontext()
+    with log as results:
+        broken = predict(args, inferencer, dataset, chosen, results)
+        if chosen and len(broken) == len(chosen):
+            raise ValueError(f"no frame can be used: {next(iter(broken.values()))}")
+        if results:
+            count = results.finish({"classes": list(dataset.metainfo["classes"])})
+            args.shard.seal(args.out, RESULTS, made_from, settings, count)
+    report(args, source, dataset.ann_file, len(chosen), broken)
+
+
+def report(
+    args: argparse.Namespace, source: Source, ann_file: str, count: int, broken: dict[str, str]
+) -> None:
+    """Say what was written, and leave with `SKIPPED` if frames were broken."""
+    out = args.out and args.shard.path_of(args.out)
+    where = " and ".join(str(path) for path in (out, args.show_dir) if path)
+    print(f"{count - len(broken)} of {count} samples predicted: {where}")
+    if args.out and not isinstance(source.samples, AnnotationFile):
+        annotations = args.out.with_suffix(".arrow")
+        write_bytes(annotations, Path(ann_file).read_bytes())
+        if source.has_poses:
+            print(
+                f"the samples: {annotations}; the drive's map: python tools/build_map.py {args.out}"
+                f" --ann {annotations} --data-root {source.data_root} --out FOLDER"
+            )
+    if broken:
+        print(f"{len(broken)} broken frames skipped: {', '.join(broken)}")
+        sys.exit(SKIPPED)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """A small MapTR with random weights on generated samples."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,8 @@ from mmengine.config import Config
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
+from gsmap.inputs.frames import reframed
+from gsmap.inputs.source import Source
 from gsmap.visualization.figure import figure_to_rgb
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "_base_"
@@ -36,6 +39,7 @@ def make_config():
                 "dataset": {
                     "type": "VectorizedMapDataset",
                     "ann_file": "none.arrow",
+                    "frame": "lidar",
                     "split": "val",
                     "cameras": list(NAMES),
                     "pipeline": [
@@ -210,3 +214,66 @@ def test_file_of_another_range_is_refused(inferencer, tmp_path):
 def test_missing_config_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no config .*gone.py"):
         MapInferencer(tmp_path / "gone.py", None)
+
+
+def test_broken_frames_are_set_apart_and_the_others_go_on(inferencer, tmp_path):
+    samples = make_samples(tmp_path, 4)
+    (tmp_path / samples[1].cameras[0].path).write_bytes(b"no image")
+    samples[2].cameras = samples[2].cameras[:1]
+    broken = []
+    dataset = inferencer.dataset(samples, tmp_path)
+    found = inferencer.predict(dataset, batch_size=2, on_broken=broken.append)
+    assert [s.metainfo["token"] for s in found] == ["t0", "t3"]
+    assert [frame.token for frame in broken] == ["t1", "t2"]
+    assert "t1_CAM_FRONT.jpg is not an image" in broken[0].reason
+    assert "lacks the cameras ['CAM_BACK']" in broken[1].reason
+
+
+def test_several_devices_and_mixed_precision_keep_order_and_values(inferencer, tmp_path):
+    samples = make_samples(tmp_path)
+    torch.manual_seed(0)
+    pair = MapInferencer(make_config(), None, device=["cpu", "cpu"])
+    pair.replicas[1].load_state_dict(inferencer.model.state_dict())
+    pair.replicas[0].load_state_dict(inferencer.model.state_dict())
+    pair._camera_embeds = inferencer._camera_embeds
+    alone, together = inferencer(samples, tmp_path), pair(samples, tmp_path)
+    assert [s.metainfo["token"] for s in together] == ["t0", "t1", "t2"]
+    for a, b in zip(alone, together, strict=True):
+        torch.testing.assert_close(a.pred_instances_3d.pts, b.pred_instances_3d.pts)
+    pair.amp = True
+    for a, b in zip(alone, pair(samples, tmp_path), strict=True):
+        shift = (a.pred_instances_3d.pts - b.pred_instances_3d.pts).abs()
+        assert 0 < shift.max() < 1.0  # bfloat16 has 8 bits
+
+
+def test_cameras_of_other_names_and_number_take_the_embeddings_of_their_direction(
+    inferencer, tmp_path
+):
+    """Own names alone change nothing; a camera twice is as itself; one camera does as well."""
+    samples = make_samples(tmp_path, 1)
+    (usual,) = inferencer(samples, tmp_path)
+    front, back = samples[0].cameras
+    samples[0].cameras = [replace(back, name="rear"), replace(front, name="windscreen")]
+    (renamed,) = inferencer(samples, tmp_path)
+    assert renamed.metainfo["cam_names"] == ["rear", "windscreen"]
+    torch.testing.assert_close(
+        renamed.pred_instances_3d.pts, usual.pred_instances_3d.pts, atol=1e-4, rtol=0
+    )
+    samples[0].cameras.append(replace(front, name="windscreen2"))
+    (thrice,) = inferencer(samples, tmp_path)
+    torch.testing.assert_close(
+        thrice.pred_instances_3d.pts, usual.pred_instances_3d.pts, atol=1e-3, rtol=0
+    )
+    samples[0].cameras = samples[0].cameras[:1]
+    (alone,) = inferencer(samples, tmp_path)
+    assert alone.metainfo["lidar2img"].shape == (1, 4, 4)
+    samples[0].cameras = [front, back]
+    (again,) = inferencer(samples, tmp_path)
+    torch.testing.assert_close(again.pred_instances_3d.pts, usual.pred_instances_3d.pts)
+
+
+def test_samples_of_another_frame_are_seen_from_the_model_s(inferencer, tmp_path):
+    samples = [reframed(s, "lidar", "ego") for s in make_samples(tmp_path, 1)]
+    (found,) = inferencer(Source(samples, "ego", tmp_path))
+    (expected,) = inferencer([reframed(s, "ego", "lidar") for s in samples], tmp_path)
+    torch.testing.assert_close(found.pred_instances_3d.pts, expected.pred_instances_3d.pts)

@@ -133,7 +133,7 @@ def _read_infos(path: Path) -> None:
 
 
 def _read_sample(path: Path) -> None:
-    from gsmap.apis.info_file import read_info_file
+    from gsmap.inputs.info_file import read_info_file
 
     read_info_file(path)
 

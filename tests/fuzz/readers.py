@@ -18,7 +18,6 @@ from pyarrow.feather import write_feather
 
 from fuzz import mutations
 from gsmap.apis.checkpoint import read_weights
-from gsmap.apis.info_file import read_info_file
 from gsmap.converters.argoverse2.samples import Argoverse2Options, read_log
 from gsmap.converters.custom import from_records
 from gsmap.converters.infos import convert_infos
@@ -34,6 +33,7 @@ from gsmap.datasets.annotations.file import (
 )
 from gsmap.datasets.transforms.images import read_image
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points
+from gsmap.inputs.info_file import read_info_file
 
 VERSION = "v1.0-trainval"
 LIDAR_META = AnnotationMeta("fuzz", "lidar", "train")

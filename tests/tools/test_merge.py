@@ -122,7 +122,7 @@ def predictions(tiny_config, minicity_annotations, tmp_path_factory):
     torch.save(MODELS.build(read_config(tiny_config).model).state_dict(), model)
 
     def make(shard: Shard) -> None:
-        words = (tiny_config, model, "--sample", minicity_annotations["val"], "--device", "cpu")
+        words = (minicity_annotations["val"], "--model", tiny_config, model, "--device", "cpu")
         words += ("--out", target, *words_of(shard))
         with pytest.MonkeyPatch.context() as monkeypatch:
             run(monkeypatch, *words, command=infer.main)

@@ -97,8 +97,8 @@ def test_the_data_set_and_what_a_model_finds_are_drawn(
         "--format", "png",
     )  # fmt: skip
     run(
-        sys.executable, "tools/infer.py", tiny_config, trained / "epoch_3.pth",
-        "--max-samples", "1", "--sample", minicity_root / "gsmap_minicity_val.arrow", "--order",
+        sys.executable, "tools/infer.py", minicity_root / "gsmap_minicity_val.arrow", "--model",
+        tiny_config, trained / "epoch_3.pth", "--max-samples", "1", "--order",
         "--show-dir", found, "--out", tmp_path / "map.json",
         "--cfg-options", "visualizer.width_px=400",
     )  # fmt: skip

@@ -1,8 +1,13 @@
 """A trained model on recorded samples: map elements and pictures out."""
 
+import copy
 import logging
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,53 +17,25 @@ from matplotlib.figure import Figure
 from mmdet3d.registry import DATASETS, MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.config import Config
-from mmengine.dataset import pseudo_collate
-from torch.utils.data import DataLoader, Dataset, Subset
 
 from gsmap.apis.blank_cameras import BlankCameraDataset
 from gsmap.apis.checkpoint import adopt_settings, load_weights
-from gsmap.apis.info_file import read_info_file
-from gsmap.datasets.annotations.file import write_annotations
+from gsmap.apis.frame_loader import BrokenFrame, frame_batches
+from gsmap.apis.rig_fit import similar_cameras
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
+from gsmap.datasets.elements import elements_of_predictions
 from gsmap.datasets.transforms.points import read_points
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.launch import read_config
 from gsmap.engine.named_models import named_models
-from gsmap.evaluation.map_metric import MapMetric
+from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.inputs.frames import reframed
+from gsmap.inputs.source import InputOptions, Source, open_input
 from gsmap.visualization.map_visualizer import MapVisualizer
 
 _LOGGER = logging.getLogger(__name__)
-_PATTERNS = ("*.arrow", "*.pkl")
-
-
-def find_sample_file(source: str | Path) -> Path:
-    """Return the file that describes the samples at ``source``.
-
-    Args:
-        source: An annotation file (``.arrow``), an info file of mmdet3d (``.pkl``), or a folder
-            with just one of them.
-
-    Returns:
-        The file.
-
-    Raises:
-        FileNotFoundError: If there is none.
-        ValueError: If a folder holds several, or the file is of another kind.
-    """
-    source = Path(source)
-    if source.is_dir():
-        found = sorted(path for pattern in _PATTERNS for path in source.glob(pattern))
-        if not found:
-            raise FileNotFoundError(f"{source} holds no {' or '.join(_PATTERNS)} file.")
-        if len(found) > 1:
-            names = ", ".join(path.name for path in found)
-            raise ValueError(f"{source} holds several sample files ({names}): name one of them.")
-        return found[0]
-    if not source.is_file():
-        raise FileNotFoundError(f"There is no sample file or folder {source}.")
-    if source.suffix not in (".arrow", ".pkl"):
-        raise ValueError(f"{source} must be an annotation file (.arrow) or an info file (.pkl).")
-    return source
+_LOOK_AT = 100  # samples whose cameras are an input's
 
 
 def select_samples(
@@ -100,12 +77,6 @@ def spread_evenly(count: int, max_num: int | None = None) -> list[int]:
     return np.linspace(0, count - 1, max_num).round().astype(int).tolist()
 
 
-def _lies_with_its_images(path: Path, dataset: VectorizedMapDataset) -> bool:
-    """Whether the first image of an annotation file is found from the file's own folder."""
-    cameras = dataset.sample(0).cameras
-    return bool(cameras) and (path.parent / cameras[0].path).is_file()
-
-
 class MapInferencer:
     """Runs a trained model on samples, through the pipeline that the config tests with.
 
@@ -114,8 +85,9 @@ class MapInferencer:
             (``engine/named_models.py``), such as ``gsmap_r18_minicity``.
         checkpoint: Its checkpoint, or such a name. None means the named model's, and without a name
             the initial weights (for trying out a pipeline).
-        device: Where to run; a GPU if there is one.
+        device: Where to run, or several devices that share the batches; a GPU if there is one.
         cfg_options: Overrides of the config, by dotted name.
+        amp: Whether to run in mixed precision: float16 on a GPU, bfloat16 on a CPU.
 
     Raises:
         FileNotFoundError: If the config or the checkpoint does not exist.
@@ -126,8 +98,9 @@ class MapInferencer:
         self,
         config: str | Path | Config,
         checkpoint: str | Path | None = None,
-        device: str | torch.device | None = None,
+        device: str | torch.device | Sequence[str | torch.device] | None = None,
         cfg_options: dict | None = None,
+        amp: bool = False,
     ):
         self.cfg = read_config(config, cfg_options)
         if checkpoint is None and str(config) in named_models():
@@ -138,8 +111,16 @@ class MapInferencer:
         self.model = MODELS.build(self.cfg.model)
         if checkpoint is not None:
             load_weights(self.model, checkpoint)
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-        self.model.to(self.device).eval()
+        self.model.eval()
+        device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        names = [device] if isinstance(device, str | torch.device) else list(device)
+        self.replicas = [
+            (copy.deepcopy(self.model) if i else self.model).to(torch.device(name))
+            for i, name in enumerate(names)
+        ]
+        self.devices = [torch.device(name) for name in names]
+        self.amp = amp
+        self._camera_embeds = getattr(self.model.bev_encoder, "cams_embeds", None)
         self.visualizer = self._build_visualizer()
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
         self._files = 0
@@ -155,18 +136,22 @@ class MapInferencer:
 
     def dataset(
         self,
-        source: str | Path | Sequence[MapSample],
+        source: str | Path | Source | Sequence[MapSample],
         data_root: str | Path | None = None,
         allow_missing_cameras: bool = False,
+        **options: Any,
     ) -> VectorizedMapDataset:
         """Open samples as the config's test data set.
 
+        Samples of another annotation frame are seen from the config's. If none of their cameras is
+        one of the config's, all of theirs take part, however many.
+
         Args:
-            source: An annotation file, an info file of mmdet3d, a folder with one of them, or
-                samples in the frame of the config.
+            source: Whatever ``open_input`` reads or returns, or samples in the frame of the config.
             data_root: Folder that image paths start from; by default that of the file, or the
                 config's where an annotation file lies apart from its images.
             allow_missing_cameras: Whether an info file may name images that do not exist.
+            **options: Further fields of ``InputOptions``.
 
         Returns:
             The data set, with the test pipeline.
@@ -175,26 +160,54 @@ class MapInferencer:
             FileNotFoundError: If a file does not exist.
             ValueError: If a file cannot be used with this config; the message says why.
         """
+        self._files += 1
         if isinstance(source, str | Path):
-            path = find_sample_file(source)
-            if path.suffix == ".pkl":
-                data_root = path.parent if data_root is None else data_root
-                samples = read_info_file(path, data_root, allow_missing_cameras)
-                path = self._annotation_file(samples, "lidar")
-        else:
+            options.setdefault("frames_dir", Path(self._scratch.name) / f"frames{self._files}")
+            root = None if data_root is None else Path(data_root)
+            source = open_input(source, InputOptions(root, allow_missing_cameras, **options))
+        elif not isinstance(source, Source):
             frame = self.cfg.test_dataloader.dataset.get("frame") or "lidar"
-            path = self._annotation_file(source, frame)
-        options: dict[str, Any] = dict(self.cfg.test_dataloader.dataset)
-        options |= {"ann_file": str(path.resolve()), "test_mode": True, "split": None, "dim": None}
-        if data_root is not None:
-            options["data_root"] = str(Path(data_root).resolve())
-        dataset = DATASETS.build(options)
-        if data_root is None and _lies_with_its_images(path, dataset):
-            dataset.data_root = str(path.resolve().parent)
+            source = Source(source, frame, None if data_root is None else Path(data_root))
+        settings: dict[str, Any] = dict(self.cfg.test_dataloader.dataset)
+        samples, frame = source.samples, settings.get("frame") or source.frame
+        if isinstance(samples, AnnotationFile) and source.frame == frame:
+            path = samples.path
+        else:
+            samples = [reframed(sample, source.frame, frame) for sample in samples]
+            path = self._annotation_file(samples, frame, source.has_poses)
+        settings |= {"ann_file": str(path.resolve()), "test_mode": True, "split": None, "dim": None}
+        settings["cameras"] = self._cameras(samples)
+        if source.data_root is not None:
+            settings["data_root"] = str(source.data_root.resolve())
+        dataset = DATASETS.build(settings)
         self.visualizer.dataset_meta = dataset.metainfo
         return dataset
 
-    def _annotation_file(self, samples: Sequence[MapSample], frame: str) -> Path:
+    def _cameras(self, samples: Sequence[MapSample]) -> Sequence[str] | None:
+        """Return the config's cameras, or all of the samples' if they have none of these."""
+        trained = self.cfg.test_dataloader.dataset.get("cameras")
+        found = dict.fromkeys(c.name for s in islice(samples, _LOOK_AT) for c in s.cameras)
+        if trained is None or not found or set(found) & set(trained):
+            return trained
+        return list(found)
+
+    def _fit_cameras(self, dataset: VectorizedMapDataset) -> None:
+        """Give each camera the embedding of the model's camera that looks most like it."""
+        trained = self.cfg.test_dataloader.dataset.get("cameras")
+        if self._camera_embeds is None or trained is None or dataset.cameras is None:
+            return
+        rows = list(range(len(self._camera_embeds)))
+        if set(dataset.cameras).isdisjoint(trained):
+            sample = max(
+                (dataset.sample(i) for i in range(min(len(dataset), _LOOK_AT))),
+                key=lambda sample: len(sample.cameras),
+            )
+            rows = similar_cameras(sample, dataset.metainfo["frame"], dataset.cameras, trained)
+        for replica, device in zip(self.replicas, self.devices, strict=True):
+            embeds = self._camera_embeds.detach()[rows].to(device)
+            replica.bev_encoder.cams_embeds = torch.nn.Parameter(embeds)
+
+    def _annotation_file(self, samples: Sequence[MapSample], frame: str, has_poses: bool) -> Path:
         """Write samples to an annotation file that lives as long as the inferencer."""
         options = self.cfg.test_dataloader.dataset
         grid = options.get("grid") or self.cfg.model.grid
@@ -206,9 +219,9 @@ class MapInferencer:
             x_range=tuple(grid["x_range"]),
             y_range=tuple(grid["y_range"]),
             dim=max((i.points.shape[1] for s in samples for i in s.instances or ()), default=2),
+            options={} if has_poses else {"poses": False},
             command="tools/infer.py",
         )
-        self._files += 1
         path = Path(self._scratch.name) / f"samples{self._files}.arrow"
         write_annotations(path, meta, samples)
         return path
@@ -237,7 +250,6 @@ class MapInferencer:
         matrix = lidar.frame_from_lidar
         return read_points(str(path), 5)[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
 
-    @torch.no_grad()
     def predict(
         self,
         dataset: VectorizedMapDataset,
@@ -245,8 +257,9 @@ class MapInferencer:
         batch_size: int = 1,
         num_workers: int = 0,
         allow_missing_cameras: bool = False,
+        on_broken: Callable[[BrokenFrame], object] | None = None,
     ) -> Iterator[Det3DDataSample]:
-        """Run the model.
+        """Run the model; several devices take turns.
 
         Args:
             dataset: From ``dataset()``.
@@ -254,6 +267,8 @@ class MapInferencer:
             batch_size: Samples per forward pass.
             num_workers: Processes that read images.
             allow_missing_cameras: Whether cameras that a sample lacks are left blank.
+            on_broken: Called with each sample that cannot be used, which is then left out; None
+                lets it be an error.
 
         Yields:
             The samples in order, with ``pred_instances_3d`` on the CPU.
@@ -261,15 +276,37 @@ class MapInferencer:
         Raises:
             ValueError: If a file of a sample is missing or damaged, or a camera is absent.
         """
-        chosen: Dataset = BlankCameraDataset(dataset, allow_missing_cameras)
-        if indices is not None:
-            chosen = Subset(chosen, list(indices))
-        loader = DataLoader(
-            chosen, batch_size=batch_size, num_workers=num_workers, collate_fn=pseudo_collate
-        )
-        for batch in loader:
-            for sample in self.model.test_step(batch):
-                yield sample.cpu()
+        self._fit_cameras(dataset)
+        frames = BlankCameraDataset(dataset, allow_missing_cameras)
+        batches = frame_batches(frames, indices, batch_size, num_workers)
+        with ExitStack() as stack:
+            pools = [stack.enter_context(ThreadPoolExecutor(1)) for _ in self.replicas]
+            pending: deque[Future] = deque()
+            for number, (batch, broken) in enumerate(batches):
+                for frame in broken:
+                    if on_broken is None:
+                        raise ValueError(frame.reason)
+                    on_broken(frame)
+                if batch is not None:
+                    turn = number % len(pools)
+                    pending.append(pools[turn].submit(self._step, turn, batch))
+                if len(pending) > len(pools):
+                    yield from pending.popleft().result()
+            while pending:
+                yield from pending.popleft().result()
+
+    @torch.no_grad()
+    def _step(self, turn: int, batch: dict[str, Any]) -> list[Det3DDataSample]:
+        """Predict a batch on one device."""
+        kind = self.devices[turn].type
+        half = torch.bfloat16 if kind == "cpu" else torch.float16
+        with torch.autocast(kind, half, enabled=self.amp):
+            return [sample.cpu() for sample in self.replicas[turn].test_step(batch)]
+
+    def vectors(self, data_sample: Det3DDataSample) -> list[dict[str, Any]]:
+        """Return a predicted sample's ``vectors`` of the results JSON."""
+        found = elements_of_predictions(data_sample.pred_instances_3d)
+        return vectors_of(found, self.visualizer.dataset_meta["classes"])
 
     def write(self, path: str | Path, data_samples: Sequence[Det3DDataSample]) -> None:
         """Write predictions as JSON, in the form that ``tools/test.py --out`` writes.
@@ -278,17 +315,18 @@ class MapInferencer:
             path: File to write.
             data_samples: Samples from ``predict``.
         """
-        metric = MapMetric(eval=(), out_file=str(path))
-        metric.dataset_meta = self.visualizer.dataset_meta
-        metric.process(None, [sample.to_dict() for sample in data_samples])
-        metric.evaluate(len(data_samples))
+        samples = ((str(sample.metainfo["token"]), self.vectors(sample)) for sample in data_samples)
+        classes = list(self.visualizer.dataset_meta["classes"])
+        write_results(path, sorted(samples), {"classes": classes})
 
     def draw(self, data_sample: Det3DDataSample, **options: Any) -> Figure:
         """Compose a predicted sample's picture; options as in ``MapVisualizer.draw_sample``."""
         return self.visualizer.draw_sample(data_sample, **options)
 
     def __call__(
-        self, source: str | Path | Sequence[MapSample], data_root: str | Path | None = None
+        self,
+        source: str | Path | Source | Sequence[MapSample],
+        data_root: str | Path | None = None,
     ) -> list[Det3DDataSample]:
         """Predict all samples of a source; arguments as in ``dataset``."""
         return list(self.predict(self.dataset(source, data_root)))

@@ -91,8 +91,8 @@ class LogSamples:
     sweep_offsets_ns: list[int] = field(default_factory=list)
 
 
-def read_log(log_dir: Path, options: Argoverse2Options) -> LogSamples:
-    """Make the samples of one log.
+def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -> LogSamples:
+    """Make the samples of one log, with ground truth unless ``with_map`` is false.
 
     Raises:
         FileNotFoundError: If the map or the poses are missing.
@@ -100,8 +100,9 @@ def read_log(log_dir: Path, options: Argoverse2Options) -> LogSamples:
     """
     log = Argoverse2Log(log_dir)
     times = sample_times(log, options)
-    log_map = Argoverse2Map.from_log(log_dir)
-    result = LogSamples(invalid=Counter({k: n for k, n in log_map.invalid_counts.items() if n}))
+    log_map = Argoverse2Map.from_log(log_dir) if with_map else None
+    invalid = {} if log_map is None else {k: n for k, n in log_map.invalid_counts.items() if n}
+    result = LogSamples(invalid=Counter(invalid))
     builder = _SampleBuilder(log, log_map, log_dir.relative_to(options.root).as_posix(), options)
     for timestamp_ns in times.tolist():
         try:
@@ -164,7 +165,11 @@ class _SampleBuilder:
     """Makes the samples of one log."""
 
     def __init__(
-        self, log: Argoverse2Log, log_map: Argoverse2Map, folder: str, options: Argoverse2Options
+        self,
+        log: Argoverse2Log,
+        log_map: Argoverse2Map | None,
+        folder: str,
+        options: Argoverse2Options,
     ) -> None:
         self._log = log
         self._map = log_map
@@ -192,7 +197,9 @@ class _SampleBuilder:
             instances=self._instances(city_from_ego),
         )
 
-    def _instances(self, city_from_ego: np.ndarray) -> list[MapInstance]:
+    def _instances(self, city_from_ego: np.ndarray) -> list[MapInstance] | None:
+        if self._map is None:
+            return None
         options = self._options
         elements = self._map.extract(
             city_from_ego, options.classes, options.compat, options.x_range, options.y_range

@@ -141,6 +141,9 @@ class NuScenesTables(NuScenes):
         if table_name == "sample_data":
             return self._kept_data
         records = self._records(table_name)
+        if table_name == "map":  # kept from the devkit until it has looked for masks to draw
+            self._kept_maps = list(records)
+            return []
         if table_name == "ego_pose":  # asked for before sample_data, which says what is needed
             self._kept_data = list(self._wanted_sample_data())
             wanted = {record["ego_pose_token"] for record in self._kept_data}
@@ -169,6 +172,7 @@ class NuScenesTables(NuScenes):
 
     def __make_reverse_index__(self, verbose: bool) -> None:
         """Check that every link leads somewhere, and let the devkit follow them."""
+        self.map = self._kept_maps
         for table, links in _LINKS.items():
             for name, target in links.items():
                 known = {record["token"] for record in getattr(self, target)}

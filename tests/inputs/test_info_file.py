@@ -5,8 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gsmap.apis.info_file import read_info_file
 from gsmap.datasets.plain_pickle import load_plain_pickle
+from gsmap.inputs.info_file import read_info_file
 
 
 class Attack:

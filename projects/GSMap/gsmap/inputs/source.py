@@ -1,0 +1,121 @@
+"""From whatever holds a recording to samples: the one entrance to the readers of this room."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
+from gsmap.inputs.argoverse2 import logs_in, read_logs
+from gsmap.inputs.image_folder import NAMES, read_image_folder
+from gsmap.inputs.info_file import read_info_file
+from gsmap.inputs.nuscenes import read_nuscenes, versions_in
+
+_FILES = ("*.arrow", "*.pkl")
+KINDS = (
+    "an annotation file (.arrow), an info file of mmdet3d (.pkl), a nuScenes-format root, "
+    "Argoverse 2 logs, a folder of images with calibration.yaml or calibration.json"
+)
+
+
+@dataclass(frozen=True)
+class InputOptions:
+    """How inputs are read; each kind reads what concerns it.
+
+    Args:
+        data_root: Folder that paths of an annotation or info file start from.
+        allow_missing_cameras: Whether an info file may name images that do not exist.
+        version: Version folder of a nuScenes-format root; the only one by default.
+        rate_hz: Samples per second of Argoverse 2 logs; None takes all.
+        frames_dir: Folder for images that have to be made: those of distorted cameras.
+    """
+
+    data_root: Path | None = None
+    allow_missing_cameras: bool = False
+    version: str | None = None
+    rate_hz: float | None = 2.0
+    frames_dir: Path = Path("frames")
+
+
+@dataclass(frozen=True)
+class Source:
+    """The samples of an input.
+
+    Args:
+        samples: The samples.
+        frame: Their annotation frame, ``lidar`` or ``ego``.
+        data_root: Folder that image and LiDAR paths start from; None leaves it to the config.
+        has_poses: Whether the vehicle's pose is known.
+        notes: What the reader has to say.
+    """
+
+    samples: Sequence[MapSample]
+    frame: str
+    data_root: Path | None
+    has_poses: bool = True
+    notes: tuple[str, ...] = ()
+
+
+def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Source:
+    """Read the samples of an input.
+
+    Args:
+        path: An annotation file, an info file of mmdet3d, a nuScenes-format root, an Argoverse 2
+            log or a folder with some, a folder of images with a calibration file (or that file), or
+            a folder with just one annotation or info file.
+        options: How to read it.
+
+    Returns:
+        Its samples.
+
+    Raises:
+        FileNotFoundError: If there is nothing there, or what it names.
+        ValueError: If it is none of these, or damaged; the message says why.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"There is no input {path}.")
+    if path.is_dir():
+        return _open_folder(path, options)
+    if path.suffix == ".arrow":
+        return Source(
+            annotations := AnnotationFile(path), annotations.meta.frame, options.data_root
+        )
+    if path.suffix == ".pkl":
+        root = options.data_root or path.parent
+        samples = read_info_file(path, root, options.allow_missing_cameras)
+        return Source(samples, "lidar", root)
+    if path.suffix in (".yaml", ".yml", ".json"):
+        samples, has_poses, root = read_image_folder(path, options.frames_dir)
+        return Source(samples, "ego", root, has_poses)
+    raise ValueError(f"{path} is no input: it must be {KINDS}.")
+
+
+def _open_folder(folder: Path, options: InputOptions) -> Source:
+    """Read a folder by what lies in it."""
+    if versions_in(folder):
+        return Source(read_nuscenes(folder, options.version), "lidar", folder)
+    logs = logs_in(folder)
+    if logs:
+        root = folder.parent if logs == [folder] else folder
+        samples, left_out = read_logs(logs, root, options.rate_hz)
+        return Source(samples, "ego", root, notes=_left_out(left_out))
+    files = [folder / name for name in NAMES if (folder / name).is_file()]
+    files = files or sorted(path for pattern in _FILES for path in folder.glob(pattern))
+    if len(files) == 1:
+        return open_input(files[0], options)
+    if files:
+        names = ", ".join(path.name for path in files)
+        raise ValueError(f"{folder} holds several files ({names}): name one of them.")
+    raise FileNotFoundError(f"{folder} holds no input: it must be {KINDS}.")
+
+
+def _lies_with_its_images(annotations: AnnotationFile) -> bool:
+    """Whether the first image of an annotation file is found from the file's own folder."""
+    cameras = annotations[0].cameras if len(annotations) else []
+    return bool(cameras) and (annotations.path.parent / cameras[0].path).is_file()
+
+
+def _left_out(counts: Counter[str]) -> tuple[str, ...]:
+    return tuple(f"{count} samples left out: {reason}" for reason, count in counts.items())

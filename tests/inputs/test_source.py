@@ -1,0 +1,213 @@
+"""Every kind of input becomes the samples that its annotation file has, or names its trouble."""
+
+import json
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.inputs.frames import ground_from_frame, reframed
+from gsmap.inputs.source import InputOptions, open_input
+from gsmap.structures.rigid import invert_rigid
+from gsmap.visualization.frame_view import FRAME_VIEWS
+
+
+@pytest.fixture(scope="module")
+def town(minicity_root, minicity_annotations):
+    """The root and the samples of its annotation files, by token."""
+    return {s.token: s for path in minicity_annotations.values() for s in AnnotationFile(path)}
+
+
+def same_cameras(sample, other):
+    for a, b in zip(sample.cameras, other.cameras, strict=True):
+        assert (a.name, a.width, a.height) == (b.name, b.width, b.height)
+        np.testing.assert_allclose(a.intrinsics, b.intrinsics)
+        np.testing.assert_allclose(a.cam_from_frame, b.cam_from_frame, atol=1e-6)
+
+
+def test_a_nuscenes_root_gives_the_samples_of_its_annotation_files(minicity_root, town):
+    source = open_input(minicity_root)
+    assert source.frame == "lidar"
+    assert source.data_root == minicity_root
+    assert {sample.token for sample in source.samples} == set(town)
+    for sample in source.samples:
+        other = town[sample.token]
+        same_cameras(sample, other)
+        assert [c.path for c in sample.cameras] == [c.path for c in other.cameras]
+        np.testing.assert_array_equal(sample.global_from_frame, other.global_from_frame)
+        np.testing.assert_array_equal(sample.can_bus, other.can_bus)
+        assert sample.lidar.path == other.lidar.path
+        assert sample.instances is None
+    with pytest.raises(ValueError, match=r"no version 'v9', but \['v1.0-trainval'\]"):
+        open_input(minicity_root, InputOptions(version="v9"))
+
+
+def test_another_frame_sees_the_same_cameras_and_ground(town):
+    sample = next(iter(town.values()))
+    ego = reframed(sample, "lidar", "ego")
+    back = reframed(ego, "ego", "lidar")
+    assert ego.instances is None
+    spot = np.array([7.0, 2.0, 0.0, 1.0])  # on the ground, ahead and to the left
+    for frame, seen in (("lidar", sample), ("ego", ego), ("lidar", back)):
+        at = invert_rigid(ground_from_frame(seen, frame)) @ spot
+        a, b, c = FRAME_VIEWS[frame].tilted(seen.ego_from_frame).ground
+        assert at[2] == pytest.approx(a * at[0] + b * at[1] + c)
+        world = seen.global_from_frame @ at
+        np.testing.assert_allclose(
+            world,
+            sample.global_from_frame @ invert_rigid(ground_from_frame(sample, "lidar")) @ spot,
+        )
+        in_cameras = [camera.cam_from_frame @ at for camera in seen.cameras]
+        expected = invert_rigid(ground_from_frame(sample, "lidar")) @ spot
+        np.testing.assert_allclose(
+            in_cameras, [camera.cam_from_frame @ expected for camera in sample.cameras], atol=1e-9
+        )
+
+
+def image_folder(folder, sample, root, number=0):
+    """Write a sample's images into one folder a camera; return the calibration that fits."""
+    cameras = {}
+    for camera in sample.cameras:
+        (folder / camera.name).mkdir(parents=True, exist_ok=True)
+        image = (root / camera.path).read_bytes()
+        (folder / camera.name / f"{number:03d}.jpg").write_bytes(image)
+        ground_from_cam = ground_from_frame(sample, "lidar") @ invert_rigid(camera.cam_from_frame)
+        x, y, z, w = Rotation.from_matrix(ground_from_cam[:3, :3]).as_quat().tolist()
+        k = camera.intrinsics
+        cameras[camera.name] = {
+            "intrinsics": [float(k[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))],
+            "position_m": ground_from_cam[:3, 3].tolist(),
+            "quaternion_wxyz": [w, x, y, z],
+        }
+    return {"cameras": cameras}
+
+
+@pytest.mark.parametrize("name", ["calibration.yaml", "calibration.json"])
+def test_a_folder_of_images_gives_the_cameras_that_its_calibration_says(
+    tmp_path, minicity_root, town, name
+):
+    samples = [s for s in town.values() if s.scene == next(iter(town.values())).scene]
+    for number, sample in enumerate(samples):
+        calibration = image_folder(tmp_path, sample, minicity_root, number)
+    dump = json.dumps if name.endswith("json") else partial(yaml.safe_dump, sort_keys=False)
+    (tmp_path / name).write_text(dump(calibration))
+    source = open_input(tmp_path)
+    assert not source.has_poses
+    assert [s.timestamp_ns for s in source.samples] == [0, 10**8]
+    assert source.samples[1].cameras[0].path == "CAM_FRONT/001.jpg"
+    same_cameras(reframed(source.samples[1], "ego", "lidar"), reframed_nominal(samples[1]))
+
+
+def reframed_nominal(sample):
+    """Return a sample in the nominal LiDAR frame instead of its own."""
+    return reframed(reframed(sample, "lidar", "ego"), "ego", "lidar")
+
+
+def test_angles_times_and_poses_of_a_folder(tmp_path):
+    """A camera that looks ahead and one to the left; the vehicle drives 10 m/s along y."""
+    start = 1_700_000_000_000_000_000
+    for name, shift_ns in (("ahead", 0), ("port", 20_000_000)):
+        (tmp_path / name).mkdir()
+        for i in range(3):
+            time_ns = start + i * 10**8 + shift_ns
+            cv2.imwrite(f"{tmp_path}/{name}/{name}_{time_ns}.png", np.zeros((90, 160, 3), np.uint8))
+    cameras = {
+        name: {
+            "intrinsics": [[100, 0, 80], [0, 100, 45], [0, 0, 1]],
+            "position_m": [1.5, 0.0, 1.4],
+            "yaw_pitch_roll_deg": [yaw, 0, 0],
+        }
+        for name, yaw in (("ahead", 0), ("port", 90))
+    }
+    rows = [
+        f"{1_700_000_000_000_000_000 + i * 10**8},0,{i},0,0.7071068,0,0,0.7071068" for i in (0, 2)
+    ]
+    (tmp_path / "poses.csv").write_text("timestamp_ns,x,y,z,qw,qx,qy,qz\n" + "\n".join(rows))
+    content = {"cameras": cameras, "poses": "poses.csv", "ground_z_m": -0.5}
+    (tmp_path / "calibration.yaml").write_text(yaml.safe_dump(content))
+    source = open_input(tmp_path / "calibration.yaml")
+    assert source.has_poses
+    assert [s.timestamp_ns - start for s in source.samples] == [0, 10**8, 2 * 10**8]
+    middle = source.samples[1]
+    at = invert_rigid(ground_from_frame(middle, "ego"))
+    np.testing.assert_allclose((middle.global_from_frame @ at)[:3, 3], [0, 1, -0.5], atol=1e-6)
+    ahead, port = middle.cameras
+    # 5 m ahead of the camera, at its height above the ground: 1.4 m + 0.5 m
+    np.testing.assert_allclose(
+        ahead.cam_from_frame @ at @ [6.5, 0, 1.9, 1], [0, 0, 5, 1], atol=1e-6
+    )
+    # 4 m to the left of its place 20 ms later, when the vehicle is 0.2 m further
+    np.testing.assert_allclose(port.cam_from_frame @ at @ [1.7, 4, 1.9, 1], [0, 0, 4, 1], atol=1e-6)
+
+
+def test_distorted_images_are_rectified_into_a_folder_of_their_own(tmp_path):
+    drive, frames = tmp_path / "drive", tmp_path / "frames"
+    (drive / "front").mkdir(parents=True)
+    board = (np.indices((180, 320)).sum(0) // 20 % 2 * 255).astype(np.uint8)
+    cv2.imwrite(str(drive / "front/a.png"), cv2.merge([board] * 3))
+    (drive / "front/b.png").write_bytes(b"no image")
+    camera = {
+        "intrinsics": [200, 200, 160, 90], "distortion": [-0.3, 0.1, 0, 0],
+        "position_m": [1, 0, 1.5], "yaw_pitch_roll_deg": [0, 0, 0],
+    }  # fmt: skip
+    (drive / "calibration.yaml").write_text(yaml.safe_dump({"cameras": {"front": camera}}))
+    source = open_input(drive, InputOptions(frames_dir=frames))
+    assert source.data_root == frames
+    assert [s.cameras[0].path for s in source.samples] == ["front/a.jpg", "front/b.jpg"]
+    matrix = np.array([[200.0, 0, 160], [0, 200, 90], [0, 0, 1]])
+    expected = cv2.undistort(cv2.merge([board] * 3), matrix, np.array([-0.3, 0.1, 0, 0]))
+    written = cv2.imread(str(frames / "front/a.jpg"))
+    assert np.abs(written.astype(int) - expected).mean() < 3  # JPEG's loss
+    assert (frames / "front/b.jpg").read_bytes() == b"no image"
+
+
+LEVEL = {"intrinsics": [100, 100, 80, 45], "position_m": [0, 0, 1], "yaw_pitch_roll_deg": [0, 0, 0]}
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ({"focal": 3}, r"camera 'front' cannot be used: unknown keys \['focal'\]"),
+        ({"intrinsics": [1, 2]}, r"intrinsics must be \[fx, fy, cx, cy\] or 3 x 3, got \(2,\)"),
+        ({"quaternion_wxyz": [1, 0, 0, 0]}, "say its place by"),
+        ({"images": "nowhere"}, "camera 'front' has no image at"),
+        ({"images": "../secret"}, "must lie below"),
+        ({"distortion": [1, 2], "distortion_model": "magic"}, "distortion model 'magic'"),
+        ({"yaw_pitch_roll_deg": ["a", 0, 0]}, "camera 'front' cannot be used"),
+    ],
+)  # fmt: skip
+def test_a_wrong_calibration_file_names_the_camera(tmp_path, camera, message):
+    (tmp_path / "front").mkdir()
+    cv2.imwrite(str(tmp_path / "front/a.png"), np.zeros((90, 160, 3), np.uint8))
+    content = {"cameras": {"front": LEVEL | camera}}
+    (tmp_path / "calibration.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        open_input(tmp_path)
+
+
+def test_a_mirrored_mounting_is_named(tmp_path):
+    (tmp_path / "front").mkdir()
+    cv2.imwrite(str(tmp_path / "front/a.png"), np.zeros((90, 160, 3), np.uint8))
+    mirror = np.diag([1.0, -1, 1, 1]).tolist()
+    camera = {"intrinsics": [100, 100, 80, 45], "vehicle_from_camera": mirror}
+    (tmp_path / "calibration.yaml").write_text(yaml.safe_dump({"cameras": {"front": camera}}))
+    with pytest.raises(ValueError, match=r"'front'.* mirrors .*two axes are swapped"):
+        open_input(tmp_path)
+
+
+def test_what_is_no_input_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="There is no input"):
+        open_input(tmp_path / "gone")
+    with pytest.raises(FileNotFoundError, match="holds no input: it must be an annotation file"):
+        open_input(tmp_path)
+    (tmp_path / "a.arrow").touch()
+    (tmp_path / "b.pkl").touch()
+    with pytest.raises(ValueError, match=r"several files \(a.arrow, b.pkl\)"):
+        open_input(tmp_path)
+    (tmp_path / "c.txt").touch()
+    with pytest.raises(ValueError, match=r"c.txt is no input"):
+        open_input(tmp_path / "c.txt")

@@ -1,0 +1,121 @@
+"""``tools/infer.py`` in this process: a nuScenes-format root, broken frames, a killed run."""
+
+import json
+
+import pytest
+import torch
+from mmdet3d.registry import MODELS
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.engine.launch import read_config
+from tools import infer
+
+
+@pytest.fixture(scope="module")
+def model(tiny_config, tmp_path_factory):
+    """The words after ``--model``: a tiny config, and a checkpoint of random weights."""
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("model") / "weights.pth"
+    torch.save({"state_dict": MODELS.build(read_config(tiny_config).model).state_dict()}, path)
+    return [str(tiny_config), str(path)]
+
+
+@pytest.fixture
+def drive(minicity_root, tmp_path):
+    """A copy of the root's tables, with links to its images."""
+    for name in ("can_bus", "samples", "sweeps", "v1.0-trainval"):
+        (tmp_path / "drive").mkdir(exist_ok=True)
+        (tmp_path / "drive" / name).symlink_to(minicity_root / name)
+    return tmp_path / "drive"
+
+
+def results(path):
+    return {r["sample_token"]: r["vectors"] for r in json.loads(path.read_text())["results"]}
+
+
+def test_a_root_without_annotation_files_is_predicted_and_can_be_merged(
+    drive, model, minicity_annotations, tmp_path, capsys
+):
+    out = tmp_path / "map.json"
+    infer.main([str(drive), "--model", *model, "--out", str(out), "--batch-size", "3"])
+    assert "4 of 4 samples predicted" in capsys.readouterr().out
+    found = results(out)
+    assert set(found) == {s.token for s in AnnotationFile(out.with_suffix(".arrow"))}
+    assert not list(tmp_path.glob("*.unfinished"))
+    known = tmp_path / "known.json"
+    infer.main([str(minicity_annotations["val"]), "--model", *model, "--out", str(known)])
+    for token, vectors in results(known).items():
+        for a, b in zip(vectors, found[token], strict=True):
+            # float32 sums in another order: a batch of 1 instead of 3
+            assert a["confidence_level"] == pytest.approx(b["confidence_level"], abs=1e-5)
+
+
+def test_a_killed_run_goes_on_and_broken_frames_are_named(
+    drive, model, minicity_root, tmp_path, capsys, monkeypatch
+):
+    folder = tmp_path / "drive/samples"
+    folder.unlink()
+    for source in (minicity_root / "samples").rglob("*.*"):
+        target = folder / source.relative_to(minicity_root / "samples")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.symlink_to(source)
+    broken = sorted((folder / "CAM_BACK").iterdir())[-1]
+    broken.unlink()
+    out = tmp_path / "map.json"
+    words = [str(drive), "--model", *model, "--out", str(out)]
+    original, calls = infer.MapInferencer.vectors, []
+
+    def killed_at_the_third(self, sample):
+        calls.append(sample.metainfo["token"])
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return original(self, sample)
+
+    monkeypatch.setattr(infer.MapInferencer, "vectors", killed_at_the_third)
+    with pytest.raises(KeyboardInterrupt):
+        infer.main(words)
+    assert not out.exists()
+    unfinished = tmp_path / "map.json.unfinished"
+    unfinished.write_bytes(unfinished.read_bytes()[:-7])  # the kill cuts the last line
+    monkeypatch.setattr(
+        infer.MapInferencer, "vectors", lambda s, x: calls.append("again") or original(s, x)
+    )
+    with pytest.raises(SystemExit) as end:
+        infer.main(words)
+    assert end.value.code == infer.SKIPPED
+    assert calls.count("again") == 1  # two were there, and the broken one, whose line was cut
+    printed = capsys.readouterr().out
+    assert "going on after 2 of 4 samples" in printed
+    assert "3 of 4 samples predicted" in printed
+    assert broken.name in printed
+    assert len(results(out)) == 3
+    assert not unfinished.exists()
+
+
+def test_other_settings_start_anew(drive, model, tmp_path, capsys):
+    out = tmp_path / "map.json"
+    (tmp_path / "map.json.unfinished").write_text('{"other": 1}\n{"sample_token": "x"}\n')
+    infer.main([str(drive), "--model", *model, "--out", str(out), "--max-samples", "1"])
+    assert "going on" not in capsys.readouterr().out
+    assert len(results(out)) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--model", "a", "b", "c", "--out", "x.json"], "--model takes a name, or a config"),
+        (["--out", "x.json"], "the following arguments are required: --model"),
+    ],
+)
+def test_wrong_words_are_named(drive, words, message, capsys):
+    with pytest.raises(SystemExit):
+        infer.main(["--", str(drive)] if not words else [str(drive), *words])
+    assert message in capsys.readouterr().err
+
+
+def test_nothing_to_do_and_no_usable_frame_are_named(drive, model, tmp_path):
+    with pytest.raises(ValueError, match="Nothing to do"):
+        infer.main([str(drive), "--model", *model])
+    (tmp_path / "drive/samples").unlink()
+    with pytest.raises(ValueError, match=r"no frame can be used: sample .* no image at"):
+        infer.main([str(drive), "--model", *model, "--out", str(tmp_path / "m.json")])
