@@ -79,9 +79,11 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
     if path.is_dir():
         return _open_folder(path, options)
     if path.suffix == ".arrow":
-        return Source(
-            annotations := AnnotationFile(path), annotations.meta.frame, options.data_root
-        )
+        annotations = AnnotationFile(path)
+        root = options.data_root
+        if root is None and _lies_with_its_images(annotations):
+            root = path.parent
+        return Source(annotations, annotations.meta.frame, root)
     if path.suffix == ".pkl":
         root = options.data_root or path.parent
         samples = read_info_file(path, root, options.allow_missing_cameras)
