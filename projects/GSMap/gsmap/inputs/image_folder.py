@@ -177,35 +177,38 @@ def _frames(
         The frames, and the time of each file name that has one.
     """
     root, scene = file.parent, file.parent.resolve().name
-    stems = {name: {path.stem: path for path in paths} for name, paths in images.items()}
-    times = {name: {_time_ns(stem): stem for stem in paths} for name, paths in stems.items()}
-    if all(None not in of_camera for of_camera in times.values()):
-        sorted_ns = {name: np.array(sorted(found), np.int64) for name, found in times.items()}
-        wanted = next(iter(sorted_ns.values())).tolist()
-        frames = []
-        near = nearest_images(sorted_ns, wanted, tolerance_ns)
-        for time_ns, nearest in zip(wanted, near, strict=True):
-            paths = {n: (stems[n][times[n][t]], t) for n, t in nearest.items()}
-            found = {n: (path.relative_to(root).as_posix(), t) for n, (path, t) in paths.items()}
-            frames.append(RigFrame(f"{scene}_{time_ns}", time_ns, found))
-        return frames, {stem: t for found in times.values() for t, stem in found.items() if t}
-    if all(len(paths) == 1 for paths in images.values()):
-        found = {n: (paths[0].relative_to(root).as_posix(), 0) for n, paths in images.items()}
-        return [RigFrame(f"{scene}_0", 0, found)], {path[0].stem: 0 for path in images.values()}
-    time_of = {stem: round(i * 1e9 / rate_hz) for i, stem in enumerate(next(iter(stems.values())))}
+    time_of = {path.stem: _time_ns(path.stem) for paths in images.values() for path in paths}
+    known = {stem: time_ns for stem, time_ns in time_of.items() if time_ns is not None}
+    if len(known) == len(time_of):
+        at = {name: {known[path.stem]: path for path in paths} for name, paths in images.items()}
+        times = {name: np.array(sorted(found), np.int64) for name, found in at.items()}
+        wanted = next(iter(times.values())).tolist()
+        groups = [
+            (str(time_ns), time_ns, {name: (at[name][t], t) for name, t in nearest.items()})
+            for time_ns, nearest in zip(
+                wanted, nearest_images(times, wanted, tolerance_ns), strict=True
+            )
+        ]
+    elif all(len(paths) == 1 for paths in images.values()):
+        known = {paths[0].stem: 0 for paths in images.values()}
+        groups = [("0", 0, {name: (paths[0], 0) for name, paths in images.items()})]
+    else:
+        stems = [path.stem for path in next(iter(images.values()))]
+        known = {stem: round(i * 1e9 / rate_hz) for i, stem in enumerate(stems)}
+        named = {name: {path.stem: path for path in paths} for name, paths in images.items()}
+        groups = [
+            (stem, known[stem], {n: (p[stem], known[stem]) for n, p in named.items() if stem in p})
+            for stem in stems
+        ]
     frames = [
         RigFrame(
-            f"{scene}_{stem}",
+            f"{scene}_{label}",
             time_ns,
-            {
-                name: (paths[stem].relative_to(root).as_posix(), time_ns)
-                for name, paths in stems.items()
-                if stem in paths
-            },
+            {name: (path.relative_to(root).as_posix(), t) for name, (path, t) in found.items()},
         )
-        for stem, time_ns in time_of.items()
+        for label, time_ns, found in groups
     ]
-    return frames, time_of
+    return frames, known
 
 
 def _read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> PoseTrack:

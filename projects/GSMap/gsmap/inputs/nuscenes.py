@@ -34,6 +34,7 @@ def read_nuscenes(root: Path, version: str | None = None) -> list[MapSample]:
         for record in tables.samples_of(scene):
             if LIDAR in record["data"]:
                 sample = reader.read(record, scene)
+                assert sample.ego_from_frame is not None  # nuScenes calibrates every sensor
                 pose = sample.global_from_frame @ invert_rigid(sample.ego_from_frame)
                 sample.can_bus = can_bus.signals(sample.scene, sample.timestamp_ns, pose)
                 samples.append(sample)
