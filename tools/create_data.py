@@ -11,6 +11,7 @@ import shlex
 import sys
 
 from gsmap.utils.cli import run_command
+from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import without_options
 
 COMMANDS = {
@@ -39,6 +40,8 @@ def make() -> str | None:
         if name == asked_for:
             importlib.import_module(module).add_arguments(subparser)
     arguments = parser.parse_args()
+    if getattr(arguments, "executor", None):
+        return run_on_ray(arguments, sys.argv)
     module, _ = COMMANDS[arguments.command]
     words = without_options(sys.argv, "--shard")  # the whole is made by the same command
     return importlib.import_module(module).run(arguments, shlex.join(["python", *words]))

@@ -34,7 +34,8 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.faults import nearest
-from gsmap.utils.shards import add_shard_option, digest, digest_of_common, read_shard
+from gsmap.utils.ray_shards import run_on_ray
+from gsmap.utils.shards import add_shard_options, digest, digest_of_common, read_shard
 
 DEFAULT_CLASSES = ("divider", "ped_crossing", "boundary")
 DEFAULT_RANGE = (-15.0, -30.0, 15.0, 30.0)
@@ -103,7 +104,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=1, help="number of processes")
     parser.add_argument("--out", type=output_file, help="write all figures as flat JSON")
     parser.add_argument("--pr-curves", type=output_file, help="draw PR curves and calibration")
-    add_shard_option(parser)
+    add_shard_options(parser)
     args = parser.parse_args(argv)
     if (args.results is None) == (args.prior is None):
         parser.error("name either a result file or --prior")
@@ -179,6 +180,8 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
 
 def main(argv: list[str] | None = None) -> str:
     args = parse_args(argv)
+    if args.executor:
+        return run_on_ray(args, sys.argv)
     start = time.perf_counter()
     evaluator = evaluator_from(args)
     if args.shard.count:

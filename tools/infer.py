@@ -27,7 +27,8 @@ from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.inputs.source import InputOptions, Source, open_input
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_bytes
-from gsmap.utils.shards import add_shard_option, digest
+from gsmap.utils.ray_shards import run_on_ray
+from gsmap.utils.shards import add_shard_options, digest
 from gsmap.visualization.figure import FORMATS, picture_name, save_figure
 
 SKIPPED = 1  # exit code when frames were broken
@@ -68,7 +69,6 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     group.add_argument("--workers", type=int, default=0, help="processes that read images")
     group.add_argument("--amp", action="store_true", help="mixed precision")
     add_config_options(group)
-    add_shard_option(group)
     group = parser.add_argument_group("pictures")
     group.add_argument("--format", default="png", choices=FORMATS)
     group.add_argument("--order", action="store_true", help="mark start and direction of elements")
@@ -78,6 +78,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     )
     group.add_argument("--width", type=int, help="width of the pictures in pixels")
     group.add_argument("--lidar", action="store_true", help="draw the LiDAR sweep faintly")
+    add_shard_options(parser)
     args = parser.parse_args(argv)
     if len(args.model) > 2:
         parser.error(f"--model takes a name, or a config and a checkpoint, got {args.model}")
@@ -174,8 +175,10 @@ def draw(
     save_figure(figure, args.show_dir / picture_name(token, f".{args.format}"))
 
 
-def main(argv: list[str] | None = None) -> None:
+def main(argv: list[str] | None = None) -> str | None:
     args = parse_args(argv)
+    if args.executor:
+        return run_on_ray(args, sys.argv)
     if not args.out and not args.show_dir:
         raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
     if args.width is not None and args.width < 1:
@@ -196,6 +199,7 @@ def main(argv: list[str] | None = None) -> None:
             count = results.finish({"classes": list(dataset.metainfo["classes"])})
             args.shard.seal(args.out, RESULTS, made_from, settings, count)
     report(args, source, dataset.ann_file, len(chosen), broken)
+    return None
 
 
 def report(

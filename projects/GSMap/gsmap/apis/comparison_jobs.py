@@ -1,12 +1,10 @@
 """Runs of a comparison under way: their processes, their end, and how far the whole is."""
 
-import ctypes
 import fcntl
 import json
 import os
 import re
 import shlex
-import signal
 import socket
 import subprocess
 import time
@@ -20,6 +18,7 @@ import torch
 from gsmap.apis.comparison import RECORD, SETTINGS, Run
 from gsmap.checkpoints.settings import plain
 from gsmap.utils.files import write_text
+from gsmap.utils.parallel import die_with_parent
 
 _SAID = 200  # characters of a failed run's last line
 
@@ -88,7 +87,7 @@ class Job:
                     else environment,
                     stdout=log,
                     stderr=subprocess.STDOUT,
-                    preexec_fn=_die_with_parent,
+                    preexec_fn=die_with_parent,
                 )
                 for rank in range(count)
             ]
@@ -127,11 +126,6 @@ class Job:
         self.record["peak_mib"] = self._peak_mib
         write_text(self.run.folder / RECORD, json.dumps(self.record, indent=1))
         self._lock.close()
-
-
-def _die_with_parent() -> None:
-    """Have Linux kill this process when its parent dies, however that dies."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
 def execute(

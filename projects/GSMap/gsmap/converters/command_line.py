@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from gsmap.datasets.annotations.record import CLASSES, RANGES, AnnotationMeta
 from gsmap.utils.parallel import default_workers
-from gsmap.utils.shards import WHOLE, Shard, add_shard_option
+from gsmap.utils.shards import WHOLE, Shard, add_shard_options
 
 Options = TypeVar("Options")
 
@@ -75,7 +75,7 @@ def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: in
     )
     parser.add_argument("--tag", default="", help="appended to the file names, such as _extended")
     add_workers_option(parser)
-    add_shard_option(parser)
+    add_shard_options(parser)
 
 
 def add_range_options(

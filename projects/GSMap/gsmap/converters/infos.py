@@ -35,7 +35,7 @@ from gsmap.datasets.annotations.record import (
 from gsmap.datasets.errors import naming
 from gsmap.datasets.plain_pickle import load_plain_pickle
 from gsmap.utils.cli import output_file
-from gsmap.utils.shards import WHOLE, Shard, add_shard_option
+from gsmap.utils.shards import WHOLE, Shard, add_shard_options
 
 NUSCENES_IMAGE_SIZE = (1600, 900)
 _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
@@ -280,7 +280,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--split", help="name of the split (default: what the file's name ends in)")
     parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="CLASS")
     add_range_options(parser, None)
-    add_shard_option(parser)
+    add_shard_options(parser)
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:

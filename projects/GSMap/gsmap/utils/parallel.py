@@ -1,5 +1,6 @@
 """Work spread over processes, in order, with bounded memory, and without a way to hang."""
 
+import ctypes
 import multiprocessing
 import os
 import pickle
@@ -35,6 +36,11 @@ def spared_from_signals() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def die_with_parent() -> None:
+    """Have Linux kill this process when its parent dies, however that dies."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
 class _Worker:

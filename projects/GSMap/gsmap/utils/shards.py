@@ -101,15 +101,34 @@ class ShardFile(NamedTuple):
     manifest: dict[str, Any]
 
 
-def add_shard_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--shard I/N``."""
-    parser.add_argument(
+def add_shard_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--shard I/N``, and the options that make all shards on a cluster."""
+    group = parser.add_argument_group("several machines (docs/fleet.md)")
+    group.add_argument(
         "--shard",
         type=Shard.parse,
         default=WHOLE,
         metavar="I/N",
-        help="do part I of N, I from 0 to N - 1; tools/merge.py joins the parts (docs/fleet.md)",
+        help="do part I of N, I from 0 to N - 1; tools/merge.py joins the parts",
     )
+    group.add_argument("--executor", choices=("ray",), help="make all --shards on a Ray cluster")
+    group.add_argument("--shards", type=int, default=16, help="how many (default: %(default)s)")
+    group.add_argument(
+        "--per-shard",
+        nargs="+",
+        type=_amount,
+        default=[],
+        metavar="NAME=AMOUNT",
+        help="what Ray sets aside for each, such as num_cpus=4 num_gpus=1 (default: num_cpus=1)",
+    )
+
+
+def _amount(text: str) -> tuple[str, float]:
+    """Read an amount of a resource."""
+    name, _, amount = text.partition("=")
+    if name not in ("num_cpus", "num_gpus", "memory"):
+        raise argparse.ArgumentTypeError(f"expected num_cpus=, num_gpus= or memory=, got {text!r}")
+    return name, float(amount)
 
 
 def without_options(words: Sequence[str], *names: str) -> list[str]:

@@ -30,7 +30,7 @@ from gsmap.converters.command_line import (
 )
 from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
-from gsmap.utils.shards import add_shard_option
+from gsmap.utils.shards import add_shard_options
 from minicity.camera import Camera
 from minicity.lighting import random_lighting
 from minicity.renderer import SceneRenderer
@@ -268,7 +268,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--max-frames", type=int, help="moments per log, evenly spread")
     add_workers_option(parser)
-    add_shard_option(parser)
+    add_shard_options(parser)
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:
