@@ -287,4 +287,5 @@ def run(arguments: argparse.Namespace, command: str) -> str:
     """Convert as the command line asks and return the summary."""
     split = arguments.split or arguments.infos.stem.rsplit("_", 1)[-1]
     more = {"split": split, "classes": tuple(arguments.classes), "command": command}
-    return convert_infos(**vars(arguments) | more).text()
+    names = ("infos", "target", "data_root", "x_range", "y_range", "shard")
+    return convert_infos(**{name: getattr(arguments, name) for name in names} | more).text()
