@@ -34,40 +34,40 @@ CONTENTS = {
 }
 
 CASES = """
-infer: nowhere.py K --sample VAL --out out.json | There is no config file nowhere.py
-infer: gsmap_r18_minicit K --sample VAL --out out.json | did you mean gsmap_r18_minicity?
-infer: open.py K --sample VAL --out out.json | open.py cannot be used: SyntaxError
-infer: zero.py K --sample VAL --out out.json | zero.py, line 2, cannot be used: ZeroDivisionError
-infer: base.py K --sample VAL --out out.json | base.py cannot be used: FileNotFoundError
-infer: bytes.py K --sample VAL --out out.json | bytes.py cannot be used: UnicodeDecodeError
-infer: plain.txt K --sample VAL --out out.json | plain.txt cannot be used: OSError: Only py
-infer: empty.py K --sample VAL --out out.json | empty.py: a setting is missing:
-infer: C --sample VAL --out out.json | give a checkpoint after
-infer: C nowhere.pth --sample VAL --out out.json | There is no checkpoint nowhere.pth
-infer: C damaged.pth --sample VAL --out out.json | damaged.pth was not loaded: it is broken
-infer: C foreign.pth --sample VAL --out out.json | foreign.pth does not belong to this config
-infer: C K --sample nowhere --out out.json | There is no sample file or folder nowhere
-infer: C K --sample damaged.arrow --out out.json | damaged.arrow is not a whole annotation file
-infer: C K --sample list.pkl --out out.json | list.pkl
-infer: C K --sample plain.txt --out out.json | plain.txt must be an annotation file
-infer: C K --sample VAL | give --out FILE
-infer: C K --sample VAL --out . | Is a directory: '.'; name a file in it.
-infer: C K --sample VAL --out plain.txt/a.json | plain.txt'; a part of that path is a file.
-infer: C K --sample VAL --out out.json --token abc | No sample has the token 'abc'
-infer: C K --sample VAL --out out.json --max-samples 0 | must be >= 1, got 0
-infer: C K --sample VAL --out out.json --data-root . | no image at
-infer: C K --sample VAL --show-dir out --width -5 | --width must be >= 1 pixel, got -5
-infer: C K --sample VAL --out out.json --device tpu | the device that was asked for
-infer: C K --sample VAL --out out.json --cfg-options modl.x=1 | 'modl'; did you mean 'model'?
-infer: C K --sample VAL --out out.json --cfg-options model.map_hed.num=3 | MapDetector has no setting 'map_hed'; did you mean 'map_head'?
-infer: C K --sample VAL --out out.json --cfg-options model.map_head.type=GSMapHed | there is no model of type 'GSMapHed'; did you mean 'GSMapHead'?
-infer: C K --sample VAL --out out.json --cfg-options model.map_head.embed_dims=abc | tiny.py: GaussianReference of GSMapHead of MapDetector cannot be made
-infer: C K --sample VAL --out out.json --cfg-options model.classes=[a] | K does not belong to this config
-infer: C K --sample VAL --out out.json --cfg-options test_dataloader.dataset.clas_ses=[a] | VectorizedMapDataset has no setting 'clas_ses'; did you mean 'classes'?
-infer: C K --sample VAL --out out.json --cfg-options test_dataloader.dataset.classes=[a] | VAL was made with classes
-infer: C K --sample VAL --out out.json --cfg-options test_dataloader.dataset.pipeline.9.type=x | --cfg-options of C cannot be used
-infer: C K --sample VAL --out out.json --cfg-options custom_imports.imports=[nothing] | custom_imports of C cannot be used
-infer: C K --sample VAL --out out.json --cfg-options visualizer.widht_px=3 | has no setting 'widht_px'; did you mean 'width_px'?
+infer: VAL --model nowhere.py K --out out.json | There is no config file nowhere.py
+infer: VAL --model gsmap_r18_minicit K --out out.json | did you mean gsmap_r18_minicity?
+infer: VAL --model open.py K --out out.json | open.py cannot be used: SyntaxError
+infer: VAL --model zero.py K --out out.json | zero.py, line 2, cannot be used: ZeroDivisionError
+infer: VAL --model base.py K --out out.json | base.py cannot be used: FileNotFoundError
+infer: VAL --model bytes.py K --out out.json | bytes.py cannot be used: UnicodeDecodeError
+infer: VAL --model plain.txt K --out out.json | plain.txt cannot be used: OSError: Only py
+infer: VAL --model empty.py K --out out.json | empty.py: a setting is missing:
+infer: VAL --model C --out out.json | give a checkpoint after
+infer: VAL --model C nowhere.pth --out out.json | There is no checkpoint nowhere.pth
+infer: VAL --model C damaged.pth --out out.json | damaged.pth was not loaded: it is broken
+infer: VAL --model C foreign.pth --out out.json | foreign.pth does not belong to this config
+infer: nowhere --model C K --out out.json | There is no input nowhere
+infer: damaged.arrow --model C K --out out.json | damaged.arrow is not a whole annotation file
+infer: list.pkl --model C K --out out.json | list.pkl
+infer: plain.txt --model C K --out out.json | plain.txt is no input: it must be an annotation file
+infer: VAL --model C K | give --out FILE
+infer: VAL --model C K --out . | Is a directory: '.'; name a file in it.
+infer: VAL --model C K --out plain.txt/a.json | plain.txt'; a part of that path is a file.
+infer: VAL --model C K --out out.json --token abc | No sample has the token 'abc'
+infer: VAL --model C K --out out.json --max-samples 0 | must be >= 1, got 0
+infer: VAL --model C K --out out.json --data-root . | no image at
+infer: VAL --model C K --show-dir out --width -5 | --width must be >= 1 pixel, got -5
+infer: VAL --model C K --out out.json --device tpu | the device that was asked for
+infer: VAL --model C K --out out.json --cfg-options modl.x=1 | 'modl'; did you mean 'model'?
+infer: VAL --model C K --out out.json --cfg-options model.map_hed.num=3 | MapDetector has no setting 'map_hed'; did you mean 'map_head'?
+infer: VAL --model C K --out out.json --cfg-options model.map_head.type=GSMapHed | there is no model of type 'GSMapHed'; did you mean 'GSMapHead'?
+infer: VAL --model C K --out out.json --cfg-options model.map_head.embed_dims=abc | tiny.py: GaussianReference of GSMapHead of MapDetector cannot be made
+infer: VAL --model C K --out out.json --cfg-options model.classes=[a] | K does not belong to this config
+infer: VAL --model C K --out out.json --cfg-options test_dataloader.dataset.clas_ses=[a] | VectorizedMapDataset has no setting 'clas_ses'; did you mean 'classes'?
+infer: VAL --model C K --out out.json --cfg-options test_dataloader.dataset.classes=[a] | VAL was made with classes
+infer: VAL --model C K --out out.json --cfg-options test_dataloader.dataset.pipeline.9.type=x | --cfg-options of C cannot be used
+infer: VAL --model C K --out out.json --cfg-options custom_imports.imports=[nothing] | custom_imports of C cannot be used
+infer: VAL --model C K --out out.json --cfg-options visualizer.widht_px=3 | has no setting 'widht_px'; did you mean 'width_px'?
 train: nowhere.py | There is no config file nowhere.py
 train: C --work-dir plain.txt | plain.txt
 train: C --work-dir w --cfg-options load_from=nowhere.pth | There is no checkpoint nowhere.pth
