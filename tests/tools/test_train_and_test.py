@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -156,3 +157,65 @@ def test_a_missing_checkpoint_is_named(tiny_config):
         "error: There is no checkpoint nowhere.pth, and no model of that name (gsmap_r18_minicity, "
         "maptr_r18_minicity ship).\n"
     )
+
+
+DIES = """
+import os, signal
+from mmengine.hooks import Hook
+from mmengine.registry import HOOKS
+
+@HOOKS.register_module()
+class Dies(Hook):
+    def before_train_iter(self, runner, batch_idx, data_batch=None):
+        if runner.rank == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+WAITS = """
+import torch.distributed as dist
+from gsmap.utils.cli import run_command
+
+def command():
+    dist.init_process_group("gloo")
+    if dist.get_rank() == 1:
+        raise ValueError("sample 'a' is broken")
+    dist.barrier()  # rank 0 waits for ever
+
+run_command(command, heed_kill=False)
+"""
+
+
+def end(*command: object, path: Path) -> tuple[int, list[str]]:
+    """Run a command that must fail; return its exit code and the lines that it said."""
+    paths = os.pathsep.join([str(path), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [str(part) for part in command], cwd=REPO, env=environment() | {"PYTHONPATH": paths},
+        text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False, timeout=300,
+    )  # fmt: skip
+    return done.returncode, done.stdout.splitlines()
+
+
+def test_a_rank_that_is_killed_ends_the_training(tiny_config, tmp_path):
+    (tmp_path / "dies.py").write_text(DIES)
+    (tmp_path / "leaf.py").write_text(
+        f"_base_ = '{tiny_config}'\ncustom_hooks = [dict(type='Dies')]\n"
+        "custom_imports = dict(imports=['gsmap.registered', 'dies'], allow_failed_imports=False)\n"
+    )
+    code, lines = end(
+        "tools/dist_train.sh", tmp_path / "leaf.py", 2, "--work-dir", tmp_path / "work",
+        path=tmp_path,
+    )  # fmt: skip
+    assert code == 128 + signal.SIGKILL
+    assert lines[-1] == (
+        "error: rank 1 was killed (SIGKILL, most likely for want of memory), so the run was "
+        "stopped; --resume goes on from its last checkpoint."
+    )
+
+
+def test_a_rank_that_fails_ends_the_others_with_its_reason(tmp_path):
+    (tmp_path / "waits.py").write_text(WAITS)
+    code, lines = end("tools/dist_run.sh", 2, tmp_path / "waits.py", path=tmp_path)
+    assert code == 2
+    assert "error: sample 'a' is broken" in lines
+    assert re.fullmatch(r"error: rank \d ended with 2 \(.* so the run was stopped; .*", lines[-1])
+    assert all(line.startswith("error: ") for line in lines[-2:])

@@ -29,6 +29,7 @@ _NO_MEMORY = re.compile(
 _NO_DEVICE = re.compile(
     "not compiled with CUDA|no NVIDIA driver|No CUDA GPUs|invalid device ordinal|device string"
 )
+_NO_PEER = re.compile(r"gloo.*(closed|reset) by peer|NCCL.*remote process", re.DOTALL)
 _UNEXPECTED = re.compile(r"([\w.]+)\(\) got an unexpected keyword argument '(\w+)'")
 _IN_WORKER = "Original Traceback (most recent call last)"  # in texts of torch's DataLoader
 _BUILDER = "build_from_cfg"  # mmengine's function that makes an object from a config's settings
@@ -78,7 +79,7 @@ def _is_raised(tracebacks: str) -> bool:
 
 
 def _of_the_machine(error: BaseException, text: str) -> str | None:
-    """Speak of memory that does not suffice, and of devices that are not there."""
+    """Speak of memory that does not suffice, and of devices and processes that are not there."""
     reason = text.strip().splitlines()[0].rstrip(".") if text.strip() else type(error).__name__
     speaks = isinstance(error, (RuntimeError, OSError)) and _NO_MEMORY.search(text)
     if isinstance(error, MemoryError) or speaks:
@@ -86,6 +87,8 @@ def _of_the_machine(error: BaseException, text: str) -> str | None:
             f"out of memory ({reason}): take a smaller batch (train_dataloader.batch_size=1), "
             "fewer processes (num_workers, --workers) or smaller images."
         )
+    if isinstance(error, RuntimeError) and _NO_PEER.search(text):
+        return "another rank has ended; its own words say why."
     if isinstance(error, (RuntimeError, AssertionError)) and _NO_DEVICE.search(text):
         return f"this machine does not have the device that was asked for ({reason}): give cpu."
     return None
