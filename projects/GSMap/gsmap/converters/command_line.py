@@ -1,13 +1,9 @@
-"""What the commands that make data share: options, where files go, and a progress bar."""
+"""What the commands that make data share: options, and where files go."""
 
 import argparse
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import KW_ONLY, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
-
-from tqdm import tqdm
 
 from gsmap.datasets.annotations.record import CLASSES, RANGES, AnnotationMeta
 from gsmap.utils.parallel import default_workers
@@ -141,18 +137,3 @@ def options_from(
     given = vars(arguments) | {"command": command} | more
     names = {field.name for field in fields(kind)} & given.keys()  # type: ignore[arg-type]
     return kind(**{n: tuple(v) if isinstance(v := given[n], list) else v for n in names})
-
-
-@contextmanager
-def progress_bar(title: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield what shows how many are done, of how many; the bar appears with the first call."""
-    with ExitStack() as stack:
-        bar: tqdm | None = None
-
-        def advance(done: int, total: int) -> None:
-            nonlocal bar
-            if bar is None:
-                bar = stack.enter_context(tqdm(desc=title, unit=unit, total=total, smoothing=0.05))
-            bar.update(done - bar.n)
-
-        yield advance

@@ -263,8 +263,8 @@ def convert_infos(
         command=command,
     )
     summary = ConversionSummary(classes)
-    numbered = tqdm(shard.part(list(enumerate(entries))), unit="sample")
-    with AnnotationWriter(target, meta, shard) as writer:
+    bar = tqdm(shard.part(list(enumerate(entries))), unit="sample")
+    with bar as numbered, AnnotationWriter(target, meta, shard) as writer:
         for sample in _samples(numbered, meta, infos, data_root, summary):
             writer.write(sample)
     return summary

@@ -2,12 +2,13 @@
 
 import argparse
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
 import shapely
+from tqdm import tqdm
 
 from gsmap.converters.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_split
 from gsmap.converters.argoverse2.map import COMPAT_MODES
@@ -16,7 +17,6 @@ from gsmap.converters.command_line import (
     add_file_options,
     add_log_options,
     options_from,
-    progress_bar,
 )
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
@@ -25,16 +25,13 @@ from gsmap.utils.files import SUFFIX as PARTIAL
 from gsmap.utils.parallel import ordered_map
 
 
-def convert_argoverse2(
-    options: Argoverse2Options, advance: Callable[[int, int], object] = lambda _done, _all: None
-) -> ConversionSummary:
+def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     """Convert the logs of a split to one annotation file, which appears when it is whole.
 
     A log that cannot be read does not stop the others: it is left out and the summary says why.
 
     Args:
         options: What to convert and how.
-        advance: Called after each log with the number of logs done and of all logs.
 
     Returns:
         What was written and what was left out.
@@ -52,16 +49,15 @@ def convert_argoverse2(
     read = partial(_try_log, options=options)
     sweep_offsets_ns: list[int] = []
     meta, log_dirs = _meta(options, log_dirs), options.shard.part(log_dirs)
-    advance(0, len(log_dirs))
-    with AnnotationWriter(target, meta, options.shard) as writer:
+    bar = tqdm(log_dirs, desc=f"av2 {options.split}", unit="log")
+    with bar as logs, AnnotationWriter(target, meta, options.shard) as writer:
         results = ordered_map(read, log_dirs, min(options.workers, max(len(log_dirs), 1)))
-        for done, (log_dir, result) in enumerate(zip(log_dirs, results, strict=True), 1):
+        for log_dir, result in zip(logs, results, strict=True):
             if isinstance(result, str):
                 summary.add_problem(f"log left out: {result}", log_dir.name)
             else:
                 _write_log(writer, result, log_dir.name, summary)
                 sweep_offsets_ns += result.sweep_offsets_ns
-            advance(done, len(log_dirs))
         if not len(writer) and not options.shard.count:
             raise RuntimeError(f"no sample is left for {target}:\n{summary.text()}")
         summary.notes.append(_lidar_note(sweep_offsets_ns, len(writer)))
@@ -196,5 +192,4 @@ def run(arguments: argparse.Namespace, command: str) -> str:
     """Convert as the command line asks and return the summary."""
     classes = (*CLASSES, "centerline") if arguments.centerline else CLASSES
     options = options_from(Argoverse2Options, arguments, command, classes=classes)
-    with progress_bar(f"av2 {options.split}", "log") as advance:
-        return convert_argoverse2(options, advance).text()
+    return convert_argoverse2(options).text()

@@ -4,7 +4,7 @@ import argparse
 import os
 import shutil
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ import shapely
 from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 from av2.utils.io import read_feather
+from tqdm import tqdm
 
 from gsmap.converters.argoverse2.convert import select_logs
 from gsmap.converters.argoverse2.log import RING_CAMERAS, Argoverse2Log, find_split
@@ -26,7 +27,6 @@ from gsmap.converters.command_line import (
     add_log_options,
     add_workers_option,
     options_from,
-    progress_bar,
 )
 from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
@@ -228,7 +228,6 @@ def render_logs(
     out: Path,
     options: RenderOptions,
     workers: int = 1,
-    advance: Callable[[int, int], object] = lambda _done, _all: None,
 ) -> str:
     """Render logs; one that cannot be rendered does not stop the others.
 
@@ -237,21 +236,19 @@ def render_logs(
         out: Folder of the split that the rendered logs go to.
         options: How.
         workers: Number of processes.
-        advance: Called after each log with the number of logs done and of all logs.
 
     Returns:
         What was rendered and what was left out, for people.
     """
     lines, pictures, rendered = [], 0, 0
     render = partial(_try_log, out=out, options=options)
-    advance(0, len(log_dirs))
     results = ordered_map(render, log_dirs, min(workers, max(len(log_dirs), 1)), timeout_s=3600.0)
-    for done, (log_dir, result) in enumerate(zip(log_dirs, results, strict=True), 1):
-        if isinstance(result, str):
-            lines.append(f"log {log_dir.name} left out: {result}")
-        else:
-            rendered, pictures = rendered + 1, pictures + result
-        advance(done, len(log_dirs))
+    with tqdm(log_dirs, desc="av2-render", unit="log") as logs:
+        for log_dir, result in zip(logs, results, strict=True):
+            if isinstance(result, str):
+                lines.append(f"log {log_dir.name} left out: {result}")
+            else:
+                rendered, pictures = rendered + 1, pictures + result
     return "\n".join([f"{pictures} pictures of {rendered} logs in {out}", *lines])
 
 
@@ -280,5 +277,4 @@ def run(arguments: argparse.Namespace, command: str) -> str:
     options = options_from(RenderOptions, arguments, command, calibration=calibration)
     log_dirs = arguments.shard.part(select_logs(split_dir, arguments.logs))
     out = arguments.out / (arguments.out_split or arguments.split)
-    with progress_bar("av2-render", "log") as advance:
-        return render_logs(log_dirs, out, options, arguments.workers, advance)
+    return render_logs(log_dirs, out, options, arguments.workers)

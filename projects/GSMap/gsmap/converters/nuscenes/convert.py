@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
@@ -15,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
+from tqdm import tqdm
 
 from gsmap.converters.command_line import (
     FileOptions,
     add_file_options,
     options_from,
-    progress_bar,
 )
 from gsmap.converters.nuscenes.map import (
     MAP_CLASSES,
@@ -158,22 +159,22 @@ class _Conversion:
         self.can_bus = CanBusReader(options.root)
         self.splits = _splits(options, self.tables, self.summary)
         self.split_of = {scene: split for split, scenes in self.splits.items() for scene in scenes}
-        self.positions: dict[str, dict[str, list[np.ndarray]]] = {
-            split: {} for split in self.splits
-        }
+        self.positions: defaultdict[str, defaultdict[str, list[np.ndarray]]] = defaultdict(
+            lambda: defaultdict(list)
+        )
 
-    def run(
-        self, writers: dict[str, AnnotationWriter], advance: Callable[[int, int], object]
-    ) -> None:
+    def run(self, writers: dict[str, AnnotationWriter]) -> None:
         """Convert map by map, so that one map at a time is in memory."""
         scenes = [scene for scene in self.tables.scene if scene["name"] in self.split_of]
         scenes = self.options.shard.part(sorted(scenes, key=self.tables.location_of))
-        done, total = 0, sum(scene["nbr_samples"] for scene in scenes)
-        advance(done, total)
-        for location, local in groupby(scenes, key=self.tables.location_of):
-            for sample, instances in self._with_instances(location, list(local)):
-                self._write(writers[self.split_of[sample.scene]], sample, instances)
-                advance(done := done + 1, total)
+        with tqdm(
+            desc=f"{self.options.dataset} {self.options.version}", unit="sample", smoothing=0.05,
+            total=sum(scene["nbr_samples"] for scene in scenes),
+        ) as bar:  # fmt: skip
+            for location, local in groupby(scenes, key=self.tables.location_of):
+                for sample, instances in self._with_instances(location, list(local)):
+                    self._write(writers[self.split_of[sample.scene]], sample, instances)
+                    bar.update()
 
     def _with_instances(
         self, location: str, scenes: list[dict[str, Any]]
@@ -228,15 +229,14 @@ class _Conversion:
         """Count the cameras and files that a sample lacks."""
         from gsmap.converters.nuscenes.tables import CAMERAS
 
-        files = {camera.name: camera.path for camera in sample.cameras}
+        assert sample.lidar is not None  # its frame is the sample's
+        files = {f"{camera.name} image": camera.path for camera in sample.cameras}
         for name in CAMERAS:
-            if name not in files:
+            if f"{name} image" not in files:
                 self.summary.add_problem(f"{name} absent (sample kept without it)", sample.token)
-        for name, path in files.items():
+        for name, path in {**files, "LIDAR_TOP": sample.lidar.path}.items():
             if not (self.options.root / path).is_file():
-                self.summary.add_problem(f"{name} image file missing", path)
-        if sample.lidar is not None and not (self.options.root / sample.lidar.path).is_file():
-            self.summary.add_problem("LIDAR_TOP file missing", sample.lidar.path)
+                self.summary.add_problem(f"{name} file missing", path)
 
     def _write(
         self, writer: AnnotationWriter, sample: MapSample, instances: list[MapInstance] | str
@@ -248,7 +248,7 @@ class _Conversion:
         sample.instances = instances
         writer.write(sample)
         self.summary.add_sample(writer.meta.split, sample)
-        places = self.positions[writer.meta.split].setdefault(sample.map_name, [])
+        places = self.positions[writer.meta.split][sample.map_name]
         places.append(sample.global_from_frame[:2, 3])
 
     def note_overlap(self) -> None:
@@ -265,14 +265,11 @@ class _Conversion:
             )
 
 
-def convert_nuscenes(
-    options: NuScenesOptions, advance: Callable[[int, int], object] = lambda _done, _all: None
-) -> ConversionSummary:
+def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
     """Write one annotation file per split; all appear together, when all are whole.
 
     Args:
         options: What to convert and how.
-        advance: Called after each sample with the number of samples done and of all samples.
 
     Returns:
         What was written and what was left out.
@@ -295,7 +292,7 @@ def convert_nuscenes(
             meta = options.meta(options.dataset, "lidar", split, **made_from)
             writer = AnnotationWriter(options.path_of(options.dataset, split), meta, options.shard)
             writers[split] = stack.enter_context(writer)
-        conversion.run(writers, advance)
+        conversion.run(writers)
         for writer in writers.values():  # a full disk shows here, before any file appears
             writer.finish()
     if not conversion.can_bus.available:
@@ -329,5 +326,4 @@ def run(arguments: argparse.Namespace, command: str) -> str:
     is_minicity = (arguments.root / "minicity.json").is_file()  # it says so in its root
     dataset = arguments.dataset or ("minicity" if is_minicity else "nuscenes")
     options = options_from(NuScenesOptions, arguments, command, dataset=dataset)
-    with progress_bar(f"{dataset} {options.version}", "sample") as advance:
-        return convert_nuscenes(options, advance).text()
+    return convert_nuscenes(options).text()
