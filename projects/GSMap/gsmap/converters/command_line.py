@@ -1,6 +1,8 @@
 """What the commands that make data share: options, and where files go."""
 
 import argparse
+import hashlib
+from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -51,6 +53,14 @@ class FileOptions:
     def path_of(self, dataset: str, split: str) -> Path:
         """Return where a split goes: ``gsmap_<dataset>_<split><tag>.arrow``."""
         return (self.out_dir or self.root) / f"gsmap_{dataset}_{split}{self.tag}.arrow"
+
+
+def fingerprint(sizes: Mapping[str, int], contents: Iterable[Path] = ()) -> str:
+    """Return a digest of what a file is made from: names with their sizes, and whole files."""
+    digest = hashlib.sha256("".join(f"{name} {size}\n" for name, size in sizes.items()).encode())
+    for path in contents:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: int) -> None:

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from gsmap.converters.command_line import add_range_options
 from gsmap.converters.custom import image_size
 from gsmap.converters.nuscenes.can_bus import pose_signals
-from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
+from gsmap.converters.nuscenes.map import NuScenesLocalMap, expansion, open_layers
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter, check_samples
 from gsmap.datasets.annotations.record import (
@@ -170,7 +170,7 @@ def _samples(
 
     @cache
     def map_of(name: str) -> NuScenesLocalMap | None:
-        if not name or not (root / f"maps/expansion/{name}.json").is_file():
+        if not name or not expansion(root, name).is_file():
             return None
         layers = open_layers(root, name, meta.classes)
         return NuScenesLocalMap(layers, meta.classes, meta.x_range, meta.y_range)

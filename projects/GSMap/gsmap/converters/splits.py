@@ -8,6 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 OVERLAP_DISTANCE_M = 5.0
+# (x, y) in metres of the samples of each split, by map name
+Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
 
 
 def read_split_file(path: Path) -> dict[str, list[str]]:
@@ -70,24 +72,33 @@ def resolve_scenes(
 
 
 def overlap_share(
-    train: Mapping[str, Sequence[np.ndarray]],
-    val: Mapping[str, Sequence[np.ndarray]],
-    distance_m: float = OVERLAP_DISTANCE_M,
+    train: Mapping[str, Sequence[np.ndarray]], val: Mapping[str, Sequence[np.ndarray]]
 ) -> float:
-    """Return the share of validation positions that lie near a training position on the same map.
+    """Return the share of validation positions within 5 m of a training position on the same map.
 
     Args:
         train: Positions (x, y) in metres by map name. each (n, 2)
         val: Positions by map name. each (m, 2)
-        distance_m: What counts as near, in metres, inclusive.
 
     Returns:
         A share in [0, 1]; 0 without validation positions.
     """
+    near = [
+        cKDTree(train[name]).query(positions)[0] <= OVERLAP_DISTANCE_M
+        for name, positions in val.items()
+        if len(positions) and len(train.get(name, ()))
+    ]
     total = sum(len(positions) for positions in val.values())
-    near = 0
-    for name, positions in val.items():
-        if len(positions) and len(train.get(name, ())):
-            distances, _ = cKDTree(train[name]).query(positions)
-            near += int((distances <= distance_m).sum())
-    return near / total if total else 0.0
+    return sum(int(found.sum()) for found in near) / total if total else 0.0
+
+
+def overlap_notes(positions: Positions) -> list[str]:
+    """Say, if so, how many validation samples lie near a training sample."""
+    train = next((s for s in positions if s.endswith("train")), "")
+    val = next((s for s in positions if s.endswith("val")), "")
+    share = overlap_share(positions[train], positions[val]) if train and val else 0.0
+    warning = (
+        f"warning: {share:.1%} of the {val} samples lie within 5 m of a {train} sample: "
+        "scores on them say little about new places. docs/data.md names disjoint splits."
+    )
+    return [warning] if share else []

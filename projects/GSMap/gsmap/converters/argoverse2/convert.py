@@ -1,7 +1,6 @@
 """Convert Argoverse 2 logs to an annotation file: seven ring cameras, ego frame, 60 x 30 m."""
 
 import argparse
-import hashlib
 from collections.abc import Iterable, Sequence
 from functools import partial
 from importlib.metadata import version
@@ -16,6 +15,7 @@ from gsmap.converters.argoverse2.samples import Argoverse2Options, LogSamples, r
 from gsmap.converters.command_line import (
     add_file_options,
     add_log_options,
+    fingerprint,
     options_from,
 )
 from gsmap.converters.summary import ConversionSummary
@@ -133,12 +133,17 @@ def _drop_listed(
 
 def _meta(options: Argoverse2Options, log_dirs: Iterable[Path]) -> AnnotationMeta:
     """Describe the file: what it holds, and what it was made from."""
+    sizes = {
+        f"{log_dir.name}/{path.name}": path.stat().st_size
+        for log_dir in log_dirs
+        for path in (*sorted(log_dir.glob("map/*.json")), *sorted(log_dir.glob("*.feather")))
+    }
     return options.meta(
         "av2",
         "ego",
         options.split,
         dim=options.dim,
-        source_fingerprint=_fingerprint(log_dirs),
+        source_fingerprint=fingerprint(sizes),
         versions={
             "av2": version("av2"),
             "shapely": version("shapely"),
@@ -151,16 +156,6 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path]) -> AnnotationMet
             "num_sweeps": options.max_sweeps,
         },
     )
-
-
-def _fingerprint(log_dirs: Iterable[Path]) -> str:
-    """Return a digest of the logs' names and the sizes of their maps and pose tables."""
-    digest = hashlib.sha256()
-    for log_dir in log_dirs:
-        files = (*sorted((log_dir / "map").glob("*.json")), *sorted(log_dir.glob("*.feather")))
-        for path in files:
-            digest.update(f"{log_dir.name}/{path.name} {path.stat().st_size}\n".encode())
-    return digest.hexdigest()[:16]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -21,16 +20,17 @@ from tqdm import tqdm
 from gsmap.converters.command_line import (
     FileOptions,
     add_file_options,
+    fingerprint,
     options_from,
 )
 from gsmap.converters.nuscenes.map import (
     MAP_CLASSES,
-    MapLayers,
     NuScenesLocalMap,
     check_classes,
+    expansion,
     open_layers,
 )
-from gsmap.converters.splits import overlap_share, read_split_file, resolve_scenes
+from gsmap.converters.splits import Positions, overlap_notes, read_split_file, resolve_scenes
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
@@ -86,22 +86,18 @@ def check_root(root: Path, version: str) -> None:
             f"no version {version!r} in {root}: it has {', '.join(found) or 'no version at all'}. "
             f"Name one with --version."
         )
-    if not any((root / "maps" / "expansion").glob("*.json")):
+    if not any((root / "maps/expansion").glob("*.json")):
         raise FileNotFoundError(
-            f"no map expansion in {root / 'maps' / 'expansion'}: download `Map expansion pack "
+            f"no map expansion in {root / 'maps/expansion'}: download `Map expansion pack "
             f"(v1.3)` from https://www.nuscenes.org/download and unpack it into {root / 'maps'}."
         )
 
 
-def fingerprint(root: Path, version: str) -> str:
+def _fingerprint(root: Path, version: str) -> str:
     """Return a digest of the maps, the scene list and the sizes of all tables."""
-    digest = hashlib.sha256()
-    for path in sorted((root / version).glob("*.json")):
-        digest.update(f"{path.name} {path.stat().st_size}\n".encode())
-    maps = sorted((root / "maps" / "expansion").glob("*.json"))
-    for path in (root / version / "scene.json", *maps):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
+    tables, maps = sorted((root / version).glob("*.json")), (root / "maps/expansion").glob("*.json")
+    sizes = {path.name: path.stat().st_size for path in tables}
+    return fingerprint(sizes, (root / version / "scene.json", *sorted(maps)))
 
 
 def _splits(
@@ -158,14 +154,12 @@ class _Conversion:
         self.reader = SampleReader(self.tables, options.max_sweeps)
         self.can_bus = CanBusReader(options.root)
         self.splits = _splits(options, self.tables, self.summary)
-        self.split_of = {scene: split for split, scenes in self.splits.items() for scene in scenes}
-        self.positions: defaultdict[str, defaultdict[str, list[np.ndarray]]] = defaultdict(
-            lambda: defaultdict(list)
-        )
+        self.positions: Positions = {split: defaultdict(list) for split in self.splits}
 
     def run(self, writers: dict[str, AnnotationWriter]) -> None:
         """Convert map by map, so that one map at a time is in memory."""
-        scenes = [scene for scene in self.tables.scene if scene["name"] in self.split_of]
+        split_of = {scene: split for split, scenes in self.splits.items() for scene in scenes}
+        scenes = [scene for scene in self.tables.scene if scene["name"] in split_of]
         scenes = self.options.shard.part(sorted(scenes, key=self.tables.location_of))
         with tqdm(
             desc=f"{self.options.dataset} {self.options.version}", unit="sample", smoothing=0.05,
@@ -173,7 +167,7 @@ class _Conversion:
         ) as bar:  # fmt: skip
             for location, local in groupby(scenes, key=self.tables.location_of):
                 for sample, instances in self._with_instances(location, list(local)):
-                    self._write(writers[self.split_of[sample.scene]], sample, instances)
+                    self._write(writers[split_of[sample.scene]], sample, instances)
                     bar.update()
 
     def _with_instances(
@@ -187,25 +181,19 @@ class _Conversion:
                 waiting.append(self._scene_samples(scene))
                 yield np.array([s.global_from_frame for s in waiting[-1]]).reshape(-1, 4, 4)
 
-        layers = self._layers(location)
+        if location not in LOCATIONS or not expansion(options.root, location).is_file():
+            raise FileNotFoundError(
+                f"no map expansion for {location!r} in {options.root}/maps/expansion; the devkit "
+                f"knows {', '.join(LOCATIONS)}. Unpack the map expansion pack (v1.3) there."
+            )
+        layers = open_layers(options.root, location, options.classes)
+        for reason, count in layers.skipped.items():
+            self.summary.add_problem(f"{reason} left out", location, count)
         local_map = NuScenesLocalMap(layers, options.classes, options.x_range, options.y_range)
         frames = sum(scene["nbr_samples"] for scene in scenes)
         workers = max(1, min(options.workers, len(scenes), frames // _FRAMES_PER_WORKER))
         for results in ordered_map(partial(_instances_of, local_map), poses(), workers):
             yield from zip(waiting.pop(0), results, strict=True)
-
-    def _layers(self, location: str) -> MapLayers:
-        """Read one map and count its unusable elements."""
-        file = self.options.root / f"maps/expansion/{location}.json"
-        if location not in LOCATIONS or not file.is_file():
-            raise FileNotFoundError(
-                f"no map expansion for {location!r} in {self.options.root}/maps/expansion; the "
-                f"devkit knows {', '.join(LOCATIONS)}. Unpack the map expansion pack (v1.3) there."
-            )
-        layers = open_layers(self.options.root, location, self.options.classes)
-        for reason, count in layers.skipped.items():
-            self.summary.add_problem(f"{reason} left out", location, count)
-        return layers
 
     def _scene_samples(self, scene: dict[str, Any]) -> list[MapSample]:
         """Read a scene's samples without ground truth, counting what is missing."""
@@ -247,22 +235,9 @@ class _Conversion:
             return
         sample.instances = instances
         writer.write(sample)
-        self.summary.add_sample(writer.meta.split, sample)
-        places = self.positions[writer.meta.split][sample.map_name]
-        places.append(sample.global_from_frame[:2, 3])
-
-    def note_overlap(self) -> None:
-        """Note how many validation samples lie near a training sample."""
-        train = next((s for s in self.splits if s.endswith("train")), None)
-        val = next((s for s in self.splits if s.endswith("val")), None)
-        if train is None or val is None:
-            return
-        share = overlap_share(self.positions[train], self.positions[val])
-        if share > 0:
-            self.summary.notes.append(
-                f"warning: {share:.1%} of the {val} samples lie within 5 m of a {train} sample: "
-                f"scores on them say little about new places. docs/data.md names disjoint splits."
-            )
+        split = writer.meta.split
+        self.summary.add_sample(split, sample)
+        self.positions[split][sample.map_name].append(sample.global_from_frame[:2, 3])
 
 
 def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
@@ -282,7 +257,7 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
     check_root(options.root, options.version)
     conversion = _Conversion(options)
     made_from = {
-        "source_fingerprint": fingerprint(options.root, options.version),
+        "source_fingerprint": _fingerprint(options.root, options.version),
         "versions": {name: version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")},
         "options": {"version": options.version, "max_sweeps": options.max_sweeps},
     }
@@ -295,12 +270,11 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         conversion.run(writers)
         for writer in writers.values():  # a full disk shows here, before any file appears
             writer.finish()
+    notes = conversion.summary.notes
     if not conversion.can_bus.available:
-        conversion.summary.notes.append(
-            "no CAN bus expansion: acceleration, rotation rate and velocity are 0."
-        )
+        notes.append("no CAN bus expansion: acceleration, rotation rate and velocity are 0.")
     if not options.shard.count:
-        conversion.note_overlap()
+        notes += overlap_notes(conversion.positions)
     return conversion.summary
 
 

@@ -92,6 +92,11 @@ def check_classes(classes: Collection[str]) -> None:
         raise ValueError(f"classes must be among {MAP_CLASSES}, got {unknown}.")
 
 
+def expansion(root: Path, name: str) -> Path:
+    """Return the file of a map below a data root."""
+    return root / f"maps/expansion/{name}.json"
+
+
 def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
     """Collect the geometries that the classes need from a map under a data root.
 
@@ -100,8 +105,7 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
     """
     from nuscenes.map_expansion.map_api import NuScenesMap
 
-    path = root / f"maps/expansion/{name}.json"
-    with naming(path, "unpack the map expansion pack (v1.3) again"):
+    with naming(expansion(root, name), "unpack the map expansion pack (v1.3) again"):
         layers = read_layers(NuScenesMap(str(root), name), classes)
         for geometries in (*layers.lines.values(), *layers.polygons.values()):
             if not np.isfinite(shapely.get_coordinates(geometries)).all():
