@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pyquaternion import Quaternion
 from tqdm import tqdm
 
 from gsmap.converters.command_line import add_range_options
 from gsmap.converters.custom import image_size
 from gsmap.converters.nuscenes.can_bus import pose_signals
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, expansion, open_layers
+from gsmap.converters.nuscenes.tables import pose_of
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter, check_samples
 from gsmap.datasets.annotations.record import (
@@ -39,15 +39,6 @@ from gsmap.utils.shards import WHOLE, Shard, add_shard_options
 
 NUSCENES_IMAGE_SIZE = (1600, 900)
 _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
-
-
-def _transform_of(info: Mapping[str, Any], name: str) -> np.ndarray:
-    """Return a transform from its translation and its quaternion (w, x, y, z) or matrix. (4, 4)."""
-    matrix = np.eye(4)
-    turned = np.asarray(info[f"{name}_rotation"], np.float64)
-    matrix[:3, :3] = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
-    matrix[:3, 3] = np.asarray(info[f"{name}_translation"], np.float64).reshape(3)
-    return matrix
 
 
 def _relative(path: str, root: Path) -> str:
@@ -80,15 +71,15 @@ def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstanc
 
 def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     """Read one entry of a nuScenes info file, in the LIDAR_TOP frame."""
-    ego_from_frame = _transform_of(info, "lidar2ego")
-    global_from_ego = _transform_of(info, "ego2global")
+    ego_from_frame = pose_of(info, "lidar2ego_")
+    global_from_ego = pose_of(info, "ego2global_")
     cameras = [
         CameraRecord(
             name,
             _relative(camera["data_path"], root),
             *NUSCENES_IMAGE_SIZE,
             np.asarray(camera["cam_intrinsic"], np.float64)[:3, :3],
-            np.linalg.inv(_transform_of(camera, "sensor2lidar")),
+            np.linalg.inv(pose_of(camera, "sensor2lidar_")),
         )
         for name, camera in info["cams"].items()
     ]
@@ -96,7 +87,7 @@ def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
         SweepRecord(
             _relative(sweep["data_path"], root),
             int(sweep["timestamp"]) * 1000,
-            _transform_of(sweep, "sensor2lidar"),
+            pose_of(sweep, "sensor2lidar_"),
         )
         for sweep in info.get("sweeps", [])
     ]
@@ -122,10 +113,10 @@ def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
 
 def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     """Read one entry of an Argoverse 2 info file, in the vehicle's frame."""
-    pose = _transform_of(info, "e2g")
+    pose = pose_of(info, "e2g_")
     cameras = []
     for name, camera in info["cams"].items():
-        then = _transform_of(camera, "e2g") if "e2g_translation" in camera else pose
+        then = pose_of(camera, "e2g_") if "e2g_translation" in camera else pose
         path = _relative(camera["img_fpath"], root)
         size = (1550, 2048) if name == "ring_front_center" else (2048, 1550)
         if (root / path).is_file():

@@ -1,7 +1,5 @@
 """From nuScenes-format data (nuScenes, MiniCity) to annotation files, with the official devkit."""
 
-from __future__ import annotations
-
 import argparse
 from collections import defaultdict
 from collections.abc import Iterator
@@ -11,7 +9,7 @@ from functools import partial
 from importlib.metadata import version
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import shapely
@@ -23,6 +21,7 @@ from gsmap.converters.command_line import (
     fingerprint,
     options_from,
 )
+from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.converters.nuscenes.map import (
     MAP_CLASSES,
     NuScenesLocalMap,
@@ -30,15 +29,13 @@ from gsmap.converters.nuscenes.map import (
     expansion,
     open_layers,
 )
+from gsmap.converters.nuscenes.tables import CAMERAS, LIDAR, NuScenesTables, SampleReader
 from gsmap.converters.splits import Positions, overlap_notes, read_split_file, resolve_scenes
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.parallel import ordered_map
-
-if TYPE_CHECKING:
-    from gsmap.converters.nuscenes.tables import NuScenesTables
 
 LOCATIONS = (
     "singapore-onenorth",
@@ -145,9 +142,6 @@ class _Conversion:
     """One run over all scenes; holds what its steps share."""
 
     def __init__(self, options: NuScenesOptions) -> None:
-        from gsmap.converters.nuscenes.can_bus import CanBusReader
-        from gsmap.converters.nuscenes.tables import NuScenesTables, SampleReader
-
         self.options = options
         self.summary = ConversionSummary(options.classes)
         self.tables = NuScenesTables(options.version, options.root, options.max_sweeps > 0)
@@ -197,8 +191,6 @@ class _Conversion:
 
     def _scene_samples(self, scene: dict[str, Any]) -> list[MapSample]:
         """Read a scene's samples without ground truth, counting what is missing."""
-        from gsmap.converters.nuscenes.tables import LIDAR
-
         samples = []
         for record in self.tables.samples_of(scene):
             if LIDAR not in record["data"]:  # its frame is not known
@@ -215,8 +207,6 @@ class _Conversion:
 
     def _count_missing(self, sample: MapSample) -> None:
         """Count the cameras and files that a sample lacks."""
-        from gsmap.converters.nuscenes.tables import CAMERAS
-
         assert sample.lidar is not None  # its frame is the sample's
         files = {f"{camera.name} image": camera.path for camera in sample.cameras}
         for name in CAMERAS:

@@ -1,27 +1,23 @@
-"""The tables of nuScenes-format data, opened with the devkit without what maps do not need."""
+"""The tables of nuScenes-format data, without what maps do not need."""
 
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nuscenes.nuscenes import NuScenes
-from nuscenes.utils.geometry_utils import transform_matrix
 from pyquaternion import Quaternion
 
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
-from gsmap.datasets.errors import naming
 from gsmap.structures.rigid import invert_rigid
 
 CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 )  # fmt: skip
 LIDAR = "LIDAR_TOP"
-_UNUSED = {"sample_annotation", "instance", "image_annotations"}
 # what is read of each table: fields with their type, or how many numbers they hold
 _POSE: dict[str, type | int] = {"translation": 3, "rotation": 4}
 _FIELDS: dict[str, dict[str, type | int]] = {
@@ -36,7 +32,6 @@ _FIELDS: dict[str, dict[str, type | int]] = {
         "timestamp": int, "filename": str, "is_key_frame": bool, "prev": str, "width": int,
         "height": int,
     },
-    "map": {"log_tokens": list, "filename": str},
 }  # fmt: skip
 _LINKS = {
     "calibrated_sensor": {"sensor_token": "sensor"},
@@ -113,12 +108,12 @@ def _are_numbers(value: Any, count: int) -> bool:
     return count != 4 or abs(math.hypot(*value) - 1) < 1e-3
 
 
-class NuScenesTables(NuScenes):
-    """The devkit's tables with key frames of cameras and LiDAR, and LiDAR sweeps if asked for.
+class NuScenesTables:
+    """The tables with the key frames of cameras and LiDAR, and LiDAR sweeps if asked for.
 
-    The annotation tables and every other sensor's records are left out while reading: of trainval's
-    2.6 million ``sample_data`` records a tenth remains (a fifth with sweeps), and with them their
-    poses.
+    Annotation tables and every other sensor's records are left out while reading: of trainval's 2.6
+    million ``sample_data`` records a tenth remains (a fifth with sweeps), and with them their
+    poses. Each sample's ``data`` holds the tokens of its key frames by channel.
 
     Args:
         version: Version folder, such as ``v1.0-trainval``.
@@ -126,66 +121,68 @@ class NuScenesTables(NuScenes):
         with_sweeps: Whether to keep LiDAR sweeps between key frames.
 
     Raises:
+        FileNotFoundError: If a table is missing.
         ValueError: If a table is damaged or a record points to one that there is not.
     """
 
     def __init__(self, version: str, dataroot: Path, with_sweeps: bool) -> None:
-        self._with_sweeps = with_sweeps
-        self._kept_data: list[dict[str, Any]] = []
-        with naming(dataroot / version, "download the tables again"):
-            super().__init__(version, str(dataroot), verbose=False)
+        self._folder = dataroot / version
+        self._records: dict[str, dict[str, dict[str, Any]]] = {}
+        for table in ("sensor", "calibrated_sensor", "log", "scene", "sample"):
+            self._keep(table, self._read(table))
+        self._check_links("calibrated_sensor", "scene")
+        self._keep("sample_data", self._wanted_sample_data(with_sweeps))
+        wanted = {record["ego_pose_token"] for record in self._records["sample_data"].values()}
+        self._keep("ego_pose", (r for r in self._read("ego_pose") if r["token"] in wanted))
+        self._check_links("sample_data")
+        for sample in self._records["sample"].values():
+            sample["data"] = {}
+        for token, record in self._records["sample_data"].items():
+            if record["is_key_frame"]:
+                channel = self._channel_of(record)
+                self._records["sample"][record["sample_token"]]["data"][channel] = token
+        self.scene = list(self._records["scene"].values())
 
-    def __load_table__(self, table_name: str) -> list[dict[str, Any]]:
-        if table_name in _UNUSED:
-            return []
-        if table_name == "sample_data":
-            return self._kept_data
-        records = self._records(table_name)
-        if table_name == "map":  # kept from the devkit until it has looked for masks to draw
-            self._kept_maps = list(records)
-            return []
-        if table_name == "ego_pose":  # asked for before sample_data, which says what is needed
-            self._kept_data = list(self._wanted_sample_data())
-            wanted = {record["ego_pose_token"] for record in self._kept_data}
-            records = (pose for pose in records if pose["token"] in wanted)
-        return list(records)
+    def get(self, table: str, token: str) -> dict[str, Any]:
+        """Return a record."""
+        return self._records[table][token]
 
-    def _records(self, table: str) -> Iterator[dict[str, Any]]:
+    def _keep(self, table: str, records: Iterable[dict[str, Any]]) -> None:
+        self._records[table] = {record["token"]: record for record in records}
+
+    def _read(self, table: str) -> Iterator[dict[str, Any]]:
         """Yield a table's records, checked."""
-        path = Path(self.table_root, f"{table}.json")
+        path = self._folder / f"{table}.json"
         for record in iterate_records(path):
             _check_record(record, table, path)
             yield record
 
-    def _wanted_sample_data(self) -> Iterator[dict[str, Any]]:
-        sensors = {sensor["token"]: sensor["channel"] for sensor in self.sensor}
-        channels = {c["token"]: sensors.get(c["sensor_token"]) for c in self.calibrated_sensor}
-        for record in self._records("sample_data"):
-            token = record["calibrated_sensor_token"]
-            if token not in channels:
-                raise self._broken_link("sample_data", record, "calibrated_sensor_token")
-            channel = channels[token]
-            is_sweep = channel == LIDAR and self._with_sweeps
-            if is_sweep or (record["is_key_frame"] and (channel == LIDAR or channel in CAMERAS)):
-                fields = ("token", *_FIELDS["sample_data"])
-                yield {name: record.get(name) for name in fields}
+    def _channel_of(self, record: dict[str, Any]) -> str:
+        """Return the sensor channel of a ``sample_data`` record."""
+        sensor = self._records["calibrated_sensor"][record["calibrated_sensor_token"]]
+        return self._records["sensor"][sensor["sensor_token"]]["channel"]
 
-    def __make_reverse_index__(self, verbose: bool) -> None:
-        """Check that every link leads somewhere, and let the devkit follow them."""
-        self.map = self._kept_maps
-        for table, links in _LINKS.items():
-            for name, target in links.items():
-                known = {record["token"] for record in getattr(self, target)}
-                for record in getattr(self, table):
-                    if record[name] not in known:
-                        raise self._broken_link(table, record, name)
-        super().__make_reverse_index__(verbose)
+    def _wanted_sample_data(self, with_sweeps: bool) -> Iterator[dict[str, Any]]:
+        for record in self._read("sample_data"):
+            self._check_link("sample_data", record, "calibrated_sensor_token")
+            channel = self._channel_of(record)
+            is_sweep = channel == LIDAR and with_sweeps
+            if is_sweep or (record["is_key_frame"] and channel in (LIDAR, *CAMERAS)):
+                yield {name: record[name] for name in ("token", *_FIELDS["sample_data"])}
 
-    def _broken_link(self, table: str, record: dict[str, Any], name: str) -> ValueError:
-        return ValueError(
-            f"{self.table_root}/{table}.json, record {record['token']!r}: {name} {record[name]!r} "
-            "leads nowhere; download the tables again."
-        )
+    def _check_links(self, *tables: str) -> None:
+        """Check that every link of tables leads somewhere."""
+        for table in tables:
+            for record in self._records[table].values():
+                for name in _LINKS[table]:
+                    self._check_link(table, record, name)
+
+    def _check_link(self, table: str, record: dict[str, Any], name: str) -> None:
+        if record[name] not in self._records[_LINKS[table][name]]:
+            raise ValueError(
+                f"{self._folder}/{table}.json, record {record['token']!r}: {name} "
+                f"{record[name]!r} leads nowhere; download the tables again."
+            )
 
     def chain(
         self, table: str, token: str, step: str, first: dict[str, Any]
@@ -201,20 +198,20 @@ class NuScenesTables(NuScenes):
         Raises:
             ValueError: If a link leads nowhere or back.
         """
-        known, seen, record = self._token2ind[table], set(), first
+        known, seen, record = self._records[table], set(), first
         while token:
             if token not in known:
                 raise ValueError(
-                    f"{self.table_root}/{table}.json has no record {token!r}, to which "
+                    f"{self._folder}/{table}.json has no record {token!r}, to which "
                     f"{record['token']!r} leads; download the tables again."
                 )
             if token in seen:
                 raise ValueError(
-                    f"{self.table_root}/{table}.json, record {record['token']!r}: {step} leads "
+                    f"{self._folder}/{table}.json, record {record['token']!r}: {step} leads "
                     f"back to {token!r}; download the tables again."
                 )
             seen.add(token)
-            record = self.get(table, token)
+            record = known[token]
             yield record
             token = record[step]
 
@@ -227,9 +224,16 @@ class NuScenesTables(NuScenes):
         return self.get("log", scene["log_token"])["location"]
 
 
-def _pose(record: dict[str, Any]) -> np.ndarray:
-    """Return the transform of an ``ego_pose`` or ``calibrated_sensor`` record. (4, 4)."""
-    return transform_matrix(record["translation"], Quaternion(record["rotation"]))
+def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
+    """Return the transform of a record's ``translation`` and ``rotation``. (4, 4).
+
+    The rotation is a quaternion (w, x, y, z), or in info files a matrix.
+    """
+    pose = np.eye(4)
+    turned = np.asarray(record[f"{prefix}rotation"], np.float64)
+    pose[:3, :3] = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
+    pose[:3, 3] = np.asarray(record[f"{prefix}translation"], np.float64).reshape(3)
+    return pose
 
 
 class SampleReader:
@@ -246,8 +250,8 @@ class SampleReader:
 
     def _global_from(self, data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Return global-from-sensor and ego-from-sensor of a sensor record. each (4, 4)."""
-        sensor = _pose(self._tables.get("calibrated_sensor", data["calibrated_sensor_token"]))
-        return _pose(self._tables.get("ego_pose", data["ego_pose_token"])) @ sensor, sensor
+        sensor = pose_of(self._tables.get("calibrated_sensor", data["calibrated_sensor_token"]))
+        return pose_of(self._tables.get("ego_pose", data["ego_pose_token"])) @ sensor, sensor
 
     def read(self, sample: dict[str, Any], scene: dict[str, Any]) -> MapSample:
         """Read a sample in the frame of its LiDAR, without instances and absent cameras."""
