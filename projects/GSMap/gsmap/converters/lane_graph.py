@@ -35,11 +35,10 @@ class LaneLinks:
     ) -> "LaneLinks":
         """Translate lane ids to positions; ids of lanes outside the map are left out."""
         position = {lane_id: i for i, lane_id in enumerate(ids)}
-
-        def translate(neighbours: Iterable[Hashable]) -> list[int]:
-            return [position[i] for i in neighbours if i in position]
-
-        return cls([translate(p) for p in predecessors], [translate(s) for s in successors])
+        return cls(
+            [[position[i] for i in lanes if i in position] for lanes in predecessors],
+            [[position[i] for i in lanes if i in position] for lanes in successors],
+        )
 
 
 class LanePaths:
@@ -68,22 +67,15 @@ class LanePaths:
             if not np.isfinite(line).all():
                 raise ValueError(f"polylines[{i}] holds NaN or infinity.")
         self._links = links
-        node_of_point: dict[tuple[float, ...], int] = {}
-        uses: list[int] = []
-        lanes: list[list[int]] = []
-        for line in polylines:
-            nodes = []
-            for point in map(tuple, np.round(line, ROUND_DECIMALS).tolist()):
-                node = node_of_point.setdefault(point, len(node_of_point))
-                if node == len(uses):
-                    uses.append(0)
-                uses[node] += 1
-                nodes.append(node)
-            lanes.append(nodes)
-        self._points = np.array(list(node_of_point), dtype=np.float64).reshape(-1, 3)  # (nodes, 3)
-        self._first = [nodes[0] for nodes in lanes]
-        self._last = [nodes[-1] for nodes in lanes]
-        self._edges = [_fold(nodes, uses) for nodes in lanes]
+        rounded = np.round(np.concatenate([np.empty((0, 3)), *polylines]), ROUND_DECIMALS)
+        self._points, nodes, uses = np.unique(
+            rounded, axis=0, return_inverse=True, return_counts=True
+        )  # (nodes, 3)
+        ends = np.cumsum([len(line) for line in polylines], dtype=np.int64)
+        lanes = [lane.tolist() for lane in np.split(nodes, ends)[:-1]]
+        self._first = [lane[0] for lane in lanes]
+        self._last = [lane[-1] for lane in lanes]
+        self._edges = [_fold(lane, uses) for lane in lanes]
         self._memo: tuple[tuple[int, ...], np.ndarray] = ((), np.empty(0, dtype=object))
 
     def simplified(self, lanes: Sequence[int]) -> np.ndarray:
@@ -102,22 +94,15 @@ class LanePaths:
         """
         key = tuple(lanes)
         if key != self._memo[0]:
-            paths = self._simple_paths(key)
+            graph, paths = self._subgraph(key), list[list[int]]()
+            entered = {end for edges in graph.values() for _, end in edges}
+            for source in (node for node, edges in graph.items() if edges and node not in entered):
+                paths += _paths_from(source, graph, MAX_PATHS - len(paths))
             nodes = np.array([node for path in paths for node in path], dtype=np.int64)
             indices = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
             lines = shapely.linestrings(self._points[nodes], indices=indices)
             self._memo = (key, shapely.simplify(lines, SIMPLIFY_TOLERANCE_M))
         return self._memo[1]
-
-    def _simple_paths(self, lanes: Sequence[int]) -> list[list[int]]:
-        """Return the nodes of each simple path from source to sink in the subgraph of ``lanes``."""
-        graph = self._subgraph(lanes)
-        entered = {end for edges in graph.values() for _, end in edges}
-        sources = [node for node, edges in graph.items() if edges and node not in entered]
-        paths: list[list[int]] = []
-        for source in sources:
-            paths.extend(_paths_from(source, graph, MAX_PATHS - len(paths)))
-        return paths
 
     def _subgraph(self, lanes: Sequence[int]) -> dict[int, list[Edge]]:
         """Return the edges that leave each node when only ``lanes`` take part, in their order."""
@@ -140,7 +125,7 @@ class LanePaths:
         return {node: list(edges) for node, edges in graph.items()}
 
 
-def _fold(nodes: Sequence[int], uses: Sequence[int]) -> list[tuple[int, Edge]]:
+def _fold(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge]]:
     """Return a lane's edges between its ends and shared nodes, private points folded in."""
     edges: list[tuple[int, Edge]] = []
     start, interior = nodes[0], []

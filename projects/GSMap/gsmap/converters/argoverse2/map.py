@@ -6,7 +6,6 @@ of rules.
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -57,20 +56,20 @@ def find_map(log_dir: Path) -> Path:
     return found[0]
 
 
-@dataclass(frozen=True)
-class LaneSide:
-    """The left or right boundaries of a log's lanes: which divide lanes, and how they join.
+class _LaneSide:
+    """The left or right boundaries of a log's lanes as a graph, and which divide lanes.
 
-    Args:
-        paths: The boundaries of the lanes on this side, as a graph.
-        neighbours: Position of the lane beyond the boundary; ``NO_LANE`` if it is not in the map.
-            (lanes,)
-        has_neighbour: Whether the lane names a lane beyond the boundary. (lanes,)
+    ``neighbours`` holds the position of the lane beyond each boundary, ``NO_LANE`` if it is not in
+    the map; ``has_neighbour`` whether the lane names one. each (lanes,)
     """
 
-    paths: LanePaths
-    neighbours: np.ndarray
-    has_neighbour: np.ndarray
+    def __init__(self, lanes: Sequence[LaneSegment], side: str, links: LaneLinks) -> None:
+        position = {segment.id: i for i, segment in enumerate(lanes)}
+        ids = [getattr(segment, f"{side}_neighbor_id") for segment in lanes]
+        boundaries = [getattr(segment, f"{side}_lane_boundary").xyz for segment in lanes]
+        self.paths = LanePaths(boundaries, links)
+        self.neighbours = np.array([position.get(i, NO_LANE) for i in ids], dtype=np.int64)
+        self.has_neighbour = np.array([i is not None for i in ids], dtype=bool)
 
     def dividing(self, lanes: np.ndarray) -> np.ndarray:
         """Return those of the given lanes that name a neighbour on this side."""
@@ -92,22 +91,19 @@ class Argoverse2Map:
         )
         self._lanes = GeometryLayer([shapely.Polygon(s.polygon_boundary) for s in lanes])
         self._is_intersection = np.array([s.is_intersection for s in lanes], dtype=bool)
-        self._left = _lane_side(lanes, "left", links)
-        self._right = _lane_side(lanes, "right", links)
-        self._centre = LanePaths(
-            [static_map.get_lane_segment_centerline(s.id).round(ROUND_DECIMALS) for s in lanes],
-            links,
-        )
-        self._marked = GeometryLayer(_marked_boundaries(lanes))
-        self._crossings = GeometryLayer(
-            [
-                shapely.Polygon(np.vstack([crossing.edge1.xyz, crossing.edge2.xyz[::-1]]))
-                for crossing in static_map.get_scenario_ped_crossings()
-            ]
-        )
-        self._drivable = GeometryLayer(
-            [shapely.Polygon(area.xyz) for area in static_map.get_scenario_vector_drivable_areas()]
-        )
+        self._left = _LaneSide(lanes, "left", links)
+        self._right = _LaneSide(lanes, "right", links)
+        centres = [static_map.get_lane_segment_centerline(s.id) for s in lanes]
+        self._centre = LanePaths([line.round(ROUND_DECIMALS) for line in centres], links)
+        markings = [m for s in lanes for m in (s.left_lane_marking, s.right_lane_marking)]
+        # an unknown mark counts as paint
+        painted = [m.polyline for m in markings if m.mark_type is not LaneMarkType.NONE]
+        self._marked = GeometryLayer([shapely.LineString(line) for line in painted])
+        crossings = static_map.get_scenario_ped_crossings()
+        rings = [np.vstack([c.edge1.xyz, c.edge2.xyz[::-1]]) for c in crossings]
+        self._crossings = GeometryLayer([shapely.Polygon(ring) for ring in rings])
+        areas = static_map.get_scenario_vector_drivable_areas()
+        self._drivable = GeometryLayer([shapely.Polygon(area.xyz) for area in areas])
 
     @classmethod
     def from_log(cls, log_dir: Path) -> "Argoverse2Map":
@@ -208,22 +204,3 @@ class Argoverse2Map:
         pieces, _ = clip_polygons(self._drivable.near(patch), patch)
         area = shapely.get_parts(shapely.union_all(pieces))
         return cut_rings(rings_of(area), patch.box(-EDGE_MARGIN_M))[0]
-
-
-def _lane_side(lanes: Sequence[LaneSegment], side: str, links: LaneLinks) -> LaneSide:
-    """Collect one side's boundaries and neighbours of all lanes."""
-    position = {segment.id: i for i, segment in enumerate(lanes)}
-    neighbour_ids = [getattr(segment, f"{side}_neighbor_id") for segment in lanes]
-    return LaneSide(
-        LanePaths([getattr(segment, f"{side}_lane_boundary").xyz for segment in lanes], links),
-        np.array([position.get(i, NO_LANE) for i in neighbour_ids], dtype=np.int64),
-        np.array([i is not None for i in neighbour_ids], dtype=bool),
-    )
-
-
-def _marked_boundaries(lanes: Sequence[LaneSegment]) -> list[shapely.LineString]:
-    """Return the left and right boundaries that carry paint (an unknown mark counts as paint)."""
-    markings = [m for s in lanes for m in (s.left_lane_marking, s.right_lane_marking)]
-    return [
-        shapely.LineString(m.polyline) for m in markings if m.mark_type is not LaneMarkType.NONE
-    ]

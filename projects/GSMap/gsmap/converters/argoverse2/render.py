@@ -4,7 +4,7 @@ import argparse
 import os
 import shutil
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -82,66 +82,40 @@ def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int,
     return intrinsics, width, height
 
 
-class LogRenderer:
-    """Renders the ring cameras of one log.
+def _prepare(
+    log: Argoverse2Log, cameras: dict[str, PinholeCamera], times_ns: np.ndarray, scale: float
+) -> Callable[[str, int], bytes]:
+    """Lay out the ground around where pictures will be taken, and return what takes them, as JPEG.
 
-    Args:
-        log: The log.
-        calibration: Its cameras by name, or another log's.
-        times_ns: When pictures will be taken: the ground is laid out around these places. (n,)
-        scale: Size of the pictures relative to the real cameras'.
-
-    Raises:
-        FileNotFoundError: If the map is missing.
-        ValueError: If the map's ground height is missing.
+    It takes the name of a camera and a row's time in the pose table.
     """
+    track = np.array([log.poses.at(t)[:2, 3] for t in times_ns.tolist()])  # type: ignore[index]
+    bounds = (*(track.min(0) - VIEW_M).tolist(), *(track.max(0) + VIEW_M).tolist())
+    static_map = ArgoverseStaticMap.from_json(find_map(log.log_dir))
+    try:
+        heights = GroundHeightLayer.from_file(log.log_dir / "map")
+    except RuntimeError as error:
+        raise ValueError(f"{error} in {log.log_dir / 'map'}") from error
+    pinholes = {name: scaled_camera(camera, scale) for name, camera in cameras.items()}
+    widest = max(width for _, width, _ in pinholes.values())
+    rng = np.random.default_rng(zlib.crc32(log.log_id.encode()))
+    renderer = SceneRenderer(
+        make_scene(static_map, heights, bounds),
+        bounds,
+        random_lighting(rng),
+        float(np.clip(GROUND_PIXELS_PER_IMAGE_PIXEL / widest, 0.05, 0.12)),
+        rng,
+    )
 
-    def __init__(
-        self,
-        log: Argoverse2Log,
-        calibration: dict[str, PinholeCamera],
-        times_ns: np.ndarray,
-        scale: float,
-    ) -> None:
-        self._log, self._scale = log, scale
-        self._calibration = calibration
-        track = np.array([log.poses.at(t)[:2, 3] for t in times_ns.tolist()])  # type: ignore[index]
-        low, high = track.min(0) - VIEW_M, track.max(0) + VIEW_M
-        bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        static_map = ArgoverseStaticMap.from_json(find_map(log.log_dir))
-        try:
-            heights = GroundHeightLayer.from_file(log.log_dir / "map")
-        except RuntimeError as error:
-            raise ValueError(f"{error} in {log.log_dir / 'map'}") from error
-        widths = [scaled_camera(camera, scale)[1] for camera in calibration.values()]
-        seed = zlib.crc32(log.log_id.encode())
-        self._rng = np.random.default_rng(seed)
-        self._renderer = SceneRenderer(
-            make_scene(static_map, heights, bounds),
-            bounds,
-            random_lighting(self._rng),
-            float(np.clip(GROUND_PIXELS_PER_IMAGE_PIXEL / max(widths), 0.05, 0.12)),
-            self._rng,
-        )
-
-    def render(self, name: str, timestamp_ns: int) -> bytes:
-        """Take the picture of a camera at a row of the pose table, as JPEG.
-
-        Raises:
-            ValueError: If the pose table has no such row.
-        """
-        pose = self._log.poses.at(timestamp_ns)
-        if pose is None:
-            raise ValueError(f"log {self._log.log_id} has no pose at {timestamp_ns}.")
-        camera = self._calibration[name]
-        intrinsics, width, height = scaled_camera(camera, self._scale)
-        cam_from_city = np.linalg.inv(pose @ camera.ego_SE3_cam.transform_matrix)
-        image = self._renderer.render_camera(
-            Camera(intrinsics, width, height, cam_from_city), [], self._rng
-        )
+    def take(name: str, timestamp_ns: int) -> bytes:
+        city_from_cam = log.poses.at(timestamp_ns) @ cameras[name].ego_SE3_cam.transform_matrix
+        camera = Camera(*pinholes[name], np.linalg.inv(city_from_cam))
+        image = renderer.render_camera(camera, [], rng)
         encoded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         assert encoded, image.shape
         return data.tobytes()
+
+    return take
 
 
 def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
@@ -165,11 +139,10 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
     """
     if out_dir.exists():
         raise FileExistsError(f"{out_dir} is there already and kept: delete it to render it again")
-    log = Argoverse2Log(log_dir)
-    source = log if log.calibration else None
-    if source is None and options.calibration is not None:
+    source = log = Argoverse2Log(log_dir)
+    if not log.calibration and options.calibration is not None:
         source = Argoverse2Log(options.calibration)
-    if source is None or len(source.calibration) < len(RING_CAMERAS):
+    if len(source.calibration) < len(RING_CAMERAS):
         raise ValueError(
             "no calibration of the ring cameras (--calibration-from names another log)"
         )
@@ -178,7 +151,7 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         times = thin_out(times, options.rate_hz)
     if options.max_frames is not None and len(times) > options.max_frames:
         times = times[np.linspace(0, len(times) - 1, options.max_frames).round().astype(int)]
-    renderer = LogRenderer(log, source.calibration, times, options.scale)
+    take = _prepare(log, source.calibration, times, options.scale)
     out_dir.parent.mkdir(parents=True, exist_ok=True)
     partial_dir = partial_path(out_dir)
     try:
@@ -186,7 +159,7 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         for timestamp_ns in times.tolist():
             for name in RING_CAMERAS:
                 path = partial_dir / "sensors" / "cameras" / name / f"{timestamp_ns}.jpg"
-                path.write_bytes(renderer.render(name, timestamp_ns))
+                path.write_bytes(take(name, timestamp_ns))
         os.rename(partial_dir, out_dir)
     finally:
         shutil.rmtree(partial_dir, ignore_errors=True)
