@@ -1,6 +1,8 @@
 """Predictions on their way to a result file: what a killed run goes on from."""
 
+import fcntl
 import json
+import logging
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -8,6 +10,7 @@ from typing import Any
 from gsmap.evaluation.results_json import write_results
 
 _SUFFIX = ".unfinished"
+_LOGGER = logging.getLogger(__name__)
 
 
 class ResultLog:
@@ -18,6 +21,9 @@ class ResultLog:
     Args:
         out: The result file.
         settings: What decides the predictions, as plain values.
+
+    Raises:
+        RuntimeError: If another process is at work on the same result file.
 
     Attributes:
         done: Tokens of the frames that need no more work.
@@ -33,15 +39,28 @@ class ResultLog:
 
     def __enter__(self) -> "ResultLog":
         self.out.parent.mkdir(parents=True, exist_ok=True)
-        content = self.path.read_bytes() if self.path.is_file() else b""
+        self._file = self.path.open("a", encoding="utf-8")
+        self._lock()
+        content = self.path.read_bytes()
         whole = content[: content.rfind(b"\n") + 1]  # a kill may cut the last line
         if not whole.startswith(self._head.encode()):
             whole = self._head.encode()
         for line in whole.decode().splitlines()[1:]:
             self._note(json.loads(line))
         self.path.write_bytes(whole)
-        self._file = self.path.open("a", encoding="utf-8")
         return self
+
+    def _lock(self) -> None:
+        """Raise a ``RuntimeError`` if another process writes the file, also on another machine."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self._file.close()
+            raise RuntimeError(
+                f"another process writes {self.path}: wait for its end, or give another --out."
+            ) from error
+        except OSError:  # a file system without locks
+            _LOGGER.warning("%s cannot be locked: take care that one process writes it.", self.path)
 
     def __exit__(
         self,
