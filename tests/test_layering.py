@@ -24,7 +24,7 @@ ALLOWED = {
     "datasets": {"structures", "utils"},
     "converters": {"datasets", "structures", "utils", "minicity"},
     "evaluation": {"datasets", "ops", "structures", "utils"},
-    "visualization": {"datasets", "ops", "structures", "utils"},
+    "visualization": {"datasets", "evaluation", "ops", "structures", "utils"},
     "inputs": {"converters", "datasets", "structures", "utils", "visualization"},
     "report": {"datasets", "evaluation", "structures", "utils", "visualization"},
     "maps": {"datasets", "evaluation", "structures", "utils", "visualization"},

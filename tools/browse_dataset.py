@@ -15,7 +15,7 @@ from gsmap.apis.map_inferencer import spread_evenly
 from gsmap.engine.launch import add_config_options, read_config
 from gsmap.report.page import ReportOptions, report_data, write_page
 from gsmap.utils.cli import CommandParser, output_file, run_command
-from gsmap.visualization.figure import FORMATS, picture_name, save_figure
+from gsmap.visualization.figure import FORMATS, sample_name, save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
 
 
@@ -54,8 +54,7 @@ def main() -> str:
         sample = item["data_samples"]
         images = None if args.original else images_from_inputs(item["inputs"]["img"])
         figure = visualizer.draw_sample(sample, images)
-        name = picture_name(sample.metainfo["token"], f".{args.format}")
-        save_figure(figure, args.show_dir / name)
+        save_figure(figure, args.show_dir / sample_name(sample.metainfo, f".{args.format}"))
     return f"\n{len(indices)} pictures: {args.show_dir}"
 
 

@@ -29,7 +29,7 @@ from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_bytes
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
-from gsmap.visualization.figure import FORMATS, picture_name, save_figure
+from gsmap.visualization.figure import FORMATS, sample_name, save_figure
 
 SKIPPED = 1  # exit code when frames were broken
 
@@ -172,7 +172,7 @@ def draw(
         index = dataset.annotations.column("token").index(token)
         points = inferencer.lidar_points(dataset, index)
     figure = inferencer.draw(sample, score_thr=args.score_thr, points=points)
-    save_figure(figure, args.show_dir / picture_name(token, f".{args.format}"))
+    save_figure(figure, args.show_dir / sample_name(sample.metainfo, f".{args.format}"))
 
 
 def main(argv: list[str] | None = None) -> str | None:

@@ -11,7 +11,7 @@ default_hooks = dict(
     param_scheduler=dict(type='ParamSchedulerHook'),
     checkpoint=dict(type='AtomicCheckpointHook', interval=1, max_keep_ckpts=3),
     sampler_seed=dict(type='DistSamplerSeedHook'),
-    visualization=dict(type='MapVisualizationHook', draw=False))
+    visualization=dict(type='MapVisualizationHook', draw=True, num_val_samples=2))
 custom_hooks = [dict(type='GaussianHealthHook')]
 val_evaluator = dict(type='MapMetric', eval=['chamfer'])
 test_evaluator = dict(type='MapMetric', eval=['chamfer', 'raster'])

@@ -1,8 +1,12 @@
 """What a picture shows, read back from its pixels."""
 
+from itertools import combinations
+
+import cv2
 import numpy as np
 import pytest
 from matplotlib import colors as mcolors
+from matplotlib.transforms import Bbox
 
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
@@ -17,6 +21,7 @@ from gsmap.visualization import (
 )
 from gsmap.visualization.bev_view import raster_picture
 from gsmap.visualization.camera_view import arrange_cameras, viewing_azimuth
+from gsmap.visualization.style import CLASS_COLOURS, MATCH_COLOURS, RUN_COLOURS
 
 STYLE = MapStyle()
 GRID = BEVGrid((-15, 15), (-30, 30), 60, 30)
@@ -231,6 +236,64 @@ def test_pictures_are_written_whole(tmp_path, suffix):
     path = save_figure(figure, tmp_path / "new" / f"picture{suffix}")
     assert path.stat().st_size > 1000
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_an_svg_stays_small(tmp_path):
+    """Six photographs and twenty elements with Gaussians, as a busy crossing of nuScenes has."""
+    rng = np.random.default_rng(0)
+    noise = cv2.resize(rng.integers(0, 255, (27, 48, 3), np.uint8), (1600, 900))
+    rig = [camera(c.name, a, (1600, 900)) for c, a in zip(RIG, range(0, 360, 60), strict=True)]
+    rig = [CameraView(c.name, noise, c.img_from_frame) for c in rig]
+    lines = [np.c_[np.full(20, x), np.linspace(-30, 30, 20)] for x in np.linspace(-14, 14, 20)]
+    found = MapElements.from_polylines(
+        lines,
+        np.arange(20) % 3,
+        np.linspace(0.4, 1, 20),
+        np.full((20, 20, 2), 0.5),
+        np.zeros((20, 20)),
+    )
+    panels = [
+        BEVPanel("", found),
+        BEVPanel("", found, vertices=True, scores=True),
+        BEVPanel("", found, truth=found, hits=np.arange(20)),
+        BEVPanel("", found, lines=False, gaussians=True),
+    ]
+    figure = compose_figure(rig, panels, GRID, VIEW, STYLE, found)
+    text = save_figure(figure, tmp_path / "busy.svg").read_text()
+    assert len(text) < 500_000
+    assert text.count("data:image/jpeg") == 6
+    assert "data:image/png" not in text
+    assert 'transform="scale(0.015625)"' in text  # of glyphs, which a shorter number would shrink
+
+
+def test_scores_are_clear_of_the_vehicle_the_border_and_each_other():
+    xs = np.array([-0.6, -0.3, 0.0, 0.3, 14.9])
+    lines = [np.c_[np.full(13, x), np.linspace(-6, 6, 13)] for x in xs]
+    found = MapElements.from_polylines(lines, np.zeros(5, int), np.array([0.5, 0.6, 0.9, 0.8, 0.7]))
+    figure = compose_figure([], [BEVPanel("", found, scores=True)], GRID, VIEW, STYLE)
+    figure.canvas.draw()
+    (ax,) = figure.axes
+    boxes = {t.get_text(): t.get_window_extent() for t in ax.texts}
+    assert set(boxes) == {"0.90", "0.80", "0.60", "0.50"}  # at the border there is no room
+    rear, front, width = VIEW.vehicle_m
+    car = ax.transData.transform_bbox(Bbox([[-width / 2, rear], [width / 2, front]]))
+    shown = [*boxes.values(), car]
+    assert not any(a.overlaps(b) for a, b in combinations(shown, 2))
+
+
+def test_the_legend_has_what_is_drawn():
+    def legend(*panels, over=None):
+        figure = compose_figure(RIG[:1], panels, GRID, VIEW, STYLE, over, width_px=300)
+        return [text.get_text() for text in figure.legends[0].get_texts()]
+
+    boundary = MapElements.from_polylines((np.array([[-14.0, 29], [-1, 29]]),), np.array([2]))
+    assert legend(BEVPanel("", elements())) == ["divider", "pedestrian crossing"]
+    assert legend(BEVPanel("", None), over=boundary) == ["road boundary"]
+    assert legend(BEVPanel("", MapElements.from_polylines())) == []
+
+
+def test_a_colour_means_one_thing():
+    assert not set(RUN_COLOURS) & {*CLASS_COLOURS.values(), *MATCH_COLOURS.values()}
 
 
 def test_width_is_kept():

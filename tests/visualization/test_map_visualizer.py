@@ -1,13 +1,17 @@
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from mmdet3d.registry import HOOKS, VISUALIZERS
 from mmdet3d.structures import Det3DDataSample
+from mmengine.config import Config
 from mmengine.structures import InstanceData
 
 import gsmap.visualization.map_visualization_hook  # noqa: F401 (registers the hook)
-from gsmap.visualization.figure import picture_name
+from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
+from gsmap.visualization.figure import picture_name, sample_name, sample_title
 from gsmap.visualization.frame_view import FRAME_VIEWS
 from gsmap.visualization.map_visualizer import (
     ground_truth_elements,
@@ -15,6 +19,7 @@ from gsmap.visualization.map_visualizer import (
     predicted_elements,
 )
 
+RUNTIME = Path(__file__).resolve().parents[2] / "configs/_base_/default_runtime.py"
 CLASSES = ("divider", "ped_crossing", "boundary")
 
 
@@ -33,8 +38,8 @@ def make_sample(folder, gaussians=True, truth=True, cameras=2, token="scene/1"):
             "scene": "scene",
             "img_path": paths,
             "cam_names": [f"CAM_{i}" for i in range(cameras)],
-            "lidar2img": np.stack([half @ projection] * cameras),
-            "img_aug_matrix": np.stack([half] * cameras),
+            "lidar2img": np.reshape([half @ projection] * cameras, (-1, 4, 4)),
+            "img_aug_matrix": np.reshape([half] * cameras, (-1, 4, 4)),
             "eval_ann_info": info if truth else None,
         }
     )
@@ -60,17 +65,75 @@ def titles(figure):
 
 
 def test_panels_follow_what_the_sample_has(tmp_path):
-    visualizer = make_visualizer("panels", width_px=500)
-    full = ["Ground truth", "Prediction", "Gaussians (1$\\sigma$)", "Rendered masks"]
-    assert titles(visualizer.draw_sample(make_sample(tmp_path))) == full
-    assert titles(visualizer.draw_sample(make_sample(tmp_path, gaussians=False))) == full[:2]
-    sample = make_sample(tmp_path, truth=False)
-    assert titles(visualizer.draw_sample(sample)) == full[1:]
-    silent = visualizer.draw_sample(sample, score_thr=0.99)
-    assert titles(silent) == full[1:]
-    notes = {text.get_text() for ax in silent.axes for text in ax.texts}
+    visualizer = make_visualizer("panels", width_px=300)
+
+    def drawn(score_thr=None, draw_pred=True, **parts):
+        sample = make_sample(tmp_path, cameras=0, **parts)
+        figure = visualizer.draw_sample(sample, score_thr=score_thr, draw_pred=draw_pred)
+        return titles(figure), {text.get_text() for ax in figure.axes for text in ax.texts}
+
+    full = [
+        "Ground truth",
+        "Prediction",
+        "Hits within 1 m",
+        "Gaussians (1\N{GREEK SMALL LETTER SIGMA})",
+    ]
+    assert drawn()[0] == full
+    assert drawn(gaussians=False)[0] == full[:3]
+    assert drawn(truth=False)[0] == full[1::2]
+    panels, notes = drawn(truth=False, score_thr=0.99)
+    assert panels == full[1::2]
     assert "no score reaches 0.99 (highest 0.9)" in notes
-    assert titles(visualizer.draw_sample(make_sample(tmp_path), draw_pred=False)) == full[:1]
+    assert drawn(draw_pred=False)[0] == full[:1]
+    visualizer.panels = ("rasters",)
+    assert drawn()[0] == ["Rendered masks"]
+
+
+def labels(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_hits_are_those_of_the_evaluation_and_the_legend_has_what_is_drawn(tmp_path):
+    """Dividers 0.4 m, 0.6 m and 6 m beside the only one; the crossing has no counterpart."""
+    sample = make_sample(tmp_path, cameras=0)
+    ahead = np.linspace(1, 20, 20)
+    lines = [np.c_[np.full(20, x), ahead] for x in (0.6, 0.4, 6.0, -8.0)]
+    scores = np.array([0.6, 0.9, 0.8, 0.7])
+    sample.pred_instances_3d = InstanceData(
+        scores_3d=torch.tensor(scores),
+        labels_3d=torch.tensor([0, 0, 0, 1]),
+        pts=torch.tensor(np.stack(lines)),
+    )
+    visualizer = make_visualizer("matches", panels=["matches"], width_px=300)
+    truth, found = ground_truth_elements(sample), predicted_elements(sample)
+    matched = match_chamfer(found, truth, ChamferConfig(CLASSES))
+    hits = set(matched.pred_index[matched.matched_gt[:, 1] >= 0])
+    (panel,) = visualizer._bev_panels(truth, found, None, "")
+    assert panel.fates == (["hit" if i in hits else "false" for i in range(4)], ["found"])
+    assert found.confidence[list(hits)] == [0.9]
+    figure = visualizer.draw_sample(sample)
+    assert labels(figure) == [
+        "divider",
+        "pedestrian crossing",
+        "hit (1)",
+        "false (3)",
+        "truth found (1)",
+    ]
+    assert labels(visualizer.draw_sample(sample, score_thr=0.95)) == ["truth missed (1)"]
+    visualizer.match_m = 0.2
+    strict = labels(visualizer.draw_sample(sample, score_thr=0.85))
+    assert strict == ["divider", "false (1)", "truth missed (1)"]
+
+
+def test_scene_and_time_name_a_picture(tmp_path):
+    meta = {"scene": "scene/7", "seconds": 12.5, "token": "0123456789abcdef"}
+    assert sample_name(meta, ".png") == "scene_7_0012.50s_89abcdef.png"
+    assert sample_title(meta) == "scene/7  ·  12.50 s  ·  0123456789abcdef"
+    assert sample_name({"scene": "a", "token": "b/1"}, ".png") == "b_1.png"
+    sample = make_sample(tmp_path, cameras=0)
+    sample.set_metainfo({"seconds": 3.0})
+    figure = make_visualizer("named", width_px=300).draw_sample(sample)
+    assert figure.texts[0].get_text() == "scene  ·  3.00 s  ·  scene/1"
 
 
 def test_predictions_are_chosen_by_score_and_drawn_in_its_order(tmp_path):
@@ -131,18 +194,22 @@ def test_pictures_reach_tensorboard(tmp_path):
         vis_backends=[{"type": "TensorboardVisBackend"}],
         save_dir=str(tmp_path),
     )
-    visualizer.add_datasample("val_1", None, make_sample(tmp_path), step=7)
+    hook = HOOKS.build(Config.fromfile(RUNTIME).default_hooks.visualization)
+    for runner in (FakeRunner(visualizer, batches=3), FakeRunner(visualizer, batches=3, step=9)):
+        hook.after_val_iter(runner, 0, {}, [make_sample(tmp_path, token="1")])
     visualizer.close()
     events = EventAccumulator(str(tmp_path / "vis_data")).Reload()
-    image = events.Images("val_1")[0]
-    assert (image.step, image.width) == (7, 300)
+    images = events.Images("val_1")
+    assert [(image.step, image.width) for image in images] == [(3, 300), (9, 300)]
+    picture = cv2.imdecode(np.frombuffer(images[0].encoded_image_string, np.uint8), 1)
+    assert picture.std() > 20
 
 
 class FakeRunner:
     """What the hook reads off a runner."""
 
-    def __init__(self, visualizer, batches=10, rank=0):
-        self.visualizer, self.rank, self.iter = visualizer, rank, 3
+    def __init__(self, visualizer, batches=10, rank=0, step=3):
+        self.visualizer, self.rank, self.iter = visualizer, rank, step
         self.val_dataloader = range(batches)
 
 

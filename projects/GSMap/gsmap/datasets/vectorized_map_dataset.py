@@ -202,6 +202,7 @@ class VectorizedMapDataset(BaseDataset):
             "scene": sample.scene,
             "map_name": sample.map_name,
             "timestamp_ns": sample.timestamp_ns,
+            "seconds": self.annotations.seconds_into_scene[entry["row"]],
             "timestamp": sample.timestamp_ns / 1e9,
             "lidar2global": sample.global_from_frame,
             "lidar2ego": sample.ego_from_frame,

@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.report.scores import ScoredResult
@@ -43,15 +42,6 @@ def choose_frames(
         worst = (i for i in np.argsort(f1, kind="stable").tolist() if i not in chosen)
         chosen.update(i for i, _ in zip(worst, range(max_frames - even), strict=False))
     return sorted(chosen)
-
-
-def seconds_into_scene(file: AnnotationFile) -> list[float]:
-    """Return each sample's time since the first of its scene, in seconds."""
-    scenes, times = file.column("scene"), file.column("timestamp_ns")
-    start: dict[str, int] = {}
-    for scene, time in zip(scenes, times, strict=True):
-        start[scene] = min(time, start.get(scene, time))
-    return [(t - start[scene]) / 1e9 for scene, t in zip(scenes, times, strict=True)]
 
 
 def _centimetres(points: np.ndarray, view: FrameView) -> list[int]:

@@ -18,7 +18,6 @@ from gsmap.report.frames import (
     cameras_of,
     choose_frames,
     found_of,
-    seconds_into_scene,
     truth_of,
 )
 from gsmap.report.scores import MATCH_M, score_result
@@ -85,7 +84,7 @@ def report_data(
         score_result(name, path, truth, meta, options.allow_mismatch)
         for name, path in results.items()
     ]
-    tokens, seconds = file.column("token"), seconds_into_scene(file)
+    tokens, seconds = file.column("token"), file.seconds_into_scene
     chosen = choose_frames(tokens, options.max_frames, scored, options.score_thr)
     root = Path(annotations).parent if options.data_root is None else options.data_root
     frames = []

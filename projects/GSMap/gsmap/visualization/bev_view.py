@@ -1,18 +1,28 @@
 """One bird's-eye-view panel: road ahead pointing up, metric grid, ego vehicle, map elements."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib import colors as mcolors
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
+from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 from matplotlib.patches import FancyBboxPatch, Polygon
+from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.visualization.frame_view import FrameView
-from gsmap.visualization.style import MapStyle
+from gsmap.visualization.style import FALSE_DASHES, MATCH_COLOURS, TRUTH_OPACITY, MapStyle
+
+_SCORE_PT = 6.5
+_K = 4 / 3 * (np.sqrt(2) - 1)  # four Bezier curves that make a circle within 0.03 %
+_QUARTERS = np.array([1, 1 + 1j * _K, _K + 1j]) * 1j ** np.arange(5)[:, None]
+_CIRCLE = _QUARTERS.ravel()[:13].view(np.float64).reshape(13, 2)
+_CURVES = [Path.MOVETO, *[Path.CURVE4] * 12]
 
 
 @dataclass(frozen=True)
@@ -31,6 +41,8 @@ class BEVPanel:
         rasters: Occupancy in [0, 1] per element on ``BEVGrid`` rows and columns, drawn instead of a
             background. (N, H, W)
         points: Points (x, y) to draw as faint dots, such as a LiDAR sweep. (n, >= 2)
+        truth: Ground truth in broad lines under the elements, coloured by whether it is found.
+        hits: Index of the ground truth that each element hits, or -1; colours elements by it. (N,)
     """
 
     title: str
@@ -43,6 +55,16 @@ class BEVPanel:
     scores: bool = False
     rasters: np.ndarray | None = None
     points: np.ndarray | None = None
+    truth: MapElements | None = None
+    hits: np.ndarray | None = None
+
+    @property
+    def fates(self) -> tuple[list[str], list[str]]:
+        """What becomes of each element with ``hits`` and of each ground truth in ``truth``."""
+        hits = () if self.hits is None else self.hits
+        found = np.isin(np.arange(len(self.truth or ())), hits)
+        elements = ["hit" if hit >= 0 else "false" for hit in hits]
+        return elements, ["found" if is_found else "missed" for is_found in found]
 
 
 def display_extent(grid: BEVGrid, view: FrameView) -> tuple[float, float, float, float]:
@@ -73,6 +95,13 @@ def _draw_grid(ax: Axes, extent: tuple[float, float, float, float], style: MapSt
     ax.spines[:].set(color=style.grid, linewidth=0.8)
 
 
+def _draw_points(ax: Axes, points: np.ndarray | None, view: FrameView) -> None:
+    """Draw LiDAR points faintly."""
+    if points is not None and len(points):
+        x, y = view.display_from_frame(points).T
+        ax.scatter(x, y, s=0.25, c="#9AA3AE", alpha=0.55, linewidths=0, zorder=2)
+
+
 def _draw_vehicle(ax: Axes, view: FrameView) -> None:
     """Draw the ego vehicle to scale, its windscreen towards the road ahead."""
     rear, front, width = view.vehicle_m
@@ -94,25 +123,39 @@ def _draw_vehicle(ax: Axes, view: FrameView) -> None:
 
 
 def _draw_lines(
-    ax: Axes, lines: list[np.ndarray], labels: np.ndarray, style: MapStyle, width_pt: float
+    ax: Axes,
+    lines: list[np.ndarray],
+    labels: np.ndarray,
+    style: MapStyle,
+    colours: Sequence[Any],
+    width_pt: float,
+    zorder: float = 10,
+    fates: Sequence[str] = (),
 ) -> None:
-    """Draw polylines in their classes' colours and fill the closed ones faintly."""
-    closed = [i for i, label in enumerate(labels) if style.is_closed(label)]
-    faces = mcolors.to_rgba_array(style.colours(labels[closed]), 0.16)
-    areas = PolyCollection(
-        [lines[i] for i in closed], facecolors=faces, edgecolors="none", zorder=4
+    """Draw polylines in these colours, false ones dashed, and fill those of closed classes."""
+    areas = [i for i, label in enumerate(labels) if style.is_closed(label)]
+    faces = [(*mcolors.to_rgb(colours[i]), 0.2) for i in areas]
+    shapes = [lines[i] for i in areas]
+    ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=4))
+    strokes = LineCollection(
+        lines,
+        colors=colours,
+        linewidths=width_pt,
+        linestyles=[FALSE_DASHES if fate == "false" else "-" for fate in fates] or "-",
+        joinstyle="round",
+        zorder=zorder,
     )
-    ax.add_collection(areas)
-    ax.add_collection(
-        LineCollection(
-            lines,
-            colors=style.colours(labels),
-            linewidths=width_pt,
-            capstyle="round",
-            joinstyle="round",
-            zorder=10,
-        )
-    )
+    ax.add_collection(strokes)
+
+
+def _draw_truth(
+    ax: Axes, panel: BEVPanel, truth: MapElements, view: FrameView, style: MapStyle
+) -> None:
+    """Draw the ground truth in broad lines that tell what is found from what is missed."""
+    fates = panel.fates[1]
+    colours = [mcolors.to_rgba(MATCH_COLOURS[fate], TRUTH_OPACITY[fate]) for fate in fates]
+    lines = [view.display_from_frame(line) for line in truth.polylines]
+    _draw_lines(ax, lines, truth.labels, style, colours, 2.6 * style.bev_line_pt, zorder=8)
 
 
 def _draw_order(ax: Axes, lines: list[np.ndarray], colours: list[str]) -> None:
@@ -130,38 +173,53 @@ def _draw_gaussians(ax: Axes, elements: MapElements, view: FrameView, style: Map
     """Draw each Gaussian as the ellipse at one standard deviation."""
     assert elements.scales is not None
     assert elements.rotations is not None
-    colours = style.colours(np.repeat(elements.labels, elements.num_points))
-    ellipses = EllipseCollection(
-        widths=2 * elements.scales[:, 0],
-        heights=2 * elements.scales[:, 1],
-        angles=np.degrees(elements.rotations + view.display_turn_rad),
-        units="xy",
-        offsets=view.display_from_frame(elements.points),
-        transOffset=ax.transData,
-        facecolors=mcolors.to_rgba_array(colours, 0.22),
-        edgecolors=colours,
-        linewidths=0.8,
-        zorder=11,
+    centres = view.display_from_frame(elements.points)  # (M, 2)
+    turn = elements.rotations + view.display_turn_rad
+    axes = np.stack([np.cos(turn), np.sin(turn), -np.sin(turn), np.cos(turn)], -1).reshape(-1, 2, 2)
+    edges = _CIRCLE @ (elements.scales[..., None] * axes) + centres[:, None]  # (M, 13, 2)
+    ellipses = [Path(edge, _CURVES) for edge in edges]
+    paths = [
+        Path.make_compound_path(*ellipses[a:b]) for a, b in pairwise(elements.offsets.tolist())
+    ]
+    colours = style.colours(elements.labels)
+    faces = mcolors.to_rgba_array(colours, 0.4)
+    ax.add_collection(
+        PathCollection(paths, facecolors=faces, edgecolors=colours, linewidths=0.4, zorder=11)
     )
-    ax.add_collection(ellipses)
 
 
-def _draw_scores(ax: Axes, lines: list[np.ndarray], elements: MapElements, style: MapStyle) -> None:
-    """Write each score at the middle of its element, in a darker colour."""
-    left, right = ax.get_xlim()
-    bottom, top = ax.get_ylim()
-    colours = 0.62 * mcolors.to_rgba_array(style.colours(elements.labels))[:, :3]
-    for line, colour, score in zip(lines, colours, elements.confidence, strict=True):
-        x, y = line[len(line) // 2]
+def _draw_scores(
+    ax: Axes, lines: list[np.ndarray], scores: np.ndarray, colours: list[str], view: FrameView
+) -> None:
+    """Write each score at the vertex nearest its element's middle that is free.
+
+    Free is what the border, the vehicle and the scores of surer elements leave; without such a
+    vertex a score is left out.
+    """
+    low, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
+    rear, front, width = view.vehicle_m
+    letter_m = _SCORE_PT / 72 * ax.figure.dpi * (high - low)[1] / ax.get_window_extent().height
+    half = letter_m * np.array([1.4, 0.6])  # of a score's width and height
+    taken = [np.array([0, (rear + front) / 2])]
+    reach = [half + np.array([width, front - rear]) / 2]
+    for i in np.argsort(-scores, kind="stable"):
+        count = len(lines[i])
+        at = lines[i][np.argsort(np.abs(np.arange(count) - count // 2), kind="stable")]
+        free = ((at > low + half) & (at < high - half)).all(axis=1)
+        free &= (np.abs(at[:, None] - taken) > reach).any(axis=2).all(axis=1)
+        if not free.any():
+            continue
+        taken.append(at[free.argmax()])
+        reach.append(2 * half)
         ax.text(
-            np.clip(x, left + 1.2, right - 1.2),
-            np.clip(y, bottom + 0.8, top - 0.8),
-            f"{score:.2f}",
-            fontsize=5.5,
-            color=tuple(colour),
+            taken[-1][0],
+            taken[-1][1],
+            f"{scores[i]:.2f}",
+            fontsize=_SCORE_PT,
+            color=tuple(0.62 * np.array(mcolors.to_rgb(colours[i]))),
             ha="center",
             va="center",
-            path_effects=[withStroke(linewidth=1.8, foreground="white")],
+            path_effects=[withStroke(linewidth=2, foreground="white")],
             zorder=20,
         )
 
@@ -184,6 +242,18 @@ def raster_picture(rasters: np.ndarray, labels: np.ndarray, style: MapStyle) -> 
     return picture.clip(0, 1)
 
 
+def _draw_rasters(ax: Axes, panel: BEVPanel, view: FrameView, style: MapStyle) -> None:
+    """Draw the rendered masks in place of the ground."""
+    assert panel.elements is not None
+    assert panel.rasters is not None
+    picture = raster_picture(panel.rasters, panel.elements.labels, style)
+    if view.forward == "x":
+        picture = picture.transpose(1, 0, 2)[:, ::-1]  # row = x, column = -y
+    extent = (*ax.get_xlim(), *ax.get_ylim())
+    ax.imshow(picture, origin="lower", extent=extent, interpolation="bilinear", zorder=1)
+    ax.grid(False)
+
+
 def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: MapStyle) -> None:
     """Draw one panel.
 
@@ -197,32 +267,29 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
     extent = display_extent(grid, view)
     _draw_grid(ax, extent, style)
     ax.set_title(panel.title, fontsize=8.5, color=style.ink, pad=5)
-    if panel.points is not None and len(panel.points):
-        x, y = view.display_from_frame(panel.points).T
-        ax.scatter(x, y, s=0.25, c="#9AA3AE", alpha=0.55, linewidths=0, zorder=2)
+    _draw_points(ax, panel.points, view)
     _draw_vehicle(ax, view)
+    if panel.truth:
+        _draw_truth(ax, panel, panel.truth, view, style)
     elements = panel.elements
-    if elements is None or len(elements) == 0:
+    if not elements:
         ax.text(0, extent[2] + 2, panel.note, fontsize=7, color=style.muted, ha="center")
         return
-    if panel.rasters is not None:
-        picture = raster_picture(panel.rasters, elements.labels, style)
-        if view.forward == "x":
-            picture = picture.transpose(1, 0, 2)[:, ::-1]  # row = x, column = -y
-        ax.imshow(picture, origin="lower", extent=extent, interpolation="bilinear", zorder=1)
-        ax.grid(False)
     lines = [view.display_from_frame(line) for line in elements.polylines]
+    fates = panel.fates[0]
+    colours = [MATCH_COLOURS[fate] for fate in fates] or style.colours(elements.labels)
+    if panel.rasters is not None:
+        _draw_rasters(ax, panel, view, style)
     if panel.gaussians and elements.has_gaussians:
         _draw_gaussians(ax, elements, view, style)
     if panel.lines:
-        width_pt = style.bev_line_pt * (0.5 if panel.gaussians else 1)
-        _draw_lines(ax, lines, elements.labels, style, width_pt)
+        width_pt = style.bev_line_pt
+        _draw_lines(ax, lines, elements.labels, style, colours, width_pt, fates=fates)
     if panel.vertices:
-        colours = style.colours(np.repeat(elements.labels, elements.num_points))
-        x, y = np.concatenate(lines).T
-        ax.scatter(x, y, s=7, c=colours, linewidths=0, zorder=12)
+        for line, colour in zip(lines, colours, strict=True):
+            ax.plot(*line.T[:2], "o", color=colour, markersize=2.2, markeredgewidth=0, zorder=12)
     if panel.order:
-        _draw_order(ax, lines, style.colours(elements.labels))
-    if panel.scores and elements.scores is not None:
-        _draw_scores(ax, lines, elements, style)
+        _draw_order(ax, lines, colours)
+    if panel.scores:
+        _draw_scores(ax, lines, elements.confidence, colours, view)
     ax.set(xlim=extent[:2], ylim=extent[2:])

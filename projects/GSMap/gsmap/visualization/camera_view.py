@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from matplotlib import colors as mcolors
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import PathCollection, PolyCollection
+from matplotlib.path import Path
 
 from gsmap.structures.elements import MapElements
 from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
@@ -15,6 +16,7 @@ from gsmap.visualization.frame_view import FrameView
 from gsmap.visualization.style import MapStyle
 
 _STEP_M = 1.0  # a line's width follows its depth in steps of this length
+_WIDTH_STEP = 0.12  # widths differ by this share, so that lines are few paths
 _NOMINAL_SIZE_IN = 2.4  # on a panel of this size (root of its area) lines have the style's widths
 
 
@@ -110,6 +112,12 @@ def _draw_areas(
     ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=3))
 
 
+def _corners(points: np.ndarray) -> np.ndarray:
+    """Leave out what lies on the straight line between its neighbours. (n, 2) -> (m, 2)"""
+    (ux, uy), (vx, vy) = np.diff(points[:-1], axis=0).T, np.diff(points[1:], axis=0).T
+    return points[np.hstack([True, np.abs(ux * vy - uy * vx) > 1e-3, True])]
+
+
 def _draw_polylines(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
@@ -121,16 +129,30 @@ def _draw_polylines(
     segments, depth_m, index = project_segments(starts, ends, camera.img_from_frame, camera.size_px)
     box = ax.get_window_extent()
     scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN
-    thinning = np.clip((10.0 / np.maximum(depth_m, 0.1)) ** 0.6, 0.45, 2.6)
-    widths = scale * style.camera_line_pt * thinning
+    level = np.rint(0.6 * np.log(10 / np.maximum(depth_m, 0.1)) / _WIDTH_STEP)
+    thinning = np.exp(_WIDTH_STEP * level).clip(0.45, 2.6)
+    joined = np.isclose(segments[1:, 0], segments[:-1, 1]).all(axis=1)
+    joined &= (thinning[1:] == thinning[:-1]) & (owner[index[1:]] == owner[index[:-1]])
+    first = np.flatnonzero(np.append(True, ~joined))[: len(segments)]  # of each piece
+    paths: dict[tuple[float, int], list[Path]] = {}
+    for piece, kind in zip(
+        np.split(segments, first)[1:],
+        zip(thinning[first].tolist(), owner[index[first]].tolist(), strict=True),
+        strict=True,
+    ):
+        paths.setdefault(kind, []).append(Path(_corners(np.append(piece[:, 0], piece[-1:, 1], 0))))
+    widths = scale * style.camera_line_pt * np.array([width for width, _ in paths])
     halo = mcolors.to_rgba(style.halo, 0.55)
-    for colour, extra, level in ((halo, 1.1, 4), (style.colours(owner[index]), 0.0, 5)):
-        lines = LineCollection(
-            list(segments),
-            colors=colour,
+    colours = style.colours(label for _, label in paths)
+    for colour, extra, zorder in ((halo, 1.1, 4), (colours, 0.0, 5)):
+        lines = PathCollection(
+            [Path.make_compound_path(*parts) for parts in paths.values()],
+            facecolors="none",
+            edgecolors=colour,
             linewidths=widths + extra * scale,
             capstyle="round",
-            zorder=level,
+            joinstyle="round",
+            zorder=zorder,
         )
         ax.add_collection(lines)
 

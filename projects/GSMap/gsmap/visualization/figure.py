@@ -1,10 +1,14 @@
 """Composition of cameras and bird's-eye views into one picture, rendered or written."""
 
+import base64
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import cv2
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,9 +22,15 @@ from gsmap.utils.files import atomic_write
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
 from gsmap.visualization.frame_view import FrameView
-from gsmap.visualization.style import MapStyle
+from gsmap.visualization.style import (
+    FALSE_DASHES,
+    MATCH_COLOURS,
+    MATCH_TITLES,
+    TRUTH_OPACITY,
+    MapStyle,
+)
 
-DPI = 150
+DPI = 220  # so that text of 6.5 points stays legible where a picture is shown 800 px wide
 _WIDTH = 1500  # px at DPI, for which everything is laid out
 _SAVE_OPTIONS: dict[str, dict[str, Any]] = {
     "png": {"pil_kwargs": {"compress_level": 4}},
@@ -30,10 +40,12 @@ _SAVE_OPTIONS: dict[str, dict[str, Any]] = {
     "svg": {"metadata": {"Date": None}},
 }
 FORMATS = tuple(_SAVE_OPTIONS)
-_MARGIN, _GAP, _HEADER, _TICKS, _TITLE = 26, 6, 52, 38, 34  # px at DPI
+_MARGIN, _GAP, _HEADER, _TICKS, _TITLE = 26, 6, 84, 60, 44  # px at DPI
 _USABLE = _WIDTH - 2 * _MARGIN
+_PNG_IN_SVG = re.compile(rb"data:image/png;base64,([\w+/=\s]+)")
+_LONG_NUMBER = re.compile(rb"(?<!scale\()\b(\d+\.\d\d)\d{2,}")
 _TALLEST = 0.5 * _USABLE  # of a camera row or a BEV panel
-_LONGEST_TITLE = 66  # characters beside the legend of three classes
+_LONGEST_TITLE = 88  # characters
 
 Box = tuple[float, float, float, float]  # left, top, width, height in px, from the top left corner
 
@@ -102,28 +114,43 @@ def _add_axes(figure: Figure, box: Box) -> Axes:
     return figure.add_axes(tuple(np.array([left, bottom, width, height]) / scale))
 
 
-def _draw_header(figure: Figure, title: str, style: MapStyle) -> None:
-    """Write the title on the left and the legend of classes on the right."""
+def _legend_lines(
+    maps: Sequence[MapElements | None], panels: Sequence[BEVPanel], style: MapStyle
+) -> list[Line2D]:
+    """Return what the legend explains: the classes and the kinds of matches that are drawn."""
+    classes = sorted({int(label) for elements in maps if elements for label in elements.labels})
+    lines = [Line2D([], [], color=style.colour(i), lw=2.6, label=style.title(i)) for i in classes]
+    fates = [fate for panel in panels for fate in chain(*panel.fates)]
+    for fate, colour in MATCH_COLOURS.items():
+        if fate in fates:
+            line = Line2D([], [], color=colour, label=f"{MATCH_TITLES[fate]} ({fates.count(fate)})")
+            line.set(linewidth=1.8, linestyle=FALSE_DASHES if fate == "false" else "-")
+            if fate in TRUTH_OPACITY:
+                line.set(linewidth=4.2, alpha=TRUTH_OPACITY[fate], solid_capstyle="butt")
+            lines.append(line)
+    return lines
+
+
+def _draw_header(figure: Figure, title: str, lines: Sequence[Line2D], style: MapStyle) -> None:
+    """Write the title, and the legend below it."""
     width, height = figure.get_size_inches() * DPI
-    margin, middle = _MARGIN / width, 1 - _HEADER / 2 / height
+    margin = _MARGIN / width
     if len(title) > _LONGEST_TITLE:
         title = title[: _LONGEST_TITLE - 1] + "\N{HORIZONTAL ELLIPSIS}"
-    figure.text(margin, middle, title, fontsize=9, color=style.ink, va="center")
-    handles = [
-        Line2D([], [], color=style.colour(i), lw=2.6, solid_capstyle="round", label=style.title(i))
-        for i in range(len(style.classes))
-    ]
+    figure.text(margin, 1 - 0.3 * _HEADER / height, title, size=9, color=style.ink, va="center")
+    letters = sum(len(str(line.get_label())) + 5 for line in lines)
     figure.legend(
-        handles=handles,
-        loc="center right",
-        bbox_to_anchor=(1 - margin, middle),
-        ncols=len(handles),
+        handles=lines,
+        loc="center left",
+        bbox_to_anchor=(margin, 1 - 0.75 * _HEADER / height),
+        ncols=max(len(lines), 1),
         frameon=False,
-        fontsize=8,
+        fontsize=round(min(8, 800 / max(letters, 1)), 1),
         labelcolor=style.ink,
+        borderpad=0,
         borderaxespad=0,
         handlelength=1.4,
-        columnspacing=1.6,
+        columnspacing=1.4,
     )
 
 
@@ -167,7 +194,8 @@ def compose_figure(
     figure = Figure(figsize=size_in, dpi=DPI * scale, facecolor="white")
     FigureCanvasAgg(figure)
     with matplotlib.rc_context({"font.family": style.font_family}):
-        _draw_header(figure, title, style)
+        maps = [camera_elements, *(panel.elements for panel in panels)]
+        _draw_header(figure, title, _legend_lines(maps, panels, style), style)
         for camera, box in zip((c for row in rows for c in row), camera_boxes, strict=True):
             size_px = max(round(box[2] * scale), 1), max(round(box[3] * scale), 1)
             draw_camera(_add_axes(figure, box), camera, camera_elements, view, style, size_px)
@@ -189,6 +217,22 @@ def picture_name(token: str, suffix: str) -> str:
     return re.sub(r"[^\w.+=-]", "_", token) + suffix
 
 
+def sample_title(metainfo: Mapping[str, Any]) -> str:
+    """Return a sample's scene, seconds into the scene, and token, as far as they are known."""
+    token, seconds = str(metainfo.get("token") or ""), metainfo.get("seconds")
+    parts = [metainfo.get("scene"), None if seconds is None else f"{seconds:.2f} s", token]
+    return "  \N{MIDDLE DOT}  ".join(part for part in parts if part)
+
+
+def sample_name(metainfo: Mapping[str, Any], suffix: str) -> str:
+    """Return a file name that sorts by scene and time and ends in the last letters of the token."""
+    token, seconds = str(metainfo.get("token") or ""), metainfo.get("seconds")
+    if seconds is None:
+        return picture_name(token, suffix)
+    moment = f"{metainfo.get('scene') or 'scene'}_{seconds:07.2f}s_{token[-8:]}"
+    return picture_name(moment, suffix)
+
+
 def save_figure(figure: Figure, path: str | Path) -> Path:
     """Write a figure; the file appears only when it is whole.
 
@@ -208,6 +252,21 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
         raise ValueError(
             f"Cannot write a picture to {path}: the name must end in one of {FORMATS}."
         )
+    content = BytesIO()
+    figure.savefig(content, format=kind, **_SAVE_OPTIONS[kind])
     with atomic_write(path, "wb") as file:
-        figure.savefig(file, format=kind, **_SAVE_OPTIONS[kind])
+        file.write(_compact(content.getvalue()) if kind == "svg" else content.getvalue())
     return path
+
+
+def _compact(svg: bytes) -> bytes:
+    """Shorten an SVG to its half: images as JPEG, long numbers with two decimals, fewer blanks."""
+    svg = _LONG_NUMBER.sub(rb"\1", _PNG_IN_SVG.sub(_as_jpeg, svg))
+    return svg.replace(b" \nL ", b"L").replace(b" \nC ", b"C")
+
+
+def _as_jpeg(image: re.Match[bytes]) -> bytes:
+    """Turn an image in an SVG from PNG to JPEG."""
+    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image[1]), np.uint8), cv2.IMREAD_COLOR)
+    jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 70])[1]
+    return b"data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes())

@@ -8,7 +8,7 @@ from mmdet3d.registry import HOOKS
 from mmengine.hooks import Hook
 from mmengine.runner import Runner
 
-from gsmap.visualization.figure import picture_name, save_figure
+from gsmap.visualization.figure import picture_name, sample_name, save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer
 
 
@@ -109,7 +109,7 @@ class MapVisualizationHook(Hook):
             figure = self._visualizer(runner).draw_sample(
                 sample, score_thr=self.score_thr, points=_points(data_batch, index)
             )
-            name = picture_name(sample.metainfo["token"], self.suffix)
+            name = sample_name(sample.metainfo, self.suffix)
             save_figure(figure, Path(self.test_out_dir) / name)
             self._drawn += 1
 

@@ -18,16 +18,17 @@ from gsmap.datasets.elements import (
     elements_of_truth,
 )
 from gsmap.datasets.transforms.images import read_image
+from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
-from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure
+from gsmap.visualization.figure import compose_figure, figure_to_rgb, sample_title, save_figure
 from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
 from gsmap.visualization.style import MapStyle
 
-PANELS = ("ground_truth", "prediction", "gaussians", "rasters")
+PANELS = ("ground_truth", "prediction", "matches", "gaussians", "rasters")
 
 
 def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
@@ -91,8 +92,9 @@ class MapVisualizer(Visualizer):
             mounting (``lidar2ego`` of the sample), or else the frame's usual height.
         score_thr: Smallest score of a drawn prediction.
         max_num: Largest number of drawn predictions; None draws all above the threshold.
-        panels: Which bird's-eye views to draw, of ``ground_truth``, ``prediction``, ``gaussians``,
-            ``rasters``; those that a sample has no data for are left out.
+        panels: Which bird's-eye views to draw, of ``PANELS``; those that a sample has no data
+            for are left out.
+        match_m: Largest Chamfer distance of a hit in ``matches``, in metres, as in AP_chamfer.
         camera_source: What is drawn over the cameras, ``prediction`` or ``ground_truth``; the other
             is drawn if a sample lacks it.
         show_scores: Whether to write scores.
@@ -113,7 +115,8 @@ class MapVisualizer(Visualizer):
         ground_z_m: float | None = None,
         score_thr: float = 0.4,
         max_num: int | None = None,
-        panels: Sequence[str] = PANELS,
+        panels: Sequence[str] = PANELS[:4],
+        match_m: float = 1.0,
         camera_source: str = "prediction",
         show_scores: bool = True,
         show_vertices: bool = True,
@@ -133,6 +136,7 @@ class MapVisualizer(Visualizer):
         self.score_thr = score_thr
         self.max_num = max_num
         self.panels = tuple(panels)
+        self.match_m = match_m
         self.camera_source = camera_source
         self.show_scores = show_scores
         self.show_vertices = show_vertices
@@ -230,8 +234,20 @@ class MapVisualizer(Visualizer):
                 scores=self.show_scores,
                 points=points,
             )
+        if found is not None and truth is not None and "matches" in self.panels:
+            rules = ChamferConfig(tuple(self.style.classes), (self.match_m,))
+            matched, hits = match_chamfer(found, truth, rules), np.full(len(found), -1)
+            hits[matched.pred_index] = matched.matched_gt[:, 0]
+            title = f"Hits within {self.match_m:g} m"
+            panels["matches"] = BEVPanel(title, found, note, truth=truth, hits=hits)
         if found is not None and found.has_gaussians:
-            panels["gaussians"] = BEVPanel("Gaussians (1$\\sigma$)", found, note, gaussians=True)
+            panels["gaussians"] = BEVPanel(
+                "Gaussians (1\N{GREEK SMALL LETTER SIGMA})",
+                found,
+                note,
+                lines=False,
+                gaussians=True,
+            )
             if "rasters" in self.panels:
                 masks = self._render_masks(found) if len(found) else None
                 panels["rasters"] = BEVPanel(
@@ -268,7 +284,7 @@ class MapVisualizer(Visualizer):
             draw_pred: Whether to draw the prediction.
             score_thr: Smallest drawn score instead of the visualizer's own.
             points: LiDAR points in metres of the frame, drawn as faint dots. (n, >= 2)
-            title: Heading instead of scene and token.
+            title: Heading instead of scene, time and token.
 
         Returns:
             The figure.
@@ -285,10 +301,6 @@ class MapVisualizer(Visualizer):
         everything = predicted_elements(data_sample)
         if everything:
             note = f"no score reaches {threshold:g} (highest {everything.confidence.max():.2g})"
-        if title is None:
-            scene, token = meta.get("scene") or "", meta.get("token") or ""
-            parts = [token] if token.startswith(scene) else [scene, token]
-            title = "  \N{MIDDLE DOT}  ".join(part for part in parts if part)
         return compose_figure(
             self.cameras(meta, images),
             self._bev_panels(truth, found, points, note),
@@ -296,7 +308,7 @@ class MapVisualizer(Visualizer):
             self.frame_view(meta),
             self.style,
             camera_elements=second if first is None else first,
-            title=title,
+            title=sample_title(meta) if title is None else title,
             width_px=self.width_px,
         )
 

@@ -23,6 +23,25 @@ MATCH_COLOURS = {
     "found": "#8E8E93",
     "missed": "#AF52DE",
 }
+MATCH_TITLES = {
+    "hit": "hit",
+    "false": "false",
+    "found": "truth found",
+    "missed": "truth missed",
+}
+TRUTH_OPACITY = {"found": 0.4, "missed": 0.75}
+FALSE_DASHES = (0, (3, 1.5))  # as matplotlib has them
+# Of runs and methods in plots; none is a class's or a match's colour.
+RUN_COLOURS = (
+    "#34495E",
+    "#E0457B",
+    "#A2845E",
+    "#5AC8FA",
+    "#5856D6",
+    "#B7A000",
+    "#7F1D1D",
+    "#000000",
+)
 
 
 @dataclass(frozen=True)

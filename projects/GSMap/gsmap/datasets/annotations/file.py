@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
 from types import TracebackType
@@ -348,6 +348,15 @@ class AnnotationFile(Sequence[MapSample]):
             name: ``token``, ``scene``, ``map_name`` or ``timestamp_ns``.
         """
         return [value for batch in self._batches for value in batch.column[name].to_pylist()]
+
+    @cached_property
+    def seconds_into_scene(self) -> list[float]:
+        """Each sample's time since the first of its scene, in seconds."""
+        scenes, times = self.column("scene"), self.column("timestamp_ns")
+        start: dict[str, int] = {}
+        for scene, time in zip(scenes, times, strict=True):
+            start[scene] = min(time, start.get(scene, time))
+        return [(t - start[scene]) / 1e9 for scene, t in zip(scenes, times, strict=True)]
 
     def instance_counts(self) -> np.ndarray:
         """Return each sample's number of map elements, -1 if not known. (samples,)."""

@@ -12,7 +12,7 @@ from mmdet3d.structures import Det3DDataSample
 from gsmap.datasets.errors import BrokenSampleError
 
 META_KEYS = (
-    "sample_idx", "token", "scene", "map_name", "timestamp_ns", "img_path", "cam_names",
+    "sample_idx", "token", "scene", "map_name", "timestamp_ns", "seconds", "img_path", "cam_names",
     "lidar2img", "cam2img", "lidar2cam", "img_aug_matrix", "img_shape", "ori_shape",
     "lidar2global", "lidar2ego", "can_bus", "x_range", "y_range", "eval_ann_info",
 )  # fmt: skip
