@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -65,6 +66,14 @@ def test_a_killed_training_goes_on_where_it_stopped(trained):
     assert not list(trained.glob("*.partial"))  # nothing half-written is left
 
 
+def test_training_shows_pictures_on_tensorboard(trained):
+    tags = set()
+    for file in trained.glob("*/vis_data/events.*"):
+        tags.update(EventAccumulator(str(file)).Reload().Tags()["images"])
+    assert tags
+    assert all(tag.startswith("val_") for tag in tags)
+
+
 def test_one_and_two_processes_score_and_write_the_same(tiny_config, trained, tmp_path):
     metrics = ["--eval", "chamfer", "raster"]
     options = ["--work-dir", tmp_path / "work"]
@@ -104,7 +113,11 @@ def test_the_data_set_and_what_a_model_finds_are_drawn(
         "--cfg-options", "visualizer.width_px=400",
     )  # fmt: skip
     (result,) = json.loads((tmp_path / "map.json").read_text())["results"]
-    assert [path.name for path in found.iterdir()] == [f"{result['sample_token']}.png"]
+    (picture,) = found.iterdir()
+    assert (
+        re.fullmatch(r"[\w-]+_\d{4}\.\d\ds_(\w{8})\.png", picture.name)[1]
+        == (result["sample_token"][-8:])
+    )
     assert len(list(browsed.glob("*.png"))) == 1
 
 
