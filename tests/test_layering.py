@@ -18,7 +18,7 @@ OPENMMLAB = {"mmengine", "mmcv", "mmdet", "mmdet3d"}
 ALLOWED = {
     "utils": set(),
     "structures": set(),
-    "ops": {"structures"},
+    "ops": {"structures", "utils"},
     "models": {"checkpoints", "ops", "structures"},
     "checkpoints": {"utils"},
     "datasets": {"structures", "utils"},

@@ -9,12 +9,12 @@ import argparse
 from pathlib import Path
 
 from mmdet3d.registry import DATASETS
-from mmengine.utils import track_iter_progress
 
 from gsmap.apis.map_inferencer import spread_evenly
 from gsmap.engine.launch import add_config_options, read_config
 from gsmap.report.page import ReportOptions, report_data, write_page
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.progress import Progress
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
 
@@ -49,7 +49,7 @@ def main() -> str:
     visualizer = MapVisualizer("browse", show_order=args.order)
     visualizer.dataset_meta = dataset.metainfo
     indices = spread_evenly(len(dataset), args.num)
-    for index in track_iter_progress(indices):
+    for index in Progress(indices, unit="pictures"):
         item = dataset[index]
         sample = item["data_samples"]
         images = None if args.original else images_from_inputs(item["inputs"]["img"])

@@ -9,11 +9,11 @@ import json
 from pathlib import Path
 
 from mmengine.config import Config
-from mmengine.runner import Runner
 
 from gsmap.apis.checkpoint import adopt_settings
 from gsmap.engine.launch import add_common_arguments, load_config
 from gsmap.engine.named_models import checkpoint_for
+from gsmap.engine.run_log import MapRunner
 from gsmap.utils.cli import CommandParser, is_first_rank, output_file, run_command
 from gsmap.utils.files import write_text
 
@@ -82,7 +82,7 @@ def main() -> None:
     apply_options(cfg, args)
     if notes and is_first_rank():
         print("\n".join(notes))
-    runner = Runner.from_cfg(cfg)
+    runner = MapRunner.from_cfg(cfg)
     metrics = runner.test()
     if args.metrics_out and runner.rank == 0:
         write_text(args.metrics_out, json.dumps(metrics, indent=2))

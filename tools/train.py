@@ -4,11 +4,11 @@
 import argparse
 
 from mmengine.config import Config
-from mmengine.runner import Runner
 
 from gsmap.apis.checkpoint import read_weights
 from gsmap.engine.launch import add_common_arguments, load_config, newest_checkpoint
 from gsmap.engine.named_models import find_checkpoint
+from gsmap.engine.run_log import MapRunner
 from gsmap.utils.cli import CommandParser, is_first_rank, run_command
 
 
@@ -56,7 +56,7 @@ def main() -> None:
             raise ValueError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
         cfg.auto_scale_lr.enable = True
     choose_start(cfg, args.resume)
-    Runner.from_cfg(cfg).train()
+    MapRunner.from_cfg(cfg).train()
 
 
 if __name__ == "__main__":

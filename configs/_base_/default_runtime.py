@@ -12,7 +12,7 @@ default_hooks = dict(
     checkpoint=dict(type='AtomicCheckpointHook', interval=1, max_keep_ckpts=3),
     sampler_seed=dict(type='DistSamplerSeedHook'),
     visualization=dict(type='MapVisualizationHook', draw=True, num_val_samples=2))
-custom_hooks = [dict(type='GaussianHealthHook')]
+custom_hooks = [dict(type='RunSummaryHook'), dict(type='GaussianHealthHook')]
 val_evaluator = dict(type='MapMetric', eval=['chamfer'])
 test_evaluator = dict(type='MapMetric', eval=['chamfer', 'raster'])
 vis_backends = [dict(type='LocalVisBackend'), dict(type='TensorboardVisBackend')]

@@ -74,6 +74,25 @@ def test_training_shows_pictures_on_tensorboard(trained):
     assert all(tag.startswith("val_") for tag in tags)
 
 
+def test_the_log_opens_with_what_matters(trained):
+    lines = (trained / "resumed.log").read_text().splitlines()
+    first = next(i for i, line in enumerate(lines) if "Epoch(train)" in line)
+    assert first < 20, lines[:first]
+    opening = dict(line.split(maxsplit=1) for line in lines[:first] if line.startswith("    "))
+    assert opening["model"].startswith("MapDetector with GSMapHead, 0.")
+    assert opening["start"].startswith("goes on after iteration ")
+    assert opening["cameras"] == "6, their files 400 x 225"
+    assert opening["length"].startswith("3 epochs of 2 iterations, 1 samples x 1 processes each")
+    names = re.findall(r"  ([\w.]+): ", lines[first])
+    assert names[:5] == ["lr", "eta", "time", "grad_norm", "loss"]
+    assert {"loss_cls", "loss_pts", "loss_raster"} <= set(names)
+    assert len(names) <= 10
+    logs = [log.read_text() for log in trained.glob("*/*.log")]
+    assert len(logs) == 2
+    assert not any("Name of parameter" in log for log in logs)
+    assert "val_interval=9" in (trained / "tiny.py").read_text()  # the whole config stands there
+
+
 def test_one_and_two_processes_score_and_write_the_same(tiny_config, trained, tmp_path):
     metrics = ["--eval", "chamfer", "raster"]
     options = ["--work-dir", tmp_path / "work"]

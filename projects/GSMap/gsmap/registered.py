@@ -11,6 +11,7 @@ import gsmap.datasets.vectorized_map_dataset
 import gsmap.engine.checkpoint_hook
 import gsmap.engine.gaussian_health_hook
 import gsmap.engine.log_processor
+import gsmap.engine.run_log
 import gsmap.evaluation.gaussian_metric
 import gsmap.evaluation.map_metric
 import gsmap.models.bev_encoders.bev_query_encoder

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-from tqdm import tqdm
 
 from gsmap.utils.parallel import default_workers, ordered_map
+from gsmap.utils.progress import Progress
 from minicity.config import (
     TRAIN_LOCATIONS,
     VAL_LOCATIONS,
@@ -252,8 +252,8 @@ def _run_scenes(
     results = ordered_map(make, tasks, workers, prepare, (1,), timeout_s=7200.0)
     per_scene = len(CAMERAS) * config.samples_per_scene
     done: dict[str, Records] = {}
-    with tqdm(
-        total=per_scene * len(tasks), unit="img", desc="MiniCity", disable=not progress
+    with Progress(
+        total=per_scene * len(tasks), unit="images", desc="MiniCity", disable=not progress
     ) as bar:
         for task, records in zip(tasks, results, strict=True):
             done[task.name] = records

@@ -6,13 +6,13 @@ from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
-from tqdm import tqdm
 
 from gsmap.converters.command_line import add_workers_option
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.utils.parallel import ordered_map
+from gsmap.utils.progress import Progress
 
 _SHOWN = 10
 
@@ -79,7 +79,7 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
         mark = "checksum right" if file.sealed else "no checksum, as it is of an earlier version"
         lines.append(f"{path}: {len(file)} samples, values right, {mark}")
         if root is not None:
-            samples = tqdm(file, desc=path.name, unit="sample")
+            samples = Progress(file, desc=path.name, unit="samples")
             found = ordered_map(partial(broken_files, root=root), samples, workers)
             _require_none(path, [problem for problems in found for problem in problems])
             lines[-1] += ", images and LiDAR files whole"

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from gsmap.converters.command_line import add_range_options
 from gsmap.converters.custom import image_size
@@ -35,6 +34,7 @@ from gsmap.datasets.annotations.record import (
 from gsmap.datasets.errors import naming
 from gsmap.datasets.plain_pickle import load_plain_pickle
 from gsmap.utils.cli import output_file
+from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard, add_shard_options
 
 NUSCENES_IMAGE_SIZE = (1600, 900)
@@ -254,7 +254,7 @@ def convert_infos(
         command=command,
     )
     summary = ConversionSummary(classes)
-    bar = tqdm(shard.part(list(enumerate(entries))), unit="sample")
+    bar = Progress(shard.part(list(enumerate(entries))), unit="samples")
     with bar as numbered, AnnotationWriter(target, meta, shard) as writer:
         for sample in _samples(numbered, meta, infos, data_root, summary):
             writer.write(sample)

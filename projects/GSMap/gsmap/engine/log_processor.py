@@ -7,16 +7,31 @@ from mmdet3d.registry import LOG_PROCESSORS
 from mmengine.runner import LogProcessor, Runner
 
 # All figures of MapMetric but the APs of classes and groups and their means
+# Of an iteration: layers before the last, Gaussians, the time that loading takes
+_MINOR = re.compile(r"d\d+\.|data_time:|at_floor:|[\w.]+/[\w.]+:")
 _DETAIL = re.compile(r"(.*/)?(chamfer|raster)/(?!.*\bm?AP$)")
 
 
 @LOG_PROCESSORS.register_module()
 class MapLogProcessor(LogProcessor):
-    """mmengine's log processor, whose line after an evaluation names only the main figures.
+    """mmengine's log processor, whose lines name only the main figures.
 
     `MapMetric` has some 180 figures and logs its tables itself. Backends such as TensorBoard, JSON
     logs and ``tools/test.py --metrics-out`` get all of them.
     """
+
+    def get_log_after_iter(self, runner: Runner, batch_idx: int, mode: str) -> tuple[dict, str]:
+        """Return all figures of an iteration, and a log line with the last layer's losses alone.
+
+        Args:
+            runner: The runner.
+            batch_idx: Index of the batch.
+            mode: ``train``, ``val`` or ``test``.
+        """
+        figures, line = super().get_log_after_iter(runner, batch_idx, mode)
+        head, _, rest = line.partition("]  ")
+        items = [item for item in rest.split("  ") if item and not _MINOR.match(item)]
+        return figures, "  ".join([f"{head}]", *items])
 
     def get_log_after_epoch(
         self, runner: Runner, batch_idx: int, mode: str, with_non_scalar: bool = False

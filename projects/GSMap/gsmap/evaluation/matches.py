@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
 

@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
+
 SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filling so many
 
 # Associative sums may be split into vector lanes (always in the same way, so results repeat);

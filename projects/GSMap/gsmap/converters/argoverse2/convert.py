@@ -7,7 +7,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import shapely
-from tqdm import tqdm
 
 from gsmap.converters.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_split
 from gsmap.converters.argoverse2.map import COMPAT_MODES
@@ -23,6 +22,7 @@ from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
 from gsmap.utils.files import SUFFIX as PARTIAL
 from gsmap.utils.parallel import ordered_map
+from gsmap.utils.progress import Progress
 
 
 def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
@@ -49,7 +49,7 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     read = partial(_try_log, options=options)
     sweep_offsets_ns: list[int] = []
     meta, log_dirs = _meta(options, log_dirs), options.shard.part(log_dirs)
-    bar = tqdm(log_dirs, desc=f"av2 {options.split}", unit="log")
+    bar = Progress(log_dirs, desc=f"av2 {options.split}", unit="logs")
     with bar as logs, AnnotationWriter(target, meta, options.shard) as writer:
         results = ordered_map(read, log_dirs, min(options.workers, max(len(log_dirs), 1)))
         for log_dir, result in zip(logs, results, strict=True):

@@ -16,7 +16,6 @@ import shapely
 from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 from av2.utils.io import read_feather
-from tqdm import tqdm
 
 from gsmap.converters.argoverse2.convert import select_logs
 from gsmap.converters.argoverse2.log import RING_CAMERAS, Argoverse2Log, find_split
@@ -30,6 +29,7 @@ from gsmap.converters.command_line import (
 )
 from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
+from gsmap.utils.progress import Progress
 from gsmap.utils.shards import add_shard_options
 from minicity.camera import Camera
 from minicity.lighting import random_lighting
@@ -216,7 +216,7 @@ def render_logs(
     lines, pictures, rendered = [], 0, 0
     render = partial(_try_log, out=out, options=options)
     results = ordered_map(render, log_dirs, min(workers, max(len(log_dirs), 1)), timeout_s=3600.0)
-    with tqdm(log_dirs, desc="av2-render", unit="log") as logs:
+    with Progress(log_dirs, desc="av2-render", unit="logs") as logs:
         for log_dir, result in zip(logs, results, strict=True):
             if isinstance(result, str):
                 lines.append(f"log {log_dir.name} left out: {result}")

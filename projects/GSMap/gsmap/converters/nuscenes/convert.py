@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-from tqdm import tqdm
 
 from gsmap.converters.command_line import (
     FileOptions,
@@ -36,6 +35,7 @@ from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.parallel import ordered_map
+from gsmap.utils.progress import Progress
 
 LOCATIONS = (
     "singapore-onenorth",
@@ -155,7 +155,7 @@ class _Conversion:
         split_of = {scene: split for split, scenes in self.splits.items() for scene in scenes}
         scenes = [scene for scene in self.tables.scene if scene["name"] in split_of]
         scenes = self.options.shard.part(sorted(scenes, key=self.tables.location_of))
-        with tqdm(
+        with Progress(
             desc=f"{self.options.dataset} {self.options.version}", unit="sample", smoothing=0.05,
             total=sum(scene["nbr_samples"] for scene in scenes),
         ) as bar:  # fmt: skip

@@ -1,5 +1,6 @@
 """The detector: cameras (and LiDAR) to BEV features to map elements."""
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,6 +8,7 @@ import torch
 from mmdet3d.models.detectors import Base3DDetector
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
+from mmengine.logging import MMLogger
 from torch import Tensor
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
@@ -144,6 +146,12 @@ class MapDetector(Base3DDetector):
     ) -> dict[str, Tensor]:
         """Return the head's raw outputs."""
         return self.map_head(self.extract_feat(batch_inputs, batch_data_samples))
+
+    def _dump_init_info(self) -> None:
+        """Log how each weight was initialised, which takes hundreds of lines, to debug only."""
+        handlers = MMLogger.get_current_instance().handlers
+        if min(handler.level for handler in handlers) <= logging.DEBUG:
+            super()._dump_init_info()
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any

@@ -1,0 +1,26 @@
+# Your own data (docs/custom_data.md). Copy this file beside itself, say to configs/my_city.py, and edit the first part:
+# it is the one place for files, frame, cameras, range and classes. `_base_` may be any config with a GKT encoder.
+_base_ = './maptr/maptr_r18_minicity.py'
+
+data_root = 'my_data/'  # holds train.arrow and val.arrow; --data-root names another folder
+_frame = 'ego'  # x forward, y left; 'lidar': x right, y forward
+_ground_z = 0.0  # height of the road in that frame, in metres
+_cameras = ['front', 'rear']  # one or more
+_scale = 0.25  # of the image files' size; the small model likes some 200 rows
+grid = dict(x_range=[-30.0, 30.0], y_range=[-15.0, 15.0])  # metres, as in the annotation files
+classes = ['divider', 'ped_crossing', 'boundary']  # as in the annotation files
+
+# What follows from it
+_pixel = _base_.model.bev_encoder.bev_pixel_m
+_cells = [round((grid[key][1] - grid[key][0]) / _pixel) for key in ('y_range', 'x_range')]
+_data = dict(data_root=data_root, frame=_frame, cameras=_cameras, grid=grid, classes=classes)
+_load = [dict(type='LoadCameraImages', to_float32=False), dict(type='ScaleImages', scale=_scale)]
+_targets = [dict(type='FormatMapTargets', num_points=20), dict(type='MakeBEVMask', size=_cells, thickness_px=1)]
+_pack = [dict(type='PackMapInputs')]
+
+_encoder = dict(num_cams=len(_cameras), z_range=(_ground_z - 0.25, _ground_z + 1.75))
+model = dict(grid=grid, classes=classes, bev_encoder=_encoder, map_head=dict(type='GSMapHead'))
+train_dataloader = dict(dataset=dict(**_data, ann_file='train.arrow', pipeline=[*_load, *_targets, *_pack]))
+val_dataloader = dict(dataset=dict(**_data, ann_file='val.arrow', pipeline=[*_load, *_pack]))
+test_dataloader = val_dataloader
+visualizer = dict(ground_z_m=_ground_z)  # drop this line where records have ego_from_frame: the road may be tilted

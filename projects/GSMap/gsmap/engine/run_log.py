@@ -1,0 +1,108 @@
+"""A training log that opens with what matters, in a few lines."""
+
+import logging
+from typing import Any
+
+import torch
+from mmdet3d.registry import HOOKS
+from mmengine.hooks import Hook
+from mmengine.logging import MMLogger
+from mmengine.model import is_model_wrapper
+from mmengine.runner import EpochBasedTrainLoop, Runner
+
+# How mmengine's long records begin, and those that say nothing about the run
+_DUMPS = (
+    "\n" + "-" * 60 + "\nSystem environment", "Config:\n", "Hooks will be executed", "Exp name: ",
+    '"FileClient" will be', '"HardDiskBackend" is the alias', "Distributed training is not used",
+)  # fmt: skip
+
+
+def _lower_dumps(record: logging.LogRecord) -> bool:
+    """Give mmengine's dumps the level ``DEBUG``."""
+    if record.getMessage().startswith(_DUMPS):
+        record.levelno, record.levelname = logging.DEBUG, "DEBUG"
+    return True
+
+
+class MapRunner(Runner):
+    """mmengine's runner with a short log: environment, config and hooks only with ``DEBUG``.
+
+    The whole config stands in the work folder in any case.
+    """
+
+    def build_logger(self, *args: Any, **kwargs: Any) -> MMLogger:
+        """Build mmengine's logger, which tells its dumps only if ``log_level`` is ``DEBUG``."""
+        logger = super().build_logger(*args, **kwargs)
+        logger.addFilter(_lower_dumps)
+        return logger
+
+
+@HOOKS.register_module()
+class RunSummaryHook(Hook):
+    """Logs what is trained, on what, for how long and where to, before the first iteration."""
+
+    def before_train(self, runner: Runner) -> None:
+        """Log it."""
+        model = runner.model.module if is_model_wrapper(runner.model) else runner.model
+        sizes = [(p.numel(), p.requires_grad) for p in model.parameters()]
+        frozen = sum(size for size, trained in sizes if not trained)
+        note = f", {frozen / 1e6:.2f} M of them frozen" if frozen else ""
+        kind = f"{type(model).__name__} with {type(getattr(model, 'map_head', None)).__name__}"
+        device = next(model.parameters()).device
+        lines = {
+            "model": f"{kind}, {sum(size for size, _ in sizes) / 1e6:.2f} M parameters{note}",
+            "start": _start(runner),
+            **_data(runner),
+            "length": _length(runner),
+            "runs on": f"{device}, {torch.get_num_threads()} threads; torch {torch.__version__}, "
+            f"seed {runner.seed}",
+            "writes to": f"{runner.work_dir} (checkpoints, the whole config), {runner._log_dir}",
+        }
+        text = "".join(f"\n    {name:<12}{value}" for name, value in lines.items())
+        runner.logger.info(f"This run{text}")
+
+
+def _start(runner: Runner) -> str:
+    """Say where the weights come from."""
+    if runner.iter:
+        return f"goes on after iteration {runner.iter}"
+    return f"from {runner._load_from}" if runner._load_from else "from the config's initial weights"
+
+
+def _innermost(dataset: Any) -> Any:
+    """Return the data set that wrappers, such as ``RepeatDataset``, are around."""
+    return _innermost(dataset.dataset) if hasattr(dataset, "dataset") else dataset
+
+
+def _data(runner: Runner) -> dict[str, str]:
+    """Describe the data: how many samples, cameras, range and classes."""
+    loaders = {"training": runner.train_dataloader}
+    if runner.val_loop is not None:
+        loaders["validation"] = runner.val_dataloader
+    lines = {}
+    for name, loader in loaders.items():
+        dataset = _innermost(loader.dataset)
+        file = getattr(dataset, "ann_file", type(dataset).__name__)
+        lines[name] = f"{len(loader.dataset)} samples of {file}"
+    if not hasattr(dataset, "sample"):
+        return lines
+    cameras = dataset.sample(0).cameras
+    names = dataset.cameras or [camera.name for camera in cameras]
+    sizes = sorted({f"{camera.width} x {camera.height}" for camera in cameras})
+    meta = dataset.metainfo
+    ranges = ("{} from {:g} to {:g} m".format(axis, *meta[f"{axis}_range"]) for axis in "xy")
+    lines["cameras"] = f"{len(names)}, their files {' and '.join(sizes)}"
+    lines["map"] = f"{', '.join(ranges)}; {', '.join(meta['classes'])}"
+    return lines
+
+
+def _length(runner: Runner) -> str:
+    """Say how long the run is and how often it is validated."""
+    loop, loader = runner.train_loop, runner.train_dataloader
+    by_epoch = isinstance(loop, EpochBasedTrainLoop)
+    text = f"{loop.max_epochs} epochs of {len(loader)}" if by_epoch else str(loop.max_iters)
+    unit = "epochs" if by_epoch else "iterations"
+    return (
+        f"{text} iterations, {loader.batch_size} samples x {runner.world_size} processes each; "
+        f"validation every {loop.val_interval} {unit}"
+    )

@@ -1,0 +1,33 @@
+"""Progress of long work: a bar on a terminal, a line now and then in a file or a pipe."""
+
+import sys
+from typing import Any, TextIO
+
+from tqdm import tqdm
+
+_PLAIN = {"mininterval": 60.0, "maxinterval": 60.0}
+_FORMAT = "{n_fmt} of {total_fmt} {unit}, {elapsed}"
+
+
+class Progress(tqdm):
+    """tqdm's bar; where nobody watches, a plain line each minute, at the start and at the end."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        if not sys.stderr.isatty():
+            title = f"{kwargs.pop('desc')}: " if kwargs.get("desc") else ""
+            kwargs |= {**_PLAIN, "bar_format": title + _FORMAT, "file": _Lines(sys.stderr)}
+        super().__init__(*args, **kwargs)
+
+
+class _Lines:
+    """Turns what overwrites itself on a terminal into lines."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, text: str) -> None:
+        if text.strip():
+            self._file.write(f"{text.strip()}\n")
+
+    def flush(self) -> None:
+        self._file.flush()

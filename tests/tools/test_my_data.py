@@ -1,0 +1,66 @@
+"""One's own data from records to a picture, as docs/custom_data.md says it; one camera."""
+
+import json
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+REPO = Path(__file__).resolve().parents[2]
+SMALL = """
+_base_ = '{template}'
+_heads = dict(num_heads=4, ffn_dims=16)
+model = dict(
+    img_backbone=dict(base_channels=8),
+    img_neck=dict(in_channels=[16, 32, 64], out_channels=[8, 4, 4]),
+    bev_encoder=dict(embed_dims=16, layer_cfg=_heads),
+    map_head=dict(
+        embed_dims=16, query_groups=[dict(num=5)], decoder=dict(num_layers=2, layer=_heads)))
+_still = dict(batch_size=1, num_workers=0, persistent_workers=False)
+train_dataloader, val_dataloader, test_dataloader = _still, _still, _still
+param_scheduler = []
+train_cfg = dict(max_epochs=2)
+visualizer = dict(width_px=400)
+"""
+
+
+def command(monkeypatch: pytest.MonkeyPatch, tool: str, *words: object) -> None:
+    """Run a tool in this process."""
+    monkeypatch.setattr(sys, "argv", [f"tools/{tool}.py", *map(str, words)])
+    runpy.run_path(str(REPO / f"tools/{tool}.py"), run_name="__main__")
+
+
+@pytest.fixture
+def my_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder that the documented example makes."""
+    monkeypatch.chdir(tmp_path)
+    example = re.search(r"```python\n(.*?)```", (REPO / "docs/custom_data.md").read_text(), re.S)[1]
+    exec(example, {})
+    return tmp_path / "my_data"
+
+
+def test_own_data_with_one_camera_train_test_and_infer(my_data, tmp_path, monkeypatch):
+    template = (REPO / "configs/my_data.py").read_text().replace("'./", f"'{REPO}/configs/")
+    edited = template.replace("_cameras = ['front', 'rear']", "_cameras = ['front']")
+    assert edited != template
+    (tmp_path / "my_city.py").write_text(edited)
+    config, work = tmp_path / "small.py", tmp_path / "work"
+    config.write_text(SMALL.format(template=tmp_path / "my_city.py"))
+    command(monkeypatch, "create_data", "check", my_data / "train.arrow", "--data-root", my_data)
+    command(monkeypatch, "train", config, "--data-root", my_data, "--work-dir", work)
+    model = config, work / "epoch_2.pth"
+    metrics, found = tmp_path / "metrics.json", tmp_path / "map.json"
+    common = ["--work-dir", tmp_path / "test", "--metrics-out", metrics]
+    command(monkeypatch, "test", *model, "--data-root", my_data, *common)
+    assert json.loads(metrics.read_text())["chamfer/num_samples"] == 1
+    sample = ["--sample", my_data / "all.arrow", "--out", found, "--show-dir", tmp_path / "seen"]
+    command(monkeypatch, "infer", *model, *sample)
+    tokens = [result["sample_token"] for result in json.loads(found.read_text())["results"]]
+    assert tokens == ["drive7_000", "drive7_001"]
+    pictures = sorted((tmp_path / "seen").iterdir())
+    assert [cv2.imread(str(path)).shape[1] for path in pictures] == [400, 400]
+    (log,) = (path.read_text() for path in work.glob("*/*.log"))
+    assert "cameras     1, their files 640 x 360" in log
