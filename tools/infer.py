@@ -13,7 +13,6 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from mmdet3d.structures import Det3DDataSample
-from tqdm import tqdm
 
 from gsmap.apis.frame_loader import BrokenFrame
 from gsmap.apis.map_inferencer import MapInferencer, select_samples
@@ -27,6 +26,7 @@ from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.inputs.source import InputOptions, Source, open_input
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_bytes
+from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
@@ -134,7 +134,7 @@ def predict(
 ) -> dict[str, str]:
     """Predict samples, draw them and keep what was found; return the broken ones' reasons."""
     tokens, broken = dataset.annotations.column("token"), {}
-    with tqdm(total=len(chosen), unit="sample", smoothing=0.05) as bar:
+    with Progress(total=len(chosen), unit="samples", smoothing=0.05) as bar:
         if results and results.done:
             bar.write(f"going on after {len(results.done)} of {len(chosen)} samples")
             broken.update(results.broken)

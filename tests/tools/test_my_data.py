@@ -56,11 +56,12 @@ def test_own_data_with_one_camera_train_test_and_infer(my_data, tmp_path, monkey
     common = ["--work-dir", tmp_path / "test", "--metrics-out", metrics]
     command(monkeypatch, "test", *model, "--data-root", my_data, *common)
     assert json.loads(metrics.read_text())["chamfer/num_samples"] == 1
-    sample = ["--sample", my_data / "all.arrow", "--out", found, "--show-dir", tmp_path / "seen"]
-    command(monkeypatch, "infer", *model, *sample)
+    seen = tmp_path / "seen"
+    words = ["--model", *model, "--out", found, "--show-dir", seen, "--workers", 0]
+    command(monkeypatch, "infer", my_data / "all.arrow", *words)
     tokens = [result["sample_token"] for result in json.loads(found.read_text())["results"]]
     assert tokens == ["drive7_000", "drive7_001"]
-    pictures = sorted((tmp_path / "seen").iterdir())
+    pictures = sorted(seen.iterdir())
     assert [cv2.imread(str(path)).shape[1] for path in pictures] == [400, 400]
     (log,) = (path.read_text() for path in work.glob("*/*.log"))
     assert "cameras     1, their files 640 x 360" in log
