@@ -3,8 +3,8 @@
 
 Example: ``python tools/infer.py INPUT --model gsmap_r18_minicity --out map.json --show-dir
 pictures``, or ``--model CONFIG CHECKPOINT``. INPUT is an annotation file (.arrow), an info file of
-mmdet3d (.pkl), a nuScenes-format root, an Argoverse 2 log or a folder of some, or a folder of
-images with calibration.yaml (docs/inference.md).
+mmdet3d (.pkl), a nuScenes-format root, an Argoverse 2 log or a folder of some, a folder of images
+with calibration.yaml, or a bag of ROS 1 or 2 (docs/inference.md).
 """
 
 import argparse
@@ -54,7 +54,11 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--rate",
         type=parse_rate,
         default=2.0,
-        help="samples per second of Argoverse 2 logs, or all (default: %(default)s)",
+        help="samples per second of Argoverse 2 logs and bags, or all (default: %(default)s)",
+    )
+    group.add_argument("--vehicle-frame", help="the vehicle's frame in a bag, such as base_link")
+    group.add_argument(
+        "--vehicle-ground-z", type=float, default=0.0, help="height of the road in it, in metres"
     )
     group.add_argument(
         "--allow-missing-cameras", action="store_true", help="leave absent cameras blank"
@@ -94,6 +98,8 @@ def read_input(args: argparse.Namespace) -> Source:
         version=args.version,
         rate_hz=args.rate,
         frames_dir=place.with_name(f"{place.name}_frames"),
+        vehicle_frame=args.vehicle_frame,
+        vehicle_ground_z_m=args.vehicle_ground_z,
     )
     source = open_input(args.input, options)
     for note in source.notes:

@@ -8,6 +8,7 @@ from pathlib import Path
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.inputs.argoverse2 import logs_in, read_logs
+from gsmap.inputs.bags import is_bag, read_bag
 from gsmap.inputs.image_folder import NAMES, read_image_folder
 from gsmap.inputs.info_file import read_info_file
 from gsmap.inputs.nuscenes import read_nuscenes, versions_in
@@ -15,7 +16,8 @@ from gsmap.inputs.nuscenes import read_nuscenes, versions_in
 _FILES = ("*.arrow", "*.pkl")
 KINDS = (
     "an annotation file (.arrow), an info file of mmdet3d (.pkl), a nuScenes-format root, "
-    "Argoverse 2 logs, a folder of images with calibration.yaml or calibration.json"
+    "Argoverse 2 logs, a folder of images with calibration.yaml or calibration.json, a bag of ROS "
+    "(.bag, .mcap, .db3 or a folder of rosbag2)"
 )
 
 
@@ -27,8 +29,10 @@ class InputOptions:
         data_root: Folder that paths of an annotation or info file start from.
         allow_missing_cameras: Whether an info file may name images that do not exist.
         version: Version folder of a nuScenes-format root; the only one by default.
-        rate_hz: Samples per second of Argoverse 2 logs; None takes all.
-        frames_dir: Folder for images that have to be made: those of distorted cameras.
+        rate_hz: Samples per second of Argoverse 2 logs and bags; None takes all.
+        frames_dir: Folder for images that have to be made: a bag's, and those of distorted cameras.
+        vehicle_frame: The vehicle's frame in a bag; ``base_footprint`` or ``base_link`` by default.
+        vehicle_ground_z_m: Height of the road in that frame.
     """
 
     data_root: Path | None = None
@@ -36,6 +40,8 @@ class InputOptions:
     version: str | None = None
     rate_hz: float | None = 2.0
     frames_dir: Path = Path("frames")
+    vehicle_frame: str | None = None
+    vehicle_ground_z_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -62,8 +68,8 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
 
     Args:
         path: An annotation file, an info file of mmdet3d, a nuScenes-format root, an Argoverse 2
-            log or a folder with some, a folder of images with a calibration file (or that file), or
-            a folder with just one annotation or info file.
+            log or a folder with some, a folder of images with a calibration file (or that file), a
+            bag, or a folder with just one annotation or info file.
         options: How to read it.
 
     Returns:
@@ -76,6 +82,15 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"There is no input {path}.")
+    if is_bag(path):
+        samples, has_poses = read_bag(
+            path,
+            options.frames_dir,
+            options.rate_hz,
+            options.vehicle_frame,
+            options.vehicle_ground_z_m,
+        )
+        return Source(samples, "ego", options.frames_dir, has_poses)
     if path.is_dir():
         return _open_folder(path, options)
     if path.suffix == ".arrow":

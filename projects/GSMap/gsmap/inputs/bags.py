@@ -1,0 +1,352 @@
+"""Samples of a bag: images, camera info, transforms and poses of ROS 1 or ROS 2 (also MCAP)."""
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gsmap.converters.argoverse2.samples import thin_out
+from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.errors import naming
+from gsmap.inputs.rig import PoseTrack, RigCamera, RigFrame, nearest_images, rig_samples
+from gsmap.structures.rigid import invert_rigid
+from gsmap.utils.extras import import_extra
+from gsmap.utils.files import write_bytes
+
+_IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+_INFO, _ODOMETRY = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_VEHICLE_FRAMES = ("base_footprint", "base_link")
+_GENERIC = ("compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
+            "image_rect_color")  # fmt: skip
+_TOLERANCE_NS = 50_000_000
+_TO_BGR: dict[str, int | None] = {
+    "bgr8": None, "8UC3": None, "rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR,
+    "bgra8": cv2.COLOR_BGRA2BGR, "mono8": cv2.COLOR_GRAY2BGR, "8UC1": cv2.COLOR_GRAY2BGR,
+    # OpenCV names a pattern by its second row
+    "bayer_rggb8": cv2.COLOR_BayerBG2BGR, "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR, "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
+    "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUYV, "yuv422": cv2.COLOR_YUV2BGR_UYVY,
+}  # fmt: skip
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "yuv422_yuy2": 2, "yuv422": 2}
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag: ``.bag``, ``.mcap``, ``.db3``, or a folder of rosbag2."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return path.suffix in (".bag", ".mcap", ".db3")
+
+
+def read_bag(
+    path: Path,
+    frames_dir: Path,
+    rate_hz: float | None = 2.0,
+    vehicle_frame: str | None = None,
+    ground_z_m: float = 0.0,
+) -> tuple[list[MapSample], bool]:
+    """Read the samples of a bag, in the frame ``ego``, and write their images as files.
+
+    Args:
+        path: The bag.
+        frames_dir: Folder for the images; those that are there are kept.
+        rate_hz: Samples per second of the first camera; None takes all of its images.
+        vehicle_frame: Frame of the vehicle (x ahead, y left, z up) in the bag's transforms;
+            ``base_footprint`` or ``base_link`` by default.
+        ground_z_m: Height of the road in that frame.
+
+    Returns:
+        The samples, with paths relative to ``frames_dir``, and whether they have poses.
+
+    Raises:
+        RuntimeError: If ``rosbags`` is not installed; the message names the extra.
+        ValueError: If the bag is damaged or lacks what is needed; the message lists what it holds.
+    """
+    highlevel = import_extra("rosbags.highlevel", "bags")
+    typesys = import_extra("rosbags.typesys", "bags")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    with naming(path, "record it again, or see docs/inference.md"):
+        try:
+            with highlevel.AnyReader([path], default_typestore=store) as bag:
+                return _read(bag, path, frames_dir, rate_hz, vehicle_frame, ground_z_m)
+        except highlevel.AnyReaderError as error:
+            raise ValueError(str(error)) from error
+
+
+@dataclass
+class _Content:
+    """What a first pass over a bag finds; topics are those of images."""
+
+    infos: dict[str, Any] = field(default_factory=dict)
+    frame_ids: dict[str, str] = field(default_factory=dict)
+    times_ns: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
+    transforms: dict[str, tuple[str, list[int], list[np.ndarray]]] = field(default_factory=dict)
+    static: set[str] = field(default_factory=set)
+    odometry: tuple[list[int], list[np.ndarray]] = field(default_factory=lambda: ([], []))
+
+
+def _read(
+    bag: Any,
+    path: Path,
+    frames_dir: Path,
+    rate_hz: float | None,
+    vehicle_frame: str | None,
+    ground_z_m: float,
+) -> tuple[list[MapSample], bool]:
+    topics = _camera_topics(bag)
+    content = _first_pass(bag, topics)
+    ground = np.eye(4)
+    ground[2, 3] = ground_z_m
+    vehicle = _vehicle_frame(content, vehicle_frame)
+    rig = {
+        topic: _camera(name, topic, content, vehicle, ground) for name, (topic, _) in topics.items()
+    }
+    times = {name: np.unique(content.times_ns[topic]) for name, (topic, _) in topics.items()}
+    first = next((name for name in times if "front" in name.lower()), next(iter(times)))
+    wanted = times[first] if rate_hz is None else thin_out(times[first], rate_hz)
+    nearest = nearest_images(times, wanted.tolist(), _TOLERANCE_NS)
+    frames = [
+        RigFrame(
+            f"{path.stem}_{time_ns}",
+            time_ns,
+            {name: (f"{name}/{t}.jpg", t) for name, t in found.items()},
+        )
+        for time_ns, found in zip(wanted.tolist(), nearest, strict=True)
+    ]
+    track = _track(content, vehicle, ground)
+    _write_images(bag, rig, frames, frames_dir)
+    return rig_samples(path.stem, list(rig.values()), frames, track), track is not None
+
+
+def _listing(bag: Any) -> str:
+    """Say what a bag holds."""
+    return "; ".join(
+        f"{name} ({info.msgtype or 'several types'}, {info.msgcount})"
+        for name, info in sorted(bag.topics.items())
+    )
+
+
+def _camera_topics(bag: Any) -> dict[str, tuple[str, str]]:
+    """Find the cameras: topic of images and of camera info, by name."""
+    kinds = {c.topic: c.msgtype for c in bag.connections}
+    infos = {c.rsplit("/", 1)[0]: c for c, kind in kinds.items() if kind == _INFO}
+    found: dict[str, tuple[str, str]] = {}
+    for kind in _IMAGES:  # of both kinds of one camera's images, the compressed
+        for topic in sorted(t for t, k in kinds.items() if k == kind):
+            parts = topic.split("/")
+            if parts[-1] == "compressedDepth":
+                continue
+            while len(parts) > 2 and parts[-1] in _GENERIC:
+                parts.pop()
+            base = "/".join(parts)
+            spaces = [s for s in infos if base == s or base.startswith(f"{s}/")]
+            if spaces and base not in found:
+                found[base] = topic, infos[max(spaces, key=len)]
+    if not found:
+        raise ValueError(
+            "it has no camera with images (sensor_msgs Image or CompressedImage) and a CameraInfo "
+            f"in the same namespace; it holds: {_listing(bag) or 'no topic'}"
+        )
+    short = [base.rsplit("/", 1)[-1] for base in found]
+    unique = len(set(short)) == len(short)
+    return {
+        name if unique else base.strip("/").replace("/", "_"): pair
+        for name, (base, pair) in zip(short, found.items(), strict=True)
+    }
+
+
+def _stamp_ns(header: Any) -> int:
+    stamp = header.stamp
+    return int(stamp.sec) * 10**9 + int(getattr(stamp, "nanosec", 0) or 0)
+
+
+def _matrix(place: Any, turn: Any) -> np.ndarray:
+    """Return a pose of a message. (4, 4)"""
+    pose = np.eye(4)
+    pose[:3, 3] = place.x, place.y, place.z
+    pose[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    return pose
+
+
+def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:
+    """Gather calibration, transforms, poses and the times of all images."""
+    content = _Content()
+    topic_of: dict[str, list[str]] = defaultdict(list)
+    for topic, info in topics.values():
+        topic_of[info].append(topic)
+    images = {topic for topic, _ in topics.values()}
+    kinds = (*_TRANSFORMS, _ODOMETRY)
+    chosen = [c for c in bag.connections if c.topic in images | set(topic_of) or c.msgtype in kinds]
+    for connection, _, raw in bag.messages(chosen):
+        topic, message = connection.topic, bag.deserialize(raw, connection.msgtype)
+        if topic in images:
+            content.times_ns[topic].append(_stamp_ns(message.header))
+            content.frame_ids.setdefault(topic, message.header.frame_id)
+        elif topic in topic_of:
+            content.infos |= {t: message for t in topic_of[topic] if t not in content.infos}
+        elif connection.msgtype == _ODOMETRY:
+            pose = message.pose.pose
+            content.odometry[0].append(_stamp_ns(message.header))
+            content.odometry[1].append(_matrix(pose.position, pose.orientation))
+        else:
+            _add_transforms(content, message.transforms, topic.endswith("tf_static"))
+    for name, (topic, info) in topics.items():
+        if topic not in content.infos or topic not in content.frame_ids:
+            raise ValueError(f"camera {name!r} has no message on {topic} or {info}")
+    return content
+
+
+def _add_transforms(content: _Content, transforms: Sequence[Any], is_static: bool) -> None:
+    """Keep transforms, of static ones the first."""
+    for item in transforms:
+        child, parent = item.child_frame_id.lstrip("/"), item.header.frame_id.lstrip("/")
+        if is_static:
+            content.static.add(child)
+        _, times, poses = content.transforms.setdefault(child, (parent, [], []))
+        if not is_static or not times:
+            times.append(_stamp_ns(item.header))
+            poses.append(_matrix(item.transform.translation, item.transform.rotation))
+
+
+def _vehicle_frame(content: _Content, wanted: str | None) -> str:
+    frames = set(content.transforms) | {parent for parent, _, _ in content.transforms.values()}
+    for name in _VEHICLE_FRAMES if wanted is None else (wanted,):
+        if name in frames:
+            return name
+    raise ValueError(
+        f"its transforms have no frame {wanted or ' or '.join(_VEHICLE_FRAMES)!s}: name the "
+        f"vehicle's with --vehicle-frame; there are {sorted(frames) or 'no transforms at all'}"
+    )
+
+
+def _chain(content: _Content, frame: str) -> list[str]:
+    """Return a frame and those above it, up to the root."""
+    chain = [frame]
+    while chain[-1] in content.transforms:
+        parent = content.transforms[chain[-1]][0]
+        if parent in chain:
+            raise ValueError(f"its transforms lead from {parent!r} back to it")
+        chain.append(parent)
+    return chain
+
+
+def _camera(
+    name: str, topic: str, content: _Content, vehicle: str, ground: np.ndarray
+) -> RigCamera:
+    """Read a camera's calibration and its place on the vehicle."""
+    info, frame = content.infos[topic], content.frame_ids[topic].lstrip("/")
+    above, of_vehicle = _chain(content, frame), _chain(content, vehicle)
+    if above[-1] != of_vehicle[-1]:
+        raise ValueError(
+            f"camera {name!r}: no transform leads from its frame {frame!r} to {vehicle!r}; there "
+            f"are those of {sorted(content.transforms)}"
+        )
+
+    def root_from(chain: Sequence[str]) -> np.ndarray:
+        pose = np.eye(4)
+        for step in chain[:-1]:
+            pose = content.transforms[step][2][0] @ pose
+        return pose
+
+    vehicle_from_cam = invert_rigid(root_from(of_vehicle)) @ root_from(above)
+
+    def value(key: str) -> np.ndarray:
+        found = getattr(info, key) if hasattr(info, key) else getattr(info, key.upper())
+        return np.asarray(found, np.float64)
+
+    rectified = "rect" in topic.rsplit("/", 2)[-1] or "rect" in topic.rsplit("/", 2)[-2]
+    return RigCamera(
+        name,
+        value("p").reshape(3, 4)[:, :3] if rectified else value("k").reshape(3, 3),
+        invert_rigid(vehicle_from_cam) @ ground,
+        (int(info.width), int(info.height)),
+        np.zeros(0) if rectified else value("d"),
+        str(info.distortion_model),
+    )
+
+
+@dataclass
+class _Chained:
+    """Poses through several transforms, each with times of its own; the vehicle's last."""
+
+    at_each: list[Callable[[int], np.ndarray | None]]
+    ground: np.ndarray
+
+    def at(self, time_ns: int) -> np.ndarray | None:
+        """Return the pose of the ground below the vehicle at a time. (4, 4)"""
+        pose = self.ground
+        for at in self.at_each:
+            step = at(time_ns)
+            if step is None:
+                return None
+            pose = step @ pose
+        return pose
+
+
+def _track(content: _Content, vehicle: str, ground: np.ndarray) -> _Chained | None:
+    """Return the vehicle's poses by the transforms above it, or else by odometry."""
+    steps: list[Callable[[int], np.ndarray | None]] = []
+    moving = False
+    for frame in _chain(content, vehicle)[:-1]:
+        _, times, poses = content.transforms[frame]
+        if frame in content.static:
+            steps.append(lambda _, pose=poses[0]: pose)
+        else:
+            moving = True
+            steps.append(PoseTrack(times, poses).at)
+    if moving:
+        return _Chained(steps, ground)
+    if content.odometry[0]:
+        return _Chained([PoseTrack(*content.odometry).at], ground)
+    return None
+
+
+def _write_images(
+    bag: Any, rig: Mapping[str, RigCamera], frames: Sequence[RigFrame], frames_dir: Path
+) -> None:
+    """Write the images of frames that are not there yet."""
+    missing = {
+        (name, time_ns): frames_dir / path
+        for frame in frames
+        for name, (path, time_ns) in frame.images.items()
+        if not (frames_dir / path).is_file()
+    }
+    chosen = [c for c in bag.connections if c.topic in rig]
+    for connection, _, raw in bag.messages(chosen) if missing else ():
+        message, camera = bag.deserialize(raw, connection.msgtype), rig[connection.topic]
+        target = missing.pop((camera.name, _stamp_ns(message.header)), None)
+        if target is not None:
+            _write_image(message, camera, target)
+
+
+def _write_image(message: Any, camera: RigCamera, target: Path) -> None:
+    """Write a message's image as JPEG; one that cannot be decoded goes along, to be named later."""
+    if hasattr(message, "encoding"):
+        camera.write_image(target, _raw_image(message))
+        return
+    content = np.asarray(message.data, np.uint8)
+    if not camera.is_distorted and content[:2].tobytes() == b"\xff\xd8":
+        write_bytes(target, content.tobytes())
+        return
+    image = cv2.imdecode(content, cv2.IMREAD_COLOR)
+    if image is None:
+        write_bytes(target, content.tobytes())
+    else:
+        camera.write_image(target, image)
+
+
+def _raw_image(message: Any) -> np.ndarray:
+    """Return an uncompressed image, BGR. (H, W, 3)"""
+    encoding = message.encoding
+    if encoding not in _TO_BGR:
+        raise ValueError(f"images have the encoding {encoding!r}; known are {sorted(_TO_BGR)}")
+    channels = _CHANNELS.get(encoding, 1)
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+    image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
+    code = _TO_BGR[encoding]
+    return image if code is None else cv2.cvtColor(np.ascontiguousarray(image), code)
