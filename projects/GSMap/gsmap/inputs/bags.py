@@ -1,7 +1,7 @@
 """Samples of a bag: images, camera info, transforms and poses of ROS 1 or ROS 2 (also MCAP)."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsmap.converters.argoverse2.samples import thin_out
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import naming
-from gsmap.inputs.rig import PoseTrack, RigCamera, RigFrame, nearest_images, rig_samples
+from gsmap.inputs.rig import PoseAt, PoseTrack, RigCamera, RigFrame, nearest_images, rig_samples
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import write_bytes
@@ -25,6 +25,7 @@ _VEHICLE_FRAMES = ("base_footprint", "base_link")
 _GENERIC = ("compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
             "image_rect_color")  # fmt: skip
 _TOLERANCE_NS = 50_000_000
+_GAP_NS, _FOREVER_NS = 10**9, 2**62
 _TO_BGR: dict[str, int | None] = {
     "bgr8": None, "8UC3": None, "rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR,
     "bgra8": cv2.COLOR_BGRA2BGR, "mono8": cv2.COLOR_GRAY2BGR, "8UC1": cv2.COLOR_GRAY2BGR,
@@ -118,9 +119,9 @@ def _read(
         )
         for time_ns, found in zip(wanted.tolist(), nearest, strict=True)
     ]
-    track = _track(content, vehicle, ground)
+    pose_at = _pose_at(content, vehicle, ground)
     _write_images(bag, rig, frames, frames_dir)
-    return rig_samples(path.stem, list(rig.values()), frames, track), track is not None
+    return rig_samples(path.stem, list(rig.values()), frames, pose_at), pose_at is not None
 
 
 def _listing(bag: Any) -> str:
@@ -270,40 +271,26 @@ def _camera(
     )
 
 
-@dataclass
-class _Chained:
-    """Poses through several transforms, each with times of its own; the vehicle's last."""
+def _pose_at(content: _Content, vehicle: str, ground: np.ndarray) -> PoseAt | None:
+    """Return the ground's poses by the transforms above the vehicle, or else by odometry."""
+    above = _chain(content, vehicle)[:-1]
+    if content.static.issuperset(above):
+        steps = [PoseTrack(*content.odometry)] if content.odometry[0] else []
+    else:
+        gaps = [_FOREVER_NS if frame in content.static else _GAP_NS for frame in above]
+        found = [content.transforms[frame] for frame in above]
+        steps = [PoseTrack(t, poses, gap) for (_, t, poses), gap in zip(found, gaps, strict=True)]
 
-    at_each: list[Callable[[int], np.ndarray | None]]
-    ground: np.ndarray
-
-    def at(self, time_ns: int) -> np.ndarray | None:
-        """Return the pose of the ground below the vehicle at a time. (4, 4)"""
-        pose = self.ground
-        for at in self.at_each:
-            step = at(time_ns)
-            if step is None:
+    def pose_at(time_ns: int) -> np.ndarray | None:
+        pose = ground
+        for step in steps:
+            parent_from_child = step.at(time_ns)
+            if parent_from_child is None:
                 return None
-            pose = step @ pose
+            pose = parent_from_child @ pose
         return pose
 
-
-def _track(content: _Content, vehicle: str, ground: np.ndarray) -> _Chained | None:
-    """Return the vehicle's poses by the transforms above it, or else by odometry."""
-    steps: list[Callable[[int], np.ndarray | None]] = []
-    moving = False
-    for frame in _chain(content, vehicle)[:-1]:
-        _, times, poses = content.transforms[frame]
-        if frame in content.static:
-            steps.append(lambda _, pose=poses[0]: pose)
-        else:
-            moving = True
-            steps.append(PoseTrack(times, poses).at)
-    if moving:
-        return _Chained(steps, ground)
-    if content.odometry[0]:
-        return _Chained([PoseTrack(*content.odometry).at], ground)
-    return None
+    return pose_at if steps else None
 
 
 def _write_images(

@@ -62,14 +62,18 @@ def read_image_folder(file: Path, frames_dir: Path) -> tuple[list[MapSample], bo
         rate_hz = float(content.get("rate_hz", 10.0))
         tolerance_ns = round(float(content.get("max_time_difference_ms", 50.0)) * 1e6)
         frames, time_of = _frames(images, rate_hz, tolerance_ns, file)
-        track = None
+        pose_at = None
         if content.get("poses"):
-            track = _read_poses(file.parent / content["poses"], time_of, ground)
+            pose_at = _read_poses(file.parent / content["poses"], time_of, ground).at
         root = file.parent
         if any(camera.is_distorted for camera in rig):
             root = frames_dir
             frames = [_rectified(frame, rig, file.parent, root) for frame in frames]
-        return rig_samples(file.parent.resolve().name, rig, frames, track), track is not None, root
+        return (
+            rig_samples(file.parent.resolve().name, rig, frames, pose_at),
+            pose_at is not None,
+            root,
+        )
 
 
 def _require_keys(value: Any, known: set[str], what: str) -> None:

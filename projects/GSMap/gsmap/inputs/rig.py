@@ -1,6 +1,6 @@
 """Cameras on a vehicle, its poses, and the samples that they make together."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from gsmap.inputs.frames import sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.files import write_bytes
 
+PoseAt = Callable[[int], np.ndarray | None]
 FISHEYE_MODELS = ("equidistant", "fisheye")
 PLAIN_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "")
 
@@ -143,7 +144,7 @@ def nearest_images(
 
 
 def rig_samples(
-    scene: str, rig: Sequence[RigCamera], frames: Sequence[RigFrame], track: PoseTrack | None
+    scene: str, rig: Sequence[RigCamera], frames: Sequence[RigFrame], pose_at: PoseAt | None
 ) -> list[MapSample]:
     """Make the samples of a drive, in the frame ``ego``.
 
@@ -151,20 +152,20 @@ def rig_samples(
         scene: Name of the drive.
         rig: The cameras.
         frames: What they saw.
-        track: Poses of the ground below the vehicle, or None; frames without a pose nearby are
-            left out.
+        pose_at: Pose of the ground below the vehicle at a time; frames for which it has none are
+            left out. None where no pose is known.
     """
     samples = []
     for frame in frames:
-        pose = None if track is None else track.at(frame.time_ns)
-        if track is not None and pose is None:
+        pose = None if pose_at is None else pose_at(frame.time_ns)
+        if pose_at is not None and pose is None:
             continue
         cameras = []
         for camera in rig:
             if camera.name not in frame.images:
                 continue
             path, time_ns = frame.images[camera.name]
-            then = None if track is None else track.at(time_ns)
+            then = None if pose_at is None else pose_at(time_ns)
             cam_from_ground = camera.cam_from_ground
             if then is not None and pose is not None:  # the vehicle moves between the two
                 cam_from_ground = cam_from_ground @ invert_rigid(then) @ pose
