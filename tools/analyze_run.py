@@ -2,7 +2,7 @@
 """Draw the loss and metric curves of training runs and print a table of them.
 
 Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out curves.png``.
-``--keys soft_iou/divider at_floor`` draws these figures of training, a panel each.
+``--keys soft_iou/divider at_floor`` draws these logged values instead, one panel each.
 """
 
 import argparse
@@ -23,7 +23,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--out", type=output_file, help="picture to write: .png, .jpg, .pdf or .svg"
     )
-    parser.add_argument("--keys", nargs="+", help="logged figures to draw in place of the losses")
+    parser.add_argument("--keys", nargs="+", help="logged values to draw instead of the losses")
     parser.add_argument(
         "--table", type=output_file, help="also write the Markdown table to this file"
     )

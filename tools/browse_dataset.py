@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Draw what a data set hands to training: images after augmentation, with their ground truth.
+"""Draw the samples that training sees: images after augmentation, with their ground truth.
 
 Example: ``python tools/browse_dataset.py CONFIG --split train --num 20 --show-dir pictures``.
-``--web dataset.html`` writes one page to click through instead, with the image files as they are.
+``--web dataset.html`` writes an interactive page with the original image files instead.
 """
 
 import argparse

@@ -49,7 +49,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--min-confidence",
         type=float,
         default=MergeConfig.min_confidence,
-        help="smallest share of frames, weighted by score, that must have found what they see",
+        help="keep a place if this share of the frames that see it found it, weighted by score",
     )
     parser.add_argument(
         "--min-area-confidence",
@@ -58,7 +58,9 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="the same for areas, such as crossings",
     )
     parser.add_argument(
-        "--no-gaussians", action="store_true", help="weigh by distance even if there are Gaussians"
+        "--no-gaussians",
+        action="store_true",
+        help="compute weights from the distance, not from Gaussians",
     )
     parser.add_argument(
         "--origin",

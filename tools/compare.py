@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-r"""Train, test and tabulate several configs on the same data, seeds and budget.
+r"""Train and test several configs on the same data, seeds and budget, and write a table.
 
-``CONFIG`` is a file, the name of a model, or ``NAME=CONFIG[,KEY=VALUE...]``. A command that was
-stopped goes on when it is given again; runs that are done are not run again. ``--list`` prints
-every row of the papers' tables (``configs/tables.json``) with the command that trains it here.
+``CONFIG`` is a file, the name of a model, or ``NAME=CONFIG[,KEY=VALUE...]``. Give a stopped command
+again to continue it; finished runs are not repeated. ``--list`` prints every row of the papers'
+tables (``configs/tables.json``) with the command that trains it.
 
 Examples:
     python tools/compare.py maptr_r18_minicity gsmap_r18_minicity --seeds 3 --budget 6400 --out s
@@ -48,12 +48,14 @@ def parse_args() -> argparse.Namespace:
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("configs", nargs="*", metavar="CONFIG", help="what to train and compare")
+    parser.add_argument("configs", nargs="*", metavar="CONFIG", help="configs to compare")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="seeds 0 to N - 1")
     parser.add_argument("--budget", type=int, metavar="ITERATIONS", help="length of every run")
-    parser.add_argument("--batch", type=int, default=4, help="samples of an iteration")
+    parser.add_argument("--batch", type=int, default=4, help="samples per iteration")
     parser.add_argument("--out", type=Path, metavar="DIR", help="work folders, tables and plots")
-    parser.add_argument("--init", metavar="CHECKPOINT", help="what all start from: file or name")
+    parser.add_argument(
+        "--init", metavar="CHECKPOINT", help="common start of all runs: file or name"
+    )
     parser.add_argument(
         "--runs", nargs="+", default=[], metavar="NAME=DIR", help="work folders of finished runs"
     )
@@ -62,9 +64,9 @@ def parse_args() -> argparse.Namespace:
         nargs="+",
         action=DictAction,
         metavar="KEY=VALUE",
-        help="tabulate under other rules, such as thresholds=[0.2,0.5,1.0]; trains nothing",
+        help="score again with other settings, such as thresholds=[0.2,0.5,1.0]; trains nothing",
     )
-    parser.add_argument("--only", metavar="NAME/seed_N", help="this run alone, and no tables")
+    parser.add_argument("--only", metavar="NAME/seed_N", help="only this run, without tables")
     parser.add_argument("--slurm", metavar="PARTITION", help="print a Slurm command for each run")
     parser.add_argument("--data-root", metavar="DIR", help="folder of the data set of all configs")
     parser.add_argument(

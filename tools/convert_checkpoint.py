@@ -1,4 +1,4 @@
-"""Rename a checkpoint between the format of the earlier systems and ours, whichever it is in."""
+"""Convert a checkpoint of the original systems to our format, or one of ours to theirs."""
 
 from pathlib import Path
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
-"""Turn a config of the original MapTR, MapTRv2, GeMap or MapVR into ours.
+"""Convert a config of the original MapTR, MapTRv2, GeMap or MapVR to ours.
 
-The file is read, not run; what has no place in ours is named. Example:
+The file is read, not run. Settings without a counterpart are printed. Example:
     python tools/convert_config.py maptr_tiny_r50_24e.py configs/mine/maptr_tiny.py
 """
 

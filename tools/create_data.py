@@ -1,8 +1,8 @@
 #!/usr/bin/env python
 """Make data and annotation files: ``python tools/create_data.py COMMAND --help``.
 
-Each command lives in the package as a module with ``add_arguments(parser)`` and ``run(arguments,
-command)``, imported only when it is asked for.
+Each command is a module of the package with ``add_arguments(parser)`` and ``run(arguments,
+command)``. It is imported only when needed.
 """
 
 import argparse
@@ -23,7 +23,7 @@ COMMANDS = {
         "render camera images for real Argoverse 2 logs",
     ),
     "infos": ("gsmap.converters.infos", "convert an info file of MapTR or MapTRv2"),
-    "check": ("gsmap.converters.check", "check annotation files to the bottom"),
+    "check": ("gsmap.converters.check", "check annotation files completely"),
     "export": ("gsmap.converters.export", "write an annotation file's vectors as JSON"),
 }
 

@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-"""GSMap from nothing to a map on MiniCity (``make demo``).
+"""Test a trained GSMap on MiniCity, then train one from scratch (``make demo``).
 
-First the model that ships is tested on validation towns and draws what it sees; then one is trained
-from scratch and set beside it. What is done is skipped on the next run; an interrupted training
-goes on where it stopped.
+First the model that ships is tested on validation towns, and its predictions are drawn. Then a
+model is trained from scratch and compared with it. The next run skips finished steps, and an
+interrupted training continues.
 """
 
 import hashlib
@@ -229,7 +229,7 @@ def first_picture(folder: Path) -> Path:
 
 def main() -> None:
     parser = CommandParser(description=__doc__)
-    parser.add_argument("--dir", default="demo", help="where everything goes")
+    parser.add_argument("--dir", default="demo", help="folder of all outputs")
     parser.add_argument("--budget", choices=BUDGETS, default="demo", help="how long to train")
     parser.add_argument(
         "--models", nargs="+", choices=MODELS, default=["GSMap"], help="what to train, in order"

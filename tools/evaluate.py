@@ -53,7 +53,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--prior",
         type=Path,
         metavar="TRAIN",
-        help="instead of results: the best fixed set of elements, fitted on this ground truth",
+        help="score the best fixed set of elements, fitted on this ground truth",
     )
     parser.add_argument("--prior-elements", type=int, default=50, help="elements in that set")
     parser.add_argument("--eval", nargs="+", default=list(METRIC_NAMES), choices=METRIC_NAMES)
@@ -65,7 +65,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         type=int,
         default=2,
         choices=(2, 3),
-        help="coordinates that AP_chamfer counts; 3 needs heights in results and ground truth",
+        help="coordinates of AP_chamfer; 3 needs heights in results and ground truth",
     )
     parser.add_argument("--hard", action="store_true", help="AP_chamfer at 0.2, 0.5 and 1.0 m")
     parser.add_argument("--classes", nargs="+", help="default: the annotation file's, or MapTR's")

@@ -5,7 +5,7 @@ Examples:
     python tools/export.py CONFIG CHECKPOINT --out model.onnx --check 5
     python tools/export.py CONFIG CHECKPOINT --out model_int8.onnx --int8 --calibration train.arrow
 
-Cameras are those of the config, the image size is that of the config's test samples or ``--size``.
+The config sets the cameras. The image size is that of its test samples, or ``--size``.
 """
 
 import argparse
@@ -62,7 +62,7 @@ def parse_args() -> argparse.Namespace:
         "--check", type=int, metavar="N", help="compare with torch on N samples, evenly spread"
     )
     parser.add_argument(
-        "--results", type=output_file, help="JSON file for what ONNX Runtime found there"
+        "--results", type=output_file, help="JSON file for the predictions of ONNX Runtime"
     )
     add_config_options(parser)
     args = parser.parse_args()

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Run a trained model on recordings without ground truth, and write and draw what it finds.
+"""Run a trained model on recordings without ground truth; write and draw its predictions.
 
 Example: ``python tools/infer.py INPUT --model gsmap_r18_minicity --out map.json --show-dir
 pictures``, or ``--model CONFIG CHECKPOINT``. INPUT is an annotation file (.arrow), an info file of

@@ -22,14 +22,18 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--out", type=output_file, default=Path("report.html"), help="page to write"
     )
-    parser.add_argument("--compare", type=Path, metavar="RESULTS", help="other results beside them")
+    parser.add_argument(
+        "--compare", type=Path, metavar="RESULTS", help="second result file, shown beside the first"
+    )
     parser.add_argument("--names", nargs="+", help="a name for each result file")
     parser.add_argument(
-        "--data-root", type=Path, help="where image paths start from; default: folder of --ann"
+        "--data-root", type=Path, help="root of the image paths; default: folder of --ann"
     )
     parser.add_argument("--max-frames", type=int, default=200, help="largest number of frames")
-    parser.add_argument("--score-thr", type=float, default=0.4, help="where the slider starts")
-    parser.add_argument("--image-width", type=int, default=240, help="of thumbnails, in pixels")
+    parser.add_argument("--score-thr", type=float, default=0.4, help="initial score of the slider")
+    parser.add_argument(
+        "--image-width", type=int, default=240, help="width of thumbnails in pixels"
+    )
     parser.add_argument("--no-images", action="store_true", help="leave the camera images out")
     parser.add_argument(
         "--allow-mismatch",

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Test a model: ``python tools/test.py CONFIG CHECKPOINT --eval chamfer raster``.
 
-The name of a model that ships stands for both: ``python tools/test.py gsmap_r18_minicity``.
+Or give the name of a model that ships: ``python tools/test.py gsmap_r18_minicity``.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def parse_args() -> argparse.Namespace:
         "--shuffle-images",
         type=int,
         metavar="SEED",
-        help="give every sample another one's images: what a model scores that does not look",
+        help="give every sample the images of another one, to see what a model scores without them",
     )
     add_common_arguments(parser)
     return parser.parse_args()

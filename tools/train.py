@@ -19,7 +19,7 @@ def parse_args() -> argparse.Namespace:
         "--resume",
         nargs="?",
         const="auto",
-        help="go on from the checkpoint given, or from the newest whole one in the work folder",
+        help="continue from this checkpoint, or from the newest complete one in the work folder",
     )
     parser.add_argument("--amp", action="store_true", help="train with automatic mixed precision")
     parser.add_argument(

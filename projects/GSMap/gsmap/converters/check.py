@@ -1,4 +1,4 @@
-"""Annotation files checked to the bottom: their own content, and the files that they name."""
+"""Check annotation files completely: their own content, and the files that they name."""
 
 import argparse
 from collections.abc import Sequence
