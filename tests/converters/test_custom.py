@@ -12,7 +12,6 @@ from gsmap.visualization.frame_view import FRAME_VIEWS
 
 REPO = Path(__file__).resolve().parents[2]
 DOC = REPO / "docs/custom_data.md"
-TUTORIAL = REPO / "docs/tutorial.md"
 META = AnnotationMeta("mine", "ego", "train", x_range=(-30, 30), y_range=(-15, 15))
 
 
