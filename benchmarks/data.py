@@ -61,14 +61,14 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
         reads: How many random samples the extra process reads.
 
     Returns:
-        ``open_s``; ``read_ms`` per sample; ``worker_mb``, all that the extra process holds for
-        itself, the interpreter and its libraries included; ``worker_growth_mb``, what reading added
+        ``open_s`` and ``read_ms`` per sample, both of CPU time; ``worker_mb``, all that the extra
+        process holds for itself, the interpreter and its libraries included; ``worker_growth_mb``, what reading added
         to it; ``worker_rss_mb``, with shared pages; ``file_mb``; ``samples``.
     """
-    start = time.perf_counter()
+    start = time.process_time()
     file = AnnotationFile(path)
     file.instance_counts()
-    opened = time.perf_counter() - start
+    opened = time.process_time() - start
     start = time.process_time()
     for row in np.random.default_rng(1).integers(len(file), size=1000):
         file[int(row)]
