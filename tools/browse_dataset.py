@@ -55,7 +55,7 @@ def main() -> str:
         images = None if args.original else images_from_inputs(item["inputs"]["img"])
         figure = visualizer.draw_sample(sample, images)
         save_figure(figure, args.show_dir / sample_name(sample.metainfo, f".{args.format}"))
-    return f"\n{len(indices)} pictures: {args.show_dir}"
+    return f"{len(indices)} pictures: {args.show_dir}"
 
 
 if __name__ == "__main__":

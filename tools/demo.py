@@ -24,6 +24,11 @@ from gsmap.utils.files import write_text
 
 REPO = Path(__file__).resolve().parents[1]
 MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}  # that ship
+NEXT = """
+To go on in this environment:
+    source {activate}
+    gsmap --help
+    gsmap test gsmap_r18_minicity --data-root {root}"""
 CLASSES = ("divider", "ped_crossing", "boundary")
 
 
@@ -154,7 +159,7 @@ def options_of(folder: Path, budget: Budget) -> list[str]:
         "--cfg-options",
         f"train_dataloader.dataset.data_root={train}",
         f"train_cfg.max_epochs={budget.epochs}",
-        f"train_cfg.val_interval={budget.epochs}",
+        f"train_cfg.val_interval={max(1, budget.epochs // 4)}",
         f"param_scheduler.1.T_max={budget.epochs}",
         "randomness.seed=0",
     ]
@@ -195,6 +200,12 @@ def model_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
         f"train {name}",
         ["tools/dist_train.sh", config, str(processes()), *training],
         [checkpoint],
+    )
+    curves = work / "curves.png"
+    yield Step(
+        f"draw losses and validations of {name}",
+        ["tools/analyze_run.py", str(work), "--out", str(curves)],
+        [curves],
     )
     model, tested = [config, str(checkpoint)], folder / f"{name.lower()}_test"
     yield test_step(f"test and draw {name}", model, tested, *drawing(tested), common=common)
@@ -256,7 +267,10 @@ def main() -> None:
     write_text(folder / "summary.md", summary + "\n")
     for name in args.models:
         print(f"{name} from scratch: {first_picture(folder / f'{name.lower()}_test')}")
+        print(f"its losses and validations: {folder / name.lower() / 'curves.png'}")
     print(f"{(time.monotonic() - started) / 60:.1f} minutes. Figures: {folder / 'summary.md'}")
+    root = data_root(folder, budget, "val")
+    print(NEXT.format(activate=Path(sys.prefix, "bin/activate"), root=root))
 
 
 if __name__ == "__main__":

@@ -7,10 +7,10 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 venv=${1:-.venv}
 python=${PYTHON:-python3}
-stamp="$venv/.gsmap-$(cat requirements.txt requirements-dev.txt tools/setup_env.sh | sha256sum | cut -c1-16)"
+stamp="$venv/.gsmap-$(cat requirements.txt requirements-dev.txt pyproject.toml tools/setup_env.sh | sha256sum | cut -c1-16)"
 
 if [ -f "$stamp" ]; then
-    echo "Environment $venv is ready (delete it to build it again)."
+    echo "Environment $venv is ready (delete it to build it again). Enter it with: source $venv/bin/activate"
     exit 0
 fi
 
@@ -62,4 +62,4 @@ print(f"torch {torch.__version__}, mmengine {mmengine.__version__}, mmcv {mmcv._
 PY
 rm -f "$venv"/.gsmap-*
 touch "$stamp"
-echo "Environment $venv is ready after $((SECONDS - started)) s."
+echo "Environment $venv is ready after $((SECONDS - started)) s. Enter it with: source $venv/bin/activate"

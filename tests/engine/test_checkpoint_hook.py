@@ -159,7 +159,7 @@ class Nothing(BaseMetric):
         return {"figure": 1.0}
 
 
-def learn(work_dir, epochs, resume_from=None) -> int:
+def learn(work_dir, epochs, resume_from=None, **options) -> int:
     """Train for some epochs, with a validation after every second and the last; return how many."""
     Learner.validations = 0
     before = torch.serialization.get_safe_globals()
@@ -173,7 +173,7 @@ def learn(work_dir, epochs, resume_from=None) -> int:
         val_cfg={},
         val_evaluator=Evaluator(Nothing()),
         optim_wrapper={"optimizer": {"type": "SGD", "lr": 0.1}},
-        default_hooks={"checkpoint": {"type": "AtomicCheckpointHook", "interval": 1}},
+        default_hooks={"checkpoint": {"type": "AtomicCheckpointHook", "interval": 1, **options}},
         load_from=resume_from and str(resume_from),
         resume=resume_from is not None,
         experiment_name=f"learn-{work_dir.name}-{epochs}-{resume_from is None}",
@@ -194,6 +194,13 @@ def test_a_validation_that_a_kill_prevented_is_made_up_for(tmp_path):
     (tmp_path / "last_validation").write_text("4")  # as after a kill between epoch 3 and its end
     assert learn(tmp_path, 3, tmp_path / "epoch_3.pth") == 1
     assert learn(tmp_path, 3, tmp_path / "epoch_2.pth") == 2  # that of epoch 2, then 3's
+
+
+def test_the_best_of_the_validations_is_kept(tmp_path):
+    learn(tmp_path, 3, save_best="figure", rule="greater")
+    assert [path.name for path in tmp_path.glob("best*")] == ["best_figure_epoch_2.pth"]
+    with pytest.raises(ValueError, match=r"save_best names 'chamfer/mAP', which .* not measure"):
+        learn(tmp_path / "other", 2, save_best="chamfer/mAP", rule="greater")
 
 
 def test_a_checkpoint_holds_the_models_settings_and_no_text_that_runs(tmp_path):

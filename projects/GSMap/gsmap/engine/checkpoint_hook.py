@@ -69,7 +69,17 @@ class AtomicCheckpointHook(CheckpointHook):
             runner.val_loop.run()
 
     def after_val_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
-        """Note which state was validated."""
+        """Keep the best checkpoint and note which state was validated.
+
+        Raises:
+            ValueError: If the validation does not have the figure that ``save_best`` names.
+        """
+        for name in getattr(self, "key_indicators", ()):
+            if metrics and name not in metrics:
+                raise ValueError(
+                    f"default_hooks.checkpoint.save_best names {name!r}, which the validation does "
+                    f"not measure; it has {', '.join(n for n in metrics if n.endswith('/mAP'))}."
+                )
         super().after_val_epoch(runner, metrics)
         if runner.rank == 0:
             write_text(Path(runner.work_dir, VALIDATED), str(runner.iter))

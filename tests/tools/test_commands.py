@@ -1,0 +1,64 @@
+"""The ways to start the tools: ``gsmap NAME``, TensorBoard, and the demo's steps."""
+
+import os
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tensorboard import default
+
+from gsmap.__main__ import main
+
+REPO = Path(__file__).resolve().parents[2]
+
+
+def gsmap(monkeypatch: pytest.MonkeyPatch, *words: str) -> object:
+    """Run ``gsmap WORDS`` and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["gsmap", *words])
+    with pytest.raises(SystemExit) as left:
+        main()
+    return left.value.code
+
+
+def test_gsmap_runs_the_tools_from_any_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert gsmap(monkeypatch, "convert_checkpoint", "gsmap_r18_minicity", "x.pth") == 2
+    assert "keys that upstream's maptr does not have" in capsys.readouterr().err
+    assert gsmap(monkeypatch, "create_data", "--help") == 0
+    assert "usage: create_data.py" in capsys.readouterr().out
+    assert "there is no command trian; there are analyze_run, " in gsmap(monkeypatch, "trian")
+    monkeypatch.setattr(sys, "argv", ["gsmap"])
+    main()
+    assert {"  train", "  test", "  report"} <= set(capsys.readouterr().out.splitlines())
+
+
+def test_a_broken_plugin_of_another_package_does_not_stop_tensorboard(tmp_path, monkeypatch):
+    """As open3d's on a machine without libusb."""
+    package = tmp_path / "broken-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (package / "entry_points.txt").write_text("[tensorboard_plugins]\nbroken = riddle:Plugin\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ModuleNotFoundError, match="riddle"):
+        default.get_dynamic_plugins()  # what the usual command does
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    done = subprocess.run(
+        [sys.executable, "tools/watch.py", "--logdir", str(logs), "--inspect"],
+        cwd=REPO, env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        text=True, capture_output=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, "No event files found" in done.stdout) == (0, True), done.stderr
+
+
+def test_the_demo_validates_along_the_way_and_draws_it(tmp_path):
+    demo = runpy.run_path(str(REPO / "tools/demo.py"))
+    steps = list(demo["model_steps"]("GSMap", tmp_path, demo["BUDGETS"]["demo"]))
+    assert [step.title for step in steps[:2]] == [
+        "train GSMap",
+        "draw losses and validations of GSMap",
+    ]
+    assert "train_cfg.val_interval=2" in steps[0].command
+    assert steps[1].products == [tmp_path / "gsmap/curves.png"]
