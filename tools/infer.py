@@ -23,6 +23,11 @@ from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.launch import add_config_options
 from gsmap.engine.named_models import checkpoint_for
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
+from gsmap.inputs.calibration_check import (
+    calibration_figure,
+    calibration_warnings,
+    image_warnings,
+)
 from gsmap.inputs.source import InputOptions, Source, open_input
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_bytes
@@ -31,7 +36,7 @@ from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
 
-SKIPPED = 1  # exit code when frames were broken
+SKIPPED = DOUBTFUL = 1  # exit code when frames were broken, or a calibration is implausible
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -40,12 +45,17 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--model",
         nargs="+",
-        required=True,
         metavar=("NAME_OR_CONFIG", "CHECKPOINT"),
         help="name of a model that ships, or config file and checkpoint",
     )
     parser.add_argument("--out", type=output_file, help="JSON file for the predictions")
     parser.add_argument("--show-dir", type=Path, help="folder for pictures")
+    parser.add_argument(
+        "--check-calibration",
+        type=output_file,
+        metavar="FILE.png",
+        help="judge the calibration, draw the ground plane over the first sample's images, and end",
+    )
     parser.add_argument("--token", nargs="+", help="tokens of the samples to run; all by default")
     parser.add_argument("--max-samples", type=int, help="run this many samples, evenly spread")
     group = parser.add_argument_group("input")
@@ -84,14 +94,17 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     group.add_argument("--lidar", action="store_true", help="draw the LiDAR sweep faintly")
     add_shard_options(parser)
     args = parser.parse_args(argv)
-    if len(args.model) > 2:
+    if not args.model and not args.check_calibration:
+        parser.error("the following arguments are required: --model")
+    if args.model and len(args.model) > 2:
         parser.error(f"--model takes a name, or a config and a checkpoint, got {args.model}")
     return args
 
 
 def read_input(args: argparse.Namespace) -> Source:
     """Open the input and say what its reader has to say."""
-    place = args.out.with_suffix("") if args.out else args.show_dir / "input"
+    out = args.out or args.check_calibration
+    place = out.with_suffix("") if out else args.show_dir / "input"
     options = InputOptions(
         data_root=args.data_root,
         allow_missing_cameras=args.allow_missing_cameras,
@@ -107,6 +120,18 @@ def read_input(args: argparse.Namespace) -> Source:
     if not source.has_poses:
         print("no pose is known: single frames only, no map of the drive")
     return source
+
+
+def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
+    """Print what is implausible about an input's cameras; draw them if that is asked for."""
+    sample, root = source.samples[0], source.data_root or Path()
+    warnings = calibration_warnings(source.samples, source.frame) + image_warnings(sample, root)
+    for line in warnings:
+        print(f"calibration: {line}")
+    if args.check_calibration:
+        path = save_figure(calibration_figure(sample, source.frame, root), args.check_calibration)
+        print(f"{len(warnings)} warnings; the ground plane as the cameras should see it: {path}")
+    return warnings
 
 
 def open_model(args: argparse.Namespace) -> MapInferencer:
@@ -185,11 +210,17 @@ def main(argv: list[str] | None = None) -> str | None:
     args = parse_args(argv)
     if args.executor:
         return run_on_ray(args, sys.argv)
+    if args.check_calibration:
+        if check_calibration(args, read_input(args)):
+            sys.exit(DOUBTFUL)
+        return
     if not args.out and not args.show_dir:
         raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
     if args.width is not None and args.width < 1:
         raise ValueError(f"--width must be >= 1 pixel, got {args.width}.")
     source = read_input(args)
+    if not isinstance(source.samples, AnnotationFile):
+        check_calibration(args, source)
     inferencer = open_model(args)
     dataset = inferencer.dataset(source)
     tokens = dataset.annotations.column("token")

@@ -132,7 +132,7 @@ def record(recorder, samples, root, poses="tf", raw=None, distortion=()):
                 at = time_ns + shift
                 if poses == "tf":
                     recorder.transform("/tf", at, "odom", "base_link", world_from_base)
-                    recorder.transform("/tf", at, "map", "odom", np.eye(4))
+                    recorder.transform("/tf_static", 0, "map", "odom", np.eye(4))
             for camera in sample.cameras:
                 base_from_cam = invert_rigid(axle) @ ground @ invert_rigid(camera.cam_from_frame)
                 frame = f"{camera.name}_optical"

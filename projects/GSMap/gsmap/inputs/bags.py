@@ -25,7 +25,7 @@ _VEHICLE_FRAMES = ("base_footprint", "base_link")
 _GENERIC = ("compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
             "image_rect_color")  # fmt: skip
 _TOLERANCE_NS = 50_000_000
-_GAP_NS, _FOREVER_NS = 10**9, 2**62
+_GAP_NS, _FOREVER_NS = 10**9, 10**20
 _TO_BGR: dict[str, int | None] = {
     "bgr8": None, "8UC3": None, "rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR,
     "bgra8": cv2.COLOR_BGRA2BGR, "mono8": cv2.COLOR_GRAY2BGR, "8UC1": cv2.COLOR_GRAY2BGR,
