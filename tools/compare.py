@@ -33,13 +33,13 @@ from gsmap.apis.comparison_report import (
     check_one_test_set,
     markdown,
     plot_iterations,
-    plot_precision_recall,
     read_result,
 )
 from gsmap.engine.launch import data_root_options
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.visualization.figure import save_figure
+from gsmap.visualization.plots import plot_precision_recall
 
 TABLES = Path(__file__).resolve().parents[1] / "configs/tables.json"
 

@@ -158,10 +158,10 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         write_figures(args.out, reports)
         print(f"figures: {args.out}")
     if args.pr_curves:
-        from gsmap.evaluation.curves import draw_curves
+        from gsmap.visualization.figure import save_figure  # matplotlib takes a second
+        from gsmap.visualization.plots import plot_result
 
-        draw_curves(reports, args.pr_curves)
-        print(f"curves: {args.pr_curves}")
+        print(f"curves: {save_figure(plot_result(reports), args.pr_curves)}")
 
 
 def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:

@@ -9,7 +9,6 @@ from statistics import mean, stdev
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mmengine.config import Config
 
@@ -17,7 +16,6 @@ from gsmap.apis.checkpoint import read_weights
 from gsmap.apis.comparison import RECORD
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import newest_checkpoint
-from gsmap.evaluation.average_precision import precision_recall
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.file_evaluation import evaluate_files
@@ -25,9 +23,10 @@ from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import MetricReport, flat_metrics
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.parallel import default_workers
+from gsmap.visualization.plots import finish_panel, panel_grid
 from gsmap.visualization.run_curves import RunLog, read_run
+from gsmap.visualization.style import RUN_COLOURS
 
-_COLOURS = ("#2D8CFF", "#FF9500", "#1DB954", "#AF52DE", "#FF3B30", "#5AC8FA", "#A2845E", "#34495E")
 _COSTS = {
     "iterations": ".0f",
     "million parameters": ".2f",
@@ -272,9 +271,9 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
     runs = [r for r in results if r.log and r.log.val and r.log.train]
     if not runs:
         return None
-    figure, axes = _panels(1, len(METRIC_NAMES))
+    figure, axes = panel_grid(1, len(METRIC_NAMES))
     for panel, metric in zip(axes[0], METRIC_NAMES, strict=True):
-        for name, colour in zip(dict.fromkeys(r.name for r in runs), _COLOURS * 9, strict=False):
+        for name, colour in zip(dict.fromkeys(r.name for r in runs), RUN_COLOURS * 9, strict=False):
             for index, run in enumerate(r for r in runs if r.name == name):
                 assert run.log is not None
                 per_step = 1.0
@@ -283,38 +282,9 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
                 steps, values = run.log.series(f"{metric}/mAP", validation=True)
                 label = None if index else name
                 panel.plot(per_step * steps, 100 * values, ".-", color=colour, label=label)
-        panel.set(xlabel="iteration", title=f"mAP_{metric}", ylim=(0, None))
-        panel.legend(fontsize=8)
+        panel.set_ylim(0)
+        finish_panel(panel, f"mAP_{metric} (%)", "iteration")
     return figure
-
-
-def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figure:
-    """Draw precision over recall, a panel a class and metric, at the middle threshold.
-
-    Args:
-        reports: Both metrics of one run of each config, by its name.
-    """
-    first = next(iter(reports.values()))
-    figure, axes = _panels(len(first), len(first[0].detections))
-    for index, row in enumerate(axes):
-        metric = first[index]
-        for panel, (class_name, found) in zip(row, metric.detections.items(), strict=True):
-            middle = len(found.thresholds) // 2
-            for (name, of_run), colour in zip(reports.items(), _COLOURS * 9, strict=False):
-                of_class = of_run[index].detections[class_name]
-                curve = precision_recall(of_class.hits[:, middle], of_class.num_gts)
-                panel.plot(*curve, color=colour, label=name, linewidth=1.2)
-            panel.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
-            panel.set_title(f"{class_name}, {metric.name} at {found.thresholds[middle]:g}")
-        row[0].legend(fontsize=8)
-    return figure
-
-
-def _panels(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
-    """Return a figure and its panels. (rows, columns)"""
-    figure = Figure(figsize=(3.6 * columns, 3.2 * rows), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False)
 
 
 def apply_rescoring(

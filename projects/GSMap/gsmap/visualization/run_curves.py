@@ -4,14 +4,17 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
-_COLOURS = ("#2D8CFF", "#FF9500", "#1DB954", "#AF52DE", "#FF3B30", "#5AC8FA", "#A2845E", "#34495E")
+from gsmap.visualization.plots import finish_panel, panel_grid
+from gsmap.visualization.style import RUN_COLOURS
+
 _TIMING = ("data_time", "time", "step", "epoch", "iter", "memory")
 
 
@@ -101,16 +104,9 @@ def smoothed(values: np.ndarray, window: int) -> np.ndarray:
     return (total[upper] - total[lower]) / (upper - lower)
 
 
-def _panels(count: int, width_in: float, height_in: float) -> tuple[Figure, Sequence[Axes]]:
-    """Make a figure with panels in a row."""
-    figure = Figure(figsize=(width_in * count, height_in), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(1, count, squeeze=False)[0]
-
-
 def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, window: int, title: str) -> None:
     """Draw a figure of training, faintly as it was logged and smoothed, one colour per run."""
-    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
+    for run, colour in zip(runs, RUN_COLOURS * len(runs), strict=False):
         steps, values = run.series(key)
         ax.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
         ax.plot(steps, smoothed(values, window), color=colour, linewidth=1.6, label=run.name)
@@ -121,7 +117,7 @@ def _draw_parts_of_loss(ax: Axes, run: RunLog) -> None:
     """Draw the terms of the last decoder layer; those of earlier ones begin with d0., d1."""
     keys = dict.fromkeys(k for record in run.train for k in record if "loss" in k and k != "loss")
     last = [key for key in keys if not (key[0] == "d" and key.split(".")[0][1:].isdigit())]
-    for name, colour in zip(last, _COLOURS * 8, strict=False):
+    for name, colour in zip(last, RUN_COLOURS * 8, strict=False):
         steps, values = run.series(name)
         ax.plot(steps, smoothed(values, 10), color=colour, linewidth=1.4, label=name)
     _finish(ax, f"its parts, last decoder layer ({run.name})", "iteration")
@@ -129,32 +125,29 @@ def _draw_parts_of_loss(ax: Axes, run: RunLog) -> None:
 
 def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
     """Draw the validation metrics, one colour per run and one line style per metric."""
-    for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
+    for run, colour in zip(runs, RUN_COLOURS * len(runs), strict=False):
         styles = ("-", "--", ":", "-.") * len(run.metrics)
         for name, style in zip(run.metrics, styles, strict=False):
             label = f"{run.name}: {name}" if len(runs) > 1 else name
             series = run.series(name, validation=True)
             ax.plot(*series, style, color=colour, marker=".", label=label)
     by_epoch = any("epoch" in record for run in runs for record in run.train)
-    _finish(ax, "validation", "epoch" if by_epoch else "iteration")
+    ax.set_ylim(0)
+    finish_panel(ax, "validation", "epoch" if by_epoch else "iteration")
 
 
 def _finish(ax: Axes, title: str, x_label: str) -> None:
-    """Set what all plots share; the y axis is logarithmic if the values span a decade."""
+    """Finish a panel; its y axis is logarithmic if the values span a decade."""
     lines = [np.asarray(line.get_ydata(), dtype=float) for line in ax.lines]
     values = np.concatenate([np.empty(0), *lines])
     if len(values) and values.min() > 0 and values.max() > 10 * values.min():
         ax.set_yscale("log")
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_formatter(NullFormatter())
     elif len(values) and values.min() >= 0:
         ax.set_ylim(0, 1.08 * max(values.max(), 1e-9))
-    ax.set_title(title, fontsize=10, loc="left")
-    ax.set_xlabel(x_label, fontsize=8)
-    ax.tick_params(labelsize=8)
-    ax.grid(True, color="#E3E6EA", linewidth=0.7)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.legend(fontsize=7.5, frameon=False)
+    finish_panel(ax, title, x_label)
 
 
 def plot_runs(runs: Sequence[RunLog]) -> Figure:
@@ -172,11 +165,13 @@ def plot_runs(runs: Sequence[RunLog]) -> Figure:
     if not any(run.train for run in runs):
         raise ValueError("plot_runs needs at least one run that logged a loss.")
     validated = any(run.val for run in runs)
-    figure, panels = _panels(3 if validated else 2, 4.4, 3.8)
+    figure, axes = panel_grid(2 if validated else 1, 2)
+    panels = axes.ravel()
     _draw_training(panels[0], runs, "loss", 10, "training loss")
     _draw_parts_of_loss(panels[1], runs[-1])
     if validated:
         _draw_metrics(panels[2], runs)
+        panels[3].remove()
     return figure
 
 
@@ -197,9 +192,13 @@ def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
     unknown = [key for key in keys if key not in logged]
     if unknown:
         raise ValueError(f"no run logged {unknown}; there are {sorted(logged - set(_TIMING))}.")
-    figure, panels = _panels(len(keys), 3.6, 3.2)
-    for panel, key in zip(panels, keys, strict=True):
-        _draw_training(panel, runs, key, 5, key)
+    columns = min(len(keys), 2)
+    figure, axes = panel_grid(-(-len(keys) // columns), columns)
+    for panel, key in zip_longest(axes.ravel(), keys):
+        if key is None:
+            panel.remove()
+        else:
+            _draw_training(panel, runs, key, 5, key)
     return figure
 
 

@@ -1,0 +1,103 @@
+"""Plots of figures: panels in one style, and precision over recall."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from gsmap.evaluation.average_precision import precision_recall, reliability
+from gsmap.evaluation.report import MetricReport
+from gsmap.visualization.style import RUN_COLOURS, MapStyle
+
+_WIDTH_IN = 7.5  # so that text of 7.5 points stays legible where a plot is shown 800 px wide
+
+
+def panel_grid(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
+    """Return a figure and its panels. (rows, columns)"""
+    height_in = rows * min(2.8, 0.3 + _WIDTH_IN / columns)
+    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=200, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def finish_panel(
+    ax: Axes, title: str, x_label: str = "", y_label: str = "", colour: str = "black"
+) -> None:
+    """Set what all plots share."""
+    ax.set_title(title, fontsize=9, loc="left", color=colour)
+    ax.set_xlabel(x_label, fontsize=8)
+    ax.set_ylabel(y_label, fontsize=8)
+    ax.tick_params(labelsize=7.5)
+    ax.grid(True, color="#E3E6EA", linewidth=0.7)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=7.5, frameon=False, handlelength=1.4, borderaxespad=0.2)
+
+
+def _finish_shares(ax: Axes, *options: str) -> None:
+    """Finish a panel whose axes both run from 0 to 1."""
+    ax.set(xlim=(0, 1), ylim=(0, 1.02), xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
+    finish_panel(ax, *options)
+
+
+def plot_result(reports: Sequence[MetricReport]) -> Figure:
+    """Draw a row per metric: precision over recall of each class, and the calibration of all.
+
+    Lines have the colours of their classes, those of stricter thresholds paler.
+
+    Args:
+        reports: The metrics of one result.
+    """
+    style = MapStyle(tuple(reports[0].detections))
+    figure, axes = panel_grid(len(reports), len(style.classes) + 1)
+    for row, report in zip(axes, reports, strict=True):
+        loosest = -1 if report.name == "chamfer" else 0
+        row[-1].plot([0, 1], [0, 1], color=style.grid, linewidth=1)
+        for label, (name, found) in enumerate(report.detections.items()):
+            count = len(found.thresholds)
+            for i, (threshold, hits) in enumerate(zip(found.thresholds, found.hits.T, strict=True)):
+                ap = 100 * report.metrics[f"{report.name}/{name}/AP@{threshold}"]
+                opacity = 0.3 + 0.7 * (i + 1 if loosest else count - i) / count
+                curve = precision_recall(hits, found.num_gts)
+                line = {"color": style.colour(label), "alpha": opacity, "linewidth": 1.3}
+                row[label].plot(*curve, label=f"{threshold:g}: {ap:.1f}", **line)
+            y_label = "" if label else f"{report.name}: precision"
+            _finish_shares(row[label], style.title(label), "recall", y_label, style.colour(label))
+            score, share, _ = reliability(found.scores, found.hits[:, loosest])
+            row[-1].plot(score, share, "o-", markersize=3, color=style.colour(label))
+        _finish_shares(row[-1], "calibration", "score", "share of hits")
+    return figure
+
+
+def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figure:
+    """Draw precision over recall, a panel a class and metric, at the middle threshold.
+
+    Args:
+        reports: Both metrics of one run of each config, by its name.
+    """
+    first = next(iter(reports.values()))
+    style = MapStyle(tuple(first[0].detections))
+    figure, axes = panel_grid(len(first), len(style.classes))
+    for index, row in enumerate(axes):
+        for label, (name, found) in enumerate(first[index].detections.items()):
+            middle = len(found.thresholds) // 2
+            for of_run, colour in zip(reports.values(), RUN_COLOURS * 9, strict=False):
+                of_class = of_run[index].detections[name]
+                curve = precision_recall(of_class.hits[:, middle], of_class.num_gts)
+                row[label].plot(*curve, color=colour, linewidth=1.3)
+            unit = " m" if first[index].name == "chamfer" else " IoU"
+            title = f"{style.title(label)}, {found.thresholds[middle]:g}{unit}"
+            y_label = "" if label else "precision"
+            _finish_shares(row[label], title, "recall", y_label, style.colour(label))
+    figure.legend(
+        axes[0][0].lines,
+        list(reports),
+        loc="outside upper left",
+        ncols=4,
+        fontsize=8,
+        frameon=False,
+    )
+    return figure
