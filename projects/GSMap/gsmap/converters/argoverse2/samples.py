@@ -82,13 +82,17 @@ class LogSamples:
         samples: The samples, in the order of time.
         left_out: How many samples were left out, by reason.
         invalid: How many invalid polygons the map holds, by kind; they take no part.
-        sweep_offsets_ns: How far in time the LiDAR sweep of each sample that names one lies.
     """
 
     samples: list[MapSample] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     invalid: Counter[str] = field(default_factory=Counter)
-    sweep_offsets_ns: list[int] = field(default_factory=list)
+
+    @property
+    def sweep_offsets_ns(self) -> list[int]:
+        """How far in time the LiDAR sweep of each sample that names one lies."""
+        named = [(s.timestamp_ns, s.lidar.path) for s in self.samples if s.lidar is not None]
+        return [abs(int(Path(path).stem) - timestamp_ns) for timestamp_ns, path in named]
 
 
 def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -> LogSamples:
@@ -98,23 +102,17 @@ def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -
         FileNotFoundError: If the map or the poses are missing.
         ValueError: If a file is damaged, or sensor data that ``options.at`` needs are missing.
     """
-    log = Argoverse2Log(log_dir)
+    log, result = Argoverse2Log(log_dir), LogSamples()
     times = sample_times(log, options)
     log_map = Argoverse2Map.from_log(log_dir) if with_map else None
-    invalid = {} if log_map is None else {k: n for k, n in log_map.invalid_counts.items() if n}
-    result = LogSamples(invalid=Counter(invalid))
-    builder = _SampleBuilder(log, log_map, log_dir.relative_to(options.root).as_posix(), options)
+    if log_map is not None:
+        result.invalid = +Counter(log_map.invalid_counts)  # those that are not zero
     for timestamp_ns in times.tolist():
         try:
             with naming(log_dir, "download the log again"):
-                sample = builder.build(timestamp_ns)
+                result.samples.append(_sample(log, log_map, timestamp_ns, options))
         except _LeftOut as reason:
             result.left_out[str(reason)] += 1
-            continue
-        result.samples.append(sample)
-        if sample.lidar is not None:
-            sweep_ns = int(Path(sample.lidar.path).stem)
-            result.sweep_offsets_ns.append(abs(sweep_ns - timestamp_ns))
     return result
 
 
@@ -161,90 +159,78 @@ class _LeftOut(Exception):
     """A sample that cannot be made; the message is the reason, the same for all of its kind."""
 
 
-class _SampleBuilder:
-    """Makes the samples of one log."""
+def _sample(
+    log: Argoverse2Log, log_map: Argoverse2Map | None, timestamp_ns: int, options: Argoverse2Options
+) -> MapSample:
+    """Make the sample at a time, or raise ``_LeftOut``."""
+    city_from_ego = log.poses.at(timestamp_ns)
+    if city_from_ego is None:
+        raise _LeftOut("no pose at the sample's time")
+    return MapSample(
+        token=f"{log.log_id}_{timestamp_ns}",
+        scene=log.log_id,
+        map_name=log.city,
+        timestamp_ns=timestamp_ns,
+        cameras=list(_cameras(log, timestamp_ns, city_from_ego, options)),
+        global_from_frame=city_from_ego,
+        lidar=_lidar(log, timestamp_ns, np.linalg.inv(city_from_ego), options),
+        instances=None if log_map is None else _instances(log_map, city_from_ego, options),
+    )
 
-    def __init__(
-        self,
-        log: Argoverse2Log,
-        log_map: Argoverse2Map | None,
-        folder: str,
-        options: Argoverse2Options,
-    ) -> None:
-        self._log = log
-        self._map = log_map
-        self._folder = folder
-        self._options = options
-        self._cam_from_ego = {
-            name: camera.ego_SE3_cam.inverse().transform_matrix
-            for name, camera in log.calibration.items()
-        }
 
-    def build(self, timestamp_ns: int) -> MapSample:
-        """Make the sample at a time, or raise ``_LeftOut``."""
-        city_from_ego = self._log.poses.at(timestamp_ns)
-        if city_from_ego is None:
-            raise _LeftOut("no pose at the sample's time")
-        ego_from_city = np.linalg.inv(city_from_ego)
-        return MapSample(
-            token=f"{self._log.log_id}_{timestamp_ns}",
-            scene=self._log.log_id,
-            map_name=self._log.city,
-            timestamp_ns=timestamp_ns,
-            cameras=list(self._cameras(timestamp_ns, city_from_ego)),
-            global_from_frame=city_from_ego,
-            lidar=self._lidar(timestamp_ns, ego_from_city),
-            instances=self._instances(city_from_ego),
+def _instances(
+    log_map: Argoverse2Map, city_from_ego: np.ndarray, options: Argoverse2Options
+) -> list[MapInstance]:
+    elements = log_map.extract(
+        city_from_ego, options.classes, options.compat, options.x_range, options.y_range
+    )
+    return [
+        MapInstance(label, points[:, : options.dim])
+        for label, name in enumerate(options.classes)
+        for points in elements[name]
+    ]
+
+
+def _cameras(
+    log: Argoverse2Log, timestamp_ns: int, city_from_ego: np.ndarray, options: Argoverse2Options
+) -> Iterator[CameraRecord]:
+    """Yield the image of each calibrated camera closest in time."""
+    folder = log.log_dir.relative_to(options.root).as_posix()
+    for name, camera in log.calibration.items():
+        image_ns = closest_ns(log.image_timestamps_ns[name], timestamp_ns, MAX_CAMERA_OFFSET_NS)
+        city_from_ego_then = None if image_ns is None else log.poses.at(image_ns)
+        if city_from_ego_then is None:
+            if options.pose_stride is None:
+                limit = MAX_CAMERA_OFFSET_NS / 1e6
+                raise _LeftOut(f"no image of {name} with a pose within {limit:.0f} ms")
+            continue
+        motion = np.linalg.inv(city_from_ego_then) @ city_from_ego
+        yield CameraRecord(
+            name,
+            f"{folder}/sensors/cameras/{name}/{image_ns}.jpg",
+            camera.width_px,
+            camera.height_px,
+            camera.intrinsics.K,
+            camera.ego_SE3_cam.inverse().transform_matrix @ motion,
         )
 
-    def _instances(self, city_from_ego: np.ndarray) -> list[MapInstance] | None:
-        if self._map is None:
-            return None
-        options = self._options
-        elements = self._map.extract(
-            city_from_ego, options.classes, options.compat, options.x_range, options.y_range
-        )
-        return [
-            MapInstance(label, points[:, : options.dim])
-            for label, name in enumerate(options.classes)
-            for points in elements[name]
-        ]
 
-    def _cameras(self, timestamp_ns: int, city_from_ego: np.ndarray) -> Iterator[CameraRecord]:
-        """Yield the image of each calibrated camera closest in time."""
-        for name, camera in self._log.calibration.items():
-            image_ns = closest_ns(
-                self._log.image_timestamps_ns[name], timestamp_ns, MAX_CAMERA_OFFSET_NS
-            )
-            city_from_ego_then = None if image_ns is None else self._log.poses.at(image_ns)
-            if city_from_ego_then is None:
-                if self._options.pose_stride is None:
-                    limit = MAX_CAMERA_OFFSET_NS / 1e6
-                    raise _LeftOut(f"no image of {name} with a pose within {limit:.0f} ms")
-                continue
-            motion = np.linalg.inv(city_from_ego_then) @ city_from_ego
-            yield CameraRecord(
-                name=name,
-                path=f"{self._folder}/sensors/cameras/{name}/{image_ns}.jpg",
-                width=camera.width_px,
-                height=camera.height_px,
-                intrinsics=camera.intrinsics.K,
-                cam_from_frame=self._cam_from_ego[name] @ motion,
-            )
-
-    def _lidar(self, timestamp_ns: int, ego_from_city: np.ndarray) -> LidarRecord | None:
-        """Return the closest sweep and the ones before it; sweeps are stored in the ego frame."""
-        times = self._log.lidar_timestamps_ns
-        sweep_ns = closest_ns(times, timestamp_ns, MAX_LIDAR_OFFSET_NS)
-        if sweep_ns is None:
-            return None
-        last = int(np.searchsorted(times, sweep_ns))
-        sweeps = []
-        for time in times[max(last - self._options.max_sweeps, 0) : last + 1][::-1].tolist():
-            city_from_ego_then = self._log.poses.at(time)
-            if city_from_ego_then is not None:
-                path = f"{self._folder}/sensors/lidar/{time}.feather"
-                sweeps.append(SweepRecord(path, time, ego_from_city @ city_from_ego_then))
-        if not sweeps or sweeps[0].timestamp_ns != sweep_ns:
-            return None
-        return LidarRecord(sweeps[0].path, sweeps[0].frame_from_lidar, sweeps[1:])
+def _lidar(
+    log: Argoverse2Log, timestamp_ns: int, ego_from_city: np.ndarray, options: Argoverse2Options
+) -> LidarRecord | None:
+    """Return the closest sweep and the ones before it; sweeps are stored in the ego frame."""
+    folder = log.log_dir.relative_to(options.root).as_posix()
+    times = log.lidar_timestamps_ns
+    sweep_ns = closest_ns(times, timestamp_ns, MAX_LIDAR_OFFSET_NS)
+    if sweep_ns is None:
+        return None
+    last = int(np.searchsorted(times, sweep_ns))
+    sweeps = []
+    for time in times[max(last - options.max_sweeps, 0) : last + 1][::-1].tolist():
+        city_from_ego_then = log.poses.at(time)
+        if city_from_ego_then is not None:
+            path = f"{folder}/sensors/lidar/{time}.feather"
+            sweeps.append(SweepRecord(path, time, ego_from_city @ city_from_ego_then))
+    if not sweeps or sweeps[0].timestamp_ns != sweep_ns:
+        return None
+    return LidarRecord(sweeps[0].path, sweeps[0].frame_from_lidar, sweeps[1:])
