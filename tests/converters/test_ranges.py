@@ -34,6 +34,14 @@ def targets_of(path: Path, x_m: float, y_m: float):
     return dataset[0]["data_samples"].gt_instances_3d
 
 
+def stored_targets(path: Path, x_m: float, y_m: float):
+    """Return the first sample's targets, whose vertices are those of the file."""
+    targets = targets_of(path, x_m, y_m)
+    for line, instance in zip(targets.polylines, AnnotationFile(path)[0].instances, strict=True):
+        np.testing.assert_allclose(line[: len(instance.points)], instance.points, atol=1e-5)
+    return targets
+
+
 @pytest.mark.parametrize(("x_m", "y_m"), RANGES)
 def test_own_data_keep_every_vertex_up_to_the_edge(x_m: float, y_m: float, tmp_path: Path):
     line = np.stack([np.linspace(-x_m, x_m, 41), np.linspace(-y_m, y_m, 41)], -1)
@@ -52,11 +60,7 @@ def test_a_log_reaches_as_far_as_its_range(x_m: float, y_m: float, tmp_path: Pat
     write_log(tmp_path / "val" / "log-a")
     ranges = {"x_range": (-x_m, x_m), "y_range": (-y_m, y_m)}
     convert_argoverse2(Argoverse2Options(tmp_path, **ranges))
-    path = tmp_path / "gsmap_av2_val.arrow"
-    stored = AnnotationFile(path)[0].instances
-    targets = targets_of(path, x_m, y_m)
-    for line, instance in zip(targets.polylines, stored, strict=True):
-        np.testing.assert_allclose(line[: len(instance.points)], instance.points, atol=1e-5)
+    targets = stored_targets(tmp_path / "gsmap_av2_val.arrow", x_m, y_m)
     dividers = targets.polylines[targets.labels_3d == 0]
     end_m = min(x_m, 50.0)  # the lanes end 50 m ahead
     assert float(dividers[..., 0].max()) == pytest.approx(end_m)
@@ -68,11 +72,7 @@ def test_a_town_reaches_farther_with_its_range(
 ):
     ranges = {"x_range": (-x_m, x_m), "y_range": (-y_m, y_m)}
     convert_nuscenes(NuScenesOptions(minicity_root, "v1.0-trainval", out_dir=tmp_path, **ranges))
-    path = tmp_path / "gsmap_nuscenes_train.arrow"
-    stored = AnnotationFile(path)[0].instances
-    targets = targets_of(path, x_m, y_m)
-    for line, instance in zip(targets.polylines, stored, strict=True):
-        np.testing.assert_allclose(line[: len(instance.points)], instance.points, atol=1e-5)
+    targets = stored_targets(tmp_path / "gsmap_nuscenes_train.arrow", x_m, y_m)
     assert float(targets.polylines[..., 1].max()) > y_m - 0.3  # outlines end 0.2 m before
 
 

@@ -17,13 +17,8 @@ from gsmap.utils.progress import Progress
 _SHOWN = 10
 
 
-def check_file(path: Path) -> AnnotationFile:
-    """Open an annotation file, which checks it, and compare what its footer leads to.
-
-    Raises:
-        FileNotFoundError: If it does not exist.
-        ValueError: If it is damaged.
-    """
+def _open(path: Path) -> AnnotationFile:
+    """Open an annotation file, which checks it, and compare what its footer leads to."""
     file = AnnotationFile(path)
     try:
         reader = pa.ipc.open_file(pa.memory_map(str(path)))
@@ -38,19 +33,21 @@ def check_file(path: Path) -> AnnotationFile:
     return file
 
 
-def broken_files(sample: MapSample, root: Path) -> list[str]:
+def _broken_files(sample: MapSample, root: Path) -> list[str]:
     """Read every file that a sample names, and return what is wrong with them."""
     from gsmap.datasets.transforms.images import read_image
     from gsmap.datasets.transforms.points import read_points
 
     where, problems = f"sample {sample.token!r}", []
-    lidar = [] if sample.lidar is None else [sample.lidar.path]
-    lidar += [sweep.path for sweep in sample.lidar.sweeps] if sample.lidar else []
+    lidar = (
+        [] if sample.lidar is None else [sample.lidar.path, *(s.path for s in sample.lidar.sweeps)]
+    )
     reads = [
         partial(read_image, str(root / c.path), f"{where}, camera {c.name}", (c.width, c.height))
         for c in sample.cameras
     ]
-    for read in (*reads, *(partial(read_points, str(root / path), 5) for path in lidar)):
+    reads += [partial(read_points, str(root / path), 5) for path in lidar or []]
+    for read in reads:
         try:
             read()
         except BrokenSampleError as error:
@@ -75,22 +72,19 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
     """
     lines = []
     for path in paths:
-        file = check_file(path)
+        file = _open(path)
         mark = "checksum right" if file.sealed else "no checksum, as it is of an earlier version"
         lines.append(f"{path}: {len(file)} samples, values right, {mark}")
         if root is not None:
             samples = Progress(file, desc=path.name, unit="samples")
-            found = ordered_map(partial(broken_files, root=root), samples, workers)
-            _require_none(path, [problem for problems in found for problem in problems])
+            found = ordered_map(partial(_broken_files, root=root), samples, workers)
+            problems = [problem for problems in found for problem in problems]
+            if problems:
+                more = f", and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+                shown = "; ".join(problems[:_SHOWN])
+                raise ValueError(f"{path} is right, but: {shown}{more}")
             lines[-1] += ", images and LiDAR files whole"
     return "\n".join(lines)
-
-
-def _require_none(path: Path, problems: Sequence[str]) -> None:
-    """Raise a ``ValueError`` that names the first problems."""
-    if problems:
-        more = f", and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
-        raise ValueError(f"{path} is right, but: {'; '.join(problems[:_SHOWN])}{more}")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -19,17 +19,8 @@ from gsmap.utils.files import atomic_write
 _DECIMALS = 6
 
 
-def frame_record(sample: MapSample, row: int | None = None) -> dict[str, Any]:
-    """Return one sample as a JSON object.
-
-    Args:
-        sample: A sample with ground truth.
-        row: Its row in the pose table of its Argoverse 2 log, which is ordered by time, if known.
-
-    Returns:
-        Identity and pose (of a log: log, row and pose; else position and yaw in degrees of the
-        annotation frame) with the ``vectors``: label and points in metres, rounded to 1e-6 m.
-    """
+def _frame_record(sample: MapSample, row: int | None) -> dict[str, Any]:
+    """Return a sample's identity, pose and vectors; ``row`` is its place in a pose table."""
     pose = sample.global_from_frame
     vectors = [
         {"label": i.label, "pts": i.points.astype(np.float64).round(_DECIMALS).tolist()}
@@ -94,7 +85,7 @@ def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
         if sample.instances is None:
             raise ValueError(f"{file.path}: sample {sample.token!r} has no ground truth to export.")
         # every N-th row was taken and none left out
-        yield frame_record(sample, int(stride[1]) * position[sample.scene] if stride else None)
+        yield _frame_record(sample, int(stride[1]) * position[sample.scene] if stride else None)
         position[sample.scene] += 1
 
 

@@ -46,42 +46,31 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     target = options.path_of("av2", options.split)
     log_dirs = select_logs(find_split(options.root, options.split), options.logs)
     log_dirs = _drop_listed(log_dirs, options.keep_map_changes, summary)
-    read = partial(_try_log, options=options)
-    sweep_offsets_ns: list[int] = []
     meta, log_dirs = _meta(options, log_dirs), options.shard.part(log_dirs)
+    offsets_ns: list[int] = []
     bar = Progress(log_dirs, desc=f"av2 {options.split}", unit="logs")
     with bar as logs, AnnotationWriter(target, meta, options.shard) as writer:
-        results = ordered_map(read, log_dirs, min(options.workers, max(len(log_dirs), 1)))
+        workers = min(options.workers, max(len(log_dirs), 1))
+        results = ordered_map(partial(_try_log, options=options), log_dirs, workers)
         for log_dir, result in zip(logs, results, strict=True):
             if isinstance(result, str):
                 summary.add_problem(f"log left out: {result}", log_dir.name)
-            else:
-                _write_log(writer, result, log_dir.name, summary)
-                sweep_offsets_ns += result.sweep_offsets_ns
+                continue
+            for sample in result.samples:
+                writer.write(sample)
+                summary.add_sample(options.split, sample)
+            for reason, count in result.left_out.items():
+                summary.add_problem(f"sample left out: {reason}", log_dir.name, count)
+            for kind, count in result.invalid.items():
+                reason = f"invalid polygon among the {kind} takes no part"
+                summary.add_problem(reason, log_dir.name, count)
+            offsets_ns += result.sweep_offsets_ns
         if not len(writer) and not options.shard.count:
             raise RuntimeError(f"no sample is left for {target}:\n{summary.text()}")
-        summary.notes.append(_lidar_note(sweep_offsets_ns, len(writer)))
-    summary.notes.append(f"written to {writer.path}")
+    named = f"LiDAR sweep named by {len(offsets_ns)} of {len(writer)} samples"
+    away = f", at most {max(offsets_ns) / 1e6:.0f} ms away" if offsets_ns else ""
+    summary.notes += [named + away, f"written to {writer.path}"]
     return summary
-
-
-def _write_log(
-    writer: AnnotationWriter, result: LogSamples, log_id: str, summary: ConversionSummary
-) -> None:
-    """Write a log's samples and count what it leaves out."""
-    for sample in result.samples:
-        writer.write(sample)
-        summary.add_sample(writer.meta.split, sample)
-    for reason, count in result.left_out.items():
-        summary.add_problem(f"sample left out: {reason}", log_id, count)
-    for kind, count in result.invalid.items():
-        summary.add_problem(f"invalid polygon among the {kind} takes no part", log_id, count)
-
-
-def _lidar_note(offsets_ns: Sequence[int], samples: int) -> str:
-    """Say how many samples name a LiDAR sweep, and how far in time the farthest lies."""
-    named = f"LiDAR sweep named by {len(offsets_ns)} of {samples} samples"
-    return f"{named}, at most {max(offsets_ns) / 1e6:.0f} ms away" if offsets_ns else named
 
 
 def _try_log(log_dir: Path, options: Argoverse2Options) -> LogSamples | str:

@@ -22,11 +22,7 @@ from gsmap.converters.argoverse2.log import RING_CAMERAS, Argoverse2Log, find_sp
 from gsmap.converters.argoverse2.map import find_map
 from gsmap.converters.argoverse2.samples import thin_out
 from gsmap.converters.argoverse2.scene import make_scene
-from gsmap.converters.command_line import (
-    add_log_options,
-    add_workers_option,
-    options_from,
-)
+from gsmap.converters.command_line import add_log_options, add_workers_option, options_from
 from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
@@ -197,10 +193,7 @@ def _try_log(log_dir: Path, out: Path, options: RenderOptions) -> int | str:
 
 
 def render_logs(
-    log_dirs: Sequence[Path],
-    out: Path,
-    options: RenderOptions,
-    workers: int = 1,
+    log_dirs: Sequence[Path], out: Path, options: RenderOptions, workers: int = 1
 ) -> str:
     """Render logs; one that cannot be rendered does not stop the others.
 

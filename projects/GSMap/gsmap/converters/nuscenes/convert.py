@@ -14,12 +14,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from gsmap.converters.command_line import (
-    FileOptions,
-    add_file_options,
-    fingerprint,
-    options_from,
-)
+from gsmap.converters.command_line import FileOptions, add_file_options, fingerprint, options_from
 from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.converters.nuscenes.map import (
     MAP_CLASSES,
