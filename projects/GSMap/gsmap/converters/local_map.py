@@ -22,11 +22,19 @@ class LocalPatch:
         global_from_frame: Pose of the annotation frame in the map. (4, 4)
         x_range: Smallest and largest x in the frame, in metres.
         y_range: Smallest and largest y in the frame, in metres.
+
+    Raises:
+        ValueError: If the pose is not a finite 4 x 4 matrix.
     """
 
     global_from_frame: np.ndarray
     x_range: tuple[float, float]
     y_range: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        pose = np.asarray(self.global_from_frame)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError(f"global_from_frame must be a finite 4 x 4 matrix, got {pose}.")
 
     @cached_property
     def rotation(self) -> np.ndarray:

@@ -147,7 +147,7 @@ class Argoverse2Map:
             For each class, the vertices of its elements in metres. list of (n, 3)
 
         Raises:
-            ValueError: If a class or the rules are unknown.
+            ValueError: If a class or the rules are unknown, or the pose is malformed.
         """
         check_rules(classes, compat)
         patch = LocalPatch(np.asarray(city_from_ego, dtype=np.float64), x_range, y_range)
