@@ -62,8 +62,8 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
 
     Returns:
         ``open_s`` and ``read_ms`` per sample, both of CPU time; ``worker_mb``, all that the extra
-        process holds for itself, the interpreter and its libraries included; ``worker_growth_mb``, what reading added
-        to it; ``worker_rss_mb``, with shared pages; ``file_mb``; ``samples``.
+        process holds for itself, the interpreter and its libraries included; ``worker_growth_mb``,
+        what reading added to it; ``worker_rss_mb``, with shared pages; ``file_mb``; ``samples``.
     """
     start = time.process_time()
     file = AnnotationFile(path)
