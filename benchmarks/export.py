@@ -9,7 +9,14 @@ import torch
 
 from benchmarks.fps import predict_once
 from benchmarks.measure import Cost, measure
-from benchmarks.model import add_model_arguments, build, in_fresh_processes, random_batch, report
+from benchmarks.model import (
+    add_model_arguments,
+    build,
+    image_shape,
+    in_fresh_processes,
+    random_batch,
+    report,
+)
 from gsmap.apis.export import export_onnx
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.structures.calibration import calibration_arrays
@@ -48,7 +55,7 @@ def run(args: argparse.Namespace) -> None:
 def torch_cost(path: str, args: argparse.Namespace) -> Cost:
     """Measure a config's way from images to decoded elements in torch."""
     model = build(path, args).eval()
-    inputs, samples = random_batch(model, 1, tuple(args.size), "cpu")
+    inputs, samples = random_batch(model, 1, image_shape(path, args), "cpu")
     predict = partial(predict_once, model, inputs, samples, args)
     return measure(predict, torch.device("cpu"), args.repeats)
 
@@ -56,11 +63,12 @@ def torch_cost(path: str, args: argparse.Namespace) -> Cost:
 def onnx_cost(path: str, args: argparse.Namespace) -> Cost:
     """Measure the same way in ONNX Runtime; the file's own reading is not counted."""
     model = build(path, args).eval()
-    inputs, samples = random_batch(model, 1, tuple(args.size), "cpu")
+    shape = image_shape(path, args)
+    inputs, samples = random_batch(model, 1, shape, "cpu")
     arrays = calibration_arrays(samples[0].metainfo, model.bev_encoder.calibration)
     arrays["images"] = inputs["imgs"][0].numpy()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "model.onnx")
-        export_onnx(model, file, [f"camera {i}" for i in range(6)], args.size)
+        export_onnx(model, file, [f"camera {i}" for i in range(shape[0])], shape[1:])
         exported = OnnxInferencer(file, num_threads=args.threads)
     return measure(partial(exported.run, arrays), torch.device("cpu"), args.repeats)

@@ -12,6 +12,7 @@ from benchmarks.measure import MIB, Cost, measure
 from benchmarks.model import (
     add_model_arguments,
     build,
+    image_shape,
     in_fresh_processes,
     random_batch,
     report,
@@ -49,7 +50,7 @@ def frame_cost(path: str, args: argparse.Namespace) -> Cost:
     """Measure a config's way from images to decoded elements."""
     model = build(path, args)
     model.eval()
-    inputs, samples = random_batch(model, 1, tuple(args.size), args.device)
+    inputs, samples = random_batch(model, 1, image_shape(path, args), args.device)
     predict = partial(predict_once, model, inputs, samples, args)
     return measure(predict, torch.device(args.device), args.repeats)
 

@@ -1,6 +1,7 @@
 """Whole models on random inputs: what the commands that measure them share."""
 
 import argparse
+import math
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -19,7 +20,13 @@ from gsmap.engine.launch import read_config
 def add_model_arguments(parser: argparse.ArgumentParser) -> None:
     """Add which models to measure, and how."""
     parser.add_argument("configs", nargs="+", help="ratios are to the first of them")
-    parser.add_argument("--size", type=int, nargs=2, default=(480, 800), metavar=("H", "W"))
+    parser.add_argument(
+        "--size",
+        type=int,
+        nargs=2,
+        metavar=("H", "W"),
+        help="of images; the config's by default",
+    )
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
@@ -58,14 +65,33 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
     return MODELS.build(cfg.model).to(args.device)
 
 
+def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
+    """Return how many cameras, rows and columns a config's network sees, padding included.
+
+    Raises:
+        ValueError: If the config does not say how large its image files are.
+    """
+    cfg = read_config(path)
+    dataset = cfg.test_dataloader.dataset
+    if args.size:
+        return len(dataset.cameras), *args.size
+    if "_file_size" not in cfg:
+        raise ValueError(f"{path} says nothing of _file_size (width, height): give --size H W.")
+    scale = next((step.scale for step in dataset.pipeline if step.type == "ScaleImages"), 1.0)
+    unit = cfg.model.data_preprocessor.get("pad_size_divisor", 1)
+    width, height = (math.ceil(int(side * scale + 1e-6) / unit) * unit for side in cfg._file_size)
+    return len(dataset.cameras), height, width
+
+
 def random_batch(
-    model: Any, batch: int, size: tuple[int, int], device: str, elements: int = 15
+    model: Any, batch: int, shape: tuple[int, int, int], device: str, elements: int = 15
 ) -> tuple[dict[str, torch.Tensor], list[Det3DDataSample]]:
-    """Make normalised images of six cameras in a ring, and straight elements as ground truth."""
+    """Make normalised images of cameras in a ring, and straight elements as ground truth."""
     generator = torch.Generator().manual_seed(0)
-    images = torch.randn(batch, 6, 3, *size, generator=generator).to(device)
-    eyes = np.stack([np.eye(4)] * 6)
-    metainfo = {"token": "random", "lidar2img": ring_of_cameras(6, size), "cam2img": eyes}
+    cameras, *size = shape
+    images = torch.randn(batch, cameras, 3, *size, generator=generator).to(device)
+    eyes = np.stack([np.eye(4)] * cameras)
+    metainfo = {"token": "random", "lidar2img": ring_of_cameras(*shape), "cam2img": eyes}
     metainfo |= {"lidar2cam": eyes, "img_aug_matrix": eyes, "lidar2ego": np.eye(4)}
     grid = model.map_head.grid
     samples = []
@@ -81,26 +107,26 @@ def random_batch(
             pts_shifts=torch.stack([pts, pts.flip(1)], 1),
             polylines=pts,
         ).to(device)
-        add_auxiliary_targets(sample, model, size, generator)
+        add_auxiliary_targets(sample, model, shape, generator)
         samples.append(sample.to(device))
     return {"imgs": images}, samples
 
 
 def add_auxiliary_targets(
-    sample: Det3DDataSample, model: Any, size: tuple[int, int], generator: torch.Generator
+    sample: Det3DDataSample, model: Any, shape: tuple[int, int, int], generator: torch.Generator
 ) -> None:
     """Add what auxiliary heads train on: masks of every class and depth, at random."""
     classes, stride = len(model.map_head.classes), 32
     cells = model.bev_encoder.grid
+    views, *size = shape
     features = size[0] // stride, size[1] // stride
     sample.gt_seg = torch.rand(classes, cells.height, cells.width, generator=generator).round()
-    sample.gt_pv_seg = torch.rand(6, classes, *features, generator=generator).round()
-    sample.gt_depth = 1 + 33 * torch.rand(6, *size, generator=generator)
+    sample.gt_pv_seg = torch.rand(views, classes, *features, generator=generator).round()
+    sample.gt_depth = 1 + 33 * torch.rand(views, *size, generator=generator)
 
 
-def ring_of_cameras(num_cams: int, size: tuple[int, int]) -> np.ndarray:
+def ring_of_cameras(num_cams: int, height: int, width: int) -> np.ndarray:
     """Return projections of level cameras, outward at equal angles, 90 degrees wide. (V, 4, 4)"""
-    height, width = size
     intrinsics = np.eye(4)
     intrinsics[:3, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]]
     matrices = []
@@ -117,7 +143,9 @@ def report(args: argparse.Namespace, header: list[str], rows: list[list[str]]) -
     """Print the table and say how it was measured."""
     clock = "wall clock" if args.device != "cpu" else "processor time of all threads"
     kind = "fp16 autocast" if args.fp16 else "float32"
+    shapes = dict.fromkeys(image_shape(path, args) for path in args.configs)
+    sizes = " and ".join(f"{cameras} cameras of {h} x {w}" for cameras, h, w in shapes)
     print(
-        f"{args.size[0]} x {args.size[1]}, six cameras, {kind}, {args.device}, {args.threads} "
-        f"threads, torch {torch.__version__}; {clock}\n\n{markdown_table(header, rows)}"
+        f"{sizes}, {kind}, {args.device}, {args.threads} threads, torch {torch.__version__}; "
+        f"{clock}\n\n{markdown_table(header, rows)}"
     )

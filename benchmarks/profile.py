@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.model import add_model_arguments, build, random_batch
+from benchmarks.model import add_model_arguments, build, image_shape, random_batch
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -24,19 +24,20 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def run(args: argparse.Namespace) -> None:
     """Time the parts of every config's model and print them."""
     for config in args.configs:
-        parts = profile(build(config, args).eval(), args)
+        shape = image_shape(config, args)
+        parts = profile(build(config, args).eval(), shape, args)
         backbone = parts["image backbone"]
         parts["total"] = sum(parts.values())
-        print(f"{config}, {args.size[0]} x {args.size[1]}, {args.threads} threads")
+        print(f"{config}, {shape[0]} cameras of {shape[1]} x {shape[2]}, {args.threads} threads")
         for part, seconds in parts.items():
             print(f"  {part:<22}{seconds:>8.3f} s {seconds / backbone:>7.3f} of the backbone")
 
 
 @torch.no_grad()
-def profile(model: Any, args: argparse.Namespace) -> dict[str, float]:
+def profile(model: Any, shape: tuple[int, int, int], args: argparse.Namespace) -> dict[str, float]:
     """Return the CPU (on a GPU: wall) seconds of every part, fastest of all repeats."""
-    inputs, samples = random_batch(model, 1, tuple(args.size), args.device)
-    samples[0].set_metainfo({"batch_input_shape": tuple(args.size)})
+    inputs, samples = random_batch(model, 1, shape, args.device)
+    samples[0].set_metainfo({"batch_input_shape": shape[1:]})
     images = inputs["imgs"][0].contiguous(memory_format=torch.channels_last)
     on_gpu = args.device != "cpu"
     clock = time.perf_counter if on_gpu else time.process_time

@@ -12,6 +12,7 @@ from benchmarks.measure import MIB, Cost, measure
 from benchmarks.model import (
     add_model_arguments,
     build,
+    image_shape,
     in_fresh_processes,
     random_batch,
     report,
@@ -56,7 +57,7 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     """Measure a config's training step, with another raster size if one is given."""
     model = build(path, args, raster)
     model.train()
-    inputs, samples = random_batch(model, args.batch, tuple(args.size), args.device)
+    inputs, samples = random_batch(model, args.batch, image_shape(path, args), args.device)
     step = training_step(model, inputs, samples, args)
     return measure(step, torch.device(args.device), args.repeats)
 

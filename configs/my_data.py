@@ -6,13 +6,13 @@ data_root = 'my_data/'  # holds train.arrow and val.arrow; --data-root names ano
 _frame = 'ego'  # x forward, y left; 'lidar': x right, y forward
 _ground_z = 0.0  # height of the road in that frame, in metres
 _cameras = ['front', 'rear']  # one or more
+_file_size = (640, 360)  # of the image files, width and height: for benchmarks
 _scale = 0.25  # of the image files' size; the small model likes some 200 rows
 grid = dict(x_range=[-30.0, 30.0], y_range=[-15.0, 15.0])  # metres, as in the annotation files
 classes = ['divider', 'ped_crossing', 'boundary']  # as in the annotation files
 
 # What follows from it
-_pixel = _base_.model.bev_encoder.bev_pixel_m
-_cells = [round((grid[key][1] - grid[key][0]) / _pixel) for key in ('y_range', 'x_range')]
+_cells = [round((b - a) / _base_.model.bev_encoder.bev_pixel_m) for a, b in (grid['y_range'], grid['x_range'])]
 _data = dict(data_root=data_root, frame=_frame, cameras=_cameras, grid=grid, classes=classes)
 _load = [dict(type='LoadCameraImages', to_float32=False), dict(type='ScaleImages', scale=_scale)]
 _targets = [dict(type='FormatMapTargets', num_points=20), dict(type='MakeBEVMask', size=_cells, thickness_px=1)]

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from benchmarks import fps, profile, step
+from benchmarks.model import image_shape
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -24,6 +25,22 @@ def cells(printed: str) -> list[list[str]]:
     """Return the cells of the table's rows."""
     lines = [line for line in printed.splitlines() if line.startswith("| ")][2:]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+@pytest.mark.parametrize(
+    ("config", "shape"),
+    [
+        ("maptr/maptr_r50_24e", (6, 480, 800)),
+        ("maptr/maptr_r18_nano_110e", (6, 192, 320)),
+        ("maptr/maptr_r18_minicity", (6, 192, 320)),
+        ("maptr/maptr_r18_av2_rendered", (7, 128, 128)),
+        ("my_data", (2, 96, 160)),
+    ],
+)
+def test_images_are_as_large_as_the_configs(config, shape):
+    path = str(REPO / f"configs/{config}.py")
+    assert image_shape(path, argparse.Namespace(size=None)) == shape
+    assert image_shape(path, argparse.Namespace(size=[64, 96])) == (shape[0], 64, 96)
 
 
 def test_frames_per_second_are_those_of_the_time(capsys):

@@ -4,6 +4,7 @@
 _base_ = './nuscenes.py'
 
 data_root = 'data/av2/'
+_file_size = (2048, 2048)  # of the image files, width and height, with the padding
 grid = dict(x_range=[-30.0, 30.0], y_range=[-15.0, 15.0])  # metres; travel is along the longer side
 
 _load = [dict(type='LoadCameraImages'), dict(type='ScaleImages', scale=0.3)]

@@ -4,6 +4,7 @@
 _base_ = './av2.py'
 
 data_root = 'data/av2_rendered/'
+_file_size = (512, 512)  # of the image files, width and height, with the padding
 _load = [dict(type='LoadCameraImages', to_float32=False), dict(type='ScaleImages', scale=0.25)]
 
 train_dataloader = dict(

@@ -4,6 +4,7 @@
 _base_ = './nuscenes.py'
 
 data_root = 'data/minicity/'
+_file_size = (800, 450)  # of the image files, width and height
 _load = [dict(type='LoadCameraImages', to_float32=False), dict(type='ScaleImages', scale=0.4)]
 
 train_dataloader = dict(

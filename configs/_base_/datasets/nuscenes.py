@@ -1,6 +1,7 @@
 # nuScenes, six cameras at half size, ground truth of 60 x 30 m in the LIDAR_TOP frame. The other data sets say what
 # differs. `python tools/create_data.py nuscenes --root data/nuscenes` makes the annotation files.
 data_root = 'data/nuscenes/'
+_file_size = (1600, 900)  # of the image files, width and height
 # the one place of range and classes: leaves hand them to the model
 grid = dict(x_range=[-15.0, 15.0], y_range=[-30.0, 30.0])  # metres; travel is along the longer side
 classes = ['divider', 'ped_crossing', 'boundary']
