@@ -16,9 +16,7 @@ def precision_recall(hits: BoolArray, num_gts: int) -> tuple[FloatArray, FloatAr
 def area_ap(hits: BoolArray, num_gts: int) -> float:
     """Return the area under the monotone precision envelope (VOC 2010, as MapTR computes it).
 
-    Args:
-        hits: Whether each prediction matches, in descending order of score. (N,)
-        num_gts: Number of ground truths; without any the result is 0.
+    ``hits`` (N,) are in descending order of score; without ground truths the result is 0.
     """
     if num_gts == 0:
         return 0.0
@@ -30,9 +28,7 @@ def area_ap(hits: BoolArray, num_gts: int) -> float:
 def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
     """Return the mean of the precision envelope at 101 recalls (COCO, as MapVR computes it).
 
-    Args:
-        hits: Whether each prediction matches, in descending order of score. (N,)
-        num_gts: Number of ground truths; without any the result is -1.
+    ``hits`` (N,) are in descending order of score; without ground truths the result is -1.
     """
     if num_gts == 0:
         return -1.0
@@ -47,16 +43,10 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
 def reliability(
     scores: FloatArray, hits: BoolArray, num_bins: int = 10
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compare scores with the share of predictions that match, in bins of equal width.
+    """Compare scores in [0, 1] with the share of predictions that match, in bins of equal width.
 
-    Args:
-        scores: Confidence in [0, 1]. (N,)
-        hits: Whether each prediction matches. (N,)
-        num_bins: Number of bins.
-
-    Returns:
-        Mean score, share of matches and number of predictions of each bin that is not empty.
-        3 x (<= num_bins,)
+    Mean score, share of matches and number of predictions of each bin that is not empty.
+    2 x (N,) -> 3 x (<= num_bins,)
     """
     bins = np.clip((scores * num_bins).astype(np.int64), 0, num_bins - 1)
     _, bins, counts = np.unique(bins, return_inverse=True, return_counts=True)
@@ -67,12 +57,7 @@ def reliability(
 def calibration_error(scores: FloatArray, hits: BoolArray) -> float:
     """Return the expected calibration error: the mean gap between score and share of matches.
 
-    Args:
-        scores: Confidence in [0, 1]. (N,)
-        hits: Whether each prediction matches. (N,)
-
-    Returns:
-        The error in [0, 1], of ten bins; -1 without predictions.
+    In [0, 1], of ten bins; -1 without predictions. 2 x (N,)
     """
     if not len(scores):
         return -1.0

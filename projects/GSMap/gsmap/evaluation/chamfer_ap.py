@@ -101,15 +101,9 @@ def nearest_by_chamfer(
 ) -> tuple[IntArray, FloatArray]:
     """Find the nearest ground truth of each prediction among those whose strips touch its own.
 
-    Args:
-        predictions: N predictions.
-        ground_truth: K ground truths.
-        config: Rules.
-        max_distance: Farther pairs are passed over, in metres.
-
     Returns:
-        Index of the nearest ground truth, or -1 if none is within ``max_distance`` (N,), and its
-        Chamfer distance in metres, or infinity (N,).
+        Its index, or -1 if none is within ``max_distance`` metres, and its Chamfer distance in
+        metres, or infinity. 2 x (N,)
 
     Raises:
         ValueError: If heights count, and a side has none.
@@ -139,13 +133,7 @@ def match_chamfer(
     """Match the predictions of one sample with its ground truth.
 
     Predictions with fewer than two points are dropped. Ground truth of zero length, or of fewer
-    than two points, counts as a ground truth that nobody can match.
-
-    Args:
-        predictions: Predictions of the sample.
-        ground_truth: Ground truth of the sample.
-        config: Rules.
-        token: Name of the sample.
+    than two points, counts as a ground truth that nobody can match. ``token`` names the sample.
 
     Raises:
         ValueError: If heights count, and a side has none.
@@ -174,14 +162,10 @@ def match_chamfer(
 
 
 def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> MetricReport:
-    """Compute AP_chamfer from the matches of all samples.
+    """Compute AP_chamfer from the matches of all samples, in any order; a token counts once.
 
     A class without ground truth counts as 0 in ``mAP``, as in MapTR, but not in the mean per
     threshold.
-
-    Args:
-        matches: All samples, in any order; repeated tokens count once.
-        config: Rules.
     """
     classes, thresholds = config.classes, config.thresholds
     records = unique_by_token(matches)

@@ -18,12 +18,7 @@ _BOUND_SLACK = 1.0 - 1e-12  # a lower bound may be too large by the rounding of 
 
 @njit(cache=True, fastmath=_NO_NAN)
 def chamfer_distance(first: FloatArray, second: FloatArray) -> float:
-    """Return the mean of the two directed mean nearest-neighbour distances.
-
-    Args:
-        first: Points in metres, at least one. (3, P)
-        second: Points in metres, at least one. (3, Q)
-    """
+    """Return the mean of both directed mean nearest-neighbour distances. (3, P), (3, Q) metres"""
     ax, ay, az = first[0], first[1], first[2]
     bx, by, bz = second[0], second[1], second[2]
     back, squared = np.full(len(bx), np.inf), np.empty(len(bx))

@@ -51,13 +51,7 @@ class MapEvaluator:
     def match(
         self, token: str, predictions: MapElements, ground_truth: MapElements
     ) -> SampleMatches:
-        """Match one sample under every metric that is asked for.
-
-        Args:
-            token: Name of the sample.
-            predictions: Its predictions.
-            ground_truth: Its ground truth.
-        """
+        """Match one sample, named by its token, under every metric that is asked for."""
         if self.ground_truth_points is not None:
             points, offsets = ground_truth.points, ground_truth.offsets
             resampled = resample_all(points, offsets, self.ground_truth_points)
@@ -72,11 +66,7 @@ class MapEvaluator:
         return found
 
     def reports(self, samples: Iterable[SampleMatches]) -> list[MetricReport]:
-        """Compute the metrics from the matches of all samples.
-
-        Args:
-            samples: Matches in any order; repeated tokens count once.
-        """
+        """Compute the metrics from the matches of all samples; repeated tokens count once."""
         records, found = list(samples), []
         if self.chamfer:
             found.append(chamfer_report((r["chamfer"] for r in records), self.chamfer))

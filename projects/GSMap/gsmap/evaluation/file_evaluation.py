@@ -29,15 +29,9 @@ Evaluation = tuple[list[MetricReport], list[str]]
 def read_ground_truth(
     path: str | Path, classes: Sequence[str], shard: Shard = WHOLE
 ) -> tuple[dict[str, MapElements], Counter[str]]:
-    """Read ground truth: our annotation file, or MapTR's and MapVR's JSON (``*.json``).
+    """Read a shard of ground truth: our annotation file, or MapTR's and MapVR's JSON (``*.json``).
 
-    Args:
-        path: The file.
-        classes: Names of the classes to score.
-        shard: Which part of its samples to read.
-
-    Returns:
-        As ``read_samples``.
+    Returns what ``read_samples`` does.
 
     Raises:
         ValueError: If an annotation file lacks one of the classes, or a sample has no ground truth;
@@ -66,15 +60,10 @@ def read_ground_truth(
 
 
 def mismatch_notes(results: Samples, truth: Samples, allowed: bool) -> list[str]:
-    """Say which samples have no results or no ground truth, or raise an error that does.
-
-    Args:
-        results: Predictions by token.
-        truth: Ground truth by token.
-        allowed: As ``allow_mismatch`` of ``evaluate_files``.
+    """Say which samples have no results or no ground truth.
 
     Raises:
-        ValueError: If the tokens differ and that is not allowed.
+        ValueError: If the tokens differ and that is not ``allowed``.
     """
     silent, extra = ([t for t in a if t not in b] for a, b in ((truth, results), (results, truth)))
     notes = []
@@ -176,14 +165,9 @@ def match_samples(
     num_workers: int = 1,
     progress: Progress | None = None,
 ) -> list[SampleMatches]:
-    """Match all samples of the ground truth.
+    """Match all samples of the ground truth, by token; other results are left out.
 
-    Args:
-        results: Predictions by token; those of samples without ground truth are left out.
-        truth: Ground truth by token.
-        evaluator: Metrics and their rules.
-        num_workers: Number of processes.
-        progress: Called with the number of samples done and in all.
+    ``progress`` is called with the number of samples done and in all.
     """
     nothing = MapElements.from_polylines()
     pairs = [(token, results.get(token, nothing), of_token) for token, of_token in truth.items()]

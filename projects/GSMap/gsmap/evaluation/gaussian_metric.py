@@ -52,12 +52,9 @@ class GaussianMetric(BaseMetric):
     def process(self, data_batch: Any, data_samples: Sequence[dict[str, Any]]) -> None:
         """Measure the samples of a batch.
 
-        Args:
-            data_batch: Not used.
-            data_samples: Samples with ``token``, ``x_range`` and ``y_range`` in metres,
-                ``eval_ann_info`` (``polylines``, K x (n, 2), ``labels``), and ``pred_instances_3d``
-                (``scores_3d``, ``labels_3d`` (N,), ``pts``, ``scales`` (N, P, 2), ``rotations``
-                (N, P), ``min_scale_m``).
+        They have ``token``, ``x_range`` and ``y_range`` in metres, ``eval_ann_info`` (``polylines``
+        K x (n, 2), ``labels``) and ``pred_instances_3d`` (``scores_3d``, ``labels_3d`` (N,),
+        ``pts``, ``scales`` (N, P, 2), ``rotations`` (N, P), ``min_scale_m``).
         """
         for sample in data_samples:
             measured = sample.get("eval_ann_info") and "scales" in sample["pred_instances_3d"]
@@ -121,9 +118,8 @@ class GaussianMetric(BaseMetric):
             if not len(size):
                 rows.append(f"  {name}: no confident prediction")
                 continue
-            along, across = np.median(size, 0)
-            metrics[f"sigma_along/{name}"] = float(along)
-            metrics[f"sigma_across/{name}"] = float(across)
+            along, across = np.median(size, 0).tolist()
+            metrics[f"sigma_along/{name}"], metrics[f"sigma_across/{name}"] = along, across
             rows.append(
                 f"  {name}: {overlap}, sigma {along:.2f} m along, {across:.2f} m across (medians)"
             )

@@ -83,11 +83,8 @@ class MapMetric(BaseMetric):
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
         """Match one batch and keep its matches.
 
-        Args:
-            data_batch: Not used.
-            data_samples: Samples with ``token``, ``pred_instances_3d`` (``pts``, ``scores_3d``,
-                ``labels_3d``) and, if a metric is asked for, ``eval_ann_info`` (``polylines``,
-                ``labels``).
+        Samples have ``token``, ``pred_instances_3d`` (``pts``, ``scores_3d``, ``labels_3d``) and,
+        if a metric is asked for, ``eval_ann_info`` (``polylines``, ``labels``).
         """
         for sample in data_samples:
             token = str(sample["token"])
@@ -103,21 +100,13 @@ class MapMetric(BaseMetric):
             self.results.append(record)
 
     def evaluate(self, size: int) -> dict[str, float]:
-        """Collect the records of all ranks and compute the metrics.
-
-        Args:
-            size: Number of samples in the data set.
-        """
+        """Collect the records of all ranks and compute the metrics of ``size`` samples."""
         self._size = size
         # MMEngine would cut the list off at `size` by position; repeated samples go by their token
         return super().evaluate(sys.maxsize)
 
     def compute_metrics(self, results: list[dict[str, Any]]) -> dict[str, float]:
-        """Compute the figures, print the tables and write the file; on the first rank only.
-
-        Args:
-            results: Records of all ranks.
-        """
+        """Compute the figures, print the tables and write the file; on the first rank only."""
         unique = {record["token"]: record for record in reversed(results)}
         records = [unique[token] for token in sorted(unique)]
         if len(records) != self._size:

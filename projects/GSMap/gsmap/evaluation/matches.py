@@ -72,16 +72,9 @@ def ranked_predictions(
     min_score: float = -np.inf,
     max_num: int | None = None,
 ) -> IntArray:
-    """Choose the predictions of a sample that count: lines of known classes with enough score.
+    """Choose the predictions that count: lines of known classes with ``min_score`` or more.
 
-    Args:
-        predictions: N predictions.
-        num_classes: Number of classes.
-        min_score: Smallest score that counts.
-        max_num: How many of each class count; None: all.
-
-    Returns:
-        Their positions, in descending order of score. (<= N,)
+    Returns the positions in descending order of score, of each class at most ``max_num``. (<= N,)
     """
     scores = predictions.confidence
     rows = np.flatnonzero((predictions.num_points >= 2) & (scores >= min_score))
@@ -108,11 +101,8 @@ def detections_per_class(
 
     Equal scores keep the order of the samples, then the order within the sample: the reference
     evaluators leave their order to an unstable sort (AP_chamfer) or to the order of the file
-    (AP_raster).
-
-    Args:
-        records: The samples, from ``unique_by_token``.
-        thresholds: Thresholds of each class, by its name, in the order of the labels. C x (T,)
+    (AP_raster). ``records`` come from ``unique_by_token``; ``thresholds`` are those of each class,
+    by its name, in the order of the labels. C x (T,)
     """
     none = np.zeros(0)
     num_thresholds = len(next(iter(thresholds.values())))

@@ -135,11 +135,8 @@ def fit_prior(
         truth: Ground truth of each training sample.
         chamfer: Rules of AP_chamfer.
         max_elements: Elements in the set, over all classes; a network of 50 queries predicts 50.
-        max_candidates: Ground truths of a class that are tried, evenly drawn from the training set.
+        max_candidates: Ground truths of a class that are tried, drawn with ``seed``.
         seed: Draws the candidates.
-
-    Returns:
-        The elements, with their scores.
 
     Raises:
         ValueError: If the training set holds no ground truth.
@@ -166,13 +163,9 @@ def evaluate_prior(
     evaluator: MapEvaluator,
     max_elements: int = 50,
 ) -> Evaluation:
-    """Fit the prior on one file of ground truth and score it on another.
+    """Fit a prior of ``max_elements`` on one file of ground truth and score it on another.
 
-    Args:
-        train_path: Ground truth to fit on: an annotation file, or MapTR's JSON.
-        truth_path: Ground truth to score on.
-        evaluator: Metrics and their rules.
-        max_elements: Elements in the set.
+    Both are annotation files, or MapTR's JSON.
     """
     chamfer = evaluator.chamfer or ChamferConfig(evaluator.classes)
     everything, _ = read_ground_truth(train_path, evaluator.classes)

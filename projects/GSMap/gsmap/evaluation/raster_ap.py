@@ -108,12 +108,7 @@ class RasterConfig:
 def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
     """Round points to pixels, halves to even, with the arithmetic of the reference evaluator.
 
-    Args:
-        points: Points in metres. (M, 2)
-        config: Rules.
-
-    Returns:
-        Column and row. (M, 2)
+    (x, y) in metres (M, 2) -> column and row (M, 2)
     """
     origin = (config.grid.x_range[0], config.grid.y_range[0])
     pixels = (points - origin) / config.grid.extent_m * (config.width, config.height)
@@ -122,16 +117,9 @@ def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
 
 
 def rasterize(elements: MapElements, config: RasterConfig) -> kernels.WordArray:
-    """Draw and dilate the elements of one sample.
+    """Draw and dilate elements of known classes, 64 columns to a word. N -> (N, H, words)
 
     The parts of an element outside the canvas are cut off before the dilation.
-
-    Args:
-        elements: N elements with labels below the number of classes.
-        config: Rules.
-
-    Returns:
-        The masks, 64 columns to a word. (N, H, words)
     """
     pixels = pixels_from_metres(elements.with_coordinates(2).points, config)
     filled = np.array(config.is_polygon)[elements.labels]
@@ -157,11 +145,7 @@ def match_raster(
 ) -> FrameMatches:
     """Match the predictions of one sample with its ground truth by the IoU of their masks.
 
-    Args:
-        predictions: Predictions of the sample.
-        ground_truth: Ground truth of the sample, at full resolution.
-        config: Rules.
-        token: Name of the sample.
+    Ground truth is at full resolution; ``token`` names the sample.
     """
     num_classes = len(config.classes)
     rows = ranked_predictions(predictions, num_classes, config.min_score, config.max_predictions)
@@ -204,13 +188,9 @@ def _mean_of_defined(values: Iterable[float]) -> float:
 
 
 def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> MetricReport:
-    """Compute AP_raster from the matches of all samples.
+    """Compute AP_raster from the matches of all samples, in any order; a token counts once.
 
     A class without ground truth is left out of the means.
-
-    Args:
-        matches: All samples, in any order; repeated tokens count once.
-        config: Rules.
     """
     records = unique_by_token(matches)
     detections = detections_per_class(records, config.thresholds)
@@ -221,9 +201,7 @@ def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> Metr
     groups: dict[str, list[str]] = {}
     for name, polygon in zip(config.classes, config.is_polygon, strict=True):
         groups.setdefault("polygon" if polygon else "line", []).append(name)
-    metrics = {
-        f"{name}/{key}": value for name, found in figures.items() for key, value in found.items()
-    }
+    metrics = {f"{name}/{key}": v for name, found in figures.items() for key, v in found.items()}
     for group, names in groups.items():
         for key in figures[names[0]]:
             if key.startswith(("AP", "AR", "recall", "mIoU")):

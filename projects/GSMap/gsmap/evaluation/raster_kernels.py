@@ -137,17 +137,10 @@ def _fill(
 def draw(
     pixels: IntArray, offsets: IntArray, filled: BoolArray, size: tuple[int, int], radius: int
 ) -> WordArray:
-    """Draw and dilate elements, each on a canvas of its own.
+    """Draw and dilate elements, each on a canvas of its own. (N, H, words of W columns)
 
-    Args:
-        pixels: Column and row of all points. (M, 2)
-        offsets: Element i owns the points ``offsets[i]:offsets[i + 1]``. (N + 1,)
-        filled: Which elements are polygons. (N,)
-        size: Rows H and columns W of the canvas.
-        radius: Half the side of the dilating square, less the centre.
-
-    Returns:
-        The masks. (N, H, words of W columns)
+    Points are column and row (M, 2), of element i ``offsets[i]:offsets[i + 1]``; ``filled`` ones
+    (N,) are polygons; ``size`` is H and W, ``radius`` half the dilating square, less the centre.
     """
     height, width = size
     masks = np.zeros((len(filled), height, (width + 63) // 64), np.uint64)

@@ -48,10 +48,8 @@ def class_figures(
 ) -> dict[str, float]:
     """Return the figures of one class that both metrics have, by the last part of their key.
 
-    Args:
-        found: The predictions of the class.
-        average_precision: Turns hits (N,) and the number of ground truths into an AP.
-        absent: Recall of a class without ground truth.
+    ``average_precision`` turns hits (N,) and the number of ground truths into an AP; ``absent`` is
+    the recall of a class without ground truth.
     """
     figures: dict[str, float] = {}
     for threshold, hits in zip(found.thresholds, found.hits.T, strict=True):

@@ -48,12 +48,7 @@ def _elements(
 
 
 def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, Any]]:
-    """Convert predictions to the ``vectors`` of one sample, with their Gaussians if they have any.
-
-    Args:
-        elements: Predictions. (N,)
-        classes: Names of the classes.
-    """
+    """Convert predictions to a sample's ``vectors``, with their Gaussians if they have any."""
     labels, scores = elements.labels.tolist(), elements.confidence.tolist()
     vectors: list[dict[str, Any]] = [
         {
@@ -134,13 +129,9 @@ def write_results(
     meta: Mapping[str, Any] | None = None,
     key: str = RESULTS_KEY,
 ) -> None:
-    """Write a result (or ground-truth) file, sample by sample; it appears only when it is whole.
+    """Write a file of ``results`` or ``GTs`` (``key``), which appears only when it is whole.
 
-    Args:
-        path: File to write; parent folders are made.
-        samples: Token and vectors of each sample.
-        meta: What to say about the file.
-        key: ``results``, or ``GTs`` for ground truth.
+    Samples are tokens and vectors, taken one by one; ``meta`` is what to say about the file.
     """
     with atomic_write(path) as file:
         file.write(f'{{"meta":{json.dumps(dict(meta or {}))},"{key}":[')
