@@ -1,16 +1,14 @@
 """BEV encoder with one learned query per cell that attends to the BEV and to the cameras."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from mmcv.cnn.bricks.transformer import FFN
 from mmdet.models.layers import LearnedPositionalEncoding
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.models.bev_encoders.img_metas import stack_calibration
+from gsmap.models.bev_encoders.camera_encoder import CameraEncoder
 from gsmap.models.bev_encoders.projection import PillarProjection, pillar_points, project_pillars
 from gsmap.models.layers.deformable_attention import (
     BEVDeformableAttention,
@@ -96,7 +94,7 @@ class BEVEncoderLayer(nn.Module):
 
 
 @MODELS.register_module()
-class BEVQueryEncoder(BaseModule):
+class BEVQueryEncoder(CameraEncoder):
     """Lift camera features to BEV with a learned query per cell.
 
     BEVFormer without history, or GKT, according to the camera cross-attention.
@@ -113,9 +111,6 @@ class BEVQueryEncoder(BaseModule):
         num_feature_levels: Rows of the level embedding; only the first is used, as there is one
             level.
         init_cfg: As in mmengine.
-
-    Attributes:
-        calibration: What it reads of a sample, names of `calibration_arrays`.
     """
 
     calibration = ("img_from_frame", "can_bus")
@@ -162,39 +157,10 @@ class BEVQueryEncoder(BaseModule):
         init_matrices(self.layers)
         init_matrices(self.can_bus_mlp)
 
-    def forward(
-        self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]
-    ) -> dict[str, Tensor]:
-        """Encode camera features into BEV features.
-
-        Args:
-            mlvl_feats: Image features; the first level is used. List of (B, V, C, h, w)
-            img_metas: Per sample ``lidar2img`` (V, 4, 4), ``batch_input_shape``, optionally
-                ``can_bus`` (18,).
-
-        Returns:
-            ``bev_feats`` (B, C, H, W), row 0 at the smallest y.
-
-        Raises:
-            ValueError: If the number of cameras is not the configured one, or a sample lacks its
-                matrices.
-        """
-        feats = mlvl_feats[0]
-        calibration = stack_calibration(img_metas, self.calibration, feats.device)
-        return self.encode(feats, calibration, img_metas[0]["batch_input_shape"])
-
     def encode(
         self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Tensor]:
-        """Encode camera features, with the calibration as tensors.
-
-        Args:
-            feats: Image features. (B, V, C, h, w)
-            calibration: ``img_from_frame`` (B, V, 4, 4) and ``can_bus`` (B, 18).
-            img_shape: Rows and columns of the padded images.
-
-        Returns:
-            As `forward`.
+        """Return ``bev_feats``, from ``img_from_frame`` (B, V, 4, 4) and ``can_bus`` (B, 18).
 
         Raises:
             ValueError: If the number of cameras is not the configured one.

@@ -51,15 +51,10 @@ class LidarEncoder(BaseModule):
         self.bev_size = (cells.height, cells.width)
 
     def forward(self, voxels: dict[str, Tensor], batch_size: int) -> Tensor:
-        """Encode the voxels of a batch.
+        """Encode the voxels of a batch to BEV features (B, C, H, W), row 0 at the smallest y.
 
-        Args:
-            voxels: ``voxels`` (M, points, channels), ``num_points`` (M,) and ``coors`` (M, 4):
-                sample, z, y, x.
-            batch_size: Number of samples B.
-
-        Returns:
-            BEV features, row 0 at the smallest y. (B, C, H, W)
+        They are ``voxels`` (M, points, channels), ``num_points`` (M,) and ``coors`` (M, 4): sample,
+        z, y, x.
 
         Raises:
             RuntimeError: If a sparse encoder is to run on the CPU without spconv, or to train

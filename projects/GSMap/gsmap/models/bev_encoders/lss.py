@@ -5,12 +5,11 @@ from typing import Any, cast
 
 import torch
 from mmdet3d.registry import MODELS
-from mmengine.model import BaseModule
 from torch import Tensor, nn
 
+from gsmap.models.bev_encoders.camera_encoder import CameraEncoder
 from gsmap.models.bev_encoders.depth_net import CameraAwareDepthNet, PlainDepthNet
 from gsmap.models.bev_encoders.frustum import camera_vector, frustum_points
-from gsmap.models.bev_encoders.img_metas import stack_calibration
 from gsmap.models.losses.auxiliary import num_depth_bins
 from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
 from gsmap.structures.grid import BEVGrid
@@ -19,7 +18,7 @@ CAMERA_MATRICES = ("cam2img", "img_aug_matrix", "ego_from_cam")
 
 
 @MODELS.register_module()
-class LSSEncoder(BaseModule):
+class LSSEncoder(CameraEncoder):
     """Lift image features by predicted depth, sum them in BEV cells, refine by convolutions.
 
     The cells are half as large as those of the output; the second convolution halves the
@@ -35,9 +34,6 @@ class LSSEncoder(BaseModule):
             convolution (the BEVPool variant of MapTR).
         aspp_channels: Channels of each branch of the camera-aware depth head's pyramid.
         init_cfg: As in mmengine.
-
-    Attributes:
-        calibration: What it reads of a sample, names of `calibration_arrays`.
 
     Raises:
         ValueError: If ``depth_range`` holds no bin.
@@ -80,42 +76,14 @@ class LSSEncoder(BaseModule):
             if parameter.dim() > 1:
                 nn.init.xavier_uniform_(parameter)
 
-    def forward(
-        self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]
-    ) -> dict[str, Any]:
-        """Encode camera features into BEV features.
-
-        Args:
-            mlvl_feats: Image features; the first level is used. List of (B, V, C, h, w)
-            img_metas: Per sample ``lidar2img`` (V, 4, 4) and ``batch_input_shape``; camera-aware
-                also ``cam2img``, ``img_aug_matrix``, ``lidar2cam`` (V, 4, 4) and ``lidar2ego`` (4,
-                4).
-
-        Returns:
-            ``bev_feats`` (B, C, H, W), row 0 at the smallest y; ``depth``, the probability of each
-            depth bin (B, V, D, h, w), and their ``depth_range``; ``img_feats``, the image features
-            used (B, V, C, h, w).
-
-        Raises:
-            ValueError: If a sample lacks a matrix.
-        """
-        feats = mlvl_feats[0]
-        calibration = stack_calibration(img_metas, self.calibration, feats.device)
-        return self.encode(feats, calibration, img_metas[0]["batch_input_shape"])
-
     def encode(
         self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode camera features, with the calibration as tensors.
-
-        Args:
-            feats: Image features. (B, V, C, h, w)
-            calibration: ``frame_from_img``, and camera-aware also ``cam2img``, ``img_aug_matrix``
-                and ``ego_from_cam``. (B, V, 4, 4)
-            img_shape: Rows and columns of the padded images.
+        """Encode features, with ``frame_from_img`` and, camera-aware, ``CAMERA_MATRICES``.
 
         Returns:
-            As `forward`.
+            ``bev_feats`` (B, C, H, W); ``depth``, the probability of each depth bin (B, V, D, h,
+            w), and their ``depth_range``; ``img_feats``, the image features used (B, V, C, h, w).
         """
         vectors = None
         if self.camera_aware:

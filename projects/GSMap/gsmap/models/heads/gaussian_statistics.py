@@ -19,13 +19,8 @@ def gaussian_statistics(
 ) -> dict[str, Tensor]:
     """Summarise matched elements by class; a class without one is left out.
 
-    Args:
-        gaussians: Gaussians of the matched predictions. (M, P)
-        rendered: Their masks. (M, H, W)
-        masks: Masks of their ground truths. (M, H, W)
-        labels: Classes of their ground truths. (M,)
-        class_names: Names of the classes.
-        floor_m: Smallest sigma in metres.
+    Gaussians of the predictions (M, P), their masks, those of their ground truths (M, H, W), and
+    classes (M,); ``floor_m`` is the smallest sigma in metres.
 
     Returns:
         Per class ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>``

@@ -141,10 +141,7 @@ class MapHead(BaseModule):
         fit_instance_queries(state, key, self.instance_embedding.weight, self.query_groups[0].num)
 
     def forward(self, bev_outputs: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Predict the elements after every decoder layer.
-
-        Args:
-            bev_outputs: The BEV encoder's outputs; ``bev_feats`` (B, C, H, W) is read.
+        """Predict the elements after every decoder layer from ``bev_feats`` (B, C, H, W).
 
         Returns:
             ``all_cls_scores`` logits (L, B, N, classes), ``all_pts_preds`` normalised (L, B, N, P,
@@ -198,11 +195,8 @@ class MapHead(BaseModule):
     ) -> dict[str, Tensor]:
         """Prepare the ground truth and return the losses of every decoder layer and query group.
 
-        Args:
-            outputs: What :meth:`forward` returned.
-            batch_gt_instances: Per sample ``labels_3d`` (K,), ``pts`` (K, P, 2), ``pts_shifts`` (K,
-                S, P, 2) in metres, and for masks ``polylines`` (K, M, 2).
-            batch_img_metas: Meta dicts.
+        Ground truth is, per sample, ``labels_3d`` (K,), ``pts`` (K, P, 2), ``pts_shifts`` (K, S, P,
+        2) in metres, and for masks ``polylines`` (K, M, 2).
 
         Returns:
             The last layer's losses under their names, the others' with the prefix ``d<layer>.``;
@@ -342,13 +336,8 @@ class MapHead(BaseModule):
     ) -> list[InstanceData]:
         """Decode the last layer's predictions.
 
-        Args:
-            outputs: What :meth:`forward` returned.
-            batch_img_metas: Meta dicts.
-
-        Returns:
-            Per sample ``scores_3d`` (M,), ``labels_3d`` (M,) and ``pts`` (M, P, 2) in metres, best
-            first, and what else the reference decodes.
+        They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,) and ``pts`` (M, P, 2) in
+        metres, best first, and what else the reference decodes.
         """
         results = []
         last = zip(outputs["all_cls_scores"][-1], outputs["all_references"][-1], strict=True)

@@ -12,11 +12,7 @@ if TYPE_CHECKING:
 
 
 def by_name(modules: Sequence[nn.Module]) -> nn.ModuleDict:
-    """Return modules by their ``name``.
-
-    Raises:
-        ValueError: If two have the same.
-    """
+    """Return modules by their ``name``; ValueError if two have the same."""
     _refuse_twins([str(module.name) for module in modules], "parts")
     return nn.ModuleDict({str(module.name): module for module in modules})
 

@@ -44,16 +44,10 @@ def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights
 def place_samples(
     offsets: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None = None
 ) -> Tensor:
-    """Place samples around reference points.
+    """Place samples around reference points, (x, y) in [0, 1] over the map. (B, Q, heads, S, 2)
 
-    Args:
-        offsets: Offsets (x, y) in cells. (B, Q, heads, S, 2)
-        reference: Reference; the first two entries are the point, [0, 1] over the map. (B, Q, D)
-        shape: Rows and columns of the map.
-        frames: What turns each query's offsets, or None. (B, Q, 2, 2)
-
-    Returns:
-        Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
+    Offsets are in cells (B, Q, heads, S, 2), turned by the frames (B, Q, 2, 2) if there are any;
+    the reference's (B, Q, D) first two entries are the point; ``shape`` is rows and columns.
     """
     if frames is not None:
         offsets = torch.sum(frames[:, :, None, None] * offsets[..., None, :], -1)
@@ -137,17 +131,9 @@ class BEVDeformableAttention(SamplingAttention):
     def forward(
         self, query: Tensor, reference: Tensor, feats: Tensor, frames: Tensor | None = None
     ) -> Tensor:
-        """Sample the map for each query.
+        """Sample the map (B, C, H, W) for each query. (B, Q, C) -> (B, Q, C)
 
-        Args:
-            query: Query with its position added. (B, Q, C)
-            reference: Reference; the first two entries are the point, [0, 1] over the map. (B, Q,
-                D)
-            feats: The map. (B, C, H, W)
-            frames: What turns each query's sampling offsets, or None. (B, Q, 2, 2)
-
-        Returns:
-            Attended features, without the residual. (B, Q, C)
+        Queries have their position; references and frames are as in `place_samples`.
         """
         shape = (feats.shape[-2], feats.shape[-1])
         tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)

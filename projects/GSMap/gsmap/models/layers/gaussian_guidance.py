@@ -54,12 +54,8 @@ class GaussianGuidance(nn.Module):
     def frames(self, reference: Tensor, shape: tuple[int, int]) -> Tensor | None:
         """Return what turns sampling offsets in cells into each Gaussian's frame, or None.
 
-        Args:
-            reference: The Gaussians. (B, Q, D)
-            shape: Rows and columns of the map that is sampled.
-
-        Returns:
-            Matrices that multiply offsets (x, y) in cells from the left. (B, Q, 2, 2)
+        The matrices (B, Q, 2, 2) of references (B, Q, D) multiply offsets (x, y) in cells of the
+        sampled map, of ``shape`` rows and columns, from the left.
         """
         if not self.sampling:
             return None

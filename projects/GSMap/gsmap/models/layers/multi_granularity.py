@@ -62,18 +62,11 @@ class PerPointSampling(SamplingAttention):
         feats: Sequence[Tensor],
         frames: Tensor | None = None,
     ) -> Granularities:
-        """Update the queries from the BEV.
+        """Update the queries from the BEV, residuals included.
 
-        Args:
-            state: The queries; points and their code are those of the layer before.
-            position: Position of the instance queries. (B, N, C)
-            reference: References of the points; the first two entries are the point, [0, 1] over
-                the map. (B, N, P, D)
-            feats: BEV features, finest level first. levels x (B, C, H, W)
-            frames: What turns the sampling offsets of each point, or None. (B, N * P, 2, 2)
-
-        Returns:
-            Updated queries, residuals included.
+        Points and their code are those of the layer before. Instances have a position (B, N, C),
+        points references (B, N, P, D) and frames (B, N * P, 2, 2), as in `place_samples`; features
+        are levels x (B, C, H, W), the finest first.
 
         Raises:
             ValueError: If the numbers of levels or points are not the module's.

@@ -37,11 +37,7 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
 
 
 def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
-    """Return the number of bins of ``(low, high, step)``.
-
-    Raises:
-        ValueError: If the range holds no bin.
-    """
+    """Return the number of bins of ``(low, high, step)``; ValueError if there is none."""
     low, high, step = depth_range
     if step <= 0 or high - low < step:
         raise ValueError(
@@ -53,14 +49,8 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
 def depth_loss(probs: Tensor, bins: Tensor) -> Tensor:
     """Return the mean of -log p at the target bin, over the pixels that have one (0 if none has).
 
-    Only the target bin enters; the other bins are held down by the softmax.
-
-    Args:
-        probs: Probability of each depth bin. (..., D, h, w)
-        bins: Target bin, -1 for none. (..., h, w)
-
-    Raises:
-        ValueError: If the shapes disagree.
+    Only the target bin enters; the other bins are held down by the softmax. ValueError if the
+    shapes disagree. Probabilities (..., D, h, w), bins, -1 for none (..., h, w) -> ()
     """
     if probs.shape[:-3] + probs.shape[-2:] != bins.shape:
         raise ValueError(

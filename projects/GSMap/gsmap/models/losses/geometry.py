@@ -99,17 +99,11 @@ class EuclideanLoss(nn.Module):
         counts: Sequence[int],
         avg_factor: float | Tensor | None = None,
     ) -> Tensor:
-        """Return the weighted loss. Its parts are means: no number of matches divides them.
+        """Return the weighted loss, 0 with a gradient of 0 if nothing is matched.
 
-        Args:
-            pred: Points of matched predictions, normalised to [0, 1], sample after sample;
-                heights are left out. (M, P, 2 or 3)
-            target: Points of their ground truth, in the order that was matched. (M, P, 2 or 3)
-            counts: Number of matches of each sample.
-            avg_factor: Not used.
-
-        Returns:
-            The loss; 0 with a gradient of 0 if nothing is matched. ()
+        Its parts are means: ``avg_factor`` does not divide them. Points are normalised to [0, 1],
+        sample after sample, of ``counts`` matches each, in the matched order; heights are left out.
+        2 x (M, P, 2 or 3) -> ()
         """
         with torch.autocast(pred.device.type, enabled=False):
             dtype = torch.promote_types(pred.dtype, torch.float32)

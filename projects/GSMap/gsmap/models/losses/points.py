@@ -49,21 +49,17 @@ class SamplingLocationLoss(PointsLoss):
         return super().forward(pred, target[..., :2], avg_factor)
 
 
-class DirectionLoss(nn.Module):
+class DirectionLoss(PointsLoss):
     """One minus the cosine between the edges of matched pairs (MapTR Eq. 7).
 
     Closed shapes need no extra edge: their last point is their first.
-
-    Args:
-        loss_weight: Weight of the loss.
     """
 
     name = "dir"
-    reads: tuple[str, ...] = ("pred.pts_m", "gt.pts_m")
+    reads = ("pred.pts_m", "gt.pts_m")
 
     def __init__(self, loss_weight: float = 0.005) -> None:
-        super().__init__()
-        self.loss_weight = loss_weight
+        super().__init__(loss_weight)
 
     def forward(self, pred: Tensor, target: Tensor, avg_factor: float | Tensor) -> Tensor:
         """Return the weighted sum over ``avg_factor``. 2 x (M, P, 2 or 3) -> ()

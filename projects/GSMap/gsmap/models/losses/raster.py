@@ -26,15 +26,10 @@ class _MaskLoss(nn.Module):
     def forward(
         self, preds: Tensor, targets: Tensor, avg_factor: float | Tensor | None = None
     ) -> Tensor:
-        """Return the weighted loss.
+        """Return the weighted sum over ``avg_factor``, or the mean over the n instances without it.
 
-        Args:
-            preds: Rendered masks of the matched instances. (n, H, W)
-            targets: Masks of their ground truths. (n, H, W)
-            avg_factor: What the sum over instances is divided by; n without it.
-
-        Returns:
-            The loss; 0 with a gradient of 0 if nothing is matched. ()
+        Rendered masks and those of their ground truths, 2 x (n, H, W); 0 with a gradient of 0 if
+        nothing is matched.
         """
         if not len(preds):
             return preds.float().sum() * 0

@@ -15,19 +15,11 @@ PAIRINGS = ("matched", "released")
 def class_mask_losses(
     logits: Tensor, targets: Tensor, pos_weight: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Return cross-entropy and dice of class masks.
+    """Return the mean binary cross-entropy of class masks, and the dice of all classes together.
 
-    Args:
-        logits: Predicted masks, one channel per class. (B, classes, H, W)
-        targets: 0 or 1, any dtype. (B, classes, H, W)
-        pos_weight: Weight of the cells where ``targets`` is 1, in the cross-entropy.
-
-    Returns:
-        The mean binary cross-entropy () and the mean over samples of the dice loss of all classes
-        together ().
-
-    Raises:
-        ValueError: If the shapes disagree.
+    Targets are 0 or 1, of any dtype; ``pos_weight`` is the weight of cells of 1 in the
+    cross-entropy; dice is a mean over samples. ValueError if the shapes disagree.
+    2 x (B, classes, H, W) -> (), ()
     """
     _check_shapes(logits, targets)
     logits, targets = logits.float(), targets.float()
@@ -107,15 +99,9 @@ class InstanceMaskLoss(nn.Module):
     ) -> Tensor:
         """Return the weighted loss, 0 if nothing is matched.
 
-        Args:
-            states: Instance states of matched queries, samples concatenated, queries of a sample in
-                ascending order. (M, C)
-            masks: Masks of their ground truths; those of another size than the features are
-                averaged over the cells. (M, h, w)
-            gt_inds: Number of each one's ground truth in its sample. (M,)
-            counts: Matches of each sample.
-            bev_feats: BEV features. (B, C, H, W)
-            avg_factor: The divisor: the number of matched elements, at least 1.
+        States (M, C) of matched queries, ascending in a sample of ``counts`` matches; masks (M, h,
+        w) of their ground truths, averaged over the cells of the features (B, C, H, W);
+        ``gt_inds`` (M,), each one's ground truth in its sample.
         """
         samples = zip(states.split(list(counts)), bev_feats, strict=True)
         logits = torch.cat([self.logits(*sample) for sample in samples])

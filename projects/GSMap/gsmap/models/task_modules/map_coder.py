@@ -52,14 +52,9 @@ class MapCoder:
         self.score_threshold = score_threshold
 
     def decode(self, scores: Tensor, pts: Tensor) -> Detections:
-        """Select the detections of one sample.
+        """Select at most ``max_num`` detections; index ``pts`` with their ``query_inds``.
 
-        Args:
-            scores: Class logits. (N, classes)
-            pts: Points in metres. (N, P, 2 or 3)
-
-        Returns:
-            At most ``max_num`` detections; index ``pts`` with their ``query_inds``.
+        Class logits (N, classes), points in metres (N, P, 2 or 3).
         """
         best, labels, query = self.best(scores)
         keep = torch.ones_like(best, dtype=torch.bool)

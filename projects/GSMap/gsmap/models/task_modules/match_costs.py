@@ -14,15 +14,7 @@ from gsmap.ops.soft_iou import pairwise_soft_iou
 def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
     """Return the summed L1 distance of every prediction to every order of every ground truth.
 
-    Args:
-        pts: Predicted points. (N, P, 2)
-        pts_shifts: Equivalent orders of the annotated points, in the same units. (K, S, P, 2)
-
-    Returns:
-        Distances, summed over points and coordinates. (N, K, S)
-
-    Raises:
-        ValueError: If the numbers of points differ.
+    ValueError if the numbers of points differ. (N, P, 2), (K, S, P, 2) -> (N, K, S)
     """
     if pts.shape[-2:] != pts_shifts.shape[-2:]:
         raise ValueError(
