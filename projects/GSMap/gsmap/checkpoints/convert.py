@@ -67,10 +67,7 @@ def _serves_training(key: str) -> bool:
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a checkpoint file without running any code from it.
-
-    Args:
-        path: A checkpoint with or without ``state_dict`` around the weights.
+    """Read a checkpoint file, with or without ``state_dict``, without running any code from it.
 
     Returns:
         The state dict, and what else the checkpoint says of itself (its ``meta``).

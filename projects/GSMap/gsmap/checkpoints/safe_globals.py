@@ -14,12 +14,8 @@ def mmengine_globals() -> list[Any]:
 
     A checkpoint to resume from holds the message hub: ``HistoryBuffer`` objects around arrays,
     numbers, and references to the class's own statistics (``getattr(HistoryBuffer, "mean")``).
-    Naming just these keeps torch's protection on for everything else.
-
-    numpy's values are rebuilt by checked functions, as numpy's own give a file memory access.
-
-    Returns:
-        The list for ``torch.serialization.safe_globals`` or ``add_safe_globals``.
+    Naming just these keeps torch's protection on for everything else. numpy's values are rebuilt by
+    checked functions, as numpy's own give a file memory access.
     """
     checked = [(function, name) for name, function in CHECKED.items()]
     return [HistoryBuffer, *checked, (_history_statistic, "builtins.getattr")]

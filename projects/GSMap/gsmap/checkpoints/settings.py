@@ -13,15 +13,9 @@ def plain(settings: Any) -> Any:
 
 
 def differences(ours: Any, others: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
-    """Compare nested settings.
+    """Compare nested dictionaries, lists and plain values.
 
-    Args:
-        ours: Dictionaries, lists and plain values.
-        others: The same, to compare with.
-        name: Name of the whole, which begins the dotted names.
-
-    Returns:
-        Both values by dotted name; None stands for what is not there.
+    Returns both values by dotted name, which begins with ``name``; None is what is not there.
     """
     parts = [
         dict(enumerate(side)) if isinstance(side, list) else side

@@ -21,29 +21,20 @@ def elements_of_instances(instances: Sequence[MapInstance]) -> MapElements:
 
 
 def elements_of_truth(info: Mapping[str, Any]) -> MapElements:
-    """Convert a data sample's ``eval_ann_info``.
-
-    Args:
-        info: ``polylines``, K x (n, 2 or 3) in metres, and ``labels``. (K,)
-    """
+    """Convert ``eval_ann_info``: ``polylines``, K x (n, 2 or 3) in metres, and ``labels`` (K,)."""
     return MapElements.from_polylines([_array(p) for p in info["polylines"]], info["labels"])
 
 
 def elements_of_targets(instances: Any) -> MapElements:
-    """Convert a data sample's ``gt_instances_3d``.
-
-    Args:
-        instances: ``pts`` in metres (K, P, 2) and ``labels_3d``. (K,)
-    """
+    """Convert ``gt_instances_3d``: ``pts`` in metres (K, P, 2) and ``labels_3d`` (K,)."""
     return MapElements.from_polylines(_array(instances["pts"]), _array(instances["labels_3d"]))
 
 
 def elements_of_predictions(instances: Any) -> MapElements:
-    """Convert a data sample's ``pred_instances_3d``.
+    """Convert ``pred_instances_3d``.
 
-    Args:
-        instances: ``pts`` (N, P, 2) in metres, ``labels_3d`` (N,), ``scores_3d`` (N,) and, where
-            there are Gaussians, ``scales`` (N, P, 2) in metres and ``rotations`` (N, P).
+    It has ``pts`` (N, P, 2) in metres, ``labels_3d`` (N,), ``scores_3d`` (N,) and, where there are
+    Gaussians, ``scales`` (N, P, 2) in metres and ``rotations`` (N, P).
 
     Raises:
         ValueError: If a point or a score is not finite.

@@ -23,11 +23,7 @@ _UNEXPECTED = (
 
 @contextmanager
 def naming(what: object, remedy: str) -> Iterator[None]:
-    """Say whose content is meant where reading it meets with something unexpected.
-
-    Args:
-        what: The file, or the part of it.
-        remedy: What to do.
+    """Say whose content is meant, and what to do, where reading it meets with something unexpected.
 
     Raises:
         ValueError: In place of what indexing, arithmetic or a parser raises in the block.

@@ -178,12 +178,6 @@ def _count(value: Any, counts: dict[int, int], depth: int = 0) -> int:
 def load_plain_pickle(path: str | Path) -> Any:
     """Read a pickle of plain containers and numpy values.
 
-    Args:
-        path: The file.
-
-    Returns:
-        Its content.
-
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it is not a whole pickle, or asks for anything but plain data.

@@ -180,9 +180,6 @@ class VectorizedMapDataset(BaseDataset):
     def get_data_info(self, idx: int) -> dict[str, Any]:
         """Return a sample as the pipeline takes it.
 
-        Args:
-            idx: Index of the sample.
-
         Returns:
             Keys of mmdet3d's multi-view pipelines (``images``, ``lidar_points``, ``lidar_sweeps``,
             ``timestamp``), the keys of the packed metainfo, ``dim`` and ``map_instances``: the
@@ -274,13 +271,7 @@ class VectorizedMapDataset(BaseDataset):
         }
 
     def prepare_data(self, idx: int) -> Any:
-        """Run the pipeline on a sample.
-
-        Args:
-            idx: Index of the sample.
-
-        Returns:
-            What the pipeline gives, or None if the sample is broken and may be skipped.
+        """Run the pipeline on a sample; None if that is broken and may be skipped.
 
         Raises:
             BrokenSampleError: If a file is missing or damaged and ``broken_samples`` is ``raise``.

@@ -184,13 +184,7 @@ def load_config(args: argparse.Namespace) -> Config:
 def newest_checkpoint(work_dir: str | Path) -> Path | None:
     """Return the newest whole checkpoint of a run, whatever its ``last_checkpoint`` says.
 
-    A damaged one is named and passed over.
-
-    Args:
-        work_dir: Work folder of the run.
-
-    Returns:
-        The checkpoint; None if there is none.
+    A damaged one is named and passed over; None if there is none.
     """
     numbered = {
         int(match[1]): path

@@ -36,14 +36,7 @@ class MapLogProcessor(LogProcessor):
     def get_log_after_epoch(
         self, runner: Runner, batch_idx: int, mode: str, with_non_scalar: bool = False
     ) -> tuple[dict[str, Any], str]:
-        """Return all figures of an evaluation, and the log line with the main ones.
-
-        Args:
-            runner: The runner.
-            batch_idx: Index of the last batch.
-            mode: ``val`` or ``test``.
-            with_non_scalar: Whether to return what is no number, too.
-        """
+        """Return all figures of an evaluation, and the log line with the main ones."""
         self._details: dict[str, Any] = {}
         figures, line = super().get_log_after_epoch(runner, batch_idx, mode, with_non_scalar)
         return {**self._details, **figures}, line

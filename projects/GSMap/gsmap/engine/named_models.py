@@ -50,10 +50,7 @@ def named_models() -> dict[str, NamedModel]:
 
 
 def find_config(config: str | Path) -> Path:
-    """Return a config's file.
-
-    Args:
-        config: The file, or the name of a model.
+    """Return a config's file, given that or the name of a model.
 
     Raises:
         FileNotFoundError: If it is neither; the message has the nearest name.

@@ -115,10 +115,7 @@ class MapElements:
         return self.scales is not None and self.rotations is not None
 
     def with_coordinates(self, dim: int) -> "MapElements":
-        """Return the elements with (x, y), or (x, y, z), per vertex.
-
-        Args:
-            dim: Coordinates per vertex, 2 or 3.
+        """Return the elements with ``dim`` coordinates, 2 or 3, per vertex.
 
         Raises:
             ValueError: If there are vertices of fewer coordinates.
@@ -132,11 +129,7 @@ class MapElements:
         return replace(self, points=np.ascontiguousarray(points))
 
     def select(self, index: IntArray | BoolArray) -> "MapElements":
-        """Return some of the elements, in the order that is asked for.
-
-        Args:
-            index: Positions, or a mask. (K,) or (N,)
-        """
+        """Return some of the elements, by positions in their order (K,), or by a mask (N,)."""
         rows = np.flatnonzero(index) if index.dtype == np.bool_ else np.asarray(index)
         counts = self.num_points[rows]
         offsets = np.append(0, np.cumsum(counts))

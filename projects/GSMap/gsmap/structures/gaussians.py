@@ -81,14 +81,10 @@ class GaussianSpace:
         return 0.0 if self.grid.forward == "x" else math.pi / 2
 
     def decode(self, reference: Tensor) -> Gaussians:
-        """Return the Gaussians that a reference stands for, in float32 at least.
+        """Return the Gaussians that a reference stands for, differentiable, in float32 at least.
 
-        Args:
-            reference: Centre in [0, 1] (and perhaps a height), then sigma and theta before their
-                activation. (..., 5 or more)
-
-        Returns:
-            The Gaussians, differentiable in ``reference``. (...)
+        Its entries are the centre in [0, 1] (and perhaps a height), then sigma and theta before
+        their activation. (..., 5 or more) -> (...)
 
         Raises:
             ValueError: If the last axis holds fewer than five numbers.
@@ -123,14 +119,7 @@ class GaussianSpace:
         along that axis. With the stretch :math:`D = \mathrm{diag}(\sigma / \sigma_{init})` and the
         direction of travel :math:`\theta_0`, the matrix is :math:`R(\theta) D R(\theta_0)^T`. The
         invariant one, :math:`R(\theta) D R(\theta)^T`, is the same for theta and theta + pi, which
-        are the same Gaussian.
-
-        Args:
-            reference: As in :meth:`decode`. (..., 5 or more)
-            invariant: Which of the two.
-
-        Returns:
-            Matrices that multiply (x, y) in metres from the left. (..., 2, 2)
+        are the same Gaussian. They multiply (x, y) in metres from the left. (..., D) -> (..., 2, 2)
         """
         gaussians = self.decode(reference)
         start = self.scales(gaussians.scales.new_zeros(2))
@@ -140,16 +129,10 @@ class GaussianSpace:
         return (turned * stretch[..., None, :]) @ back.transpose(-1, -2)
 
     def describe(self, reference: Tensor) -> Tensor:
-        """Return numbers of unit size that describe the Gaussians, for an embedding.
+        """Return numbers of unit size that describe the Gaussians. (..., 5 or more) -> (..., 6)
 
-        The angle enters as cosine and sine of 2 theta: a Gaussian turned by half a circle is the
-        same.
-
-        Args:
-            reference: As in :meth:`decode`. (..., 5 or more)
-
-        Returns:
-            mu in [-1, 1], sigma before its activation, cos and sin of 2 theta. (..., 6)
+        They are mu in [-1, 1], sigma before its activation, cos and sin of 2 theta, as a Gaussian
+        turned by half a circle is the same.
         """
         centre, raw_scales, theta = reference[..., :2], reference[..., -3:-1], reference[..., -1:]
         angle = 2 * (theta + self.heading_rad)
@@ -165,13 +148,8 @@ def _rotations(angles: Tensor) -> Tensor:
 def extents_along_line(gaussians: Gaussians) -> Tensor:
     r"""Return each Gaussian's standard deviation along and across the line of its centres.
 
-    The line's direction at a centre joins its neighbours, or at an end the end and its neighbour.
-
-    Args:
-        gaussians: Ordered Gaussians of each element, at least two. (..., P)
-
-    Returns:
-        :math:`\sqrt{d^T \Sigma d}` for d along and across the line, in metres. (..., P, 2)
+    :math:`\sqrt{d^T \Sigma d}` in metres; the line's direction d at a centre joins its neighbours,
+    or at an end the end and its neighbour. Two or more Gaussians each. (..., P) -> (..., P, 2)
     """
     means = gaussians.means
     padded = torch.cat([means[..., :1, :], means, means[..., -1:, :]], -2)

@@ -28,13 +28,7 @@ def arc_lengths(points: Points) -> NDArray[np.float64]:
     """Return the distance in the plane from the first point to each point along a polyline.
 
     Heights do not lengthen a line, as in shapely, which MapTRv2 resamples 3D lines with: the same
-    line with and without z is resampled at the same (x, y).
-
-    Args:
-        points: Vertices in metres. (n, D)
-
-    Returns:
-        Distances in metres, from 0 to the length. (n,)
+    line with and without z is resampled at the same (x, y). (n, D) in metres -> (n,)
     """
     steps = np.linalg.norm(np.diff(np.asarray(points, np.float64)[:, :2], axis=0), axis=-1)
     return np.concatenate([[0.0], np.cumsum(steps)])
@@ -43,12 +37,7 @@ def arc_lengths(points: Points) -> NDArray[np.float64]:
 def resample(points: Points, num_points: int) -> NDArray[np.float64]:
     """Resample a polyline at equal arc length in the plane, both end points included.
 
-    Args:
-        points: Vertices in metres; z is interpolated. (n, D)
-        num_points: Number P of points to return, >= 2.
-
-    Returns:
-        Resampled points in metres. (P, D)
+    z is interpolated. (n, D) in metres -> (P, D)
 
     Raises:
         ValueError: If ``points`` is no polyline or ``num_points`` is below 2.
@@ -147,15 +136,9 @@ def bounding_boxes(points: Points) -> Points:
 
 
 def clamp(points: Points, x_range: tuple[float, float], y_range: tuple[float, float]) -> Points:
-    """Move points outside a rectangle to its nearest edge; entries after (x, y) are kept.
+    """Return points with those outside a rectangle moved to its nearest edge. (..., D) -> (..., D)
 
-    Args:
-        points: Points in metres. (..., D)
-        x_range: Smallest and largest x in metres.
-        y_range: Smallest and largest y in metres.
-
-    Returns:
-        A copy. (..., D)
+    Ranges are in metres; entries after (x, y) are kept.
     """
     clamped = np.array(points)
     clamped[..., 0] = np.clip(clamped[..., 0], *x_range)

@@ -9,16 +9,8 @@ from numpy.typing import NDArray
 def invert_rigid(transform: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Return the inverse of a rotation with a translation, without a linear solver.
 
-    A general inverse of thousands of small matrices spends its time in starting threads.
-
-    Args:
-        transform: Rigid transforms. (..., 4, 4)
-
-    Returns:
-        Their inverses. (..., 4, 4)
-
-    Raises:
-        ValueError: If the shape is not (..., 4, 4).
+    A general inverse of thousands of small matrices spends its time in starting threads. ValueError
+    if the shape is not (..., 4, 4). (..., 4, 4) -> (..., 4, 4)
     """
     matrices = np.asarray(transform, np.float64)
     if matrices.shape[-2:] != (4, 4):
@@ -33,14 +25,9 @@ def invert_rigid(transform: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
 
 @np.errstate(invalid="ignore", over="ignore")
 def is_rigid(transform: NDArray[np.floating[Any]], tolerance: float = 1e-3) -> NDArray[np.bool_]:
-    """Say which matrices are a proper rotation with a finite translation.
+    """Say which matrices are a proper rotation with a finite translation. (..., 4, 4) -> (...)
 
-    Args:
-        transform: Matrices. (..., 4, 4)
-        tolerance: How far products of the rotation's rows may be off.
-
-    Returns:
-        Whether each is rigid. (...,)
+    ``tolerance`` is how far products of the rotation's rows may be off.
     """
     m = np.moveaxis(transform, (-2, -1), (0, 1)).copy()  # (4, 4, ...): each entry in one piece
     (x, y, z), shift = m[:3, :3], m[:3, 3]

@@ -81,19 +81,19 @@ def bev_pool_conv3x3(
     """Pool as `bev_pool` does and convolve the result with a 3x3 kernel, zero-padded.
 
     Both steps are linear, so the kernel's nine matrices can be applied to the few context vectors
-    instead of the many
-    cells: at MapTRv2's size (2,250 pixels, 80,000 cells) this is 35 times less arithmetic.
+    instead of the many cells: at MapTRv2's size (2,250 pixels, 80,000 cells) this is 35 times less
+    arithmetic. The first arguments are those of `bev_pool`.
 
     Args:
         probs: Probability of each depth bin. (B, V, D, h, w)
         context: Image features. (B, V, C, h, w)
-        cells: Cell of each point, -1 for none, from `cell_indices`. (B, V, D, h, w)
-        grid: The cells, H rows and W columns.
+        cells: Cell of each point. (B, V, D, h, w)
+        grid: The cells.
         weight: Convolution kernel without bias. (O, C, 3, 3)
 
     Returns:
-        ``conv2d(bev_pool(...), weight, padding=1)``, differentiable in ``probs``, ``context`` and
-        ``weight``. (B, O, H, W)
+        ``conv2d(bev_pool(...), weight, padding=1)``, also differentiable in ``weight``.
+        (B, O, H, W)
 
     Raises:
         ValueError: If the shapes disagree.

@@ -94,18 +94,10 @@ def draw_reference(
     pixel: float,
     antialias: bool,
 ) -> Tensor:
-    """Draw ground-truth masks.
+    """Draw lines of half a width, or filled polygons (K,), of vertices (K, P, 2). (K, H, W)
 
-    Args:
-        polylines: Vertices. (K, P, 2)
-        filled: Which are filled as polygons. (K,)
-        pixels: Pixel centres in the unit of ``polylines``. (H, W, 2)
-        half_width: Half a line's width.
-        pixel: Side of the square that is as large as a pixel.
-        antialias: Whether a pixel takes the share that is covered, or 0 or 1.
-
-    Returns:
-        Masks in [0, 1]. (K, H, W)
+    All are in one unit: pixels are their centres (H, W, 2), ``pixel`` is the side of the square
+    that is as large as one. It takes the share that is covered with ``antialias``, else 0 or 1.
     """
     to_line = _edge_distances(pixels, polylines[:, :-1], polylines[:, 1:]).sqrt()
     to_closing = _edge_distances(pixels, polylines[:, -1:], polylines[:, :1]).sqrt()

@@ -39,18 +39,10 @@ def dssim_map(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, T
 def raster_loss_sums_reference(
     preds: Tensor, targets: Tensor, window_size: int, window_sigma: float, weight: float
 ) -> Tensor:
-    """Sum what Eq. 12 is made of over each instance's pixels.
+    """Sum what Eq. 12 is made of over each instance's pixels. 2 x (n, H, W) -> (n, 7)
 
-    Args:
-        preds: Masks in [0, 1]. (n, H, W)
-        targets: Masks in [0, 1]. (n, H, W)
-        window_size: Side of SSIM's window in pixels, odd.
-        window_sigma: Standard deviation of SSIM's window in pixels.
-        weight: Weight of a pixel of the ground truth; w = 1 + (weight - 1) t.
-
-    Returns:
-        sum w |p - t|, sum w p, sum (1 - SSIM), sum w t, sum (w - 1), and the number of pixels whose
-        window sees the target, and either mask. (n, 7)
+    With w = 1 + (weight - 1) t: sum w |p - t|, sum w p, sum (1 - SSIM), sum w t, sum (w - 1), and
+    the number of pixels whose window sees the target, and either mask.
     """
     excess = (weight - 1) * targets
     weights = 1 + excess
