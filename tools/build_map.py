@@ -22,6 +22,7 @@ from gsmap.maps.geojson import write_geojson
 from gsmap.maps.lanelet2 import write_lanelet2
 from gsmap.maps.mcap import write_mcap
 from gsmap.maps.merging import confident, merge, suppress
+from gsmap.maps.replay import Replay
 from gsmap.maps.rerun import write_rerun
 from gsmap.maps.scoring import figures_table, map_figures
 from gsmap.maps.truth import true_map
@@ -89,12 +90,12 @@ def write_map(
         )
     style, root = MapStyle(classes), args.data_root or args.ann.parent
     colours = [style.colour(label) for label in range(len(classes))]
-    replayed = {"frame_kind": ann.meta.frame, "colours": colours, "data_root": root}
+    replay = Replay(drive, elements, ann.meta.frame, colours, root)
     writers = {
         "geojson": partial(write_geojson, classes=classes, origin=None),
         "osm": partial(write_lanelet2, classes=classes, origin=origin),
-        "rrd": lambda path, found: write_rerun(path, drive, found, **replayed),
-        "mcap": lambda path, found: write_mcap(path, drive, found, **replayed),
+        "rrd": lambda path, _: write_rerun(path, replay),
+        "mcap": lambda path, _: write_mcap(path, replay),
     }
     paths = []
     for key in args.formats:

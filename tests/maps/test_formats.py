@@ -13,7 +13,7 @@ from gsmap.maps.geodetic import MapOrigin, known_origin
 from gsmap.maps.geojson import write_geojson
 from gsmap.maps.lanelet2 import write_lanelet2
 from gsmap.maps.mcap import write_mcap
-from gsmap.maps.replay import replay
+from gsmap.maps.replay import Replay, replay
 from gsmap.maps.rerun import write_rerun
 from gsmap.maps.truth import true_map
 from gsmap.structures.elements import MapElements
@@ -136,7 +136,7 @@ def test_mcap_holds_images_lines_and_gaussians_of_every_frame(tmp_path, camera_d
     pytest.importorskip("foxglove", reason="pip install -e .[viz]")
     reader = pytest.importorskip("mcap.reader", reason="pip install mcap")
     drive, root = camera_drive
-    write_mcap(tmp_path / "drive.mcap", drive, true, "lidar", COLOURS, root)
+    write_mcap(tmp_path / "drive.mcap", Replay(drive, true, "lidar", COLOURS, root))
     with (tmp_path / "drive.mcap").open("rb") as file:
         summary = reader.make_reader(file).get_summary()
     counts = summary.statistics.channel_message_counts
@@ -151,7 +151,7 @@ def test_mcap_holds_images_lines_and_gaussians_of_every_frame(tmp_path, camera_d
 def test_rerun_recording_holds_cameras_lines_and_gaussians(tmp_path, camera_drive, true):
     pytest.importorskip("rerun", reason="pip install -e .[viz]")
     drive, root = camera_drive
-    write_rerun(tmp_path / "drive.rrd", drive, true, "lidar", COLOURS, root)
+    write_rerun(tmp_path / "drive.rrd", Replay(drive, true, "lidar", COLOURS, root))
     content = (tmp_path / "drive.rrd").read_bytes()
     assert content[:3] == b"RRF"
     for entity in (b"/world/map", b"/world/vehicle/CAM_FRONT", b"predictions/gaussians"):
@@ -162,8 +162,8 @@ def test_rerun_recording_holds_cameras_lines_and_gaussians(tmp_path, camera_driv
     ("module", "extra", "write"),
     [
         ("pyproj", "maps", lambda p, d, t: write_geojson(p, t, CLASSES, MapOrigin(1.0, 2.0))),
-        ("rerun", "viz", lambda p, d, t: write_rerun(p, d, t, "lidar", COLOURS)),
-        ("foxglove", "viz", lambda p, d, t: write_mcap(p, d, t, "lidar", COLOURS)),
+        ("rerun", "viz", lambda p, d, t: write_rerun(p, Replay(d, t, "lidar", COLOURS))),
+        ("foxglove", "viz", lambda p, d, t: write_mcap(p, Replay(d, t, "lidar", COLOURS))),
     ],
 )
 def test_a_missing_extra_is_named(module, extra, write, tmp_path, monkeypatch, true):

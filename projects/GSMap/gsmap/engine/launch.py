@@ -1,6 +1,7 @@
 """What the tools share: reading a config, changing it, checking it, the work folder."""
 
 import argparse
+import inspect
 import logging
 import os
 import re
@@ -17,51 +18,18 @@ from mmdet3d.registry import OPTIMIZERS
 from mmengine.config import Config, DictAction
 from mmengine.logging import print_log
 from mmengine.registry import init_default_scope
+from mmengine.runner import Runner
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.engine.named_models import find_config
 from gsmap.utils.faults import nearest
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
-KNOWN_KEYS = frozenset(
-    [
-        "auto_scale_lr",
-        "backend_args",
-        "classes",
-        "custom_hooks",
-        "custom_imports",
-        "data_preprocessor",
-        "data_root",
-        "default_hooks",
-        "default_scope",
-        "env_cfg",
-        "experiment_name",
-        "find_unused_parameters",
-        "grid",
-        "launcher",
-        "load_from",
-        "log_level",
-        "log_processor",
-        "model",
-        "model_wrapper_cfg",
-        "optim_wrapper",
-        "param_scheduler",
-        "randomness",
-        "resume",
-        "runner_type",
-        "test_cfg",
-        "test_dataloader",
-        "test_evaluator",
-        "train_cfg",
-        "train_dataloader",
-        "val_cfg",
-        "val_dataloader",
-        "val_evaluator",
-        "vis_backends",
-        "visualizer",
-        "work_dir",
-    ]
-)
+_OWN_KEYS = (
+    "backend_args", "classes", "custom_imports", "data_root", "find_unused_parameters", "grid",
+    "model_wrapper_cfg", "runner_type", "vis_backends",
+)  # fmt: skip
+KNOWN_KEYS = frozenset(inspect.signature(Runner).parameters) - {"cfg"} | set(_OWN_KEYS)
 
 
 def data_root_options(data_root: str | Path) -> dict[str, str]:

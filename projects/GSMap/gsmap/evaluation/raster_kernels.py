@@ -36,13 +36,6 @@ def _stamp(mask: WordArray, width: int, row: int, left: int, right: int, radius:
 
 
 @njit(cache=True)
-def _towards_zero(numerator: int, denominator: int) -> int:
-    """Divide integers as C does."""
-    quotient = abs(numerator) // abs(denominator)
-    return quotient if (numerator >= 0) == (denominator >= 0) else -quotient
-
-
-@njit(cache=True)
 def _side(value: int, limit: int) -> int:
     """Return -1 below 0, 1 above the limit, 0 between."""
     return -1 if value < 0 else (1 if value > limit else 0)
@@ -114,7 +107,8 @@ def _fill(
         a, b = corners[i], corners[(i + 1) % num_edges]
         if a[1] != b[1]:
             first, last = edges[i, 0], edges[i, 1]
-            slope[i] = _towards_zero((last[0] - first[0]) * _ONE, last[1] - first[1])
+            # as C divides: no quotient of such numbers (2^37) rounds up to the next integer
+            slope[i] = int((last[0] - first[0]) * _ONE / (last[1] - first[1]))
             low[i], high[i] = min(a[1], b[1]), max(a[1], b[1])
             upper = first if a[1] < b[1] else last
             x_start[i] = upper[0] * _ONE + (low[i] - upper[1]) * slope[i]

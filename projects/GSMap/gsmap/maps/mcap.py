@@ -9,9 +9,8 @@ from matplotlib.colors import to_rgba
 from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.record import CameraRecord
-from gsmap.maps.drive import Drive
-from gsmap.maps.replay import Moment, replay
-from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.maps.replay import Moment, Replay
+from gsmap.structures.elements import FloatArray
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
@@ -20,39 +19,24 @@ _GLOBAL, _FRAME = "global", "vehicle"
 _FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp"}
 
 
-def write_mcap(
-    path: str | Path,
-    drive: Drive,
-    elements: MapElements,
-    frame_kind: str,
-    colours: Sequence[str],
-    data_root: Path | None = None,
-) -> None:
-    """Write cameras, predictions, their Gaussians as ellipses, and the growing map.
-
-    Args:
-        path: File to write (``.mcap``).
-        drive: Frames with their predictions.
-        elements: The drive's map.
-        frame_kind: The annotation frame, ``lidar`` or ``ego``.
-        colours: Colour of each class, ``#RRGGBB``.
-        data_root: Folder that the paths of images start from; None leaves the images out.
+def write_mcap(path: str | Path, replay: Replay) -> None:
+    """Write cameras, predictions, their Gaussians as ellipses, and the growing map (``.mcap``).
 
     Raises:
         FileNotFoundError: If an image is missing.
         RuntimeError: If ``foxglove-sdk`` is missing.
     """
     foxglove = import_extra("foxglove", "viz")
-    log = _Log(foxglove.Context(), colours)
+    log = _Log(foxglove.Context(), replay.colours)
     with (
         atomic_write(path, "wb") as file,
         foxglove.open_mcap(file, context=log.context),
     ):
-        for moment in replay(drive, elements, frame_kind):
+        for moment in replay.moments():
             sample, time_ns = moment.frame.sample, moment.frame.sample.timestamp_ns
             log.transform(_GLOBAL, _FRAME, sample.global_from_frame, time_ns)
             for camera in sample.cameras:
-                log.camera(camera, data_root, time_ns)
+                log.camera(camera, replay.data_root, time_ns)
             log.predictions(moment, time_ns)
             log.lines("/map", _GLOBAL, moment.seen, time_ns)
 

@@ -1,7 +1,8 @@
 """What viewers show of a drive over time, with heights, independent of any viewer's format."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import shapely
@@ -72,6 +73,29 @@ def replay(drive: Drive, elements: MapElements, frame_kind: str) -> Iterator[Mom
                     seen.append((label, _raised(drive, views, points, nearest)))
         local = [ground.lifted(frame.to_frame(p)) for p in frame.elements.polylines]
         yield Moment(frame, local, seen)
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """A drive and its map with what a viewer needs to show them.
+
+    Args:
+        drive: Frames with their predictions.
+        elements: The drive's map.
+        frame_kind: The annotation frame, a key of ``FRAME_VIEWS``.
+        colours: Colour of each class, ``#RRGGBB``.
+        data_root: Folder that the paths of images start from; None leaves the images out.
+    """
+
+    drive: Drive
+    elements: MapElements
+    frame_kind: str
+    colours: Sequence[str]
+    data_root: Path | None = None
+
+    def moments(self) -> Iterator[Moment]:
+        """Yield what there is to see at each frame."""
+        return replay(self.drive, self.elements, self.frame_kind)
 
 
 def _raised(

@@ -9,9 +9,7 @@ import numpy as np
 from matplotlib.colors import to_rgba_array
 
 from gsmap.datasets.annotations.record import CameraRecord
-from gsmap.maps.drive import Drive
-from gsmap.maps.replay import Moment, replay
-from gsmap.structures.elements import MapElements
+from gsmap.maps.replay import Moment, Replay
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
@@ -20,47 +18,32 @@ TIMELINE = "time"
 _VEHICLE, _MAP = "world/vehicle", "world/map"
 
 
-def write_rerun(
-    path: str | Path,
-    drive: Drive,
-    elements: MapElements,
-    frame_kind: str,
-    colours: Sequence[str],
-    data_root: Path | None = None,
-) -> None:
-    """Write cameras, predictions, their Gaussians as ellipses, and the growing map.
+def write_rerun(path: str | Path, replay: Replay) -> None:
+    """Write cameras, predictions, their Gaussians as ellipses, and the growing map (``.rrd``).
 
     Predictions and map stand in space, so that the viewer lays them over the cameras as well.
-
-    Args:
-        path: File to write (``.rrd``).
-        drive: Frames with their predictions.
-        elements: The drive's map.
-        frame_kind: The annotation frame, ``lidar`` or ``ego``.
-        colours: Colour of each class, ``#RRGGBB``.
-        data_root: Folder that the paths of images start from; None leaves the images out.
 
     Raises:
         FileNotFoundError: If an image is missing.
         RuntimeError: If ``rerun-sdk`` is missing.
     """
     rr = import_extra("rerun", "viz")
-    recording = rr.RecordingStream("gsmap", recording_id=drive.scene)
+    recording = rr.RecordingStream("gsmap", recording_id=replay.drive.scene)
     stream = recording.binary_stream()
-    cameras = drive.frames[0].sample.cameras
+    cameras = replay.drive.frames[0].sample.cameras
     recording.send_blueprint(_layout(cameras))
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     with atomic_write(path, "wb") as file:
-        for moment in replay(drive, elements, frame_kind):
+        for moment in replay.moments():
             sample, pose = moment.frame.sample, moment.frame.sample.global_from_frame
             recording.set_time(TIMELINE, timestamp=np.datetime64(sample.timestamp_ns, "ns"))
             recording.log(_VEHICLE, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
             for camera in sample.cameras:
-                _log_camera(recording, rr, camera, data_root)
-            _log_predictions(recording, rr, moment, colours)
+                _log_camera(recording, rr, camera, replay.data_root)
+            _log_predictions(recording, rr, moment, replay.colours)
             lines, rgb = (
                 [line for _, line in moment.seen],
-                _rgb([k for k, _ in moment.seen], colours),
+                _rgb([k for k, _ in moment.seen], replay.colours),
             )
             recording.log(_MAP, rr.LineStrips3D(lines, colors=rgb, radii=0.1))
             file.write(stream.read(flush=True))
