@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.results_json import write_results
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 
 CLASSES = ("divider", "ped_crossing", "boundary")
 TOOL = Path(__file__).resolve().parents[1] / "tools" / "evaluate.py"
@@ -57,18 +59,29 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         default=100,
         help="the reference's way is measured on so many: it is linear in them",
     )
+    parser.add_argument(
+        "--size",
+        nargs=2,
+        type=float,
+        default=(30.0, 60.0),
+        metavar=("X", "Y"),
+        help="the map in metres; generated lines grow with it",
+    )
     parser.add_argument("--out", type=Path, help="write the tables to this file, too")
     parser.set_defaults(run=run)
 
 
-def generated_frames(count: int, seed: int = 0) -> list[Record]:
+def generated_frames(
+    count: int, seed: int = 0, size_m: Sequence[float] = (30.0, 60.0)
+) -> list[Record]:
     """Return frames like a validation set's: lines across the range and crossings, with noise.
 
     Args:
         count: Number of frames.
         seed: Of the generator.
+        size_m: The map's size along x and y; elements are as many and so much longer.
     """
-    rng = np.random.default_rng(seed)
+    rng, stretch = np.random.default_rng(seed), np.array(size_m) / (30.0, 60.0)
     frames = []
     for number in range(count):
         truth, found = [], []
@@ -82,6 +95,7 @@ def generated_frames(count: int, seed: int = 0) -> list[Record]:
                     t = np.linspace(-rng.uniform(3, 28), rng.uniform(3, 28), 20)
                     bend = rng.normal(scale=0.004) * t**2
                     line = np.clip(centre[0] + np.stack([bend, t], axis=1), [-15, -30], [15, 30])
+                line = line * stretch
                 truth.append({"label": label, "pts": np.round(line, 3).tolist()})
                 at = np.linspace(0, len(line) - 1, 20)
                 points = np.stack([np.interp(at, range(len(line)), c) for c in line.T], axis=1)
@@ -134,9 +148,11 @@ def _resident_mib(pid: int) -> float:
     return int(own.split()[1]) / 1024 + sum(_resident_mib(int(child)) for child in children)
 
 
-def _evaluate(files: tuple[Path, Path], metrics: list[str], workers: int = 1) -> Run:
+def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, workers: int = 1) -> Run:
     """Run the command and measure it with everything that it starts."""
     command = [sys.executable, str(TOOL), *map(str, files), "--eval", *metrics]
+    (x0, x1), (y0, y1) = grid.x_range, grid.y_range
+    command += ["--range", *map(str, (x0, y0, x1, y1))]
     start = time.perf_counter()
     process = subprocess.Popen([*command, "--workers", str(workers)], stdout=subprocess.DEVNULL)
     peak, pid = 0.0, 0
@@ -162,12 +178,12 @@ def _frame(record: Record) -> tuple[MapElements, MapElements]:
     )
 
 
-def _reference_table(frames: list[Record], count: int) -> str:
+def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
     """Compare the reference's way with ours on a few samples, in this process, loading apart."""
     from benchmarks import reference_evaluation as reference  # needs pycocotools
 
     samples = [_frame(frames[k % len(frames)]) for k in range(count)]
-    chamfer, raster = ChamferConfig(CLASSES), RasterConfig(CLASSES)
+    chamfer, raster = ChamferConfig(CLASSES), RasterConfig(CLASSES, grid)
     rows = []
     for name, evaluator, slow in (
         ("chamfer", MapEvaluator(chamfer, None), lambda: reference.chamfer_map(samples, 3)),
@@ -203,8 +219,10 @@ def _say(text: str) -> None:
 def run(args: argparse.Namespace) -> None:
     """Measure, print and write the tables."""
     given = json.loads(args.frames.read_text())["frames"] if args.frames else None
-    frames = given or generated_frames(320)
-    reference = _reference_table(frames, args.reference_samples)
+    x, y = (size / 2 for size in args.size)
+    grid = BEVGrid((-x, x), (-y, y))
+    frames = given or generated_frames(320, size_m=args.size)
+    reference = _reference_table(frames, args.reference_samples, grid)
     _say(reference)
     parts = [
         f"Matching alone, processor time a frame, {args.reference_samples} samples:\n",
@@ -213,7 +231,7 @@ def run(args: argparse.Namespace) -> None:
     ]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        _evaluate(write_race(Path(folder), frames, 8), ["chamfer", "raster"])  # compiles once
+        _evaluate(write_race(Path(folder), frames, 8), ["chamfer", "raster"], grid)  # compiles once
         for count in args.samples:
             files = write_race(Path(folder), frames, count)
             for metrics, workers in (
@@ -222,7 +240,7 @@ def run(args: argparse.Namespace) -> None:
                 (["chamfer", "raster"], 1),
                 (["chamfer", "raster"], 2),
             ):
-                cost = _evaluate(files, metrics, workers)
+                cost = _evaluate(files, metrics, grid, workers)
                 _say(f"{count} samples, {metrics}, {workers} processes: {cost}")
                 rows.append(
                     [
