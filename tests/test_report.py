@@ -101,6 +101,10 @@ def test_texts_of_files_cannot_leave_the_block_of_data(data):
     block = re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1]
     assert "<" not in block
     assert json.loads(block)["results"] == ["good", STRANGE]
+    assert "data:image" not in block  # each frame's images are read when it is opened
+    images = re.findall(r'class="images">(.*?)</script>', page)
+    assert [len(json.loads(each)) for each in images] == [2] * FRAMES
+    assert page.count("data:image/jpeg") == 2 * FRAMES
     assert json.loads(block)["frames"][0]["title"].startswith(STRANGE)
     assert page.count("<img") == 0
     assert "innerHTML" not in page

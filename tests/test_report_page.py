@@ -59,6 +59,7 @@ def browser(tmp_path_factory):
 def opened(browser, page):
     browser.get("about:blank")
     browser.get(page.as_uri())
+    until_drawn(browser)
     yield browser
     assert browser.get_log("browser") == []  # no error, nothing refused by the page's policy
 
@@ -80,6 +81,13 @@ def choose(browser, name, value):
     browser.find_element(By.CSS_SELECTOR, f"#{name} option[value='{value}']").click()
 
 
+def until_drawn(browser):
+    """Scroll to the small maps and wait until they are drawn."""
+    browser.execute_script("document.getElementById('grid').scrollIntoView()")
+    drawn = (By.CSS_SELECTOR, ".card svg")
+    WebDriverWait(browser, 20).until(lambda found: len(found.find_elements(*drawn)) == FRAMES)
+
+
 def until_position(browser, position):
     """Wait for the frame at a position, counted from 1; 0 is the overview."""
     wanted = f"{position} of {FRAMES}" if position else ""
@@ -95,7 +103,7 @@ def test_figures_and_strangers_texts_are_shown_as_text_and_nothing_is_fetched(op
     assert text(opened, "h1") == f"case val: good and {STRANGE}"
     assert len(shown(opened, "table")) == 4
     assert len(shown(opened, "#curves figure")) == 6
-    assert len(shown(opened, ".card")) == FRAMES
+    assert len(shown(opened, ".card svg")) == FRAMES
     assert opened.find_elements(By.CSS_SELECTOR, "main img") == []
     fetched = opened.execute_script(
         "return performance.getEntriesByType('resource').map((entry) => entry.name)"
@@ -213,6 +221,18 @@ def test_a_phone_shows_everything_in_its_width(opened, frame):
     width = opened.execute_script("return document.documentElement.scrollWidth")
     opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
     assert width == 360
+
+
+def test_small_maps_are_drawn_when_they_come_near(browser, page):
+    browser.get(page.as_uri())  # the tables and curves above the frames are higher than the window
+    drawn = browser.execute_async_script(
+        "requestAnimationFrame(() => setTimeout("
+        "() => arguments[0](document.querySelectorAll('.card svg').length), 100))"
+    )
+    assert drawn == 0
+    choose(browser, "shown", "1")
+    until_drawn(browser)
+    assert len(browser.find_elements(By.CSS_SELECTOR, ".card[href='#frame-0'] .found")) == 1
 
 
 def test_dark_mode_has_a_dark_page_and_light_text(opened):

@@ -261,11 +261,11 @@ function projected(item, m) {
   return d;
 }
 
-function cameraView(camera, frame, r) {
+function cameraView(camera, src, frame, r) {
   const [width, height] = camera.size;
   const drawing = { frame, r, parts: [] };
   drawing.view = make("svg:svg", { class: "camera", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `camera ${camera.title}` });
-  if (camera.src) drawing.view.append(make("svg:image", { href: camera.src, width, height, preserveAspectRatio: "none" }));
+  if (src) drawing.view.append(make("svg:image", { href: src, width, height, preserveAspectRatio: "none" }));
   drawing.view.append(...shapes(frame, r, drawing.parts, (item) => projected(item, camera.matrix)));
   return drawing;
 }
@@ -309,14 +309,26 @@ function sortCards() {
   byId("grid").replaceChildren(...state.order.map((i) => cards[i].link));
 }
 
+// Small maps are drawn when they come near the window.
+const nearby = new IntersectionObserver((entries) => {
+  for (const { isIntersecting, target } of entries) {
+    const card = isIntersecting && cards.find((each) => each.link === target);
+    if (!card || card.view) continue;
+    Object.assign(card, birdsEye(card.frame, shownResult(), false));
+    card.view.setAttribute("aria-hidden", "true");
+    target.firstChild.replaceWith(card.view);
+    restyle(card);
+  }
+}, { rootMargin: "600px" });
+
 function drawCards() {
+  nearby.disconnect();
   cards.length = 0;
   data.frames.forEach((frame, i) => {
-    const drawing = birdsEye(frame, shownResult(), false);
-    drawing.view.setAttribute("aria-hidden", "true");
-    drawing.value = make("span", { class: "value" });
-    drawing.link = make("a", { class: "card", href: `#frame-${i}` }, drawing.view, make("span", {}, frame.title), drawing.value);
-    cards.push(drawing);
+    const value = make("span", { class: "value" });
+    const link = make("a", { class: "card", href: `#frame-${i}` }, make("div", { class: "bev" }), make("span", {}, frame.title), value);
+    cards.push({ frame, r: shownResult(), parts: [], value, link });
+    nearby.observe(link);
   });
   sortCards();
 }
@@ -328,10 +340,11 @@ function drawFrame() {
   byId("frame-token").textContent = [frame.place, `sample ${frame.token}`].filter(Boolean).join(", ");
   byId("position").textContent = `${state.order.indexOf(state.frame) + 1} of ${state.order.length}`;
   opened = [];
+  const images = JSON.parse(document.getElementsByClassName("images")[state.frame].textContent);
   const rows = frame.cameras.map((row) => {
     const line = make("div", { class: "row" });
     for (const camera of row) {
-      const drawing = cameraView(camera, frame, shownResult());
+      const drawing = cameraView(camera, images.shift(), frame, shownResult());
       opened.push(drawing);
       line.append(make("figure", {}, drawing.view, make("figcaption", {}, camera.title)));
     }

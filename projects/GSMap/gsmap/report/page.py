@@ -140,14 +140,30 @@ def page_html(data: Mapping[str, Any]) -> str:
         name: files("gsmap.report").joinpath(f"page.{name}").read_text("utf-8")
         for name in ("html", "css", "js")
     }
+    frames, images = [], []
+    for frame in data["frames"]:  # its images stand apart and are read when it is opened
+        rows = [
+            [{k: v for k, v in each.items() if k != "src"} for each in row]
+            for row in frame["cameras"]
+        ]
+        frames.append({**frame, "cameras": rows})
+        images.append([each["src"] for row in frame["cameras"] for each in row])
     style, script = (f"'sha256-{_digest(parts[name])}'" for name in ("css", "js"))
     return Template(parts["html"]).substitute(
         policy=f"default-src 'none'; img-src data:; style-src {style}; script-src {script}",
         title=html.escape(str(data["title"])),
         style=parts["css"],
         script=parts["js"],
-        data=json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        data=_block({**data, "frames": frames}),
+        images="".join(
+            f'<script type="application/json" class="images">{_block(i)}</script>' for i in images
+        ),
     )
+
+
+def _block(value: Any) -> str:
+    """Return JSON that cannot end the element it stands in."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
 def _digest(text: str) -> str:
