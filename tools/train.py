@@ -3,6 +3,7 @@
 
 import argparse
 
+from mmdet3d.registry import RUNNERS
 from mmengine.config import Config
 
 from gsmap.apis.checkpoint import read_weights
@@ -56,7 +57,8 @@ def main() -> None:
             raise ValueError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
         cfg.auto_scale_lr.enable = True
     choose_start(cfg, args.resume)
-    MapRunner.from_cfg(cfg).train()
+    runner = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
+    runner.from_cfg(cfg).train()
 
 
 if __name__ == "__main__":

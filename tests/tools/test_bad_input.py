@@ -76,6 +76,7 @@ train: C --work-dir w --cfg-options train_dataloader.batch_sise=2 | has no setti
 train: C --work-dir w --cfg-options train_cfg.max_epoch=2 | has no setting 'max_epoch'; did you mean 'max_epochs'?
 train: C --work-dir w --cfg-options default_hooks.logger.intervl=2 | has no setting 'intervl'; did you mean 'interval'?
 train: C --work-dir w --cfg-options optim_wrapper.optimizer.type=AdmW | there is no optimizer of type 'AdmW'; did you mean 'AdamW'?
+train: C --work-dir w --cfg-options runner_type=FlexibelRunner | there is no runner of type 'FlexibelRunner'; did you mean 'FlexibleRunner'?
 train: C --work-dir w --cfg-options randomness.sede=2 | has no setting 'sede'; did you mean 'seed'?
 train: C --work-dir w --cfg-options train_dataloader.dataset.data_root=nowhere | no annotation file at nowhere
 train: C --work-dir w --cfg-options train_dataloader.dataset.cameras=[A] train_dataloader.num_workers=1 | has no camera 'A'
@@ -90,6 +91,10 @@ browse_dataset: C --num 0 | must be >= 1, got 0
 browse_dataset: C --web . | Is a directory
 browse_dataset: C --show-dir plain.txt | File exists: 'plain.txt'
 browse_dataset: C --cfg-options train_dataloader.dataset.pipeline.0.type=LoadCameraImage | there is no transform of type 'LoadCameraImage'; did you mean 'LoadCameraImages'?
+infer: VAL --model C K --out out.json --shard 2/2 | expected I/N with I from 0 to N - 1
+infer: VAL --model C K --out out.json --executor ray --shards 0 | --executor needs --shards N
+evaluate: nothing.json VAL --shard 0/2 | --shard needs --out
+evaluate: nothing.json VAL --shard / --out out.json | expected I/N with I from 0 to N - 1
 evaluate: nowhere.json VAL | No such file or directory: 'nowhere.json'; check the path.
 evaluate: damaged.json VAL | damaged.json is empty or holds no complete list
 evaluate: list.json VAL | list.json is empty or holds no complete list
@@ -141,7 +146,7 @@ export: C K --out . | Is a directory
 export: C nowhere.pth --out m.onnx | There is no checkpoint nowhere.pth
 export: C K --out m.onnx --samples nowhere | nowhere
 export: C K --out m.onnx --size 0 0 | size
-merge: nowhere.arrow | nowhere.arrow
+merge: nowhere.arrow | there are no shards of nowhere.arrow
 demo: --dir plain.txt --budget tiny | generate the towns of val ended with 2
 benchmarks: parameters nowhere.py | There is no config file nowhere.py
 benchmarks: parameters C --depth x | invalid int value

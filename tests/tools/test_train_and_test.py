@@ -11,7 +11,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from mmengine.runner import FlexibleRunner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from tools.train import main as train
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -177,6 +180,15 @@ def test_two_processes_learn_what_one_learns_from_the_same_batch(tiny_config, tm
     assert max(moved) > 1e-4
     for name, value in weights[0].items():
         torch.testing.assert_close(weights[1][name], value, rtol=0, atol=1e-6, msg=name)
+
+
+def test_the_config_chooses_the_runner(tiny_config, tmp_path, monkeypatch):
+    built = []
+    monkeypatch.setattr(FlexibleRunner, "train", lambda runner: built.append(runner))
+    words = ["train.py", str(tiny_config), "--work-dir", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", [*words, "--cfg-options", "runner_type=FlexibleRunner"])
+    train()
+    assert [type(runner) for runner in built] == [FlexibleRunner]
 
 
 def test_a_missing_checkpoint_is_named(tiny_config):

@@ -14,7 +14,7 @@ from typing import Any
 
 import mmengine.optim
 import torch
-from mmdet3d.registry import OPTIMIZERS
+from mmdet3d.registry import OPTIMIZERS, RUNNERS
 from mmengine.config import Config, DictAction
 from mmengine.logging import print_log
 from mmengine.registry import init_default_scope
@@ -27,7 +27,7 @@ from gsmap.utils.faults import nearest
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 _OWN_KEYS = (
     "backend_args", "classes", "custom_imports", "data_root", "find_unused_parameters", "grid",
-    "model_wrapper_cfg", "runner_type", "vis_backends",
+    "model_wrapper_cfg", "runner_type", "strategy", "vis_backends",
 )  # fmt: skip
 KNOWN_KEYS = frozenset(inspect.signature(Runner).parameters) - {"cfg"} | set(_OWN_KEYS)
 
@@ -203,6 +203,10 @@ def check_config(cfg: Config) -> None:
     if isinstance(kind, str) and OPTIMIZERS.get(kind) is None:  # mmengine goes on without one
         close = nearest(kind, mmengine.registry.OPTIMIZERS.module_dict)
         raise ValueError(f"{cfg.filename}: there is no optimizer of type {kind!r}{close or '.'}")
+    runner = cfg.get("runner_type", "Runner")
+    if RUNNERS.get(runner) is None:
+        close = nearest(runner, mmengine.registry.RUNNERS.module_dict)
+        raise ValueError(f"{cfg.filename}: there is no runner of type {runner!r}{close or '.'}")
 
 
 def _check_keys(cfg: Config) -> None:
