@@ -49,6 +49,7 @@ class RunSummaryHook(Hook):
         note = f", {frozen / 1e6:.2f} M of them frozen" if frozen else ""
         kind = f"{type(model).__name__} with {type(getattr(model, 'map_head', None)).__name__}"
         device = next(model.parameters()).device
+        log_dir = getattr(runner, "log_dir", None) or runner._log_dir  # FlexibleRunner's is public
         lines = {
             "model": f"{kind}, {sum(size for size, _ in sizes) / 1e6:.2f} M parameters{note}",
             "start": _start(runner),
@@ -56,7 +57,7 @@ class RunSummaryHook(Hook):
             "length": _length(runner),
             "runs on": f"{device}, {torch.get_num_threads()} threads; torch {torch.__version__}, "
             f"seed {runner.seed}",
-            "writes to": f"{runner.work_dir} (checkpoints, the whole config), {runner._log_dir}",
+            "writes to": f"{runner.work_dir} (checkpoints, the whole config), {log_dir}",
         }
         text = "".join(f"\n    {name:<12}{value}" for name, value in lines.items())
         runner.logger.info(f"This run{text}")
