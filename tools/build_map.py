@@ -26,12 +26,13 @@ from gsmap.maps.replay import Replay
 from gsmap.maps.rerun import write_rerun
 from gsmap.maps.scoring import figures_table, map_figures
 from gsmap.maps.truth import true_map
+from gsmap.maps.video import write_video
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.visualization.style import MapStyle
 
-FORMATS = ("geojson", "osm", "rrd", "mcap")
+FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4")
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -72,7 +73,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "nuScenes' and Argoverse 2's are known",
     )
     parser.add_argument(
-        "--data-root", type=Path, help="folder of the images for rrd and mcap: that of --ann"
+        "--data-root", type=Path, help="folder of the images for rrd, mcap and mp4: that of --ann"
     )
     return parser.parse_args(argv)
 
@@ -96,6 +97,7 @@ def write_map(
         "osm": partial(write_lanelet2, classes=classes, origin=origin),
         "rrd": lambda path, _: write_rerun(path, replay),
         "mcap": lambda path, _: write_mcap(path, replay),
+        "mp4": lambda path, _: write_video(path, replay),
     }
     paths = []
     for key in args.formats:
@@ -131,10 +133,16 @@ def main(argv: list[str] | None = None) -> str:
         min_confidence=args.min_confidence,
         min_area_confidence=args.min_area_confidence,
     )
+    has_poses = ann.meta.options.get("poses", True)
+    if not has_poses and args.formats != ["mp4"]:
+        raise ValueError(
+            f"the samples of {args.ann} have no poses, so there is no map of the drive: --formats "
+            "mp4 shows the single frames."
+        )
     drives, merged = [], []
     for scene in args.scene or sorted(set(ann.column("scene"))):
         drives.append(confident(read_drive(ann, scene, results), args.score_thr))
-        merged.append(merge(drives[-1], config))
+        merged.append(merge(drives[-1], config) if has_poses else MapElements.from_polylines())
         for path in write_map(args.out / scene, args, ann, drives[-1], merged[-1]):
             print(f"{len(merged[-1])} elements of {len(drives[-1].frames)} frames: {path}")
     if has_truth(ann):

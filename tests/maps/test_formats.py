@@ -2,10 +2,12 @@ import json
 import sys
 from dataclasses import replace
 
+import av
 import numpy as np
 import pytest
 import shapely
 from drive_cases import CLASSES, drive_of
+from PIL import Image
 
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord
 from gsmap.maps.drive import DriveFrame
@@ -16,6 +18,7 @@ from gsmap.maps.mcap import write_mcap
 from gsmap.maps.replay import Replay, replay
 from gsmap.maps.rerun import write_rerun
 from gsmap.maps.truth import true_map
+from gsmap.maps.video import write_video
 from gsmap.structures.elements import MapElements
 
 ORIGIN = MapOrigin(48.26, 11.67)
@@ -158,12 +161,44 @@ def test_rerun_recording_holds_cameras_lines_and_gaussians(tmp_path, camera_driv
         assert entity in content
 
 
+def test_a_film_shows_every_frame_at_the_pace_of_the_drive(tmp_path, camera_drive, true):
+    """H.264 of 4:2:0, which players take; a map has a panel of its own and grows."""
+    drive, root = camera_drive
+    for number, value in enumerate((40, 120, 200)):
+        Image.new("RGB", (400, 225), (value, value, value)).save(tmp_path / f"{number}.jpg")
+    frames = [
+        DriveFrame(replace(f.sample, timestamp_ns=i * 250_000_000), f.elements)
+        for i, f in enumerate(drive.frames)
+    ]
+    drive = replace(drive, frames=frames)
+    pictures = {}
+    for name, elements in (("map", true), ("none", MapElements.from_polylines())):
+        replayed = Replay(drive, elements, "lidar", COLOURS, tmp_path)
+        write_video(tmp_path / f"{name}.mp4", replayed, width_px=480)
+        with av.open(tmp_path / f"{name}.mp4") as film:
+            stream = film.streams.video[0]
+            assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
+            assert stream.average_rate == 4
+            assert stream.width == 480
+            pictures[name] = [f.to_ndarray(format="rgb24") for f in film.decode(video=0)]
+        assert len(pictures[name]) == 3
+    greys = [np.median(picture[60:100, 100:380]) for picture in pictures["none"]]
+    np.testing.assert_allclose(greys, (40, 120, 200), atol=4)  # the image of each moment
+    assert pictures["map"][0].shape != pictures["none"][0].shape or (
+        np.abs(pictures["map"][0].astype(int) - pictures["none"][0]).max() > 50
+    )
+    with pytest.raises(ValueError, match=r"no image at .*0.jpg"):
+        write_video(tmp_path / "no.mp4", Replay(drive, true, "lidar", COLOURS, tmp_path / "a"))
+    assert not (tmp_path / "no.mp4").exists()
+
+
 @pytest.mark.parametrize(
     ("module", "extra", "write"),
     [
         ("pyproj", "maps", lambda p, d, t: write_geojson(p, t, CLASSES, MapOrigin(1.0, 2.0))),
         ("rerun", "viz", lambda p, d, t: write_rerun(p, Replay(d, t, "lidar", COLOURS))),
         ("foxglove", "viz", lambda p, d, t: write_mcap(p, Replay(d, t, "lidar", COLOURS))),
+        ("av", "viz", lambda p, d, t: write_video(p, Replay(d, t, "lidar", COLOURS))),
     ],
 )
 def test_a_missing_extra_is_named(module, extra, write, tmp_path, monkeypatch, true):

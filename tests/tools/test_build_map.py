@@ -3,10 +3,16 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from drive_cases import CLASSES, drive_of
 
-from gsmap.datasets.annotations.file import AnnotationMeta, MapInstance, write_annotations
+from gsmap.datasets.annotations.file import (
+    AnnotationFile,
+    AnnotationMeta,
+    MapInstance,
+    write_annotations,
+)
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.results_json import vectors_of, write_results
 from tools.build_map import main
@@ -51,6 +57,18 @@ def test_what_a_user_can_get_wrong_is_said(files, tmp_path, options, message):
     results, ann = files
     with pytest.raises(ValueError, match=message):
         main([str(results), "--ann", str(ann), "--out", str(tmp_path), *options])
+
+
+def test_samples_without_poses_have_no_map_but_a_film(files, tmp_path):
+    results, ann = files
+    samples = [replace(s, instances=None, global_from_frame=np.eye(4)) for s in AnnotationFile(ann)]
+    meta = AnnotationMeta("own", "lidar", "test", options={"poses": False})
+    write_annotations(tmp_path / "own.arrow", meta, samples[:2])
+    words = [str(results), "--ann", str(tmp_path / "own.arrow"), "--out", str(tmp_path)]
+    with pytest.raises(ValueError, match=r"have no poses, .*--formats mp4"):
+        main(words)
+    main([*words, "--formats", "mp4"])
+    assert (tmp_path / "scene.mp4").stat().st_size > 10_000
 
 
 def test_results_of_other_samples_are_refused(files, tmp_path):

@@ -8,14 +8,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
-from gsmap.datasets.errors import BrokenSampleError
-from gsmap.datasets.transforms.images import read_image
 from gsmap.inputs.frames import ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid
 from gsmap.visualization.bev_view import BEVPanel
-from gsmap.visualization.camera_view import CameraView
+from gsmap.visualization.camera_view import camera_views
 from gsmap.visualization.figure import compose_figure
 from gsmap.visualization.frame_view import FRAME_VIEWS
 from gsmap.visualization.style import MapStyle
@@ -152,15 +150,6 @@ def calibration_figure(sample: MapSample, frame: str, data_root: Path) -> Figure
         The picture: lines ahead, to the left, to the right and behind have colours of their own.
     """
     frame_from_ground = invert_rigid(ground_from_frame(sample, frame))
-    cameras = []
-    for camera in sample.cameras:
-        try:
-            image = read_image(str(data_root / camera.path), f"camera {camera.name}")[..., ::-1]
-        except BrokenSampleError:
-            image = np.full((camera.height, camera.width, 3), 128, np.uint8)
-        projection = np.eye(4)
-        projection[:3, :3] = camera.intrinsics
-        cameras.append(CameraView(camera.name, image, projection @ camera.cam_from_frame))
     lines = _ground_lines(frame_from_ground)
     wedges = [("cameras", _wedge(c, frame_from_ground, frame, sample)) for c in sample.cameras]
     style = MapStyle(classes=_LINES)
@@ -168,7 +157,7 @@ def calibration_figure(sample: MapSample, frame: str, data_root: Path) -> Figure
     if FRAME_VIEWS[frame].forward == "x":
         (x0, x1), (y0, y1) = (y0, y1), (x0, x1)
     return compose_figure(
-        cameras,
+        camera_views(sample.cameras, data_root, sample.token, grey=True),
         [BEVPanel("From above", _elements([*lines, *wedges]))],
         BEVGrid((x0, x1), (y0, y1)),
         FRAME_VIEWS[frame].tilted(sample.ego_from_frame),

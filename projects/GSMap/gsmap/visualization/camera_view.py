@@ -2,14 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from matplotlib import colors as mcolors
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection, PolyCollection
-from matplotlib.path import Path
+from matplotlib.path import Path as Outline
 
+from gsmap.datasets.annotations.record import CameraRecord
+from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.transforms.images import read_image
 from gsmap.structures.elements import MapElements
 from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
 from gsmap.visualization.frame_view import FrameView
@@ -59,6 +63,35 @@ class CameraView:
         """The channel name as a reader would write it."""
         words = self.name.lower().replace("_", " ").split()
         return " ".join(word for word in words if word not in ("cam", "ring", "camera"))
+
+
+def camera_views(
+    cameras: Sequence[CameraRecord], data_root: Path, token: str, grey: bool = False
+) -> list[CameraView]:
+    """Pair the images of a sample's records with their projections.
+
+    Args:
+        cameras: The cameras.
+        data_root: Folder that their paths start from.
+        token: The sample's, for messages.
+        grey: Whether an image that is missing or damaged is grey instead of an error.
+
+    Raises:
+        BrokenSampleError: If an image is missing or damaged.
+    """
+    views = []
+    for camera in cameras:
+        path, where = data_root / camera.path, f"sample {token!r}, camera {camera.name}"
+        try:
+            image = read_image(str(path), where)[..., ::-1]
+        except BrokenSampleError:
+            if not grey:
+                raise
+            image = np.full((camera.height, camera.width, 3), 128, np.uint8)
+        projection = np.eye(4)
+        projection[:3, :3] = camera.intrinsics
+        views.append(CameraView(camera.name, image, projection @ camera.cam_from_frame))
+    return views
 
 
 def viewing_azimuth(img_from_frame: np.ndarray, view: FrameView) -> float:
@@ -134,19 +167,21 @@ def _draw_polylines(
     joined = np.isclose(segments[1:, 0], segments[:-1, 1]).all(axis=1)
     joined &= (thinning[1:] == thinning[:-1]) & (owner[index[1:]] == owner[index[:-1]])
     first = np.flatnonzero(np.append(True, ~joined))[: len(segments)]  # of each piece
-    paths: dict[tuple[float, int], list[Path]] = {}
+    paths: dict[tuple[float, int], list[Outline]] = {}
     for piece, kind in zip(
         np.split(segments, first)[1:],
         zip(thinning[first].tolist(), owner[index[first]].tolist(), strict=True),
         strict=True,
     ):
-        paths.setdefault(kind, []).append(Path(_corners(np.append(piece[:, 0], piece[-1:, 1], 0))))
+        paths.setdefault(kind, []).append(
+            Outline(_corners(np.append(piece[:, 0], piece[-1:, 1], 0)))
+        )
     widths = scale * style.camera_line_pt * np.array([width for width, _ in paths])
     halo = mcolors.to_rgba(style.halo, 0.55)
     colours = style.colours(label for _, label in paths)
     for colour, extra, zorder in ((halo, 1.1, 4), (colours, 0.0, 5)):
         lines = PathCollection(
-            [Path.make_compound_path(*parts) for parts in paths.values()],
+            [Outline.make_compound_path(*parts) for parts in paths.values()],
             facecolors="none",
             edgecolors=colour,
             linewidths=widths + extra * scale,
