@@ -1,5 +1,6 @@
 """Every reader of files with something whole to read, and what of its results can be checked."""
 
+import json
 import pickle
 import shutil
 from collections.abc import Callable, Sequence
@@ -13,7 +14,10 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import torch
+import upstream_configs
 from argoverse2_road import write_log
+from mmdet3d.registry import DATASETS
+from mmengine.config import Config
 from pyarrow.feather import write_feather
 
 from fuzz import mutations
@@ -31,9 +35,16 @@ from gsmap.datasets.annotations.file import (
     MapSample,
     write_annotations,
 )
+from gsmap.datasets.elements import elements_of_instances
 from gsmap.datasets.transforms.images import read_image
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points
+from gsmap.engine.launch import check_config, read_config
+from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, vectors_of, write_results
+from gsmap.inputs.image_folder import read_image_folder
 from gsmap.inputs.info_file import read_info_file
+from gsmap.structures.elements import MapElements
+from gsmap.utils.faults import in_words
+from tools.convert_config import convert
 
 VERSION = "v1.0-trainval"
 LIDAR_META = AnnotationMeta("fuzz", "lidar", "train")
@@ -65,13 +76,13 @@ class Reader:
         mutations.write(self.path, rng.choice(self.damages)(self.content, rng))
         try:
             result = self.read()
-        except (ValueError, OSError) as error:
-            text = str(error)
+        except Exception as error:
+            text = in_words(error)
+            if text is None:
+                return "traceback", f"{type(error).__name__}: {error}"
             names = self.path.name, str(self.path.parent), "sample '", "record "
             named = any(name in text for name in names)
             return ("clear" if named else "vague"), f"{type(error).__name__}: {text}"
-        except Exception as error:
-            return "traceback", f"{type(error).__name__}: {error}"
         finally:
             mutations.write(self.path, self.content)
         if pickle.dumps(result) == self.right:
@@ -90,6 +101,9 @@ def implausible(result: Any) -> str:
         return ""  # weights that are not finite are another matter
     if isinstance(result, np.ndarray) and result.dtype.kind == "f":
         return "" if np.isfinite(result).all() else "not finite"
+    if isinstance(result, MapElements):
+        arrays = result.points, result.scores, result.scales, result.rotations
+        return implausible([array for array in arrays if array is not None])
     return _implausible_sample(result) if isinstance(result, MapSample) else ""
 
 
@@ -161,6 +175,33 @@ def info_of_maptr(sample: MapSample) -> dict[str, Any]:
     return {"infos": [entry], "metadata": {"version": "x"}}
 
 
+def info_of_argoverse2(sample: MapSample) -> dict[str, Any]:
+    """Return MapTRv2's info file of a sample of Argoverse 2."""
+    turn = {"e2g_translation": [5.0, 6.0, 0.0], "e2g_rotation": [1.0, 0.0, 0.0, 0.0]}
+    lines: dict[str, list[Any]] = {name: [] for name in EGO_META.classes}
+    for instance in sample.instances:  # along x, as the range is
+        points = instance.points[:, ::-1].astype(float).tolist()
+        lines[EGO_META.classes[instance.label]].append(points)
+    cameras = {
+        c.name: {"img_fpath": c.path, "intrinsics": c.intrinsics.tolist(),
+                 "extrinsics": c.cam_from_frame.tolist(), **turn}
+        for c in sample.cameras
+    }  # fmt: skip
+    entry = {"token": "t", "log_id": "l", "timestamp": 7, "lidar_path": sample.lidar.path,
+             "cams": cameras, "annotation": lines, **turn}  # fmt: skip
+    return {"samples": [entry]}
+
+
+def own_calibration(sample: MapSample) -> dict[str, Any]:
+    """Return a calibration file for the images of a sample."""
+    cameras = {
+        c.name: {"images": c.path, "intrinsics": c.intrinsics.tolist(),
+                 "vehicle_from_camera": np.linalg.inv(c.cam_from_frame).tolist()}
+        for c in sample.cameras
+    }  # fmt: skip
+    return {"cameras": cameras, "ground_z_m": 0.1}
+
+
 def own_record(sample: MapSample) -> dict[str, Any]:
     """Return a sample as a plain record."""
     cameras = [
@@ -208,7 +249,14 @@ class Files:
             "annotation file, its values": lambda: self.annotations(mutations.damaged_rows),
             "info file of mmdet3d": lambda: self.pickle("v2.pkl", info_v2, read_info_file),
             "info file of MapTRv2": lambda: self.pickle("maptr.pkl", info_of_maptr, self.infos),
-            "own records and calibration": self.records,
+            "info file of MapTRv2, Argoverse 2": lambda: self.pickle(
+                "av2.pkl", info_of_argoverse2, self.infos
+            ),
+            "own records": self.records,
+            "calibration of own images": self.calibration,
+            "results": self.results,
+            "config": self.config,
+            "config of another repository": self.upstream,
             "image, JPEG": lambda: self.image(".jpg"),
             "image, PNG": lambda: self.image(".png"),
             "nuScenes map expansion": lambda: self.json(town, self.expansion),
@@ -258,6 +306,50 @@ class Files:
             return list(AnnotationFile(self.work / "own.arrow"))
 
         return Reader(path, read, (mutations.damaged_pickle,))
+
+    def calibration(self) -> Reader:
+        content = json.dumps(own_calibration(self.sample)).encode()
+        path = self.put("calibration.json", content)
+
+        def read() -> list[MapSample]:
+            return self.written(EGO_META, read_image_folder(path, self.work / "frames")[0])
+
+        return self.json(path, read)
+
+    def results(self) -> Reader:
+        path = self.work / "results.json"
+        elements = elements_of_instances(self.sample.instances)
+        write_results(path, [("a", vectors_of(elements, LIDAR_META.classes)), ("b", [])])
+
+        def read() -> dict[str, MapElements]:
+            return read_samples(path, RESULTS_KEY, LIDAR_META.classes)[0]
+
+        return self.json(path, read)
+
+    def config(self) -> Reader:
+        file = Path(__file__).resolve().parents[2] / "configs/_base_/datasets/minicity.py"
+        settings = Config.fromfile(file).to_dict()
+        dataset = settings["test_dataloader"]["dataset"]
+        dataset |= {"ann_file": str(self.arrow), "data_root": str(self.work), "split": "train"}
+        path = self.put("config.json", json.dumps(settings).encode())
+
+        def read() -> list[Any]:
+            cfg = read_config(path)
+            check_config(cfg)
+            dataset = DATASETS.build(cfg.test_dataloader.dataset)
+            return [cfg.to_dict(), dataset.metainfo, len(dataset)]
+
+        return self.json(path, read)
+
+    def upstream(self) -> Reader:
+        path = self.put("upstream.py", upstream_configs.maptrv2().encode())
+        target = self.work / "ours.py"
+
+        def read() -> str:
+            convert(path, target)
+            return target.read_text()
+
+        return Reader(path, read, (mutations.damaged_bytes,))
 
     def image(self, suffix: str) -> Reader:
         content = cv2.imencode(

@@ -15,7 +15,7 @@ from gsmap.converters.argoverse2.log import (
     Argoverse2Log,
     closest_ns,
 )
-from gsmap.converters.argoverse2.map import Argoverse2Map, check_rules
+from gsmap.converters.argoverse2.map import Argoverse2Map, check_rules, find_map
 from gsmap.converters.command_line import FileOptions
 from gsmap.datasets.annotations.record import (
     RANGES,
@@ -174,16 +174,20 @@ def _sample(
         cameras=list(_cameras(log, timestamp_ns, city_from_ego, options)),
         global_from_frame=city_from_ego,
         lidar=_lidar(log, timestamp_ns, np.linalg.inv(city_from_ego), options),
-        instances=None if log_map is None else _instances(log_map, city_from_ego, options),
+        instances=None if log_map is None else _instances(log, log_map, city_from_ego, options),
     )
 
 
 def _instances(
-    log_map: Argoverse2Map, city_from_ego: np.ndarray, options: Argoverse2Options
+    log: Argoverse2Log,
+    log_map: Argoverse2Map,
+    city_from_ego: np.ndarray,
+    options: Argoverse2Options,
 ) -> list[MapInstance]:
-    elements = log_map.extract(
-        city_from_ego, options.classes, options.compat, options.x_range, options.y_range
-    )
+    with naming(find_map(log.log_dir), "download it again"):
+        elements = log_map.extract(
+            city_from_ego, options.classes, options.compat, options.x_range, options.y_range
+        )
     return [
         MapInstance(label, points[:, : options.dim])
         for label, name in enumerate(options.classes)
