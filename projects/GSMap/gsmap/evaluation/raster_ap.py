@@ -174,17 +174,17 @@ def _class_figures(found: ClassDetections, ious: FloatArray) -> dict[str, float]
     figures = class_figures(found, interpolated_ap, absent=UNDEFINED)
     for limit in RECALL_LIMITS:
         hits = found.hits[found.ranks < limit].sum(axis=0)
-        figures[f"AR@{limit}"] = (
-            float(np.mean(hits / found.num_gts)) if found.num_gts else UNDEFINED
-        )
-    ious = ious[~np.isnan(ious)]
-    figures["mIoU"] = float(np.mean(ious)) if len(ious) else UNDEFINED
+        figures[f"AR@{limit}"] = _mean(hits / found.num_gts if found.num_gts else ())
+    figures["mIoU"] = _mean(ious[~np.isnan(ious)])
     return figures
 
 
+def _mean(values: Sequence[float] | FloatArray) -> float:
+    return float(np.mean(values)) if len(values) else UNDEFINED
+
+
 def _mean_of_defined(values: Iterable[float]) -> float:
-    defined = [v for v in values if v != UNDEFINED]
-    return float(np.mean(defined)) if defined else UNDEFINED
+    return _mean([value for value in values if value != UNDEFINED])
 
 
 def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> MetricReport:

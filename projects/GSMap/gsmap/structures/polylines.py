@@ -12,10 +12,12 @@ PADDING = -10000.0
 """Fills the rows of ``equivalent_orders`` that are not used."""
 
 
-def _check_polyline(points: Points) -> Points:
+def _check_polyline(points: Points, num_points: int = 2) -> Points:
     points = np.asarray(points)
     if points.ndim != 2 or len(points) < 2 or points.shape[1] < 2:
         raise ValueError(f"points must have shape (n >= 2, 2 or 3), got {points.shape}.")
+    if num_points < 2:
+        raise ValueError(f"num_points must be >= 2, got {num_points}.")
     return points.astype(np.float64, copy=False)
 
 
@@ -42,9 +44,7 @@ def resample(points: Points, num_points: int) -> NDArray[np.float64]:
     Raises:
         ValueError: If ``points`` is no polyline or ``num_points`` is below 2.
     """
-    points = _check_polyline(points)
-    if num_points < 2:
-        raise ValueError(f"num_points must be >= 2, got {num_points}.")
+    points = _check_polyline(points, num_points)
     return resample_all(points, np.array([0, len(points)]), num_points)[0]
 
 
@@ -108,9 +108,7 @@ def equivalent_orders(
     Raises:
         ValueError: If ``points`` is no polyline or ``num_points`` is below 2.
     """
-    points = _check_polyline(points)
-    if num_points < 2:
-        raise ValueError(f"num_points must be >= 2, got {num_points}.")
+    points = _check_polyline(points, num_points)
     slots = max(num_points - 1, 2)
     orders = np.full((slots, num_points, points.shape[1]), PADDING)
     if not is_closed(points):

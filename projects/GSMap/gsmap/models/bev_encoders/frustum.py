@@ -20,7 +20,7 @@ def frustum_points(
             the pixel (u, v) and the depth d in metres, to (x, y, z, 1) in metres. (..., 4, 4)
         image_size: Height and width of the (padded) image in pixels.
         feature_size: Height h and width w of the feature map.
-        depths_m: Depths in metres, along the optical axis. (D,)
+        depths_m: Along the optical axis. (D,)
 
     Returns:
         Points (x, y, z) in metres. (..., D, h, w, 3)

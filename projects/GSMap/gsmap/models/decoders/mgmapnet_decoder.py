@@ -17,17 +17,13 @@ from gsmap.models.layers.multi_granularity import Granularities
 class MGMapNetDecoderLayer(MapDecoderLayer):
     """Self-attention of the instances, attention on the BEV, and a network for each granularity.
 
+    The attention on the BEV is `MultiGranularityAttention`. Arguments besides those of
+    `MapDecoderLayer`:
+
     Args:
-        embed_dims: Channels C.
-        num_points: Points per instance P.
         num_levels: Levels of BEV features.
-        ffn_dims: Hidden channels of both feed-forward networks.
-        dropout: Dropout of every sublayer.
-        self_attn: Config of the instances' self-attention (`PointSelfAttention`).
-        cross_attn: Config of the attention on the BEV (`MultiGranularityAttention`).
         reference_dims: Entries of the reference that its position code reads; None for the learned
             position instead.
-        kwargs: Further arguments of `MapDecoderLayer`.
     """
 
     def __init__(
@@ -121,8 +117,6 @@ class MGMapNetDecoder(MapDecoder):
     Args:
         layer: Config of the layer (`MGMapNetDecoderLayer`). Its ``reference_dims`` holds from the
             second layer on: before that no point has moved.
-        embed_dims: Channels C.
-        num_points: Points per instance P.
         num_levels: Levels of BEV features.
         kwargs: Further arguments of `MapDecoder`.
     """

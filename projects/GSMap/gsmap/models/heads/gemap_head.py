@@ -17,15 +17,13 @@ class GeMapHead(MapHead):
 
     On a MapTR config this is GeMap with its simple objective, on MapTRv2 with its full one.
 
+    Arguments besides those of `MapHead`:
+
     Args:
-        decoder: Config of the decoder.
-        losses: Configs of the losses of the head that this one extends.
-        query_groups: Settings of each query group.
         loss_euclidean: Settings of `EuclideanLoss`, or None to train without it.
         decoupled: Let the layers' self-attention be GeMap's; else it is the config's.
         one_to_many: Keep the further query groups, which GeMap does not have. The Euclidean loss of
             many matches takes much memory: name the losses of such a group.
-        kwargs: Further arguments of `MapHead`.
     """
 
     def __init__(

@@ -20,20 +20,15 @@ class GSMapHead(MapHead):
 
     A query's reference becomes a Gaussian (paper, Eq. 1), the decoder's layers are guided by it,
     matching adds the IoU cost of rendered masks (Eq. 9) and the losses the raster loss (Eqs. 10 and
-    12). Nothing is rendered at inference. Each of these can be switched off by itself.
+    12). Nothing is rendered at inference. Each of these can be switched off by itself. Arguments
+    besides those of `MapHead`:
 
     Args:
-        grid: The map's extent.
-        decoder: Config of the decoder, whose layers become guided ones.
-        losses: Configs of the losses of the head that this one extends.
-        match_costs: Configs of its matching costs.
         loss_raster: Settings of the loss of the rendered masks, or None to train without it; what
             they leave out is as by default.
         iou_cost: The same of the matching cost of the rendered masks.
-        masks: Settings of `ElementMasks`.
         reference: Settings of `GaussianReference`; its smallest sigma is half a pixel of the masks
             by default.
-        kwargs: Further arguments of `MapHead`.
     """
 
     def __init__(

@@ -18,12 +18,10 @@ class MapVRHead(MapHead):
 
     Matched points are rendered softly, as lines or as polygons by their class, and compared by the
     dice loss; matching does the same on coarser rasters. Points weigh less than in MapTR, and the
-    direction loss asks for straight predictions instead of the ground truth's directions.
+    direction loss asks for straight predictions instead of the ground truth's directions. Arguments
+    besides those of `MapHead`:
 
     Args:
-        grid: The map's extent.
-        classes: Names of the classes.
-        decoder: Config of the decoder.
         losses: Configs of the losses of the head that this one extends; of these, `PointsLoss` gets
             another weight, `DirectionLoss` is replaced.
         match_costs: Configs of its matching costs; `OrderedPointsCost` gets another weight.
@@ -37,7 +35,6 @@ class MapVRHead(MapHead):
         masks: Sizes of pixels as in `ElementMasks`: 256 x 128 and, for matching, 128 x 64 on a map
             of 60 x 30 m.
         dropout: Dropout in the decoder's layers.
-        kwargs: Further arguments of `MapHead`.
 
     Raises:
         ValueError: If ``polygons`` names what is no class.

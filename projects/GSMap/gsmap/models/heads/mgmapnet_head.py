@@ -19,17 +19,14 @@ QUERY_GROUPS: tuple[PARTS, ...] = ({"num": 100}, {"name": "one2many", "num": 600
 class MGMapHead(MapHead):
     """The map head with MGMapNet's parts as defaults, on whatever else it is made of.
 
+    Arguments besides those of `MapHead`:
+
     Args:
-        grid: The map's extent.
         decoder: Config of the decoder; one of another type becomes `MGMapNetDecoder`, its layers
             without the attentions that are not MGMapNet's.
-        losses: Configs of the losses of the head that this one extends.
-        query_groups: Settings of each query group.
         loss_mean_loc: Settings of `SamplingLocationLoss`, or None to train without it.
         loss_ins_seg: Settings of `InstanceMaskLoss`, or None to train without it.
         masks: Settings of `ElementMasks`; its lines are 3 pixels wide by default.
-        embed_dims: Channels C.
-        kwargs: Further arguments of `MapHead`.
     """
 
     def __init__(

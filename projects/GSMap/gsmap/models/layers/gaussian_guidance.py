@@ -11,15 +11,8 @@ class GaussianGuidance(nn.Module):
     """What a decoder layer takes from the Gaussians, for whichever attentions it has.
 
     Both parts start neutral: the sampling frame is the identity and the embedding zero, so a layer
-    with the weights of a MapTR layer computes what that layer computes.
-
-    Args:
-        space: How the reference stands for a Gaussian.
-        embed_dims: Channels C.
-        sampling: Place the samples of the BEV features in each Gaussian's own frame.
-        embedding: Add an embedding of (mu, sigma, theta) to the query's position.
-        invariant: Take the sampling frame that is the same for theta and theta + pi.
-        hidden_dims: Hidden channels of the embedding.
+    with the weights of a MapTR layer computes what that layer computes. The settings are those of
+    `GaussianDecoderLayer`; ``space`` says how the reference stands for a Gaussian.
     """
 
     neutral_keys = ("embedding.",)

@@ -87,8 +87,7 @@ class MaskOverlapLoss(_MaskLoss):
 
     Args:
         loss_weight: Weight of the loss.
-        kind: ``"dice"``: 1 - (2 sum(p t) + 1) / (sum p + sum t + 1), as MapVR; ``"iou"``: 1 - sum
-            min / sum max.
+        kind: ``"dice"``, as MapVR (`dice_loss`), or ``"iou"``: 1 - sum min / sum max.
         last_layer_only: Leave it out of all decoder layers but the last.
 
     Raises:

@@ -43,18 +43,11 @@ class MapAssigner:
         img_meta: dict[str, Any] | None = None,
         repeats: int = 1,
     ) -> MapMatch:
-        """Match each ground truth to ``repeats`` predictions.
+        """Match each ground truth to ``repeats`` predictions: min(N, K * repeats) pairs.
 
-        Args:
-            pred_instances: ``scores`` logits (N, classes), ``pts`` normalised (N, P, 2), and what
-                further costs read.
-            gt_instances: ``labels`` (K,), ``pts_shifts`` normalised (K, S, P, 2), and what further
-                costs read.
-            img_meta: Meta dict of the sample; its ``token`` names the sample in errors.
-            repeats: To how many predictions each ground truth is matched.
-
-        Returns:
-            The matched pairs, min(N, K * repeats) of them.
+        Predictions have ``scores``, logits (N, classes), ``pts`` normalised (N, P, 2), ground
+        truths ``labels`` (K,), ``pts_shifts`` normalised (K, S, P, 2), and both what further costs
+        read. The meta dict's ``token`` names the sample in errors.
 
         Raises:
             FloatingPointError: If a cost (or, without ground truth, a score) is not finite.
