@@ -32,14 +32,9 @@ def adapt_state(
     """Rename upstream's keys in place, then compare the state with what the model expects.
 
     Batch counters of BatchNorm may be missing, as in old checkpoints. Neutral keys, which then
-    stay as they are, may be missing all together.
-
-    Args:
-        state: The checkpoint's state dict; changed in place.
-        expected: The model's state dict.
-        prefix: Prefix of both.
-        neutral: Keys from :func:`neutral_keys`.
-        fit: Changes the renamed state in place before it is compared, or None.
+    stay as they are, may be missing all together. ``prefix`` is that of both states; ``neutral``
+    comes from :func:`neutral_keys`; ``fit`` changes the renamed state in place before it is
+    compared.
 
     Raises:
         ValueError: If a key is missing, left over or of another shape.

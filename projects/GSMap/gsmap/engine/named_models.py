@@ -69,9 +69,6 @@ def find_config(config: str | Path) -> Path:
 def find_checkpoint(checkpoint: str | Path) -> Path:
     """Return a checkpoint's file, checked against its digest if it was asked for by name.
 
-    Args:
-        checkpoint: The file, or the name of a model.
-
     Raises:
         FileNotFoundError: If it is neither, or the named model's file is not there.
         ValueError: If the named model's file is not the registry's.

@@ -67,10 +67,7 @@ class BEVGrid:
         return replace(self, height=height, width=width)
 
     def rasterized(self, pixel_m: float | Sequence[float]) -> "BEVGrid":
-        """Return the same extent divided into pixels of a size.
-
-        Args:
-            pixel_m: Side of a square pixel in metres, or its sizes along x and y.
+        """Return the same extent in pixels of a side in metres, or of sizes along x and y.
 
         Raises:
             ValueError: If the pixels do not divide the extent.

@@ -51,15 +51,9 @@ def resample(points: Points, num_points: int) -> NDArray[np.float64]:
 def resample_all(
     points: Points, offsets: NDArray[np.integer[Any]], num_points: int
 ) -> NDArray[np.float64]:
-    """Resample many polylines at equal arc length in the plane, both end points included.
+    """Resample many polylines as `resample` does one, to P points each; none give zeros.
 
-    Args:
-        points: Vertices of all polylines in metres; z is interpolated. (M, D)
-        offsets: Polyline i owns the vertices ``offsets[i]:offsets[i + 1]``. (N + 1,)
-        num_points: Number P of points of each, >= 2.
-
-    Returns:
-        Resampled points in metres; zeros for a polyline without vertices. (N, P, D)
+    Polyline i owns the vertices ``offsets[i]:offsets[i + 1]``. (M, D), (N + 1,) -> (N, P, D)
     """
     counts = np.diff(offsets)
     resampled = np.zeros((len(counts), num_points, points.shape[1]))
@@ -167,15 +161,7 @@ def clip_to_box(
 
     Direction is kept, further coordinates are interpolated, and a ring that is cut comes back as
     open pieces, none of which ends at the ring's arbitrary start. Pieces that only touch the
-    rectangle are left out.
-
-    Args:
-        points: Vertices in metres. (n, D)
-        x_range: Smallest and largest x in metres.
-        y_range: Smallest and largest y in metres.
-
-    Returns:
-        The pieces inside, in order. each (m >= 2, D)
+    rectangle are left out. (n, D) in metres -> the pieces inside, in order, each (m >= 2, D)
 
     Raises:
         ValueError: If ``points`` is no polyline.

@@ -17,10 +17,6 @@ def check_batch(batch: Batch, meta: AnnotationMeta) -> None:
     Labels are among the classes, points and calibration finite, transforms rigid (proper rotations
     to 1e-3), focal lengths and image sizes positive, and paths relative and inside the data root.
 
-    Args:
-        batch: The samples.
-        meta: Metadata of the file that they are meant for.
-
     Raises:
         ValueError: If a value is wrong; the message names the sample.
     """

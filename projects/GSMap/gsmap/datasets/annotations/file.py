@@ -98,9 +98,6 @@ class AnnotationWriter:
     def write(self, sample: MapSample) -> None:
         """Append a sample.
 
-        Args:
-            sample: The sample.
-
         Raises:
             ValueError: If a shape is wrong or its token was already written. A wrong value
                 (``check_batch``) may be noticed some samples later, or when the file is finished.
@@ -302,11 +299,7 @@ class AnnotationFile(Sequence[MapSample]):
         return f"make it again with `{self.meta.command or 'python tools/create_data.py --help'}`."
 
     def require(self, **expected: Any) -> None:
-        """Refuse a file made for something else.
-
-        Args:
-            **expected: Names of ``AnnotationMeta`` with the values that they must have; None is not
-                checked.
+        """Refuse a file whose ``AnnotationMeta`` has other values than expected; None is any.
 
         Raises:
             ValueError: If a value differs; the message names it and says what to run.
@@ -342,11 +335,7 @@ class AnnotationFile(Sequence[MapSample]):
         ]
 
     def column(self, name: str) -> list[Any]:
-        """Return one plain column of all samples.
-
-        Args:
-            name: ``token``, ``scene``, ``map_name`` or ``timestamp_ns``.
-        """
+        """Return ``token``, ``scene``, ``map_name`` or ``timestamp_ns`` of all samples."""
         return [value for batch in self._batches for value in batch.column[name].to_pylist()]
 
     @cached_property

@@ -184,11 +184,7 @@ def _require_known(known: bool, what: str) -> None:
 
 
 class Batch:
-    """Numpy views on one record batch, from which rows are decoded.
-
-    Args:
-        batch: The record batch, whose own structure is valid.
-        dim: Coordinates per point.
+    """Numpy views on one valid record batch, from which rows of ``dim`` coordinates are decoded.
 
     Raises:
         ValueError: If something is missing that every sample has.
