@@ -1,4 +1,4 @@
-"""The documentation builds as a site, whole and without network."""
+"""The documentation builds as a site, whole and without network; its lines are short."""
 
 import re
 from pathlib import Path
@@ -8,6 +8,11 @@ from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
 REPO = Path(__file__).resolve().parents[1]
+PAGES = [
+    path
+    for folder in (REPO, REPO / "docs", REPO / "models", REPO / "projects")
+    for path in (folder.glob("*.md") if folder == REPO else folder.rglob("*.md"))
+]
 LOADED = re.compile(
     r"""<(?:script|img|iframe)[^>]*\bsrc=["']?(?:https?:)?//|<link[^>]*\bhref=["']?(?:https?:)?//|"""
     r"""@import|url\(["']?(?:https?:)?//"""
@@ -49,3 +54,11 @@ def test_the_reference_has_every_registered_name(site: Path):
     assert {name for name in names if not re.search(rf'id="gsmap\.[\w.]+\.{name}"', shown)} == set()
     assert ":math:" not in shown
     assert "<math" in shown
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPO)))
+def test_lines_are_short(page: Path):
+    """Table rows cannot be broken; everything else is shorter than 120 characters."""
+    lines = enumerate(page.read_text(encoding="utf-8").splitlines(), start=1)
+    long = [n for n, line in lines if len(line) >= 120 and not line.startswith("|")]
+    assert long == [], f"{page}: lines of 120 characters or more"
