@@ -331,6 +331,13 @@ def test_a_broken_record_is_named(
         convert_nuscenes(replace(options, root=damaged_root))
 
 
+def test_a_record_that_stands_twice_is_named(options: NuScenesOptions, damaged_root: Path):
+    first = change(damaged_root, "scene", 0)[0]
+    change(damaged_root, "scene", 1, token=first["token"])
+    with pytest.raises(ValueError, match=f"scene.json has record '{first['token']}' twice"):
+        convert_nuscenes(replace(options, root=damaged_root))
+
+
 def test_a_circle_of_samples_ends_and_is_named(options: NuScenesOptions, damaged_root: Path):
     records = change(damaged_root, "sample", 0)
     first = next(r for r in records if not r["prev"])

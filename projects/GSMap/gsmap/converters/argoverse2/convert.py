@@ -105,18 +105,19 @@ def _drop_listed(
     log_dirs: Sequence[Path], keep_map_changes: bool, summary: ConversionSummary
 ) -> list[Path]:
     """Leave out the logs that are known to be unfit, and count them."""
+    changed = "its map was changed on purpose and contradicts the images (Argoverse 2's own note)"
     kept = []
     for log_dir in log_dirs:
-        reason = BROKEN_LOGS.get(log_dir.name)
-        change = MAP_CHANGE_LOGS.get(log_dir.name)
-        if change and keep_map_changes:
-            summary.add_problem(f"log kept, but {change}", log_dir.name)
-        elif change:
-            reason = f"{change}; --keep-map-changes keeps it"
-        if reason:
-            summary.add_problem(f"log left out: {reason}", log_dir.name)
+        name = log_dir.name
+        if name in BROKEN_LOGS:
+            reason = "log left out: its map or sensor data cannot be used (known to fail)"
+            summary.add_problem(reason, name)
+        elif name in MAP_CHANGE_LOGS and not keep_map_changes:
+            summary.add_problem(f"log left out: {changed}; --keep-map-changes keeps it", name)
         else:
             kept.append(log_dir)
+            if name in MAP_CHANGE_LOGS:
+                summary.add_problem(f"log kept, but {changed}", name)
     return kept
 
 

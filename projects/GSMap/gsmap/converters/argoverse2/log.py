@@ -21,19 +21,15 @@ RING_CAMERAS = (
 MAX_CAMERA_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_RING_CAM_TIMESTAMP_DIFF)  # 25 ms
 MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 51 ms
 
-BROKEN_LOGS = {
-    log_id: "its map or sensor data cannot be used (known to fail)"
-    for log_id in ("01bb304d-7bd8-35f8-bbef-7086b688e35e", "453e5558-6363-38e3-bf9b-42b5ba0a6f1d")
-}
-MAP_CHANGE_LOGS = {
-    log_id: "its map was changed on purpose and contradicts the images (Argoverse 2's own note)"
-    for log_id in (
-        "75e8adad-50a6-3245-8726-5e612db3d165",
-        "54bc6dbc-ebfb-3fba-b5b3-57f88b4b79ca",
-        "af170aac-8465-3d7b-82c5-64147e94af7d",
-        "6e106cf8-f6dd-38f6-89c8-9be7a71e7275",
-    )
-}
+# their maps or sensor data cannot be used
+BROKEN_LOGS = (
+    "01bb304d-7bd8-35f8-bbef-7086b688e35e", "453e5558-6363-38e3-bf9b-42b5ba0a6f1d",
+)  # fmt: skip
+# by Argoverse 2's own note
+MAP_CHANGE_LOGS = (
+    "75e8adad-50a6-3245-8726-5e612db3d165", "54bc6dbc-ebfb-3fba-b5b3-57f88b4b79ca",
+    "af170aac-8465-3d7b-82c5-64147e94af7d", "6e106cf8-f6dd-38f6-89c8-9be7a71e7275",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

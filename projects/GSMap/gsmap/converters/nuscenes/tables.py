@@ -148,7 +148,14 @@ class NuScenesTables:
         return self._records[table][token]
 
     def _keep(self, table: str, records: Iterable[dict[str, Any]]) -> None:
-        self._records[table] = {record["token"]: record for record in records}
+        """Keep a table's records by token."""
+        kept = self._records[table] = {}
+        for record in records:
+            if kept.setdefault(record["token"], record) is not record:
+                raise ValueError(
+                    f"{self._folder}/{table}.json has record {record['token']!r} twice; download "
+                    "the tables again."
+                )
 
     def _read(self, table: str) -> Iterator[dict[str, Any]]:
         """Yield a table's records, checked."""
