@@ -3,7 +3,7 @@
 import ast
 import copy
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -52,51 +52,48 @@ def read_assignments(path: str | Path) -> dict[str, Any]:
 
 def _value(node: ast.expr, names: dict[str, Any]) -> Any:
     """Return what an expression stands for."""
-    if isinstance(node, ast.Constant):
-        return node.value
-    if isinstance(node, ast.Name):
-        if node.id not in names:
-            raise ValueError(f"{node.id} is not assigned before")
-        return copy.deepcopy(names[node.id])
-    if isinstance(node, (ast.List, ast.Tuple)):
-        values = [_value(element, names) for element in node.elts]
-        return values if isinstance(node, ast.List) else tuple(values)
-    if isinstance(node, ast.Dict):
-        return _mapping(zip(node.keys, node.values, strict=True), names)
-    if isinstance(node, ast.Call):
-        return _call(node, names)
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        return -_value(node.operand, names)
-    if isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
-        return _arithmetic(node.op, _value(node.left, names), _value(node.right, names))
-    if isinstance(node, ast.Subscript):
-        return _value(node.value, names)[_value(node.slice, names)]
+    match node:
+        case ast.Constant(value):
+            return value
+        case ast.Name(name):
+            if name not in names:
+                raise ValueError(f"{name} is not assigned before")
+            return copy.deepcopy(names[name])
+        case ast.List(elements):
+            return [_value(element, names) for element in elements]
+        case ast.Tuple(elements):
+            return tuple(_value(element, names) for element in elements)
+        case ast.Dict(keys, values):
+            return _mapping(zip(keys, values, strict=True), names)
+        case ast.Subscript(value, index):
+            return _value(value, names)[_value(index, names)]
+    return _computed(node, names)
+
+
+def _computed(node: ast.expr, names: dict[str, Any]) -> Any:
+    """Return the value of a call or of arithmetic."""
+    match node:
+        case ast.Call(ast.Name("dict"), [], keywords):
+            pairs = [(k.arg and ast.Constant(k.arg), k.value) for k in keywords]
+            return _mapping(pairs, names)
+        case ast.Call(ast.Name(name), [argument], []) if name in CALLS:
+            return CALLS[name](_value(argument, names))
+        case ast.Call(function):
+            raise ValueError(f"{ast.unparse(function)}() is not called")
+        case ast.UnaryOp(ast.USub(), operand):
+            return -_value(operand, names)
+        case ast.BinOp(left, sign, right) if type(sign) in ARITHMETIC:
+            sides = _value(left, names), _value(right, names)
+            # a text or list multiplied may fill the memory
+            if isinstance(sign, ast.Mult) and not all(isinstance(v, (int, float)) for v in sides):
+                raise ValueError("only numbers are multiplied")
+            return ARITHMETIC[type(sign)](*sides)
     raise ValueError(f"{ast.unparse(node)!r} is more than a value")
 
 
-def _arithmetic(sign: ast.operator, left: Any, right: Any) -> Any:
-    """Return a sum, difference, product or quotient; text and lists are added, not multiplied."""
-    if isinstance(sign, ast.Mult) and not all(isinstance(v, (int, float)) for v in (left, right)):
-        raise ValueError("only numbers are multiplied")
-    return ARITHMETIC[type(sign)](left, right)
-
-
-def _mapping(pairs: Any, names: dict[str, Any]) -> dict[Any, Any]:
+def _mapping(pairs: Iterable[Any], names: dict[str, Any]) -> dict[Any, Any]:
     """Return a dict of pairs of key and value nodes; a key of None stands for ``**``."""
     values: dict[Any, Any] = {}
     for key, node in pairs:
-        if key is None:
-            values.update(_value(node, names))
-        else:
-            values[key if isinstance(key, str) else _value(key, names)] = _value(node, names)
+        values |= _value(node, names) if key is None else {_value(key, names): _value(node, names)}
     return values
-
-
-def _call(node: ast.Call, names: dict[str, Any]) -> Any:
-    """Return the value of a call of `dict` or of a name in `CALLS`."""
-    name = node.func.id if isinstance(node.func, ast.Name) else ""
-    if name == "dict" and not node.args:
-        return _mapping([(keyword.arg, keyword.value) for keyword in node.keywords], names)
-    if name in CALLS and len(node.args) == 1 and not node.keywords:
-        return CALLS[name](_value(node.args[0], names))
-    raise ValueError(f"{ast.unparse(node.func)}() is not called")
