@@ -320,6 +320,7 @@ def change(root: Path, table: str, number: int, **fields: Any) -> list[dict]:
         ("ego_pose", {"translation": [1, 2]}, "ego_pose.json, .*translation must be 3 finite"),
         ("ego_pose", {"rotation": [float("nan"), 0, 0, 1]}, "ego_pose.json is damaged .*NaN is no"),
         ("sample", {"timestamp": "now"}, "sample.json, .*timestamp must be a int, got 'now'"),
+        ("sample_data", {"timestamp": 10**18}, "sample_data.json, .*timestamp must be a int"),
         ("log", {"token": "other"}, "scene.json, record .*log_token .* leads nowhere"),
     ],
 )
