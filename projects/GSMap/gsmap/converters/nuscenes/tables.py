@@ -90,7 +90,7 @@ def _check_record(record: Any, table: str, path: Path) -> None:
         value = record.get(name) if isinstance(record, dict) else None
         good = _are_numbers(value, kind) if isinstance(kind, int) else type(value) is kind
         if kind is int:  # microseconds that nanoseconds of 64 bits hold
-            good = good and abs(value) <= 1 << 53
+            good = isinstance(value, int) and good and abs(value) <= 1 << 53
         if name == "camera_intrinsic" and value:  # a matrix, or nothing for another sensor
             good = good and len(value) == 3 and all(_are_numbers(row, 3) for row in value)
         if not good:
