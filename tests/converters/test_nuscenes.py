@@ -370,6 +370,7 @@ def test_tables_are_read_whole(options: NuScenesOptions, damaged_root: Path, dam
 
 
 def test_damaged_maps_and_signals_are_named(options: NuScenesOptions, damaged_root: Path):
+    (damaged_root / "v1.0-trainval/map.json").unlink()  # not needed
     signals = next((damaged_root / "can_bus").glob("*_pose.json"))
     whole = signals.read_text()
     signals.write_text(whole.replace('"accel": [', '"accel": [1, ', 1))
@@ -379,6 +380,9 @@ def test_damaged_maps_and_signals_are_named(options: NuScenesOptions, damaged_ro
     for expansion in (damaged_root / "maps/expansion").glob("*.json"):
         expansion.write_text(expansion.read_text()[:-9])
     with pytest.raises(ValueError, match=r"maps/expansion/.*.json cannot be used: .*unpack"):
+        convert_nuscenes(replace(options, root=damaged_root))
+    (damaged_root / "v1.0-trainval/sensor.json").unlink()
+    with pytest.raises(FileNotFoundError, match=r"no table at .*/sensor.json: download"):
         convert_nuscenes(replace(options, root=damaged_root))
 
 

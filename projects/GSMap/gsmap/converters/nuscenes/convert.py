@@ -151,7 +151,7 @@ class _Conversion:
         scenes = [scene for scene in self.tables.scene if scene["name"] in split_of]
         scenes = self.options.shard.part(sorted(scenes, key=self.tables.location_of))
         with Progress(
-            desc=f"{self.options.dataset} {self.options.version}", unit="sample", smoothing=0.05,
+            desc=f"{self.options.dataset} {self.options.version}", unit="samples", smoothing=0.05,
             total=sum(scene["nbr_samples"] for scene in scenes),
         ) as bar:  # fmt: skip
             for location, local in groupby(scenes, key=self.tables.location_of):

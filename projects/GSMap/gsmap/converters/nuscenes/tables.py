@@ -162,6 +162,8 @@ class NuScenesTables:
     def _read(self, table: str) -> Iterator[dict[str, Any]]:
         """Yield a table's records, checked."""
         path = self._folder / f"{table}.json"
+        if not path.is_file():
+            raise FileNotFoundError(f"no table at {path}: download the tables again.")
         for record in iterate_records(path):
             _check_record(record, table, path)
             yield record
