@@ -57,7 +57,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--reference-samples",
         type=int,
         default=100,
-        help="the reference's way is measured on so many: it is linear in them",
+        help="number of samples for the algorithm of the reference, which is linear in them",
     )
     parser.add_argument(
         "--size",

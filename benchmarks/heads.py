@@ -41,7 +41,7 @@ class Task:
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the subcommand ``heads``."""
     parser = subparsers.add_parser("heads", help=__doc__)
-    parser.add_argument("config", type=Path, help="whose backbone, encoder and data are used")
+    parser.add_argument("config", type=Path, help="config of backbone, encoder and data")
     parser.add_argument("checkpoint", help="of that config, or the name of a model")
     parser.add_argument(
         "variants", type=Path, help='JSON file, {"name": "CONFIG KEY=VALUE ...", ...}'
@@ -52,7 +52,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--lr", type=float, default=3e-4)
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=1, help="runs side by side")
+    parser.add_argument("--workers", type=int, default=1, help="runs at the same time")
     parser.set_defaults(run=run)
 
 

@@ -19,13 +19,13 @@ from gsmap.engine.launch import read_config
 
 def add_model_arguments(parser: argparse.ArgumentParser) -> None:
     """Add which models to measure, and how."""
-    parser.add_argument("configs", nargs="+", help="ratios are to the first of them")
+    parser.add_argument("configs", nargs="+", help="configs; ratios refer to the first")
     parser.add_argument(
         "--size",
         type=int,
         nargs=2,
         metavar=("H", "W"),
-        help="of images; the config's by default",
+        help="image size (default: that of the config)",
     )
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=2)

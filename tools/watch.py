@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Watch runs in TensorBoard: ``python tools/watch.py --logdir work_dirs``; the options are its own.
+"""Start TensorBoard with its own options: ``python tools/watch.py --logdir work_dirs``.
 
-The plugins of other packages are left out: open3d's, which mmdet3d brings, ends the usual command
-on machines without libusb.
+Plugins of other packages are left out. The plugin of open3d, which mmdet3d installs, stops the
+usual command on machines without libusb.
 """
 
 import sys

@@ -16,9 +16,9 @@ def image_size(text: str) -> tuple[int, int]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the command's arguments."""
-    parser.add_argument("--root", required=True, help="folder to make, in the nuScenes layout")
+    parser.add_argument("--root", required=True, help="output folder, in nuScenes layout")
     parser.add_argument(
-        "--scenes", type=int, required=True, help="scenes in all, a fifth of them validation"
+        "--scenes", type=int, required=True, help="total number of scenes, a fifth for validation"
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of every random choice")
     parser.add_argument("--image-size", type=image_size, default=(800, 450), metavar="WxH")
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sweeps-per-sample", type=int, default=2, help="LiDAR sweeps between key frames"
     )
     parser.add_argument("--val-scenes", type=int, help="validation scenes, instead of a fifth")
-    parser.add_argument("--workers", type=int, help="processes; one per core without it")
+    parser.add_argument("--workers", type=int, help="processes (default: one per core)")
 
 
 def run(arguments: argparse.Namespace, command: str) -> str:

@@ -111,7 +111,11 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--split", default="val", choices=("train", "val", "test"))
     parser.add_argument(
-        "--logs", nargs="+", default=(), metavar="LOG", help="only these (ids, or how they begin)"
+        "--logs",
+        nargs="+",
+        default=(),
+        metavar="LOG",
+        help="only these (ids, or their first characters)",
     )
     parser.add_argument(
         "--rate", type=parse_rate, default=2.0, dest="rate_hz",

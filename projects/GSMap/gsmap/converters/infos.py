@@ -266,9 +266,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("infos", type=Path, help="info file of MapTR or MapTRv2 (.pkl)")
     parser.add_argument("target", type=output_file, help="annotation file to write (.arrow)")
     parser.add_argument(
-        "--data-root", type=Path, required=True, help="what paths shall be relative to"
+        "--data-root", type=Path, required=True, help="folder that paths become relative to"
     )
-    parser.add_argument("--split", help="name of the split (default: what the file's name ends in)")
+    parser.add_argument("--split", help="name of the split (default: the end of the file's name)")
     parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="CLASS")
     add_range_options(parser, None)
     add_shard_options(parser)

@@ -56,7 +56,7 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="DIR",
         action=_DataRootAction,
-        help="folder of the data set: annotation files, and what their paths start from",
+        help="folder of the data set: annotation files, and root of the paths in them",
     )
     parser.add_argument(
         "--cfg-options",

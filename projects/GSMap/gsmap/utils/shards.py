@@ -119,7 +119,7 @@ def add_shard_options(parser: argparse.ArgumentParser) -> None:
         type=_amount,
         default=[],
         metavar="NAME=AMOUNT",
-        help="what Ray sets aside for each, such as num_cpus=4 num_gpus=1 (default: num_cpus=1)",
+        help="resources of each in Ray, such as num_cpus=4 num_gpus=1 (default: num_cpus=1)",
     )
 
 

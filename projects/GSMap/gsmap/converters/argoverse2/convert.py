@@ -162,7 +162,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--compat",
         default="maptrv2",
         choices=COMPAT_MODES,
-        help="whose ground-truth rules (default: %(default)s)",
+        help="rules of the ground truth (default: %(default)s)",
     )
     parser.add_argument("--centerline", action="store_true", help="add the class centerline")
     parser.add_argument(

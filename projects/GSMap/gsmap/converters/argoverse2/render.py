@@ -221,15 +221,17 @@ def render_logs(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the renderer's options to a parser."""
     add_log_options(parser)
-    parser.add_argument("--out", type=Path, required=True, help="data root to make")
+    parser.add_argument("--out", type=Path, required=True, help="data root to write")
     parser.add_argument(
-        "--out-split", choices=("train", "val", "test"), help="split there (default: the same)"
+        "--out-split", choices=("train", "val", "test"), help="split in --out (default: the same)"
     )
-    parser.add_argument("--scale", type=float, default=0.25, help="of the real image size")
     parser.add_argument(
-        "--calibration-from", metavar="LOG", help="log whose calibration fills in for a missing one"
+        "--scale", type=float, default=0.25, help="size relative to the real images"
     )
-    parser.add_argument("--max-frames", type=int, help="moments per log, evenly spread")
+    parser.add_argument(
+        "--calibration-from", metavar="LOG", help="log whose calibration replaces a missing one"
+    )
+    parser.add_argument("--max-frames", type=int, help="frames per log, evenly spread")
     add_workers_option(parser)
     add_shard_options(parser)
 
