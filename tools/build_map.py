@@ -12,6 +12,8 @@ import json
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
@@ -30,9 +32,11 @@ from gsmap.maps.video import write_video
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
+from gsmap.visualization.figure import save_figure
+from gsmap.visualization.plots import plot_maps
 from gsmap.visualization.style import MapStyle
 
-FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4")
+FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -99,6 +103,8 @@ def write_map(
         "mcap": lambda path, _: write_mcap(path, replay),
         "mp4": lambda path, _: write_video(path, replay),
     }
+    for key in {"png", "svg"} & set(args.formats):
+        writers[key] = lambda path, _: draw(path, drive, elements, ann, style)
     paths = []
     for key in args.formats:
         paths.append(f"{stem}.{key}")
@@ -107,6 +113,18 @@ def write_map(
         paths.append(f"{stem}_lonlat.geojson")
         write_geojson(paths[-1], elements, classes, origin)
     return paths
+
+
+def draw(
+    path: str, drive: Drive, merged: MapElements, ann: AnnotationFile, style: MapStyle
+) -> None:
+    """Draw the baseline, the merged and, where it is known, the true map."""
+    maps = {"suppressed (baseline)": suppress(drive), "merged": merged}
+    if has_truth(ann):
+        annotated = {s.token: elements_of_instances(s.instances or []) for s in ann}
+        maps["true"] = true_map(read_drive(ann, drive.scene, annotated))
+    track = np.array([frame.sample.global_from_frame[:2, 3] for frame in drive.frames])
+    save_figure(plot_maps(maps, track, style), path)
 
 
 def has_truth(ann: AnnotationFile) -> bool:

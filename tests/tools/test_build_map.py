@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from drive_cases import CLASSES, drive_of
@@ -36,13 +37,18 @@ def files(tmp_path_factory):
 
 def test_ground_truth_as_predictions_scores_1(files, tmp_path, capsys):
     results, ann = files
-    assert main([str(results), "--ann", str(ann), "--out", str(tmp_path)]) == "1 drives"
+    formats = ["--formats", "geojson", "png"]
+    assert main([str(results), "--ann", str(ann), "--out", str(tmp_path), *formats]) == "1 drives"
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert scores["merged"]["AP"]["mean"] == pytest.approx(1.0)
     assert scores["merged"]["completeness@0.5"]["mean"] > 0.99
     assert scores["merged"]["accuracy@0.5"]["mean"] > 0.99
     assert len(json.loads((tmp_path / "scene.geojson").read_text())["features"]) == 6
     assert "| AP | suppressed |" in capsys.readouterr().out
+    picture = cv2.imread(str(tmp_path / "scene.png"))
+    assert picture.shape[1] == 1500
+    orange = np.abs(picture[..., ::-1].astype(int) - [255, 149, 0]).max(axis=-1) < 4
+    assert orange.mean() > 1e-3  # the dividers, in the colour of all pictures
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,7 @@ def _draw_vehicle(ax: Axes, view: FrameView) -> None:
     ax.add_patch(Polygon(windscreen, facecolor="#D5E3F2", edgecolor="none", zorder=31))
 
 
-def _draw_lines(
+def draw_lines(
     ax: Axes,
     lines: list[np.ndarray],
     labels: np.ndarray,
@@ -155,7 +155,7 @@ def _draw_truth(
     fates = panel.fates[1]
     colours = [mcolors.to_rgba(MATCH_COLOURS[fate], TRUTH_OPACITY[fate]) for fate in fates]
     lines = [view.display_from_frame(line) for line in truth.polylines]
-    _draw_lines(ax, lines, truth.labels, style, colours, 2.6 * style.bev_line_pt, zorder=8)
+    draw_lines(ax, lines, truth.labels, style, colours, 2.6 * style.bev_line_pt, zorder=8)
 
 
 def _draw_order(ax: Axes, lines: list[np.ndarray], colours: list[str]) -> None:
@@ -284,7 +284,7 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
         _draw_gaussians(ax, elements, view, style)
     if panel.lines:
         width_pt = style.bev_line_pt
-        _draw_lines(ax, lines, elements.labels, style, colours, width_pt, fates=fates)
+        draw_lines(ax, lines, elements.labels, style, colours, width_pt, fates=fates)
     if panel.vertices:
         for line, colour in zip(lines, colours, strict=True):
             ax.plot(*line.T[:2], "o", color=colour, markersize=2.2, markeredgewidth=0, zorder=12)

@@ -1,4 +1,4 @@
-"""Plots of figures: panels in one style, and precision over recall."""
+"""Plots: panels in one style, precision over recall, maps of drives."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,9 +6,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from gsmap.evaluation.average_precision import precision_recall, reliability
 from gsmap.evaluation.report import MetricReport
+from gsmap.structures.elements import MapElements
+from gsmap.visualization.bev_view import draw_lines
 from gsmap.visualization.style import RUN_COLOURS, MapStyle
 
 _WIDTH_IN = 7.5  # so that text of 7.5 points stays legible where a plot is shown 800 px wide
@@ -100,4 +103,33 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
         fontsize=8,
         frameon=False,
     )
+    return figure
+
+
+def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyle) -> Figure:
+    """Draw maps of one drive, one below or beside the other, each with the vehicle's way.
+
+    Args:
+        maps: Maps in the global frame, by their titles.
+        track: Positions of the vehicle. (n, 2)
+        style: Colours.
+    """
+    points = np.concatenate([track, *(elements.points[:, :2] for elements in maps.values())])
+    low, high = points.min(axis=0) - 5, points.max(axis=0) + 5
+    width, height = high - low
+    rows = len(maps) if width > height else 1
+    figure, axes = panel_grid(rows, len(maps) // rows)
+    across = _WIDTH_IN * rows / len(maps) - 0.5  # without the labels
+    figure.set_figheight(0.4 + rows * (across * min(height / width, 2) + 0.5))
+    for ax, (title, elements) in zip(axes.ravel(), maps.items(), strict=True):
+        lines = [line[:, :2] - low for line in elements.polylines]
+        draw_lines(ax, lines, elements.labels, style, style.colours(elements.labels), 1.2)
+        ax.plot(*(track - low).T, ".", color=style.muted, markersize=2.5)
+        ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")
+        finish_panel(ax, title)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter("{x:g} m")
+    labels = sorted({int(label) for elements in maps.values() for label in elements.labels})
+    lines = [Line2D([], [], color=style.colour(i), lw=2, label=style.title(i)) for i in labels]
+    figure.legend(handles=lines, loc="outside upper right", ncols=4, fontsize=8, frameon=False)
     return figure
