@@ -107,7 +107,7 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
 
 
 def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyle) -> Figure:
-    """Draw maps of one drive, one below or beside the other, each with the vehicle's way.
+    """Draw maps of one drive side by side (long ones one below the other), with the way driven.
 
     Args:
         maps: Maps in the global frame, by their titles.
@@ -117,14 +117,14 @@ def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyl
     points = np.concatenate([track, *(elements.points[:, :2] for elements in maps.values())])
     low, high = points.min(axis=0) - 5, points.max(axis=0) + 5
     width, height = high - low
-    rows = len(maps) if width > height else 1
+    rows = len(maps) if width > 2.5 * height else 1
     figure, axes = panel_grid(rows, len(maps) // rows)
     across = _WIDTH_IN * rows / len(maps) - 0.5  # without the labels
     figure.set_figheight(0.4 + rows * (across * min(height / width, 2) + 0.5))
     for ax, (title, elements) in zip(axes.ravel(), maps.items(), strict=True):
         lines = [line[:, :2] - low for line in elements.polylines]
-        draw_lines(ax, lines, elements.labels, style, style.colours(elements.labels), 1.2)
-        ax.plot(*(track - low).T, ".", color=style.muted, markersize=2.5)
+        draw_lines(ax, lines, elements.labels, style, style.colours(elements.labels), 0.8)
+        ax.plot(*(track - low).T, ".", color=style.ink, markersize=1.2)
         ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")
         finish_panel(ax, title)
         for axis in (ax.xaxis, ax.yaxis):
