@@ -10,6 +10,7 @@ from gsmap.engine.launch import (
     check_config,
     load_config,
     newest_checkpoint,
+    read_config,
 )
 
 
@@ -48,6 +49,12 @@ def test_a_missing_config_is_named():
 def test_a_misspelt_key_is_refused_with_the_right_one():
     with pytest.raises(ValueError, match=r"'optim_wraper'; did you mean 'optim_wrapper'\?"):
         check_config(Config({"optim_wraper": {}}))
+
+
+def test_a_section_that_is_none_is_refused(tmp_path):
+    (tmp_path / "a.py").write_text("test_dataloader = ['a']\n")
+    with pytest.raises(ValueError, match=r"a\.py: test_dataloader must be dict\(\.\.\.\), got"):
+        read_config(tmp_path / "a.py")
 
 
 def test_own_values_start_with_an_underscore():

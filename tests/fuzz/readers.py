@@ -240,7 +240,7 @@ class Files:
     def readers(self) -> dict[str, Callable[[], Reader]]:
         """Return what makes each reader, by name."""
         tables = ("scene", "sample", "sample_data", "ego_pose", "calibrated_sensor", "sensor",
-                  "log", "map")  # fmt: skip
+                  "log")  # fmt: skip
         town = self.work / f"maps/expansion/{self.sample.map_name}.json"
         plan = self.put("splits.json", b'{"train": ["scene-0001", "b"], "val": ["scene-0003"]}')
         byte = mutations.damaged_bytes

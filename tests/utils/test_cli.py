@@ -156,7 +156,8 @@ def test_a_full_disk_is_one_line(capsys):
     with pytest.raises(SystemExit):
         run_command(full_disk)
     assert capsys.readouterr().err == (
-        "error: [Errno 28] No space left on device; free some space there, or write elsewhere.\n"
+        "error: [Errno 28] No space left on device: '/dev/full'; free some space there, or write "
+        "elsewhere.\n"
     )
 
 

@@ -49,6 +49,10 @@ class _DataRootAction(argparse.Action):
         namespace.cfg_options = {**data_root_options(values), **given}
 
 
+_SECTIONS = {key for key in KNOWN_KEYS if key.endswith(("_cfg", "_dataloader", "_hooks"))}
+_SECTIONS = _SECTIONS - {"custom_hooks"} | {"model", "optim_wrapper", "randomness"}
+
+
 def add_config_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--data-root`` and ``--cfg-options``; both go to `read_config` as ``cfg_options``."""
     parser.add_argument(
@@ -210,7 +214,9 @@ def check_config(cfg: Config) -> None:
 
 
 def _check_keys(cfg: Config) -> None:
-    for key in cfg:
+    for key, value in cfg.items():
+        if key in _SECTIONS and not isinstance(value, dict | None):
+            raise ValueError(f"{cfg.filename}: {key} must be dict(...), got {value!r:.60}.")
         if key in KNOWN_KEYS or key.startswith("_"):
             continue
         hint = nearest(key, KNOWN_KEYS) or "; names of a config's own values start with '_'."

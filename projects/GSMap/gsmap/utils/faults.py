@@ -5,6 +5,7 @@ import re
 import traceback
 from collections.abc import Iterable
 from difflib import get_close_matches
+from io import IOBase
 from pathlib import PurePath
 from types import FrameType
 from typing import Any
@@ -98,7 +99,12 @@ def _of_a_file(error: BaseException, text: str, frames: list[FrameType]) -> str 
     """Speak of what the system or a parser says, with the file's name."""
     if isinstance(error, OSError):
         remedy = _REMEDIES.get(error.errno or 0)
-        return f"{text}; {remedy}." if remedy and text.startswith("[Errno") else text
+        if not remedy or not text.startswith("[Errno"):
+            return text
+        parts = (value for frame in reversed(frames) for value in frame.f_locals.values())
+        files = (part.name for part in parts if error.filename is None and isinstance(part, IOBase))
+        name = next((name for name in files if isinstance(name, str)), "")
+        return f"{text}{name and f': {name!r}'}; {remedy}."
     if not isinstance(error, ValueError) or type(error) is ValueError:
         return None
     names = ("self", "path", "source")
