@@ -102,9 +102,10 @@ def _of_a_file(error: BaseException, text: str, frames: list[FrameType]) -> str 
         if not remedy or not text.startswith("[Errno"):
             return text
         parts = (value for frame in reversed(frames) for value in frame.f_locals.values())
-        files = (part.name for part in parts if error.filename is None and isinstance(part, IOBase))
-        name = next((name for name in files if isinstance(name, str)), "")
-        return f"{text}{name and f': {name!r}'}; {remedy}."
+        files = (getattr(part, "name", None) for part in parts if isinstance(part, IOBase))
+        name = error.filename or next((name for name in files if isinstance(name, str)), "")
+        named = "" if not name or str(name) in text else f": {name!r}"
+        return f"{text}{named}; {remedy}."
     if not isinstance(error, ValueError) or type(error) is ValueError:
         return None
     names = ("self", "path", "source")
