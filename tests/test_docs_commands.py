@@ -1,10 +1,11 @@
-"""Every command of README and docs: its tool exists, takes its words, and what it names is there.
+"""Every command of README, docs and tools: it exists, takes its words, and names what is there.
 
 bash itself reads the blocks, with every program replaced by a function that notes its words. So
 variables, loops and comments mean what they mean to a reader; nothing is run.
 """
 
 import argparse
+import ast
 import importlib
 import re
 import runpy
@@ -23,11 +24,14 @@ from gsmap.engine.launch import check_config, parse_options, read_config
 REPO = Path(__file__).resolve().parents[1]
 PAGES = [REPO / name for name in ("README.md", "CONTRIBUTING.md", "models/README.md")]
 PAGES += sorted([*(REPO / "docs").rglob("*.md"), *(REPO / "projects").glob("*/README.md")])
-CONFIG = "configs/maptr/maptr_r18_minicity.py"
-STAND_INS = {"CONFIG": CONFIG, "ITERATIONS": "100", "GROUND_TRUTH": "truth.arrow"}
+PAGES += sorted((REPO / "tools").glob("*.py"))
+STAND_INS = {"CONFIG": "configs/maptr/maptr_r18_minicity.py", "ITERATIONS": "100"}
+STAND_INS |= {"COMMAND": "check", "GROUND_TRUTH": "truth.arrow"}
 PROGRAMS = ("python", "make", "pip", "cp", "source", "trtexec", "tools/dist_train.sh")
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(python (?:tools/\w+\.py|-m \w+) [^`]+)`")
+QUOTED = re.compile(r"``(python tools/\w+\.py [^`]+)``")
+INDENTED = re.compile(r"^ +(python .*)$", re.MULTILINE)
 COMMAND = re.compile(rf"^ *(\w+=\S+ +)?({'|'.join(map(re.escape, PROGRAMS))}|for) ", re.MULTILINE)
 HERE = re.compile(r"(configs|projects|tools|tests|benchmarks|models|docs)/[\w./-]+")
 
@@ -39,6 +43,9 @@ class Parsed(Exception):
 def script(page: Path) -> str:
     """Return the blocks that hold commands, and the inline commands, a line each."""
     text = page.read_text()
+    if page.suffix == ".py":  # a tool's docstring
+        text = (ast.get_docstring(ast.parse(text)) or "").replace("\\\n", " ")
+        return "\n".join([*QUOTED.findall(text.replace("\n", " ")), *INDENTED.findall(text)])
     shell = [block for language, block in FENCED.findall(text) if language in ("", "bash", "sh")]
     fenced = [block for block in shell if COMMAND.search(block)]
     return "\n".join([*fenced, *INLINE.findall(text.replace("\n", " "))])
@@ -50,13 +57,15 @@ def words_of(block: str) -> list[list[str]]:
     functions = "".join(f"{name}() {{ {note.format(name)}}}\n" for name in PROGRAMS)
     unknown = f"command_not_found_handle() {{ {note.format('')}}}\n"
     shell = str(shutil.which("bash"))
+    for word, stand_in in STAND_INS.items():
+        block = re.sub(rf"\b{word}\b", stand_in, block)
     done = subprocess.run(
         [shell, "-f", "-c", functions + unknown + block],
         env={"PATH": ""}, text=True, capture_output=True, check=False,
     )  # fmt: skip
     assert not done.stderr, f"{block}\n{done.stderr}"
     commands = [part.strip("\0").split("\0") for part in done.stdout.split("\n\0") if part]
-    return [[STAND_INS.get(word, word) for word in words if word != "..."] for words in commands]
+    return [[word for word in words if word != "..."] for words in commands]
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -113,9 +122,10 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     program, *rest = words
     named = {word for text in words for word in re.split("[=,]", text) if HERE.fullmatch(word)}
     assert not [word for word in named - MADE if not (REPO / word).exists()], words
-    if names_alone(words):
+    if rest[-1] == "--help" or names_alone(words):
+        name, *asked = rest[1:] if rest[0] == "-m" else rest
         with pytest.raises(SystemExit, match="0"):
-            parse(words[2], [words[3], "--help"], monkeypatch)
+            parse(name, [*asked, "--help"], monkeypatch)
     elif program == "python" and rest[0] == "-m" and rest[1] != "pytest":
         parse(rest[1], rest[2:], monkeypatch)
     elif program == "python" and rest[0].startswith("tools/") and rest[0] != "tools/watch.py":

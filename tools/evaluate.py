@@ -2,9 +2,9 @@
 """Score the result file of any model: AP_chamfer and AP_raster.
 
 Examples:
-    python tools/evaluate.py results.json data/nuscenes/annotations_val.arrow --eval chamfer raster
+    python tools/evaluate.py results.json data/nuscenes/gsmap_nuscenes_val.arrow --eval chamfer raster
     python tools/evaluate.py results.json nuscenes_map_anns_val.json --eval chamfer --hard
-    python tools/evaluate.py annotations_val.arrow --prior annotations_train.arrow
+    python tools/evaluate.py gsmap_nuscenes_val.arrow --prior gsmap_nuscenes_train.arrow
 """
 
 # ruff: noqa: E402 - numpy reads these variables when it is imported

@@ -168,14 +168,14 @@ def test_lidar_points_are_in_the_annotation_frame(inferencer, tmp_path):
 
 
 def test_absent_camera_is_an_error_or_sees_nothing(inferencer, tmp_path):
-    samples = make_samples(tmp_path, 1)
+    samples = make_samples(tmp_path, 2)
     samples[0].cameras = samples[0].cameras[1:]
     dataset = inferencer.dataset(samples, tmp_path)
     with pytest.raises(
         ValueError, match=r"'t0' lacks the cameras \['CAM_FRONT'\].*--allow-missing"
     ):
         list(inferencer.predict(dataset))
-    (found,) = inferencer.predict(dataset, allow_missing_cameras=True)
+    found, _ = inferencer.predict(dataset, allow_missing_cameras=True)
     assert found.metainfo["cam_names"] == list(NAMES)
     assert found.metainfo["img_path"][0] is None
     assert found.metainfo["lidar2img"].shape == (2, 4, 4)
@@ -184,6 +184,20 @@ def test_absent_camera_is_an_error_or_sees_nothing(inferencer, tmp_path):
         (found.metainfo["lidar2img"][0] @ corners.T)[2] < 0
     ).all()  # all behind the blank camera
     assert len(inferencer.visualizer.cameras(found.metainfo)) == 1
+
+
+def test_cameras_that_no_sample_has_cost_nothing(inferencer, tmp_path):
+    """A single camera is one image, not one and blank ones; what is found is the same."""
+    samples = make_samples(tmp_path, 2)
+    samples[0].cameras = samples[0].cameras[1:]
+    blank, _ = inferencer.predict(inferencer.dataset(samples, tmp_path), None, 1, 0, True)
+    (single,) = inferencer.predict(inferencer.dataset(samples[:1], tmp_path), None, 1, 0, True)
+    assert single.metainfo["cam_names"] == ["CAM_BACK"]
+    assert len(single.metainfo["lidar2img"]) == 1
+    for name in ("pts", "scores_3d"):  # float32 sums over one and over two cameras
+        found, expected = single.pred_instances_3d[name], blank.pred_instances_3d[name]
+        torch.testing.assert_close(found, expected, atol=1e-3, rtol=0)
+    assert len(inferencer(make_samples(tmp_path, 1), tmp_path)[0].metainfo["lidar2img"]) == 2
 
 
 def test_truncated_and_missing_images_are_named(inferencer, tmp_path):

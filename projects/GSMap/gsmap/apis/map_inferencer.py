@@ -191,21 +191,35 @@ class MapInferencer:
             return trained
         return list(found)
 
-    def _fit_cameras(self, dataset: VectorizedMapDataset) -> None:
-        """Give each camera the embedding of the model's camera that looks most like it."""
+    def _fit_cameras(
+        self, dataset: VectorizedMapDataset, allow_missing_cameras: bool
+    ) -> VectorizedMapDataset:
+        """Leave out cameras that no sample has, and fit the model's cameras to the others.
+
+        Each gets its own embedding, or that of the model's camera that looks most like it.
+        """
         trained = self.cfg.test_dataloader.dataset.get("cameras")
-        if self._camera_embeds is None or trained is None or dataset.cameras is None:
-            return
-        rows = list(range(len(self._camera_embeds)))
-        if set(dataset.cameras).isdisjoint(trained):
+        names = dataset.cameras
+        if trained is None or names is None:
+            return dataset
+        if allow_missing_cameras:
+            seen = {c.name for i in range(len(dataset)) for c in dataset.sample(i).cameras}
+            dataset = copy.copy(dataset)
+            dataset.cameras = names = tuple(name for name in names if name in seen) or names
+        if self._camera_embeds is None:
+            return dataset
+        if set(names) <= set(trained):
+            rows = [list(trained).index(name) for name in names]
+        else:
             sample = max(
                 (dataset.sample(i) for i in range(min(len(dataset), _LOOK_AT))),
                 key=lambda sample: len(sample.cameras),
             )
-            rows = similar_cameras(sample, dataset.metainfo["frame"], dataset.cameras, trained)
+            rows = similar_cameras(sample, dataset.metainfo["frame"], names, trained)
         for replica, device in zip(self.replicas, self.devices, strict=True):
             embeds = self._camera_embeds.detach()[rows].to(device)
             replica.bev_encoder.cams_embeds = torch.nn.Parameter(embeds)
+        return dataset
 
     def _annotation_file(self, samples: Sequence[MapSample], frame: str, has_poses: bool) -> Path:
         """Write samples to an annotation file that lives as long as the inferencer."""
@@ -266,7 +280,8 @@ class MapInferencer:
             indices: Which samples; all by default.
             batch_size: Samples per forward pass.
             num_workers: Processes that read images.
-            allow_missing_cameras: Whether cameras that a sample lacks are left blank.
+            allow_missing_cameras: Whether cameras that a sample lacks are left blank; those that no
+                sample has are left out.
             on_broken: Called with each sample that cannot be used, which is then left out; None
                 lets it be an error.
 
@@ -276,7 +291,7 @@ class MapInferencer:
         Raises:
             ValueError: If a file of a sample is missing or damaged, or a camera is absent.
         """
-        self._fit_cameras(dataset)
+        dataset = self._fit_cameras(dataset, allow_missing_cameras)
         frames = BlankCameraDataset(dataset, allow_missing_cameras)
         batches = frame_batches(frames, indices, batch_size, num_workers)
         with ExitStack() as stack:
