@@ -163,7 +163,7 @@ def test_rerun_recording_holds_cameras_lines_and_gaussians(tmp_path, camera_driv
 
 def test_a_film_shows_every_frame_at_the_pace_of_the_drive(tmp_path, camera_drive, true):
     """H.264 of 4:2:0, which players take; a map has a panel of its own and grows."""
-    drive, root = camera_drive
+    drive, _ = camera_drive
     for number, value in enumerate((40, 120, 200)):
         Image.new("RGB", (400, 225), (value, value, value)).save(tmp_path / f"{number}.jpg")
     frames = [

@@ -18,8 +18,6 @@ SampleMatches = dict[str, FrameMatches]  # by the name of the metric
 class MapEvaluator:
     """Which metrics to compute, and how: ``match`` each sample, then make ``reports`` of all.
 
-    Matches take a few kilobytes a sample and may come from several processes.
-
     Args:
         chamfer: Rules of AP_chamfer, or None to leave it out.
         raster: Rules of AP_raster, or None to leave it out.

@@ -85,11 +85,7 @@ def ranked_predictions(
 
 
 def unique_by_token(matches: Iterable[FrameMatches]) -> list[FrameMatches]:
-    """Return one record per token, in the order of the tokens.
-
-    Samples that a sampler repeated to fill the last batch are counted once, and no figure depends
-    on the order of the samples or on the process that saw them.
-    """
+    """Return one record per token, sorted: no figure depends on repeats, order or processes."""
     first = {record.token: record for record in reversed(list(matches))}
     return [first[token] for token in sorted(first)]
 

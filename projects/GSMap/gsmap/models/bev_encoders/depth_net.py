@@ -77,11 +77,7 @@ class ASPP(nn.Module):
 class CameraAwareDepthNet(nn.Module):
     """Predict D depth logits and C context features, both gated by the camera's parameters.
 
-    Args:
-        in_channels: Channels of the image features.
-        context_channels: Channels C of the context.
-        depth_channels: Number of depth bins D.
-        aspp_channels: Channels of each branch of the depth head's pyramid.
+    ``aspp_channels`` are those of each branch of the depth head's pyramid.
     """
 
     def __init__(

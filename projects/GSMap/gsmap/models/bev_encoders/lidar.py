@@ -90,14 +90,7 @@ class LidarEncoder(BaseModule):
 
 @MODELS.register_module()
 class ConvFuser(ConvModule):
-    """One convolution over the concatenated BEV features of cameras and LiDAR.
-
-    Args:
-        camera_channels: Channels of the cameras' features.
-        lidar_channels: Channels of the LiDAR's features.
-        out_channels: Channels of the result.
-        kwargs: Further arguments of mmcv's ``ConvModule``.
-    """
+    """One convolution over the joined BEV features of cameras and LiDAR (mmcv's ``ConvModule``)."""
 
     def __init__(
         self, camera_channels: int, lidar_channels: int, out_channels: int, **kwargs: Any

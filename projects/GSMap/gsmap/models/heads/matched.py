@@ -31,15 +31,8 @@ class MatchedPairs:
     ``gt.pts``, normalised, in the matched order (M, P, 2); ``pred.masks``, rendered from the
     Gaussians, and ``gt.masks`` (M, H, W); ``gt.samples``, the sample's number in the batch (M,);
     ``gt.inds``, the ground truth's number in its sample (M,); ``gt.counts``, each sample's number
-    of pairs, Python integers; ``bev_feats`` of the batch (B, C, H, W).
-
-    Args:
-        predictions: Predictions of one layer, per sample.
-        gts: Prepared ground truths, per sample.
-        matches: Their matches, per sample.
-        reference: What the predictions' references mean.
-        masks: How masks are made.
-        bev_feats: BEV features, for losses that read them. (B, C, H, W)
+    of pairs, Python integers; ``bev_feats`` of the batch (B, C, H, W). Predictions of one layer,
+    prepared ground truths and their matches are given per sample.
 
     Attributes:
         avg_factor: Matched elements in the batch, averaged over ranks, at least 1. ()

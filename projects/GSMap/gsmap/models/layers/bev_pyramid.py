@@ -4,11 +4,7 @@ from torch import Tensor, nn
 
 
 class PatchMerging(nn.Module):
-    """Halve a map: the channels of 2 x 2 cells are joined, normalised and mixed (MGMapNet).
-
-    Args:
-        embed_dims: Channels C of the map and of the output.
-    """
+    """Halve a map: the C channels of 2 x 2 cells are joined, normalised and mixed (MGMapNet)."""
 
     def __init__(self, embed_dims: int) -> None:
         super().__init__()
@@ -34,12 +30,8 @@ class PatchMerging(nn.Module):
 class BEVPyramid(nn.Module):
     """BEV features, and the same at half the resolution, a quarter and so on.
 
-    Args:
-        embed_dims: Channels C.
-        num_levels: Number of levels; 1 adds nothing.
-
     Raises:
-        ValueError: If there is no level.
+        ValueError: If there is no level; one level adds nothing.
     """
 
     def __init__(self, embed_dims: int = 256, num_levels: int = 2) -> None:

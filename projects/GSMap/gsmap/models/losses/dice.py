@@ -94,8 +94,8 @@ class RenderedDiceLoss(nn.Module):
     ) -> Tensor:
         """Return the weighted sum over ``avg_factor``, or the mean over the n pairs without it.
 
-        Normalised points (n, P, 2), the ground truth's in their first order; a pair is rendered as
-        its ground truth's class (n,). 0 with a gradient of 0 if nothing is matched.
+        Points are normalised (n, P, 2), the ground truth's in their first order; a pair is rendered
+        as its ground truth's class (n,). 0 with a gradient of 0 if nothing is matched.
         """
         if not len(pred_points):
             return pred_points.float().sum() * 0

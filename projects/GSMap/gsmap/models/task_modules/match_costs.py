@@ -29,11 +29,7 @@ def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
 
 @TASK_UTILS.register_module()
 class OrderedPointsCost:
-    """L1 distance to the closest equivalent point order (MapTR Eq. 5).
-
-    Args:
-        weight: Factor of the cost.
-    """
+    """L1 distance to the closest equivalent point order (MapTR Eq. 5), times a weight."""
 
     reads = ("pred.pts", "gt.pts_shifts")
 
