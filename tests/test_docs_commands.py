@@ -162,7 +162,7 @@ def test_every_command_is_understood(page: Path, monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     "block",
     [
-        "python tools/trian.py CONFIG",
+        "python tools/trainer.py CONFIG",
         "python tools/test.py CONFIG CHECKPOINT --evil chamfer",
         "C=configs/maptr/nowhere.py\npython tools/train.py $C",
         "python tools/train.py CONFIG --cfg-options train_cgf.max_epochs=2",
