@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import shapely
-from PIL import Image, UnidentifiedImageError
 
 from gsmap.converters.local_map import POLYGON, vertices_of
 from gsmap.datasets.annotations.file import check_samples, write_annotations
@@ -22,6 +21,7 @@ from gsmap.datasets.annotations.record import (
     SweepRecord,
 )
 from gsmap.datasets.errors import naming
+from gsmap.datasets.image_size import image_size
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.shards import WHOLE, Shard
 
@@ -140,22 +140,6 @@ def _camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
         )
         camera = {**camera, "width": width, "height": height}
     return _record(CameraRecord, camera)
-
-
-def image_size(file: Path, where: str) -> tuple[int, int]:
-    """Return an image's width and height.
-
-    Raises:
-        FileNotFoundError: If it is missing.
-        ValueError: If it is not an image.
-    """
-    if not file.is_file():
-        raise FileNotFoundError(f"{where}: no image at {file}; paths are relative to data_root.")
-    try:
-        with Image.open(file) as image:
-            return image.size
-    except UnidentifiedImageError as error:
-        raise ValueError(f"{where}: {file} is not an image; fetch it again.") from error
 
 
 def _label(label: Any, meta: AnnotationMeta) -> int:

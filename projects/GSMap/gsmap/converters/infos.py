@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from gsmap.converters.command_line import add_range_options
-from gsmap.converters.custom import image_size
 from gsmap.converters.nuscenes.can_bus import pose_signals
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, expansion, open_layers
 from gsmap.converters.nuscenes.tables import pose_of
@@ -32,6 +31,7 @@ from gsmap.datasets.annotations.record import (
     SweepRecord,
 )
 from gsmap.datasets.errors import naming
+from gsmap.datasets.image_size import image_size
 from gsmap.datasets.plain_pickle import load_plain_pickle
 from gsmap.utils.cli import output_file
 from gsmap.utils.progress import Progress

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from PIL import Image
 
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
+from gsmap.datasets.image_size import image_size
 from gsmap.inputs.frames import ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
@@ -128,8 +128,7 @@ def image_warnings(sample: MapSample, data_root: Path) -> list[str]:
     for camera in sample.cameras:
         path = data_root / camera.path
         if path.is_file():
-            with Image.open(path) as picture:
-                size = picture.size
+            size = image_size(path, f"camera {camera.name!r}")
             if size != (camera.width, camera.height):
                 found.append(
                     f"camera {camera.name!r} has images of {size[0]} x {size[1]} pixels, but is "

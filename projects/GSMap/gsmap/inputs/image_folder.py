@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import yaml
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError, naming
+from gsmap.datasets.image_size import image_size
 from gsmap.datasets.transforms.images import read_image
 from gsmap.inputs.rig import PoseTrack, RigCamera, RigFrame, nearest_images, rig_samples
 from gsmap.structures.rigid import invert_rigid, is_rigid
@@ -110,11 +110,7 @@ def _camera(
         given = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     if given.shape != (3, 3):
         raise ValueError(f"intrinsics must be [fx, fy, cx, cy] or 3 x 3, got {given.shape}")
-    if "size_px" in camera:
-        width, height = camera["size_px"]
-    else:
-        with Image.open(images[0]) as picture:
-            width, height = picture.size
+    width, height = camera.get("size_px") or image_size(images[0], f"camera {name!r}")
     return RigCamera(
         name,
         given,

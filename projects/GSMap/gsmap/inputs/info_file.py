@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from gsmap.datasets.annotations.file import check_samples
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
 from gsmap.datasets.errors import naming
+from gsmap.datasets.image_size import image_size
 from gsmap.datasets.plain_pickle import load_plain_pickle
 
 _REMEDY = (
@@ -83,11 +83,7 @@ def _camera(name: str, info: Mapping[str, Any], root: Path, where: str) -> Camer
     """Read one camera's record."""
     what = f"{where}, camera {name}"
     path = _locate(info["img_path"], name, root, what)
-    try:
-        with Image.open(root / path) as image:
-            width, height = image.size
-    except UnidentifiedImageError as error:
-        raise ValueError(f"{what}: {root / path} is not an image; fetch it again.") from error
+    width, height = image_size(root / path, what)
     return CameraRecord(
         name=name,
         path=path.as_posix(),

@@ -5,7 +5,6 @@ from pathlib import Path
 from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables, SampleReader
 from gsmap.datasets.annotations.record import MapSample
-from gsmap.structures.rigid import invert_rigid
 
 
 def versions_in(root: Path) -> list[str]:
@@ -29,13 +28,10 @@ def read_nuscenes(root: Path, version: str | None = None) -> list[MapSample]:
     if version is not None and version not in found:
         raise ValueError(f"{root} holds no version {version!r}, but {found}.")
     tables = NuScenesTables(version or found[0], root, with_sweeps=True)
-    reader, can_bus, samples = SampleReader(tables, max_sweeps=10), CanBusReader(root), []
-    for scene in tables.scene:
-        for record in tables.samples_of(scene):
-            if LIDAR in record["data"]:
-                sample = reader.read(record, scene)
-                assert sample.ego_from_frame is not None  # nuScenes calibrates every sensor
-                pose = sample.global_from_frame @ invert_rigid(sample.ego_from_frame)
-                sample.can_bus = can_bus.signals(sample.scene, sample.timestamp_ns, pose)
-                samples.append(sample)
-    return samples
+    reader = SampleReader(tables, 10, CanBusReader(root))
+    return [
+        reader.read(record, scene)
+        for scene in tables.scene
+        for record in tables.samples_of(scene)
+        if LIDAR in record["data"]
+    ]

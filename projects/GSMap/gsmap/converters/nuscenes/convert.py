@@ -28,7 +28,6 @@ from gsmap.converters.splits import Positions, overlap_notes, read_split_file, r
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
-from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 
@@ -140,8 +139,8 @@ class _Conversion:
         self.options = options
         self.summary = ConversionSummary(options.classes)
         self.tables = NuScenesTables(options.version, options.root, options.max_sweeps > 0)
-        self.reader = SampleReader(self.tables, options.max_sweeps)
         self.can_bus = CanBusReader(options.root)
+        self.reader = SampleReader(self.tables, options.max_sweeps, self.can_bus)
         self.splits = _splits(options, self.tables, self.summary)
         self.positions: Positions = {split: defaultdict(list) for split in self.splits}
 
@@ -194,9 +193,6 @@ class _Conversion:
                 continue
             sample = self.reader.read(record, scene)
             self._count_missing(sample)
-            assert sample.ego_from_frame is not None  # nuScenes calibrates every sensor
-            pose = sample.global_from_frame @ invert_rigid(sample.ego_from_frame)
-            sample.can_bus = self.can_bus.signals(sample.scene, sample.timestamp_ns, pose)
             samples.append(sample)
         return samples
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from pyquaternion import Quaternion
 
+from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
 from gsmap.structures.rigid import invert_rigid
 
@@ -253,11 +254,13 @@ class SampleReader:
     Args:
         tables: The opened tables.
         max_sweeps: How many earlier LiDAR sweeps a sample lists at most.
+        can_bus: The vehicle's signals; None leaves them unknown.
     """
 
-    def __init__(self, tables: NuScenesTables, max_sweeps: int) -> None:
-        self._tables = tables
-        self._max_sweeps = max_sweeps
+    def __init__(
+        self, tables: NuScenesTables, max_sweeps: int, can_bus: CanBusReader | None = None
+    ) -> None:
+        self._tables, self._max_sweeps, self._can_bus = tables, max_sweeps, can_bus
 
     def _global_from(self, data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Return global-from-sensor and ego-from-sensor of a sensor record. each (4, 4)."""
@@ -268,6 +271,10 @@ class SampleReader:
         """Read a sample in the frame of its LiDAR, without instances and absent cameras."""
         lidar = self._tables.get("sample_data", sample["data"][LIDAR])
         global_from_frame, ego_from_frame = self._global_from(lidar)
+        signals = None
+        if self._can_bus is not None:
+            pose = global_from_frame @ invert_rigid(ego_from_frame)
+            signals = self._can_bus.signals(scene["name"], sample["timestamp"] * 1000, pose)
         return MapSample(
             token=sample["token"],
             scene=scene["name"],
@@ -277,6 +284,7 @@ class SampleReader:
             global_from_frame=global_from_frame,
             lidar=LidarRecord(lidar["filename"], np.eye(4), self._sweeps(lidar, global_from_frame)),
             ego_from_frame=ego_from_frame,
+            can_bus=signals,
         )
 
     def _cameras(self, sample: dict[str, Any], global_from_frame: np.ndarray) -> list[CameraRecord]:
