@@ -9,6 +9,7 @@ Examples:
 
 import argparse
 import json
+import time
 from functools import partial
 from pathlib import Path
 
@@ -157,15 +158,18 @@ def main(argv: list[str] | None = None) -> str:
             f"the samples of {args.ann} have no poses, so there is no map of the drive: --formats "
             "mp4 shows the single frames."
         )
-    drives, merged = [], []
+    drives, merged, spent_s = [], [], 0.0
     for scene in args.scene or sorted(set(ann.column("scene"))):
         drives.append(confident(read_drive(ann, scene, results), args.score_thr))
+        start_s = time.process_time()
         merged.append(merge(drives[-1], config) if has_poses else MapElements.from_polylines())
+        spent_s += time.process_time() - start_s
         for path in write_map(args.out / scene, args, ann, drives[-1], merged[-1]):
             print(f"{len(merged[-1])} elements of {len(drives[-1].frames)} frames: {path}")
     if has_truth(ann):
         score(drives, merged, ann, args.out)
-    return f"{len(drives)} drives"
+    frames = sum(len(drive.frames) for drive in drives)
+    return f"{len(drives)} drives, {frames} frames, merged in {spent_s:.1f} s of processor time"
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import argparse
 import sys
 from contextlib import nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from mmdet3d.structures import Det3DDataSample
 
@@ -36,6 +37,7 @@ from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
 
+_ONE_SAMPLE_HZ = 1e-4
 SKIPPED = DOUBTFUL = 1  # exit code when frames were broken, or a calibration is implausible
 
 
@@ -101,16 +103,15 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     return args
 
 
-def read_input(args: argparse.Namespace) -> Source:
-    """Open the input and say what its reader has to say."""
-    out = args.out or args.check_calibration
-    place = out.with_suffix("") if out else args.show_dir / "input"
+def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
+    """Open the input and say what its reader has to say; with a folder for frames, few samples."""
+    place = args.out.with_suffix("") if args.out else (args.show_dir or Path()) / "input"
     options = InputOptions(
         data_root=args.data_root,
         allow_missing_cameras=args.allow_missing_cameras,
         version=args.version,
-        rate_hz=args.rate,
-        frames_dir=place.with_name(f"{place.name}_frames"),
+        rate_hz=args.rate if frames is None else _ONE_SAMPLE_HZ,
+        frames_dir=frames or place.with_name(f"{place.name}_frames"),
         vehicle_frame=args.vehicle_frame,
         vehicle_ground_z_m=args.vehicle_ground_z,
     )
@@ -211,9 +212,9 @@ def main(argv: list[str] | None = None) -> str | None:
     if args.executor:
         return run_on_ray(args, sys.argv)
     if args.check_calibration:
-        if check_calibration(args, read_input(args)):
-            sys.exit(DOUBTFUL)
-        return
+        with TemporaryDirectory() as frames:
+            doubts = check_calibration(args, read_input(args, Path(frames)))
+        sys.exit(DOUBTFUL if doubts else 0)
     if not args.out and not args.show_dir:
         raise ValueError("Nothing to do: give --out FILE, --show-dir FOLDER, or both.")
     if args.width is not None and args.width < 1:

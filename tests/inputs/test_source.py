@@ -2,6 +2,7 @@
 
 import json
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,11 +10,14 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from gsmap.converters.argoverse2.log import Argoverse2Log
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.inputs.frames import ground_from_frame, reframed
 from gsmap.inputs.source import InputOptions, open_input
 from gsmap.structures.rigid import invert_rigid
 from gsmap.visualization.frame_view import FRAME_VIEWS
+
+LOG = Path("av2/sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede")
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +70,34 @@ def test_another_frame_sees_the_same_cameras_and_ground(town):
         np.testing.assert_allclose(
             in_cameras, [camera.cam_from_frame @ expected for camera in sample.cameras], atol=1e-9
         )
+
+
+def test_an_argoverse_2_log_needs_no_map(tmp_path, shared_dir):
+    """A real log's calibration and poses; images at three times of its poses, 0.6 s apart."""
+    log_dir, real = tmp_path / "sensor/val" / LOG.name, Argoverse2Log(shared_dir / LOG)
+    log_dir.mkdir(parents=True)
+    for name in ("calibration", "city_SE3_egovehicle.feather"):
+        (log_dir / name).symlink_to(real.log_dir / name)
+    with pytest.raises(ValueError, match=r"no sample can be read from .* no images of ring_front"):
+        open_input(tmp_path)
+    poses = real.poses.timestamps_ns
+    times = [int(poses[np.searchsorted(poses, poses[0] + i * 600_000_000)]) for i in range(3)]
+    for name in real.calibration:
+        (log_dir / "sensors/cameras" / name).mkdir(parents=True)
+        for time_ns in times:
+            (log_dir / f"sensors/cameras/{name}/{time_ns}.jpg").touch()
+    for path in (tmp_path, log_dir):
+        source = open_input(path)
+        assert source.frame == "ego"
+        assert [s.timestamp_ns for s in source.samples] == times
+        sample = source.samples[1]
+        np.testing.assert_array_equal(sample.global_from_frame, real.poses.at(times[1]))
+        assert {c.name for c in sample.cameras} == set(real.calibration)
+        for camera in sample.cameras:
+            assert (source.data_root / camera.path).is_file()
+            expected = real.calibration[camera.name].ego_SE3_cam.inverse().transform_matrix
+            np.testing.assert_allclose(camera.cam_from_frame, expected, atol=1e-9)
+    assert len(open_input(tmp_path, InputOptions(rate_hz=1.0)).samples) == 2
 
 
 def image_folder(folder, sample, root, number=0):

@@ -71,7 +71,7 @@ def read_bag(
     highlevel = import_extra("rosbags.highlevel", "bags")
     typesys = import_extra("rosbags.typesys", "bags")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    with naming(path, "record it again, or see docs/inference.md"):
+    with naming(path, "see docs/inference.md"):
         try:
             with highlevel.AnyReader([path], default_typestore=store) as bag:
                 return _read(bag, path, frames_dir, rate_hz, vehicle_frame, ground_z_m)
