@@ -19,8 +19,8 @@ from gsmap.visualization.camera_projection import project_polygon, project_segme
 from gsmap.visualization.frame_view import FrameView
 from gsmap.visualization.style import MapStyle
 
-_STEP_M = 1.0  # a line's width follows its depth in steps of this length
-_WIDTH_STEP = 0.12  # widths differ by this share, so that lines are few paths
+_STEP_M = 2.0  # a line's width follows its depth in steps of this length
+_WIDTH_STEP = 0.2  # widths differ by this share, so that lines are few paths
 _NOMINAL_SIZE_IN = 2.4  # on a panel of this size (root of its area) lines have the style's widths
 
 
@@ -145,12 +145,6 @@ def _draw_areas(
     ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=3))
 
 
-def _corners(points: np.ndarray) -> np.ndarray:
-    """Leave out what lies on the straight line between its neighbours. (n, 2) -> (m, 2)"""
-    (ux, uy), (vx, vy) = np.diff(points[:-1], axis=0).T, np.diff(points[1:], axis=0).T
-    return points[np.hstack([True, np.abs(ux * vy - uy * vx) > 1e-3, True])]
-
-
 def _draw_polylines(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
@@ -162,26 +156,17 @@ def _draw_polylines(
     segments, depth_m, index = project_segments(starts, ends, camera.img_from_frame, camera.size_px)
     box = ax.get_window_extent()
     scale = np.sqrt(box.width * box.height) / ax.figure.dpi / _NOMINAL_SIZE_IN
-    level = np.rint(0.6 * np.log(10 / np.maximum(depth_m, 0.1)) / _WIDTH_STEP)
-    thinning = np.exp(_WIDTH_STEP * level).clip(0.45, 2.6)
-    joined = np.isclose(segments[1:, 0], segments[:-1, 1]).all(axis=1)
-    joined &= (thinning[1:] == thinning[:-1]) & (owner[index[1:]] == owner[index[:-1]])
-    first = np.flatnonzero(np.append(True, ~joined))[: len(segments)]  # of each piece
-    paths: dict[tuple[float, int], list[Outline]] = {}
-    for piece, kind in zip(
-        np.split(segments, first)[1:],
-        zip(thinning[first].tolist(), owner[index[first]].tolist(), strict=True),
-        strict=True,
-    ):
-        paths.setdefault(kind, []).append(
-            Outline(_corners(np.append(piece[:, 0], piece[-1:, 1], 0)))
-        )
-    widths = scale * style.camera_line_pt * np.array([width for width, _ in paths])
+    level = np.rint(0.6 * np.log(10 / np.maximum(depth_m, 0.1)) / _WIDTH_STEP).astype(int)
+    kinds, kind = np.unique(np.c_[owner[index], level], axis=0, return_inverse=True)
+    parts = [segments[kind == i] for i in range(len(kinds))]  # one path per class and width
+    codes = [Outline.MOVETO, Outline.LINETO]
+    paths = [Outline(np.concatenate(part), codes * len(part)) for part in parts]
+    thinning = np.exp(_WIDTH_STEP * kinds[:, 1]).clip(0.45, 2.6)
+    widths = scale * style.camera_line_pt * thinning
     halo = mcolors.to_rgba(style.halo, 0.55)
-    colours = style.colours(label for _, label in paths)
-    for colour, extra, zorder in ((halo, 1.1, 4), (colours, 0.0, 5)):
+    for colour, extra, zorder in ((halo, 1.1, 4), (style.colours(kinds[:, 0]), 0.0, 5)):
         lines = PathCollection(
-            [Outline.make_compound_path(*parts) for parts in paths.values()],
+            paths,
             facecolors="none",
             edgecolors=colour,
             linewidths=widths + extra * scale,

@@ -262,11 +262,11 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
 def _compact(svg: bytes) -> bytes:
     """Shorten an SVG to its half: images as JPEG, long numbers with two decimals, fewer blanks."""
     svg = _LONG_NUMBER.sub(rb"\1", _PNG_IN_SVG.sub(_as_jpeg, svg))
-    return svg.replace(b" \nL ", b"L").replace(b" \nC ", b"C")
+    return re.sub(rb" \n([MLC]) ", rb"\1", svg)
 
 
 def _as_jpeg(image: re.Match[bytes]) -> bytes:
     """Turn an image in an SVG from PNG to JPEG."""
     pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image[1]), np.uint8), cv2.IMREAD_COLOR)
-    jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 70])[1]
+    jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 65])[1]
     return b"data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes())
