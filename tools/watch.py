@@ -5,11 +5,11 @@ Plugins of other packages are left out. The plugin of open3d, which mmdet3d inst
 usual command on machines without libusb.
 """
 
-import sys
-
 from absl import app
 from tensorboard import default, main_lib, program
 from tensorboard.plugins.base_plugin import FlagsError
+
+from gsmap.utils.cli import run_command
 
 
 def main() -> None:
@@ -18,8 +18,8 @@ def main() -> None:
     try:
         app.run(board.main, flags_parser=board.configure)
     except FlagsError as error:
-        sys.exit(f"error: {error}")
+        raise ValueError(str(error)) from error
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main, heed_kill=False)

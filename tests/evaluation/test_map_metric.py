@@ -54,6 +54,21 @@ def test_figures_through_the_runner_do_not_count_padding():
     assert metrics["raster/num_samples"] == 3
 
 
+def test_a_full_disk_does_not_take_the_figures(monkeypatch):
+    shown = []
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(map_metric, "write_results", full)
+    monkeypatch.setattr(map_metric, "format_table", lambda report: shown.append(report.name))
+    evaluator = build(out_file="results.json")
+    evaluator.process([sample("a", 0.1)])
+    with pytest.raises(OSError, match="No space left"):
+        evaluator.evaluate(1)
+    assert shown == ["chamfer", "raster"]
+
+
 def test_any_order_and_any_split_over_ranks_gives_the_same_digits(monkeypatch):
     samples = [sample(f"s{i}", 0.07 * i) for i in range(9)]
     alone = build()

@@ -7,6 +7,8 @@ import runpy
 import sys
 from pathlib import Path
 
+from gsmap.utils.cli import BAD_INPUT
+
 TOOLS = Path(__file__).resolve().parents[3] / "tools"
 
 
@@ -20,7 +22,8 @@ def main() -> None:
         lines = ["usage: gsmap COMMAND ...", "", "gsmap COMMAND --help says more:", *commands]
         sys.stdout.write("\n  ".join(lines) + "\n")
     elif name not in commands:
-        sys.exit(f"error: there is no command {name}; there are {', '.join(commands)}.")
+        sys.stderr.write(f"error: there is no command {name}; there are {', '.join(commands)}.\n")
+        sys.exit(BAD_INPUT)
     else:
         del sys.argv[0]
         sys.argv[0] = str(TOOLS / f"{name}.py")
