@@ -161,8 +161,8 @@ def _draw_truth(
 def _draw_order(ax: Axes, lines: list[np.ndarray], colours: list[str]) -> None:
     """Mark the first vertex with a ring and the direction with an arrow head at the middle."""
     x, y = np.stack([line[0] for line in lines]).T
-    ax.scatter(x, y, s=20, facecolors="white", edgecolors=colours, linewidths=1.1, zorder=13)
-    head = {"arrowstyle": "-|>", "lw": 0, "mutation_scale": 9, "shrinkA": 0, "shrinkB": 0}
+    ax.scatter(x, y, s=13, facecolors="white", edgecolors=colours, linewidths=1.0, zorder=13)
+    head = {"arrowstyle": "-|>", "lw": 0, "mutation_scale": 8.5, "shrinkA": 0, "shrinkB": 0}
     for line, colour in zip(lines, colours, strict=True):
         middle = max(len(line) // 2, 1)
         start, end = tuple(line[middle - 1]), tuple(line[middle])

@@ -89,7 +89,7 @@ def _layout(
         slope = sum(1 / sum(row) for row in rows)
         offset = _GAP * (len(rows) - 1) - sum(_GAP * (len(row) - 1) / sum(row) for row in rows)
         frame = _TITLE + _TICKS  # px above and below the panel
-        taken = 2 * _TICKS + aspect * (offset - frame)
+        taken = 1.3 * _TICKS + aspect * (offset - frame)
         boxes, bottom = _camera_boxes(rows, (_USABLE - taken) / (1 + aspect * slope))
         height = bottom - _GAP - _HEADER - frame
         left = _WIDTH - _MARGIN - height * aspect
