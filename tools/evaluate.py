@@ -2,7 +2,7 @@
 """Score the result file of any model: AP_chamfer and AP_raster.
 
 Examples:
-    python tools/evaluate.py results.json data/nuscenes/gsmap_nuscenes_val.arrow --eval chamfer raster
+    python tools/evaluate.py results.json gsmap_nuscenes_val.arrow --eval chamfer raster
     python tools/evaluate.py results.json nuscenes_map_anns_val.json --eval chamfer --hard
     python tools/evaluate.py gsmap_nuscenes_val.arrow --prior gsmap_nuscenes_train.arrow
 """
