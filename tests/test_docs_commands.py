@@ -27,10 +27,9 @@ PAGES += sorted([*(REPO / "docs").rglob("*.md"), *(REPO / "projects").glob("*/RE
 PAGES += sorted((REPO / "tools").glob("*.py"))
 STAND_INS = {"CONFIG": "configs/maptr/maptr_r18_minicity.py", "ITERATIONS": "100"}
 STAND_INS |= {"COMMAND": "check", "GROUND_TRUTH": "truth.arrow"}
-PROGRAMS = (
-    "python", "make", "pip", "cp", "source", "trtexec", "tools/dist_train.sh",
-    "tools/slurm_train.sh",
-)  # fmt: skip
+SCRIPTS = tuple(str(path.relative_to(REPO)) for path in (REPO / "tools").glob("*.sh"))
+PROGRAMS = ("python", "make", "pip", "cp", "source", "trtexec", *SCRIPTS)
+SETTINGS = {"PATH": "", "SLURM_ARRAY_TASK_ID": "0", "SLURM_ARRAY_TASK_COUNT": "16"}
 FENCED = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(python (?:tools/\w+\.py|-m \w+) [^`]+)`")
 QUOTED = re.compile(r"``(python tools/\w+\.py [^`]+)``")
@@ -64,8 +63,7 @@ def words_of(block: str) -> list[list[str]]:
         block = re.sub(rf"\b{word}\b", stand_in, block)
     done = subprocess.run(
         [shell, "-f", "-c", functions + unknown + block],
-        env={"PATH": "", "SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "16"},
-        text=True, capture_output=True, check=False,
+        cwd="/", env=SETTINGS, text=True, capture_output=True, check=False,
     )  # fmt: skip
     assert not done.stderr, f"{block}\n{done.stderr}"
     commands = [part.strip("\0").split("\0") for part in done.stdout.split("\n\0") if part]
@@ -134,15 +132,10 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         parse(rest[1], rest[2:], monkeypatch)
     elif program == "python" and rest[0].startswith("tools/") and rest[0] != "tools/watch.py":
         check_configs(rest[0], parse(rest[0], rest[1:], monkeypatch))
-    elif program.startswith("tools/"):
-        launcher, name = re.findall("/(dist|slurm)_(.*).sh", program)[0]
-        name = f"tools/{name}.py"
-        if launcher == "slurm":
-            rest = rest[2:]  # after the partition and the job's name
-        else:
-            (processes,) = [word for word in rest[1:3] if word.isdigit()]
-            rest.remove(processes)
-        check_configs(name, parse(name, [*rest, "--launcher", "pytorch"], monkeypatch))
+    elif program in SCRIPTS:  # CONFIG GPUS ..., or PARTITION JOB_NAME CONFIG ...
+        launcher, name = re.fullmatch(r"tools/(dist|slurm)_(\w+)\.sh", program).groups()
+        rest = [rest[0], *rest[2:]] if launcher == "dist" else rest[2:]
+        check_configs(f"tools/{name}.py", parse(f"tools/{name}.py", rest, monkeypatch))
     elif program == "make":
         assert re.search(rf"^{rest[0]}:", (REPO / "Makefile").read_text(), re.MULTILINE), words
     elif program == "pip":
