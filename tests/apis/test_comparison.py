@@ -59,7 +59,7 @@ def test_runs_are_planned_with_one_budget_seed_by_seed(tiny_config, protocol):
         ),
         (["a=CONFIG,train_cfg.max_epochs=5"], "leave it out"),
         (["a=CONFIG,model.map_head.no_such_part=1"], "no_such_part"),
-        (["a=CONFIG,optim_wraper.x=1"], "Did you mean 'optim_wrapper'"),
+        (["a=CONFIG,optim_wraper.x=1"], "did you mean 'optim_wrapper'"),
     ],
 )
 def test_bad_input_is_refused_before_anything_trains(tiny_config, protocol, texts, message):
