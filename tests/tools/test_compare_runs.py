@@ -55,7 +55,7 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
         time.sleep(0.05)
     assert not ranks(folder)  # training died with it
 
-    bad = f"bad={tiny_config},optim_wrapper.optimizer.type=NoSuchOptimizer"
+    bad = f"bad={tiny_config},optim_wrapper.optimizer.lr=-1.0"
     done = subprocess.run(
         [*command, bad], cwd=REPO, env=environment, text=True, capture_output=True, check=False
     )
@@ -65,7 +65,7 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
     assert f"Load checkpoint from {folder}/epoch_" in (folder / "train.log").read_text()
     assert "| good | 1 |" in done.stdout
     assert "| bad | 0 (1 not done) |" in done.stdout
-    assert "NoSuchOptimizer" in (tmp_path / "comparison.md").read_text()
+    assert "Invalid learning rate: -1.0" in (tmp_path / "comparison.md").read_text()
     assert "| bad | 0 | train ended with exit code" in done.stdout
     report = json.loads((tmp_path / "comparison.json").read_text())
     good = report["runs"][0]
