@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import mmengine.optim
 import torch
 from mmdet3d.registry import OPTIMIZERS, RUNNERS
 from mmengine.config import Config, DictAction
@@ -22,7 +21,7 @@ from mmengine.runner import Runner
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.engine.named_models import find_config
-from gsmap.utils.faults import nearest
+from gsmap.utils.faults import nearest, registered
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 _OWN_KEYS = (
@@ -30,6 +29,9 @@ _OWN_KEYS = (
     "model_wrapper_cfg", "runner_type", "strategy", "vis_backends",
 )  # fmt: skip
 KNOWN_KEYS = frozenset(inspect.signature(Runner).parameters) - {"cfg"} | set(_OWN_KEYS)
+_ENDINGS = ("_cfg", "_dataloader", "default_hooks")
+_SECTIONS = {key for key in KNOWN_KEYS if key.endswith(_ENDINGS)}
+_SECTIONS |= {"model", "optim_wrapper", "randomness"}
 
 
 def data_root_options(data_root: str | Path) -> dict[str, str]:
@@ -47,10 +49,6 @@ class _DataRootAction(argparse.Action):
         namespace.data_root = values
         given = getattr(namespace, "cfg_options", None) or {}
         namespace.cfg_options = {**data_root_options(values), **given}
-
-
-_SECTIONS = {key for key in KNOWN_KEYS if key.endswith(("_cfg", "_dataloader", "_hooks"))}
-_SECTIONS = _SECTIONS - {"custom_hooks"} | {"model", "optim_wrapper", "randomness"}
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
@@ -203,14 +201,13 @@ def check_config(cfg: Config) -> None:
     """
     _check_keys(cfg)
     _check_schedule(cfg)
-    kind = ((cfg.get("optim_wrapper") or {}).get("optimizer") or {}).get("type")
-    if isinstance(kind, str) and OPTIMIZERS.get(kind) is None:  # mmengine goes on without one
-        close = nearest(kind, mmengine.registry.OPTIMIZERS.module_dict)
-        raise ValueError(f"{cfg.filename}: there is no optimizer of type {kind!r}{close or '.'}")
+    optimizer = ((cfg.get("optim_wrapper") or {}).get("optimizer") or {}).get("type")
     runner = cfg.get("runner_type", "Runner")
-    if RUNNERS.get(runner) is None:
-        close = nearest(runner, mmengine.registry.RUNNERS.module_dict)
-        raise ValueError(f"{cfg.filename}: there is no runner of type {runner!r}{close or '.'}")
+    # mmengine goes on without an optimizer that it does not know
+    for what, registry, kind in (("optimizer", OPTIMIZERS, optimizer), ("runner", RUNNERS, runner)):
+        if isinstance(kind, str) and registry.get(kind) is None:
+            close = nearest(kind, registered(registry)) or "."
+            raise ValueError(f"{cfg.filename}: there is no {what} of type {kind!r}{close}")
 
 
 def _check_keys(cfg: Config) -> None:

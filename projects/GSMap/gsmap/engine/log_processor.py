@@ -6,9 +6,9 @@ from typing import Any
 from mmdet3d.registry import LOG_PROCESSORS
 from mmengine.runner import LogProcessor, Runner
 
-# All figures of MapMetric but the APs of classes and groups and their means
 # Of an iteration: layers before the last, Gaussians, the time that loading takes
 _MINOR = re.compile(r"d\d+\.|data_time:|at_floor:|[\w.]+/[\w.]+:")
+# All figures of MapMetric but the APs of classes and groups and their means
 _DETAIL = re.compile(r"(.*/)?(chamfer|raster)/(?!.*\bm?AP$)")
 
 

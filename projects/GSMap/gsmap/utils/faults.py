@@ -73,6 +73,16 @@ def nearest(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
+def registered(registry: Any) -> list[str]:
+    """Return the names in a registry of mmengine, its parents and their children."""
+    while registry.parent is not None:
+        registry = registry.parent
+    family = [registry]
+    for member in family:
+        family += member.children.values()
+    return [name for member in family for name in member.module_dict]
+
+
 def _is_raised(tracebacks: str) -> bool:
     """Whether a ``raise`` statement stands at the end, and not what Python itself found."""
     statements = re.findall(r'^  File ".*\n    (.*)', tracebacks, re.MULTILINE)
@@ -130,7 +140,7 @@ def _of_a_config(
         return None
     if absent := re.match(r"(\S+) is not in the \S+ registry", text):
         registry = built[-1]["registry"]
-        close = nearest(absent[1], _registered(registry))
+        close = nearest(absent[1], registered(registry))
         return f"{where}there is no {registry.name} of type {absent[1]!r}{close or '.'}"
     if raised and isinstance(error, _CHECKS):
         return text if "/" in text else where + text
@@ -150,16 +160,6 @@ def _config_file(frames: list[FrameType]) -> str:
             if isinstance(name, str):
                 return f"{name}: "
     return ""
-
-
-def _registered(registry: Any) -> list[str]:
-    """Return the names in a registry of mmengine, its parents and their children."""
-    while registry.parent is not None:
-        registry = registry.parent
-    family = [registry]
-    for member in family:
-        family += member.children.values()
-    return [name for member in family for name in member.module_dict]
 
 
 def _unknown_setting(
