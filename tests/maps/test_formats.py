@@ -15,7 +15,7 @@ from gsmap.maps.geodetic import MapOrigin, known_origin
 from gsmap.maps.geojson import write_geojson
 from gsmap.maps.lanelet2 import write_lanelet2
 from gsmap.maps.mcap import write_mcap
-from gsmap.maps.replay import Replay, replay
+from gsmap.maps.replay import Replay
 from gsmap.maps.rerun import write_rerun
 from gsmap.maps.truth import true_map
 from gsmap.maps.video import write_video
@@ -123,7 +123,7 @@ def test_origins_are_those_of_the_devkits():
 def test_the_map_grows_on_the_ground(camera_drive, true):
     drive, _ = camera_drive
     lengths = []
-    for moment in replay(drive, true, "lidar"):
+    for moment in Replay(drive, true, "lidar", ()).moments():
         lengths.append(sum(shapely.LineString(line[:, :2]).length for _, line in moment.seen))
         for local in moment.lines:
             np.testing.assert_allclose(local[:, 2], -1.84)

@@ -150,7 +150,7 @@ def calibration_figure(sample: MapSample, frame: str, data_root: Path) -> Figure
     """
     frame_from_ground = invert_rigid(ground_from_frame(sample, frame))
     lines = _ground_lines(frame_from_ground)
-    wedges = [("cameras", _wedge(c, frame_from_ground, frame, sample)) for c in sample.cameras]
+    wedges = [("cameras", _wedge(c, frame_from_ground)) for c in sample.cameras]
     style = MapStyle(classes=_LINES)
     (x0, x1), (y0, y1) = ((-15.0, 15.0), (-30.0, 30.0))
     if FRAME_VIEWS[frame].forward == "x":
@@ -186,13 +186,11 @@ def _ground_lines(frame_from_ground: np.ndarray) -> list[tuple[str, np.ndarray]]
     ]
 
 
-def _wedge(
-    camera: CameraRecord, frame_from_ground: np.ndarray, frame: str, sample: MapSample
-) -> np.ndarray:
+def _wedge(camera: CameraRecord, frame_from_ground: np.ndarray) -> np.ndarray:
     """Return the outline of what a camera sees within 6 m, on the road. (4, 3)"""
-    k, ground = camera.intrinsics, ground_from_frame(sample, frame)
+    k = camera.intrinsics
     rays = [[(u - k[0, 2]) / k[0, 0], 0, 1] for u in (0, camera.width)]
-    pose = ground @ invert_rigid(camera.cam_from_frame)
+    pose = invert_rigid(camera.cam_from_frame @ frame_from_ground)
     tips = [pose[:3, 3] + 6 * (ray := pose[:3, :3] @ r) / np.linalg.norm(ray) for r in rays]
     outline = np.array([pose[:3, 3], *tips, pose[:3, 3]])
     outline[:, 2] = 0

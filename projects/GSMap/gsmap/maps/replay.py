@@ -46,35 +46,6 @@ class Moment:
         return centres, SHOWN_SIGMAS * elements.scales, quaternions
 
 
-def replay(drive: Drive, elements: MapElements, frame_kind: str) -> Iterator[Moment]:
-    """Go through a drive and let its map grow.
-
-    Args:
-        drive: Frames with their predictions.
-        elements: The drive's map.
-        frame_kind: The annotation frame, a key of ``FRAME_VIEWS``; it says where the ground is.
-
-    Yields:
-        What there is to see at each frame.
-    """
-    view = FRAME_VIEWS[frame_kind]
-    views = [view.tilted(frame.sample.ego_from_frame) for frame in drive.frames]
-    places = cKDTree([f.sample.global_from_frame[:2, 3] for f in drive.frames])
-    lines = [shapely.linestrings(line) for line in elements.polylines]
-    explored = shapely.Polygon()
-    for frame, ground in zip(drive.frames, views, strict=True):
-        explored |= drive.footprint(frame)
-        seen = []
-        for label, line in zip(elements.labels.tolist(), lines, strict=True):
-            for part in shapely.get_parts(shapely.intersection(line, explored)):
-                if part.length:
-                    points = shapely.get_coordinates(part)
-                    nearest = places.query(points)[1]
-                    seen.append((label, _raised(drive, views, points, nearest)))
-        local = [ground.lifted(frame.to_frame(p)) for p in frame.elements.polylines]
-        yield Moment(frame, local, seen)
-
-
 @dataclass(frozen=True, eq=False)
 class Replay:
     """A drive and its map with what a viewer needs to show them.
@@ -94,8 +65,23 @@ class Replay:
     data_root: Path | None = None
 
     def moments(self) -> Iterator[Moment]:
-        """Yield what there is to see at each frame."""
-        return replay(self.drive, self.elements, self.frame_kind)
+        """Go through the drive and let its map grow: yield what there is to see at each frame."""
+        view, drive = FRAME_VIEWS[self.frame_kind], self.drive
+        views = [view.tilted(frame.sample.ego_from_frame) for frame in drive.frames]
+        places = cKDTree([f.sample.global_from_frame[:2, 3] for f in drive.frames])
+        lines = [shapely.linestrings(line) for line in self.elements.polylines]
+        explored = shapely.Polygon()
+        for frame, ground in zip(drive.frames, views, strict=True):
+            explored |= drive.footprint(frame)
+            seen = []
+            for label, line in zip(self.elements.labels.tolist(), lines, strict=True):
+                for part in shapely.get_parts(shapely.intersection(line, explored)):
+                    if part.length:
+                        points = shapely.get_coordinates(part)
+                        nearest = places.query(points)[1]
+                        seen.append((label, _raised(drive, views, points, nearest)))
+            local = [ground.lifted(frame.to_frame(p)) for p in frame.elements.polylines]
+            yield Moment(frame, local, seen)
 
 
 def _raised(
