@@ -16,7 +16,12 @@ from scipy.ndimage import grey_dilation
 from scipy.spatial.distance import cdist
 
 from gsmap.evaluation.average_precision import area_ap, interpolated_ap
-from gsmap.evaluation.raster_ap import RasterConfig, pixels_from_metres
+from gsmap.evaluation.raster_ap import (
+    MAX_PREDICTIONS,
+    MIN_SCORE,
+    RasterConfig,
+    pixels_from_metres,
+)
 from gsmap.structures.elements import MapElements
 
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth
@@ -96,7 +101,7 @@ def chamfer_map(
 def _codes(elements: MapElements, rows: np.ndarray, polygon: bool, config: RasterConfig) -> list:
     codes = []
     for i in rows:
-        canvas = np.zeros((config.height, config.width), np.uint8)
+        canvas = np.zeros(config.size_px[::-1], np.uint8)
         points = pixels_from_metres(elements.polylines[i], config).astype(np.int32)
         if polygon:
             cv2.fillPoly(canvas, [points], (1,))
@@ -133,7 +138,7 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig) -> float:
     for label, (polygon, thresholds) in enumerate(pairs):
         scores, ious, num_gts = [], [], 0
         for pred, gt in frames:
-            rows = _ranked(pred, label, config.min_score)[: config.max_predictions]
+            rows = _ranked(pred, label, MIN_SCORE)[:MAX_PREDICTIONS]
             truths = np.flatnonzero(gt.labels == label)
             num_gts += len(truths)
             codes = _codes(pred, rows, polygon, config), _codes(gt, truths, polygon, config)

@@ -142,12 +142,6 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
     return MapEvaluator(chamfer, raster, args.gt_points)
 
 
-def show_progress(done: int, total: int) -> None:
-    if sys.stderr.isatty():
-        end = "\n" if done == total else ""
-        print(f"\r{done} / {total} samples", end=end, file=sys.stderr, flush=True)
-
-
 def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     reports, notes = outcome
     for found in reports:
@@ -171,7 +165,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
         results, source = args.results, digest(args.results)
     else:  # of results in shards, too, the same one is enough
         source = digest_of_common(read_shard(results))
-    rules = evaluator, args.workers, args.allow_mismatch, show_progress, args.shard
+    rules = evaluator, args.workers, args.allow_mismatch, args.shard
     matches, notes = match_files(results, args.ground_truth, *rules)
     source += digest(args.ground_truth)
     path = write_matches(args.out, args.shard, matches, notes, evaluator, source)
@@ -189,14 +183,8 @@ def main(argv: list[str] | None = None) -> str:
     if args.prior:
         outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, args.prior_elements)
     else:
-        outcome = evaluate_files(
-            args.results,
-            args.ground_truth,
-            evaluator,
-            args.workers,
-            args.allow_mismatch,
-            show_progress,
-        )
+        rules = evaluator, args.workers, args.allow_mismatch
+        outcome = evaluate_files(args.results, args.ground_truth, *rules)
     report(outcome, args)
     first = outcome[0][0]
     number = int(first.metrics[f"{first.name}/num_samples"])

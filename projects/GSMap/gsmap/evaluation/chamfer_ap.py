@@ -15,14 +15,7 @@ import numpy as np
 
 from gsmap.evaluation import chamfer_kernels as kernels
 from gsmap.evaluation.average_precision import area_ap
-from gsmap.evaluation.matches import (
-    FrameMatches,
-    assign,
-    detections_per_class,
-    is_known,
-    ranked_predictions,
-    unique_by_token,
-)
+from gsmap.evaluation.matches import FrameMatches, assign, gather, ranked_predictions
 from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
@@ -149,16 +142,10 @@ def match_chamfer(
     fit = np.full((len(rows), len(ground_truth) + 1), -np.inf)
     fit[np.arange(len(rows)), best[rows]] = -distance[rows]  # in the last column without a nearest
     matched = assign(fit, np.tile(np.negative(config.thresholds), (len(rows), 1)))
-    known_gts = ground_truth.labels[is_known(ground_truth.labels, num_classes)]
-    return FrameMatches(
-        token=token,
-        pred_index=rows,
-        labels=predictions.labels[rows],
-        scores=predictions.confidence[rows],
-        matched_gt=matched,
-        quality=np.where((matched >= 0).any(axis=1), distance[rows], np.nan),
-        num_gts=np.bincount(known_gts, minlength=num_classes),
-    )
+    quality = np.where((matched >= 0).any(axis=1), distance[rows], np.nan)
+    num_gts = (ground_truth.labels == np.arange(num_classes)[:, None]).sum(axis=1)
+    labels, scores = predictions.labels[rows], predictions.confidence[rows]
+    return FrameMatches(token, rows, labels, scores, matched, quality, num_gts)
 
 
 def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> MetricReport:
@@ -168,8 +155,7 @@ def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> Me
     threshold.
     """
     classes, thresholds = config.classes, config.thresholds
-    records = unique_by_token(matches)
-    detections = detections_per_class(records, dict.fromkeys(classes, thresholds))
+    records, detections = gather(matches, dict.fromkeys(classes, thresholds))
     metrics: dict[str, float] = {}
     for name, found in detections.items():
         figures = class_figures(found, area_ap, absent=0.0)

@@ -11,6 +11,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import resample_all
 
 METRIC_NAMES = ("chamfer", "raster")
+Sample = tuple[str, MapElements, MapElements]  # token, predictions, ground truth
 SampleMatches = dict[str, FrameMatches]  # by the name of the metric
 
 
@@ -21,8 +22,8 @@ class MapEvaluator:
     Args:
         chamfer: Rules of AP_chamfer, or None to leave it out.
         raster: Rules of AP_raster, or None to leave it out.
-        ground_truth_points: If set, ground truth is first resampled to that many points, such as
-            the 20 of the training targets; by default it keeps its full resolution.
+        ground_truth_points: To how many points ground truth is first resampled, such as the 20 of
+            the training targets; None keeps its full resolution.
 
     Raises:
         ValueError: If both are left out, or their classes differ.
@@ -62,6 +63,10 @@ class MapEvaluator:
         if self.raster:
             found["raster"] = match_raster(predictions, ground_truth, self.raster, token)
         return found
+
+    def match_all(self, samples: Iterable[Sample]) -> list[SampleMatches]:
+        """Match several samples."""
+        return [self.match(*sample) for sample in samples]
 
     def reports(self, samples: Iterable[SampleMatches]) -> list[MetricReport]:
         """Compute the metrics from the matches of all samples; repeated tokens count once."""

@@ -1,9 +1,8 @@
 """Score a result file against a ground-truth file, in one or more processes."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,11 @@ from gsmap.evaluation.report import MetricReport
 from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, read_samples
 from gsmap.structures.elements import MapElements
 from gsmap.utils.parallel import ordered_map
+from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard
 
 CHUNK = 64  # samples per task: large enough to hide the hand-over, small enough to share evenly
 Samples = Mapping[str, MapElements]
-Progress = Callable[[int, int], None]  # samples done and in all
-
-
 Evaluation = tuple[list[MetricReport], list[str]]
 """A report per metric, and notes: elements left out, z ignored, samples without results."""
 
@@ -65,18 +62,15 @@ def mismatch_notes(results: Samples, truth: Samples, allowed: bool) -> list[str]
     Raises:
         ValueError: If the tokens differ and that is not ``allowed``.
     """
-    silent, extra = ([t for t in a if t not in b] for a, b in ((truth, results), (results, truth)))
     notes = []
-    if silent:
-        notes.append(
-            f"{len(silent)} samples have no results, such as {silent[0]!r}"
-            + ": counted as without predictions" * allowed
-        )
-    if extra:
-        notes.append(
-            f"{len(extra)} results have no ground truth, such as {extra[0]!r}"
-            + ": left out" * allowed
-        )
+    for these, others, what, treatment in (
+        (truth, results, "samples have no results", "counted as without predictions"),
+        (results, truth, "results have no ground truth", "left out"),
+    ):
+        alone = [token for token in these if token not in others]
+        if alone:
+            said = f"{len(alone)} {what}, such as {alone[0]!r}"
+            notes.append(f"{said}: {treatment}" if allowed else said)
     if notes and not allowed:
         raise ValueError(
             "; ".join(notes) + ": score the split that was predicted, or allow the mismatch."
@@ -90,12 +84,9 @@ def evaluate_files(
     evaluator: MapEvaluator,
     num_workers: int = 1,
     allow_mismatch: bool = False,
-    progress: Progress | None = None,
 ) -> Evaluation:
     """Score a result file; arguments as of ``match_files``."""
-    matches, notes = match_files(
-        results_path, truth_path, evaluator, num_workers, allow_mismatch, progress
-    )
+    matches, notes = match_files(results_path, truth_path, evaluator, num_workers, allow_mismatch)
     return evaluator.reports(matches), notes
 
 
@@ -105,19 +96,17 @@ def match_files(
     evaluator: MapEvaluator,
     num_workers: int = 1,
     allow_mismatch: bool = False,
-    progress: Progress | None = None,
     shard: Shard = WHOLE,
 ) -> tuple[list[SampleMatches], list[str]]:
     """Match the samples of a result file.
 
     Args:
         results_path: Results in MapTR's JSON form.
-        truth_path: Ground truth: an annotation file, or MapTR's JSON.
+        truth_path: Ground truth, as ``read_ground_truth`` reads it.
         evaluator: Metrics and their rules.
         num_workers: Number of processes.
         allow_mismatch: A sample without results counts as without predictions, and results without
             ground truth are left out; otherwise both are errors.
-        progress: Called with the number of samples done and in all.
         shard: Which part of the ground truth's samples to match.
 
     Returns:
@@ -130,8 +119,11 @@ def match_files(
     results, other_results = read_samples(results_path, RESULTS_KEY, evaluator.classes)
     truth, other_truth = read_ground_truth(truth_path, evaluator.classes, shard)
     if shard.count:  # what belongs to other shards is theirs
-        elsewhere = _tokens(truth_path) - set(truth)
-        results = {token: found for token, found in results.items() if token not in elsewhere}
+        if Path(truth_path).suffix.lower() == ".json":
+            everywhere = set(read_samples(truth_path, GROUND_TRUTH_KEY, ())[0])
+        else:
+            everywhere = set(AnnotationFile(truth_path).column("token"))
+        results = {t: found for t, found in results.items() if t in truth or t not in everywhere}
     notes = mismatch_notes(results, truth, allow_mismatch)
     with_height = other_results.pop(THREE_D, 0) + other_truth.pop(THREE_D, 0)
     if with_height and not (evaluator.chamfer and evaluator.chamfer.dim == 3):
@@ -143,44 +135,19 @@ def match_files(
         )
     for what, counts in (("predictions", other_results), ("ground truths", other_truth)):
         notes += [f"{n} {what} of class {c!r} are not scored" for c, n in sorted(counts.items())]
-    return match_samples(results, truth, evaluator, num_workers, progress), notes
-
-
-def _tokens(path: str | Path) -> set[str]:
-    """Return the tokens of all samples of a ground-truth file."""
-    if Path(path).suffix.lower() == ".json":
-        return set(read_samples(path, GROUND_TRUTH_KEY, ())[0])
-    return set(AnnotationFile(path).column("token"))
-
-
-def score(results: Samples, truth: Samples, evaluator: MapEvaluator) -> list[MetricReport]:
-    """Match all samples of the ground truth and compute the metrics; as ``match_samples``."""
-    return evaluator.reports(match_samples(results, truth, evaluator))
+    return match_samples(results, truth, evaluator, num_workers), notes
 
 
 def match_samples(
-    results: Samples,
-    truth: Samples,
-    evaluator: MapEvaluator,
-    num_workers: int = 1,
-    progress: Progress | None = None,
+    results: Samples, truth: Samples, evaluator: MapEvaluator, num_workers: int = 1
 ) -> list[SampleMatches]:
-    """Match all samples of the ground truth, by token; other results are left out.
-
-    ``progress`` is called with the number of samples done and in all.
-    """
+    """Match all samples of the ground truth, by token; other results are left out."""
     nothing = MapElements.from_polylines()
     pairs = [(token, results.get(token, nothing), of_token) for token, of_token in truth.items()]
     tasks = [pairs[i : i + CHUNK] for i in range(0, len(pairs), CHUNK)]
     matches: list[SampleMatches] = []
-    for found in ordered_map(partial(_match_all, evaluator), tasks, num_workers):
-        matches += found
-        if progress is not None:
-            progress(len(matches), len(pairs))
+    with Progress(total=len(pairs), unit="samples") as bar:
+        for found in ordered_map(evaluator.match_all, tasks, num_workers):
+            matches += found
+            bar.update(len(found))
     return matches
-
-
-def _match_all(
-    evaluator: MapEvaluator, samples: Sequence[tuple[str, MapElements, MapElements]]
-) -> list[SampleMatches]:
-    return [evaluator.match(*sample) for sample in samples]

@@ -20,34 +20,20 @@ from gsmap.structures.grid import BEVGrid
 
 Array = npt.NDArray[Any]
 
+SCORE_THRESHOLD = 0.3
+PIXEL_M = 0.3
+LINE_WIDTH_M = 0.75  # in the mask of a ground truth
+
 
 @METRICS.register_module()
 class GaussianMetric(BaseMetric):
     """Soft IoU of the masks of predictions and ground truths, and the sizes of the Gaussians.
 
     Predictions of a class are assigned to its ground truths by the soft IoU of their masks. Figures
-    are of confident predictions only; models without Gaussians have none.
-
-    Args:
-        score_threshold: Smallest score of a confident prediction.
-        pixel_m: Side of a pixel of the masks in metres.
-        line_width_m: Width of a line in the ground-truth mask, in metres.
-        **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
+    are of predictions with a score of 0.3 or more; models without Gaussians have none.
     """
 
     default_prefix = "gaussians"
-
-    def __init__(
-        self,
-        score_threshold: float = 0.3,
-        pixel_m: float = 0.3,
-        line_width_m: float = 0.75,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(**kwargs)
-        self.score_threshold = score_threshold
-        self.pixel_m = pixel_m
-        self.line_width_m = line_width_m
 
     def process(self, data_batch: Any, data_samples: Sequence[dict[str, Any]]) -> None:
         """Measure the samples of a batch.
@@ -63,8 +49,8 @@ class GaussianMetric(BaseMetric):
     def _measure(self, sample: dict[str, Any]) -> tuple[Array, dict[int, tuple[Array, Array]]]:
         """Return which Gaussians are at their floor; per class soft IoUs, sizes (n, 2)."""
         predicted, truth = sample["pred_instances_3d"], sample["eval_ann_info"]
-        grid = BEVGrid(sample["x_range"], sample["y_range"]).rasterized(self.pixel_m)
-        chosen = predicted["scores_3d"] >= self.score_threshold
+        grid = BEVGrid(sample["x_range"], sample["y_range"]).rasterized(PIXEL_M)
+        chosen = predicted["scores_3d"] >= SCORE_THRESHOLD
         labels = predicted["labels_3d"][chosen].cpu()
         means, scales, rotations = (
             predicted[name][chosen].float().cpu() for name in ("pts", "scales", "rotations")
@@ -88,7 +74,7 @@ class GaussianMetric(BaseMetric):
         longest = max(len(line) for line in lines)
         padded = [np.pad(line[:, :2], ((0, longest - len(line)), (0, 0)), "edge") for line in lines]
         vertices = torch.from_numpy(np.stack(padded).astype(np.float32))
-        iou = pairwise_soft_iou(masks, draw_polylines(vertices, grid, self.line_width_m)).numpy()
+        iou = pairwise_soft_iou(masks, draw_polylines(vertices, grid, LINE_WIDTH_M)).numpy()
         return iou[linear_sum_assignment(-iou)]
 
     def compute_metrics(self, results: list[tuple[str, Any]]) -> dict[str, float]:
@@ -104,7 +90,7 @@ class GaussianMetric(BaseMetric):
         floor = np.concatenate([at_floor for at_floor, _ in samples])
         metrics = {"at_floor": float(floor.mean()) if len(floor) else 0.0}
         rows = [
-            f"Gaussians of predictions with a score of {self.score_threshold} or more, "
+            f"Gaussians of predictions with a score of {SCORE_THRESHOLD} or more, "
             f"{100 * metrics['at_floor']:.1f} % of them at their smallest size:"
         ]
         for label, name in enumerate(self.dataset_meta["classes"]):

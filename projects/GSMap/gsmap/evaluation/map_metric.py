@@ -16,7 +16,6 @@ from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import flat_metrics, format_table
 from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 
 
@@ -24,10 +23,10 @@ from gsmap.structures.grid import BEVGrid
 class MapMetric(BaseMetric):
     """AP_chamfer and AP_raster of predicted map elements.
 
-    Samples are matched as they come, so evaluation overlaps inference; what is kept and collected
-    from the ranks are matches, never masks. Figures do not depend on the number of ranks, the
-    order of the samples or the padding of the last batch. Classes, range and coordinates per point
-    are those of the data set's metainfo (``classes``, ``x_range``, ``y_range``, ``dim``).
+    Samples are matched as they come; what is kept and collected from the ranks are matches, never
+    masks. Figures do not depend on the number of ranks, the order of the samples or the padding of
+    the last batch. Classes, range and coordinates per point are those of the data set's metainfo
+    (``classes``, ``x_range``, ``y_range``, ``dim``).
 
     Args:
         eval: Metrics to compute: ``chamfer``, ``raster``; may be empty if only ``out_file`` is
@@ -94,7 +93,14 @@ class MapMetric(BaseMetric):
                 raise ValueError(f"predictions of sample {token}: {error}") from error
             record: dict[str, Any] = {"token": token}
             if self.evaluator is not None:
-                record["matches"] = self.evaluator.match(token, predictions, _truth(sample))
+                info = sample.get("eval_ann_info")
+                if info is None:
+                    raise ValueError(
+                        f"sample {token} has no ground truth (eval_ann_info): it cannot be scored. "
+                        "Use an annotation file with instances, or eval=[] with an out_file."
+                    )
+                truth = elements_of_truth(info)
+                record["matches"] = self.evaluator.match(token, predictions, truth)
             if self.out_file is not None:
                 record["vectors"] = vectors_of(predictions, self._meta("classes"))
             self.results.append(record)
@@ -110,12 +116,8 @@ class MapMetric(BaseMetric):
         unique = {record["token"]: record for record in reversed(results)}
         records = [unique[token] for token in sorted(unique)]
         if len(records) != self._size:
-            print_log(
-                f"MapMetric: {len(records)} different samples were scored, the data set has "
-                f"{self._size}.",
-                "current",
-                level=30,
-            )
+            text = f"MapMetric: {len(records)} different samples were scored, the data set has "
+            print_log(f"{text}{self._size}.", "current", level=30)
         reports = []
         if self.evaluator is not None:
             reports = self.evaluator.reports(record["matches"] for record in records)
@@ -126,14 +128,3 @@ class MapMetric(BaseMetric):
             write_results(self.out_file, samples, {"classes": list(self._meta("classes"))})
             print_log(f"Results of {len(records)} samples written to {self.out_file}", "current")
         return flat_metrics(reports)
-
-
-def _truth(sample: Mapping[str, Any]) -> MapElements:
-    """Read the ground truth of one sample."""
-    info = sample.get("eval_ann_info")
-    if info is None:
-        raise ValueError(
-            f"sample {sample['token']} has no ground truth (eval_ann_info): it cannot be scored. "
-            "Use an annotation file with instances, or eval=[] with an out_file."
-        )
-    return elements_of_truth(info)

@@ -12,10 +12,9 @@ from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElemen
 
 @dataclass(frozen=True)
 class FrameMatches:
-    """The matches of one sample's predictions.
+    """The matches of one sample's predictions: those that count, in descending order of score.
 
-    Rows are the predictions that count, in descending order of score (equal scores in the order
-    in which they were given).
+    Equal scores keep the order in which they were given.
 
     Args:
         token: Name of the sample.
@@ -61,11 +60,6 @@ class ClassDetections:
     num_gts: int
 
 
-def is_known(labels: IntArray, num_classes: int) -> BoolArray:
-    """Whether labels are those of classes that are scored. (N,)"""
-    return (labels >= 0) & (labels < num_classes)
-
-
 def ranked_predictions(
     predictions: MapElements,
     num_classes: int,
@@ -84,22 +78,24 @@ def ranked_predictions(
     return rows[np.sort(np.concatenate(counted))]
 
 
-def unique_by_token(matches: Iterable[FrameMatches]) -> list[FrameMatches]:
-    """Return one record per token, sorted: no figure depends on repeats, order or processes."""
-    first = {record.token: record for record in reversed(list(matches))}
-    return [first[token] for token in sorted(first)]
+def gather(
+    matches: Iterable[FrameMatches], thresholds: Mapping[str, Sequence[float]]
+) -> tuple[list[FrameMatches], dict[str, ClassDetections]]:
+    """Rank the predictions of each class over all samples by score.
 
+    No figure depends on repeats, order or processes: a token counts once, and equal scores keep
+    the order of the tokens, then the order within the sample. (The reference evaluators leave it to
+    an unstable sort, in AP_chamfer, or to the order of the file, in AP_raster.)
 
-def detections_per_class(
-    records: Sequence[FrameMatches], thresholds: Mapping[str, Sequence[float]]
-) -> dict[str, ClassDetections]:
-    """Gather the predictions of each class over all samples and rank them by score.
+    Args:
+        matches: Records of the samples, in any order.
+        thresholds: Those of each class, by its name, in the order of the labels. C x (T,)
 
-    Equal scores keep the order of the samples, then the order within the sample: the reference
-    evaluators leave their order to an unstable sort (AP_chamfer) or to the order of the file
-    (AP_raster). ``records`` come from ``unique_by_token``; ``thresholds`` are those of each class,
-    by its name, in the order of the labels. C x (T,)
+    Returns:
+        One record per token, sorted, and the ranked predictions of each class.
     """
+    unique = {record.token: record for record in reversed(list(matches))}
+    records = [unique[token] for token in sorted(unique)]
     none = np.zeros(0)
     num_thresholds = len(next(iter(thresholds.values())))
     labels = np.concatenate([none, *(m.labels for m in records)])
@@ -116,7 +112,7 @@ def detections_per_class(
         detections[name] = ClassDetections(
             of_class, scores[rows], matched[rows] >= 0, quality[rows], ranks[order], num_gts
         )
-    return detections
+    return records, detections
 
 
 @njit(cache=True)

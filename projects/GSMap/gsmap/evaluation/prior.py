@@ -12,14 +12,15 @@ import numpy as np
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig, nearest_by_chamfer
 from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.file_evaluation import Evaluation, read_ground_truth, score
+from gsmap.evaluation.file_evaluation import Evaluation, match_samples, read_ground_truth
+from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
 
-_LOWEST_SCORE = 0.05  # AP_raster drops lower ones; the order, which is all that counts, stays
 _MIN_PRECISION = 1e-3  # an element that is right once in a thousand samples adds nothing
 _REFINEMENTS = 3  # how often a chosen element is moved to the mean of what it matches
 _NUM_POINTS = 20  # of each element
+_MAX_CANDIDATES = 400  # of a class, drawn at random
 _MAX_TRAINING_SAMPLES = 2000  # evenly spread over the file
 
 
@@ -44,14 +45,7 @@ def _aligned_mean(line: FloatArray, others: FloatArray) -> FloatArray:
 class _ClassFit:
     """Greedy choice of the elements of one class."""
 
-    def __init__(
-        self,
-        label: int,
-        truth: Sequence[MapElements],
-        chamfer: ChamferConfig,
-        max_candidates: int,
-        seed: int,
-    ) -> None:
+    def __init__(self, label: int, truth: Sequence[MapElements], chamfer: ChamferConfig) -> None:
         self.label, self.chamfer, self.num_samples = label, chamfer, len(truth)
         self.thresholds = np.asarray(chamfer.thresholds)
         truth = [elements.with_coordinates(chamfer.dim) for elements in truth]
@@ -62,15 +56,12 @@ class _ClassFit:
         none = np.empty((0, _NUM_POINTS, chamfer.dim))
         self.points = np.concatenate([none, *points])  # (K, P, 2 or 3)
         self.taken = np.zeros((len(self.thresholds), len(self.points)), dtype=np.bool_)
-        drawn = np.random.default_rng(seed).permutation(len(self.points))
-        self.candidates = self.points[np.sort(drawn[:max_candidates])]
+        drawn = np.random.default_rng(0).permutation(len(self.points))
+        self.candidates = self.points[np.sort(drawn[:_MAX_CANDIDATES])]
         self.nearest, self.distance = self._compare(self.candidates)
 
     def _compare(self, lines: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Find the flat index of the ground truth nearest to each line in each frame, or -1.
-
-        Returns it with its distance in metres. 2 x (N, F)
-        """
+        """Return the ground truth nearest to each line in each frame, or -1; metres. 2 x (N, F)"""
         elements = MapElements.from_polylines(lines, np.full(len(lines), self.label))
         nearest = np.full((len(lines), len(self.frames)), -1)
         distance = np.full(nearest.shape, np.inf)
@@ -117,32 +108,24 @@ class _ClassFit:
 
 
 def fit_prior(
-    truth: Sequence[MapElements],
-    chamfer: ChamferConfig,
-    max_elements: int = 50,
-    max_candidates: int = 400,
-    seed: int = 0,
+    truth: Sequence[MapElements], chamfer: ChamferConfig, max_elements: int = 50
 ) -> MapElements:
     """Fit the fixed set of elements that scores best on a training set.
 
     At every step the element is added whose new matches raise the area under the precision-recall
     curve the most (precision times recall of the new matches, each class by its own count of ground
-    truths); its score rises with the share of samples in which it is a new match. An element of the
-    set is a ground truth of the training set, moved to the mean of what it matches where that
-    helps.
+    truths); its score rises with the share of samples in which it is a new match. An element is a
+    ground truth of the training set, moved to the mean of what it matches where that helps.
 
     Args:
         truth: Ground truth of each training sample.
         chamfer: Rules of AP_chamfer.
         max_elements: Elements in the set, over all classes; a network of 50 queries predicts 50.
-        max_candidates: Ground truths of a class that are tried, drawn with ``seed``.
-        seed: Draws the candidates.
 
     Raises:
         ValueError: If the training set holds no ground truth.
     """
-    labels = range(len(chamfer.classes))
-    fits = [_ClassFit(label, truth, chamfer, max_candidates, seed) for label in labels]
+    fits = [_ClassFit(label, truth, chamfer) for label in range(len(chamfer.classes))]
     if not any(len(fit.candidates) for fit in fits):
         raise ValueError("the training set holds no ground truth of these classes.")
     chosen: list[tuple[FloatArray, int, float]] = []  # line, label, score
@@ -153,7 +136,8 @@ def fit_prior(
         if precision < _MIN_PRECISION:
             break
         line, share = fits[label].take(index)
-        chosen.append((line, label, _LOWEST_SCORE + (1.0 - _LOWEST_SCORE) * min(share, 1.0)))
+        # AP_raster drops lower scores; the order, which is all that counts, stays
+        chosen.append((line, label, MIN_SCORE + (1.0 - MIN_SCORE) * min(share, 1.0)))
     return MapElements.from_polylines(*zip(*chosen, strict=True))
 
 
@@ -173,9 +157,11 @@ def evaluate_prior(
     train = dict(list(everything.items())[::step])
     truth, _ = read_ground_truth(truth_path, evaluator.classes)
     fitted = fit_prior(list(train.values()), chamfer, max_elements)
-    (on_train,) = score(dict.fromkeys(train, fitted), train, MapEvaluator(chamfer, None))
+    alone = MapEvaluator(chamfer, None)
+    (on_train,) = alone.reports(match_samples(dict.fromkeys(train, fitted), train, alone))
     note = (
         f"the same {len(fitted)} elements in every sample, fitted on {len(train)} training "
         f"samples; mAP_chamfer there {on_train.metrics['chamfer/mAP']:.6f}"
     )
-    return score(dict.fromkeys(truth, fitted), truth, evaluator), [note]
+    matches = match_samples(dict.fromkeys(truth, fitted), truth, evaluator)
+    return evaluator.reports(matches), [note]

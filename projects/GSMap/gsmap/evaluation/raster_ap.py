@@ -12,15 +12,7 @@ import numpy as np
 
 from gsmap.evaluation import raster_kernels as kernels
 from gsmap.evaluation.average_precision import interpolated_ap
-from gsmap.evaluation.matches import (
-    ClassDetections,
-    FrameMatches,
-    assign,
-    detections_per_class,
-    is_known,
-    ranked_predictions,
-    unique_by_token,
-)
+from gsmap.evaluation.matches import FrameMatches, assign, gather, ranked_predictions
 from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
@@ -28,6 +20,8 @@ from gsmap.structures.grid import BEVGrid
 
 LINE_THRESHOLDS = (0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 POLYGON_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75)
+MIN_SCORE = 0.05
+MAX_PREDICTIONS = 100  # of a class and sample
 RECALL_LIMITS = (1, 10, 100)
 NUSCENES_GRID = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
 _COCO_SLACK = 1.0 - 1e-10  # COCO lowers a threshold of 1, so that equal masks match
@@ -43,11 +37,7 @@ class RasterConfig:
         grid: Extent of the canvas; its raster is not used.
         polygon_classes: The classes that are filled; names that do not occur are allowed.
         px_per_m: Pixels per metre.
-        line_thresholds: Smallest IoUs of a match of lines.
-        polygon_thresholds: Smallest IoUs of a match of polygons, as many as of lines.
         dilation_px: Side of the square that masks are dilated by; odd.
-        min_score: Predictions with a lower score are dropped.
-        max_predictions: How many predictions of a class and sample count.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -57,39 +47,21 @@ class RasterConfig:
     grid: BEVGrid = NUSCENES_GRID
     polygon_classes: tuple[str, ...] = AREA_CLASSES
     px_per_m: float = 8.0
-    line_thresholds: tuple[float, ...] = LINE_THRESHOLDS
-    polygon_thresholds: tuple[float, ...] = POLYGON_THRESHOLDS
     dilation_px: int = 5
-    min_score: float = 0.05
-    max_predictions: int = 100
 
     def __post_init__(self) -> None:
-        for name in ("line_thresholds", "polygon_thresholds"):
-            values = tuple(sorted(round(float(t), 6) for t in getattr(self, name)))
-            object.__setattr__(self, name, values)
-            if not values or not 0 < values[0] <= values[-1] <= 1:
-                raise ValueError(f"{name} must lie in (0, 1], got {values}.")
-        if len(self.line_thresholds) != len(self.polygon_thresholds):
-            raise ValueError(
-                "line_thresholds and polygon_thresholds must be equally many, got "
-                f"{self.line_thresholds} and {self.polygon_thresholds}."
-            )
         if not self.classes:
             raise ValueError("classes must not be empty.")
-        if self.px_per_m <= 0 or min(self.width, self.height) < 1:
+        if self.px_per_m <= 0 or min(self.size_px) < 1:
             raise ValueError(f"px_per_m must give at least one pixel, got {self.px_per_m}.")
         if self.dilation_px < 1 or self.dilation_px % 2 == 0:
             raise ValueError(f"dilation_px must be odd and >= 1, got {self.dilation_px}.")
 
     @property
-    def width(self) -> int:
-        """Columns of the canvas (along x)."""
-        return round(self.grid.extent_m[0] * self.px_per_m)
-
-    @property
-    def height(self) -> int:
-        """Rows of the canvas (along y)."""
-        return round(self.grid.extent_m[1] * self.px_per_m)
+    def size_px(self) -> tuple[int, int]:
+        """Columns (along x) and rows (along y) of the canvas."""
+        x_m, y_m = self.grid.extent_m
+        return round(x_m * self.px_per_m), round(y_m * self.px_per_m)
 
     @property
     def is_polygon(self) -> tuple[bool, ...]:
@@ -98,11 +70,9 @@ class RasterConfig:
 
     @property
     def thresholds(self) -> dict[str, tuple[float, ...]]:
-        """The IoU thresholds of each class, by its name. C x (T,)"""
-        both = (self.line_thresholds, self.polygon_thresholds)
-        return {
-            name: both[polygon] for name, polygon in zip(self.classes, self.is_polygon, strict=True)
-        }
+        """Smallest IoUs of a match of each class, by its name. C x (T,)"""
+        found = [POLYGON_THRESHOLDS if polygon else LINE_THRESHOLDS for polygon in self.is_polygon]
+        return dict(zip(self.classes, found, strict=True))
 
 
 def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
@@ -111,7 +81,7 @@ def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
     (x, y) in metres (M, 2) -> column and row (M, 2)
     """
     origin = (config.grid.x_range[0], config.grid.y_range[0])
-    pixels = (points - origin) / config.grid.extent_m * (config.width, config.height)
+    pixels = (points - origin) / config.grid.extent_m * config.size_px
     np.clip(pixels, -_FAR_PX, _FAR_PX, out=pixels)
     return np.rint(pixels).astype(np.int64)
 
@@ -123,8 +93,8 @@ def rasterize(elements: MapElements, config: RasterConfig) -> kernels.WordArray:
     """
     pixels = pixels_from_metres(elements.with_coordinates(2).points, config)
     filled = np.array(config.is_polygon)[elements.labels]
-    size, radius = (config.height, config.width), config.dilation_px // 2
-    return kernels.draw(pixels, elements.offsets, filled, size, radius)
+    height_width = config.size_px[::-1]
+    return kernels.draw(pixels, elements.offsets, filled, height_width, config.dilation_px // 2)
 
 
 def _class_ious(
@@ -147,44 +117,28 @@ def match_raster(
 
     Ground truth is at full resolution; ``token`` names the sample.
     """
-    num_classes = len(config.classes)
-    rows = ranked_predictions(predictions, num_classes, config.min_score, config.max_predictions)
-    gt_index = np.flatnonzero(is_known(ground_truth.labels, num_classes))
+    num_classes, gt_labels = len(config.classes), ground_truth.labels
+    rows = ranked_predictions(predictions, num_classes, MIN_SCORE, MAX_PREDICTIONS)
+    gt_index = np.flatnonzero((gt_labels >= 0) & (gt_labels < num_classes))
     pred = rasterize(predictions.select(rows), config)
     gt = rasterize(ground_truth.select(gt_index), config)
-    labels = predictions.labels[rows], ground_truth.labels[gt_index]
+    labels = predictions.labels[rows], gt_labels[gt_index]
     ious = kernels.mask_ious(pred, gt, *labels)
     thresholds = np.minimum(list(config.thresholds.values()), _COCO_SLACK)
     matched = assign(ious, thresholds[labels[0]])
     matched_iou = np.pad(ious, ((0, 0), (0, 1)), constant_values=np.nan)  # column -1: no match
-    return FrameMatches(
-        token=token,
-        pred_index=rows,
-        labels=labels[0],
-        scores=predictions.confidence[rows],
-        matched_gt=np.append(gt_index, -1)[matched],
-        quality=matched_iou[np.arange(len(rows)), matched[:, 0]],
-        num_gts=np.bincount(labels[1], minlength=num_classes),
-        class_iou=_class_ious(pred, gt, labels, num_classes),
-    )
+    quality = matched_iou[np.arange(len(rows)), matched[:, 0]]
+    matched_gt = np.append(gt_index, -1)[matched]
+    num_gts = np.bincount(labels[1], minlength=num_classes)
+    class_iou = _class_ious(pred, gt, labels, num_classes)
+    scores = predictions.confidence[rows]
+    return FrameMatches(token, rows, labels[0], scores, matched_gt, quality, num_gts, class_iou)
 
 
-def _class_figures(found: ClassDetections, ious: FloatArray) -> dict[str, float]:
-    """Return the figures of one class, by the last part of their key."""
-    figures = class_figures(found, interpolated_ap, absent=UNDEFINED)
-    for limit in RECALL_LIMITS:
-        hits = found.hits[found.ranks < limit].sum(axis=0)
-        figures[f"AR@{limit}"] = _mean(hits / found.num_gts if found.num_gts else ())
-    figures["mIoU"] = _mean(ious[~np.isnan(ious)])
-    return figures
-
-
-def _mean(values: Sequence[float] | FloatArray) -> float:
-    return float(np.mean(values)) if len(values) else UNDEFINED
-
-
-def _mean_of_defined(values: Iterable[float]) -> float:
-    return _mean([value for value in values if value != UNDEFINED])
+def _mean(values: Iterable[float]) -> float:
+    """Return the mean of the values that are defined."""
+    defined = [value for value in values if value != UNDEFINED]
+    return float(np.mean(defined)) if defined else UNDEFINED
 
 
 def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> MetricReport:
@@ -192,12 +146,15 @@ def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> Metr
 
     A class without ground truth is left out of the means.
     """
-    records = unique_by_token(matches)
-    detections = detections_per_class(records, config.thresholds)
+    records, detections = gather(matches, config.thresholds)
     figures: dict[str, dict[str, float]] = {}
     for c, (name, found) in enumerate(detections.items()):
+        figures[name] = of_class = class_figures(found, interpolated_ap, absent=UNDEFINED)
+        for limit in RECALL_LIMITS:
+            hits = found.hits[found.ranks < limit].sum(axis=0)
+            of_class[f"AR@{limit}"] = _mean(hits / found.num_gts if found.num_gts else ())
         ious = np.array([m.class_iou[c] for m in records if m.class_iou is not None])
-        figures[name] = _class_figures(found, ious)
+        of_class["mIoU"] = _mean(ious[~np.isnan(ious)])
     groups: dict[str, list[str]] = {}
     for name, polygon in zip(config.classes, config.is_polygon, strict=True):
         groups.setdefault("polygon" if polygon else "line", []).append(name)
@@ -205,9 +162,9 @@ def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> Metr
     for group, names in groups.items():
         for key in figures[names[0]]:
             if key.startswith(("AP", "AR", "recall", "mIoU")):
-                metrics[f"{group}/{key}"] = _mean_of_defined(figures[name][key] for name in names)
-    for mean, key in (("mAP", "AP"), ("mIoU", "mIoU")):
-        metrics[mean] = _mean_of_defined(found[key] for found in figures.values())
+                metrics[f"{group}/{key}"] = _mean(figures[name][key] for name in names)
+    metrics["mAP"] = _mean(found["AP"] for found in figures.values())
+    metrics["mIoU"] = _mean(found["mIoU"] for found in figures.values())
     metrics["num_samples"] = float(len(records))
     flat = {f"raster/{key}": value for key, value in metrics.items()}
     return MetricReport("raster", groups, flat, detections)

@@ -71,9 +71,7 @@ def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, 
 def read_samples(
     path: str | Path, key: str, classes: Sequence[str], gaussians: bool = False
 ) -> tuple[dict[str, MapElements], Counter[str]]:
-    """Read a result or ground-truth file.
-
-    Samples become arrays while the file is parsed, so that no more than one is ever held as lists.
+    """Read a result or ground-truth file; samples become arrays while it is parsed.
 
     Args:
         path: The file.
@@ -143,14 +141,9 @@ def write_results(
 
 
 def merge_results(path: Path, shards: Sequence[ShardFile]) -> int:
-    """Write a result file from its shards, whose samples are in the order of their tokens.
+    """Write a result file from its shards (``find_shards``) and return how many samples it has.
 
-    Args:
-        path: File to write.
-        shards: All of its shards, from ``find_shards``.
-
-    Returns:
-        How many samples it has.
+    The samples are in the order of their tokens.
 
     Raises:
         ValueError: If the shards say other things about themselves, or a sample occurs twice.
