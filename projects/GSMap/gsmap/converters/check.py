@@ -22,7 +22,7 @@ def _open(path: Path) -> AnnotationFile:
     file = AnnotationFile(path)
     try:
         reader = pa.ipc.open_file(pa.memory_map(str(path)))
-        for number, batch in enumerate(file.record_batches()):
+        for number, batch in enumerate(file.batches):
             if not reader.get_batch(number).equals(batch):
                 raise ValueError(f"part {number} is another one")
     except (pa.ArrowException, OSError, ValueError) as error:

@@ -1,104 +1,137 @@
 """What samples of an annotation file must be: checked where one is written and where it is read."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from gsmap.datasets.annotations.record import AnnotationMeta
-from gsmap.datasets.annotations.schema import Batch
+from gsmap.datasets.annotations.schema import matrices_of
 from gsmap.structures.rigid import is_rigid
 
+_OPTIONAL = {"lidar", "can_bus", "instances", "ego_from_frame"}
+_PLACES = {"cameras[]": "camera's ", "lidar": "LiDAR ", "sweeps[]": "sweep's "}
 _OUTSIDE = r"^$|^/|\\|\x00|(^|/)\.\.(/|$)"  # of a data root, with forward slashes
 
 
-def check_batch(batch: Batch, meta: AnnotationMeta) -> None:
+def check_batch(batch: pa.RecordBatch, meta: AnnotationMeta) -> None:
     """Check the values of a batch of samples.
 
     Labels are among the classes, points and calibration finite, transforms rigid (proper rotations
     to 1e-3), focal lengths and image sizes positive, and paths relative and inside the data root.
 
     Raises:
-        ValueError: If a value is wrong; the message names the sample.
+        ValueError: If a value is wrong or missing; the message names the sample.
     """
-    each = np.arange(len(batch) + 1)
-    if pc.any(pc.equal(batch.column["token"], "")).as_py():
-        raise ValueError("a sample has an empty token.")
-    _require_rigid(batch.global_from_frame, each, batch, "global_from_frame")
-    if batch.has_mounting.any():
-        known = np.cumsum([0, *batch.has_mounting])
-        mountings = batch.ego_from_frame[batch.has_mounting]
-        _require_rigid(mountings, known, batch, "ego_from_frame")
-    if batch.has_can_bus.any():
-        finite = np.isfinite(batch.can_bus).all(-1) | ~batch.has_can_bus
-        _require(finite, each, batch, "can_bus holds NaN or infinity")
-    _check_cameras(batch)
-    if batch.has_lidar.any():
-        known = np.cumsum([0, *batch.has_lidar])
-        matrices = batch.frame_from_lidar[batch.has_lidar]
-        _require_rigid(matrices, known, batch, "frame_from_lidar")
-        paths = batch.lidar_path.filter(pa.array(batch.has_lidar))
-        _require_inside(paths, known, batch, "LiDAR path")
-        _require_inside(batch.sweep["path"], batch.sweep_offsets, batch, "path of a LiDAR sweep")
-        _require_rigid(batch.sweep_from, batch.sweep_offsets, batch, "frame_from_lidar of a sweep")
-    _check_instances(batch, meta)
+    checks = _Checks(batch.column("token"), meta)
+    for name in batch.schema.names:
+        checks.walk(batch.column(name), name, np.arange(len(batch)))
 
 
-def _require(good: np.ndarray, offsets: np.ndarray, batch: Batch, wrong: str) -> None:
-    """Raise a ``ValueError`` that names the sample of the first item that is not good."""
-    if offsets[0] != 0 or offsets[-1] != len(good):
-        raise ValueError("a list has items that belong to no sample.")
-    if not good.all():
-        row = int(np.searchsorted(offsets, np.argmin(good), side="right")) - 1
-        raise ValueError(f"sample {batch.column['token'][row].as_py()!r}: {wrong}.")
+class _Checks:
+    """A walk through a batch, which checks every array and all that is in it."""
 
+    def __init__(self, tokens: pa.StringArray, meta: AnnotationMeta) -> None:
+        self.tokens = tokens
+        self.meta = meta
 
-def _require_rigid(matrices: np.ndarray, offsets: np.ndarray, batch: Batch, name: str) -> None:
-    wrong = f"{name} is no rigid transform: it must be finite, with a rotation and 0, 0, 0, 1 below"
-    _require(is_rigid(matrices), offsets, batch, wrong)
+    def walk(self, array: pa.Array, name: str, rows: np.ndarray, where: str = "") -> None:
+        """Check an array; ``rows`` are the samples that its items belong to. (items,)."""
+        if array.null_count:
+            known = array.is_valid().to_numpy(zero_copy_only=False)
+            self.require(known | (name in _OPTIONAL), rows, f"{where}{name} is missing")
+            array, rows = array.drop_null(), rows[known]
+        if pa.types.is_struct(array.type):
+            for part in array.type:
+                self.walk(array.field(part.name), part.name, rows, where + _PLACES.get(name, ""))
+        elif pa.types.is_nested(array.type):
+            self.walk_list(array, name, rows, where)
+        if name in _RULES:
+            rule, wrong = _RULES[name]
+            good = rule(array, rows, self.meta)
+            value = None if good.all() else array[int(np.argmin(good))].as_py()
+            self.require(good, rows, where + name + wrong.format(value, self.meta))
 
+    def walk_list(self, array: pa.Array, name: str, rows: np.ndarray, where: str) -> None:
+        """Check the items of a list."""
+        if pa.types.is_list(array.type):
+            lengths = np.diff(array.offsets.to_numpy())
+            if lengths.sum() != len(array.values):
+                raise ValueError(f"{where}{name} has items that belong to no sample.")
+        if pa.types.is_struct(array.type.value_type):
+            self.walk(array.values, f"{name}[]", np.repeat(rows, lengths), where)
+        elif array.values.null_count:
+            raise ValueError(f"a number of {where}{name} is missing.")
 
-def _require_inside(paths: pa.StringArray, offsets: np.ndarray, batch: Batch, name: str) -> None:
-    stored = paths.buffers()[2]
-    text = b"" if stored is None else stored.to_pybytes()
-    letters = np.frombuffer(text + b"/", np.uint8)
-    starts = np.frombuffer(paths.buffers()[1], np.int32, len(paths) + 1)
-    # a look at the bytes is enough for nearly all files, and much faster than an expression
-    dots = letters == ord(".")
-    odd = (dots[1:] & dots[:-1]).any() or b"\\" in text or b"\0" in text
-    if not odd and (letters[starts[:-1]] != ord("/")).all():
-        return
-    good = ~pc.match_substring_regex(paths, _OUTSIDE).to_numpy(False)
-    wrong = f"{name} must be relative to the data root, with forward slashes and without '..'"
-    if not good.all():
-        wrong += f", got {paths[int(np.argmin(good))].as_py()!r}"
-    _require(good, offsets, batch, wrong)
+    def require(self, good: np.ndarray, rows: np.ndarray, wrong: str) -> None:
+        """Raise an error that names the sample of the first item that is not good."""
+        if not good.all():
+            token = self.tokens[int(rows[np.argmin(good)])].as_py()
+            raise ValueError(f"sample {token!r}: {wrong}.")
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def _check_cameras(batch: Batch) -> None:
-    offsets = batch.camera_offsets
-    width, height = (batch.camera[name].to_numpy() for name in ("width", "height"))
-    _require((width > 0) & (height > 0), offsets, batch, "a camera's size is not positive")
-    names = batch.camera["name"].dictionary_encode()
-    each = np.repeat(np.arange(len(batch)) * len(names.dictionary), np.diff(offsets))
-    each += names.indices.to_numpy(False)
-    _require(np.bincount(each)[each] == 1, offsets, batch, "a camera appears twice")
-    _require_inside(batch.camera["path"], offsets, batch, "path of a camera")
-    entries = np.ascontiguousarray(batch.intrinsics.reshape(-1, 9).T)  # each in one piece
+def _are_pinholes(arrays: pa.FixedSizeListArray, *_of: object) -> np.ndarray:
+    entries = np.ascontiguousarray(matrices_of(arrays, 9).T)  # each in one piece
     good = np.isfinite(entries.sum(0)) & (entries[[0, 4]] > 0).all(0)
-    good &= (entries[6] == 0) & (entries[7] == 0) & (entries[8] == 1)
-    wrong = "intrinsics of a camera must be finite, with focal lengths > 0 and 0, 0, 1 below"
-    _require(good, offsets, batch, wrong)
-    _require_rigid(batch.cam_from_frame, offsets, batch, "cam_from_frame of a camera")
+    return good & (entries[6] == 0) & (entries[7] == 0) & (entries[8] == 1)
 
 
-def _check_instances(batch: Batch, meta: AnnotationMeta) -> None:
-    labels, offsets = batch.labels, batch.instance_offsets
-    good = (labels >= 0) & (labels < len(meta.classes))
-    label = 0 if good.all() else labels[np.argmin(good)]
-    _require(good, offsets, batch, f"label {label} is none of the classes {meta.classes}")
-    counts = np.diff(batch.point_offsets)
+def _are_inside(paths: pa.StringArray, *_of: object) -> np.ndarray:
+    text = b"" if paths.buffers()[2] is None else paths.buffers()[2].to_pybytes()
+    starts = np.frombuffer(paths.buffers()[1], np.int32, len(paths) + 1)[:-1]
+    # a look at the bytes is enough for nearly all files, and much faster than an expression
+    plain = not any(part in text for part in (b"..", b"\\", b"\0"))
+    if plain and (np.frombuffer(text + b"/", np.uint8)[starts] != ord("/")).all():
+        return np.ones(len(paths), bool)
+    return ~pc.match_substring_regex(paths, _OUTSIDE).to_numpy(zero_copy_only=False)
+
+
+def _are_unique(names: pa.StringArray, rows: np.ndarray, _meta: AnnotationMeta) -> np.ndarray:
+    """Say which cameras have a name of their own in their sample."""
+    encoded = names.dictionary_encode()
+    each = rows * len(encoded.dictionary) + encoded.indices.to_numpy()
+    return np.bincount(each)[each] == 1
+
+
+def _are_elements(lists: pa.ListArray, _rows: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
+    """Say which elements have two finite points or more."""
+    counts = np.diff(lists.offsets.to_numpy())
     good = (counts % meta.dim == 0) & (counts >= 2 * meta.dim)
-    _require(good, offsets, batch, f"points of an element must be (n >= 2, {meta.dim})")
-    wrong = "points of an element hold NaN or infinity"
-    _require(np.isfinite(batch.points), batch.point_offsets[offsets], batch, wrong)
+    finite = np.isfinite(lists.values.to_numpy())
+    if not finite.all():
+        good[np.repeat(np.arange(len(counts)), counts)[~finite]] = False
+    return good
+
+
+_TRANSFORM = (
+    lambda arrays, *_: is_rigid(matrices_of(arrays, 4, 4)),
+    " is no rigid transform: it must be finite, with a rotation and 0, 0, 0, 1 below",
+)
+_SIZE = lambda numbers, *_: numbers.to_numpy() > 0, " {0}: the size is not positive"
+_RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
+    "token": (lambda texts, *_: pc.not_equal(texts, "").to_numpy(False), " is empty"),
+    "global_from_frame": _TRANSFORM,
+    "ego_from_frame": _TRANSFORM,
+    "cam_from_frame": _TRANSFORM,
+    "frame_from_lidar": _TRANSFORM,
+    "can_bus": (
+        lambda arrays, *_: np.isfinite(matrices_of(arrays, 18)).all(-1),
+        " holds NaN or infinity",
+    ),
+    "name": (_are_unique, " {0!r} appears twice"),
+    "path": (
+        _are_inside,
+        " must be relative to the data root, with forward slashes and without '..', got {0!r}",
+    ),
+    "width": _SIZE,
+    "height": _SIZE,
+    "intrinsics": (_are_pinholes, " must be finite, with focal lengths > 0 and 0, 0, 1 below"),
+    "label": (
+        lambda labels, _, meta: (labels.to_numpy() >= 0) & (labels.to_numpy() < len(meta.classes)),
+        " {0} is none of the classes {1.classes}",
+    ),
+    "points": (_are_elements, " of an element must be (n >= 2, {1.dim}), not NaN or infinite"),
+}
+"""By field: which items of an array are good, and what is said of the first that is not."""

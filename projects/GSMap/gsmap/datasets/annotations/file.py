@@ -13,7 +13,6 @@ from dataclasses import asdict
 from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,14 @@ from gsmap.datasets.annotations.record import (
     MapSample,
     SweepRecord,
 )
-from gsmap.datasets.annotations.schema import FIELDS, META_KEY, Batch, batch_of, row_of, schema_of
+from gsmap.datasets.annotations.schema import (
+    FIELDS,
+    META_KEY,
+    batch_of,
+    decoder_of,
+    row_of,
+    schema_of,
+)
 from gsmap.utils.files import atomic_write
 from gsmap.utils.shards import WHOLE, Shard, ShardFile
 
@@ -112,7 +118,7 @@ class AnnotationWriter:
     def _flush(self) -> None:
         if self._rows:
             batch = batch_of(self._rows, self._schema)
-            check_batch(Batch(batch, self.meta.dim), self.meta)
+            check_batch(batch, self.meta)
             self._writer.write_batch(batch)
             self._rows.clear()
 
@@ -135,15 +141,10 @@ class AnnotationWriter:
         os.fsync(self._file.fileno())
         self._finished = True
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         with self._opened:
-            if value is not None:
-                raise value
+            if error is not None:
+                raise error
             self.finish()
         self._seal(len(self))
 
@@ -202,7 +203,7 @@ def check_samples(samples: Sequence[MapSample], meta: AnnotationMeta) -> None:
         ValueError: If a shape or value is wrong; the message names the sample.
     """
     batch = batch_of([row_of(sample, meta) for sample in samples], schema_of(meta))
-    check_batch(Batch(batch, meta.dim), meta)
+    check_batch(batch, meta)
 
 
 class AnnotationFile(Sequence[MapSample]):
@@ -222,6 +223,8 @@ class AnnotationFile(Sequence[MapSample]):
 
     sealed: bool
     """Whether the file has a checksum; those of earlier versions have none."""
+    batches: list[pa.RecordBatch]
+    """The samples as Arrow has them."""
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
@@ -235,7 +238,7 @@ class AnnotationFile(Sequence[MapSample]):
             )
         try:
             content = pa.memory_map(str(self.path)).read_buffer()
-            schema, batches, seal = _messages(content)
+            schema, self.batches, seal = _messages(content)
         except (pa.ArrowException, OSError, ValueError) as error:
             raise ValueError(
                 f"{self.path} is not a whole annotation file ({error}): delete it and run "
@@ -248,21 +251,29 @@ class AnnotationFile(Sequence[MapSample]):
                 f"{self.path} has other columns than format version {FORMAT_VERSION}: {self.remedy}"
             )
         try:
-            if check and seal is not None:
-                _check_seal(json.loads(seal), content, batches)
-            for batch in batches if check else ():
-                batch.validate(full=True)
-            self._batches = [Batch(batch, self.meta.dim) for batch in batches]
-            for views in self._batches if check else ():
-                check_batch(views, self.meta)
             if check:
-                _require_different([batch.column["token"] for batch in self._batches])
+                self._check(content, seal)
         except (pa.ArrowException, ValueError, TypeError, KeyError) as error:
             text = str(error).rstrip(".")
             raise ValueError(
                 f"{self.path} is damaged: {text}. Copy it again, or {self.remedy}"
             ) from error
-        self._starts = np.cumsum([0, *map(len, self._batches)])
+        self._decoders = [decoder_of(b.to_struct_array(), self.meta.dim) for b in self.batches]
+        self._starts = np.cumsum([0, *map(len, self.batches)])
+
+    def _check(self, content: pa.Buffer, seal: bytes | None) -> None:
+        """Raise an error unless a file's bytes, rows and values are those that were written."""
+        if seal is not None:
+            stated = json.loads(seal)
+            found = zlib.crc32(memoryview(content)[: stated["bytes"]])
+            if found != stated["crc32"] or sum(map(len, self.batches)) != stated["rows"]:
+                raise ValueError("its checksum does not fit its content")
+        for batch in self.batches:
+            batch.validate(full=True)
+            check_batch(batch, self.meta)
+        tokens = pa.chunked_array([batch.column("token") for batch in self.batches], pa.string())
+        if pc.count_distinct(tokens).as_py() < len(tokens):
+            raise ValueError("two samples have one token")
 
     def _read_meta(self, schema: pa.Schema) -> AnnotationMeta:
         stored = (schema.metadata or {}).get(META_KEY)
@@ -323,20 +334,14 @@ class AnnotationFile(Sequence[MapSample]):
             raise IndexError(f"sample {index} of {len(self)} in {self.path}.")
         index %= len(self)
         number = int(np.searchsorted(self._starts, index, side="right")) - 1
-        return self._batches[number].sample(index - int(self._starts[number]))
+        return self._decoders[number](index - int(self._starts[number]))
 
     def __iter__(self) -> Iterator[MapSample]:
         return (self[i] for i in range(len(self)))
 
-    def record_batches(self) -> list[pa.RecordBatch]:
-        """Return the samples as Arrow has them."""
-        return [
-            pa.record_batch(list(batch.column.values()), list(FIELDS)) for batch in self._batches
-        ]
-
     def column(self, name: str) -> list[Any]:
         """Return ``token``, ``scene``, ``map_name`` or ``timestamp_ns`` of all samples."""
-        return [value for batch in self._batches for value in batch.column[name].to_pylist()]
+        return [value for batch in self.batches for value in batch.column(name).to_pylist()]
 
     @cached_property
     def seconds_into_scene(self) -> list[float]:
@@ -349,11 +354,9 @@ class AnnotationFile(Sequence[MapSample]):
 
     def instance_counts(self) -> np.ndarray:
         """Return each sample's number of map elements, -1 if not known. (samples,)."""
-        counts = [
-            np.where(batch.has_instances, np.diff(batch.instance_offsets), -1)
-            for batch in self._batches
-        ]
-        return np.concatenate([np.empty(0, np.int64), *counts])
+        counts = (pc.list_value_length(batch.column("instances")) for batch in self.batches)
+        known = [count.fill_null(-1).to_numpy() for count in counts]
+        return np.concatenate([np.empty(0, np.int64), *known])
 
 
 def _messages(content: pa.Buffer) -> tuple[pa.Schema, list[pa.RecordBatch], bytes | None]:
@@ -373,17 +376,3 @@ def _messages(content: pa.Buffer) -> tuple[pa.Schema, list[pa.RecordBatch], byte
     if not all(map(len, batches)):
         raise ValueError("it has an empty part")  # as a seal with a damaged name would be
     return reader.schema, batches, seal
-
-
-def _check_seal(seal: Any, content: pa.Buffer, batches: Sequence[pa.RecordBatch]) -> None:
-    """Raise a ``ValueError`` unless a file's bytes and rows are those that were written."""
-    whole = memoryview(content)[: seal["bytes"]]
-    if zlib.crc32(whole) != seal["crc32"] or sum(map(len, batches)) != seal["rows"]:
-        raise ValueError("its checksum does not fit its content")
-
-
-def _require_different(tokens: list[pa.StringArray]) -> None:
-    """Raise a ``ValueError`` if two samples have one token."""
-    column = pa.chunked_array(tokens, pa.string())
-    if pc.count_distinct(column).as_py() < len(column):
-        raise ValueError("two samples have one token")
