@@ -10,31 +10,19 @@ from mmengine.dataset import BaseDataset
 from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.annotations.record import (
-    CAN_BUS_SIZE,
-    LidarRecord,
-    MapInstance,
-    MapSample,
-)
+from gsmap.datasets.annotations.record import CAN_BUS_SIZE, LidarRecord, MapInstance, MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.structures.grid import BEVGrid
 
 _BROKEN = ("raise", "skip")
 
 
-def _homogeneous(intrinsics: np.ndarray) -> np.ndarray:
-    """Embed a pinhole matrix (3, 3) into a (4, 4) one."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = intrinsics
-    return matrix
-
-
 @DATASETS.register_module()
 class VectorizedMapDataset(BaseDataset):
     """Samples with their map elements, read from a memory-mapped annotation file.
 
-    Nothing is made or cached on the way: ``tools/create_data.py`` makes the file once, and a file
-    made for another range, class list, split or frame is refused.
+    ``tools/create_data.py`` makes the file; one for another range, class list, split or frame is
+    refused.
 
     Args:
         ann_file: Annotation file; relative to ``data_root`` unless absolute.
@@ -99,8 +87,8 @@ class VectorizedMapDataset(BaseDataset):
         self._broken_in_a_row = 0
         self._expected = {
             "classes": None if classes is None else tuple(classes),
-            "x_range": None if extent is None else extent.x_range,
-            "y_range": None if extent is None else extent.y_range,
+            "x_range": extent and extent.x_range,
+            "y_range": extent and extent.y_range,
             "split": split,
             "frame": frame,
             "dim": 3 if dim == 3 else None,
@@ -138,7 +126,16 @@ class VectorizedMapDataset(BaseDataset):
         """Leave out samples without elements, and shuffle images, where that is asked for."""
         rows = np.array([entry["row"] for entry in self.data_list], np.int64)
         if self._filter_empty_gt:
-            rows = rows[self._has_elements(rows)]
+            counts = self.annotations.instance_counts()[rows]
+            if (counts < 0).any():
+                raise ValueError(
+                    f"{(counts < 0).sum()} samples of {self.ann_file} have no ground truth, so it "
+                    "cannot be trained on."
+                )
+            if empty := int((counts == 0).sum()):
+                text = f"{self.ann_file}: {empty} samples without any map element are left out."
+                print_log(text, "current")
+            rows = rows[counts > 0]
         if not len(rows):
             raise ValueError(f"{self.ann_file} has no sample to use (of {len(self.annotations)}).")
         donors = rows
@@ -148,21 +145,6 @@ class VectorizedMapDataset(BaseDataset):
             donors[order] = rows[np.roll(order, 1)]
         pairs = zip(rows.tolist(), donors.tolist(), strict=True)
         return [{"row": row, "image_row": donor} for row, donor in pairs]
-
-    def _has_elements(self, rows: np.ndarray) -> np.ndarray:
-        """Say which samples have map elements, and log how many have none. (samples,) bool."""
-        counts = self.annotations.instance_counts()[rows]
-        if (counts < 0).any():
-            raise ValueError(
-                f"{(counts < 0).sum()} samples of {self.ann_file} have no ground truth, so it "
-                "cannot be trained on."
-            )
-        empty = int((counts == 0).sum())
-        if empty:
-            print_log(
-                f"{self.ann_file}: {empty} samples without any map element are left out.", "current"
-            )
-        return counts > 0
 
     def _copy_without_annotation(self, memo: dict[int, Any] | None = None) -> BaseDataset:
         """Copy with a memo of its own: mmengine's is shared by all calls and mixes objects up."""
@@ -203,7 +185,7 @@ class VectorizedMapDataset(BaseDataset):
             "timestamp": sample.timestamp_ns / 1e9,
             "lidar2global": sample.global_from_frame,
             "lidar2ego": sample.ego_from_frame,
-            "can_bus": self._can_bus(sample),
+            "can_bus": np.zeros(CAN_BUS_SIZE),
             "x_range": self.annotations.meta.x_range,
             "y_range": self.annotations.meta.y_range,
             "dim": dim,
@@ -212,6 +194,8 @@ class VectorizedMapDataset(BaseDataset):
             "eval_ann_info": None,
         }
         info["cam_names"] = list(info["images"])
+        if sample.can_bus is not None:  # as MapTR sees a single frame: position and yaw change 0
+            info["can_bus"][3:17] = sample.can_bus[3:17]
         if instances is not None:
             info["eval_ann_info"] = {
                 "polylines": [instance.points for instance in instances],
@@ -221,37 +205,29 @@ class VectorizedMapDataset(BaseDataset):
             info.update(self._lidar(sample.lidar))
         return info
 
-    def _can_bus(self, sample: MapSample) -> np.ndarray:
-        """Return the signals as MapTR sees a single frame: position and yaw change 0. (18,)."""
-        signals = np.zeros(CAN_BUS_SIZE)
-        if sample.can_bus is not None:
-            signals[3:17] = sample.can_bus[3:17]
-        return signals
-
     def _images(self, sample: MapSample, entry: dict[str, int]) -> dict[str, dict[str, Any]]:
         """Return path and calibration of each camera; paths may come from another sample."""
-        cameras = {camera.name: camera for camera in sample.cameras}
-        names = tuple(cameras) if self.cameras is None else self.cameras
-        images = cameras
+        donor = sample
         if entry["image_row"] != entry["row"]:
             donor = self.annotations[entry["image_row"]]
-            images = {camera.name: camera for camera in donor.cameras}
-        for name in names:
+        cameras, images = ({c.name: c for c in s.cameras} for s in (sample, donor))
+        found = {}
+        for name in tuple(cameras) if self.cameras is None else self.cameras:
             if name not in cameras or name not in images:
                 raise BrokenSampleError(
                     f"sample {sample.token!r} has no camera {name!r}, only {list(cameras)}: name "
                     "the cameras that all samples have (`cameras=[...]`), or train with "
                     "broken_samples='skip'."
                 )
-        return {
-            name: {
-                "img_path": str(Path(self.data_root, images[name].path)),
-                "size": (images[name].width, images[name].height),
-                "cam2img": _homogeneous(cameras[name].intrinsics),
+            image, cam2img = images[name], np.eye(4)
+            cam2img[:3, :3] = cameras[name].intrinsics
+            found[name] = {
+                "img_path": str(Path(self.data_root, image.path)),
+                "size": (image.width, image.height),
+                "cam2img": cam2img,
                 "lidar2cam": cameras[name].cam_from_frame,
             }
-            for name in names
-        }
+        return found
 
     def _lidar(self, lidar: LidarRecord) -> dict[str, Any]:
         """Return LiDAR paths in the form that mmdet3d's point transforms read."""
@@ -282,21 +258,17 @@ class VectorizedMapDataset(BaseDataset):
         except BrokenSampleError as error:
             if self.broken_samples == "raise":
                 raise
-            self._count_broken(self.sample(idx).token, str(error))
+            self._broken_in_a_row += 1
+            if self._broken_in_a_row > self.max_refetch:
+                raise RuntimeError(
+                    f"{self._broken_in_a_row} samples in a row are broken; the latest: {error}"
+                ) from error
+            token = self.sample(idx).token
+            if token not in self.broken_tokens:
+                self.broken_tokens[token] = str(error)
+                MMLogger.get_current_instance().warning(
+                    f"broken sample skipped ({len(self.broken_tokens)} so far): {error}"
+                )
             return None
         self._broken_in_a_row = 0
         return data
-
-    def _count_broken(self, token: str, reason: str) -> None:
-        """Count and log a broken sample, and stop when there is nothing but such."""
-        self._broken_in_a_row += 1
-        if self._broken_in_a_row > self.max_refetch:
-            raise RuntimeError(
-                f"{self._broken_in_a_row} samples in a row are broken; the latest: {reason}"
-            )
-        if token not in self.broken_tokens:
-            self.broken_tokens[token] = reason
-            count = len(self.broken_tokens)
-            MMLogger.get_current_instance().warning(
-                f"broken sample skipped ({count} so far): {reason}"
-            )
