@@ -44,8 +44,7 @@ class VectorizedMapDataset(BaseDataset):
             another one in its place, and counts and logs it (in training only).
         max_refetch: How many samples in a row may be skipped.
         indices: Of the samples that are left, the first N, the last -N, or the listed ones.
-        lazy_init: Whether to open the file later, with ``full_init``.
-        serialize_data: Whether the list of samples is kept as bytes that worker processes share.
+        **options: ``lazy_init`` and ``serialize_data`` of mmengine's ``BaseDataset``.
 
     Raises:
         FileNotFoundError: If there is no annotation file.
@@ -69,8 +68,7 @@ class VectorizedMapDataset(BaseDataset):
         broken_samples: str = "raise",
         max_refetch: int = 100,
         indices: int | Sequence[int] | None = None,
-        lazy_init: bool = False,
-        serialize_data: bool = True,
+        **options: bool,
     ) -> None:
         if broken_samples not in _BROKEN:
             raise ValueError(f"broken_samples must be one of {_BROKEN}, got {broken_samples!r}.")
@@ -103,8 +101,7 @@ class VectorizedMapDataset(BaseDataset):
             test_mode=test_mode,
             max_refetch=max_refetch,
             indices=indices,
-            lazy_init=lazy_init,
-            serialize_data=serialize_data,
+            **options,
         )
 
     def load_data_list(self) -> list[dict[str, int]]:

@@ -85,10 +85,8 @@ class LoadCameraImages(BaseTransform):
 
     Adds the keys of mmdet3d's ``LoadMultiViewImageFromFiles`` that others read, and ``lidar2img``,
     ``img_aug_matrix`` (lists of (4, 4)) and ``img_path``. Images of different size are padded at
-    the bottom and right to the largest; ``raw_shapes`` are (height, width) before that.
-
-    mmdet3d's transform stacks the images along a last axis and takes strided views of that: copies
-    that cost as much as decoding, and would make each later step slower.
+    the bottom and right to the largest; ``raw_shapes`` are (height, width) before that. Unlike
+    there, no image is a strided view of a stack, which costs as much as decoding.
 
     Args:
         to_float32: Whether to convert to float32 before anything else.
@@ -108,27 +106,20 @@ class LoadCameraImages(BaseTransform):
             read_image(camera["img_path"], f"sample {token!r}, camera {name}", camera.get("size"))
             for name, camera in cameras.items()
         ]
-        height = max(image.shape[0] for image in images)
-        width = max(image.shape[1] for image in images)
-        results["img"] = [self._prepared(image, (height, width)) for image in images]
-        results["img_shape"] = results["ori_shape"] = results["pad_shape"] = (height, width)
         results["raw_shapes"] = [image.shape[:2] for image in images]
+        shape = tuple(map(max, zip(*results["raw_shapes"], strict=True)))
+        padded = [i if i.shape[:2] == shape else mmcv.impad(i, shape=shape) for i in images]
+        results["img"] = [i.astype(np.float32) if self.to_float32 else i for i in padded]
+        results["img_shape"] = results["ori_shape"] = results["pad_shape"] = shape
         results["num_views"] = len(images)
-        results["img_path"] = [camera["img_path"] for camera in cameras.values()]
-        results["cam2img"] = [camera["cam2img"] for camera in cameras.values()]
-        results["lidar2cam"] = [camera["lidar2cam"] for camera in cameras.values()]
+        for key in ("img_path", "cam2img", "lidar2cam"):
+            results[key] = [camera[key] for camera in cameras.values()]
         results["img_aug_matrix"] = [np.eye(4) for _ in images]
         results["lidar2img"] = [
             cam2img @ lidar2cam
             for cam2img, lidar2cam in zip(results["cam2img"], results["lidar2cam"], strict=True)
         ]
         return results
-
-    def _prepared(self, image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Pad an image to the common size and convert it. (H, W, 3)."""
-        if image.shape[:2] != size:
-            image = mmcv.impad(image, shape=size, pad_val=0)
-        return image.astype(np.float32) if self.to_float32 else image
 
 
 @TRANSFORMS.register_module()
@@ -138,17 +129,15 @@ class ScaleImages(BaseTransform):
     Args:
         scale: Factor, > 0; sizes are rounded down, and the matrices take the exact ratio of each
             axis.
-        interpolation: As in ``mmcv.imresize``.
 
     Raises:
         ValueError: If ``scale`` is not positive.
     """
 
-    def __init__(self, scale: float, interpolation: str = "bilinear") -> None:
+    def __init__(self, scale: float) -> None:
         if not scale > 0:
             raise ValueError(f"scale must be > 0, got {scale}.")
         self.scale = scale
-        self.interpolation = interpolation
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Scale ``results['img']``."""
@@ -159,14 +148,9 @@ class ScaleImages(BaseTransform):
             raise ValueError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
         matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
         if size != (width, height):
-            results["img"] = [
-                mmcv.imresize(img, size, interpolation=self.interpolation) for img in results["img"]
-            ]
-        results["lidar2img"] = [matrix @ m for m in results["lidar2img"]]
-        results["img_aug_matrix"] = [matrix @ m for m in results["img_aug_matrix"]]
+            results["img"] = [mmcv.imresize(img, size) for img in results["img"]]
+        for key in ("lidar2img", "img_aug_matrix"):
+            results[key] = [matrix @ m for m in results[key]]
         results["img_shape"] = results["pad_shape"] = size[::-1]
         results["scale_factor"] = self.scale
         return results
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(scale={self.scale})"

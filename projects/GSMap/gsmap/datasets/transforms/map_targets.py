@@ -49,9 +49,10 @@ def map_targets(
     slots = max(num_points - 1, 2)
     points = np.empty((len(instances), num_points, dim))
     orders = np.empty((len(instances), slots, num_points, dim))
-    boxes = np.empty((len(instances), 4))
+    boxes = np.empty((len(instances), 2, 2))
     longest = max((len(instance.points) for instance in instances), default=2)
     polylines = np.empty((len(instances), longest, 2))
+    closed = np.empty(len(instances), bool)
     for i, instance in enumerate(instances):
         if instance.points.shape[1] < dim:
             raise ValueError(
@@ -61,23 +62,19 @@ def map_targets(
         line = instance.points[:, :dim].astype(np.float64)
         orders[i] = equivalent_orders(line, num_points, rng)
         points[i] = resample(line, num_points)
-        boxes[i] = bounding_boxes(line)
+        boxes[i] = bounding_boxes(line).reshape(2, 2)
         polylines[i, : len(line)] = line[:, :2]
         polylines[i, len(line) :] = line[-1, :2]
-    points = clamp(points, x_range, y_range)
+        closed[i] = is_closed(instance.points[:, :dim])
     unused = orders == PADDING
-    orders = clamp(orders, x_range, y_range)
-    orders[unused] = PADDING
-    corners = clamp(boxes.reshape(-1, 2, 2), x_range, y_range)
+    metres = {"pts": points, "pts_shifts": orders, "boxes": boxes, "polylines": polylines}
+    targets = {name: clamp(array, x_range, y_range) for name, array in metres.items()}
+    targets["pts_shifts"][unused] = PADDING
+    targets["boxes"] = targets["boxes"].reshape(-1, 4)
     return InstanceData(
         labels_3d=torch.tensor([instance.label for instance in instances], dtype=torch.int64),
-        pts=torch.from_numpy(points.astype(np.float32)),
-        pts_shifts=torch.from_numpy(orders.astype(np.float32)),
-        boxes=torch.from_numpy(corners.reshape(-1, 4).astype(np.float32)),
-        polylines=torch.from_numpy(clamp(polylines, x_range, y_range).astype(np.float32)),
-        closed=torch.tensor(
-            [is_closed(instance.points[:, :dim]) for instance in instances], dtype=torch.bool
-        ),
+        closed=torch.from_numpy(closed),
+        **{name: torch.from_numpy(a.astype(np.float32)) for name, a in targets.items()},
     )
 
 
@@ -85,17 +82,15 @@ def map_targets(
 class FormatMapTargets(BaseTransform):
     """Add ``gt_instances_3d``, the training targets, from ``map_instances``.
 
-    Points have as many coordinates as the data set hands on (its ``dim``).
+    Points have as many coordinates as the data set hands on (its ``dim``). The orders of rings with
+    more than P - 1 vertices are drawn anew each time, as in MapTR.
 
     Args:
         num_points: Points P per element.
-        random_orders: Whether the orders of rings with more than P - 1 vertices are drawn anew each
-            time, as in MapTR; else they are evenly spread over the ring.
     """
 
-    def __init__(self, num_points: int = 20, random_orders: bool = True) -> None:
+    def __init__(self, num_points: int = 20) -> None:
         self.num_points = num_points
-        self.random_orders = random_orders
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets.
@@ -108,9 +103,8 @@ class FormatMapTargets(BaseTransform):
                 f"sample {results['token']!r} has no ground truth: leave FormatMapTargets out of "
                 "this pipeline."
             )
-        rng = None
-        if self.random_orders:  # seeded from the generator that mmengine seeds in each worker
-            rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
+        # seeded from the generator that mmengine seeds in each worker
+        rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
         results["gt_instances_3d"] = map_targets(
             results["map_instances"],
             self.num_points,

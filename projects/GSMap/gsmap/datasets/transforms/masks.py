@@ -40,11 +40,10 @@ class MakeBEVMask(BaseTransform):
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Draw the mask."""
         masks = np.zeros((self.num_classes or 1, *self.size), np.uint8)
-        origin = np.array([results["x_range"][0], results["y_range"][0]])
-        extent = np.array([results["x_range"][1], results["y_range"][1]]) - origin
-        scale = np.array(self.size[::-1]) / extent
+        low, high = np.array([results["x_range"], results["y_range"]]).T
+        scale = np.array(self.size[::-1]) / (high - low)
         for instance in results["map_instances"]:
-            pixels = ((instance.points[:, :2].astype(np.float64) - origin) * scale).astype(np.int32)
+            pixels = ((instance.points[:, :2].astype(np.float64) - low) * scale).astype(np.int32)
             channel = channel_of(instance, self.num_classes)
             cv2.polylines(masks[channel], [pixels], False, (1,), self.thickness_px)
         results["gt_seg"] = torch.from_numpy(masks.astype(np.float32))

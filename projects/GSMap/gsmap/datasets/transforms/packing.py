@@ -1,6 +1,5 @@
 """Packing a sample for the model."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,13 +27,11 @@ class PackMapInputs(BaseTransform):
     4).
 
     Args:
-        meta_keys: Metainfo besides ``META_KEYS``.
         with_points: Whether loaded points go to the model; they may have served for targets only.
     """
 
-    def __init__(self, meta_keys: Sequence[str] = (), with_points: bool = True) -> None:
+    def __init__(self, with_points: bool = True) -> None:
         self.with_points = with_points
-        self.meta_keys = (*META_KEYS, *meta_keys)
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Pack the sample.
@@ -51,7 +48,7 @@ class PackMapInputs(BaseTransform):
         for key in TARGET_KEYS:
             if key in results:
                 setattr(sample, key, results[key])
-        metainfo = {key: results[key] for key in self.meta_keys if key in results}
+        metainfo = {key: results[key] for key in META_KEYS if key in results}
         metainfo |= {key: np.stack(metainfo[key]) for key in _MATRIX_KEYS if key in metainfo}
         sample.set_metainfo(metainfo)
         return {"inputs": inputs, "data_samples": sample}

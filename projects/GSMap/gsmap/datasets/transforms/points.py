@@ -40,21 +40,19 @@ def read_points(path: str, load_dim: int) -> np.ndarray:
             f"no LiDAR file at {path}: correct data_root, download it, or take a config without "
             "LiDAR."
         )
-    points = _read_feather(path, load_dim) if file.suffix == ".feather" else _read(file, load_dim)
-    if not np.isfinite(points).all():
-        raise BrokenSampleError(f"{path} holds NaN or infinity: copy it again.")
-    return points
-
-
-def _read(file: Path, load_dim: int) -> np.ndarray:
-    """Read a sweep of nuScenes. (n, load_dim)."""
     size = file.stat().st_size
-    if size == 0 or size % (4 * load_dim):  # float32 values
+    if file.suffix == ".feather":
+        points = _read_feather(path, load_dim)
+    elif size == 0 or size % (4 * load_dim):  # float32 values
         raise BrokenSampleError(
             f"{file} has {size} bytes, not a multiple of {load_dim} float32 values: copy it again, "
             "or correct load_dim."
         )
-    return np.fromfile(file, np.float32).reshape(-1, load_dim)
+    else:
+        points = np.fromfile(file, np.float32).reshape(-1, load_dim)
+    if not np.isfinite(points).all():
+        raise BrokenSampleError(f"{path} holds NaN or infinity: copy it again.")
+    return points
 
 
 def _read_feather(path: str, load_dim: int) -> np.ndarray:
@@ -136,8 +134,7 @@ class LoadLidarSweeps(LoadPointsFromMultiSweeps):
 class PointsToFrame(BaseTransform):
     """Move the points of a sensor that is not the annotation frame into it.
 
-    Comes between ``LoadLidarPoints`` and ``LoadLidarSweeps`` (whose sweeps are moved already); on
-    nuScenes it changes nothing.
+    Comes between ``LoadLidarPoints`` and ``LoadLidarSweeps`` (whose sweeps are moved already).
     """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
@@ -145,9 +142,8 @@ class PointsToFrame(BaseTransform):
         matrix = results["lidar2frame"]
         if not np.array_equal(matrix, np.eye(4)):
             points = results["points"].tensor
-            rotation = torch.as_tensor(matrix[:3, :3], dtype=points.dtype)
-            shift = torch.as_tensor(matrix[:3, 3], dtype=points.dtype)
-            points[:, :3] = points[:, :3] @ rotation.T + shift
+            moved = torch.as_tensor(matrix, dtype=points.dtype)
+            points[:, :3] = points[:, :3] @ moved[:3, :3].T + moved[:3, 3]
         return results
 
 
