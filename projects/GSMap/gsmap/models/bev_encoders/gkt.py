@@ -55,10 +55,7 @@ class GeometryKernelAttention(nn.Module):
     offsets: Tensor
 
     def __init__(
-        self,
-        embed_dims: int = 256,
-        num_heads: int = 4,
-        kernel_size: tuple[int, int] = (3, 5),
+        self, embed_dims: int = 256, num_heads: int = 4, kernel_size: tuple[int, int] = (3, 5)
     ) -> None:
         super().__init__()
         if any(size % 2 == 0 for size in kernel_size):

@@ -78,16 +78,7 @@ def _density(gaussian, x, y):
 
 @triton.jit
 def forward_kernel(
-    gaussians,
-    masks,
-    count,
-    x_min,
-    y_min,
-    step_x,
-    step_y,
-    height,
-    width,
-    TILE: tl.constexpr,
+    gaussians, masks, count, x_min, y_min, step_x, step_y, height, width, TILE: tl.constexpr
 ):
     """Render one tile of one instance: gaussians (N, P, 8) to masks (N, H, W)."""
     n, tile = tl.program_id(1).to(tl.int64), tl.program_id(0)
