@@ -210,8 +210,8 @@ def test_operator_is_well_formed():
     leaves = [value.requires_grad_() for value in random_gaussians(2, 3, 0.5, 3)]
     render_gaussians(*leaves, ODD_GRID, "cpu")  # registers the operator
     torch.library.opcheck(
-        torch.ops.gsmap.render_gaussians_cpu.default,
-        (*leaves, [-15.0, -30.0, 1.0, 2.0], 21, 33),
+        torch.ops.gsmap.render_gaussians.default,
+        (*leaves, [-15.0, -30.0, 1.0, 2.0], 21, 33, "cpu"),
         test_utils=("test_schema", "test_faketensor", "test_autograd_registration"),
     )
 

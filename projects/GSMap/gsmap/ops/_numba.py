@@ -1,15 +1,16 @@
-"""What the numba kernels share: an exponential that vectorises, and threads over instances.
+"""What the numba kernels share: ranges of pixels, and threads over instances.
 
 Numba's cache watches the file of a kernel alone: delete ``__pycache__`` after a change here.
 """
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
@@ -43,8 +44,8 @@ def run_in_threads(kernel: Callable[..., None], count: int, pixels: int, *argume
             job.result()
 
 
-def exp2_coefficients(degree: int = 5) -> tuple[np.float32, ...]:
-    """Coefficients of 2^x on [-0.5, 0.5], lowest power first, relative error about 1e-7."""
-    nodes = np.polynomial.chebyshev.chebpts1(64) / 2
-    fit = np.polynomial.Polynomial.fit(nodes, np.exp2(nodes), degree, w=1 / np.exp2(nodes))
-    return tuple(np.float32(c) for c in fit.convert().coef)
+@njit(inline="always")
+def pixel_range(low, high, origin, step, size):  # type: ignore[no-untyped-def]
+    """Return the first and one past the last of the pixels whose centres lie in [low, high]."""
+    first, last = (low - origin) / step - 0.5, (high - origin) / step - 0.5
+    return math.ceil(min(max(first, 0.0), size)), math.floor(max(min(last, size - 1.0), -1.0)) + 1

@@ -1,30 +1,28 @@
-"""The choice between plain torch and the fused kernels, and the gradient of a fused operator."""
+"""The choice between plain torch and the fused kernels, which become operators of torch."""
 
 import os
 import warnings
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.library import CustomOpDef
+from torch.library import CustomOpDef, custom_op
 
-HAS_NUMBA = find_spec("numba") is not None
-HAS_TRITON = find_spec("triton") is not None
+PACKAGES = {"cpu": "numba", "triton": "triton"}
+HAS_NUMBA, HAS_TRITON = (find_spec(package) is not None for package in PACKAGES.values())
 
 
 def choose_backend(backend: str, tensor: Tensor, fused: Collection[str] = ("cpu", "triton")) -> str:
-    """Name the backend that is to work on a tensor.
+    """Name the backend that is to work on a tensor: ``"reference"``, ``"cpu"`` or ``"triton"``.
 
     Args:
         backend: ``"auto"``: the fused kernels that serve the tensor's device and type, else the
             reference; or the backend itself.
         tensor: What is worked on.
         fused: Which fused kernels there are: ``"cpu"`` (numba), ``"triton"``.
-
-    Returns:
-        ``"reference"``, ``"cpu"`` or ``"triton"``.
 
     Raises:
         ValueError: If ``backend`` is unknown, does not serve the tensor, or is not installed.
@@ -34,8 +32,17 @@ def choose_backend(backend: str, tensor: Tensor, fused: Collection[str] = ("cpu"
         raise ValueError(f"backend must be one of {known}, got {backend!r}.")
     if backend == "auto":
         return _fastest(tensor, fused)
-    if backend != "reference":
-        _check_serves(backend, tensor)
+    if backend == "reference":
+        return backend
+    if tensor.dtype != torch.float32:
+        raise ValueError(
+            f"backend {backend!r} computes in float32, got {tensor.dtype}: use 'reference'."
+        )
+    if not (HAS_NUMBA if backend == "cpu" else HAS_TRITON):
+        raise ValueError(f"backend {backend!r} needs {PACKAGES[backend]}, which is not installed.")
+    interpreted = backend == "triton" and os.environ.get("TRITON_INTERPRET") == "1"
+    if tensor.device.type != {"cpu": "cpu", "triton": "cuda"}[backend] and not interpreted:
+        raise ValueError(f"backend {backend!r} does not serve tensors on {tensor.device}.")
     return backend
 
 
@@ -51,58 +58,59 @@ def _fastest(tensor: Tensor, fused: Collection[str]) -> str:
             "Install it with `pip install numba`.",
             stacklevel=2,
         )
-    if tensor.is_cuda and HAS_TRITON and "triton" in fused:
-        return "triton"
-    return "reference"
+    return "triton" if tensor.is_cuda and HAS_TRITON and "triton" in fused else "reference"
 
 
-def _check_serves(backend: str, tensor: Tensor) -> None:
-    """Raise if a fused backend is not installed or does not serve a tensor."""
-    if tensor.dtype != torch.float32:
-        raise ValueError(
-            f"backend {backend!r} computes in float32, got {tensor.dtype}: use 'reference'."
-        )
-    if backend == "cpu":
-        package, installed, serves = "numba", HAS_NUMBA, tensor.device.type == "cpu"
-    else:
-        interpreted = os.environ.get("TRITON_INTERPRET") == "1"
-        package, installed, serves = "triton", HAS_TRITON, tensor.is_cuda or interpreted
-    if not installed:
-        raise ValueError(f"backend {backend!r} needs {package}, which is not installed.")
-    if not serves:
-        raise ValueError(f"backend {backend!r} does not serve tensors on {tensor.device}.")
-
-
-def register_gradient(
-    forward: CustomOpDef, backward: CustomOpDef, tensors: int, differentiable: int = 1
-) -> None:
-    """Make an operator the gradient of another.
+def fused_operator(
+    name: str, arguments: str, shape: Callable[..., Sequence[int]], differentiable: int = 0
+) -> CustomOpDef:
+    """Register an operator of torch, ``gsmap::<function>``, that fused kernels compute.
 
     Registered operators work under torch.compile, autocast, DistributedDataParallel and gradient
     checkpointing. Only inputs are kept, so the backward pass can run twice (``retain_graph``).
 
     Args:
-        forward: ``(*tensors, *settings) -> tensor``.
-        backward: ``(grads, *tensors, *settings) -> gradients``, contiguous.
-        tensors: How many of the inputs are tensors.
-        differentiable: In how many of them, the first ones, there are gradients.
+        name: ``<folder>.<function>``. The folder's modules, imported when first used, have the
+            function, which returns a tensor, and, of the gradient in it and the same arguments,
+            ``<function>_backward``, which returns contiguous gradients.
+        arguments: The function's arguments as in a schema of torch, tensors first; the operator
+            takes the backend after them.
+        shape: Of the arguments, the output's shape.
+        differentiable: In how many of the tensors, the first ones, there are gradients.
     """
+    folder, function = name.split(".")
+    tensors = arguments.count("Tensor ")
 
-    @backward.register_fake
-    def fake(grads: Tensor, *inputs: Any) -> Any:
-        gradients = tuple(
-            torch.empty_like(value, memory_format=torch.contiguous_format)
-            for value in inputs[:differentiable]
-        )
-        return gradients if differentiable > 1 else gradients[0]
+    def fused(backend: str, function: str) -> Callable[..., Any]:
+        return getattr(import_module(f"gsmap.ops.{folder}.{PACKAGES[backend]}"), function)
+
+    def forward(*inputs: Any) -> Tensor:
+        return fused(inputs[-1], function)(*inputs[:-1])
+
+    schema = f"({arguments}, str backend) -> Tensor"
+    operator = custom_op(f"gsmap::{function}", forward, mutates_args=(), schema=schema)
+    operator.register_fake(lambda *inputs: inputs[0].new_empty(shape(*inputs[:-1])))
+    if not differentiable:
+        return operator
+
+    def backward(*inputs: Any) -> list[Tensor]:
+        return list(fused(inputs[-1], f"{function}_backward")(*inputs[:-1]))
+
+    schema = f"(Tensor grads, {arguments}, str backend) -> Tensor[]"
+    gradient = custom_op(f"gsmap::{function}_backward", backward, mutates_args=(), schema=schema)
+
+    @gradient.register_fake
+    def fake_gradients(_: Tensor, *inputs: Any) -> list[Tensor]:
+        contiguous = torch.contiguous_format
+        return [torch.empty_like(x, memory_format=contiguous) for x in inputs[:differentiable]]
 
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.save_for_backward(*inputs[:tensors])
         ctx.settings = inputs[tensors:]
 
     def differentiate(ctx: Any, grads: Tensor) -> tuple[Any, ...]:
-        gradients = backward(grads, *ctx.saved_tensors, *ctx.settings)
-        gradients = gradients if differentiable > 1 else (gradients,)
+        gradients = gradient(grads, *ctx.saved_tensors, *ctx.settings)
         return *gradients, *(None,) * (tensors + len(ctx.settings) - differentiable)
 
-    forward.register_autograd(differentiate, setup_context=setup_context)
+    operator.register_autograd(differentiate, setup_context=setup_context)
+    return operator

@@ -4,7 +4,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsmap.ops.backends import choose_backend
+from gsmap.ops.backends import choose_backend, fused_operator
+
+_sum_rows = fused_operator(
+    "deformable_sampling.sum_rows",
+    "Tensor table, Tensor weights, Tensor rows",
+    lambda table, weights, rows: (len(rows), table.shape[1]),
+    differentiable=2,
+)
 
 
 def deformable_sample(
@@ -81,7 +88,5 @@ def sum_rows(table: Tensor, rows: Tensor, weights: Tensor, backend: str = "auto"
     if not wants_gradient or choose_backend(backend, table, ("cpu",)) == "reference":
         out = F.embedding_bag(bags, table, per_sample_weights=factors, mode="sum")
     else:
-        from gsmap.ops.deformable_sampling.numba import sum_rows_cpu
-
-        out = sum_rows_cpu(table, factors, bags)
+        out = _sum_rows(table, factors, bags, "cpu")
     return out.view(*rows.shape[:-1], table.shape[-1])

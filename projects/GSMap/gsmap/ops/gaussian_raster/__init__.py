@@ -1,14 +1,20 @@
 """Rendering of 2D Gaussians to soft masks (GSMap Eq. 6)."""
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from gsmap.ops.backends import choose_backend
+from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.gaussian_raster.reference import render_gaussians_reference
 from gsmap.structures.grid import BEVGrid
+
+_render = fused_operator(
+    "gaussian_raster.render_gaussians",
+    "Tensor means, Tensor scales, Tensor rotations, float[] frame, int height, int width",
+    lambda means, scales, rotations, frame, height, width: (len(means), height, width),
+    differentiable=3,
+)
 
 
 def render_gaussians(
@@ -44,28 +50,11 @@ def render_gaussians(
         backend = choose_backend(backend, means)
         if backend == "reference":
             return render_gaussians_reference(means, scales, rotations, grid)
-        batch, count = means.shape[:-2], means.shape[-2]
-        instances = math.prod(batch)
-        masks = _operator(backend)(
-            means.reshape(instances, count, 2),
-            scales.reshape(instances, count, 2),
-            rotations.reshape(instances, count),
-            [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m],
-            grid.height,
-            grid.width,
-        )
-        return masks.reshape(*batch, grid.height, grid.width)
-
-
-def _operator(backend: str) -> Callable[..., Tensor]:
-    """Import a fused backend when it is first used."""
-    if backend == "triton":
-        from gsmap.ops.gaussian_raster import triton
-
-        return triton.render
-    from gsmap.ops.gaussian_raster import numba
-
-    return numba.render
+        flat = math.prod(means.shape[:-2]), means.shape[-2]
+        gaussians = means.reshape(*flat, 2), scales.reshape(*flat, 2), rotations.reshape(flat)
+        frame = [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m]
+        masks = _render(*gaussians, frame, grid.height, grid.width, backend)
+        return masks.reshape(*means.shape[:-2], grid.height, grid.width)
 
 
 def _check(means: Tensor, scales: Tensor, rotations: Tensor) -> None:

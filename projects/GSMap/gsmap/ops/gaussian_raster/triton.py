@@ -1,33 +1,18 @@
 # Triton infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-r"""Triton kernels and their operators: masks of 2D Gaussians, a tile of an instance per program.
+r"""Triton kernels: masks of 2D Gaussians, a tile of an instance per program.
 
-How the work is laid out
-    The raster of an instance is cut into TILE x TILE pixels; a program owns one tile and keeps its
-    pixels in registers (8 per thread with 32 x 32 pixels and 4 warps). It walks over the instance's
-    P Gaussians. Each comes as eight numbers, made beforehand by a few torch operations on (N, P)
-    values: mean, cos, sin, 1 / sigma along both axes, and half the size of the box outside which
-    the Gaussian is below the cut. A Gaussian whose box misses the tile is skipped by a scalar
-    branch, without touching a pixel. A NaN compares false, so it is never skipped and shows up in
-    the mask as it does in the reference.
+The raster of an instance is cut into TILE x TILE pixels; a program keeps those of one tile in
+registers and walks over the instance's P Gaussians. One whose box (outside of which it is below the
+cut) misses the tile is skipped by a scalar branch; a NaN compares false, so it is never skipped and
+shows up in the mask. In the Gaussian's own frame u = (c dx + s dy) / sigma_u, v = (c dy - s dx) /
+sigma_v, and G = exp(-(u^2 + v^2) / 2); the mask gathers R <- R + G (1 - R), which is 1 - prod (1 -
+G) and exact for small G.
 
-    In the Gaussian's own frame u = (c dx + s dy) / sigma_u, v = (c dy - s dx) / sigma_v, and
-    G = exp(-(u^2 + v^2) / 2); the mask gathers R <- R + G (1 - R), which is 1 - prod (1 - G) and
-    exact for small G. It is written once. Offsets from the mean are taken in metres, whose
-    float32 spacing (2e-6 m at 30 m) is far below any useful sigma.
-
-Backward
-    Only (N, P) values are kept from the forward pass. A program rebuilds its tile's transmittance
-    T = prod (1 - G) in registers, reads dL/dR once, and takes for each Gaussian that touches the
-    tile the five sums of w, w = dL/dR * T * G / (1 - G): w u, w v, w u^2, w u v, w v^2. They go to
-    a buffer (N, tiles, P, 5) that no other program writes: no atomics, so two runs give the same
-    bits. torch adds up the tiles and turns the moments into gradients on (N, P) values.
-
-The floor
-    Memory: forward writes the masks once (N H W 4 bytes); backward reads dL/dR once. The moments'
-    buffer is 20 P / TILE^2 bytes per 4 bytes of mask: a tenth of the masks at P = 20, TILE = 32.
-    Arithmetic: one exponential forward and two backward per pixel of a tile that a Gaussian's box
-    touches. At Setting T a Gaussian of 1.0 x 0.4 m touches about 4 of 28 tiles.
+The backward pass rebuilds the tile's transmittance T = prod (1 - G), reads dL/dR once, and takes
+for each Gaussian that touches the tile the sums of w u, w v, w u^2, w u v and w v^2, with w =
+dL/dR * T * G / (1 - G). They go to a buffer (N, tiles, P, 5) that no other program writes: no
+atomics, so two runs give the same bits. torch adds up the tiles and turns them into gradients.
 
 No launch waits for the device, nothing is autotuned, and no size is compiled in but TILE.
 """
@@ -37,9 +22,7 @@ import math
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from gsmap.ops.backends import register_gradient
 from gsmap.ops.gaussian_raster.reference import SQUARED_REACH
 
 TILE = 32
@@ -136,7 +119,12 @@ def backward_kernel(
                 tl.store(out + p * 5 + i, 0.0)
 
 
-def _pack(means: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:
+def _tiles(height, width):
+    """Return the number of tiles of a raster."""
+    return math.ceil(height / TILE) * math.ceil(width / TILE)
+
+
+def _pack(means, scales, rotations):
     """Return mean, cos, sin, 1 / sigma and half the box of each Gaussian. (N, P, 8)"""
     reach = math.sqrt(SQUARED_REACH)
     cos, sin = torch.cos(rotations)[..., None], torch.sin(rotations)[..., None]
@@ -146,75 +134,32 @@ def _pack(means: Tensor, scales: Tensor, rotations: Tensor) -> Tensor:
     return torch.cat([means, cos, sin, scales.reciprocal(), half_x, half_y], -1).contiguous()
 
 
-@torch.library.custom_op("gsmap::render_gaussians_triton", mutates_args=())
-def render(
-    means: Tensor, scales: Tensor, rotations: Tensor, frame: list[float], height: int, width: int
-) -> Tensor:
+def render_gaussians(means, scales, rotations, frame, height, width):
     """Render float32 Gaussians; ``frame``: smallest x and y, pixel size along both. (N, H, W)"""
     masks = means.new_empty(len(means), height, width)
-    if not len(means):
-        return masks
-    tiles = math.ceil(height / TILE) * math.ceil(width / TILE)
-    with torch.cuda.device_of(means):
-        forward_kernel[tiles, len(means)](
-            _pack(means, scales, rotations),
-            masks,
-            means.shape[1],
-            *frame,
-            height,
-            width,
-            TILE=TILE,
-            num_warps=4,
-        )
+    if len(means):
+        with torch.cuda.device_of(means):
+            launch = forward_kernel[_tiles(height, width), len(means)]
+            gaussians = _pack(means, scales, rotations)
+            launch(gaussians, masks, means.shape[1], *frame, height, width, TILE=TILE, num_warps=4)
     return masks
 
 
-@torch.library.custom_op("gsmap::render_gaussians_triton_backward", mutates_args=())
-def _backward(
-    grads: Tensor,
-    means: Tensor,
-    scales: Tensor,
-    rotations: Tensor,
-    frame: list[float],
-    height: int,
-    width: int,
-) -> tuple[Tensor, Tensor, Tensor]:
+def render_gaussians_backward(grads, means, scales, rotations, frame, height, width):
     """Return the gradients in means, scales and rotations."""
     instances, count = rotations.shape
     if not rotations.numel():
         return torch.zeros_like(means), torch.zeros_like(scales), torch.zeros_like(rotations)
-    tiles = math.ceil(height / TILE) * math.ceil(width / TILE)
+    tiles = _tiles(height, width)
     moments = means.new_empty(instances, tiles, count, 5)
     gaussians = _pack(means, scales, rotations)
+    arguments = gaussians, grads.contiguous(), moments, count, *frame, height, width
     with torch.cuda.device_of(means):
-        backward_kernel[tiles, instances](
-            gaussians,
-            grads.contiguous(),
-            moments,
-            count,
-            *frame,
-            height,
-            width,
-            TILE=TILE,
-            num_warps=4,
-        )
-    return _gradients(moments.sum(1), gaussians, scales)
-
-
-def _gradients(moments: Tensor, gaussians: Tensor, scales: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Turn the moments of w (u, v, u^2, u v, v^2, in units of sigma) into gradients."""
+        backward_kernel[tiles, instances](*arguments, TILE=TILE, num_warps=4)
     cos, sin, inv_u, inv_v = gaussians[..., 2:6].unbind(-1)
-    m_u, m_v, m_uu, m_uv, m_vv = moments.unbind(-1)
+    m_u, m_v, m_uu, m_uv, m_vv = moments.sum(1).unbind(-1)  # in units of sigma
     m_u, m_v = m_u * inv_u, m_v * inv_v
     grad_means = torch.stack([cos * m_u - sin * m_v, sin * m_u + cos * m_v], -1)
     grad_scales = torch.stack([m_uu * inv_u, m_vv * inv_v], -1)
     scale_u, scale_v = scales.unbind(-1)
     return grad_means, grad_scales, m_uv * (scale_u * inv_v - scale_v * inv_u)
-
-
-@render.register_fake
-def _(means, scales, rotations, frame, height, width):
-    return means.new_empty(means.shape[0], height, width)
-
-
-register_gradient(render, _backward, tensors=3, differentiable=3)

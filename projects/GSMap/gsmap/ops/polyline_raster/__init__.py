@@ -3,12 +3,24 @@
 import torch
 from torch import Tensor
 
-from gsmap.ops.backends import choose_backend
+from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.polyline_raster.reference import draw_reference, soft_rasters_reference
 from gsmap.structures.grid import BEVGrid
 
 LANE_GAP_PX = 0.01  # how far MapVR moves a line's way back: both form a polygon
 DISTANCES = ("squared", "plain")
+_draw = fused_operator(
+    "polyline_raster.draw_polylines",
+    "Tensor polylines, Tensor filled, int height, int width, float[] frame, float half_width, "
+    "float pixel",
+    lambda polylines, filled, height, width, *_: (len(polylines), height, width),
+)
+_soft_rasters = fused_operator(
+    "polyline_raster.soft_rasters",
+    "Tensor rings, Tensor is_polygon, int height, int width, float[] softness, bool plain",
+    lambda rings, is_polygon, height, width, *_: (len(rings), height, width),
+    differentiable=1,
+)
 
 
 def draw_polylines(
@@ -16,10 +28,11 @@ def draw_polylines(
     grid: BEVGrid,
     width_m: float = 0.6,
     filled: Tensor | None = None,
-    antialias: bool = True,
     backend: str = "auto",
 ) -> Tensor:
     """Draw the masks of ground-truth polylines, all at once and on their own device.
+
+    A pixel takes the share that the shape covers of it, measured across the nearest edge.
 
     Args:
         polylines: Vertices in metres, in the frame of ``grid``. (K, P, 2)
@@ -28,8 +41,6 @@ def draw_polylines(
             of 0.125 m).
         filled: Which polylines are filled as polygons (to their vertices, without the line's
             width), bool; all are drawn as lines without it. (K,)
-        antialias: Give a pixel the share that the shape covers of it, taken across the nearest
-            edge; otherwise 1 if its centre is covered and 0 if not.
         backend: ``"reference"``, ``"cpu"`` (fused), or ``"auto"``.
 
     Returns:
@@ -50,12 +61,10 @@ def draw_polylines(
     half_width_m, pixel_m = width_m / 2, (dx * dy) ** 0.5
     with torch.autocast(polylines.device.type, enabled=False):
         if choose_backend(backend, polylines, ("cpu",)) == "cpu":
-            from gsmap.ops.polyline_raster.numba import draw_cpu
-
             size, frame = (grid.height, grid.width), [grid.x_range[0], grid.y_range[0], dx, dy]
-            return draw_cpu(polylines, flags, *size, frame, half_width_m, pixel_m, antialias)
+            return _draw(polylines, flags, *size, frame, half_width_m, pixel_m, "cpu")
         pixels = grid.pixel_centres(polylines.device, polylines.dtype)
-        return draw_reference(polylines, flags, pixels, half_width_m, pixel_m, antialias)
+        return draw_reference(polylines, flags, pixels, half_width_m, pixel_m)
 
 
 def soft_rasters(
@@ -110,9 +119,7 @@ def soft_rasters(
         rings = torch.cat([vertices, torch.where(flags[:, None, None], stay, back)], 1)
         softness = [line_softness, polygon_softness]
         if choose_backend(backend, rings, ("cpu",)) == "cpu":
-            from gsmap.ops.polyline_raster.numba import soft_rasters_cpu
-
-            return soft_rasters_cpu(rings, flags, height, width, softness, plain)
+            return _soft_rasters(rings, flags, height, width, softness, plain, "cpu")
         return soft_rasters_reference(rings, flags, height, width, softness, plain)
 
 

@@ -1,6 +1,6 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-r"""Fused CPU kernels (numba) and their operators: soft rasters and ground-truth masks.
+"""Fused CPU kernels (numba): soft rasters and ground-truth masks.
 
 One thread works on one element at a time. Edge by edge and row by row, only the pixels within a
 reach of the edge are visited: beyond it a soft raster differs from 0 or 1 by less than 1e-8, and a
@@ -15,23 +15,13 @@ import math
 import numpy as np
 import torch
 from numba import njit
-from torch import Tensor
 
-from gsmap.ops._numba import FASTMATH, run_in_threads
-from gsmap.ops.backends import register_gradient
+from gsmap.ops._numba import FASTMATH, pixel_range, run_in_threads
 from gsmap.ops.polyline_raster.reference import DISTANCE_EPS, LENGTH_EPS
 
 FAR = np.float32(np.inf)
 REACH = -math.log(1e-8)  # in units of softness: beyond it masks are 0 or 1
 INTEGER_FRAME = (-0.5, -0.5, 1.0, 1.0)  # MapVR samples pixel (row, col) at (col, row)
-Pair = tuple[float, float]
-
-
-@njit(inline="always")
-def _columns(low, high, origin, step, width):
-    """Return the first and one past the last of the columns whose centres lie in [low, high]."""
-    first, last = (low - origin) / step - 0.5, (high - origin) / step - 0.5
-    return math.ceil(min(max(first, 0.0), width)), math.floor(max(min(last, width - 1.0), -1.0)) + 1
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")
@@ -47,7 +37,7 @@ def _visit_edge(start, end, index, frame, reach, eps, steps, distances, owners):
     ex, ey, step = np.float32(edge_x), np.float32(edge_y), np.float32(step_x)
     low_y, high_y = min(y0, y0 + edge_y) - reach, max(y0, y0 + edge_y) + reach
     low_x, high_x = min(x0, x0 + edge_x) - reach, max(x0, x0 + edge_x) + reach
-    top, bottom = _columns(low_y, high_y, y_min, step_y, height)
+    top, bottom = pixel_range(low_y, high_y, y_min, step_y, height)
     for row in range(top, bottom):
         offset_y = y_min + (row + 0.5) * step_y - y0
         left_x, right_x = low_x, high_x
@@ -55,7 +45,7 @@ def _visit_edge(start, end, index, frame, reach, eps, steps, distances, owners):
             crossing = x0 + offset_y * edge_x / edge_y
             half = reach * length / abs(edge_y)
             left_x, right_x = max(left_x, crossing - half), min(right_x, crossing + half)
-        left, right = _columns(left_x, right_x, x_min, step_x, width)
+        left, right = pixel_range(left_x, right_x, x_min, step_x, width)
         nearest, owner = distances[row, left : max(left, right)], owners[row, left:right]
         first, fy = np.float32(x_min + (left + 0.5) * step_x - x0), np.float32(offset_y)
         for k in range(len(nearest)):
@@ -69,16 +59,6 @@ def _visit_edge(start, end, index, frame, reach, eps, steps, distances, owners):
 
 
 @njit(nogil=True, cache=True)
-def _nearest_edges(ring, edges, frame, reach, eps, steps, distances, owners):
-    """Fill the squared distances (H, W), infinite beyond the reach, and the nearest edges."""
-    distances[:] = FAR
-    owners[:] = -1
-    for i in range(edges):
-        j = i + 1 if i + 1 < len(ring) else 0
-        _visit_edge(ring[i], ring[j], np.int32(i), frame, reach, eps, steps, distances, owners)
-
-
-@njit(nogil=True, cache=True)
 def _fill_inside(ring, frame, inside):
     """Set pixels (H, W) to 1 inside the closed ring by the even-odd rule, and to 0 outside."""
     x_min, y_min, step_x, step_y = frame
@@ -88,7 +68,7 @@ def _fill_inside(ring, frame, inside):
         x0, y0, x1, y1 = float(ring[i, 0]), float(ring[i, 1]), float(ring[j, 0]), float(ring[j, 1])
         if y0 == y1:
             continue
-        top, bottom = _columns(min(y0, y1), max(y0, y1), y_min, step_y, len(inside))
+        top, bottom = pixel_range(min(y0, y1), max(y0, y1), y_min, step_y, len(inside))
         for row in range(top, bottom):
             y = y_min + (row + 0.5) * step_y
             if (y0 > y) == (y1 > y):
@@ -104,6 +84,25 @@ def _buffers(shape):
     """Return a thread's scratch: column numbers, distances, owners, inside."""
     steps = np.arange(shape[1]).astype(np.float32)
     return steps, np.empty(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.uint8)
+
+
+@njit(nogil=True, cache=True)
+def _survey(ring, closed, filled, frame, reach, eps, buffers):
+    """Fill squared distances, infinite beyond the reach, nearest edges and, if filled, the inside.
+
+    False, and nothing is filled, if a vertex is not finite.
+    """
+    if not np.isfinite(ring).all():
+        return False
+    steps, distances, owners, inside = buffers
+    distances[:] = FAR
+    owners[:] = -1
+    for i in range(len(ring) if closed else len(ring) - 1):
+        j = i + 1 if i + 1 < len(ring) else 0
+        _visit_edge(ring[i], ring[j], np.int32(i), frame, reach, eps, steps, distances, owners)
+    if filled:
+        _fill_inside(ring, frame, inside)
+    return True
 
 
 @njit(inline="always")
@@ -122,15 +121,13 @@ def soft_forward(rings, polygons, frame, reach, eps, softness, nearest, masks, f
     distance to the nearest edge; else D is the distance, or ``nearest`` where it is smaller, and
     there it has no gradient.
     """
-    steps, distances, owners, inside = _buffers(masks.shape[1:])
+    buffers = _buffers(masks.shape[1:])
+    _, distances, owners, inside = buffers
     for n in range(first, last):
-        ring, kind = rings[n], int(polygons[n])
-        if not np.isfinite(ring).all():
+        kind = int(polygons[n])
+        if not _survey(rings[n], True, kind, frame, reach[kind], eps, buffers):
             masks[n] = np.nan
             continue
-        _nearest_edges(ring, len(ring), frame, reach[kind], eps, steps, distances, owners)
-        if kind:
-            _fill_inside(ring, frame, inside)
         for row in range(masks.shape[1]):
             for col in range(masks.shape[2]):
                 fade = 0.0
@@ -164,17 +161,15 @@ def _scatter(ring, owner, x, y, eps, weight, out):
 @njit(nogil=True, cache=True)
 def soft_backward(rings, polygons, frame, reach, eps, softness, nearest, grads, out, first, last):
     """Write to ``out`` (N, V, 2), float64, the gradient in the rings of ``grads`` (N, H, W)."""
-    steps, distances, owners, inside = _buffers(grads.shape[1:])
+    buffers = _buffers(grads.shape[1:])
+    _, distances, owners, inside = buffers
     x_min, y_min, step_x, step_y = frame
     for n in range(first, last):
         ring, kind = rings[n], int(polygons[n])
         out[n] = 0
-        if not np.isfinite(ring).all():
+        if not _survey(ring, True, kind, frame, reach[kind], eps, buffers):
             out[n] = np.nan
             continue
-        _nearest_edges(ring, len(ring), frame, reach[kind], eps, steps, distances, owners)
-        if kind:
-            _fill_inside(ring, frame, inside)
         for row in range(grads.shape[1]):
             for col in range(grads.shape[2]):
                 if owners[row, col] < 0 or grads[n, row, col] == 0:
@@ -192,48 +187,35 @@ def soft_backward(rings, polygons, frame, reach, eps, softness, nearest, grads, 
 
 
 @njit(nogil=True, cache=True)
-def draw(polylines, filled, frame, half_width, pixel, antialias, masks, first, last):
+def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
     """Write masks of lines of a width, or of filled polygons; arguments as of `draw_reference`."""
-    steps, distances, owners, inside = _buffers(masks.shape[1:])
+    buffers = _buffers(masks.shape[1:])
+    _, distances, _, inside = buffers
     for n in range(first, last):
-        ring, kind = polylines[n], filled[n]
-        if not np.isfinite(ring).all():
+        kind = filled[n]
+        reach = pixel if kind else half_width + pixel
+        if not _survey(polylines[n], kind, kind, frame, reach, 0.0, buffers):
             masks[n] = np.nan
             continue
-        reach = pixel if kind else half_width + pixel
-        edges = len(ring) if kind else len(ring) - 1
-        _nearest_edges(ring, edges, frame, reach, 0.0, steps, distances, owners)
-        if kind:
-            _fill_inside(ring, frame, inside)
         for row in range(masks.shape[1]):
             for col in range(masks.shape[2]):
                 distance = math.sqrt(distances[row, col])
                 if kind:
                     signed = distance if inside[row, col] else -distance
-                    share = min(max(0.5 + signed / pixel, 0.0), 1.0)
-                    share = share if antialias else float(inside[row, col])
-                elif antialias:
-                    near = min((distance + half_width) / pixel, 0.5)
-                    share = max(near - max((distance - half_width) / pixel, -0.5), 0.0)
+                    share = min(0.5 + signed / pixel, 1.0)
                 else:
-                    share = 1.0 if distance <= half_width else 0.0
-                masks[n, row, col] = share
+                    near = min((distance + half_width) / pixel, 0.5)
+                    share = near - max((distance - half_width) / pixel, -0.5)
+                masks[n, row, col] = max(share, 0.0)
 
 
-def _settings(
-    softness: list[float], plain: bool
-) -> tuple[tuple[float, ...], Pair, float, Pair, float]:
+def _settings(softness, plain):
     """Return the kernels' frame, reach, eps, softness and smallest distance."""
-    line, polygon = softness
-    reach = REACH * line, REACH * polygon
-    reach = reach if plain else (math.sqrt(reach[0]), math.sqrt(reach[1]))
-    return INTEGER_FRAME, reach, LENGTH_EPS, (line, polygon), DISTANCE_EPS if plain else 0.0
+    reach = tuple(REACH * tau if plain else math.sqrt(REACH * tau) for tau in softness)
+    return INTEGER_FRAME, reach, LENGTH_EPS, tuple(softness), DISTANCE_EPS if plain else 0.0
 
 
-@torch.library.custom_op("gsmap::soft_rasters", mutates_args=(), device_types="cpu")
-def soft_rasters_cpu(
-    rings: Tensor, is_polygon: Tensor, height: int, width: int, softness: list[float], plain: bool
-) -> Tensor:
+def soft_rasters(rings, is_polygon, height, width, softness, plain):
     """Render closed float32 rings softly; see ``soft_rasters_reference``. (n, H, W)"""
     masks = torch.empty(len(rings), height, width, dtype=torch.float32)
     arguments = rings, is_polygon, *_settings(softness, plain), masks
@@ -241,45 +223,17 @@ def soft_rasters_cpu(
     return masks
 
 
-@torch.library.custom_op("gsmap::soft_rasters_backward", mutates_args=(), device_types="cpu")
-def _soft_rasters_backward(
-    grads: Tensor,
-    rings: Tensor,
-    is_polygon: Tensor,
-    height: int,
-    width: int,
-    softness: list[float],
-    plain: bool,
-) -> Tensor:
+def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, plain):
     """Return the gradient in the rings. (n, V, 2)"""
     gradients = torch.empty(rings.shape, dtype=torch.float64)
     arguments = rings, is_polygon, *_settings(softness, plain), grads, gradients
     run_in_threads(soft_backward, len(rings), height * width, *arguments)
-    return gradients.float()
+    return (gradients.float(),)
 
 
-@torch.library.custom_op("gsmap::draw_polylines", mutates_args=(), device_types="cpu")
-def draw_cpu(
-    polylines: Tensor,
-    filled: Tensor,
-    height: int,
-    width: int,
-    frame: list[float],
-    half_width: float,
-    pixel: float,
-    antialias: bool,
-) -> Tensor:
+def draw_polylines(polylines, filled, height, width, frame, half_width, pixel):
     """Draw float32 polylines; see ``draw_reference``. (K, H, W)"""
     masks = torch.empty(len(polylines), height, width, dtype=torch.float32)
-    arguments = polylines, filled, tuple(frame), half_width, pixel, antialias, masks
+    arguments = polylines, filled, tuple(frame), half_width, pixel, masks
     run_in_threads(draw, len(polylines), height * width, *arguments)
     return masks
-
-
-@soft_rasters_cpu.register_fake
-@draw_cpu.register_fake
-def _(elements, flags, height, width, *settings):
-    return elements.new_empty(elements.shape[0], height, width)
-
-
-register_gradient(soft_rasters_cpu, _soft_rasters_backward, tensors=2)

@@ -87,23 +87,16 @@ def soft_rasters_reference(
 
 
 def draw_reference(
-    polylines: Tensor,
-    filled: Tensor,
-    pixels: Tensor,
-    half_width: float,
-    pixel: float,
-    antialias: bool,
+    polylines: Tensor, filled: Tensor, pixels: Tensor, half_width: float, pixel: float
 ) -> Tensor:
     """Draw lines of half a width, or filled polygons (K,), of vertices (K, P, 2). (K, H, W)
 
     All are in one unit: pixels are their centres (H, W, 2), ``pixel`` is the side of the square
-    that is as large as one. It takes the share that is covered with ``antialias``, else 0 or 1.
+    that is as large as one.
     """
     to_line = _edge_distances(pixels, polylines[:, :-1], polylines[:, 1:]).sqrt()
     to_closing = _edge_distances(pixels, polylines[:, -1:], polylines[:, :1]).sqrt()
     inside = _inside_polygon(pixels, polylines)
-    if not antialias:
-        return torch.where(filled[:, None, None], inside, to_line <= half_width).to(pixels.dtype)
     near, far = (to_line + half_width) / pixel, (to_line - half_width) / pixel
     lines = (near.clamp(max=0.5) - far.clamp(min=-0.5)).clamp(min=0)
     to_edge = torch.minimum(to_line, to_closing) / pixel

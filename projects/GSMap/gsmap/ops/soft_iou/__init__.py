@@ -3,8 +3,14 @@
 import torch
 from torch import Tensor
 
-from gsmap.ops.backends import choose_backend
+from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.soft_iou.reference import pairwise_minima_reference
+
+_pairwise_minima = fused_operator(
+    "soft_iou.pairwise_minima",
+    "Tensor preds, Tensor targets",
+    lambda *masks: tuple(map(len, masks)),
+)
 
 
 def pairwise_soft_iou(
@@ -36,24 +42,12 @@ def pairwise_soft_iou(
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds, targets = preds.to(dtype).flatten(1), targets.to(dtype).flatten(1)  # (N, HW), (K, HW)
     wants_gradient = torch.is_grad_enabled() and (preds.requires_grad or targets.requires_grad)
-    if backend == "auto" and wants_gradient:
-        backend = "reference"
-    backend = choose_backend(backend, preds)
-    if backend != "reference":
-        preds, targets = preds.detach(), targets.detach()
-    minima = _minima(backend, preds, targets)
-    union = preds.sum(-1)[:, None] + targets.sum(-1) - minima
-    return minima / (union + eps)
-
-
-def _minima(backend: str, preds: Tensor, targets: Tensor) -> Tensor:
-    """Sum the minimum of every pair by a backend, imported when it is first used. (N, K)"""
+    backend = choose_backend(
+        "reference" if backend == "auto" and wants_gradient else backend, preds
+    )
     if backend == "reference":
-        return pairwise_minima_reference(preds, targets)
-    if backend == "triton":
-        from gsmap.ops.soft_iou import triton
-
-        return triton.pairwise_minima(preds, targets)
-    from gsmap.ops.soft_iou import numba
-
-    return numba.pairwise_minima(preds, targets)
+        minima = pairwise_minima_reference(preds, targets)
+    else:
+        preds, targets = preds.detach(), targets.detach()
+        minima = _pairwise_minima(preds, targets, backend)
+    return minima / (preds.sum(-1)[:, None] + targets.sum(-1) - minima + eps)

@@ -1,6 +1,6 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-"""Fused CPU kernel (numba) and its operator: the sum of minima of every pair of masks.
+"""Fused CPU kernel (numba): the sum of minima of every pair of masks.
 
 A target is 0 almost everywhere, and so is the minimum: each target's pixels that are not 0 are
 listed once, and every prediction is read at those alone. Rows of predictions are shared out among
@@ -10,7 +10,6 @@ threads; a sum runs in a fixed order in one thread, so two runs give the same bi
 import numpy as np
 import torch
 from numba import njit
-from torch import Tensor
 
 from gsmap.ops._numba import run_in_threads
 
@@ -43,16 +42,10 @@ def sum_minima(preds, starts, indices, values, out, first, last):
             out[n, k] = total
 
 
-@torch.library.custom_op("gsmap::pairwise_minima_cpu", mutates_args=(), device_types="cpu")
-def pairwise_minima(preds: Tensor, targets: Tensor) -> Tensor:
+def pairwise_minima(preds, targets):
     """Sum the minimum of every pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
     minima = torch.empty(len(preds), len(targets), dtype=torch.float32)
     starts, pixels, values = list_pixels(targets.contiguous().numpy())
     arguments = preds, starts, pixels, values, minima
     run_in_threads(sum_minima, len(preds), len(pixels), *arguments)
     return minima
-
-
-@pairwise_minima.register_fake
-def _(preds, targets):
-    return preds.new_empty(preds.shape[0], targets.shape[0])

@@ -1,6 +1,6 @@
 # Triton infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-"""Triton kernel and its operator: the sum of minima of every pair of masks.
+"""Triton kernel: the sum of minima of every pair of masks.
 
 A program owns one pair and walks over its pixels in blocks, one partial sum per lane, added up at
 the end: no atomics, so two runs give the same bits. Masks are small (20 kB at 100 x 50), so all but
@@ -10,7 +10,6 @@ the first read of each comes from the cache; no (N, K, pixels) tensor exists.
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
 BLOCK = 1024
 
@@ -28,23 +27,12 @@ def minima_kernel(preds, targets, minima, pixels, BLOCK: tl.constexpr):
     tl.store(minima + n * tl.num_programs(0) + k, tl.sum(sums))
 
 
-@torch.library.custom_op("gsmap::pairwise_minima_triton", mutates_args=())
-def pairwise_minima(preds: Tensor, targets: Tensor) -> Tensor:
+def pairwise_minima(preds, targets):
     """Sum the minimum of every pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
     minima = preds.new_empty(len(preds), len(targets))
     if minima.numel():
+        masks = preds.contiguous(), targets.contiguous()
         with torch.cuda.device_of(preds):
-            minima_kernel[len(targets), len(preds)](
-                preds.contiguous(),
-                targets.contiguous(),
-                minima,
-                preds.shape[1],
-                BLOCK=BLOCK,
-                num_warps=4,
-            )
+            launch = minima_kernel[len(targets), len(preds)]
+            launch(*masks, minima, preds.shape[1], BLOCK=BLOCK, num_warps=4)
     return minima
-
-
-@pairwise_minima.register_fake
-def _(preds, targets):
-    return preds.new_empty(preds.shape[0], targets.shape[0])
