@@ -6,12 +6,18 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gsmap.ops.backends import choose_backend
+from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.raster_loss.reference import gaussian_window, raster_loss_sums_reference
 
 NORMALIZATIONS = ("both", "foreground", "pixels")
 MIN_FOREGROUND = 0.005  # "foreground": a smaller ground truth counts as this share of the raster
 _EPS = 1e-6
+_raster_loss_sums = fused_operator(
+    "raster_loss.raster_loss_sums",
+    "Tensor preds, Tensor targets, Tensor window, float weight",
+    lambda preds, *_: (len(preds), 7),
+    differentiable=1,
+)
 
 
 def raster_loss(
@@ -65,7 +71,14 @@ def raster_loss(
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds, targets = preds.to(dtype), targets.detach().to(dtype)
     with torch.autocast(preds.device.type, enabled=False):
-        sums = _sums(preds, targets, foreground_weight, window_size, window_sigma, backend)
+        settings = window_size, window_sigma
+        if choose_backend(backend, preds, ("cpu",)) == "cpu":
+            window = gaussian_window(*settings, preds)
+            sums = _raster_loss_sums(preds, targets, window, foreground_weight, "cpu")
+        else:  # nothing is random, and saving its state would wait for a GPU
+            arguments = preds, targets, *settings, foreground_weight
+            kept = {"use_reentrant": False, "preserve_rng_state": False}
+            sums = checkpoint(raster_loss_sums_reference, *arguments, **kept)
         l1, predicted, dissimilarity, foreground, excess, sees_target, sees_either = sums.unbind(-1)
         pixels = math.prod(preds.shape[1:])
         if normalize == "both":
@@ -78,23 +91,3 @@ def raster_loss(
         else:
             l1, dissimilarity = l1 / (pixels + excess), dissimilarity / pixels
         return alpha * l1 + (1 - alpha) * dissimilarity
-
-
-def _sums(
-    preds: Tensor, targets: Tensor, weight: float, size: int, sigma: float, backend: str
-) -> Tensor:
-    """Return the sums of `raster_loss_sums_reference` by the backend that serves. (n, 7)"""
-    if choose_backend(backend, preds, ("cpu",)) == "cpu":
-        from gsmap.ops.raster_loss.numba import raster_loss_sums
-
-        return raster_loss_sums(preds, targets, gaussian_window(size, sigma, preds), weight)
-    return checkpoint(
-        raster_loss_sums_reference,
-        preds,
-        targets,
-        size,
-        sigma,
-        weight,
-        use_reentrant=False,
-        preserve_rng_state=False,  # nothing is random, and saving it would wait for a GPU
-    )

@@ -1,34 +1,26 @@
 # numba infers the types of its kernels:
 # mypy: disable-error-code="no-untyped-def"
-r"""Fused CPU kernels (numba) and their operators: the raster loss on the pixels that matter.
+"""Fused CPU kernels (numba): the raster loss on the pixels that matter.
 
 One thread works on one instance at a time. Where neither mask has anything within SSIM's window,
 SSIM is exactly 1 and the L1 term exactly 0, so every step runs, row by row, from the first to the
 last column that can differ: from the masks' own columns, grown by the window's radius for each
-blur. The window is separable: 2 x 11 taps in place of 121, and the row pass takes symmetric taps
-together.
+blur. The window is separable, and the row pass takes symmetric taps together.
 
-Nothing is kept for the backward pass but the two masks, which the caller holds anyway: the five
-blurred maps (p, t, p^2, t^2, p t) are built again, turned into the derivatives of SSIM by the
-blurred p, p^2 and p t, and blurred once more (the window is symmetric, so the blur is its own
-transpose). Scratch: 15 buffers of one mask per thread, however many instances there are.
-
-Sums run in a fixed order in one thread, so two runs give the same bits.
+Nothing is kept for the backward pass but the two masks: the five blurred maps (p, t, p^2, t^2, p t)
+are built again, turned into the derivatives of SSIM by the blurred p, p^2 and p t, and blurred once
+more (the window is symmetric, so the blur is its own transpose). Sums run in a fixed order in one
+thread, so two runs give the same bits.
 """
-
-from typing import Any
 
 import numpy as np
 import torch
 from numba import njit
-from torch import Tensor
 
 from gsmap.ops._numba import FASTMATH, run_in_threads
-from gsmap.ops.backends import register_gradient
 from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
 
 ONE, TWO, ZERO = np.float32(1), np.float32(2), np.float32(0)
-SUMS, DIFFERENTIABLE_SUMS = 7, 3
 
 
 @njit(nogil=True, cache=True)
@@ -103,16 +95,6 @@ def _blur(images, spans, window, padded, rows, out, out_spans):
                 _add_scaled(out[c, row, low:high], rows[c, other, low:high], window[k])
 
 
-@njit(nogil=True, cache=True)
-def _multiply(preds, targets, spans, images):
-    """Fill p, t, p^2, t^2 and p t inside the spans. (5, H, W)"""
-    for row in range(len(spans)):
-        for col in range(spans[row, 0], spans[row, 1]):
-            p, t = preds[row, col], targets[row, col]
-            images[0, row, col], images[1, row, col] = p, t
-            images[2, row, col], images[3, row, col], images[4, row, col] = p * p, t * t, p * t
-
-
 @njit(inline="always")
 def _ssim_terms(maps, row, col, c1, c2):
     """Return the blurred p and t and SSIM's two numerators and two denominators at a pixel."""
@@ -172,14 +154,26 @@ def _weighted_masses(preds, targets, spans, weight):
 @njit(nogil=True, cache=True)
 def _buffers(shape, radius):
     """Return a thread's scratch: products, row pass, blurred maps, padded row, three spans."""
-    height, width = shape
-    return (
-        np.empty((5, height, width), np.float32),
-        np.empty((5, height, width), np.float32),
-        np.empty((5, height, width), np.float32),
-        np.empty(width + 4 * radius, np.float32),
-        np.empty((3, height, 2), np.int64),
-    )
+    maps = np.empty((3, 5, *shape), np.float32)
+    padded = np.empty(shape[1] + 4 * radius, np.float32)
+    return maps[0], maps[1], maps[2], padded, np.empty((3, shape[0], 2), np.int64)
+
+
+@njit(nogil=True, cache=True)
+def _blur_products(preds, targets, window, buffers):
+    """Fill an instance's spans and the blurred p, t, p^2, t^2 and p t inside the second."""
+    products, rows, maps, padded, spans = buffers
+    radius = len(window) // 2
+    _find_spans(preds, targets, spans[0])
+    _grow_spans(spans[0], radius, preds.shape[1], spans[1])
+    _grow_spans(spans[1], radius, preds.shape[1], spans[2])
+    for row in range(len(preds)):
+        for col in range(spans[0, row, 0], spans[0, row, 1]):
+            p, t = preds[row, col], targets[row, col]
+            products[0, row, col], products[1, row, col] = p, t
+            products[2, row, col], products[3, row, col] = p * p, t * t
+            products[4, row, col] = p * t
+    _blur(products, spans[0], window, padded, rows, maps, spans[1])
 
 
 @njit(nogil=True, cache=True)
@@ -189,13 +183,10 @@ def loss_forward(preds, targets, window, constants, weight, results, first, last
     Masks (n, H, W), the window (size,) and all numbers are float32; ``constants`` are SSIM's C1 and
     C2, and from what mean on a window sees a mask.
     """
-    radius = len(window) // 2
-    products, rows, maps, padded, spans = _buffers(preds.shape[1:], radius)
+    buffers = _buffers(preds.shape[1:], len(window) // 2)
+    _, _, maps, _, spans = buffers
     for n in range(first, last):
-        _find_spans(preds[n], targets[n], spans[0])
-        _grow_spans(spans[0], radius, preds.shape[2], spans[1])
-        _multiply(preds[n], targets[n], spans[0], products)
-        _blur(products, spans[0], window, padded, rows, maps, spans[1])
+        _blur_products(preds[n], targets[n], window, buffers)
         masses = _weighted_masses(preds[n], targets[n], spans[0], weight)
         results[n, 0], results[n, 1], results[n, 3], results[n, 4] = masses
         dissimilarity = _dissimilarity(maps, spans[1], constants)
@@ -205,17 +196,13 @@ def loss_forward(preds, targets, window, constants, weight, results, first, last
 @njit(nogil=True, cache=True)
 def loss_backward(preds, targets, window, constants, weight, factors, grads, first, last):
     """Write the gradient (n, H, W) of the first three sums, each times its factor (n, 3)."""
-    radius, width = len(window) // 2, preds.shape[2]
-    products, rows, maps, padded, spans = _buffers(preds.shape[1:], radius)
+    buffers = _buffers(preds.shape[1:], len(window) // 2)
+    slopes, rows, maps, padded, spans = buffers
     for n in range(first, last):
         grads[n] = factors[n, 1]  # outside the spans w is 1, and nothing else depends on p
-        _find_spans(preds[n], targets[n], spans[0])
-        _grow_spans(spans[0], radius, width, spans[1])
-        _grow_spans(spans[1], radius, width, spans[2])
-        _multiply(preds[n], targets[n], spans[0], products)
-        _blur(products, spans[0], window, padded, rows, maps, spans[1])
-        _derivatives(maps, spans[1], constants, products[:3])
-        _blur(products[:3], spans[1], window, padded, rows, maps[:3], spans[2])
+        _blur_products(preds[n], targets[n], window, buffers)
+        _derivatives(maps, spans[1], constants, slopes[:3])
+        _blur(slopes[:3], spans[1], window, padded, rows, maps[:3], spans[2])
         for row in range(preds.shape[1]):
             for col in range(spans[2, row, 0], spans[2, row, 1]):
                 p, t = preds[n, row, col], targets[n, row, col]
@@ -225,36 +212,23 @@ def loss_backward(preds, targets, window, constants, weight, factors, grads, fir
                 grads[n, row, col] = (ONE + extra) * slope - factors[n, 2] * ssim
 
 
-def _settings(window: Tensor, weight: float) -> tuple[Any, Any, Any]:
-    """Return the kernels' window, constants and weight in float32."""
+def _run(kernel, preds, targets, window, weight, *arguments):
+    """Run a kernel with SSIM's constants, in float32."""
     constants = np.float32(SSIM_C1), np.float32(SSIM_C2), np.float32(SEEN)
-    return window.float(), constants, np.float32(weight)
+    settings = window.float(), constants, np.float32(weight)
+    pixels = preds.shape[1:].numel()
+    run_in_threads(kernel, len(preds), pixels, preds, targets, *settings, *arguments)
 
 
-@torch.library.custom_op("gsmap::raster_loss_sums", mutates_args=(), device_types="cpu")
-def raster_loss_sums(preds: Tensor, targets: Tensor, window: Tensor, weight: float) -> Tensor:
+def raster_loss_sums(preds, targets, window, weight):
     """Return the sums of `raster_loss_sums_reference`; the first three are differentiable."""
-    sums = torch.empty(len(preds), SUMS, dtype=torch.float64)
-    arguments = preds, targets, *_settings(window, weight), sums
-    run_in_threads(loss_forward, len(preds), preds.shape[1:].numel(), *arguments)
+    sums = torch.empty(len(preds), 7, dtype=torch.float64)
+    _run(loss_forward, preds, targets, window, weight, sums)
     return sums.float()
 
 
-@torch.library.custom_op("gsmap::raster_loss_backward", mutates_args=(), device_types="cpu")
-def _backward(
-    grads: Tensor, preds: Tensor, targets: Tensor, window: Tensor, weight: float
-) -> Tensor:
+def raster_loss_sums_backward(grads, preds, targets, window, weight):
     """Return the gradient in the predictions. (n, H, W)"""
     gradient = torch.empty(preds.shape, dtype=torch.float32)
-    factors = grads[:, :DIFFERENTIABLE_SUMS]
-    arguments = preds, targets, *_settings(window, weight), factors, gradient
-    run_in_threads(loss_backward, len(preds), preds.shape[1:].numel(), *arguments)
-    return gradient
-
-
-@raster_loss_sums.register_fake
-def _(preds, targets, window, weight):
-    return preds.new_empty(preds.shape[0], SUMS)
-
-
-register_gradient(raster_loss_sums, _backward, tensors=3)
+    _run(loss_backward, preds, targets, window, weight, grads[:, :3], gradient)
+    return (gradient,)
