@@ -1,6 +1,6 @@
 """Rasterizers and other tensor operations.
 
 ``ops/<op>/__init__.py`` holds the public functions, which check and choose a backend;
-``reference.py`` plain torch, the definition of right; ``numba.py`` and ``triton.py`` fused kernels
-and their operators, imported when they are first used. What torch itself does fast is one file.
+``reference.py`` plain torch, the definition of right; ``numba.py`` and ``triton.py`` fused kernels,
+imported when they are first used. What torch itself does fast is one file.
 """

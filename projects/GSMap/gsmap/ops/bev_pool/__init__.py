@@ -6,7 +6,7 @@ each cell is a weighted bag of context vectors, so that memory stays at pixels +
 forward pass is deterministic on every device.
 """
 
-from typing import NamedTuple
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -15,16 +15,8 @@ from torch import Tensor
 from gsmap.structures.grid import BEVGrid
 
 
-class _SortedPoints(NamedTuple):
-    """Points inside the grid, sorted by cell; B * cells bags."""
-
-    pixels: Tensor  # row of the context table (n,)
-    probs: Tensor  # (n,)
-    counts: Tensor  # points per cell (B * cells,)
-
-
 def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) -> Tensor:
-    """Find the grid cell that each point falls into.
+    """Return ``row * width + col`` of the grid cell that each point falls into, -1 outside. (...)
 
     An index is truncated towards zero, as in MapTRv2: points up to one cell below the lower edge
     count into index 0.
@@ -33,9 +25,6 @@ def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) 
         points_m: Points (x, y, z) in metres, in the frame of ``grid``. (..., 3)
         grid: The cells.
         z_range: Lowest and highest z in metres of the one layer of cells.
-
-    Returns:
-        ``row * width + col``, or -1 outside. (...)
 
     Raises:
         ValueError: If points do not end in (x, y, z) or ``z_range`` is empty.
@@ -53,16 +42,15 @@ def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) 
 
 
 def bev_pool(probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid) -> Tensor:
-    """Sum depth probability times context feature over the points of every cell.
+    """Sum depth probability times context feature over the points of every cell. (B, C, H, W)
+
+    The sums are differentiable in ``probs`` and ``context``.
 
     Args:
         probs: Probability of each depth bin. (B, V, D, h, w)
         context: Image features. (B, V, C, h, w)
         cells: Cell of each point, -1 for none, from `cell_indices`. (B, V, D, h, w)
         grid: The cells, H rows and W columns.
-
-    Returns:
-        Pooled features, differentiable in ``probs`` and ``context``. (B, C, H, W)
 
     Raises:
         ValueError: If the shapes disagree.
@@ -78,22 +66,11 @@ def bev_pool(probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid) -> Te
 def bev_pool_conv3x3(
     probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid, weight: Tensor
 ) -> Tensor:
-    """Pool as `bev_pool` does and convolve the result with a 3x3 kernel, zero-padded.
+    """Return ``conv2d(bev_pool(...), weight, padding=1)``, differentiable also in the weight.
 
-    Both steps are linear, so the kernel's nine matrices can be applied to the few context vectors
-    instead of the many cells: at MapTRv2's size (2,250 pixels, 80,000 cells) this is 35 times less
-    arithmetic. The first arguments are those of `bev_pool`.
-
-    Args:
-        probs: Probability of each depth bin. (B, V, D, h, w)
-        context: Image features. (B, V, C, h, w)
-        cells: Cell of each point. (B, V, D, h, w)
-        grid: The cells.
-        weight: Convolution kernel without bias. (O, C, 3, 3)
-
-    Returns:
-        ``conv2d(bev_pool(...), weight, padding=1)``, also differentiable in ``weight``.
-        (B, O, H, W)
+    Both steps are linear, so the kernel's nine matrices (O, C, 3, 3) can be applied to the few
+    context vectors instead of the many cells: at MapTRv2's size (2,250 pixels, 80,000 cells) this
+    is 35 times less arithmetic. The other arguments are those of `bev_pool`. -> (B, O, H, W)
 
     Raises:
         ValueError: If the shapes disagree.
@@ -106,23 +83,28 @@ def bev_pool_conv3x3(
         )
     if torch.compiler.is_exporting():  # ONNX can scatter sums, and has no bags of many sizes
         return F.conv2d(bev_pool(probs, context, cells, grid), weight, padding=1)
-    points = _sort_by_cell(probs, cells, grid)
+    pixels, probs, counts = _sort_by_cell(probs, cells, grid)
     taps = weight.permute(1, 2, 3, 0).flatten(1)  # (C, 9*O)
     table = context.permute(0, 1, 3, 4, 2).flatten(0, 3) @ taps  # (B*V*h*w, 9*O)
     table = table.view(-1, weight.shape[0])  # row = pixel * 9 + tap
-    counts = points.counts.view(-1, grid.height, grid.width)  # (B, H, W)
-    starts = (points.counts.cumsum(0) - points.counts).view_as(counts)
+    starts = counts.flatten().cumsum(0).view_as(counts) - counts  # (B, H, W)
     # the nine neighbours of every cell, in the kernel's order, as ranges of the sorted points
-    lengths, firsts = (_neighbours(x).flatten() for x in (counts, starts))  # (B*H*W*9,)
-    shift = firsts - (lengths.cumsum(0) - lengths)
+    lengths, firsts = (
+        F.pad(x, (1, 1, 1, 1)).unfold(1, 3, 1).unfold(2, 3, 1).flatten() for x in (counts, starts)
+    )  # (B*H*W*9,)
     total = int(lengths.sum())
-    order = torch.arange(total, device=cells.device) + shift.repeat_interleave(
-        lengths, output_size=total
+    spread = partial(torch.repeat_interleave, repeats=lengths, output_size=total)
+    shift = spread(firsts - (lengths.cumsum(0) - lengths))
+    tap = spread(torch.arange(9, device=cells.device).repeat(counts.numel()))
+    order = torch.arange(total, device=cells.device) + shift
+    pooled = F.embedding_bag(
+        pixels[order] * 9 + tap,
+        table,
+        F.pad(lengths.view(-1, 9).sum(-1).cumsum(0), (1, 0)),
+        mode="sum",
+        per_sample_weights=probs[order],
+        include_last_offset=True,
     )
-    tap = torch.arange(9, device=cells.device).repeat(counts.numel())
-    rows = points.pixels[order] * 9 + tap.repeat_interleave(lengths, output_size=total)
-    bags = lengths.view(-1, 9).sum(-1)
-    pooled = _weighted_bags(table, rows, points.probs[order], bags)
     return pooled.view(*counts.shape, -1).permute(0, 3, 1, 2)
 
 
@@ -148,29 +130,17 @@ def _bag_numbers(cells: Tensor, grid: BEVGrid, outside: int) -> Tensor:
     return torch.where(cells >= 0, bags, outside).flatten()
 
 
-def _sort_by_cell(probs: Tensor, cells: Tensor, grid: BEVGrid) -> _SortedPoints:
-    """Keep the points inside the grid and bring each cell's points together, in order."""
+def _sort_by_cell(probs: Tensor, cells: Tensor, grid: BEVGrid) -> tuple[Tensor, Tensor, Tensor]:
+    """Return pixels and probabilities of points, cell by cell, and how many a cell has. (B, H, W)
+
+    Points outside the grid are left out.
+    """
     batch, views, _, height, width = probs.shape
-    num_cells = grid.height * grid.width
     keys = _bag_numbers(cells, grid, outside=-1)
     kept = (keys >= 0).nonzero().squeeze(1)
     keys, order = keys[kept].sort(stable=True)
+    kept = kept[order]
     pixels = torch.arange(batch * views * height * width, device=cells.device)
     pixels = pixels.view(batch, views, 1, height, width).expand_as(cells).flatten()
-    kept = kept[order]
-    counts = torch.bincount(keys, minlength=batch * num_cells)
-    return _SortedPoints(pixels[kept], probs.flatten()[kept], counts)
-
-
-def _neighbours(cells: Tensor) -> Tensor:
-    """Return the 3x3 neighbourhood of every cell, 0 outside. (B, H, W) -> (B, H, W, 9)"""
-    padded = F.pad(cells, (1, 1, 1, 1))
-    return padded.unfold(1, 3, 1).unfold(2, 3, 1).flatten(3)
-
-
-def _weighted_bags(table: Tensor, rows: Tensor, weights: Tensor, counts: Tensor) -> Tensor:
-    """Sum ``weights * table[rows]`` over consecutive runs of ``counts`` entries. (bags, C)"""
-    offsets = F.pad(counts.cumsum(0), (1, 0))
-    return F.embedding_bag(
-        rows, table, offsets, mode="sum", per_sample_weights=weights, include_last_offset=True
-    )
+    counts = torch.bincount(keys, minlength=batch * grid.height * grid.width)
+    return pixels[kept], probs.flatten()[kept], counts.view(batch, grid.height, grid.width)

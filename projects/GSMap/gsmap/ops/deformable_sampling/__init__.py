@@ -19,16 +19,14 @@ def deformable_sample(
 ) -> Tensor:
     """Sum bilinear samples of a map, each head with its own places (Deformable DETR Eq. 2).
 
-    Each output row is one weighted bag of table rows: no tensor of samples in between.
+    Each output row is one weighted bag of table rows: no tensor of samples in between. The heads'
+    sums are concatenated. -> (B, Q, heads * C)
 
     Args:
         value: Flattened map, row-major. (B, H * W, heads, C)
         shape: Rows and columns of the map.
         locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
         weights: Attention weights. (B, Q, heads, S)
-
-    Returns:
-        Weighted sums, heads concatenated. (B, Q, heads * C)
     """
     batch, num_cells, heads, channels = value.shape
     cells, cell_weights = bilinear_cells(locations, weights, shape)  # (B, Q, heads, 4 S)
@@ -41,19 +39,11 @@ def deformable_sample(
 def bilinear_cells(
     locations: Tensor, weights: Tensor, shape: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Turn weighted sampling locations into the cells around them and their weights.
+    """Return the cells (row-major) around sampling locations, and their weights. 2 x (..., 4 S)
 
-    The value of a cell lies at its centre; outside the map everything is zero
-    (``align_corners=False`` and zero padding, as in ``grid_sample``).
-
-    Args:
-        locations: Points (x, y), [0, 1] over the map. (..., S, 2)
-        weights: Their weights. (..., S)
-        shape: Rows and columns of the map.
-
-    Returns:
-        Row-major cell indices and weights, both zero outside the map; a location that is not a
-        number has a valid index and its weight is not a number. 2 x (..., 4 S)
+    The value of a cell lies at its centre (``align_corners=False``). Outside the map both are zero;
+    a location that is not a number has a valid index and its weight is not a number. Locations (x,
+    y) are [0, 1] over the map (..., S, 2), weights (..., S), the shape rows and columns.
     """
     height, width = shape
     x, y = locations[..., 0] * width - 0.5, locations[..., 1] * height - 0.5
@@ -69,7 +59,9 @@ def bilinear_cells(
 
 
 def sum_rows(table: Tensor, rows: Tensor, weights: Tensor, backend: str = "auto") -> Tensor:
-    """Sum weighted rows of a table.
+    """Sum weighted rows of a table, without a tensor of all the rows in between. (..., C)
+
+    The sums are differentiable in ``table`` and ``weights``.
 
     Args:
         table: The table. (R, C)
@@ -77,10 +69,6 @@ def sum_rows(table: Tensor, rows: Tensor, weights: Tensor, backend: str = "auto"
         weights: Their weights. (..., S)
         backend: ``"reference"`` (torch's embedding bags), ``"cpu"`` (the same forward pass with a
             fused backward pass), or ``"auto"``.
-
-    Returns:
-        The sums, without a tensor of all the rows in between; differentiable in ``table`` and
-        ``weights``. (..., C)
     """
     bags = rows.reshape(-1, rows.shape[-1])
     factors = weights.reshape(-1, rows.shape[-1]).to(table.dtype)

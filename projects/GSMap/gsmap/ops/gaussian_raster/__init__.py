@@ -20,22 +20,18 @@ _render = fused_operator(
 def render_gaussians(
     means: Tensor, scales: Tensor, rotations: Tensor, grid: BEVGrid, backend: str = "auto"
 ) -> Tensor:
-    r"""Render each map element's 2D Gaussians to a soft occupancy raster.
+    r"""Render each map element's 2D Gaussians to soft occupancy in [0, 1]. (..., H, W)
 
     A pixel :math:`p` takes :math:`1 - \prod_i (1 - G_i(p))` (GSMap Eq. 6), with :math:`G_i` from
-    Eq. 2. Inputs of several types are computed in the widest, and at least in float32, also under
-    autocast.
+    Eq. 2, differentiable in the first three inputs. Inputs of several types are computed in the
+    widest, and at least in float32, also under autocast.
 
     Args:
         means: Centres (x, y) in metres, in the frame of ``grid``. (..., P, 2)
         scales: Standard deviations along each Gaussian's own axes, in metres, > 0. (..., P, 2)
         rotations: Angle of the first axis from +x, in radians, anticlockwise. (..., P)
         grid: The raster: its extent in metres and its size in pixels.
-        backend: ``"reference"`` (plain torch), ``"cpu"`` or ``"triton"`` (fused kernels), or
-            ``"auto"``: the fastest one that serves the inputs' device and type.
-
-    Returns:
-        Occupancy in [0, 1], differentiable in the first three inputs. (..., H, W)
+        backend: As in `choose_backend`.
 
     Raises:
         TypeError: If an input is not floating point.

@@ -32,8 +32,8 @@ from gsmap.ops._numba import FASTMATH, pixel_range, run_in_threads
 from gsmap.ops.gaussian_raster.reference import SQUARED_REACH
 
 # of 2^x on [-0.5, 0.5], fitted at Chebyshev points: relative error about 1e-7
-C0, C1, C2, C3, C4, C5 = np.float32(
-    [1.0000001, 0.69314694, 0.24022122, 0.055507425, 0.00967546, 0.0013266971]
+C0, C1, C2, C3, C4, C5 = map(
+    np.float32, (1.0000001, 0.69314694, 0.24022122, 0.055507425, 0.00967546, 0.0013266971)
 )
 HALF, ONE, LOWEST = np.float32(0.5), np.float32(1), np.float32(-126)
 BIAS, MANTISSA_BITS = np.int32(127), np.int32(23)

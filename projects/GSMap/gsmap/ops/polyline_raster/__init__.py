@@ -30,9 +30,10 @@ def draw_polylines(
     filled: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Draw the masks of ground-truth polylines, all at once and on their own device.
+    """Draw the masks of ground-truth polylines, in [0, 1], without gradient. (K, H, W)
 
-    A pixel takes the share that the shape covers of it, measured across the nearest edge.
+    A pixel takes the share that the shape covers of it, measured across the nearest edge. All are
+    drawn at once on their own device, at least in float32.
 
     Args:
         polylines: Vertices in metres, in the frame of ``grid``. (K, P, 2)
@@ -41,10 +42,7 @@ def draw_polylines(
             of 0.125 m).
         filled: Which polylines are filled as polygons (to their vertices, without the line's
             width), bool; all are drawn as lines without it. (K,)
-        backend: ``"reference"``, ``"cpu"`` (fused), or ``"auto"``.
-
-    Returns:
-        Masks in [0, 1], without gradient, at least float32. (K, H, W)
+        backend: As in `choose_backend`, without ``"triton"``.
 
     Raises:
         ValueError: If a shape is wrong, ``width_m`` is not positive or ``backend`` does not serve.
@@ -81,7 +79,7 @@ def soft_rasters(
 
     D is a pixel's distance to the nearest edge, or its square; the sign is + inside (MapVR
     Eqs. 2-3). A line is rendered as the thin closed polygon of itself and its way back, a polygon
-    is closed implicitly.
+    is closed implicitly. Masks are in [0, 1], differentiable in ``vertices``. -> (n, H, W)
 
     Args:
         vertices: In pixels (x = column, y = row); pixel (row, col) is sampled at (col, row).
@@ -93,10 +91,7 @@ def soft_rasters(
         polygon_softness: :math:`\tau` of polygons, in the unit of D.
         distance: ``"squared"``: D in square pixels, as in MapVR's released rasterizer; ``"plain"``:
             D in pixels, as in its equations.
-        backend: ``"reference"``, ``"cpu"`` (fused), or ``"auto"``.
-
-    Returns:
-        Masks in [0, 1], differentiable in ``vertices``. (n, H, W)
+        backend: As in `choose_backend`, without ``"triton"``.
 
     Raises:
         ValueError: If a shape is wrong, a softness is not positive, ``distance`` is unknown or

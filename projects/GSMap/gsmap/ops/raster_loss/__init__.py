@@ -43,7 +43,8 @@ def raster_loss(
       at least 0.5 % of the raster. Gaussians that lie off by 2 m are pushed to shrink.
     * ``"pixels"``: plain means over the raster, weighted by w.
 
-    Nothing but the masks is kept for the backward pass; the rest is computed again.
+    Nothing but the masks is kept for the backward pass; the rest is computed again. The values are
+    differentiable in ``preds``. -> (n,)
 
     Args:
         preds: Rendered masks in [0, 1]. (n, H, W)
@@ -53,10 +54,7 @@ def raster_loss(
         normalize: ``"both"``, ``"foreground"`` or ``"pixels"``.
         window_size: Side of SSIM's window in pixels, odd.
         window_sigma: Standard deviation of SSIM's window in pixels.
-        backend: ``"reference"``, ``"cpu"`` (fused), or ``"auto"``.
-
-    Returns:
-        One value per instance, differentiable in ``preds``. (n,)
+        backend: As in `choose_backend`, without ``"triton"``.
 
     Raises:
         ValueError: If the shapes disagree, or ``normalize`` or ``backend`` does not serve.
@@ -75,10 +73,10 @@ def raster_loss(
         if choose_backend(backend, preds, ("cpu",)) == "cpu":
             window = gaussian_window(*settings, preds)
             sums = _raster_loss_sums(preds, targets, window, foreground_weight, "cpu")
-        else:  # nothing is random, and saving its state would wait for a GPU
-            arguments = preds, targets, *settings, foreground_weight
-            kept = {"use_reentrant": False, "preserve_rng_state": False}
-            sums = checkpoint(raster_loss_sums_reference, *arguments, **kept)
+        else:
+            arguments = raster_loss_sums_reference, preds, targets, *settings, foreground_weight
+            # nothing is random, and saving its state would wait for a GPU
+            sums = checkpoint(*arguments, use_reentrant=False, preserve_rng_state=False)
         l1, predicted, dissimilarity, foreground, excess, sees_target, sees_either = sums.unbind(-1)
         pixels = math.prod(preds.shape[1:])
         if normalize == "both":

@@ -20,7 +20,7 @@ from numba import njit
 from gsmap.ops._numba import FASTMATH, run_in_threads
 from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
 
-ONE, TWO, ZERO = np.float32(1), np.float32(2), np.float32(0)
+ONE, TWO = np.float32(1), np.float32(2)
 
 
 @njit(nogil=True, cache=True)

@@ -16,20 +16,17 @@ _pairwise_minima = fused_operator(
 def pairwise_soft_iou(
     preds: Tensor, targets: Tensor, eps: float = 1e-6, backend: str = "auto"
 ) -> Tensor:
-    r"""Soft IoU of every prediction with every ground truth, without an (N, K, H, W) tensor.
+    r"""Return the soft IoU in [0, 1] of every prediction with every ground truth. (N, K)
 
     :math:`\sum_p \min(a, b) / \sum_p \max(a, b)`; since min + max = a + b, only the minimum is
-    summed per pair.
+    summed per pair, without an (N, K, H, W) tensor.
 
     Args:
         preds: Masks in [0, 1]. (N, H, W)
         targets: Masks in [0, 1]. (K, H, W)
         eps: Added to the union, so that two empty masks have IoU 0.
-        backend: ``"reference"`` (plain torch), ``"cpu"`` or ``"triton"`` (fused), or ``"auto"``: a
-            fused kernel where it serves and no gradient is asked for.
-
-    Returns:
-        IoU in [0, 1]; without gradient from the fused kernels. (N, K)
+        backend: As in `choose_backend`. The fused kernels give no gradient; ``"auto"`` takes them
+            where none is asked for.
 
     Raises:
         ValueError: If the shapes disagree or ``backend`` does not serve.
