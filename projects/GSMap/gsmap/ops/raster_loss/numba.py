@@ -154,9 +154,14 @@ def _weighted_masses(preds, targets, spans, weight):
 @njit(nogil=True, cache=True)
 def _buffers(shape, radius):
     """Return a thread's scratch: products, row pass, blurred maps, padded row, three spans."""
-    maps = np.empty((3, 5, *shape), np.float32)
+    size = 5, shape[0], shape[1]
+    products, rows, maps = (
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+    )
     padded = np.empty(shape[1] + 4 * radius, np.float32)
-    return maps[0], maps[1], maps[2], padded, np.empty((3, shape[0], 2), np.int64)
+    return products, rows, maps, padded, np.empty((3, shape[0], 2), np.int64)
 
 
 @njit(nogil=True, cache=True)
