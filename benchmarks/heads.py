@@ -1,8 +1,9 @@
 """Ablate the map head alone, on stored BEV features of a common checkpoint, in paired runs.
 
 Backbone, neck and BEV encoder are frozen and run once (the pipeline must not augment), so a run
-costs a fraction of fine-tuning the whole model. Every variant starts from the same weights, sees
-the same batches in the same order, and is tested on the same features.
+costs a fraction of fine-tuning the whole model. Every variant starts from the head of the
+checkpoint (or, with ``--from-scratch``, from a new one), sees the same batches in the same order,
+and is tested on the same features.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from gsmap.engine.launch import data_root_options, parse_options, read_config
 from gsmap.utils.files import atomic_write
 
 METRIC_NAMES = ("chamfer", "raster")
-_DECIDING = ("config", "checkpoint", "data_root", "iterations", "batch", "lr")
+_DECIDING = ("config", "checkpoint", "data_root", "iterations", "batch", "lr", "from_scratch")
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,11 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--lr", type=float, default=3e-4)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument(
+        "--from-scratch",
+        action="store_true",
+        help="train new heads on the features, not trained ones",
+    )
     parser.add_argument("--workers", type=int, default=1, help="runs at the same time")
     parser.set_defaults(run=run)
 
@@ -136,7 +142,8 @@ def train_and_test(
     cfg = read_config(task.config, task.options)
     model = MODELS.build(cfg.model)
     model.init_weights()
-    load_weights(model, args.checkpoint)
+    if not args.from_scratch:
+        load_weights(model, args.checkpoint)
     head = model.map_head.train()
     rates = cfg.optim_wrapper
     optimizer = torch.optim.AdamW(

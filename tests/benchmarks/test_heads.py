@@ -24,6 +24,7 @@ def test_variants_of_a_head_are_trained_on_stored_features(
     args = Namespace(
         config=Path(maptr), checkpoint="maptr_r18_minicity", variants=variants, out=tmp_path,
         data_root=f"{minicity_root}/", iterations=0, batch=2, lr=3e-4, seeds=1, workers=1,
+        from_scratch=False,
     )  # fmt: skip
     heads.run(args)
     # What GSMap adds starts neutral, so without a step every head finds what MapTR's finds.
@@ -43,3 +44,8 @@ def test_variants_of_a_head_are_trained_on_stored_features(
     args.iterations = 4
     with pytest.raises(ValueError, match="figures of other settings: give another --out"):
         heads.run(args)
+    variants.write_text(json.dumps({"new": maptr}))
+    args.iterations, args.from_scratch = 0, True
+    heads.run(args)
+    new = json.loads((args.out / "new-0.json").read_text())
+    assert new["chamfer/mAP"] < figures[0]["chamfer/mAP"] / 10
