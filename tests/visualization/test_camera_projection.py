@@ -6,7 +6,12 @@ focal length of 100 px and the principal point in the middle of an image of 200 
 
 import numpy as np
 
-from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
+from gsmap.visualization.camera_projection import (
+    NEAR_M,
+    project_polygon,
+    project_segments,
+    subdivided,
+)
 
 SIZE = (200, 100)
 CAMERA = np.array(
@@ -14,8 +19,8 @@ CAMERA = np.array(
 )  # img_from_frame
 
 
-def project(start, end, near_m=0.5):
-    return project_segments(np.array([start], float), np.array([end], float), CAMERA, SIZE, near_m)
+def project(start, end):
+    return project_segments(np.array([start], float), np.array([end], float), CAMERA, SIZE)
 
 
 def test_visible_segment_keeps_its_ends():
@@ -26,10 +31,10 @@ def test_visible_segment_keeps_its_ends():
 
 
 def test_segment_that_runs_behind_the_camera_is_cut_at_the_near_plane():
-    # From 10 m ahead to 10 m behind, 0.1 m beside the axis: at 0.5 m depth it lies at u = 100 + 100
-    # * 0.1 / 0.5.
-    segments, _, _ = project((0.1, 0, 10), (0.1, 0, -10))
-    np.testing.assert_allclose(segments[0], [[101, 50], [120, 50]])
+    # From 10 m ahead to 10 m behind, 0.12 m beside the axis: at 0.3 m depth it lies at
+    # u = 100 + 100 * 0.12 / 0.3.
+    segments, _, _ = project((0.12, 0, 10), (0.12, 0, -10))
+    np.testing.assert_allclose(segments[0], [[101.2, 50], [140, 50]])
 
 
 def test_segment_behind_the_camera_vanishes_although_its_projection_lies_inside():
@@ -62,14 +67,14 @@ def test_no_segments_give_empty_arrays():
 def test_agrees_with_dense_sampling_on_random_segments():
     rng = np.random.default_rng(0)
     starts, ends = rng.uniform(-20, 20, (2, 200, 3))
-    segments, _, index = project_segments(starts, ends, CAMERA, SIZE, near_m=0.5)
+    segments, _, index = project_segments(starts, ends, CAMERA, SIZE)
     t = np.linspace(0, 1, 4001)[:, None]
     visible = []
     for i, (a, b) in enumerate(zip(starts, ends, strict=True)):
         points = a + t * (b - a)
         w = points[:, 2]
         uv = points[:, :2] * 100 / np.where(w > 0, w, 1)[:, None] + [100, 50]
-        inside = (w >= 0.5) & (uv >= 0).all(1) & (uv <= SIZE).all(1)
+        inside = (w >= NEAR_M) & (uv >= 0).all(1) & (uv <= SIZE).all(1)
         if inside.sum() > 1:
             visible.append(i)
             found = segments[index.tolist().index(i)]

@@ -62,9 +62,9 @@ class BEVPanel:
     def fates(self) -> tuple[list[str], list[str]]:
         """What becomes of each element with ``hits`` and of each ground truth in ``truth``."""
         hits = () if self.hits is None else self.hits
-        found = np.isin(np.arange(len(self.truth or ())), hits)
+        truth = range(len(self.truth or ()))
         elements = ["hit" if hit >= 0 else "false" for hit in hits]
-        return elements, ["found" if is_found else "missed" for is_found in found]
+        return elements, ["found" if index in hits else "missed" for index in truth]
 
 
 def display_extent(grid: BEVGrid, view: FrameView) -> tuple[float, float, float, float]:
@@ -83,9 +83,11 @@ def _ticks(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     return at, [*labels[:-1], f"{labels[-1]} m"]
 
 
-def _draw_grid(ax: Axes, extent: tuple[float, float, float, float], style: MapStyle) -> None:
-    """Draw a metric grid with labels on the left and at the bottom."""
-    left, right, bottom, top = extent
+def _draw_ground(
+    ax: Axes, points: np.ndarray | None, grid: BEVGrid, view: FrameView, style: MapStyle
+) -> None:
+    """Draw a metric grid with labels on the left and at the bottom, and LiDAR points faintly."""
+    left, right, bottom, top = display_extent(grid, view)
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", facecolor=style.ground)
     ax.set_xticks(*_ticks(left, right))
     ax.set_yticks(*_ticks(bottom, top))
@@ -93,10 +95,6 @@ def _draw_grid(ax: Axes, extent: tuple[float, float, float, float], style: MapSt
     ax.set_axisbelow(True)
     ax.tick_params(length=0, labelsize=6.5, colors=style.muted, pad=2)
     ax.spines[:].set(color=style.grid, linewidth=0.8)
-
-
-def _draw_points(ax: Axes, points: np.ndarray | None, view: FrameView) -> None:
-    """Draw LiDAR points faintly."""
     if points is not None and len(points):
         x, y = view.display_from_frame(points).T
         ax.scatter(x, y, s=0.25, c="#9AA3AE", alpha=0.55, linewidths=0, zorder=2)
@@ -106,16 +104,9 @@ def _draw_vehicle(ax: Axes, view: FrameView) -> None:
     """Draw the ego vehicle to scale, its windscreen towards the road ahead."""
     rear, front, width = view.vehicle_m
     half, glass = width / 2, front - 0.30 * (front - rear)
-    body = FancyBboxPatch(
-        (-half + 0.35, rear + 0.35),
-        width - 0.7,
-        front - rear - 0.7,
-        boxstyle="round,pad=0.35,rounding_size=0.55",
-        facecolor="#3A4452",
-        edgecolor="white",
-        linewidth=0.9,
-        zorder=30,
-    )
+    corner, size = (-half + 0.35, rear + 0.35), (width - 0.7, front - rear - 0.7)
+    body = FancyBboxPatch(corner, *size, boxstyle="round,pad=0.35,rounding_size=0.55")
+    body.set(facecolor="#3A4452", edgecolor="white", linewidth=0.9, zorder=30)
     top, bottom, low = 0.72 * half, 0.55 * half, glass - 0.62
     windscreen = [(-top, glass), (top, glass), (bottom, low), (-bottom, low)]
     ax.add_patch(body)
@@ -137,25 +128,10 @@ def draw_lines(
     faces = [(*mcolors.to_rgb(colours[i]), 0.2) for i in areas]
     shapes = [lines[i] for i in areas]
     ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=4))
-    strokes = LineCollection(
-        lines,
-        colors=colours,
-        linewidths=width_pt,
-        linestyles=[FALSE_DASHES if fate == "false" else "-" for fate in fates] or "-",
-        joinstyle="round",
-        zorder=zorder,
-    )
+    dashes = [FALSE_DASHES if fate == "false" else "-" for fate in fates] or "-"
+    strokes = LineCollection(lines, colors=colours, linewidths=width_pt, linestyles=dashes)
+    strokes.set(joinstyle="round", zorder=zorder)
     ax.add_collection(strokes)
-
-
-def _draw_truth(
-    ax: Axes, panel: BEVPanel, truth: MapElements, view: FrameView, style: MapStyle
-) -> None:
-    """Draw the ground truth in broad lines that tell what is found from what is missed."""
-    fates = panel.fates[1]
-    colours = [mcolors.to_rgba(MATCH_COLOURS[fate], TRUTH_OPACITY[fate]) for fate in fates]
-    lines = [view.display_from_frame(line) for line in truth.polylines]
-    draw_lines(ax, lines, truth.labels, style, colours, 2.6 * style.bev_line_pt, zorder=8)
 
 
 def _draw_order(ax: Axes, lines: list[np.ndarray], colours: list[str]) -> None:
@@ -178,23 +154,20 @@ def _draw_gaussians(ax: Axes, elements: MapElements, view: FrameView, style: Map
     axes = np.stack([np.cos(turn), np.sin(turn), -np.sin(turn), np.cos(turn)], -1).reshape(-1, 2, 2)
     edges = _CIRCLE @ (elements.scales[..., None] * axes) + centres[:, None]  # (M, 13, 2)
     ellipses = [Path(edge, _CURVES) for edge in edges]
-    paths = [
-        Path.make_compound_path(*ellipses[a:b]) for a, b in pairwise(elements.offsets.tolist())
-    ]
+    ends = pairwise(elements.offsets.tolist())
+    paths = [Path.make_compound_path(*ellipses[a:b]) for a, b in ends]
     colours = style.colours(elements.labels)
-    faces = mcolors.to_rgba_array(colours, 0.4)
-    ax.add_collection(
-        PathCollection(paths, facecolors=faces, edgecolors=colours, linewidths=0.4, zorder=11)
-    )
+    shapes = PathCollection(paths, facecolors=mcolors.to_rgba_array(colours, 0.4), zorder=11)
+    shapes.set(edgecolors=colours, linewidths=0.4)
+    ax.add_collection(shapes)
 
 
 def _draw_scores(
     ax: Axes, lines: list[np.ndarray], scores: np.ndarray, colours: list[str], view: FrameView
 ) -> None:
-    """Write each score at the vertex nearest its element's middle that is free.
+    """Write each score at the vertex nearest its element's middle that is free, if there is one.
 
-    Free is what the border, the vehicle and the scores of surer elements leave; without such a
-    vertex a score is left out.
+    Free is what the border, the vehicle and the scores of surer elements leave.
     """
     low, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
     rear, front, width = view.vehicle_m
@@ -211,29 +184,16 @@ def _draw_scores(
             continue
         taken.append(at[free.argmax()])
         reach.append(2 * half)
-        ax.text(
-            taken[-1][0],
-            taken[-1][1],
-            f"{scores[i]:.2f}",
-            fontsize=_SCORE_PT,
-            color=tuple(0.62 * np.array(mcolors.to_rgb(colours[i]))),
-            ha="center",
-            va="center",
-            path_effects=[withStroke(linewidth=2, foreground="white")],
-            zorder=20,
-        )
+        x, y = taken[-1]
+        text = ax.text(x, y, f"{scores[i]:.2f}", ha="center", va="center", zorder=20)
+        text.set(fontsize=_SCORE_PT, color=0.62 * np.array(mcolors.to_rgb(colours[i])))
+        text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
 def raster_picture(rasters: np.ndarray, labels: np.ndarray, style: MapStyle) -> np.ndarray:
-    """Blend the elements' rasters into one picture over white.
+    """Blend the elements' occupancies in [0, 1] (N, H, W) into one picture, RGB in [0, 1].
 
-    Args:
-        rasters: Occupancy in [0, 1]. (N, H, W)
-        labels: Class index of each. (N,)
-        style: Colours.
-
-    Returns:
-        RGB in [0, 1]: each class covers white by the largest occupancy of its elements. (H, W, 3)
+    Each class covers white by the largest occupancy of its elements. -> (H, W, 3)
     """
     picture = np.ones((*rasters.shape[1:], 3))
     for label in np.unique(labels):
@@ -255,36 +215,28 @@ def _draw_rasters(ax: Axes, panel: BEVPanel, view: FrameView, style: MapStyle) -
 
 
 def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: MapStyle) -> None:
-    """Draw one panel.
-
-    Args:
-        ax: Axes to fill.
-        panel: What to show.
-        grid: Extent of the map in metres.
-        view: Orientation of the frame.
-        style: Colours and widths.
-    """
-    extent = display_extent(grid, view)
-    _draw_grid(ax, extent, style)
+    """Draw one panel of a map with the extent of ``grid``."""
+    extent, elements = display_extent(grid, view), panel.elements
+    fates, truth_fates = panel.fates
+    _draw_ground(ax, panel.points, grid, view, style)
     ax.set_title(panel.title, fontsize=8.5, color=style.ink, pad=5)
-    _draw_points(ax, panel.points, view)
     _draw_vehicle(ax, view)
     if panel.truth:
-        _draw_truth(ax, panel, panel.truth, view, style)
-    elements = panel.elements
+        lines = [view.display_from_frame(line) for line in panel.truth.polylines]
+        shades = [mcolors.to_rgba(MATCH_COLOURS[f], TRUTH_OPACITY[f]) for f in truth_fates]
+        width_pt = 2.6 * style.bev_line_pt
+        draw_lines(ax, lines, panel.truth.labels, style, shades, width_pt, zorder=8)
     if not elements:
         ax.text(0, extent[2] + 2, panel.note, fontsize=7, color=style.muted, ha="center")
         return
     lines = [view.display_from_frame(line) for line in elements.polylines]
-    fates = panel.fates[0]
     colours = [MATCH_COLOURS[fate] for fate in fates] or style.colours(elements.labels)
     if panel.rasters is not None:
         _draw_rasters(ax, panel, view, style)
     if panel.gaussians and elements.has_gaussians:
         _draw_gaussians(ax, elements, view, style)
     if panel.lines:
-        width_pt = style.bev_line_pt
-        draw_lines(ax, lines, elements.labels, style, colours, width_pt, fates=fates)
+        draw_lines(ax, lines, elements.labels, style, colours, style.bev_line_pt, fates=fates)
     if panel.vertices:
         for line, colour in zip(lines, colours, strict=True):
             ax.plot(*line.T[:2], "o", color=colour, markersize=2.2, markeredgewidth=0, zorder=12)

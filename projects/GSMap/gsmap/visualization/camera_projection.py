@@ -7,7 +7,7 @@ camera is cut instead of wrapping round, and no dense sampling is needed for a c
 
 import numpy as np
 
-NEAR_M = 0.3
+NEAR_M = 0.3  # smallest depth that is drawn
 
 
 def _homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarray:
@@ -15,19 +15,15 @@ def _homogeneous_px(points: np.ndarray, img_from_frame: np.ndarray) -> np.ndarra
     return points @ img_from_frame[:3, :3].T + img_from_frame[:3, 3]
 
 
-def _frustum_values(points: np.ndarray, size_px: tuple[int, int], near_m: float) -> np.ndarray:
+def _frustum_values(points: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """Signed distances to the five planes of the frustum, >= 0 inside. (n, 3) -> (5, n)"""
     width, height = size_px
     u, v, w = points.T
-    return np.stack([w - near_m, u, width * w - u, v, height * w - v])
+    return np.stack([w - NEAR_M, u, width * w - u, v, height * w - v])
 
 
 def project_segments(
-    starts: np.ndarray,
-    ends: np.ndarray,
-    img_from_frame: np.ndarray,
-    size_px: tuple[int, int],
-    near_m: float = NEAR_M,
+    starts: np.ndarray, ends: np.ndarray, img_from_frame: np.ndarray, size_px: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Project straight segments into an image and keep the visible parts (Liang-Barsky clipping).
 
@@ -36,14 +32,13 @@ def project_segments(
         ends: Second end points in metres. (n, 3)
         img_from_frame: Projection matrix, intrinsics times extrinsics. (4, 4)
         size_px: Width and height of the image.
-        near_m: Smallest depth that is drawn, > 0.
 
     Returns:
         The visible segments as pixel coordinates (m, 2, 2), the depth of their middle in metres
         (m,), and the index of the segment that each came from (m,).
     """
     first, last = (_homogeneous_px(points, img_from_frame) for points in (starts, ends))
-    f0, f1 = (_frustum_values(points, size_px, near_m) for points in (first, last))  # (5, n)
+    f0, f1 = (_frustum_values(points, size_px) for points in (first, last))  # (5, n)
     crossing = (f0 < 0) != (f1 < 0)
     t = np.where(crossing, f0 / np.where(crossing, f0 - f1, 1.0), 0.0)
     enter = np.where(crossing & (f0 < 0), t, 0.0).max(axis=0)  # (n,)
@@ -56,10 +51,7 @@ def project_segments(
 
 
 def project_polygon(
-    ring: np.ndarray,
-    img_from_frame: np.ndarray,
-    size_px: tuple[int, int],
-    near_m: float = NEAR_M,
+    ring: np.ndarray, img_from_frame: np.ndarray, size_px: tuple[int, int]
 ) -> np.ndarray:
     """Project a polygon and cut it to the image (Sutherland and Hodgman, 1974).
 
@@ -67,14 +59,13 @@ def project_polygon(
         ring: Vertices in metres; repeating the first one at the end is optional. (n, 3)
         img_from_frame: Projection matrix. (4, 4)
         size_px: Width and height of the image.
-        near_m: Smallest depth that is drawn.
 
     Returns:
         Pixel coordinates of the visible part, empty if there is none. (m, 2)
     """
     points = _homogeneous_px(ring, img_from_frame)
     for plane in range(5):
-        values = _frustum_values(points, size_px, near_m)[plane]
+        values = _frustum_values(points, size_px)[plane]
         following, next_values = np.roll(points, -1, axis=0), np.roll(values, -1)
         kept: list[np.ndarray] = []
         for p, q, f0, f1 in zip(points, following, values, next_values, strict=True):
@@ -89,15 +80,7 @@ def project_polygon(
 
 
 def subdivided(points: np.ndarray, step_m: float) -> np.ndarray:
-    """Insert vertices so that no segment is longer than a step; every original vertex is kept.
-
-    Args:
-        points: Polyline in metres, at least one point. (n, D)
-        step_m: Longest allowed segment, > 0.
-
-    Returns:
-        The denser polyline. (m, D)
-    """
+    """Insert vertices so that no segment is longer than a step. (n >= 1, D) metres -> (m, D)"""
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     counts = np.maximum(np.ceil(lengths / step_m).astype(int), 1)
     parts = [i + np.arange(n) / n for i, n in enumerate(counts)]

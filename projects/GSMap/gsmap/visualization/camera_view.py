@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +35,7 @@ class CameraView:
         img_from_frame: Projection from the annotation frame to this image's pixels. (4, 4)
 
     Raises:
-        ValueError: If the image or the matrix has another shape or type.
+        ValueError: If the image has another shape or type.
     """
 
     name: str
@@ -42,15 +43,10 @@ class CameraView:
     img_from_frame: np.ndarray
 
     def __post_init__(self) -> None:
-        image, matrix = self.image, self.img_from_frame
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        kind, shape = self.image.dtype, self.image.shape
+        if len(shape) != 3 or shape[2] != 3 or kind != np.uint8:
             raise ValueError(
-                f"image of camera {self.name} must be RGB uint8 (h, w, 3), "
-                f"got {image.dtype} {image.shape}."
-            )
-        if np.shape(matrix) != (4, 4):
-            raise ValueError(
-                f"img_from_frame of camera {self.name} must be (4, 4), got {np.shape(matrix)}."
+                f"image of camera {self.name} must be RGB uint8 (h, w, 3), got {kind} {shape}."
             )
 
     @property
@@ -95,30 +91,19 @@ def camera_views(
 
 
 def viewing_azimuth(img_from_frame: np.ndarray, view: FrameView) -> float:
-    """Return the direction in which a camera looks.
+    """Return where the camera of a projection matrix (4, 4) looks: its angle from straight ahead.
 
-    The third row of a projection matrix is the optical axis, up to a positive factor.
-
-    Args:
-        img_from_frame: Projection matrix. (4, 4)
-        view: Orientation of the frame.
-
-    Returns:
-        Angle from straight ahead, anticlockwise (to the left) positive, in radians, in (-pi, pi].
+    In radians, in (-pi, pi], to the left positive. The third row of the matrix is the optical axis,
+    up to a positive factor.
     """
     right, ahead = view.display_from_frame(np.asarray(img_from_frame)[2, :2])
     return float(np.arctan2(-right, ahead))
 
 
 def arrange_cameras(cameras: Sequence[CameraView], view: FrameView) -> list[list[CameraView]]:
-    """Arrange cameras as on the car: looking ahead above, looking back below, left to right.
+    """Arrange cameras as on the car, left to right: looking ahead in a row, looking back below.
 
-    Args:
-        cameras: Any number of cameras.
-        view: Orientation of the frame.
-
-    Returns:
-        One or two rows of cameras, without empty rows.
+    A row without cameras is left out.
     """
     ahead: list[tuple[float, CameraView]] = []
     back: list[tuple[float, CameraView]] = []
@@ -136,12 +121,10 @@ def _draw_areas(
     ax: Axes, elements: MapElements, camera: CameraView, view: FrameView, style: MapStyle
 ) -> None:
     """Fill the closed elements faintly."""
-    shapes, colours = [], []
-    for line, label in zip(elements.polylines, elements.labels, strict=True):
-        if style.is_closed(label):
-            shapes.append(project_polygon(view.lifted(line), camera.img_from_frame, camera.size_px))
-            colours.append(style.colour(label))
-    faces = mcolors.to_rgba_array(colours, 0.25)
+    closed = elements.select(np.array([style.is_closed(label) for label in elements.labels]))
+    rings = (view.lifted(line) for line in closed.polylines)
+    shapes = [project_polygon(ring, camera.img_from_frame, camera.size_px) for ring in rings]
+    faces = mcolors.to_rgba_array(style.colours(closed.labels), 0.25)
     ax.add_collection(PolyCollection(shapes, facecolors=faces, edgecolors="none", zorder=3))
 
 
@@ -164,17 +147,10 @@ def _draw_polylines(
     thinning = np.exp(_WIDTH_STEP * kinds[:, 1]).clip(0.45, 2.6)
     widths = scale * style.camera_line_pt * thinning
     halo = mcolors.to_rgba(style.halo, 0.55)
+    rounded: dict[str, Any] = {"facecolors": "none", "capstyle": "round", "joinstyle": "round"}
     for colour, extra, zorder in ((halo, 1.1, 4), (style.colours(kinds[:, 0]), 0.0, 5)):
-        lines = PathCollection(
-            paths,
-            facecolors="none",
-            edgecolors=colour,
-            linewidths=widths + extra * scale,
-            capstyle="round",
-            joinstyle="round",
-            zorder=zorder,
-        )
-        ax.add_collection(lines)
+        line = {"edgecolors": colour, "linewidths": widths + extra * scale, "zorder": zorder}
+        ax.add_collection(PathCollection(paths, **line, **rounded))
 
 
 def draw_camera(
@@ -193,8 +169,7 @@ def draw_camera(
         elements: Map elements, or None for the bare image.
         view: Ground plane of the frame.
         style: Colours and widths.
-        size_px: Width and height of the axes on the canvas; the image is resampled to it with an
-            area filter.
+        size_px: Width and height of the axes on the canvas, to which the image is resampled.
     """
     width, height = camera.size_px
     method = cv2.INTER_AREA if size_px[0] < width else cv2.INTER_CUBIC
@@ -205,14 +180,6 @@ def draw_camera(
         _draw_polylines(ax, elements, camera, view, style)
     ax.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
-    ax.text(
-        0.014,
-        0.965,
-        camera.title,
-        transform=ax.transAxes,
-        fontsize=7,
-        color="white",
-        va="top",
-        bbox={"boxstyle": "round,pad=0.3", "facecolor": (0, 0, 0, 0.5), "edgecolor": "none"},
-        zorder=8,
-    )
+    plate = {"boxstyle": "round,pad=0.3", "facecolor": (0, 0, 0, 0.5), "edgecolor": "none"}
+    title = ax.text(0.014, 0.965, camera.title, va="top", transform=ax.transAxes, zorder=8)
+    title.set(fontsize=7, color="white", bbox=plate)

@@ -22,13 +22,7 @@ from gsmap.utils.files import atomic_write
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
 from gsmap.visualization.frame_view import FrameView
-from gsmap.visualization.style import (
-    FALSE_DASHES,
-    MATCH_COLOURS,
-    MATCH_TITLES,
-    TRUTH_OPACITY,
-    MapStyle,
-)
+from gsmap.visualization.style import FALSE_DASHES, MATCH_COLOURS, TRUTH_OPACITY, MapStyle
 
 DPI = 220  # so that text of 6.5 points stays legible where a picture is shown 800 px wide
 _WIDTH = 1500  # px at DPI, for which everything is laid out
@@ -74,15 +68,9 @@ def _camera_boxes(rows: Sequence[Sequence[float]], width: float) -> tuple[list[B
 def _layout(
     rows: Sequence[Sequence[float]], num_panels: int, aspect: float
 ) -> tuple[list[Box], list[Box], float]:
-    """Place all pictures: a single panel beside the cameras, several in a centred row below.
+    """Place rows of cameras, one panel beside them or several in a centred row below.
 
-    Args:
-        rows: Aspect ratios (width / height) of the cameras in each row.
-        num_panels: Number of bird's-eye views.
-        aspect: Their aspect ratio.
-
-    Returns:
-        The boxes of the cameras and of the panels, and the lower edge of all.
+    Returns the boxes of the cameras and of the panels, and the lower edge of all.
     """
     if num_panels == 1 and len(rows) > 1:
         # The cameras' height is slope * width + offset, so both heights agree at one width.
@@ -123,7 +111,8 @@ def _legend_lines(
     fates = [fate for panel in panels for fate in chain(*panel.fates)]
     for fate, colour in MATCH_COLOURS.items():
         if fate in fates:
-            line = Line2D([], [], color=colour, label=f"{MATCH_TITLES[fate]} ({fates.count(fate)})")
+            title = f"truth {fate}" if fate in TRUTH_OPACITY else fate
+            line = Line2D([], [], color=colour, label=f"{title} ({fates.count(fate)})")
             line.set(linewidth=1.8, linestyle=FALSE_DASHES if fate == "false" else "-")
             if fate in TRUTH_OPACITY:
                 line.set(linewidth=4.2, alpha=TRUTH_OPACITY[fate], solid_capstyle="butt")
@@ -139,19 +128,11 @@ def _draw_header(figure: Figure, title: str, lines: Sequence[Line2D], style: Map
         title = title[: _LONGEST_TITLE - 1] + "\N{HORIZONTAL ELLIPSIS}"
     figure.text(margin, 1 - 0.3 * _HEADER / height, title, size=9, color=style.ink, va="center")
     letters = sum(len(str(line.get_label())) + 5 for line in lines)
-    figure.legend(
-        handles=lines,
-        loc="center left",
-        bbox_to_anchor=(margin, 1 - 0.75 * _HEADER / height),
-        ncols=max(len(lines), 1),
-        frameon=False,
-        fontsize=round(min(8, 800 / max(letters, 1)), 1),
-        labelcolor=style.ink,
-        borderpad=0,
-        borderaxespad=0,
-        handlelength=1.4,
-        columnspacing=1.4,
-    )
+    text = {"fontsize": round(min(8, 800 / max(letters, 1)), 1), "labelcolor": style.ink}
+    gaps = {"borderpad": 0, "borderaxespad": 0, "handlelength": 1.4, "columnspacing": 1.4}
+    options: dict[str, Any] = {"ncols": max(len(lines), 1), "frameon": False, **text, **gaps}
+    corner = margin, 1 - 0.75 * _HEADER / height
+    figure.legend(handles=lines, loc="center left", bbox_to_anchor=corner, **options)
 
 
 def compose_figure(
@@ -166,6 +147,8 @@ def compose_figure(
 ) -> Figure:
     """Compose one picture: cameras arranged as on the car, bird's-eye views in a row below.
 
+    ``figure_to_rgb`` and ``save_figure`` render it.
+
     Args:
         cameras: Any number of cameras, also none.
         panels: Bird's-eye views, at least one if there is no camera.
@@ -174,10 +157,7 @@ def compose_figure(
         style: Colours and widths.
         camera_elements: Map elements drawn over the images.
         title: Heading.
-        width_px: Width of the picture in pixels.
-
-    Returns:
-        The figure; ``figure_to_rgb`` and ``save_figure`` render it.
+        width_px: Width of the picture.
 
     Raises:
         ValueError: If there is nothing to draw.
@@ -187,16 +167,15 @@ def compose_figure(
     rows = arrange_cameras(cameras, view)
     aspects = [[c.size_px[0] / c.size_px[1] for c in row] for row in rows]
     left, right, low, high = display_extent(grid, view)
-    layout = _layout(aspects, len(panels), (right - left) / (high - low))
-    camera_boxes, panel_boxes, bottom = layout
+    aspect = (right - left) / (high - low)
+    camera_boxes, panel_boxes, bottom = _layout(aspects, len(panels), aspect)
     size_in = _WIDTH / DPI, (bottom + _MARGIN / 2) / DPI
     scale = width_px / _WIDTH  # boxes are laid out for one width and the dots per inch follow
     figure = Figure(figsize=size_in, dpi=DPI * scale, facecolor="white")
-    FigureCanvasAgg(figure)
     with matplotlib.rc_context({"font.family": style.font_family}):
         maps = [camera_elements, *(panel.elements for panel in panels)]
         _draw_header(figure, title, _legend_lines(maps, panels, style), style)
-        for camera, box in zip((c for row in rows for c in row), camera_boxes, strict=True):
+        for camera, box in zip(chain(*rows), camera_boxes, strict=True):
             size_px = max(round(box[2] * scale), 1), max(round(box[3] * scale), 1)
             draw_camera(_add_axes(figure, box), camera, camera_elements, view, style, size_px)
         for panel, box in zip(panels, panel_boxes, strict=True):
@@ -206,8 +185,7 @@ def compose_figure(
 
 def figure_to_rgb(figure: Figure) -> np.ndarray:
     """Render a figure. Returns RGB (h, w, 3) uint8."""
-    canvas = figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)
+    canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
@@ -226,22 +204,16 @@ def sample_title(metainfo: Mapping[str, Any]) -> str:
 
 def sample_name(metainfo: Mapping[str, Any], suffix: str) -> str:
     """Return a file name that sorts by scene and time and ends in the last letters of the token."""
-    token, seconds = str(metainfo.get("token") or ""), metainfo.get("seconds")
-    if seconds is None:
-        return picture_name(token, suffix)
-    moment = f"{metainfo.get('scene') or 'scene'}_{seconds:07.2f}s_{token[-8:]}"
-    return picture_name(moment, suffix)
+    name, seconds = str(metainfo.get("token") or ""), metainfo.get("seconds")
+    if seconds is not None:
+        name = f"{metainfo.get('scene') or 'scene'}_{seconds:07.2f}s_{name[-8:]}"
+    return picture_name(name, suffix)
 
 
 def save_figure(figure: Figure, path: str | Path) -> Path:
-    """Write a figure; the file appears only when it is whole.
+    """Write a figure and return the path; the file appears only when it is whole.
 
-    Args:
-        figure: What to write.
-        path: ``.png``, ``.jpg`` or ``.webp`` for pixels, ``.pdf`` or ``.svg`` for vectors.
-
-    Returns:
-        The path.
+    ``.png``, ``.jpg`` and ``.webp`` hold pixels, ``.pdf`` and ``.svg`` vectors.
 
     Raises:
         ValueError: If the suffix is none of these.

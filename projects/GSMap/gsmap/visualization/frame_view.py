@@ -27,11 +27,7 @@ class FrameView:
         """Return the view with the ground plane that the sensor's mounting implies.
 
         A roof LiDAR is mounted with a tilt of a degree or two, which at 20 m moves the ground by
-        half a metre.
-
-        Args:
-            ego_from_frame: Transform from the annotation frame to the vehicle; None leaves the
-                frame's usual level ground. (4, 4)
+        half a metre. None leaves the frame's usual level ground. (4, 4)
         """
         if ego_from_frame is None:
             return self

@@ -18,6 +18,16 @@ def _points(data_batch: Any, index: int) -> np.ndarray | None:
     return None if clouds is None else np.asarray(clouds[index].detach().cpu())
 
 
+def _visualizer(runner: Runner) -> MapVisualizer:
+    """Return the runner's visualizer, which must be ours."""
+    if not isinstance(runner.visualizer, MapVisualizer):
+        raise TypeError(
+            "MapVisualizationHook needs visualizer=dict(type='MapVisualizer') in the config, "
+            f"got {type(runner.visualizer).__name__}."
+        )
+    return runner.visualizer
+
+
 @HOOKS.register_module()
 class MapVisualizationHook(Hook):
     """Draws predictions: to ``test_out_dir`` in testing, to the backends in validation.
@@ -28,11 +38,8 @@ class MapVisualizationHook(Hook):
     Args:
         draw: Whether to draw at all.
         interval: In testing, draw every ``interval``-th sample of a rank.
-        max_samples: In testing, largest number of pictures per rank; None draws all.
         num_val_samples: In validation, how many samples to draw.
-        score_thr: Smallest drawn score; None leaves it to the visualizer.
         test_out_dir: Folder for the pictures of a test (``tools/test.py --show-dir``).
-        suffix: Format of the pictures: ``.jpg``, ``.png``, ``.webp``, ``.pdf`` or ``.svg``.
 
     Raises:
         ValueError: If ``interval`` is smaller than 1.
@@ -44,33 +51,16 @@ class MapVisualizationHook(Hook):
         self,
         draw: bool = False,
         interval: int = 1,
-        max_samples: int | None = None,
         num_val_samples: int = 4,
-        score_thr: float | None = None,
         test_out_dir: str | None = None,
-        suffix: str = ".jpg",
     ):
         if interval < 1:
             raise ValueError(f"interval must be >= 1, got {interval}.")
         self.draw = draw
         self.interval = interval
-        self.max_samples = max_samples
         self.num_val_samples = num_val_samples
-        self.score_thr = score_thr
         self.test_out_dir = test_out_dir
-        self.suffix = suffix
         self._seen = 0
-        self._drawn = 0
-
-    @staticmethod
-    def _visualizer(runner: Runner) -> MapVisualizer:
-        """Return the runner's visualizer, which must be ours."""
-        if not isinstance(runner.visualizer, MapVisualizer):
-            raise TypeError(
-                "MapVisualizationHook needs visualizer=dict(type='MapVisualizer') in the config, "
-                f"got {type(runner.visualizer).__name__}."
-            )
-        return runner.visualizer
 
     def after_val_iter(
         self, runner: Runner, batch_idx: int, data_batch: Any = None, outputs: Any = None
@@ -81,19 +71,13 @@ class MapVisualizationHook(Hook):
         stride = max(len(runner.val_dataloader) // max(self.num_val_samples, 1), 1)
         if batch_idx % stride or batch_idx // stride >= self.num_val_samples:
             return
-        sample = outputs[0]
-        self._visualizer(runner).add_datasample(
-            picture_name(f"val_{sample.metainfo['token']}", ""),
-            None,
-            sample,
-            step=runner.iter,
-            pred_score_thr=self.score_thr,
-            points=_points(data_batch, 0),
-        )
+        name = picture_name(f"val_{outputs[0].metainfo['token']}", "")
+        points = _points(data_batch, 0)
+        _visualizer(runner).add_datasample(name, None, outputs[0], step=runner.iter, points=points)
 
     def before_test_epoch(self, runner: Runner) -> None:
         """Start counting anew."""
-        self._seen = self._drawn = 0
+        self._seen = 0
 
     def after_test_iter(
         self, runner: Runner, batch_idx: int, data_batch: Any = None, outputs: Any = None
@@ -102,18 +86,14 @@ class MapVisualizationHook(Hook):
         if not self.draw or self.test_out_dir is None:
             return
         for index, sample in enumerate(outputs or ()):
-            chosen = self._seen % self.interval == 0
+            if self._seen % self.interval == 0:
+                points = _points(data_batch, index)
+                figure = _visualizer(runner).draw_sample(sample, points=points)
+                save_figure(figure, Path(self.test_out_dir) / sample_name(sample.metainfo, ".jpg"))
             self._seen += 1
-            if not chosen or (self.max_samples is not None and self._drawn >= self.max_samples):
-                continue
-            figure = self._visualizer(runner).draw_sample(
-                sample, score_thr=self.score_thr, points=_points(data_batch, index)
-            )
-            name = sample_name(sample.metainfo, self.suffix)
-            save_figure(figure, Path(self.test_out_dir) / name)
-            self._drawn += 1
 
     def after_test_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
         """Say where the pictures are."""
-        if self._drawn:
-            runner.logger.info(f"{self._drawn} pictures of predictions are in {self.test_out_dir}.")
+        if self._seen:
+            count = -(-self._seen // self.interval)
+            runner.logger.info(f"{count} pictures of predictions are in {self.test_out_dir}.")

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,21 +23,18 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
-from gsmap.visualization.figure import compose_figure, figure_to_rgb, sample_title, save_figure
+from gsmap.visualization.figure import compose_figure, figure_to_rgb, sample_title
 from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
 from gsmap.visualization.style import MapStyle
 
 PANELS = ("ground_truth", "prediction", "matches", "gaussians", "rasters")
+RASTER_SIZE = (400, 200)  # rows and columns of rendered masks
 
 
 def images_from_inputs(images: torch.Tensor) -> list[np.ndarray]:
     """Turn a pipeline's images back into pictures.
 
-    Args:
-        images: BGR, 0 to 255, before normalisation. (V, 3, H, W)
-
-    Returns:
-        RGB pictures, V x (H, W, 3) uint8.
+    BGR, 0 to 255, before normalisation (V, 3, H, W) -> RGB, V x (H, W, 3) uint8
 
     Raises:
         ValueError: If the shape is wrong.
@@ -61,21 +57,17 @@ def ground_truth_elements(data_sample: Any) -> MapElements | None:
     return elements_of_targets(instances) if "pts" in instances else None
 
 
-def predicted_elements(
-    data_sample: Any, score_thr: float = 0.0, max_num: int | None = None
-) -> MapElements | None:
+def predicted_elements(data_sample: Any, score_thr: float = 0.0) -> MapElements | None:
     """Read a ``Det3DDataSample``'s predictions, the most confident last, to be drawn on top.
 
-    At most ``max_num`` with a score of ``score_thr`` are kept; it is None if there are no
-    ``pred_instances_3d``.
+    It is None if there are no ``pred_instances_3d``.
     """
     instances = getattr(data_sample, "pred_instances_3d", ())
     if "pts" not in instances:
         return None
     found = elements_of_predictions(instances)
     order = np.argsort(found.confidence, kind="stable")
-    order = order[found.confidence[order] >= score_thr]
-    return found.select(order[::-1][:max_num][::-1])
+    return found.select(order[found.confidence[order] >= score_thr])
 
 
 @VISUALIZERS.register_module()
@@ -83,43 +75,31 @@ class MapVisualizer(Visualizer):
     """Draws samples: the map over the cameras, and bird's-eye views of truth and prediction.
 
     Extent, classes and frame come from the data set's ``metainfo`` (``dataset_meta``, which the
-    runner sets).
+    runner sets). The prediction is drawn over the cameras, or else the ground truth.
 
     Args:
-        name: Name of the instance.
-        raster_size: Rows and columns of the rendered masks.
         ground_z_m: Level ground at this z of the frame. By default the ground follows the sensor's
             mounting (``lidar2ego`` of the sample), or else the frame's usual height.
         score_thr: Smallest score of a drawn prediction.
-        max_num: Largest number of drawn predictions; None draws all above the threshold.
         panels: Which bird's-eye views to draw, of ``PANELS``; those that a sample has no data
             for are left out.
         match_m: Largest Chamfer distance of a hit in ``matches``, in metres, as in AP_chamfer.
-        camera_source: What is drawn over the cameras, ``prediction`` or ``ground_truth``; the other
-            is drawn if a sample lacks it.
-        show_scores: Whether to write scores.
-        show_vertices: Whether to mark the predicted vertices.
         show_order: Whether to mark the start and direction of elements.
         width_px: Width of the picture.
         style: Other options of ``MapStyle``, by name.
-        **kwargs: Options of mmengine's ``Visualizer``: ``vis_backends``, ``save_dir``.
+        name, **kwargs: Options of mmengine's ``Visualizer``: ``vis_backends``, ``save_dir``.
 
     Raises:
-        ValueError: If a panel or the camera source is not known.
+        ValueError: If a panel is not known.
     """
 
     def __init__(
         self,
         name: str = "visualizer",
-        raster_size: tuple[int, int] = (400, 200),
         ground_z_m: float | None = None,
         score_thr: float = 0.4,
-        max_num: int | None = None,
         panels: Sequence[str] = PANELS[:4],
         match_m: float = 1.0,
-        camera_source: str = "prediction",
-        show_scores: bool = True,
-        show_vertices: bool = True,
         show_order: bool = False,
         width_px: int = 1500,
         style: dict | None = None,
@@ -129,17 +109,10 @@ class MapVisualizer(Visualizer):
         unknown = set(panels) - set(PANELS)
         if unknown:
             raise ValueError(f"panels must be among {PANELS}, got {sorted(unknown)}.")
-        if camera_source not in PANELS[:2]:
-            raise ValueError(f"camera_source must be one of {PANELS[:2]}, got {camera_source!r}.")
-        self.raster_size = tuple(raster_size)
         self.ground_z_m = ground_z_m
         self.score_thr = score_thr
-        self.max_num = max_num
         self.panels = tuple(panels)
         self.match_m = match_m
-        self.camera_source = camera_source
-        self.show_scores = show_scores
-        self.show_vertices = show_vertices
         self.show_order = show_order
         self.width_px = width_px
         self.style_options = dict(style or {})
@@ -149,8 +122,7 @@ class MapVisualizer(Visualizer):
         """Extent of the map and size of its rendered masks."""
         meta = self.dataset_meta or {}
         x_range, y_range = meta.get("x_range", (-15.0, 15.0)), meta.get("y_range", (-30.0, 30.0))
-        height, width = self.raster_size
-        return BEVGrid(x_range, y_range, height, width)
+        return BEVGrid(x_range, y_range, *RASTER_SIZE)
 
     @property
     def style(self) -> MapStyle:
@@ -174,17 +146,10 @@ class MapVisualizer(Visualizer):
     def cameras(
         self, metainfo: dict, images: Sequence[np.ndarray] | None = None
     ) -> list[CameraView]:
-        """Pair a sample's images with their projections.
+        """Pair a sample's images with their projections; a camera whose path is None is left out.
 
-        Args:
-            metainfo: Meta data of the sample; without ``img_path`` and ``images`` there are no
-                cameras.
-            images: RGB images in the geometry that the model sees (after augmentation); None reads
-                the original files and takes the augmentation out of the projections; a camera whose
-                path is None is left out.
-
-        Returns:
-            One view per camera.
+        ``images`` are RGB in the geometry that the model sees (after augmentation); None reads the
+        original files, if there are any, and takes the augmentation out of the projections.
 
         Raises:
             ValueError: If the numbers of images and projections disagree, or a file is missing or
@@ -200,16 +165,13 @@ class MapVisualizer(Visualizer):
                 unscaled = np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64))
                 projections = unscaled @ projections
             where = f"sample {metainfo.get('token')!r}"
-            return [
-                CameraView(name, read_image(path, where)[..., ::-1], projection)
-                for name, path, projection in zip(names, paths or (), projections, strict=True)
-                if path is not None
-            ]
+            images = [path and read_image(path, where)[..., ::-1] for path in paths or ()]
         if len(images) != len(projections):
             raise ValueError(
                 f"A sample has {len(images)} images, but {len(projections)} projections."
             )
-        return [CameraView(*fields) for fields in zip(names, images, projections, strict=True)]
+        triples = zip(names, images, projections, strict=True)
+        return [CameraView(*triple) for triple in triples if triple[1] is not None]
 
     def _bev_panels(
         self,
@@ -220,20 +182,12 @@ class MapVisualizer(Visualizer):
     ) -> list[BEVPanel]:
         """Choose the bird's-eye views that the sample has data for."""
         panels = {}
+        both: dict[str, Any] = {"order": self.show_order, "points": points}
         if truth is not None:
-            panels["ground_truth"] = BEVPanel(
-                "Ground truth", truth, order=self.show_order, points=points
-            )
+            panels["ground_truth"] = BEVPanel("Ground truth", truth, **both)
         if found is not None:
-            panels["prediction"] = BEVPanel(
-                "Prediction",
-                found,
-                note,
-                vertices=self.show_vertices,
-                order=self.show_order,
-                scores=self.show_scores,
-                points=points,
-            )
+            title = "Prediction"
+            panels["prediction"] = BEVPanel(title, found, note, vertices=True, scores=True, **both)
         if found is not None and truth is not None and "matches" in self.panels:
             rules = ChamferConfig(tuple(self.style.classes), (self.match_m,))
             matched, hits = match_chamfer(found, truth, rules), np.full(len(found), -1)
@@ -241,18 +195,12 @@ class MapVisualizer(Visualizer):
             title = f"Hits within {self.match_m:g} m"
             panels["matches"] = BEVPanel(title, found, note, truth=truth, hits=hits)
         if found is not None and found.has_gaussians:
-            panels["gaussians"] = BEVPanel(
-                "Gaussians (1\N{GREEK SMALL LETTER SIGMA})",
-                found,
-                note,
-                lines=False,
-                gaussians=True,
-            )
+            title = "Gaussians (1\N{GREEK SMALL LETTER SIGMA})"
+            panels["gaussians"] = BEVPanel(title, found, note, lines=False, gaussians=True)
             if "rasters" in self.panels:
                 masks = self._render_masks(found) if len(found) else None
-                panels["rasters"] = BEVPanel(
-                    "Rendered masks", found, note, lines=False, rasters=masks
-                )
+                title = "Rendered masks"
+                panels["rasters"] = BEVPanel(title, found, note, lines=False, rasters=masks)
         return [panel for name, panel in panels.items() if name in self.panels]
 
     def _render_masks(self, elements: MapElements) -> np.ndarray:
@@ -268,35 +216,24 @@ class MapVisualizer(Visualizer):
         self,
         data_sample: Any,
         images: Sequence[np.ndarray] | None = None,
-        draw_gt: bool = True,
-        draw_pred: bool = True,
         score_thr: float | None = None,
         points: np.ndarray | None = None,
-        title: str | None = None,
     ) -> Figure:
         """Compose the picture of one sample.
 
         Args:
             data_sample: A ``Det3DDataSample`` as ``docs/architecture.md`` describes it.
-            images: RGB images after augmentation, V x (h, w, 3) uint8; None reads the original
-                files.
-            draw_gt: Whether to draw the ground truth.
-            draw_pred: Whether to draw the prediction.
+            images: RGB images after augmentation; None reads the original files. V x (h, w, 3)
             score_thr: Smallest drawn score instead of the visualizer's own.
             points: LiDAR points in metres of the frame, drawn as faint dots. (n, >= 2)
-            title: Heading instead of scene, time and token.
-
-        Returns:
-            The figure.
 
         Raises:
             ValueError: If the sample has neither images nor a map.
         """
         meta = data_sample.metainfo
-        truth = ground_truth_elements(data_sample) if draw_gt else None
+        truth = ground_truth_elements(data_sample)
         threshold = self.score_thr if score_thr is None else score_thr
-        found = predicted_elements(data_sample, threshold, self.max_num) if draw_pred else None
-        first, second = (found, truth) if self.camera_source == "prediction" else (truth, found)
+        found = predicted_elements(data_sample, threshold)
         note = "no elements"
         everything = predicted_elements(data_sample)
         if everything:
@@ -307,8 +244,8 @@ class MapVisualizer(Visualizer):
             self.grid,
             self.frame_view(meta),
             self.style,
-            camera_elements=second if first is None else first,
-            title=sample_title(meta) if title is None else title,
+            camera_elements=truth if found is None else found,
+            title=sample_title(meta),
             width_px=self.width_px,
         )
 
@@ -318,28 +255,12 @@ class MapVisualizer(Visualizer):
         name: str,
         image: Sequence[np.ndarray] | None,
         data_sample: Any,
-        draw_gt: bool = True,
-        draw_pred: bool = True,
         step: int = 0,
-        out_file: str | Path | None = None,
-        pred_score_thr: float | None = None,
         points: np.ndarray | None = None,
     ) -> None:
-        """Draw one sample to a file, or else to the backends (TensorBoard, ``vis_data``).
+        """Draw one sample, as `draw_sample` does, to the backends (TensorBoard, ``vis_data``).
 
-        Args:
-            name: Tag in the backends.
-            image: RGB images after augmentation, or None to read the original files.
-            data_sample: The sample.
-            draw_gt: Whether to draw the ground truth.
-            draw_pred: Whether to draw the prediction.
-            step: Global step of the picture in the backends.
-            out_file: File to write instead; its suffix chooses the format.
-            pred_score_thr: Smallest drawn score instead of the visualizer's own.
-            points: LiDAR points in metres. (n, >= 2)
+        ``name`` is its tag there, ``step`` the training step.
         """
-        figure = self.draw_sample(data_sample, image, draw_gt, draw_pred, pred_score_thr, points)
-        if out_file is not None:
-            save_figure(figure, out_file)
-        else:
-            self.add_image(name, figure_to_rgb(figure), step)
+        figure = self.draw_sample(data_sample, image, points=points)
+        self.add_image(name, figure_to_rgb(figure), step)

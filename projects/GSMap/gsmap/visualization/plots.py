@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -21,7 +20,6 @@ def panel_grid(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     """Return a figure and its panels. (rows, columns)"""
     height_in = rows * min(2.8, 0.3 + _WIDTH_IN / columns)
     figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=200, layout="constrained")
-    FigureCanvasAgg(figure)
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
@@ -47,12 +45,9 @@ def _finish_shares(ax: Axes, *options: str) -> None:
 
 
 def plot_result(reports: Sequence[MetricReport]) -> Figure:
-    """Draw a row per metric: precision over recall of each class, and the calibration of all.
+    """Draw a row per metric of a result: precision over recall of each class, and the calibration.
 
     Lines have the colours of their classes, those of stricter thresholds paler.
-
-    Args:
-        reports: The metrics of one result.
     """
     style = MapStyle(tuple(reports[0].detections))
     figure, axes = panel_grid(len(reports), len(style.classes) + 1)
@@ -76,10 +71,9 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
 
 
 def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figure:
-    """Draw precision over recall, a panel a class and metric, at the middle threshold.
+    """Draw precision over recall of configs, by name, at the middle threshold.
 
-    Args:
-        reports: Both metrics of one run of each config, by its name.
+    ``reports`` are of one run of each; a row is a metric, a panel a class.
     """
     first = next(iter(reports.values()))
     style = MapStyle(tuple(first[0].detections))
@@ -95,24 +89,16 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
             title = f"{style.title(label)}, {found.thresholds[middle]:g}{unit}"
             y_label = "" if label else "precision"
             _finish_shares(row[label], title, "recall", y_label, style.colour(label))
-    figure.legend(
-        axes[0][0].lines,
-        list(reports),
-        loc="outside upper left",
-        ncols=4,
-        fontsize=8,
-        frameon=False,
-    )
+    lines, names = axes[0, 0].lines, list(reports)
+    figure.legend(lines, names, loc="outside upper left", ncols=4, fontsize=8, frameon=False)
     return figure
 
 
 def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyle) -> Figure:
     """Draw maps of one drive side by side (long ones one below the other), with the way driven.
 
-    Args:
-        maps: Maps in the global frame, by their titles.
-        track: Positions of the vehicle. (n, 2)
-        style: Colours.
+    ``maps`` are in the global frame, by their titles; ``track`` holds the vehicle's positions in
+    metres. (n, 2)
     """
     points = np.concatenate([track, *(elements.points[:, :2] for elements in maps.values())])
     low, high = points.min(axis=0) - 5, points.max(axis=0) + 5

@@ -2,9 +2,9 @@
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +24,8 @@ class RunLog:
 
     Args:
         name: Name for legends and tables.
-        train: Records of training, by iteration: ``step`` and every scalar, such as ``loss``.
-        val: Records of validation, in order: ``step`` (epoch or iteration) and every metric.
+        train: Records of training: ``step`` (iteration) and every scalar, such as ``loss``.
+        val: Records of validation: ``step`` (epoch or iteration) and every metric.
     """
 
     name: str
@@ -70,9 +70,6 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
         path: Work folder of the run, or a ``scalars.json``.
         name: Name for legends and tables; the folder's by default.
 
-    Returns:
-        The log.
-
     Raises:
         FileNotFoundError: If there is no log.
         ValueError: If a line is not JSON, or there is no record.
@@ -110,17 +107,17 @@ def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, window: int, titl
         steps, values = run.series(key)
         ax.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
         ax.plot(steps, smoothed(values, window), color=colour, linewidth=1.6, label=run.name)
-    _finish(ax, title, "iteration")
+    _finish(ax, title)
 
 
 def _draw_parts_of_loss(ax: Axes, run: RunLog) -> None:
     """Draw the terms of the last decoder layer; those of earlier ones begin with d0., d1."""
     keys = dict.fromkeys(k for record in run.train for k in record if "loss" in k and k != "loss")
-    last = [key for key in keys if not (key[0] == "d" and key.split(".")[0][1:].isdigit())]
+    last = [key for key in keys if not re.match(r"d\d+\.", key)]
     for name, colour in zip(last, RUN_COLOURS * 8, strict=False):
         steps, values = run.series(name)
         ax.plot(steps, smoothed(values, 10), color=colour, linewidth=1.4, label=name)
-    _finish(ax, f"its parts, last decoder layer ({run.name})", "iteration")
+    _finish(ax, f"its parts, last decoder layer ({run.name})")
 
 
 def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
@@ -136,10 +133,9 @@ def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
     finish_panel(ax, "validation", "epoch" if by_epoch else "iteration")
 
 
-def _finish(ax: Axes, title: str, x_label: str) -> None:
+def _finish(ax: Axes, title: str) -> None:
     """Finish a panel; its y axis is logarithmic if the values span a decade."""
-    lines = [np.asarray(line.get_ydata(), dtype=float) for line in ax.lines]
-    values = np.concatenate([np.empty(0), *lines])
+    values = np.concatenate([np.empty(0), *(np.asarray(line.get_ydata()) for line in ax.lines)])
     if len(values) and values.min() > 0 and values.max() > 10 * values.min():
         ax.set_yscale("log")
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -147,17 +143,11 @@ def _finish(ax: Axes, title: str, x_label: str) -> None:
         ax.yaxis.set_minor_formatter(NullFormatter())
     elif len(values) and values.min() >= 0:
         ax.set_ylim(0, 1.08 * max(values.max(), 1e-9))
-    finish_panel(ax, title, x_label)
+    finish_panel(ax, title, "iteration")
 
 
 def plot_runs(runs: Sequence[RunLog]) -> Figure:
-    """Draw total loss, the loss's parts, and the validation metrics of runs.
-
-    Args:
-        runs: At least one; the parts of the loss are drawn for the last.
-
-    Returns:
-        The figure.
+    """Draw total loss, the loss's parts (of the last run), and the validation metrics of runs.
 
     Raises:
         ValueError: If there is no run, or none that logged a loss.
@@ -166,24 +156,16 @@ def plot_runs(runs: Sequence[RunLog]) -> Figure:
         raise ValueError("plot_runs needs at least one run that logged a loss.")
     validated = any(run.val for run in runs)
     figure, axes = panel_grid(2 if validated else 1, 2)
-    panels = axes.ravel()
-    _draw_training(panels[0], runs, "loss", 10, "training loss")
-    _draw_parts_of_loss(panels[1], runs[-1])
+    _draw_training(axes[0, 0], runs, "loss", 10, "training loss")
+    _draw_parts_of_loss(axes[0, 1], runs[-1])
     if validated:
-        _draw_metrics(panels[2], runs)
-        panels[3].remove()
+        _draw_metrics(axes[1, 0], runs)
+        axes[1, 1].remove()
     return figure
 
 
 def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
-    """Draw logged figures of training, a panel a figure, one colour per run.
-
-    Args:
-        runs: At least one.
-        keys: Names of the figures, such as ``soft_iou/divider``.
-
-    Returns:
-        The figure.
+    """Draw logged figures of training, such as ``at_floor``, a panel each, one colour per run.
 
     Raises:
         ValueError: If a figure is in no run's log.
@@ -194,11 +176,10 @@ def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
         raise ValueError(f"no run logged {unknown}; there are {sorted(logged - set(_TIMING))}.")
     columns = min(len(keys), 2)
     figure, axes = panel_grid(-(-len(keys) // columns), columns)
-    for panel, key in zip_longest(axes.ravel(), keys):
-        if key is None:
-            panel.remove()
-        else:
-            _draw_training(panel, runs, key, 5, key)
+    for panel, key in zip(axes.ravel(), keys, strict=False):
+        _draw_training(panel, runs, key, 5, key)
+    for panel in axes.ravel()[len(keys) :]:
+        panel.remove()
     return figure
 
 

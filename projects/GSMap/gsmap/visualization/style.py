@@ -23,12 +23,6 @@ MATCH_COLOURS = {
     "found": "#8E8E93",
     "missed": "#AF52DE",
 }
-MATCH_TITLES = {
-    "hit": "hit",
-    "false": "false",
-    "found": "truth found",
-    "missed": "truth missed",
-}
 TRUTH_OPACITY = {"found": 0.4, "missed": 0.75}
 FALSE_DASHES = (0, (3, 1.5))  # as matplotlib has them
 # Of runs and methods in plots; none is a class's or a match's colour.
@@ -53,13 +47,10 @@ class MapStyle:
         closed_classes: Names of the classes that are areas, filled faintly.
         font_family: Font of all text.
         bev_line_pt: Line width in bird's-eye view, in points.
-        camera_line_pt: Line width over an image for an element 10 m away, in points; nearer is
-            thicker.
+        camera_line_pt: Line width over an image 10 m away, in points; nearer is thicker.
         halo: Colour of the edge that keeps lines legible over an image.
-        ink: Colour of titles.
-        muted: Colour of labels and notes.
-        ground: Background of bird's-eye views.
-        grid: Colour of their metric grid.
+        ink, muted: Colours of titles, and of labels and notes.
+        ground, grid: Colours of the background of bird's-eye views, and of their metric grid.
         spare: Colours for classes that ``CLASS_COLOURS`` does not name, in the order of labels.
     """
 
