@@ -87,7 +87,7 @@ class MapVisualizer(Visualizer):
         show_order: Whether to mark the start and direction of elements.
         width_px: Width of the picture.
         style: Other options of ``MapStyle``, by name.
-        name, **kwargs: Options of mmengine's ``Visualizer``: ``vis_backends``, ``save_dir``.
+        **kwargs: Options of mmengine's ``Visualizer``: ``vis_backends``, ``save_dir``.
 
     Raises:
         ValueError: If a panel is not known.

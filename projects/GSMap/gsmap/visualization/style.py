@@ -49,8 +49,10 @@ class MapStyle:
         bev_line_pt: Line width in bird's-eye view, in points.
         camera_line_pt: Line width over an image 10 m away, in points; nearer is thicker.
         halo: Colour of the edge that keeps lines legible over an image.
-        ink, muted: Colours of titles, and of labels and notes.
-        ground, grid: Colours of the background of bird's-eye views, and of their metric grid.
+        ink: Colour of titles.
+        muted: Colour of labels and notes.
+        ground: Background of bird's-eye views.
+        grid: Colour of their metric grid.
         spare: Colours for classes that ``CLASS_COLOURS`` does not name, in the order of labels.
     """
 
