@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from gsmap.converters import lane_graph
-from gsmap.converters.lane_graph import LaneLinks, LanePaths
+from gsmap.converters.lane_graph import LanePaths, link_lanes
 
 
 def line(*xy: tuple[float, float]) -> np.ndarray:
@@ -16,7 +16,7 @@ def line(*xy: tuple[float, float]) -> np.ndarray:
 def paths(polylines: list[np.ndarray], successors: list[list[int]], lanes: list[int] | None = None):
     count = len(polylines)
     predecessors = [[j for j in range(count) if i in successors[j]] for i in range(count)]
-    links = LaneLinks.from_ids(range(count), predecessors, successors)
+    links = link_lanes(range(count), predecessors, successors)
     simplified = LanePaths(polylines, links).simplified(range(count) if lanes is None else lanes)
     return [shapely.get_coordinates(path).tolist() for path in simplified]
 
@@ -68,7 +68,7 @@ def test_too_many_paths_are_refused(monkeypatch):
 
 def test_a_polyline_needs_two_points():
     with pytest.raises(ValueError, match=r"polylines\[0\] must have shape"):
-        LanePaths([np.zeros((1, 3))], LaneLinks([[]], [[]]))
+        LanePaths([np.zeros((1, 3))], [[]])
 
 
 @pytest.mark.parametrize("seed", range(25))

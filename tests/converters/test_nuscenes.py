@@ -14,7 +14,7 @@ import pytest
 import shapely
 
 from gsmap.converters.export import export_json
-from gsmap.converters.lane_graph import LaneLinks
+from gsmap.converters.lane_graph import link_lanes
 from gsmap.converters.nuscenes import convert as nuscenes
 from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.converters.nuscenes.map import MapLayers, NuScenesLocalMap
@@ -42,7 +42,7 @@ def local_map(classes: tuple[str, ...], **layers: list) -> NuScenesLocalMap:
     for name in classes:
         if name not in ("divider", "boundary"):
             polygons.setdefault(name, np.empty(0, object))
-    return NuScenesLocalMap(MapLayers("town", lines, polygons, Counter()), classes)
+    return NuScenesLocalMap(MapLayers(lines, polygons, Counter()), classes)
 
 
 def pose(x: float, y: float, yaw_deg: float) -> np.ndarray:
@@ -104,13 +104,13 @@ def test_an_island_inside_stays_a_ring_however_its_chunks_fall():
 
 def test_centre_lines_follow_each_way_through_a_fork():
     """One lane splits into two connectors: two paths, both cut at the patch's upper edge."""
-    layers = MapLayers("town", {}, {}, Counter())
+    layers = MapLayers({}, {}, Counter())
     layers.centerlines = [
         np.array([[0, -40, 0], [0, 0, 0.0]]),
         np.array([[0, 0, 0], [0, 40, 0.0]]),
         np.array([[0, 0, 0], [10, 40, 0.0]]),
     ]
-    layers.links = LaneLinks([[], [0], [0]], [[1, 2], [], []])
+    layers.links = link_lanes(range(3), [[], [0], [0]], [[1, 2], [], []])
     town = NuScenesLocalMap(layers, ("centerline",))
     found = sorted((i.points for i in town.instances(pose(0, 0, 0))), key=lambda p: p[-1, 0])
     np.testing.assert_allclose([line[0] for line in found], [[0, -30], [0, -30]], atol=1e-9)

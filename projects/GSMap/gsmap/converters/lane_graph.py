@@ -1,7 +1,7 @@
 """The lane graph of a map: which lines along lanes join to one (MapTRv2)."""
 
-from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from itertools import chain, islice
 
 import numpy as np
 import shapely
@@ -12,33 +12,22 @@ MAX_PATHS = 20_000
 
 # An edge leads to a node by way of one lane's private points: (interior point ids, end point id).
 Edge = tuple[tuple[int, ...], int]
+# For each lane of a map, its links: positions of a lane and of the one that follows it.
+LaneLinks = Sequence[Sequence[tuple[int, int]]]
 
 
-@dataclass(frozen=True)
-class LaneLinks:
-    """How the lanes of a map follow one another; a lane is named by its position in the map.
-
-    Args:
-        predecessors: For each lane, the lanes that lead into it.
-        successors: For each lane, the lanes that it leads into.
-    """
-
-    predecessors: Sequence[Sequence[int]]
-    successors: Sequence[Sequence[int]]
-
-    @classmethod
-    def from_ids(
-        cls,
-        ids: Sequence[Hashable],
-        predecessors: Sequence[Iterable[Hashable]],
-        successors: Sequence[Iterable[Hashable]],
-    ) -> "LaneLinks":
-        """Translate lane ids to positions; ids of lanes outside the map are left out."""
-        position = {lane_id: i for i, lane_id in enumerate(ids)}
-        return cls(
-            [[position[i] for i in lanes if i in position] for lanes in predecessors],
-            [[position[i] for i in lanes if i in position] for lanes in successors],
-        )
+def link_lanes(
+    ids: Sequence[Hashable],
+    predecessors: Sequence[Iterable[Hashable]],
+    successors: Sequence[Iterable[Hashable]],
+) -> LaneLinks:
+    """Say by position which lanes follow one another; ids of lanes outside the map are left out."""
+    position = {lane_id: i for i, lane_id in enumerate(ids)}
+    return [
+        [(position[other], i) for other in before if other in position]
+        + [(i, position[other]) for other in after if other in position]
+        for i, (before, after) in enumerate(zip(predecessors, successors, strict=True))
+    ]
 
 
 class LanePaths:
@@ -66,16 +55,16 @@ class LanePaths:
                 raise ValueError(f"polylines[{i}] must have shape (n >= 2, 3), got {line.shape}.")
             if not np.isfinite(line).all():
                 raise ValueError(f"polylines[{i}] holds NaN or infinity.")
-        self._links = links
         rounded = np.round(np.concatenate([np.empty((0, 3)), *polylines]), ROUND_DECIMALS)
         self._points, nodes, uses = np.unique(
             rounded, axis=0, return_inverse=True, return_counts=True
         )  # (nodes, 3)
         ends = np.cumsum([len(line) for line in polylines], dtype=np.int64)
         lanes = [lane.tolist() for lane in np.split(nodes, ends)[:-1]]
-        self._first = [lane[0] for lane in lanes]
-        self._last = [lane[-1] for lane in lanes]
         self._edges = [_fold(lane, uses) for lane in lanes]
+        self._links = [
+            [(a, b, (lanes[a][-1], ((), lanes[b][0]))) for a, b in of_lane] for of_lane in links
+        ]
         self._memo: tuple[tuple[int, ...], np.ndarray] = ((), np.empty(0, dtype=object))
 
     def simplified(self, lanes: Sequence[int]) -> np.ndarray:
@@ -94,10 +83,16 @@ class LanePaths:
         """
         key = tuple(lanes)
         if key != self._memo[0]:
-            graph, paths = self._subgraph(key), list[list[int]]()
+            graph = self._subgraph(key)
             entered = {end for edges in graph.values() for _, end in edges}
-            for source in (node for node, edges in graph.items() if edges and node not in entered):
-                paths += _paths_from(source, graph, MAX_PATHS - len(paths))
+            sources = (node for node, edges in graph.items() if edges and node not in entered)
+            found = chain.from_iterable(_paths_from(source, graph) for source in sources)
+            paths = list(islice(found, MAX_PATHS + 1))
+            if len(paths) > MAX_PATHS:
+                raise ValueError(
+                    f"the lanes of one frame allow more than {MAX_PATHS} paths: the lane graph is "
+                    "damaged."
+                )
             nodes = np.array([node for path in paths for node in path], dtype=np.int64)
             indices = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
             lines = shapely.linestrings(self._points[nodes], indices=indices)
@@ -107,21 +102,12 @@ class LanePaths:
     def _subgraph(self, lanes: Sequence[int]) -> dict[int, list[Edge]]:
         """Return the edges that leave each node when only ``lanes`` take part, in their order."""
         members = set(lanes)
-        graph: dict[int, dict[Edge, None]] = {}
-
-        def add(start: int, edge: Edge) -> None:
-            graph.setdefault(start, {})[edge] = None  # a dict: an ordered set
-            graph.setdefault(edge[1], {})
-
+        graph: dict[int, dict[Edge, None]] = {}  # inner dicts: ordered sets
         for lane in lanes:
-            for start, edge in self._edges[lane]:
-                add(start, edge)
-            for other in self._links.predecessors[lane]:
-                if other in members:
-                    add(self._last[other], ((), self._first[lane]))
-            for other in self._links.successors[lane]:
-                if other in members:
-                    add(self._last[lane], ((), self._first[other]))
+            links = (edge for a, b, edge in self._links[lane] if a in members and b in members)
+            for start, edge in chain(self._edges[lane], links):
+                graph.setdefault(start, {})[edge] = None
+                graph.setdefault(edge[1], {})
         return {node: list(edges) for node, edges in graph.items()}
 
 
@@ -138,9 +124,8 @@ def _fold(nodes: Sequence[int], uses: np.ndarray) -> list[tuple[int, Edge]]:
     return edges
 
 
-def _paths_from(source: int, graph: dict[int, list[Edge]], limit: int) -> list[list[int]]:
-    """Return the nodes of every simple path from ``source`` to a node that leads nowhere."""
-    paths: list[list[int]] = []
+def _paths_from(source: int, graph: dict[int, list[Edge]]) -> Iterator[list[int]]:
+    """Yield the nodes of every simple path from ``source`` to a node that leads nowhere."""
     path, visited = [source], {source}
     # (length of the path up to the node, node, edges still to try)
     stack = [(1, source, iter(graph[source]))]
@@ -153,16 +138,9 @@ def _paths_from(source: int, graph: dict[int, list[Edge]], limit: int) -> list[l
             visited.discard(node)
             continue
         interior, end = edge
-        path.extend(interior)
-        path.append(end)
+        path += *interior, end
         if graph[end]:
             visited.add(end)
             stack.append((len(path), end, iter(graph[end])))
-            continue
-        if len(paths) >= limit:
-            raise ValueError(
-                f"the lanes of one frame allow more than {MAX_PATHS} paths: the lane graph is "
-                "damaged."
-            )
-        paths.append(path.copy())
-    return paths
+        else:
+            yield path.copy()

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -124,13 +123,9 @@ def vertices_of(lines: Sequence[shapely.Geometry] | np.ndarray, dim: int) -> lis
 
 
 def rings_of(polygons: np.ndarray) -> np.ndarray:
-    """Return all rings of polygons: exteriors clockwise, holes anticlockwise.
+    """Return all rings, polygon by polygon: the exterior clockwise, then holes anticlockwise.
 
-    Args:
-        polygons: Polygons. (n,)
-
-    Returns:
-        Rings, polygon by polygon, the exterior first. (rings,)
+    (n,) -> (rings,)
     """
     rings, owner = shapely.get_rings(polygons, return_index=True)
     is_hole = np.zeros(len(rings), dtype=bool)
@@ -148,48 +143,36 @@ class OutlineIndex:
     """
 
     def __init__(self, rings: np.ndarray) -> None:
-        self._rings = [shapely.get_coordinates(ring) for ring in rings]
-        chunks, owners = [], []
-        self._starts: list[np.ndarray] = []
-        for number, points in enumerate(self._rings):
-            starts = np.arange(0, len(points) - 1, _CHUNK_SEGMENTS)
-            self._starts.append(starts)
-            for position, start in enumerate(starts.tolist()):
-                chunks.append(shapely.LineString(points[start : start + _CHUNK_SEGMENTS + 1]))
-                owners.append((number, position))
-        self._tree = shapely.STRtree(chunks)
-        self._owners = np.array(owners, np.int64).reshape(-1, 2)
+        self._chunks, owners = [], []
+        for number, ring in enumerate(rings):
+            points = shapely.get_coordinates(ring)
+            for start in range(0, len(points) - 1, _CHUNK_SEGMENTS):
+                self._chunks.append(points[start : start + _CHUNK_SEGMENTS + 1])
+                owners.append(number)
+        self._owners = np.array(owners, np.int64)
+        self._tree = shapely.STRtree([shapely.LineString(points) for points in self._chunks])
 
     def cut(self, patch: LocalPatch, margin_m: float) -> list[np.ndarray]:
-        """Return the parts of the rings inside a patch.
+        """Return the parts of the rings inside a patch, shrunk by ``margin_m`` on each side.
 
-        Args:
-            patch: Where to cut.
-            margin_m: By how much the patch is shrunk on each side, in metres.
-
-        Returns:
-            Pieces in the patch's frame; a ring wholly inside stays closed. each (n, 2)
+        They are in the patch's frame; a ring wholly inside stays closed. each (n, 2)
         """
-        near = self._owners[self._tree.query(patch.polygon, predicate="intersects")]
+        near = np.sort(self._tree.query(patch.polygon, predicate="intersects"))
         x_range, y_range = (
             (low + margin_m, high - margin_m) for low, high in (patch.x_range, patch.y_range)
         )
         pieces = []
-        for number in np.unique(near[:, 0]):
-            positions = np.sort(near[near[:, 0] == number, 1])
-            for points in self._runs(int(number), positions):
+        for number in np.unique(self._owners[near]):
+            for chunks in self._runs(near[self._owners[near] == number]):
+                first, *others = (self._chunks[i] for i in chunks)
+                points = np.concatenate([first, *(chunk[1:] for chunk in others)])
                 pieces += clip_to_box(patch.points_to_local(points), x_range, y_range)
         return pieces
 
-    def _runs(self, number: int, positions: np.ndarray) -> list[np.ndarray]:
-        """Return the polylines that consecutive chunks form; positions ascend. each (n, 2)."""
-        ring, starts = self._rings[number], self._starts[number]
-        if len(positions) == len(starts):
-            return [ring]
-        ends = np.append(starts[1:], len(ring) - 1)
-        breaks = np.flatnonzero(np.diff(positions) > 1) + 1
-        runs = [positions[a:b] for a, b in pairwise([0, *breaks.tolist(), len(positions)])]
-        polylines = [ring[starts[run[0]] : ends[run[-1]] + 1] for run in runs]
-        if len(runs) > 1 and positions[0] == 0 and positions[-1] == len(starts) - 1:
-            polylines[0] = np.concatenate([polylines.pop(), polylines[0][1:]])
-        return polylines
+    def _runs(self, chunks: np.ndarray) -> list[np.ndarray]:
+        """Return which of one ring's chunks, ascending, follow one another."""
+        runs = np.split(chunks, np.flatnonzero(np.diff(chunks) > 1) + 1)
+        first, last = np.flatnonzero(self._owners == self._owners[chunks[0]])[[0, -1]]
+        if len(runs) > 1 and chunks[0] == first and chunks[-1] == last:  # across the ring's start
+            runs[0] = np.concatenate([runs.pop(), runs[0]])
+        return runs

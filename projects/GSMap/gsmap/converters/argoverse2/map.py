@@ -22,14 +22,14 @@ from gsmap.converters.argoverse2.rules import (
     merge_parallel,
     merge_until_stable,
 )
-from gsmap.converters.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths
+from gsmap.converters.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths, link_lanes
 from gsmap.converters.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.errors import naming
 
 COMPAT_MODES = ("maptrv2", "maptr")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")
-NO_LANE = -1
+NO_LANE, OUTSIDE = -2, -1  # no neighbour; one that is not in the map
 
 
 def check_rules(classes: Collection[str], compat: str) -> None:
@@ -57,23 +57,19 @@ def find_map(log_dir: Path) -> Path:
 
 
 class _LaneSide:
-    """The left or right boundaries of a log's lanes as a graph, and which divide lanes.
-
-    ``neighbours`` holds the position of the lane beyond each boundary, ``NO_LANE`` if it is not in
-    the map; ``has_neighbour`` whether the lane names one. each (lanes,)
-    """
+    """The left or right boundaries of a log's lanes: their paths, and the lane beyond each."""
 
     def __init__(self, lanes: Sequence[LaneSegment], side: str, links: LaneLinks) -> None:
         position = {segment.id: i for i, segment in enumerate(lanes)}
         ids = [getattr(segment, f"{side}_neighbor_id") for segment in lanes]
         boundaries = [getattr(segment, f"{side}_lane_boundary").xyz for segment in lanes]
         self.paths = LanePaths(boundaries, links)
-        self.neighbours = np.array([position.get(i, NO_LANE) for i in ids], dtype=np.int64)
-        self.has_neighbour = np.array([i is not None for i in ids], dtype=bool)
+        beyond = [NO_LANE if i is None else position.get(i, OUTSIDE) for i in ids]
+        self.neighbours = np.array(beyond, dtype=np.int64)  # (lanes,)
 
     def dividing(self, lanes: np.ndarray) -> np.ndarray:
         """Return those of the given lanes that name a neighbour on this side."""
-        return lanes[self.has_neighbour[lanes]]
+        return lanes[self.neighbours[lanes] != NO_LANE]
 
 
 class Argoverse2Map:
@@ -84,9 +80,8 @@ class Argoverse2Map:
     """
 
     def __init__(self, static_map: ArgoverseStaticMap) -> None:
-        self.log_id = static_map.log_id
         lanes = static_map.get_scenario_lane_segments()
-        links = LaneLinks.from_ids(
+        links = link_lanes(
             [s.id for s in lanes], [s.predecessors for s in lanes], [s.successors for s in lanes]
         )
         self._lanes = GeometryLayer([shapely.Polygon(s.polygon_boundary) for s in lanes])
@@ -165,8 +160,7 @@ class Argoverse2Map:
         """Lines between neighbouring lanes outside intersections (MapTRv2)."""
         lanes = lanes[~self._is_intersection[lanes]]
         left, right = self._left.dividing(lanes), self._right.dividing(lanes)
-        # Two lanes share each line: it is taken once, from the lane on its right where that one is
-        # in view.
+        # two lanes share each line: it is taken once, from the lane on its right if that is in view
         right = right[~np.isin(right, self._left.neighbours[left])]
         left = left[~np.isin(left, self._right.neighbours[right])]
         sides = ((self._left, left), (self._right, right))
@@ -191,7 +185,7 @@ class Argoverse2Map:
         points, line = shapely.get_coordinates(lines, include_z=True, return_index=True)
         if len(points) == 0:
             return lines
-        # The pieces of one crossing stay one instance.
+        # the pieces of one crossing stay one instance
         return shapely.linestrings(points, indices=np.unique(owner, return_inverse=True)[1][line])
 
     def _crossing_rings(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:

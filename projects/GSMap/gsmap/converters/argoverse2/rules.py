@@ -19,8 +19,7 @@ def clip_lines(lines: np.ndarray, patch: LocalPatch) -> np.ndarray:
 def clip_polygons(polygons: np.ndarray, patch: LocalPatch) -> tuple[np.ndarray, np.ndarray]:
     """Cut valid polygons of the city with the patch and move the pieces to the vehicle's frame.
 
-    Returns:
-        Valid pieces (pieces,), and which polygon each came from (pieces,).
+    Returns the valid pieces (pieces,), and which polygon each came from (pieces,).
     """
     pieces, owner = shapely.get_parts(
         shapely.intersection(polygons, patch.polygon), return_index=True
@@ -34,8 +33,7 @@ def clip_polygons(polygons: np.ndarray, patch: LocalPatch) -> tuple[np.ndarray, 
 def cut_rings(rings: np.ndarray, box: shapely.Polygon) -> tuple[np.ndarray, np.ndarray]:
     """Return what of each ring lies in the box, its pieces joined where they touch.
 
-    Returns:
-        Lines (pieces,), and which ring each came from (pieces,).
+    They are lines (pieces,), with the ring that each came from (pieces,).
     """
     cut = shapely.intersection(rings, box)
     for i in np.flatnonzero(shapely.get_type_id(cut) == COLLECTION):  # lines and points that touch
@@ -81,18 +79,15 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
     carriageway mapped crossings of one road become one.
 
     Args:
-        pieces: Polygons in the vehicle's frame.
-        owner: Ascending; pieces with the same owner are one crossing.
-
-    Returns:
-        Polygons, each one instance.
+        pieces: Polygons in the vehicle's frame. (pieces,)
+        owner: Ascending; pieces with the same owner are one crossing. (pieces,)
     """
     crossings = shapely.multipolygons(pieces, indices=np.unique(owner, return_inverse=True)[1])
     bounds = shapely.bounds(crossings)
     near = (bounds[:, None, :2] <= bounds[None, :, 2:]).all(-1)
     near &= near.T
-    free = np.ones(len(crossings), dtype=bool)
     np.fill_diagonal(near, False)
+    free = np.ones(len(crossings), dtype=bool)
     sides = np.zeros((len(crossings), 2))
     for i in np.flatnonzero(near.any(1)):
         sides[i] = _long_side(crossings[i])
@@ -102,10 +97,8 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
             continue
         free[i] = False
         others = np.flatnonzero(near[i] & free)
-        if len(others):
-            cosines = sides[others] @ sides[i]
-            others = others[1.0 - np.abs(cosines) < PARALLEL_COSINE_GAP]
-            free[others] = False
+        others = others[1.0 - np.abs(sides[others] @ sides[i]) < PARALLEL_COSINE_GAP]
+        free[others] = False
         merged.append(shapely.union_all(crossings[[i, *others]]) if len(others) else crossing)
     return shapely.get_parts(np.array(merged, dtype=object))
 

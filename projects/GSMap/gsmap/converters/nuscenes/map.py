@@ -8,13 +8,14 @@ near.
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 
-from gsmap.converters.lane_graph import LaneLinks, LanePaths
+from gsmap.converters.lane_graph import LaneLinks, LanePaths, link_lanes
 from gsmap.converters.local_map import (
     POLYGON,
     GeometryLayer,
@@ -43,7 +44,6 @@ class MapLayers:
     """The geometries of one map in its global frame; plain enough to hand to another process.
 
     Args:
-        name: Location.
         lines: Lines by layer. each (n,) of LineString
         polygons: Valid polygons by layer or class. each (n,) of Polygon
         skipped: How many elements were left out, by reason.
@@ -51,12 +51,11 @@ class MapLayers:
         links: Which of these lead into which.
     """
 
-    name: str
     lines: dict[str, np.ndarray]
     polygons: dict[str, np.ndarray]
     skipped: Counter[str]
     centerlines: list[np.ndarray] = field(default_factory=list)
-    links: LaneLinks = field(default_factory=lambda: LaneLinks([], []))
+    links: LaneLinks = ()
 
 
 def _read_lines(nusc_map: "NuScenesMap", layer: str, skipped: Counter[str]) -> np.ndarray:
@@ -73,11 +72,11 @@ def _read_lines(nusc_map: "NuScenesMap", layer: str, skipped: Counter[str]) -> n
 
 def _read_polygons(nusc_map: "NuScenesMap", name: str, skipped: Counter[str]) -> np.ndarray:
     """Return the polygons of a layer or class; invalid ones are counted. (n,) of Polygon."""
-    records: list[dict[str, Any]] = getattr(
-        nusc_map, "road_segment" if name == "intersection" else name
-    )
+    records: list[dict[str, Any]]
     if name == "intersection":
-        records = [record for record in records if record.get("is_intersection", False)]
+        records = [r for r in nusc_map.road_segment if r.get("is_intersection", False)]
+    else:
+        records = getattr(nusc_map, name)
     polygons = [nusc_map.extract_polygon(record["polygon_token"]) for record in records]
     valid = [polygon for polygon in polygons if polygon.is_valid and not polygon.is_empty]
     if len(valid) < len(polygons):
@@ -114,24 +113,18 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
 
 
 def read_layers(nusc_map: "NuScenesMap", classes: Collection[str]) -> MapLayers:
-    """Collect the geometries that the classes need from a map of the official devkit.
+    """Collect the geometries that the classes (of ``MAP_CLASSES``) need from a devkit's map.
 
-    Args:
-        nusc_map: The opened map.
-        classes: Names out of ``MAP_CLASSES``.
-
-    Returns:
-        The layers; lines without two nodes and invalid polygons are left out and counted.
+    Lines without two nodes and invalid polygons are left out and counted.
     """
     skipped: Counter[str] = Counter()
     names = set(AREA_CLASSES) & set(classes)
     if "boundary" in classes:
         names |= set(SURFACE_LAYERS)
     areas = {name: _read_polygons(nusc_map, name, skipped) for name in sorted(names)}
-    marks = {}
-    if "divider" in classes:
-        marks = {layer: _read_lines(nusc_map, layer, skipped) for layer in LINE_LAYERS}
-    layers = MapLayers(nusc_map.map_name, marks, areas, skipped)
+    marked = LINE_LAYERS if "divider" in classes else ()
+    marks = {layer: _read_lines(nusc_map, layer, skipped) for layer in marked}
+    layers = MapLayers(marks, areas, skipped)
     if "centerline" in classes:
         _read_centerlines(nusc_map, layers)
     return layers
@@ -145,16 +138,11 @@ def _read_centerlines(nusc_map: "NuScenesMap", layers: MapLayers) -> None:
         if len(poses) < 2:
             layers.skipped["lane without a centre line"] += 1
             continue
-        line = np.zeros((len(poses), 3))
-        line[:, :2] = np.array(poses)[:, :2]
-        layers.centerlines.append(line)
+        layers.centerlines.append(np.pad(np.array(poses)[:, :2], ((0, 0), (0, 1))))
         tokens.append(record["token"])
     neighbours = [nusc_map.connectivity.get(token, {}) for token in tokens]
-    layers.links = LaneLinks.from_ids(
-        tokens,
-        [links.get("incoming", []) for links in neighbours],
-        [links.get("outgoing", []) for links in neighbours],
-    )
+    before, after = ([n.get(way, []) for n in neighbours] for way in ("incoming", "outgoing"))
+    layers.links = link_lanes(tokens, before, after)
 
 
 class NuScenesLocalMap:
@@ -185,10 +173,9 @@ class NuScenesLocalMap:
         check_classes(classes)
         self.classes = tuple(classes)
         self.x_range, self.y_range = x_range, y_range
-        marks = [layers.lines[layer] for layer in LINE_LAYERS if layer in layers.lines]
-        self._lines = GeometryLayer(np.concatenate(marks) if marks else [])
-        names = [name for name in AREA_CLASSES if name in self.classes]
-        self._areas = {name: GeometryLayer(layers.polygons[name]) for name in names}
+        self._lines = GeometryLayer(list(chain.from_iterable(layers.lines.values())))
+        areas = set(AREA_CLASSES) & set(classes)
+        self._areas = {name: GeometryLayer(layers.polygons[name]) for name in areas}
         surface = [layers.polygons[name] for name in SURFACE_LAYERS if name in layers.polygons]
         outlines = shapely.get_parts(shapely.union_all([shapely.union_all(p) for p in surface]))
         self._outlines = OutlineIndex(rings_of(outlines))
@@ -206,10 +193,11 @@ class NuScenesLocalMap:
             Elements in the frame, class by class in label order; points are (n, 2) in metres.
         """
         patch = LocalPatch(global_from_frame, self.x_range, self.y_range)
-        found = []
-        for label, name in enumerate(self.classes):
-            found += [MapInstance(label, points) for points in self._polylines(name, patch)]
-        return found
+        return [
+            MapInstance(label, points)
+            for label, name in enumerate(self.classes)
+            for points in self._polylines(name, patch)
+        ]
 
     def _polylines(self, name: str, patch: LocalPatch) -> list[Points]:
         if name == "divider":
@@ -220,14 +208,10 @@ class NuScenesLocalMap:
             near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
             paths = self._lane_paths.simplified(near.tolist())
             return self._cut(shapely.force_2d(paths), patch)
-        return self._area_outlines(name, patch)
+        pieces = shapely.intersection(self._areas[name].near(patch), patch.polygon)
+        merged = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
+        return vertices_of(rings_of(merged[shapely.get_type_id(merged) == POLYGON]), 2)
 
     def _cut(self, lines: np.ndarray, patch: LocalPatch) -> list[Points]:
         """Return the parts of lines inside the patch, in the frame. each (n, 2)."""
         return vertices_of(patch.to_local(patch.lines_inside(lines)), 2)
-
-    def _area_outlines(self, name: str, patch: LocalPatch) -> list[Points]:
-        """Return the rings of the areas inside the patch, united. each (n, 2)."""
-        pieces = shapely.intersection(self._areas[name].near(patch), patch.polygon)
-        merged = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
-        return vertices_of(rings_of(merged[shapely.get_type_id(merged) == POLYGON]), 2)
