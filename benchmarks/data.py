@@ -13,7 +13,6 @@ import psutil
 import shapely
 from shapely import affinity
 
-from gsmap.converters.nuscenes.convert import LOCATIONS
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, read_layers
 from gsmap.datasets.annotations.file import (
     AnnotationFile,
@@ -186,10 +185,10 @@ def open_maps(root: Path, x_range: tuple[float, float], y_range: tuple[float, fl
     Returns:
         ``NuScenesLocalMap`` by name, and ``PerItemGroundTruth`` by name.
     """
-    from nuscenes.map_expansion.map_api import NuScenesMap
+    from nuscenes.map_expansion.map_api import NuScenesMap, locations
 
     prepared, per_item = {}, {}
-    for name in LOCATIONS:
+    for name in locations:
         if (root / f"maps/expansion/{name}.json").is_file():
             nusc_map = NuScenesMap(str(root), name)
             layers = read_layers(nusc_map, _CLASSES)

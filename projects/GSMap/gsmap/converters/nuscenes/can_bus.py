@@ -24,26 +24,22 @@ def pose_signals(global_from_ego: np.ndarray) -> np.ndarray:
 
 
 class CanBusReader:
-    """Read the ``pose`` messages of scenes; without the expansion the signals are zero.
+    """Read the ``pose`` messages of scenes from the folder ``can_bus`` of a data root.
 
-    So are those of the scenes that the devkit itself refuses (161 to 176, 309 to 314).
-
-    Args:
-        dataroot: Data root; the expansion lies in its folder ``can_bus``.
+    Without the expansion the signals are zero, and so are those of the scenes that the devkit
+    itself refuses (161 to 176, 309 to 314).
     """
 
     def __init__(self, dataroot: Path) -> None:
         self.available = (dataroot / "can_bus").is_dir()
         self._dataroot = dataroot
-        self._scene = ""
-        self._times: np.ndarray = np.empty(0)
-        self._measured: np.ndarray = np.empty((0, 9))
+        self._scene, self._times, self._measured = "", np.empty(0), np.empty((0, 9))
 
     def _open(self, scene: str) -> None:
         from nuscenes.can_bus.can_bus_api import NuScenesCanBus
 
         self._scene, messages = scene, []
-        path = self._dataroot / "can_bus" / f"{scene}_pose.json"
+        path = self._dataroot / f"can_bus/{scene}_pose.json"
         with naming(path, "unpack the CAN bus expansion again"):
             if path.is_file():
                 api = NuScenesCanBus(dataroot=str(self._dataroot))
@@ -56,15 +52,7 @@ class CanBusReader:
                 raise ValueError("a number is not finite")
 
     def signals(self, scene: str, timestamp_ns: int, global_from_ego: np.ndarray) -> np.ndarray:
-        """Return the vehicle's pose with the latest message; zeros in place of one that is absent.
-
-        Args:
-            scene: Scene name.
-            timestamp_ns: Time in nanoseconds.
-            global_from_ego: Pose of the vehicle. (4, 4)
-
-        Returns:
-            The signals, as ``pose_signals`` says. (18,)
+        """Return the vehicle's pose (4, 4) with the latest message, as ``pose_signals`` says. (18,)
 
         Raises:
             ValueError: If the scene's file is damaged.

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from importlib.metadata import version
-from itertools import groupby
+from itertools import groupby, tee
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +31,6 @@ from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 
-LOCATIONS = (
-    "singapore-onenorth",
-    "singapore-hollandvillage",
-    "singapore-queenstown",
-    "boston-seaport",
-)
 _OFFICIAL_SPLITS = {
     "v1.0-trainval": ("train", "val"),
     "v1.0-mini": ("mini_train", "mini_val"),
@@ -63,7 +57,7 @@ class NuScenesOptions(FileOptions):
     max_sweeps: int = 10
 
 
-def check_root(root: Path, version: str) -> None:
+def _check_root(root: Path, version: str) -> None:
     """Raise a ``FileNotFoundError`` if the data root, the version or the maps are not there."""
     if not root.is_dir():
         raise FileNotFoundError(
@@ -75,7 +69,7 @@ def check_root(root: Path, version: str) -> None:
         found = sorted(p.parent.name for p in root.glob("*/scene.json"))
         raise FileNotFoundError(
             f"no version {version!r} in {root}: it has {', '.join(found) or 'no version at all'}. "
-            f"Name one with --version."
+            "Name one with --version."
         )
     if not any((root / "maps/expansion").glob("*.json")):
         raise FileNotFoundError(
@@ -86,9 +80,9 @@ def check_root(root: Path, version: str) -> None:
 
 def _fingerprint(root: Path, version: str) -> str:
     """Return a digest of the maps, the scene list and the sizes of all tables."""
-    tables, maps = sorted((root / version).glob("*.json")), (root / "maps/expansion").glob("*.json")
-    sizes = {path.name: path.stat().st_size for path in tables}
-    return fingerprint(sizes, (root / version / "scene.json", *sorted(maps)))
+    sizes = {path.name: path.stat().st_size for path in sorted((root / version).glob("*.json"))}
+    maps = sorted((root / "maps/expansion").glob("*.json"))
+    return fingerprint(sizes, [root / version / "scene.json", *maps])
 
 
 def _splits(
@@ -133,7 +127,7 @@ def _instances_of(local_map: NuScenesLocalMap, poses: np.ndarray) -> list[list[M
 
 
 class _Conversion:
-    """One run over all scenes; holds what its steps share."""
+    """One run over all scenes."""
 
     def __init__(self, options: NuScenesOptions) -> None:
         self.options = options
@@ -155,24 +149,28 @@ class _Conversion:
         ) as bar:  # fmt: skip
             for location, local in groupby(scenes, key=self.tables.location_of):
                 for sample, instances in self._with_instances(location, list(local)):
-                    self._write(writers[split_of[sample.scene]], sample, instances)
                     bar.update()
+                    if isinstance(instances, str):
+                        self.summary.add_problem(f"sample left out: {instances}", sample.token)
+                        continue
+                    sample.instances = instances
+                    split = split_of[sample.scene]
+                    writers[split].write(sample)
+                    self.summary.add_sample(split, sample)
+                    place = sample.global_from_frame[:2, 3]
+                    self.positions[split][sample.map_name].append(place)
 
     def _with_instances(
         self, location: str, scenes: list[dict[str, Any]]
     ) -> Iterator[tuple[MapSample, list[MapInstance] | str]]:
         """Yield the samples of one map with their instances, or why there are none."""
-        options, waiting = self.options, []
+        from nuscenes.map_expansion.map_api import locations
 
-        def poses() -> Iterator[np.ndarray]:
-            for scene in scenes:
-                waiting.append(self._scene_samples(scene))
-                yield np.array([s.global_from_frame for s in waiting[-1]]).reshape(-1, 4, 4)
-
-        if location not in LOCATIONS or not expansion(options.root, location).is_file():
+        options = self.options
+        if location not in locations or not expansion(options.root, location).is_file():
             raise FileNotFoundError(
                 f"no map expansion for {location!r} in {options.root}/maps/expansion; the devkit "
-                f"knows {', '.join(LOCATIONS)}. Unpack the map expansion pack (v1.3) there."
+                f"knows {', '.join(locations)}. Unpack the map expansion pack (v1.3) there."
             )
         layers = open_layers(options.root, location, options.classes)
         for reason, count in layers.skipped.items():
@@ -180,62 +178,43 @@ class _Conversion:
         local_map = NuScenesLocalMap(layers, options.classes, options.x_range, options.y_range)
         frames = sum(scene["nbr_samples"] for scene in scenes)
         workers = max(1, min(options.workers, len(scenes), frames // _FRAMES_PER_WORKER))
-        for results in ordered_map(partial(_instances_of, local_map), poses(), workers):
-            yield from zip(waiting.pop(0), results, strict=True)
+        samples, ahead = tee(map(self._scene_samples, scenes))
+        poses = (np.array([s.global_from_frame for s in scene]) for scene in ahead)
+        results = ordered_map(partial(_instances_of, local_map), poses, workers)
+        for of_scene, instances in zip(samples, results, strict=True):
+            yield from zip(of_scene, instances, strict=True)
 
     def _scene_samples(self, scene: dict[str, Any]) -> list[MapSample]:
         """Read a scene's samples without ground truth, counting what is missing."""
         samples = []
         for record in self.tables.samples_of(scene):
+            token = record["token"]
             if LIDAR not in record["data"]:  # its frame is not known
-                reason = f"sample left out: no {LIDAR} key frame"
-                self.summary.add_problem(reason, record["token"])
+                self.summary.add_problem(f"sample left out: no {LIDAR} key frame", token)
                 continue
+            for name in CAMERAS:
+                if name not in record["data"]:
+                    self.summary.add_problem(f"{name} absent (sample kept without it)", token)
             sample = self.reader.read(record, scene)
-            self._count_missing(sample)
+            files = {f"{camera.name} image": camera.path for camera in sample.cameras}
+            for name, path in {**files, LIDAR: sample.lidar.path}.items():  # type: ignore[union-attr]
+                if not (self.options.root / path).is_file():
+                    self.summary.add_problem(f"{name} file missing", path)
             samples.append(sample)
         return samples
-
-    def _count_missing(self, sample: MapSample) -> None:
-        """Count the cameras and files that a sample lacks."""
-        assert sample.lidar is not None  # its frame is the sample's
-        files = {f"{camera.name} image": camera.path for camera in sample.cameras}
-        for name in CAMERAS:
-            if f"{name} image" not in files:
-                self.summary.add_problem(f"{name} absent (sample kept without it)", sample.token)
-        for name, path in {**files, "LIDAR_TOP": sample.lidar.path}.items():
-            if not (self.options.root / path).is_file():
-                self.summary.add_problem(f"{name} file missing", path)
-
-    def _write(
-        self, writer: AnnotationWriter, sample: MapSample, instances: list[MapInstance] | str
-    ) -> None:
-        """Write a sample, or count why it has no ground truth."""
-        if isinstance(instances, str):
-            self.summary.add_problem(f"sample left out: {instances}", sample.token)
-            return
-        sample.instances = instances
-        writer.write(sample)
-        split = writer.meta.split
-        self.summary.add_sample(split, sample)
-        self.positions[split][sample.map_name].append(sample.global_from_frame[:2, 3])
 
 
 def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
     """Write one annotation file per split; all appear together, when all are whole.
 
-    Args:
-        options: What to convert and how.
-
-    Returns:
-        What was written and what was left out.
+    Returns what was written and what was left out.
 
     Raises:
         FileNotFoundError: If the data set, its version or a map is missing.
         ValueError: If splits or classes do not fit the data set.
     """
     check_classes(options.classes)
-    check_root(options.root, options.version)
+    _check_root(options.root, options.version)
     conversion = _Conversion(options)
     made_from = {
         "source_fingerprint": _fingerprint(options.root, options.version),

@@ -19,15 +19,17 @@ CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 )  # fmt: skip
 LIDAR = "LIDAR_TOP"
+_MARK = re.compile(r"\s*([\[\],]?)\s*")
+_CHUNK_CHARACTERS = 1 << 20  # a record is shorter
 # what is read of each table: fields with their type, or how many numbers they hold
 _POSE: dict[str, type | int] = {"translation": 3, "rotation": 4}
 _FIELDS: dict[str, dict[str, type | int]] = {
-    "sensor": {"channel": str, "modality": str},
+    "sensor": {"channel": str},
     "calibrated_sensor": {"sensor_token": str, "camera_intrinsic": list, **_POSE},
     "ego_pose": _POSE,
     "log": {"location": str},
-    "scene": {"name": str, "log_token": str, "first_sample_token": str, "nbr_samples": int},
     "sample": {"timestamp": int, "next": str},
+    "scene": {"name": str, "log_token": str, "first_sample_token": str, "nbr_samples": int},
     "sample_data": {
         "sample_token": str, "ego_pose_token": str, "calibrated_sensor_token": str,
         "timestamp": int, "filename": str, "is_key_frame": bool, "prev": str, "width": int,
@@ -42,8 +44,6 @@ _LINKS = {
         "calibrated_sensor_token": "calibrated_sensor",
     },
 }  # fmt: skip
-_MARK = re.compile(r"\s*([\[\],]?)\s*")
-_CHUNK_CHARACTERS = 1 << 20  # a record is shorter
 
 
 def _refuse_constant(name: str) -> float:
@@ -83,32 +83,21 @@ def iterate_records(path: Path) -> Iterator[dict[str, Any]]:
             ) from error
 
 
-def _check_record(record: Any, table: str, path: Path) -> None:
-    """Raise a ``ValueError`` if a record lacks a field that is read, or it is of another type."""
-    token = record.get("token") if isinstance(record, dict) else None
-    fields: dict[str, type | int] = {"token": str, **_FIELDS.get(table, {})}
-    for name, kind in fields.items():
-        value = record.get(name) if isinstance(record, dict) else None
-        good = _are_numbers(value, kind) if isinstance(kind, int) else type(value) is kind
-        if kind is int:  # microseconds that nanoseconds of 64 bits hold
-            good = isinstance(value, int) and good and abs(value) <= 1 << 53
-        if name == "camera_intrinsic" and value:  # a matrix, or nothing for another sensor
-            good = good and len(value) == 3 and all(_are_numbers(row, 3) for row in value)
-        if not good:
-            wanted = f"{kind} finite numbers" if isinstance(kind, int) else f"a {kind.__name__}"
-            raise ValueError(
-                f"{path}, record {token!r}: {name} must be {wanted}, got {value!r}; download it "
-                "again."
-            )
-
-
-def _are_numbers(value: Any, count: int) -> bool:
-    """Whether a value is a list of finite numbers; four are a quaternion, which has length 1."""
-    if type(value) is not list or len(value) != count:
+def _is_right(value: Any, kind: type | int) -> bool:
+    """Whether a value is of a type, or a list of so many finite numbers."""
+    if kind is list:  # a matrix of intrinsics, or nothing for another sensor
+        return type(value) is list and (
+            not value or (len(value) == 3 and all(_is_right(row, 3) for row in value))
+        )
+    if kind is int:  # microseconds that nanoseconds of 64 bits hold
+        return type(value) is int and abs(value) <= 1 << 53
+    if isinstance(kind, type):
+        return type(value) is kind
+    if type(value) is not list or len(value) != kind:
         return False
     if not all(type(v) in (int, float) and math.isfinite(v) for v in value):
         return False
-    return count != 4 or abs(math.hypot(*value) - 1) < 1e-3
+    return kind != 4 or abs(math.hypot(*value) - 1) < 1e-3  # a quaternion
 
 
 class NuScenesTables:
@@ -131,42 +120,55 @@ class NuScenesTables:
     def __init__(self, version: str, dataroot: Path, with_sweeps: bool) -> None:
         self._folder = dataroot / version
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
-        for table in ("sensor", "calibrated_sensor", "log", "scene", "sample"):
+        for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
             self._keep(table, self._read(table))
-        self._check_links("calibrated_sensor", "scene")
-        self._keep("sample_data", self._wanted_sample_data(with_sweeps))
-        wanted = {record["ego_pose_token"] for record in self._records["sample_data"].values()}
+        data = list(self._wanted_sample_data(with_sweeps))
+        wanted = {record["ego_pose_token"] for record in data}
         self._keep("ego_pose", (r for r in self._read("ego_pose") if r["token"] in wanted))
-        self._check_links("sample_data")
+        self._keep("sample_data", data)
         for sample in self._records["sample"].values():
             sample["data"] = {}
-        for token, record in self._records["sample_data"].items():
+        for record in data:
             if record["is_key_frame"]:
-                channel = self._channel_of(record)
-                self._records["sample"][record["sample_token"]]["data"][channel] = token
+                keys = self._records["sample"][record["sample_token"]]["data"]
+                keys[self._channel_of(record)] = record["token"]
         self.scene = list(self._records["scene"].values())
 
     def get(self, table: str, token: str) -> dict[str, Any]:
         """Return a record."""
         return self._records[table][token]
 
+    def _damaged(self, table: str, wrong: str) -> ValueError:
+        return ValueError(f"{self._folder}/{table}.json{wrong}; download the tables again.")
+
     def _keep(self, table: str, records: Iterable[dict[str, Any]]) -> None:
-        """Keep a table's records by token."""
+        """Keep a table's records by token; those that they link to are there already."""
         kept = self._records[table] = {}
         for record in records:
+            for link in _LINKS.get(table, ()):
+                self._check_link(table, record, link)
             if kept.setdefault(record["token"], record) is not record:
-                raise ValueError(
-                    f"{self._folder}/{table}.json has record {record['token']!r} twice; download "
-                    "the tables again."
-                )
+                raise self._damaged(table, f" has record {record['token']!r} twice")
+
+    def _check_link(self, table: str, record: dict[str, Any], name: str) -> None:
+        if record[name] not in self._records[_LINKS[table][name]]:
+            wrong = f", record {record['token']!r}: {name} {record[name]!r} leads nowhere"
+            raise self._damaged(table, wrong)
 
     def _read(self, table: str) -> Iterator[dict[str, Any]]:
-        """Yield a table's records, checked."""
+        """Yield a table's records, what is read of each checked."""
         path = self._folder / f"{table}.json"
         if not path.is_file():
             raise FileNotFoundError(f"no table at {path}: download the tables again.")
+        fields: dict[str, type | int] = {"token": str, **_FIELDS[table]}
         for record in iterate_records(path):
-            _check_record(record, table, path)
+            values = record if isinstance(record, dict) else {}
+            for name, kind in fields.items():
+                if not _is_right(value := values.get(name), kind):
+                    numbers = f"{kind} finite numbers"
+                    wanted = f"a {kind.__name__}" if isinstance(kind, type) else numbers
+                    wrong = f", record {values.get('token')!r}: {name} must be {wanted}"
+                    raise self._damaged(table, f"{wrong}, got {value!r}")
             yield record
 
     def _channel_of(self, record: dict[str, Any]) -> str:
@@ -182,46 +184,22 @@ class NuScenesTables:
             if is_sweep or (record["is_key_frame"] and channel in (LIDAR, *CAMERAS)):
                 yield {name: record[name] for name in ("token", *_FIELDS["sample_data"])}
 
-    def _check_links(self, *tables: str) -> None:
-        """Check that every link of tables leads somewhere."""
-        for table in tables:
-            for record in self._records[table].values():
-                for name in _LINKS[table]:
-                    self._check_link(table, record, name)
-
-    def _check_link(self, table: str, record: dict[str, Any], name: str) -> None:
-        if record[name] not in self._records[_LINKS[table][name]]:
-            raise ValueError(
-                f"{self._folder}/{table}.json, record {record['token']!r}: {name} "
-                f"{record[name]!r} leads nowhere; download the tables again."
-            )
-
     def chain(
         self, table: str, token: str, step: str, first: dict[str, Any]
     ) -> Iterator[dict[str, Any]]:
-        """Yield records that lead from one to the next.
-
-        Args:
-            table: Their table.
-            token: The first one's token; an empty one ends the chain.
-            step: The field that leads on.
-            first: The record that leads to the first one.
+        """Yield a table's records from ``token`` on, to which ``first`` leads; ``step`` leads on.
 
         Raises:
-            ValueError: If a link leads nowhere or back.
+            ValueError: If a link leads nowhere or back; an empty one ends the chain.
         """
         known, seen, record = self._records[table], set(), first
         while token:
             if token not in known:
-                raise ValueError(
-                    f"{self._folder}/{table}.json has no record {token!r}, to which "
-                    f"{record['token']!r} leads; download the tables again."
-                )
+                origin = record["token"]
+                raise self._damaged(table, f" has no record {token!r}, to which {origin!r} leads")
             if token in seen:
-                raise ValueError(
-                    f"{self._folder}/{table}.json, record {record['token']!r}: {step} leads "
-                    f"back to {token!r}; download the tables again."
-                )
+                wrong = f", record {record['token']!r}: {step} leads back to {token!r}"
+                raise self._damaged(table, wrong)
             seen.add(token)
             record = known[token]
             yield record
@@ -262,49 +240,48 @@ class SampleReader:
     ) -> None:
         self._tables, self._max_sweeps, self._can_bus = tables, max_sweeps, can_bus
 
-    def _global_from(self, data: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Return global-from-sensor and ego-from-sensor of a sensor record. each (4, 4)."""
-        sensor = pose_of(self._tables.get("calibrated_sensor", data["calibrated_sensor_token"]))
-        return pose_of(self._tables.get("ego_pose", data["ego_pose_token"])) @ sensor, sensor
+    def _global_from(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return global-from-sensor (4, 4) and the calibration of a sensor record."""
+        calibration = self._tables.get("calibrated_sensor", data["calibrated_sensor_token"])
+        global_from_ego = pose_of(self._tables.get("ego_pose", data["ego_pose_token"]))
+        return global_from_ego @ pose_of(calibration), calibration
 
     def read(self, sample: dict[str, Any], scene: dict[str, Any]) -> MapSample:
         """Read a sample in the frame of its LiDAR, without instances and absent cameras."""
         lidar = self._tables.get("sample_data", sample["data"][LIDAR])
-        global_from_frame, ego_from_frame = self._global_from(lidar)
+        global_from_frame, calibration = self._global_from(lidar)
+        ego_from_frame, timestamp_ns = pose_of(calibration), sample["timestamp"] * 1000
         signals = None
         if self._can_bus is not None:
             pose = global_from_frame @ invert_rigid(ego_from_frame)
-            signals = self._can_bus.signals(scene["name"], sample["timestamp"] * 1000, pose)
+            signals = self._can_bus.signals(scene["name"], timestamp_ns, pose)
+        names = [name for name in CAMERAS if name in sample["data"]]
         return MapSample(
             token=sample["token"],
             scene=scene["name"],
             map_name=self._tables.location_of(scene),
-            timestamp_ns=sample["timestamp"] * 1000,
-            cameras=self._cameras(sample, global_from_frame),
+            timestamp_ns=timestamp_ns,
+            cameras=[self._camera(n, sample["data"][n], global_from_frame) for n in names],
             global_from_frame=global_from_frame,
             lidar=LidarRecord(lidar["filename"], np.eye(4), self._sweeps(lidar, global_from_frame)),
             ego_from_frame=ego_from_frame,
             can_bus=signals,
         )
 
-    def _cameras(self, sample: dict[str, Any], global_from_frame: np.ndarray) -> list[CameraRecord]:
-        cameras = []
-        for name in CAMERAS:
-            if name not in sample["data"]:
-                continue
-            data = self._tables.get("sample_data", sample["data"][name])
-            calibration = self._tables.get("calibrated_sensor", data["calibrated_sensor_token"])
-            global_from_cam, _ = self._global_from(data)
-            size = data["width"], data["height"]
-            cam_from_frame = invert_rigid(global_from_cam) @ global_from_frame
-            intrinsics = np.array(calibration["camera_intrinsic"])
-            cameras.append(CameraRecord(name, data["filename"], *size, intrinsics, cam_from_frame))
-        return cameras
+    def _camera(self, name: str, token: str, global_from_frame: np.ndarray) -> CameraRecord:
+        data = self._tables.get("sample_data", token)
+        global_from_cam, calibration = self._global_from(data)
+        return CameraRecord(
+            name,
+            data["filename"],
+            data["width"],
+            data["height"],
+            np.array(calibration["camera_intrinsic"]),
+            invert_rigid(global_from_cam) @ global_from_frame,
+        )
 
     def _sweeps(self, lidar: dict[str, Any], global_from_frame: np.ndarray) -> list[SweepRecord]:
         frame_from_global = invert_rigid(global_from_frame)
-        if not self._max_sweeps:
-            return []
         earlier = self._tables.chain("sample_data", lidar["prev"], "prev", lidar)
         return [
             SweepRecord(
