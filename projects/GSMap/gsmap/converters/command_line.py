@@ -45,10 +45,8 @@ class FileOptions:
 
     def meta(self, dataset: str, frame: str, split: str, **more: Any) -> AnnotationMeta:
         """Describe a split's annotation file; ``more`` are further fields."""
-        ranges = self.x_range, self.y_range
-        return AnnotationMeta(
-            dataset, frame, split, self.classes, *ranges, command=self.command, **more
-        )
+        given = self.classes, self.x_range, self.y_range
+        return AnnotationMeta(dataset, frame, split, *given, command=self.command, **more)
 
     def path_of(self, dataset: str, split: str) -> Path:
         """Return where a split goes: ``gsmap_<dataset>_<split><tag>.arrow``."""
@@ -64,13 +62,7 @@ def fingerprint(sizes: Mapping[str, int], contents: Iterable[Path] = ()) -> str:
 
 
 def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: int) -> None:
-    """Add what every converter of a data set asks: range, sweeps, name, folder, processes.
-
-    Args:
-        parser: Parser to add to.
-        frame: Frame of the data set, whose usual range is the default.
-        max_sweeps: Default number of earlier LiDAR sweeps per sample.
-    """
+    """Add what every converter of a data set asks; by default its frame's usual range."""
     add_range_options(parser, RANGES[frame])
     parser.add_argument(
         "--max-sweeps", type=int, default=max_sweeps,
@@ -111,12 +103,9 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--split", default="val", choices=("train", "val", "test"))
     parser.add_argument(
-        "--logs",
-        nargs="+",
-        default=(),
-        metavar="LOG",
+        "--logs", nargs="+", default=(), metavar="LOG",
         help="only these (ids, or their first characters)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--rate", type=parse_rate, default=2.0, dest="rate_hz",
         help="samples or pictures per second, such as 2.5hz, or all (default: %(default)s)",
@@ -124,11 +113,7 @@ def add_log_options(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_rate(text: str) -> float | None:
-    """Read samples per second, such as ``2.5hz`` or ``2``; ``all`` gives None.
-
-    Raises:
-        ValueError: If it is neither a positive number nor ``all``.
-    """
+    """Read samples per second, such as ``2.5hz`` or ``2``; ``all`` gives None."""
     if text.lower() == "all":
         return None
     rate = float(text.lower().removesuffix("hz"))
@@ -142,11 +127,7 @@ def options_from(
 ) -> Options:
     """Build a dataclass of options from the arguments that have the names of its fields.
 
-    Args:
-        kind: The dataclass.
-        arguments: Parsed arguments; lists become tuples.
-        command: The command line, for the field ``command``.
-        **more: Further fields; they come before the arguments.
+    Lists become tuples; ``more`` are fields that come before the arguments.
     """
     given = vars(arguments) | {"command": command} | more
     names = {field.name for field in fields(kind)} & given.keys()  # type: ignore[arg-type]

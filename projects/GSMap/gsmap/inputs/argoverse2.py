@@ -3,16 +3,14 @@
 from collections import Counter
 from pathlib import Path
 
+from gsmap.converters.argoverse2.log import POSES
 from gsmap.converters.argoverse2.samples import Argoverse2Options, read_log
 from gsmap.datasets.annotations.record import MapSample
-
-_POSES = "city_SE3_egovehicle.feather"
 
 
 def logs_in(folder: Path) -> list[Path]:
     """Return the logs at or up to three folders below a folder (``sensor/val/LOG``)."""
-    patterns = (_POSES, *("/".join(["*"] * depth + [_POSES]) for depth in (1, 2, 3)))
-    found = (sorted(folder.glob(pattern)) for pattern in patterns)
+    found = (sorted(folder.glob("*/" * depth + POSES)) for depth in range(4))
     return [path.parent for path in next(filter(None, found), [])]
 
 

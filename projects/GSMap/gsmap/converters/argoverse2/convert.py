@@ -8,7 +8,7 @@ from pathlib import Path
 
 import shapely
 
-from gsmap.converters.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_split
+from gsmap.converters.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, POSES, find_split
 from gsmap.converters.argoverse2.map import COMPAT_MODES
 from gsmap.converters.argoverse2.samples import Argoverse2Options, LogSamples, read_log
 from gsmap.converters.command_line import (
@@ -29,12 +29,6 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     """Convert the logs of a split to one annotation file, which appears when it is whole.
 
     A log that cannot be read does not stop the others: it is left out and the summary says why.
-
-    Args:
-        options: What to convert and how.
-
-    Returns:
-        What was written and what was left out.
 
     Raises:
         FileNotFoundError: If the split or a log asked for is missing.
@@ -64,12 +58,13 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
             for kind, count in result.invalid.items():
                 reason = f"invalid polygon among the {kind} takes no part"
                 summary.add_problem(reason, log_dir.name, count)
-            offsets_ns += result.sweep_offsets_ns
+            named = ((s.timestamp_ns, s.lidar.path) for s in result.samples if s.lidar is not None)
+            offsets_ns += [abs(int(Path(path).stem) - time_ns) for time_ns, path in named]
         if not len(writer) and not options.shard.count:
             raise RuntimeError(f"no sample is left for {target}:\n{summary.text()}")
-    named = f"LiDAR sweep named by {len(offsets_ns)} of {len(writer)} samples"
+    note = f"LiDAR sweep named by {len(offsets_ns)} of {len(writer)} samples"
     away = f", at most {max(offsets_ns) / 1e6:.0f} ms away" if offsets_ns else ""
-    summary.notes += [named + away, f"written to {writer.path}"]
+    summary.notes += [note + away, f"written to {writer.path}"]
     return summary
 
 
@@ -90,8 +85,7 @@ def select_logs(split_dir: Path, logs: Sequence[str] = ()) -> list[Path]:
     found = sorted(
         path
         for path in split_dir.iterdir()
-        if path.suffix != PARTIAL
-        and ((path / "map").is_dir() or (path / "city_SE3_egovehicle.feather").is_file())
+        if path.suffix != PARTIAL and ((path / "map").is_dir() or (path / POSES).is_file())
     )
     for prefix in logs:
         if not any(path.name.startswith(prefix) for path in found):
@@ -106,45 +100,33 @@ def _drop_listed(
 ) -> list[Path]:
     """Leave out the logs that are known to be unfit, and count them."""
     changed = "its map was changed on purpose and contradicts the images (Argoverse 2's own note)"
-    kept = []
-    for log_dir in log_dirs:
-        name = log_dir.name
-        if name in BROKEN_LOGS:
-            reason = "log left out: its map or sensor data cannot be used (known to fail)"
-            summary.add_problem(reason, name)
-        elif name in MAP_CHANGE_LOGS and not keep_map_changes:
-            summary.add_problem(f"log left out: {changed}; --keep-map-changes keeps it", name)
-        else:
-            kept.append(log_dir)
-            if name in MAP_CHANGE_LOGS:
-                summary.add_problem(f"log kept, but {changed}", name)
-    return kept
+    left_out = dict.fromkeys(BROKEN_LOGS, "its map or sensor data cannot be used (known to fail)")
+    if not keep_map_changes:
+        left_out |= dict.fromkeys(MAP_CHANGE_LOGS, f"{changed}; --keep-map-changes keeps it")
+    for name in (log_dir.name for log_dir in log_dirs):
+        if name in left_out:
+            summary.add_problem(f"log left out: {left_out[name]}", name)
+        elif name in MAP_CHANGE_LOGS:
+            summary.add_problem(f"log kept, but {changed}", name)
+    return [log_dir for log_dir in log_dirs if log_dir.name not in left_out]
 
 
 def _meta(options: Argoverse2Options, log_dirs: Iterable[Path]) -> AnnotationMeta:
-    """Describe the file: what it holds, and what it was made from."""
     sizes = {
         f"{log_dir.name}/{path.name}": path.stat().st_size
         for log_dir in log_dirs
         for path in (*sorted(log_dir.glob("map/*.json")), *sorted(log_dir.glob("*.feather")))
     }
+    versions = {name: version(name) for name in ("av2", "shapely")}
+    made_with = {name: getattr(options, name) for name in ("at", "rate_hz", "compat")}
     return options.meta(
         "av2",
         "ego",
         options.split,
         dim=options.dim,
         source_fingerprint=fingerprint(sizes),
-        versions={
-            "av2": version("av2"),
-            "shapely": version("shapely"),
-            "geos": ".".join(map(str, shapely.geos_version)),
-        },
-        options={
-            "at": options.at,
-            "rate_hz": options.rate_hz,
-            "compat": options.compat,
-            "num_sweeps": options.max_sweeps,
-        },
+        versions={**versions, "geos": ".".join(map(str, shapely.geos_version))},
+        options={**made_with, "num_sweeps": options.max_sweeps},
     )
 
 
@@ -152,24 +134,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the converter's options to a parser."""
     add_log_options(parser)
     parser.add_argument(
-        "--at",
-        default="auto",
+        "--at", default="auto",
         help="times: lidar, cameras, auto (sweeps where there are some, else images) "
         "or poses:N, every N-th row of the pose table without sensor data (default: %(default)s)",
-    )
+    )  # fmt: skip
     parser.add_argument("--dim", type=int, default=2, choices=(2, 3), help="coordinates per point")
     parser.add_argument(
-        "--compat",
-        default="maptrv2",
-        choices=COMPAT_MODES,
+        "--compat", default="maptrv2", choices=COMPAT_MODES,
         help="rules of the ground truth (default: %(default)s)",
-    )
+    )  # fmt: skip
     parser.add_argument("--centerline", action="store_true", help="add the class centerline")
     parser.add_argument(
-        "--keep-map-changes",
-        action="store_true",
+        "--keep-map-changes", action="store_true",
         help="keep the four logs whose map was changed on purpose",
-    )
+    )  # fmt: skip
     add_file_options(parser, "ego", max_sweeps=0)
 
 

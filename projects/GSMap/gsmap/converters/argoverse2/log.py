@@ -21,6 +21,8 @@ RING_CAMERAS = (
 MAX_CAMERA_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_RING_CAM_TIMESTAMP_DIFF)  # 25 ms
 MAX_LIDAR_OFFSET_NS = int(SynchronizationDB.MAX_LIDAR_ANYCAM_TIMESTAMP_DIFF)  # 51 ms
 
+POSES = "city_SE3_egovehicle.feather"
+
 # their maps or sensor data cannot be used
 BROKEN_LOGS = (
     "01bb304d-7bd8-35f8-bbef-7086b688e35e", "453e5558-6363-38e3-bf9b-42b5ba0a6f1d",
@@ -46,13 +48,13 @@ class PoseTable:
 
     @classmethod
     def read(cls, log_dir: Path) -> "PoseTable":
-        """Read ``city_SE3_egovehicle.feather`` of a log's folder.
+        """Read the table of a log's folder.
 
         Raises:
             FileNotFoundError: If the table is missing.
             ValueError: If it is damaged or holds no finite pose.
         """
-        path = log_dir / "city_SE3_egovehicle.feather"
+        path = log_dir / POSES
         if not path.is_file():
             raise FileNotFoundError(f"no poses at {path}: download the log again.")
         with naming(path, "download the log again"):
@@ -84,20 +86,12 @@ def check_feather(path: Path) -> None:
 
 
 class Argoverse2Log:
-    """One log's folder, read on demand.
-
-    Args:
-        log_dir: The folder, named by the log's id.
-
-    Raises:
-        FileNotFoundError: If there is no such folder.
-    """
+    """One log's folder, named by its id, read on demand; a FileNotFoundError if it is not there."""
 
     def __init__(self, log_dir: Path) -> None:
         if not log_dir.is_dir():
             raise FileNotFoundError(f"no log folder {log_dir}.")
-        self.log_dir = log_dir
-        self.log_id = log_dir.name
+        self.log_dir, self.log_id = log_dir, log_dir.name
 
     @cached_property
     def poses(self) -> PoseTable:
@@ -112,11 +106,7 @@ class Argoverse2Log:
 
     @cached_property
     def calibration(self) -> dict[str, PinholeCamera]:
-        """The calibrated ring cameras by name; empty if the log has no calibration.
-
-        Raises:
-            ValueError: If calibration files are there but damaged.
-        """
+        """The calibrated ring cameras by name; empty if the log has no calibration."""
         folder = self.log_dir / "calibration"
         names = ("intrinsics.feather", "egovehicle_SE3_sensor.feather")
         if not all((folder / name).is_file() for name in names):
@@ -154,11 +144,7 @@ def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> 
 
 
 def find_split(root: Path, split: str) -> Path:
-    """Return the folder of a split's logs under a data root, or under its folder ``sensor``.
-
-    Raises:
-        FileNotFoundError: If there is no such split.
-    """
+    """Return the folder of a split's logs under a data root, or under its folder ``sensor``."""
     for folder in (root / split, root / "sensor" / split):
         if folder.is_dir():
             return folder

@@ -18,7 +18,7 @@ from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 from av2.utils.io import read_feather
 
 from gsmap.converters.argoverse2.convert import select_logs
-from gsmap.converters.argoverse2.log import RING_CAMERAS, Argoverse2Log, find_split
+from gsmap.converters.argoverse2.log import POSES, RING_CAMERAS, Argoverse2Log, find_split
 from gsmap.converters.argoverse2.map import find_map
 from gsmap.converters.argoverse2.samples import thin_out
 from gsmap.converters.argoverse2.scene import make_scene
@@ -41,14 +41,11 @@ class RenderOptions:
     """How logs are rendered.
 
     Args:
-        rate_hz: Pictures per second and camera; None takes every row of the pose table.
-        scale: Size of the pictures relative to the real cameras'.
+        rate_hz: Pictures per second and camera, > 0; None takes every row of the pose table.
+        scale: Size of the pictures relative to the real cameras', in (0, 1].
         calibration: Folder of the log whose calibration stands in for a missing one; None leaves
             logs without one out.
-        max_frames: Render only so many moments per log, evenly spread; None renders all.
-
-    Raises:
-        ValueError: If a value is out of its domain.
+        max_frames: Render only so many moments per log, >= 1, evenly spread; None renders all.
     """
 
     rate_hz: float | None = 2.0
@@ -81,7 +78,7 @@ def scaled_camera(camera: PinholeCamera, scale: float) -> tuple[np.ndarray, int,
 def _prepare(
     log: Argoverse2Log, cameras: dict[str, PinholeCamera], times_ns: np.ndarray, scale: float
 ) -> Callable[[str, int], bytes]:
-    """Lay out the ground around where pictures will be taken, and return what takes them, as JPEG.
+    """Lay out the ground around a log's track and return what takes a picture there, as JPEG.
 
     It takes the name of a camera and a row's time in the pose table.
     """
@@ -139,9 +136,8 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
     if not log.calibration and options.calibration is not None:
         source = Argoverse2Log(options.calibration)
     if len(source.calibration) < len(RING_CAMERAS):
-        raise ValueError(
-            "no calibration of the ring cameras (--calibration-from names another log)"
-        )
+        missing = "no calibration of the ring cameras (--calibration-from names another log)"
+        raise ValueError(missing)
     times = log.poses.timestamps_ns
     if options.rate_hz is not None:
         times = thin_out(times, options.rate_hz)
@@ -154,7 +150,7 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         _copy_log(log_dir, source, partial_dir, options.scale)
         for timestamp_ns in times.tolist():
             for name in RING_CAMERAS:
-                path = partial_dir / "sensors" / "cameras" / name / f"{timestamp_ns}.jpg"
+                path = partial_dir / f"sensors/cameras/{name}/{timestamp_ns}.jpg"
                 path.write_bytes(take(name, timestamp_ns))
         os.rename(partial_dir, out_dir)
     finally:
@@ -166,8 +162,7 @@ def _copy_log(log_dir: Path, source: Argoverse2Log, target: Path, scale: float) 
     """Copy map and poses, write the calibration of the scaled cameras, make the image folders."""
     target.mkdir(parents=True)
     shutil.copytree(log_dir / "map", target / "map", copy_function=shutil.copyfile)
-    poses = "city_SE3_egovehicle.feather"
-    shutil.copyfile(log_dir / poses, target / poses)
+    shutil.copyfile(log_dir / POSES, target / POSES)
     (target / "calibration").mkdir()
     extrinsics = "calibration/egovehicle_SE3_sensor.feather"
     shutil.copyfile(source.log_dir / extrinsics, target / extrinsics)
@@ -181,7 +176,7 @@ def _copy_log(log_dir: Path, source: Argoverse2Log, target: Path, scale: float) 
     table[["k1", "k2", "k3"]] = 0.0  # the renderer's lens is perfect
     feather.write_feather(table, target / "calibration" / "intrinsics.feather")
     for name in RING_CAMERAS:
-        (target / "sensors" / "cameras" / name).mkdir(parents=True)
+        (target / "sensors/cameras" / name).mkdir(parents=True)
 
 
 def _try_log(log_dir: Path, out: Path, options: RenderOptions) -> int | str:
@@ -195,16 +190,9 @@ def _try_log(log_dir: Path, out: Path, options: RenderOptions) -> int | str:
 def render_logs(
     log_dirs: Sequence[Path], out: Path, options: RenderOptions, workers: int = 1
 ) -> str:
-    """Render logs; one that cannot be rendered does not stop the others.
+    """Render logs into the folder ``out``; one that cannot be rendered does not stop the others.
 
-    Args:
-        log_dirs: Folders of the real logs.
-        out: Folder of the split that the rendered logs go to.
-        options: How.
-        workers: Number of processes.
-
-    Returns:
-        What was rendered and what was left out, for people.
+    Returns what was rendered and what was left out, for people.
     """
     lines, pictures, rendered = [], 0, 0
     render = partial(_try_log, out=out, options=options)
@@ -225,9 +213,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out-split", choices=("train", "val", "test"), help="split in --out (default: the same)"
     )
-    parser.add_argument(
-        "--scale", type=float, default=0.25, help="size relative to the real images"
-    )
+    parser.add_argument("--scale", type=float, default=0.25, help="size relative to real images")
     parser.add_argument(
         "--calibration-from", metavar="LOG", help="log whose calibration replaces a missing one"
     )
@@ -239,9 +225,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, command: str) -> str:
     """Render as the command line asks and return the summary."""
     split_dir = find_split(arguments.root, arguments.split)
-    log, calibration = arguments.calibration_from, None
-    if log:
-        calibration = select_logs(split_dir, [log])[0]
+    log = arguments.calibration_from
+    calibration = select_logs(split_dir, [log])[0] if log else None
     options = options_from(RenderOptions, arguments, command, calibration=calibration)
     log_dirs = arguments.shard.part(select_logs(split_dir, arguments.logs))
     out = arguments.out / (arguments.out_split or arguments.split)

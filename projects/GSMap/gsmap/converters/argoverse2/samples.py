@@ -37,14 +37,11 @@ class Argoverse2Options(FileOptions):
         at: ``lidar``: at the sweeps; ``cameras``: at the front centre camera's images; ``auto``: at
             the sweeps where the log has some, else at the images; ``poses:N``: at every N-th row of
             the pose table, whether or not there are sensor data.
-        rate_hz: Samples per second, thinned out from the times of ``at``; None takes them all.
+        rate_hz: Samples per second, > 0, of the times of ``at``; None takes them all.
         compat: Whose rules the ground truth follows: ``maptrv2`` or ``maptr``.
         dim: Coordinates per point: 2 or 3.
         logs: Ids of the logs to convert, or how they begin; empty takes all.
         keep_map_changes: Whether to keep the four logs whose map was changed on purpose.
-
-    Raises:
-        ValueError: If a value is out of its domain.
     """
 
     _: KW_ONLY
@@ -76,23 +73,11 @@ class Argoverse2Options(FileOptions):
 
 @dataclass
 class LogSamples:
-    """What one log gave.
-
-    Args:
-        samples: The samples, in the order of time.
-        left_out: How many samples were left out, by reason.
-        invalid: How many invalid polygons the map holds, by kind; they take no part.
-    """
+    """A log's samples by time, how many are left out by reason, and invalid polygons by kind."""
 
     samples: list[MapSample] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     invalid: Counter[str] = field(default_factory=Counter)
-
-    @property
-    def sweep_offsets_ns(self) -> list[int]:
-        """How far in time the LiDAR sweep of each sample that names one lies."""
-        named = [(s.timestamp_ns, s.lidar.path) for s in self.samples if s.lidar is not None]
-        return [abs(int(Path(path).stem) - timestamp_ns) for timestamp_ns, path in named]
 
 
 def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -> LogSamples:
@@ -103,11 +88,11 @@ def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -
         ValueError: If a file is damaged, or sensor data that ``options.at`` needs are missing.
     """
     log, result = Argoverse2Log(log_dir), LogSamples()
-    times = sample_times(log, options)
+    times = sample_times(log, options).tolist()
     log_map = Argoverse2Map.from_log(log_dir) if with_map else None
     if log_map is not None:
         result.invalid = +Counter(log_map.invalid_counts)  # those that are not zero
-    for timestamp_ns in times.tolist():
+    for timestamp_ns in times:
         try:
             with naming(log_dir, "download the log again"):
                 result.samples.append(_sample(log, log_map, timestamp_ns, options))
@@ -128,12 +113,9 @@ def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
     if missing:
         which = ", ".join(missing) if log.calibration else "the ring cameras"
         raise ValueError(f"no calibration of {which} (--at poses:10 needs none)")
-    sweeps = log.lidar_timestamps_ns
-    images = log.image_timestamps_ns[RING_CAMERAS[0]]
-    at = options.at if options.at != "auto" else "lidar" if len(sweeps) else "cameras"
-    times, kind = (
-        (sweeps, "LiDAR sweeps") if at == "lidar" else (images, f"images of {RING_CAMERAS[0]}")
-    )
+    times, kind = log.lidar_timestamps_ns, "LiDAR sweeps"
+    if options.at == "cameras" or (options.at == "auto" and len(times) == 0):
+        times, kind = log.image_timestamps_ns[RING_CAMERAS[0]], f"images of {RING_CAMERAS[0]}"
     if len(times) == 0:
         raise ValueError(f"no {kind} (--at poses:10 needs neither sweeps nor images)")
     return times if options.rate_hz is None else thin_out(times, options.rate_hz)
@@ -166,7 +148,7 @@ def _sample(
     city_from_ego = log.poses.at(timestamp_ns)
     if city_from_ego is None:
         raise _LeftOut("no pose at the sample's time")
-    return MapSample(
+    sample = MapSample(
         token=f"{log.log_id}_{timestamp_ns}",
         scene=log.log_id,
         map_name=log.city,
@@ -174,25 +156,17 @@ def _sample(
         cameras=list(_cameras(log, timestamp_ns, city_from_ego, options)),
         global_from_frame=city_from_ego,
         lidar=_lidar(log, timestamp_ns, np.linalg.inv(city_from_ego), options),
-        instances=None if log_map is None else _instances(log, log_map, city_from_ego, options),
     )
-
-
-def _instances(
-    log: Argoverse2Log,
-    log_map: Argoverse2Map,
-    city_from_ego: np.ndarray,
-    options: Argoverse2Options,
-) -> list[MapInstance]:
-    with naming(find_map(log.log_dir), "download it again"):
-        elements = log_map.extract(
-            city_from_ego, options.classes, options.compat, options.x_range, options.y_range
-        )
-    return [
-        MapInstance(label, points[:, : options.dim])
-        for label, name in enumerate(options.classes)
-        for points in elements[name]
-    ]
+    if log_map is not None:
+        ranges = options.x_range, options.y_range
+        with naming(find_map(log.log_dir), "download it again"):
+            found = log_map.extract(city_from_ego, options.classes, options.compat, *ranges)
+        sample.instances = [
+            MapInstance(label, points[:, : options.dim])
+            for label, name in enumerate(options.classes)
+            for points in found[name]
+        ]
+    return sample
 
 
 def _cameras(
@@ -223,18 +197,15 @@ def _lidar(
     log: Argoverse2Log, timestamp_ns: int, ego_from_city: np.ndarray, options: Argoverse2Options
 ) -> LidarRecord | None:
     """Return the closest sweep and the ones before it; sweeps are stored in the ego frame."""
-    folder = log.log_dir.relative_to(options.root).as_posix()
     times = log.lidar_timestamps_ns
     sweep_ns = closest_ns(times, timestamp_ns, MAX_LIDAR_OFFSET_NS)
-    if sweep_ns is None:
+    if sweep_ns is None or log.poses.at(sweep_ns) is None:
         return None
+    folder = log.log_dir.relative_to(options.root).as_posix()
     last = int(np.searchsorted(times, sweep_ns))
-    sweeps = []
-    for time in times[max(last - options.max_sweeps, 0) : last + 1][::-1].tolist():
-        city_from_ego_then = log.poses.at(time)
-        if city_from_ego_then is not None:
-            path = f"{folder}/sensors/lidar/{time}.feather"
-            sweeps.append(SweepRecord(path, time, ego_from_city @ city_from_ego_then))
-    if not sweeps or sweeps[0].timestamp_ns != sweep_ns:
-        return None
-    return LidarRecord(sweeps[0].path, sweeps[0].frame_from_lidar, sweeps[1:])
+    sweep, *earlier = (
+        SweepRecord(f"{folder}/sensors/lidar/{time}.feather", time, ego_from_city @ pose)
+        for time in times[max(last - options.max_sweeps, 0) : last + 1][::-1].tolist()
+        if (pose := log.poses.at(time)) is not None
+    )
+    return LidarRecord(sweep.path, sweep.frame_from_lidar, earlier)
