@@ -66,8 +66,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         own, dataset = f"data.{part}", f"{part}_dataloader.dataset."
         settings |= {dataset + name: value for name, value in shared.items()}
         settings[dataset + "data_root"] = fields.take(own + ".data_root", root)
-        fields.only(own, {"pc_range": low_high, "map_classes": classes})
-        fields.drop(own, OF_THE_FILE)
+        fields.drop(own, OF_THE_FILE, pc_range=low_high, map_classes=classes)
         for step in fields.items(own + ".pipeline") if "pipeline" in fields.section(own) else []:
             _place_step(fields, step, settings)
     return settings
@@ -114,8 +113,8 @@ def schedule_settings(fields: Fields) -> dict[str, Any]:
     scale = fields.take("fp16.loss_scale", None)
     if scale is not None:
         settings |= {"optim_wrapper.type": "AmpOptimWrapper", "optim_wrapper.loss_scale": scale}
-    fields.only("lr_config", {"policy": "CosineAnnealing", "warmup": "linear"})
-    fields.only("runner", {"type": "EpochBasedRunner"})
+    fields.drop("lr_config", policy="CosineAnnealing", warmup="linear")
+    fields.drop("runner", type="EpochBasedRunner")
     fields.drop("evaluation", "pipeline metric save_best rule")
     fields.drop("log_config", "hooks")
     return settings

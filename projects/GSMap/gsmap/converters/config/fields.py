@@ -9,10 +9,7 @@ _REQUIRED = object()
 class Fields:
     """A config's settings by dotted name; what is taken or dropped is gone, the rest is left over.
 
-    A number in a name is a place in a list.
-
-    Args:
-        values: The settings; changed in place.
+    A number in a name is a place in a list. The dict that is given is used up.
     """
 
     def __init__(self, values: dict[str, Any]) -> None:
@@ -29,11 +26,7 @@ class Fields:
         return value if isinstance(value, dict) else {}
 
     def take(self, name: str, default: Any = _REQUIRED) -> Any:
-        """Return a setting, which counts as placed.
-
-        Raises:
-            ValueError: If it is missing and there is no default.
-        """
+        """Return a setting, which counts as placed; ValueError if it must be there and is not."""
         section, _, key = name.rpartition(".")
         values = self.section(section) if section else self._values
         if key not in values and default is _REQUIRED:
@@ -41,11 +34,7 @@ class Fields:
         return values.pop(key, default)
 
     def items(self, name: str) -> list[str]:
-        """Return the names of a list's items.
-
-        Raises:
-            ValueError: If there is no such list.
-        """
+        """Return the names of a list's items; ValueError if there is no such list."""
         section, _, key = name.rpartition(".")
         values = self.section(section).get(key)
         if not isinstance(values, (list, tuple)):
@@ -53,24 +42,20 @@ class Fields:
         return [f"{name}.{i}" for i in range(len(values))]
 
     def move(self, places: dict[str, str], required: bool = True) -> dict[str, Any]:
-        """Take settings by their names and return them by their new ones.
-
-        Raises:
-            ValueError: If a required one is missing.
-        """
+        """Take settings by their names and return them by their new ones."""
         default = _REQUIRED if required else None
         found = {new: self.take(name, default) for name, new in places.items()}
         return {name: value for name, value in found.items() if required or value is not None}
 
-    def drop(self, section: str, names: str) -> None:
-        """Leave out settings of a section that mean nothing here, named with spaces between."""
-        for name in names.split():
-            self.section(section).pop(name, None)
+    def drop(self, section: str, names: str = "", **fixed: Any) -> None:
+        """Leave out settings of a section that mean nothing here, named with spaces between.
 
-    def only(self, section: str, values: dict[str, Any]) -> None:
-        """Leave out settings of a section that have the one value that ours has too."""
+        Of those in ``fixed`` this holds for one value, which ours has too.
+        """
         found = self.section(section)
-        for name, value in values.items():
+        for name in names.split():
+            found.pop(name, None)
+        for name, value in fixed.items():
             if found.get(name) == value:
                 found.pop(name)
 

@@ -102,10 +102,7 @@ class Conversion:
 
 
 def convert_upstream(names: dict[str, Any]) -> Conversion:
-    """Turn the assignments of an original config into settings of ours.
-
-    Args:
-        names: Values by name, as `read_assignments` returns them; they are used up.
+    """Turn the assignments of an original config, which are used up, into settings of ours.
 
     Raises:
         ValueError: If the config is of no model that is known.
@@ -121,24 +118,17 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
     _decoder_settings(fields, settings)
     _head_settings(fields, settings)
     _margin(fields, settings, sides)
-    for section, values in FIXED.items():
-        fields.only(section, values)
     for section, weight in WEIGHTS.items():
         if fields.section(section).get(weight) == 0:
             fields.section(section).clear()
-    for section, dropped in DROPPED.items():
-        fields.drop(section, dropped)
+    for section in {**DROPPED, **FIXED}:
+        fields.drop(section, DROPPED.get(section, ""), **FIXED.get(section, {}))
     base = _base(encoder, sides[0] == -30.0, settings.pop("with_depth"))
     return Conversion(base, settings, settings.pop("steps"), fields.left_over())
 
 
 def merge(conversion: Conversion, configs: Path) -> Config:
-    """Return our config with the conversion's settings.
-
-    Args:
-        conversion: What an original config became.
-        configs: The folder of our configs.
-    """
+    """Return our config, from the folder of our configs, with the conversion's settings."""
     values = Config.fromfile(configs / conversion.base, import_custom_modules=False).to_dict()
     for name, value in conversion.settings.items():
         *path, last = name.split(".")
@@ -187,23 +177,23 @@ def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[flo
     settings[_BEV + "z_range"] = tuple(settings.pop("z_range"))
     settings[_BEV + "bev_pixel_m"] = sizes[0] if abs(sizes[0] - sizes[1]) < 1e-6 else list(sizes)
     if kind == "LSSTransform":
-        fields.only(_ENCODER, {"downsample": 2})
-        fields.drop(_ENCODER, "out_channels feat_down_sample")
+        fields.drop(_ENCODER, "out_channels feat_down_sample", downsample=2)
         aspp = fields.take(f"{_ENCODER}.depthnet_cfg.aspp_mid_channels", 96)
         settings[_BEV + "depth_range"] = tuple(fields.take(f"{_ENCODER}.dbound"))
         settings[_BEV + "aspp_channels"] = aspp
         return kind
-    fields.only(_ENCODER, {"num_points_in_pillar": 4})
+    fields.drop(_ENCODER, num_points_in_pillar=4)
     settings[_BEV + "num_cams"] = fields.take(f"{_TRANSFORMER}.num_cams", 6)
     settings |= fields.move(MOVED_OF_PILLARS)
     kind = fields.take(f"{_SPATIAL}.type")
+    attention = _BEV + "cross_attn."
     if kind == "GeometrySptialCrossAttention":
-        kernel = f"{_SPATIAL}.attention."
-        settings[_BEV + "cross_attn.num_heads"] = fields.take(kernel + "num_heads")
-        settings[_BEV + "cross_attn.kernel_size"] = tuple(fields.take(kernel + "kernel_size"))
+        kernel = fields.take(f"{_SPATIAL}.attention.kernel_size")
+        settings[attention + "num_heads"] = fields.take(f"{_SPATIAL}.attention.num_heads")
+        settings[attention + "kernel_size"] = tuple(kernel)
     elif kind == "SpatialCrossAttention":
         points = fields.take(f"{_SPATIAL}.deformable_attention.num_points", 8)
-        settings[_BEV + "cross_attn.num_points"] = points
+        settings[attention + "num_points"] = points
     return kind
 
 
@@ -218,10 +208,9 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
         "DecoupledSelfAttention" if decoupled else ATTENTIONS.get(kind, kind)
     )
     fields.drop(first, "embed_dims num_ins num_pts")
+    dropout = fields.section(first).get("dropout")
     for other in others:  # MapTRv2's second attention has the settings of its first
-        fields.drop(other, "type embed_dims")
-        same = {"num_heads": heads, "dropout": fields.section(first).get("dropout")}
-        fields.only(other, same)
+        fields.drop(other, "type embed_dims", num_heads=heads, dropout=dropout)
     fields.drop(cross, "type embed_dims num_levels")
     # the deformable attention's own default is not the layer's
     for part, name, default in (("self_attn", first, 0.0), ("cross_attn", cross, 0.1)):
@@ -232,27 +221,24 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
 
 def _head_settings(fields: Fields, settings: dict[str, Any]) -> None:
     """Add the settings of queries and losses, and the head that has them."""
-    fields.only(_THEIRS, {"num_pts_per_gt_vec": settings[_HEAD + "num_points"]})
+    fields.drop(_THEIRS, num_pts_per_gt_vec=settings[_HEAD + "num_points"])
     settings[_HEAD + "loss_cls"] |= {"type": f"mmdet.{settings[_HEAD + 'loss_cls']['type']}"}
 
     def take(name: str, default: Any) -> Any:
         return fields.take(f"{_THEIRS}.{name}", default)
 
     num = take("num_vec_one2one", None) or fields.take(f"{_THEIRS}.num_vec")
-    groups = [{"num": num}]
     further = {
+        "name": "one2many",
         "num": take("num_vec_one2many", 0),
         "repeats": take("k_one2many", 6),
         "weight": take("lambda_one2many", 1.0),
     }
-    if further["num"]:
-        groups.append({"name": "one2many", **further})
-    settings[_HEAD + "query_groups"] = groups
+    settings[_HEAD + "query_groups"] = [{"num": num}, further] if further["num"] else [{"num": num}]
     _mapvr_settings(fields, settings)
     if take("use_geo_loss", False):
         fields.drop(_THEIRS, "intra_loss_weight inter_loss_weight")
-        fields.drop(f"{_THEIRS}.loss_geo", "type num_ins num_pts pc_range")
-        fields.only(f"{_THEIRS}.loss_geo", {"loss_type": "l1"})
+        fields.drop(f"{_THEIRS}.loss_geo", "type num_ins num_pts pc_range", loss_type="l1")
         settings[_HEAD + "type"] = "GeMapHead"
         settings[_HEAD + "loss_euclidean"] = {
             "loss_weight": fields.take(f"{_THEIRS}.loss_geo.loss_weight"),
