@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import pyarrow as pa
@@ -39,14 +40,13 @@ def _broken_files(sample: MapSample, root: Path) -> list[str]:
     from gsmap.datasets.transforms.points import read_points
 
     where, problems = f"sample {sample.token!r}", []
-    lidar = (
-        [] if sample.lidar is None else [sample.lidar.path, *(s.path for s in sample.lidar.sweeps)]
-    )
     reads = [
         partial(read_image, str(root / c.path), f"{where}, camera {c.name}", (c.width, c.height))
         for c in sample.cameras
     ]
-    reads += [partial(read_points, str(root / path), 5) for path in lidar or []]
+    lidar = sample.lidar
+    paths = [lidar.path, *(sweep.path for sweep in lidar.sweeps)] if lidar else []
+    reads += [partial(read_points, str(root / path), 5) for path in paths]
     for read in reads:
         try:
             read()
@@ -58,13 +58,7 @@ def _broken_files(sample: MapSample, root: Path) -> list[str]:
 def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
     """Check annotation files and, with a data root, the images and sweeps that they name.
 
-    Args:
-        paths: Annotation files.
-        root: Folder that their paths are relative to; None leaves images and sweeps alone.
-        workers: Number of processes that read these.
-
-    Returns:
-        What was found to be right.
+    Returns what was found to be right.
 
     Raises:
         FileNotFoundError: If an annotation file does not exist.
@@ -78,8 +72,7 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
         if root is not None:
             samples = Progress(file, desc=path.name, unit="samples")
             found = ordered_map(partial(_broken_files, root=root), samples, workers)
-            problems = [problem for problems in found for problem in problems]
-            if problems:
+            if problems := list(chain.from_iterable(found)):
                 more = f", and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
                 shown = "; ".join(problems[:_SHOWN])
                 raise ValueError(f"{path} is right, but: {shown}{more}")
@@ -90,9 +83,8 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py check``."""
     parser.add_argument("annotations", type=Path, nargs="+", help="annotation files (.arrow)")
-    parser.add_argument(
-        "--data-root", type=Path, help="read every image and LiDAR file below this folder too"
-    )
+    root = "read every image and LiDAR file below this folder too"
+    parser.add_argument("--data-root", type=Path, help=root)
     add_workers_option(parser)
 
 

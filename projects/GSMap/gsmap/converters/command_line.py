@@ -18,17 +18,8 @@ Options = TypeVar("Options")
 class FileOptions:
     """What every converter of a data set to annotation files is told.
 
-    Args:
-        root: Data root, to which paths are relative.
-        classes: Class names in label order.
-        x_range: Smallest and largest x of the ground truth in metres.
-        y_range: Smallest and largest y of the ground truth in metres.
-        max_sweeps: How many earlier LiDAR sweeps each sample lists at most.
-        out_dir: Folder of the annotation files; the data root if None.
-        tag: Appended to the file names.
-        workers: Number of processes.
-        shard: Which part of the scenes or logs to convert.
-        command: The command line, for messages of readers.
+    Paths are relative to ``root``, classes are in label order, and ``command`` is the command line,
+    for messages of readers. The others are the options of ``add_file_options``.
     """
 
     root: Path
@@ -63,15 +54,12 @@ def fingerprint(sizes: Mapping[str, int], contents: Iterable[Path] = ()) -> str:
 
 def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: int) -> None:
     """Add what every converter of a data set asks; by default its frame's usual range."""
+    add = parser.add_argument
     add_range_options(parser, RANGES[frame])
-    parser.add_argument(
-        "--max-sweeps", type=int, default=max_sweeps,
-        help="earlier LiDAR sweeps to list per sample (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--out-dir", type=Path, help="where the annotation files go (default: the data root)"
-    )
-    parser.add_argument("--tag", default="", help="appended to the file names, such as _extended")
+    sweeps = "earlier LiDAR sweeps to list per sample (default: %(default)s)"
+    add("--max-sweeps", type=int, default=max_sweeps, help=sweeps)
+    add("--out-dir", type=Path, help="where the annotation files go (default: the data root)")
+    add("--tag", default="", help="appended to the file names, such as _extended")
     add_workers_option(parser)
     add_shard_options(parser)
 
@@ -98,18 +86,13 @@ def add_workers_option(parser: argparse.ArgumentParser) -> None:
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Add which Argoverse 2 logs to take, and how often per second."""
-    parser.add_argument(
-        "--root", type=Path, required=True, help="folder that holds train, val and test"
-    )
-    parser.add_argument("--split", default="val", choices=("train", "val", "test"))
-    parser.add_argument(
-        "--logs", nargs="+", default=(), metavar="LOG",
-        help="only these (ids, or their first characters)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--rate", type=parse_rate, default=2.0, dest="rate_hz",
-        help="samples or pictures per second, such as 2.5hz, or all (default: %(default)s)",
-    )  # fmt: skip
+    add = parser.add_argument
+    add("--root", type=Path, required=True, help="folder that holds train, val and test")
+    add("--split", default="val", choices=("train", "val", "test"))
+    which = "only these (ids, or their first characters)"
+    add("--logs", nargs="+", default=(), metavar="LOG", help=which)
+    rate = "samples or pictures per second, such as 2.5hz, or all (default: %(default)s)"
+    add("--rate", type=parse_rate, default=2.0, dest="rate_hz", help=rate)
 
 
 def parse_rate(text: str) -> float | None:

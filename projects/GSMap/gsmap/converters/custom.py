@@ -30,7 +30,7 @@ _UNMOUNTED = (
     "record %r has no ego_from_frame: pictures will take the road to be level, 1.84 m below the "
     "sensor (nuScenes' height), and models that lift images (MapTRv2) cannot use it."
 )
-_RECORD_KEYS = {field.name for field in fields(MapSample)}
+_KEYS = sorted(field.name for field in fields(MapSample))
 Record = TypeVar("Record")
 
 
@@ -89,11 +89,9 @@ def _samples(
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
         with naming(f"record {name!r}", "correct it"):
-            unknown = set(record) - _RECORD_KEYS
+            unknown = set(record) - set(_KEYS)
             if unknown:
-                raise ValueError(
-                    f"unknown keys {sorted(unknown)}; known are {sorted(_RECORD_KEYS)}."
-                )
+                raise ValueError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")
             sample = _sample(record, meta, root)
             check_samples([sample], meta)
             if sample.instances is not None:
@@ -135,20 +133,19 @@ def _record(kind: type[Record], values: Mapping[str, Any]) -> Record:
 
 def _camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
     if camera.get("width") is None or camera.get("height") is None:
-        width, height = image_size(
-            root / camera["path"], f"sample {token!r}, camera {camera['name']!r}"
-        )
+        where = f"sample {token!r}, camera {camera['name']!r}"
+        width, height = image_size(root / camera["path"], where)
         camera = {**camera, "width": width, "height": height}
     return _record(CameraRecord, camera)
 
 
 def _label(label: Any, meta: AnnotationMeta) -> int:
     """Return a class's index, given by its name or itself."""
-    if isinstance(label, str):
-        if label not in meta.classes:
-            raise ValueError(f"label {label!r} is not among {meta.classes}.")
-        return meta.classes.index(label)
-    return int(label)
+    if not isinstance(label, str):
+        return int(label)
+    if label not in meta.classes:
+        raise ValueError(f"label {label!r} is not among {meta.classes}.")
+    return meta.classes.index(label)
 
 
 def _clipped(points: Points, meta: AnnotationMeta) -> list[Points]:
@@ -160,9 +157,7 @@ def _clipped(points: Points, meta: AnnotationMeta) -> list[Points]:
         return list(clip_to_box(points, meta.x_range, meta.y_range))
     polygon = shapely.Polygon(points)
     if not polygon.is_valid:
-        raise ValueError(
-            "a ring that leaves the range crosses itself, so it cannot be cut: mend it."
-        )
+        raise ValueError("a ring that leaves the range crosses itself and cannot be cut: mend it.")
     parts = shapely.get_parts(shapely.intersection(polygon, shapely.box(*low, *high)))
     areas = parts[(shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)]
     return vertices_of(shapely.get_exterior_ring(areas), meta.dim)

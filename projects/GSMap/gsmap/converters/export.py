@@ -19,20 +19,15 @@ from gsmap.utils.files import atomic_write
 _DECIMALS = 6
 
 
-def _frame_record(sample: MapSample, row: int | None) -> dict[str, Any]:
-    """Return a sample's identity, pose and vectors; ``row`` is its place in a pose table."""
+def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
+    """Return a sample's name, time and pose; ``row`` is its place in a pose table."""
     pose = sample.global_from_frame
-    vectors = [
-        {"label": i.label, "pts": i.points.astype(np.float64).round(_DECIMALS).tolist()}
-        for i in sample.instances or []
-    ]
     if row is not None:
         return {
             "log": sample.scene,
             "row": row,
             "timestamp_ns": sample.timestamp_ns,
             "city_from_ego": pose.tolist(),
-            "vectors": vectors,
         }
     return {
         "sample_token": sample.token,
@@ -41,19 +36,13 @@ def _frame_record(sample: MapSample, row: int | None) -> dict[str, Any]:
         "timestamp": sample.timestamp_ns // 1000,
         "lidar2global_xy": pose[:2, 3].tolist(),
         "patch_angle_deg": float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0]))),
-        "vectors": vectors,
     }
 
 
 def export_json(annotations: Path | Sequence[Path], target: Path) -> int:
-    """Write the ground truth of annotation files as one JSON; it appears when it is whole.
+    """Write the ground truth of one data set's annotation files as one JSON, when it is whole.
 
-    Args:
-        annotations: Annotation file, or several splits of one data set.
-        target: JSON file to write.
-
-    Returns:
-        Number of samples written.
+    Returns the number of samples written.
 
     Raises:
         ValueError: If a sample has no ground truth, or the files differ in data set, frame, classes
@@ -62,9 +51,8 @@ def export_json(annotations: Path | Sequence[Path], target: Path) -> int:
     paths = [annotations] if isinstance(annotations, Path) else list(annotations)
     files = [AnnotationFile(path) for path in paths]
     meta = files[0].meta
-    same = {
-        name: getattr(meta, name) for name in ("dataset", "frame", "classes", "x_range", "y_range")
-    }
+    names = ("dataset", "frame", "classes", "x_range", "y_range")
+    same = {name: getattr(meta, name) for name in names}
     for file in files:
         file.require(**same)
     head = {**same, "split": [file.meta.split for file in files], "versions": meta.versions}
@@ -85,8 +73,13 @@ def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
         if sample.instances is None:
             raise ValueError(f"{file.path}: sample {sample.token!r} has no ground truth to export.")
         # every N-th row was taken and none left out
-        yield _frame_record(sample, int(stride[1]) * position[sample.scene] if stride else None)
+        row = int(stride[1]) * position[sample.scene] if stride else None
         position[sample.scene] += 1
+        vectors = [
+            {"label": i.label, "pts": i.points.astype(np.float64).round(_DECIMALS).tolist()}
+            for i in sample.instances
+        ]
+        yield {**_identity(sample, row), "vectors": vectors}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -37,7 +37,7 @@ from gsmap.utils.cli import output_file
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard, add_shard_options
 
-NUSCENES_IMAGE_SIZE = (1600, 900)
+NUSCENES_SIZE = (1600, 900)
 _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
 
 
@@ -52,12 +52,12 @@ def _relative(path: str, root: Path) -> str:
             first = len(parts) - 1 - parts[::-1].index(anchor)
             return Path(*parts[first:]).as_posix()
     if not Path(path).is_absolute():
-        return Path(*(part for part in parts if part != ".")).as_posix()
+        return Path(*parts).as_posix()
     raise ValueError(f"path {path!r} does not lie under {root}: give the right --data-root.")
 
 
 def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstance] | None:
-    """Return the elements of the given classes, if known; lines of one point are left out."""
+    """Return the elements of the file's classes, if known; lines of one point are left out."""
     annotation = info.get("annotation")
     if annotation is None:
         return None
@@ -73,24 +73,16 @@ def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
     """Read one entry of a nuScenes info file, in the LIDAR_TOP frame."""
     ego_from_frame = pose_of(info, "lidar2ego_")
     global_from_ego = pose_of(info, "ego2global_")
-    cameras = [
-        CameraRecord(
-            name,
-            _relative(camera["data_path"], root),
-            *NUSCENES_IMAGE_SIZE,
-            np.asarray(camera["cam_intrinsic"], np.float64)[:3, :3],
-            np.linalg.inv(pose_of(camera, "sensor2lidar_")),
-        )
-        for name, camera in info["cams"].items()
-    ]
-    sweeps = [
-        SweepRecord(
-            _relative(sweep["data_path"], root),
-            int(sweep["timestamp"]) * 1000,
-            pose_of(sweep, "sensor2lidar_"),
-        )
-        for sweep in info.get("sweeps", [])
-    ]
+    cameras = []
+    for name, camera in info["cams"].items():
+        path = _relative(camera["data_path"], root)
+        intrinsics = np.asarray(camera["cam_intrinsic"], np.float64)[:3, :3]
+        cam_from_frame = np.linalg.inv(pose_of(camera, "sensor2lidar_"))
+        cameras.append(CameraRecord(name, path, *NUSCENES_SIZE, intrinsics, cam_from_frame))
+    sweeps = []
+    for sweep in info.get("sweeps", []):
+        path, time_ns = _relative(sweep["data_path"], root), int(sweep["timestamp"]) * 1000
+        sweeps.append(SweepRecord(path, time_ns, pose_of(sweep, "sensor2lidar_")))
     can_bus = info.get("can_bus")
     if can_bus is not None:  # the pose belongs into it, as MapTR puts it there on loading
         measured = np.asarray(can_bus, np.float64)[7:16]
@@ -173,13 +165,11 @@ def _samples(
             check_samples([sample], meta)
         if sample.instances is not None:
             _check_range(sample, meta)
+        elif meta.frame == "lidar" and (town := map_of(sample.map_name)) is not None:
+            sample.instances = town.instances(sample.global_from_frame)
         elif meta.frame == "lidar":
-            town = map_of(sample.map_name)
-            if town is not None:
-                sample.instances = town.instances(sample.global_from_frame)
-            else:
-                reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
-                summary.add_problem(f"{reason} (sample kept without)", sample.token)
+            reason = f"no ground truth: maps/expansion has no map {sample.map_name!r}"
+            summary.add_problem(f"{reason} (sample kept without)", sample.token)
         summary.add_sample(meta.split, sample)
         yield sample
 
@@ -200,10 +190,10 @@ def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
 
 def _dim(entries: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> int:
     """Return how many coordinates the points of the first element have."""
-    annotations = [info["annotation"] for info in entries if "annotation" in info]
+    annotations = (info["annotation"] for info in entries if "annotation" in info)
     lines = (line for found in annotations for name in classes for line in found[name])
-    first = next(lines, None)
-    return 2 if first is None else min(np.asarray(first).shape[-1], 3)
+    first = next(lines, np.empty((0, 2)))
+    return min(np.shape(first)[-1], 3)
 
 
 def convert_infos(
@@ -230,9 +220,6 @@ def convert_infos(
         command: The command line, for messages of readers.
         shard: Which part of the samples to convert.
 
-    Returns:
-        What was written and what is missing.
-
     Raises:
         FileNotFoundError: If the pickle does not exist.
         ValueError: If it holds more than plain data, is of no known form, or holds ground truth
@@ -242,14 +229,14 @@ def convert_infos(
     with naming(infos, "make it anew"):
         dim = _dim(entries, classes) if frame == "ego" else 2
     meta = AnnotationMeta(
-        dataset="nuscenes" if frame == "lidar" else "av2",
-        frame=frame,
-        split=split,
-        classes=classes,
-        x_range=x_range or RANGES[frame][0],
-        y_range=y_range or RANGES[frame][1],
-        dim=dim,
-        source_fingerprint=hashlib.sha256(infos.read_bytes()).hexdigest()[:16],
+        "nuscenes" if frame == "lidar" else "av2",
+        frame,
+        split,
+        classes,
+        x_range or RANGES[frame][0],
+        y_range or RANGES[frame][1],
+        dim,
+        hashlib.sha256(infos.read_bytes()).hexdigest()[:16],
         options={"infos": infos.name},
         command=command,
     )
@@ -263,13 +250,12 @@ def convert_infos(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py infos``."""
-    parser.add_argument("infos", type=Path, help="info file of MapTR or MapTRv2 (.pkl)")
-    parser.add_argument("target", type=output_file, help="annotation file to write (.arrow)")
-    parser.add_argument(
-        "--data-root", type=Path, required=True, help="folder that paths become relative to"
-    )
-    parser.add_argument("--split", help="name of the split (default: the end of the file's name)")
-    parser.add_argument("--classes", nargs="+", default=list(CLASSES), metavar="CLASS")
+    add = parser.add_argument
+    add("infos", type=Path, help="info file of MapTR or MapTRv2 (.pkl)")
+    add("target", type=output_file, help="annotation file to write (.arrow)")
+    add("--data-root", type=Path, required=True, help="folder that paths become relative to")
+    add("--split", help="name of the split (default: the end of the file's name)")
+    add("--classes", nargs="+", default=list(CLASSES), metavar="CLASS")
     add_range_options(parser, None)
     add_shard_options(parser)
 

@@ -18,12 +18,9 @@ class LocalPatch:
     """A rectangle in the map's plane, turned by the pose's yaw; roll and pitch do not matter.
 
     Args:
-        global_from_frame: Pose of the annotation frame in the map. (4, 4)
+        global_from_frame: Pose of the annotation frame in the map, finite. (4, 4)
         x_range: Smallest and largest x in the frame, in metres.
         y_range: Smallest and largest y in the frame, in metres.
-
-    Raises:
-        ValueError: If the pose is not a finite 4 x 4 matrix.
     """
 
     global_from_frame: np.ndarray
@@ -85,12 +82,7 @@ class LocalPatch:
 
 
 class GeometryLayer:
-    """Geometries of one kind of a map, with a spatial index.
-
-    Args:
-        geometries: Lines or polygons in the map's frame; invalid ones are left out of every answer.
-            (n,)
-    """
+    """Lines or polygons of a map, with a spatial index; invalid ones are in no answer. (n,)"""
 
     def __init__(self, geometries: Sequence[shapely.Geometry] | np.ndarray) -> None:
         self.geometries = np.array(list(geometries), dtype=object)
@@ -136,11 +128,7 @@ def rings_of(polygons: np.ndarray) -> np.ndarray:
 
 
 class OutlineIndex:
-    """Rings of a whole map, indexed in short chunks, so that a patch touches only what is near.
-
-    Args:
-        rings: Simple rings, in the map's frame. (n,) of LinearRing
-    """
+    """Simple rings of a map (n,), indexed in short chunks: a patch touches only what is near."""
 
     def __init__(self, rings: np.ndarray) -> None:
         self._chunks, owners = [], []

@@ -1,7 +1,9 @@
 """Which scenes belong to which split, and whether splits overlap on the ground."""
 
 import json
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +17,7 @@ Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
 def read_split_file(path: Path) -> dict[str, list[str]]:
     """Read a split file: JSON, an object with a list of scene names or tokens for each split.
 
-    It is the format of the nuScenes devkit's own ``splits.json``.
-
-    Raises:
-        FileNotFoundError: If it does not exist.
-        ValueError: If it has another form, or a scene stands in two splits.
+    It is the format of the nuScenes devkit's own ``splits.json``. No scene may be in two splits.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no split file at {path}.")
@@ -45,7 +43,7 @@ def read_split_file(path: Path) -> dict[str, list[str]]:
 def resolve_scenes(
     splits: Mapping[str, Collection[str]], names: Mapping[str, str]
 ) -> tuple[dict[str, list[str]], list[str]]:
-    """Turn scene names or tokens into names of scenes that exist.
+    """Turn scene names or tokens, by split, into names of scenes that exist.
 
     Args:
         splits: Names or tokens by split.
@@ -58,16 +56,13 @@ def resolve_scenes(
         ValueError: If a scene is in two splits, once by name and once by token.
     """
     known = {name: name for name in names.values()} | dict(names)
-    resolved: dict[str, list[str]] = {}
-    missing: list[str] = []
-    seen: set[str] = set()
-    for split, entries in splits.items():
-        chosen = {known[entry] for entry in entries if entry in known}
-        missing += [entry for entry in entries if entry not in known]
-        if chosen & seen:
-            raise ValueError(f"scenes {sorted(chosen & seen)} are in more than one split.")
-        seen |= chosen
-        resolved[split] = [name for name in names.values() if name in chosen]
+    chosen = {split: {known[e] for e in entries if e in known} for split, entries in splits.items()}
+    uses = Counter(chain.from_iterable(chosen.values()))
+    twice = sorted(name for name, count in uses.items() if count > 1)
+    if twice:
+        raise ValueError(f"scenes {twice} are in more than one split.")
+    missing = [entry for entries in splits.values() for entry in entries if entry not in known]
+    resolved = {s: [n for n in names.values() if n in found] for s, found in chosen.items()}
     return resolved, missing
 
 
@@ -76,12 +71,7 @@ def overlap_share(
 ) -> float:
     """Return the share of validation positions within 5 m of a training position on the same map.
 
-    Args:
-        train: Positions (x, y) in metres by map name. each (n, 2)
-        val: Positions by map name. each (m, 2)
-
-    Returns:
-        A share in [0, 1]; 0 without validation positions.
+    Positions are (x, y) in metres by map name, each (n, 2). Without any the share is 0.
     """
     near = [
         cKDTree(train[name]).query(positions)[0] <= OVERLAP_DISTANCE_M

@@ -10,11 +10,7 @@ _EXAMPLES = 3
 
 @dataclass
 class ConversionSummary:
-    """Counts of one conversion, printed at its end.
-
-    Args:
-        classes: Class names in label order.
-    """
+    """Counts of one conversion, printed at its end; classes are in label order."""
 
     classes: tuple[str, ...]
     samples: Counter[str] = field(default_factory=Counter)

@@ -132,22 +132,21 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path]) -> AnnotationMet
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the converter's options to a parser."""
+    add = parser.add_argument
     add_log_options(parser)
-    parser.add_argument(
+    add(
         "--at", default="auto",
         help="times: lidar, cameras, auto (sweeps where there are some, else images) "
         "or poses:N, every N-th row of the pose table without sensor data (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--dim", type=int, default=2, choices=(2, 3), help="coordinates per point")
-    parser.add_argument(
+    add("--dim", type=int, default=2, choices=(2, 3), help="coordinates per point")
+    add(
         "--compat", default="maptrv2", choices=COMPAT_MODES,
         help="rules of the ground truth (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--centerline", action="store_true", help="add the class centerline")
-    parser.add_argument(
-        "--keep-map-changes", action="store_true",
-        help="keep the four logs whose map was changed on purpose",
-    )  # fmt: skip
+    add("--centerline", action="store_true", help="add the class centerline")
+    what = "keep the four logs whose map was changed on purpose"
+    add("--keep-map-changes", action="store_true", help=what)
     add_file_options(parser, "ego", max_sweeps=0)
 
 

@@ -1,8 +1,7 @@
 """Local vector maps from the map of one Argoverse 2 log, by the rules of MapTRv2 or of MapTR.
 
-Whatever does not depend on the vehicle's pose is done once per log (polygons, spatial index, lane
-graph); a frame then takes a few vectorised geometry calls. ``docs/argoverse2.md`` states both sets
-of rules.
+Whatever does not depend on the vehicle's pose is done once per log; a frame then takes a few
+vectorised geometry calls. ``docs/argoverse2.md`` states both sets of rules.
 """
 
 from collections.abc import Collection, Sequence
@@ -42,12 +41,7 @@ def check_rules(classes: Collection[str], compat: str) -> None:
 
 
 def find_map(log_dir: Path) -> Path:
-    """Return the file of a log's vector map, ``map/log_map_archive_*.json`` in its folder.
-
-    Raises:
-        FileNotFoundError: If it is missing.
-        ValueError: If there are several.
-    """
+    """Return the file of a log's vector map; an error if there is none, or several."""
     found = sorted((log_dir / "map").glob("log_map_archive_*.json"))
     if not found:
         raise FileNotFoundError(f"no map/log_map_archive_*.json in {log_dir}: download it again.")
@@ -73,11 +67,7 @@ class _LaneSide:
 
 
 class Argoverse2Map:
-    """The map of one log, prepared for cutting out what the vehicle sees at many poses.
-
-    Args:
-        static_map: The log's map as the official API reads it.
-    """
+    """A log's map, as the official API reads it, prepared for cutting out what the vehicle sees."""
 
     def __init__(self, static_map: ArgoverseStaticMap) -> None:
         lanes = static_map.get_scenario_lane_segments()

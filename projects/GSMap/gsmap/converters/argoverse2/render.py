@@ -38,14 +38,9 @@ JPEG_QUALITY = 90
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How logs are rendered.
+    """How logs are rendered: the options of the command; None for a rate or a number is all.
 
-    Args:
-        rate_hz: Pictures per second and camera, > 0; None takes every row of the pose table.
-        scale: Size of the pictures relative to the real cameras', in (0, 1].
-        calibration: Folder of the log whose calibration stands in for a missing one; None leaves
-            logs without one out.
-        max_frames: Render only so many moments per log, >= 1, evenly spread; None renders all.
+    The log in the folder ``calibration`` lends its own to logs that have none.
     """
 
     rate_hz: float | None = 2.0
@@ -116,13 +111,7 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
 
     The map, the poses and the calibration (for the scaled pictures) are written along.
 
-    Args:
-        log_dir: The real log's folder.
-        out_dir: Folder to make for the rendered log.
-        options: How.
-
-    Returns:
-        Number of pictures.
+    Returns the number of pictures.
 
     Raises:
         FileExistsError: If ``out_dir`` exists.
@@ -208,16 +197,14 @@ def render_logs(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the renderer's options to a parser."""
+    add = parser.add_argument
     add_log_options(parser)
-    parser.add_argument("--out", type=Path, required=True, help="data root to write")
-    parser.add_argument(
-        "--out-split", choices=("train", "val", "test"), help="split in --out (default: the same)"
-    )
-    parser.add_argument("--scale", type=float, default=0.25, help="size relative to real images")
-    parser.add_argument(
-        "--calibration-from", metavar="LOG", help="log whose calibration replaces a missing one"
-    )
-    parser.add_argument("--max-frames", type=int, help="frames per log, evenly spread")
+    add("--out", type=Path, required=True, help="data root to write")
+    splits = ("train", "val", "test")
+    add("--out-split", choices=splits, help="split in --out (default: the same)")
+    add("--scale", type=float, default=0.25, help="size relative to the real images")
+    add("--calibration-from", metavar="LOG", help="log whose calibration replaces a missing one")
+    add("--max-frames", type=int, help="frames per log, evenly spread")
     add_workers_option(parser)
     add_shard_options(parser)
 

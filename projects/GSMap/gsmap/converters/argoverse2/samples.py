@@ -30,19 +30,7 @@ from gsmap.datasets.errors import naming
 
 @dataclass(frozen=True)
 class Argoverse2Options(FileOptions):
-    """What to convert and how, besides what every converter is told.
-
-    Args:
-        split: ``train``, ``val`` or ``test``.
-        at: ``lidar``: at the sweeps; ``cameras``: at the front centre camera's images; ``auto``: at
-            the sweeps where the log has some, else at the images; ``poses:N``: at every N-th row of
-            the pose table, whether or not there are sensor data.
-        rate_hz: Samples per second, > 0, of the times of ``at``; None takes them all.
-        compat: Whose rules the ground truth follows: ``maptrv2`` or ``maptr``.
-        dim: Coordinates per point: 2 or 3.
-        logs: Ids of the logs to convert, or how they begin; empty takes all.
-        keep_map_changes: Whether to keep the four logs whose map was changed on purpose.
-    """
+    """What to convert and how: the options of the command; ``logs`` may be how ids begin."""
 
     _: KW_ONLY
     split: str = "val"

@@ -36,11 +36,7 @@ def make_scene(
     """Lay out what the map of a log says about the ground.
 
     Paint is where the map says that there is some; lane boundaries without paint stay invisible.
-
-    Args:
-        static_map: The log's map.
-        heights: The log's ground height.
-        bounds: xmin, ymin, xmax, ymax of the part that will be seen, city frame, in metres.
+    ``bounds`` are xmin, ymin, xmax, ymax of the part that will be seen, city frame, in metres.
 
     Raises:
         ValueError: If no ground height is known inside the bounds.
@@ -49,28 +45,24 @@ def make_scene(
     areas = [shapely.Polygon(a.xyz[:, :2]) for a in static_map.get_scenario_vector_drivable_areas()]
     road = shapely.union_all([shapely.make_valid(a) for a in areas if a.intersects(window)])
     scene = SceneMap(height=height_grid(heights, bounds, road.buffer(ROI_ISOCONTOUR_M)))
-    scene.surfaces += [
-        Surface(p, "walkway") for p in _polygons(road.buffer(WALKWAY_WIDTH_M, join_style="mitre"))
-    ]
+    walkway = _polygons(road.buffer(WALKWAY_WIDTH_M, join_style="mitre"))
+    scene.surfaces += [Surface(polygon, "walkway") for polygon in walkway]
     for polygon in _polygons(road):
         scene.surfaces.append(Surface(polygon, "asphalt"))
         scene.kerbs += [np.array(r.coords) for r in (polygon.exterior, *polygon.interiors)]
     paint = lane_paint(static_map, window)
     for crossing in static_map.get_scenario_ped_crossings():
         paint["white"] += zebra(*(edge[:, :2] for edge in crossing.get_edges_2d()))
-    scene.markings += [
-        Marking(outlines, name, WEAR) for name, outlines in paint.items() if outlines
-    ]
+    scene.markings += [Marking(areas, colour, WEAR) for colour, areas in paint.items() if areas]
     return scene
 
 
 def lane_paint(
     static_map: ArgoverseStaticMap, window: shapely.Polygon
 ) -> dict[str, list[np.ndarray]]:
-    """Return the painted areas of all marked lane boundaries, by colour.
+    """Return the painted areas of all marked lane boundaries in a window of the city, by colour.
 
-    Two lanes that share a line describe it twice; it is painted once. Lines outside ``window`` are
-    left out; outlines for ``white`` and ``yellow`` are in the city frame. each (n, 2)
+    Two lanes that share a line describe it twice; it is painted once. each (n, 2)
     """
     markings = [
         marking
@@ -105,10 +97,8 @@ def _stroke(line: np.ndarray, kind: str) -> list[np.ndarray]:
     if kind.startswith("DASHED"):
         return dashed_line(line, LINE_WIDTH_M, DASH_M, GAP_M)
     if kind.startswith(("DASH_SOLID", "SOLID_DASH")):  # one solid, one dashed line side by side
-        left, right = (
-            np.array(shapely.LineString(line).offset_curve(side * DOUBLE_GAP_M).coords)
-            for side in (1, -1)
-        )
+        curves = (shapely.LineString(line).offset_curve(d) for d in (DOUBLE_GAP_M, -DOUBLE_GAP_M))
+        left, right = (np.array(curve.coords) for curve in curves)
         dashed, solid = (left, right) if kind.startswith("DASH") else (right, left)
         return dashed_line(dashed, LINE_WIDTH_M, DASH_M, GAP_M) + solid_line(solid, LINE_WIDTH_M)
     return solid_line(line, LINE_WIDTH_M)
@@ -119,12 +109,8 @@ def height_grid(
 ) -> HeightGrid:
     """Return the ground height inside bounds, smoothed, and outwards as it is at the edge.
 
-    Away from the road the stored heights include what stands there, up to tall spikes.
-
-    Args:
-        heights: The log's ground height.
-        bounds: xmin, ymin, xmax, ymax in the city frame, in metres.
-        trusted: Where the stored heights count, in the city frame.
+    Stored heights count in the area ``trusted`` of the city: away from the road they include what
+    stands there, up to tall spikes. ``bounds`` are xmin, ymin, xmax, ymax in the city, in metres.
 
     Raises:
         ValueError: If no height is known inside the bounds, or the grid is turned.
@@ -139,9 +125,7 @@ def height_grid(
     high = np.clip(np.ceil(corners[1]).astype(int), low + 1, (columns, rows))
     part = heights.array[low[1] : high[1], low[0] : high[0]].astype(np.float64)
     origin = (low + 0.5) * cell_m - to_grid.t  # p_grid = s (p_city + t), cells centred at + 0.5
-    x, y = (
-        start + np.arange(n) * cell_m for start, n in zip(origin, part.shape[::-1], strict=True)
-    )
+    x, y = (origin[i] + np.arange(n) * cell_m for i, n in enumerate(part.shape[::-1]))
     shapely.prepare(trusted)
     known = np.isfinite(part) & shapely.contains_xy(trusted, *np.meshgrid(x, y))
     if not known.any():

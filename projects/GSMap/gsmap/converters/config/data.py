@@ -34,30 +34,25 @@ SCHEDULE = {
 
 
 def data_settings(fields: Fields) -> dict[str, Any]:
-    """Return the settings of data and image normalisation.
+    """Return the settings of data and image normalisation; ValueError if the data set is unknown.
 
     Besides: ``steps`` (settings of pipeline steps by type), ``z_range``, ``with_depth``.
-
-    Raises:
-        ValueError: If the data set is unknown.
     """
     train = dict(fields.section("data.train"))
     if train.get("type") not in DATASETS:
         raise ValueError(
             f"data.train.type must be one of {sorted(DATASETS)}, got {train.get('type')!r}."
         )
-    low_high, classes, root = train["pc_range"], list(train["map_classes"]), train.get("data_root")
-    shared = {
-        "grid": {"x_range": [low_high[0], low_high[3]], "y_range": [low_high[1], low_high[4]]},
-        "classes": classes,
-    }
+    classes, root = list(train["map_classes"]), train.get("data_root")
+    x_range, y_range, z_range = ([train["pc_range"][i], train["pc_range"][i + 3]] for i in range(3))
+    shared = {"grid": {"x_range": x_range, "y_range": y_range}, "classes": classes}
     settings: dict[str, Any] = {
         **shared,
         **{f"model.{name}": value for name, value in shared.items()},
         "train_dataloader.batch_size": fields.take("data.samples_per_gpu"),
         "train_dataloader.num_workers": fields.take("data.workers_per_gpu"),
         "data_root": root,
-        "z_range": [low_high[2], low_high[5]],
+        "z_range": z_range,
         "steps": {"FormatMapTargets": {"num_points": train["fixed_ptsnum_per_line"]}},
         "with_depth": False,
     }
@@ -66,7 +61,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         own, dataset = f"data.{part}", f"{part}_dataloader.dataset."
         settings |= {dataset + name: value for name, value in shared.items()}
         settings[dataset + "data_root"] = fields.take(own + ".data_root", root)
-        fields.drop(own, OF_THE_FILE, pc_range=low_high, map_classes=classes)
+        fields.drop(own, OF_THE_FILE, pc_range=train["pc_range"], map_classes=classes)
         for step in fields.items(own + ".pipeline") if "pipeline" in fields.section(own) else []:
             _place_step(fields, step, settings)
     return settings

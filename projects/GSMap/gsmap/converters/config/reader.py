@@ -8,12 +8,9 @@ from pathlib import Path
 from typing import Any
 
 ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.FloorDiv: operator.floordiv,
-}
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
+    ast.Div: operator.truediv, ast.FloorDiv: operator.floordiv,
+}  # fmt: skip
 CALLS: dict[str, Callable[[Any], Any]] = {"len": len, "list": list, "tuple": tuple}
 
 
@@ -21,13 +18,8 @@ def read_assignments(path: str | Path) -> dict[str, Any]:
     """Return the values of a file's top-level names, as its last assignments leave them.
 
     Known are literals, earlier names, ``dict(...)`` with ``**``, ``len``, ``list``, ``tuple``,
-    indices, and arithmetic of numbers, strings and lists. Nothing is executed.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Values by name; none shares a part with another.
+    indices, and arithmetic of numbers, strings and lists. Nothing is executed, and no value shares
+    a part with another.
 
     Raises:
         ValueError: If the file holds anything else; the message names the line.

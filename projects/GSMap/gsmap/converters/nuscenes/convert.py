@@ -32,22 +32,18 @@ from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 
 _OFFICIAL_SPLITS = {
-    "v1.0-trainval": ("train", "val"),
-    "v1.0-mini": ("mini_train", "mini_val"),
+    "v1.0-trainval": ("train", "val"), "v1.0-mini": ("mini_train", "mini_val"),
     "v1.0-test": ("test",),
-}
+}  # fmt: skip
 _FRAMES_PER_WORKER = 500  # a process takes about as long to start as these take
 
 
 @dataclass(frozen=True)
 class NuScenesOptions(FileOptions):
-    """What to convert and how, besides what every converter is told.
+    """What to convert and how: the options of ``add_arguments``.
 
-    Args:
-        version: Version folder, such as ``v1.0-trainval``.
-        dataset: Name of the data set in the files.
-        split_file: Own split file; else ``<root>/<version>/splits.json`` if it is there, else the
-            official splits.
+    Without ``split_file``, ``<root>/<version>/splits.json`` counts if it is there, else the
+    official splits.
     """
 
     version: str
@@ -76,13 +72,6 @@ def _check_root(root: Path, version: str) -> None:
             f"no map expansion in {root / 'maps/expansion'}: download `Map expansion pack "
             f"(v1.3)` from https://www.nuscenes.org/download and unpack it into {root / 'maps'}."
         )
-
-
-def _fingerprint(root: Path, version: str) -> str:
-    """Return a digest of the maps, the scene list and the sizes of all tables."""
-    sizes = {path.name: path.stat().st_size for path in sorted((root / version).glob("*.json"))}
-    maps = sorted((root / "maps/expansion").glob("*.json"))
-    return fingerprint(sizes, [root / version / "scene.json", *maps])
 
 
 def _splits(
@@ -216,14 +205,17 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
     check_classes(options.classes)
     _check_root(options.root, options.version)
     conversion = _Conversion(options)
+    tables = options.root / options.version
+    maps = sorted((options.root / "maps/expansion").glob("*.json"))
+    sizes = {path.name: path.stat().st_size for path in sorted(tables.glob("*.json"))}
     made_from = {
-        "source_fingerprint": _fingerprint(options.root, options.version),
+        "source_fingerprint": fingerprint(sizes, [tables / "scene.json", *maps]),
         "versions": {name: version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")},
         "options": {"version": options.version, "max_sweeps": options.max_sweeps},
     }
     with ExitStack() as stack:
         writers = {}
-        for split in (split for split, scenes in conversion.splits.items() if scenes):
+        for split in [s for s, scenes in conversion.splits.items() if scenes]:
             meta = options.meta(options.dataset, "lidar", split, **made_from)
             writer = AnnotationWriter(options.path_of(options.dataset, split), meta, options.shard)
             writers[split] = stack.enter_context(writer)
@@ -240,15 +232,12 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py nuscenes``."""
-    parser.add_argument(
-        "--root", type=Path, required=True, help="data root with maps, samples, v1.0-..."
-    )
-    parser.add_argument(
-        "--version", default="v1.0-trainval", help="version folder (default: %(default)s)"
-    )
-    parser.add_argument("--dataset", help="name in the files (default: minicity or nuscenes)")
-    parser.add_argument("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
-    parser.add_argument(
+    add = parser.add_argument
+    add("--root", type=Path, required=True, help="data root with maps, samples, v1.0-...")
+    add("--version", default="v1.0-trainval", help="version folder (default: %(default)s)")
+    add("--dataset", help="name in the files (default: minicity or nuscenes)")
+    add("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
+    add(
         "--classes", nargs="+", default=list(CLASSES), choices=MAP_CLASSES, metavar="CLASS",
         help=f"classes in label order, of {', '.join(MAP_CLASSES)} (default: the first three)",
     )  # fmt: skip

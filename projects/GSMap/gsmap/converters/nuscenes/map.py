@@ -1,8 +1,7 @@
 """Local vector maps from a nuScenes map expansion, by the rules of MapTR.
 
-Whatever does not depend on the pose is done once per map: geometries, spatial indices, the union of
-all road surface and its outline. A frame then takes a few vectorised geometry calls on what lies
-near.
+Whatever does not depend on the pose is done once per map; a frame then takes a few vectorised
+geometry calls on what lies near.
 """
 
 from collections import Counter
@@ -97,11 +96,7 @@ def expansion(root: Path, name: str) -> Path:
 
 
 def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
-    """Collect the geometries that the classes need from a map under a data root.
-
-    Raises:
-        ValueError: If the map is damaged.
-    """
+    """Collect the geometries that the classes need from a map of a data root, which is checked."""
     from nuscenes.map_expansion.map_api import NuScenesMap
 
     with naming(expansion(root, name), "unpack the map expansion pack (v1.3) again"):
@@ -155,12 +150,9 @@ class NuScenesLocalMap:
 
     Args:
         layers: The map's geometries.
-        classes: Names out of ``MAP_CLASSES``, in label order.
+        classes: Names out of ``MAP_CLASSES``, in label order; ValueError for others.
         x_range: Smallest and largest x of the patch in metres.
         y_range: Smallest and largest y of the patch in metres.
-
-    Raises:
-        ValueError: If a class is unknown.
     """
 
     def __init__(
@@ -184,13 +176,9 @@ class NuScenesLocalMap:
         self._lane_tree = shapely.STRtree(lanes)
 
     def instances(self, global_from_frame: np.ndarray) -> list[MapInstance]:
-        """Return the map elements around a pose.
+        """Return the map elements around a pose (4, 4) of the annotation frame, in that frame.
 
-        Args:
-            global_from_frame: Pose of the annotation frame in the map. (4, 4)
-
-        Returns:
-            Elements in the frame, class by class in label order; points are (n, 2) in metres.
+        They come class by class in label order; points are (n, 2) in metres.
         """
         patch = LocalPatch(global_from_frame, self.x_range, self.y_range)
         return [
