@@ -14,12 +14,8 @@ import shapely
 from shapely import affinity
 
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, read_layers
-from gsmap.datasets.annotations.file import (
-    AnnotationFile,
-    MapInstance,
-    MapSample,
-    write_annotations,
-)
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
+from gsmap.datasets.annotations.record import MapInstance, MapSample
 from gsmap.structures.polylines import is_closed
 
 _MEGABYTE = 2**20

@@ -6,13 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsmap.datasets.annotations.file import (
-    AnnotationMeta,
-    CameraRecord,
-    MapInstance,
-    MapSample,
-    write_annotations,
-)
+from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapInstance, MapSample
 
 STRANGE = "</script><img src=x onerror=alert(1)>${data}"
 CLASSES = ("divider", "ped_crossing", "boundary")

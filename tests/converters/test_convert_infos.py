@@ -10,7 +10,8 @@ import pytest
 from pyquaternion import Quaternion
 
 from gsmap.converters.infos import convert_infos
-from gsmap.datasets.annotations.file import AnnotationFile, MapSample
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
 
 
 def split_pose(matrix: np.ndarray) -> tuple[list[float], list[float]]:

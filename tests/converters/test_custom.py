@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from gsmap.converters.custom import from_records
-from gsmap.datasets.annotations.file import AnnotationFile, AnnotationMeta
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.visualization.frame_view import FRAME_VIEWS
 
 REPO = Path(__file__).resolve().parents[2]

@@ -13,7 +13,8 @@ from gsmap.converters.argoverse2.convert import convert_argoverse2
 from gsmap.converters.argoverse2.samples import Argoverse2Options
 from gsmap.converters.custom import from_records
 from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
-from gsmap.datasets.annotations.file import AnnotationFile, AnnotationMeta
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import AnnotationMeta
 
 RANGES = [(30.0, 15.0), (50.0, 25.0), (100.0, 50.0)]  # 60 x 30, 100 x 50 and 200 x 100 m
 

@@ -10,12 +10,8 @@ import numpy as np
 import pytest
 from golden_data import CLASSES, EVALUATOR
 
-from gsmap.datasets.annotations.file import (
-    AnnotationMeta,
-    MapInstance,
-    MapSample,
-    write_annotations,
-)
+from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSample
 from gsmap.evaluation.file_evaluation import evaluate_files, read_ground_truth
 from gsmap.evaluation.results_json import read_samples, vectors_of, write_results
 from gsmap.structures.elements import MapElements

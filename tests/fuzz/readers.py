@@ -32,12 +32,8 @@ from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables, SampleReader
 from gsmap.converters.splits import read_split_file
-from gsmap.datasets.annotations.file import (
-    AnnotationFile,
-    AnnotationMeta,
-    MapSample,
-    write_annotations,
-)
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
+from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.datasets.transforms.images import read_image
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points

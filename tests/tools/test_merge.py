@@ -15,7 +15,8 @@ from argoverse2_road import write_log
 from mmdet3d.registry import MODELS
 
 from gsmap.converters.custom import from_records
-from gsmap.datasets.annotations.file import CLASSES, AnnotationFile, AnnotationMeta
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
 from gsmap.engine.launch import read_config
 from gsmap.evaluation.results_json import read_samples, vectors_of, write_results
 from gsmap.structures.elements import MapElements

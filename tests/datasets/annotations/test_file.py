@@ -11,16 +11,14 @@ import pyarrow as pa
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsmap.datasets.annotations.file import (
-    AnnotationFile,
+from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter, write_annotations
+from gsmap.datasets.annotations.record import (
     AnnotationMeta,
-    AnnotationWriter,
     CameraRecord,
     LidarRecord,
     MapInstance,
     MapSample,
     SweepRecord,
-    write_annotations,
 )
 from gsmap.datasets.annotations.schema import FIELDS
 

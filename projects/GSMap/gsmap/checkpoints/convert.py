@@ -57,9 +57,8 @@ def upstream_from_ours(
             "them the model would find something else: it stays in our format."
         )
     renamed = {name: state[key] for key, name in names.items() if name is not None}
-    extra = {key: value for key, value in key_map.unused.items() if value is not None}
-    copies = {k: v.clone(memory_format=torch.contiguous_format) for k, v in extra.items()}
-    return {**renamed, **copies}
+    unused = ((key, value) for key, value in key_map.unused.items() if value is not None)
+    return renamed | {k: v.clone(memory_format=torch.contiguous_format) for k, v in unused}
 
 
 def _serves_training(key: str) -> bool:
@@ -85,10 +84,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]
 
 
 def convert_state(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
-    """Turn either format into the other.
-
-    Also returns what was done: ``"<architecture>: upstream to gsmap"`` or the reverse.
-    """
+    """Turn either format into the other, and say in words which way."""
     key_map = find_key_map(state)
     if is_upstream(state):
         return ours_from_upstream(state, key_map), f"{key_map.name}: upstream to gsmap"

@@ -47,22 +47,17 @@ def _pattern(template: str) -> re.Pattern[str]:
 def _rename(key: str, rules: Rules) -> str | None:
     """Replace the prefix of ``key`` by the first rule that fits."""
     for source, target in rules:
-        match = _pattern(source).match(key)
-        if match:
+        if match := _pattern(source).match(key):
             for number in match.groups():
                 target = target.replace(_NUMBER, number, 1)
             return target + key[match.end() :]
     return None
 
 
-def _moved(upstream: str, ours: str, names: Mapping[str, str]) -> Rules:
-    """Return rules for names (upstream's: ours) under a prefix on either side."""
-    return tuple((upstream + theirs, ours + own) for theirs, own in names.items())
-
-
-def _kept(upstream: str, ours: str, *names: str) -> Rules:
-    """Return rules for what has one name under a prefix on either side."""
-    return _moved(upstream, ours, {name: name for name in names})
+def _rules(upstream: str, ours: str, names: str) -> Rules:
+    """Return rules for names under a prefix on either side: ``theirs=ours``, or one for both."""
+    pairs = (name.partition("=") for name in names.split())
+    return tuple((upstream + theirs, ours + (own or theirs)) for theirs, _, own in pairs)
 
 
 def _zeros(prefix: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
@@ -74,79 +69,67 @@ _HEAD = "pts_bbox_head."
 _TRANSFORMER = "pts_bbox_head.transformer."
 _ENCODER = "pts_bbox_head.transformer.encoder."
 _ENCODER_LAYER = "pts_bbox_head.transformer.encoder.layers.{i}."
+_DECODER = "pts_bbox_head.transformer.decoder."
 _DECODER_LAYER = "pts_bbox_head.transformer.decoder.layers.{i}."
 _OUR_ENCODER_LAYER = "bev_encoder.layers.{i}."
 _LAYER = "map_head.decoder.layers.{i}."
 
-IMAGE_RULES = _kept("", "", "img_backbone.", "img_neck.")
-HEAD_RULES = (
-    *_kept(_HEAD, "map_head.", "instance_embedding.", "pts_embedding.", "cls_branches."),
-    (_HEAD + "reg_branches.", "map_head.reference.branches."),
-    (_TRANSFORMER + "reference_points.", "map_head.reference.initial."),
+_IMAGE_RULES = _rules("", "", "img_backbone. img_neck.")
+_HEAD_RULES = (
+    *_rules(_HEAD, "map_head.", "instance_embedding. pts_embedding. cls_branches."),
+    *_rules(_HEAD, "map_head.reference.", "reg_branches.=branches."),
+    *_rules(_TRANSFORMER, "map_head.reference.", "reference_points.=initial."),
 )
-DECODER_RULES = _moved(
+_DECODER_RULES = _rules(
     _DECODER_LAYER,
     _LAYER,
-    {
-        "attentions.0.attn.": "self_attn.",
-        "attentions.1.": "cross_attn.",
-        "ffns.0.": "ffn.",
-        "norms.": "norms.",
-    },
+    "attentions.0.attn.=self_attn. attentions.1.=cross_attn. ffns.0.=ffn. norms.",
 )
-BEV_QUERY_RULES = (
-    *IMAGE_RULES,
-    *HEAD_RULES,
-    *DECODER_RULES,
-    *_kept(_HEAD, "bev_encoder.", "bev_embedding.", "positional_encoding."),
-    *_kept(_TRANSFORMER, "bev_encoder.", "level_embeds", "cams_embeds", "can_bus_mlp."),
-    *_moved(
-        _ENCODER_LAYER,
-        _OUR_ENCODER_LAYER,
-        {
-            "attentions.0.": "self_attn.",
-            "attentions.1.output_proj.": "cross_attn.output_proj.",
-            "ffns.0.": "ffn.",
-            "norms.": "norms.",
-        },
+_BEV_QUERY_RULES = (
+    *_IMAGE_RULES,
+    *_HEAD_RULES,
+    *_DECODER_RULES,
+    *_rules(_HEAD, "bev_encoder.", "bev_embedding. positional_encoding."),
+    *_rules(_TRANSFORMER, "bev_encoder.", "level_embeds cams_embeds can_bus_mlp."),
+    *_rules(_ENCODER_LAYER, _OUR_ENCODER_LAYER, "attentions.0.=self_attn. ffns.0.=ffn. norms."),
+    *_rules(
+        _ENCODER_LAYER, _OUR_ENCODER_LAYER, "attentions.1.output_proj.=cross_attn.output_proj."
     ),
 )
-CODE_WEIGHTS = {_HEAD + "code_weights": torch.ones(4)}  # of box coordinates: a loss of weight 0
+_CODE_WEIGHTS = {_HEAD + "code_weights": torch.ones(4)}  # of box coordinates: a loss of weight 0
 
 _KERNELS = (_ENCODER_LAYER + "attentions.1.attention.", _OUR_ENCODER_LAYER + "cross_attn.")
 _DEFORMABLE = _ENCODER_LAYER + "attentions.1.deformable_attention."
-MAPTR = KeyMap("maptr", (*BEV_QUERY_RULES, _KERNELS), CODE_WEIGHTS)
+MAPTR = KeyMap("maptr", (*_BEV_QUERY_RULES, _KERNELS), _CODE_WEIGHTS)
 MAPTR_BEVFORMER = KeyMap(
     "maptr-bevformer",
-    (*BEV_QUERY_RULES, (_DEFORMABLE, _OUR_ENCODER_LAYER + "cross_attn.")),
-    CODE_WEIGHTS,
+    (*_BEV_QUERY_RULES, (_DEFORMABLE, _OUR_ENCODER_LAYER + "cross_attn.")),
+    _CODE_WEIGHTS,
     markers=((_DEFORMABLE, _OUR_ENCODER_LAYER + "cross_attn.sampling_offsets."),),
 )
 
-LIFTED_RULES = (
-    *IMAGE_RULES,
-    *HEAD_RULES,
-    *_moved(_HEAD, "map_head.aux_heads.", {"seg_head.": "seg.", "pv_seg_head.": "pv_seg."}),
-    *_kept(_ENCODER, "bev_encoder.", "depth_net.", "downsample."),
+_LIFTED_RULES = (
+    *_IMAGE_RULES,
+    *_HEAD_RULES,
+    *_rules(_HEAD, "map_head.aux_heads.", "seg_head.=seg. pv_seg_head.=pv_seg."),
+    *_rules(_ENCODER, "bev_encoder.", "depth_net. downsample."),
 )
-LIFTED_UNUSED: dict[str, Tensor | None] = {
-    **CODE_WEIGHTS,
+_LIFTED_UNUSED: dict[str, Tensor | None] = {
+    **_CODE_WEIGHTS,
     # parts of the encoder with learned BEV queries, which depth lifting does not run
     **_zeros(
-        _HEAD + "positional_encoding.",
-        {"row_embed.weight": (200, 128), "col_embed.weight": (100, 128)},
-    ),
-    **_zeros(
-        _TRANSFORMER,
+        _HEAD,
         {
-            "level_embeds": (4, 256),
-            "cams_embeds": (6, 256),
-            "can_bus_mlp.0.weight": (128, 18),
-            "can_bus_mlp.0.bias": (128,),
-            "can_bus_mlp.2.weight": (256, 128),
-            "can_bus_mlp.2.bias": (256,),
-            "can_bus_mlp.norm.weight": (256,),
-            "can_bus_mlp.norm.bias": (256,),
+            "positional_encoding.row_embed.weight": (200, 128),
+            "positional_encoding.col_embed.weight": (100, 128),
+            "transformer.level_embeds": (4, 256),
+            "transformer.cams_embeds": (6, 256),
+            "transformer.can_bus_mlp.0.weight": (128, 18),
+            "transformer.can_bus_mlp.0.bias": (128,),
+            "transformer.can_bus_mlp.2.weight": (256, 128),
+            "transformer.can_bus_mlp.2.bias": (256,),
+            "transformer.can_bus_mlp.norm.weight": (256,),
+            "transformer.can_bus_mlp.norm.bias": (256,),
         },
     ),
     # the grid of voxels, which the config says: size, first centre and number (x, y, z)
@@ -157,119 +140,108 @@ LIFTED_UNUSED: dict[str, Tensor | None] = {
     _HEAD + "loss_seg.loss_fn.pos_weight": torch.tensor((4.0,)),
     _HEAD + "loss_pv_seg.loss_fn.pos_weight": torch.tensor((1.0,)),
 }
-LIFTED_MARKER = (_ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv.")
+_LIFTED_MARKER = (_ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv.")
 
 MAPTRV2 = KeyMap(
     "maptrv2",
     (
-        *LIFTED_RULES,
-        *_moved(
+        *_LIFTED_RULES,
+        *_rules(
             _DECODER_LAYER,
             _LAYER,
-            {
-                "attentions.0.attn.": "self_attn.instance_attn.",
-                "attentions.1.attn.": "self_attn.point_attn.",
-                "attentions.2.": "cross_attn.",
-                "ffns.0.": "ffn.",
-                "norms.0.": "self_attn.norm.",
-                "norms.1.": "norms.0.",
-                "norms.2.": "norms.1.",
-                "norms.3.": "norms.2.",
-            },
+            "attentions.0.attn.=self_attn.instance_attn. attentions.1.attn.=self_attn.point_attn. "
+            "attentions.2.=cross_attn. ffns.0.=ffn. "
+            "norms.0.=self_attn.norm. norms.1.=norms.0. norms.2.=norms.1. norms.3.=norms.2.",
         ),
     ),
-    LIFTED_UNUSED,
-    markers=(LIFTED_MARKER,),
+    _LIFTED_UNUSED,
+    markers=(_LIFTED_MARKER,),
 )
 
 # The names are those of upstream since 2023-12-12. Before, upstream called the attention among
 # instances "intra" and the one within each "inter", and no key tells the two apart.
-GEOMETRY_RULES = _moved(
-    _DECODER_LAYER + "attentions.0.",
-    _LAYER + "self_attn.",
-    {"inter_": "inter.", "intra_": "intra."},
+_GEOMETRY_RULES = _rules(
+    _DECODER_LAYER + "attentions.0.", _LAYER + "self_attn.", "inter_=inter. intra_=intra."
 )
 GEMAP = KeyMap(
     "gemap",
-    (*GEOMETRY_RULES, *MAPTR.rules),
+    (*_GEOMETRY_RULES, *MAPTR.rules),
     {
-        **CODE_WEIGHTS,
+        **_CODE_WEIGHTS,
         # On Argoverse 2, the simple objective is the full one's head with its parts switched off.
         _HEAD + "tau": None,  # a number that no computation reads
         _HEAD + "loss_seg.loss_fn.pos_weight": None,
         _HEAD + "loss_pv_seg.loss_fn.pos_weight": None,
     },
-    markers=GEOMETRY_RULES[:1],
+    markers=_GEOMETRY_RULES[:1],
 )
 GEMAP_FULL = KeyMap(
     "gemap-full",
-    (*GEOMETRY_RULES, *LIFTED_RULES, *DECODER_RULES),
-    {**LIFTED_UNUSED, _HEAD + "tau": torch.full((1,), 0.1)},
-    markers=(*GEOMETRY_RULES[:1], LIFTED_MARKER),
+    (*_GEOMETRY_RULES, *_LIFTED_RULES, *_DECODER_RULES),
+    {**_LIFTED_UNUSED, _HEAD + "tau": torch.full((1,), 0.1)},
+    markers=(*_GEOMETRY_RULES[:1], _LIFTED_MARKER),
 )
 
-_INTERACTION = {
-    "cross_attn.": "attn.",
-    "linear1.": "ffn.layers.0.0.",
-    "linear2.": "ffn.layers.1.",
-    "norm1.": "norms.0.",
-    "norm3.": "norms.1.",
-}
-_SAMPLING = {
-    **{f"p2p_attention.{theirs}": f"p2p.{ours}" for theirs, ours in _INTERACTION.items()},
-    **{f"p2i_attention.{theirs}": f"p2i.{ours}" for theirs, ours in _INTERACTION.items()},
-    "point_pos.": "point_code.",
-    "instance_pos.": "instance_code.",
-    "output_proj_point.": "output_proj.",
-    "point2ins_proj.": "instance_mlp.",
-}
+_INTERACTION = (
+    "cross_attn.=attn. linear1.=ffn.layers.0.0. linear2.=ffn.layers.1. norm1.=norms.0. "
+    "norm3.=norms.1."
+)
 _DOWN_SAMPLING = (_TRANSFORMER + "bev_downsample.", "map_head.decoder.bev_pyramid.merges.0.")
+_IDLE = "attentions.1.output_proj_instance"
 _NORM = ("weight", "bias", "running_mean", "running_var")
 MGMAPNET = KeyMap(
     "mgmapnet",
     (
-        *LIFTED_RULES,
+        *_LIFTED_RULES,
         (_HEAD + "ins_seg_head.", "map_head.losses.ins_seg.embedding."),
         _DOWN_SAMPLING,
-        *_moved(_DECODER_LAYER + "attentions.1.", _LAYER + "cross_attn.", _SAMPLING),
-        *DECODER_RULES,
-        (_TRANSFORMER + "decoder.point_ffn.{i}.", _LAYER + "point_ffn."),
-        (_TRANSFORMER + "decoder.point_norm.{i}.", _LAYER + "point_norm."),
-        (_TRANSFORMER + "decoder.gen_pos_embed.{i}.", _LAYER + "reference_code."),
+        *_rules(
+            _DECODER_LAYER + "attentions.1.p2p_attention.", _LAYER + "cross_attn.p2p.", _INTERACTION
+        ),
+        *_rules(
+            _DECODER_LAYER + "attentions.1.p2i_attention.", _LAYER + "cross_attn.p2i.", _INTERACTION
+        ),
+        *_rules(
+            _DECODER_LAYER + "attentions.1.",
+            _LAYER + "cross_attn.",
+            "point_pos.=point_code. instance_pos.=instance_code. output_proj_point.=output_proj. "
+            "point2ins_proj.=instance_mlp.",
+        ),
+        *_DECODER_RULES,
+        *_rules(
+            _DECODER,
+            _LAYER,
+            "point_ffn.{i}.=point_ffn. point_norm.{i}.=point_norm. "
+            "gen_pos_embed.{i}.=reference_code.",
+        ),
     ),
     {
-        **LIFTED_UNUSED,
+        **_LIFTED_UNUSED,
         _HEAD + "loss_seg.loss_fn.pos_weight": None,  # a loss that MGMapNet has not
-        # the embedding of the points, which MGMapNet's queries do not use
-        **_zeros(_HEAD, {"pts_embedding.weight": (20, 512)}),
-        # the code of the first layer's reference, which adds the learned position instead
         **_zeros(
-            _TRANSFORMER + "decoder.gen_pos_embed.0.",
+            _HEAD,
             {
-                "0.weight": (256, 40),
-                "0.bias": (256,),
-                "2.weight": (256, 256),
-                "2.bias": (256,),
+                # the embedding of the points, which MGMapNet's queries do not use
+                "pts_embedding.weight": (20, 512),
+                # the second mask head of the camera view, which is never called
+                **{f"bev_pv_seg_head.{i}.weight": (256, 256, 3, 3) for i in (0, 3)},
+                **{f"bev_pv_seg_head.{i}.{leaf}": (256,) for i in (1, 4) for leaf in _NORM},
+                **{f"bev_pv_seg_head.{i}.num_batches_tracked": () for i in (1, 4)},
+                "bev_pv_seg_head.6.weight": (3, 256, 1, 1),
+                "bev_pv_seg_head.6.bias": (3,),
             },
         ),
-        # the projection of the aggregated instance query, which is never called
-        **{
-            key: value
-            for layer in range(6)
-            for key, value in _zeros(
-                _DECODER_LAYER.replace(_NUMBER, str(layer)) + "attentions.1.output_proj_instance.",
-                {"weight": (256, 256), "bias": (256,)},
-            ).items()
-        },
-        # the second mask head of the camera view, which is never called
         **_zeros(
-            _HEAD + "bev_pv_seg_head.",
+            _DECODER,
             {
-                **{f"{i}.weight": (256, 256, 3, 3) for i in (0, 3)},
-                **{f"{i}.{leaf}": (256,) for i in (1, 4) for leaf in _NORM},
-                **{f"{i}.num_batches_tracked": () for i in (1, 4)},
-                "6.weight": (3, 256, 1, 1),
-                "6.bias": (3,),
+                # the code of the first layer's reference, which adds the learned position instead
+                "gen_pos_embed.0.0.weight": (256, 40),
+                "gen_pos_embed.0.0.bias": (256,),
+                "gen_pos_embed.0.2.weight": (256, 256),
+                "gen_pos_embed.0.2.bias": (256,),
+                # the projection of the aggregated instance query, which is never called
+                **{f"layers.{i}.{_IDLE}.weight": (256, 256) for i in range(6)},
+                **{f"layers.{i}.{_IDLE}.bias": (256,) for i in range(6)},
             },
         ),
     },

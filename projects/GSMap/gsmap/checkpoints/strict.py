@@ -11,9 +11,8 @@ from gsmap.checkpoints.key_map import is_upstream
 def neutral_keys(model: nn.Module, prefix: str = "") -> set[str]:
     """Return the state keys, behind ``prefix``, that modules declare neutral at the start.
 
-    A module that extends another one, as GSMap's extend MapTR's, lists the keys that it adds in its
-    attribute ``neutral_keys`` (prefixes, relative to the module). The model can then start from a
-    checkpoint without them.
+    A module that extends another one, as GSMap's extend MapTR's, lists what it adds in its
+    attribute ``neutral_keys`` (prefixes, relative to the module); a checkpoint may lack these.
     """
     declared = []
     for name, module in model.named_modules():
@@ -31,10 +30,9 @@ def adapt_state(
 ) -> None:
     """Rename upstream's keys in place, then compare the state with what the model expects.
 
-    Batch counters of BatchNorm may be missing, as in old checkpoints. Neutral keys, which then
-    stay as they are, may be missing all together. ``prefix`` is that of both states; ``neutral``
-    comes from :func:`neutral_keys`; ``fit`` changes the renamed state in place before it is
-    compared.
+    Batch counters of BatchNorm may be missing, as in old checkpoints. Neutral keys (`neutral_keys`)
+    may be missing all together. Both states have ``prefix``; ``fit`` changes the renamed state in
+    place before it is compared.
 
     Raises:
         ValueError: If a key is missing, left over or of another shape.
@@ -51,25 +49,18 @@ def adapt_state(
     if neutral <= missing:
         missing -= neutral
         state.update({key: expected[key] for key in neutral})  # they stay as they are
-    left_over = [key for key in state if key not in expected]
-    reshaped = [
-        f"{key} {tuple(value.shape)} instead of {tuple(expected[key].shape)}"
-        for key, value in state.items()
-        if key in expected and value.shape != expected[key].shape
-    ]
-    problems = [
-        f"{what}: {listed(keys)}"
-        for what, keys in (
-            ("missing", sorted(missing)),
-            ("left over", left_over),
-            ("of another shape", reshaped),
-        )
-        if keys
-    ]
-    if problems:
+    problems = {
+        "missing": sorted(missing),
+        "left over": [key for key in state if key not in expected],
+        "of another shape": [
+            f"{key} {tuple(value.shape)} instead of {tuple(expected[key].shape)}"
+            for key, value in state.items()
+            if key in expected and value.shape != expected[key].shape
+        ],
+    }
+    text = "; ".join(f"{what}: {listed(keys)}" for what, keys in problems.items() if keys)
+    if text:
         raise ValueError(
-            "the checkpoint does not fit the model; "
-            + "; ".join(problems)
-            + ". Load it with the config it was trained with; docs/migration.md lists the "
-            "architectures that load."
+            f"the checkpoint does not fit the model; {text}. Load it with the config it was "
+            "trained with; docs/migration.md lists the architectures that load."
         )

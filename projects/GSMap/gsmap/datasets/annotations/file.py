@@ -7,7 +7,7 @@ something else, and one that is damaged.
 import json
 import os
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import cached_property, partial
@@ -20,16 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from gsmap.datasets.annotations.checks import check_batch
-from gsmap.datasets.annotations.record import (
-    CLASSES,
-    FORMAT_VERSION,
-    AnnotationMeta,
-    CameraRecord,
-    LidarRecord,
-    MapInstance,
-    MapSample,
-    SweepRecord,
-)
+from gsmap.datasets.annotations.record import FORMAT_VERSION, AnnotationMeta, MapSample
 from gsmap.datasets.annotations.schema import (
     FIELDS,
     META_KEY,
@@ -40,22 +31,6 @@ from gsmap.datasets.annotations.schema import (
 )
 from gsmap.utils.files import atomic_write
 from gsmap.utils.shards import WHOLE, Shard, ShardFile
-
-__all__ = [
-    "CLASSES",
-    "FORMAT_VERSION",
-    "AnnotationFile",
-    "AnnotationMeta",
-    "AnnotationWriter",
-    "CameraRecord",
-    "LidarRecord",
-    "MapInstance",
-    "MapSample",
-    "SweepRecord",
-    "check_samples",
-    "merge_annotations",
-    "write_annotations",
-]
 
 SHARD_KIND = "annotations"
 _ROWS_PER_BATCH = 256
@@ -156,17 +131,9 @@ def write_annotations(
     shard: Shard = WHOLE,
     source: str = "",
 ) -> int:
-    """Write an annotation file from samples.
+    """Write an annotation file from samples, and return how many it has.
 
-    Args:
-        path: File to write.
-        meta: What holds for the whole file.
-        samples: Samples with different tokens.
-        shard: Part of the file that the samples are.
-        source: As ``AnnotationWriter`` takes it.
-
-    Returns:
-        How many were written.
+    The other arguments are those of ``AnnotationWriter``.
 
     Raises:
         ValueError: If a sample is malformed; then no file is left behind.
@@ -178,14 +145,9 @@ def write_annotations(
 
 
 def merge_annotations(path: Path, shards: Sequence[ShardFile]) -> int:
-    """Write an annotation file from its shards: byte for byte as if it had been made at once.
+    """Write an annotation file from all its shards (``find_shards``), and count its samples.
 
-    Args:
-        path: File to write.
-        shards: All of its shards, from ``find_shards``.
-
-    Returns:
-        How many samples it has.
+    It is byte for byte as if it had been made at once.
 
     Raises:
         ValueError: If it has no sample, or one twice.
@@ -239,17 +201,13 @@ class AnnotationFile(Sequence[MapSample]):
         try:
             content = pa.memory_map(str(self.path)).read_buffer()
             schema, self.batches, seal = _messages(content)
-        except (pa.ArrowException, OSError, ValueError) as error:
+            self.meta = _meta_of(schema)
+        except (pa.ArrowException, OSError, ValueError, TypeError) as error:
             raise ValueError(
                 f"{self.path} is not a whole annotation file ({error}): delete it and run "
                 "tools/create_data.py again."
             ) from error
         self.sealed = seal is not None
-        self.meta = self._read_meta(schema)
-        if not schema.equals(pa.schema(FIELDS)):
-            raise ValueError(
-                f"{self.path} has other columns than format version {FORMAT_VERSION}: {self.remedy}"
-            )
         try:
             if check:
                 self._check(content, seal)
@@ -274,28 +232,6 @@ class AnnotationFile(Sequence[MapSample]):
         tokens = pa.chunked_array([batch.column("token") for batch in self.batches], pa.string())
         if pc.count_distinct(tokens).as_py() < len(tokens):
             raise ValueError("two samples have one token")
-
-    def _read_meta(self, schema: pa.Schema) -> AnnotationMeta:
-        stored = (schema.metadata or {}).get(META_KEY)
-        if stored is None:
-            raise ValueError(
-                f"{self.path} is an Arrow file, but not an annotation file: run "
-                "tools/create_data.py."
-            )
-        try:
-            values = json.loads(stored)
-            found = values.get("format_version")
-            if found == FORMAT_VERSION:
-                return AnnotationMeta(**values)
-        except (ValueError, TypeError, AttributeError) as error:
-            raise ValueError(
-                f"{self.path} has damaged metadata ({error}): delete it and run "
-                "tools/create_data.py again."
-            ) from error
-        raise ValueError(
-            f"{self.path} has format version {found}, this program reads {FORMAT_VERSION}: make it "
-            f"again with `{values.get('command') or 'tools/create_data.py'}`."
-        )
 
     def __getstate__(self) -> dict[str, Any]:
         return {"path": self.path}
@@ -336,9 +272,6 @@ class AnnotationFile(Sequence[MapSample]):
         number = int(np.searchsorted(self._starts, index, side="right")) - 1
         return self._decoders[number](index - int(self._starts[number]))
 
-    def __iter__(self) -> Iterator[MapSample]:
-        return (self[i] for i in range(len(self)))
-
     def column(self, name: str) -> list[Any]:
         """Return ``token``, ``scene``, ``map_name`` or ``timestamp_ns`` of all samples."""
         return [value for batch in self.batches for value in batch.column(name).to_pylist()]
@@ -357,6 +290,20 @@ class AnnotationFile(Sequence[MapSample]):
         counts = (pc.list_value_length(batch.column("instances")) for batch in self.batches)
         known = [count.fill_null(-1).to_numpy() for count in counts]
         return np.concatenate([np.empty(0, np.int64), *known])
+
+
+def _meta_of(schema: pa.Schema) -> AnnotationMeta:
+    """Read the metadata of a file, which tell whether it is an annotation file of this version."""
+    values = json.loads((schema.metadata or {}).get(META_KEY, b"null"))
+    if not isinstance(values, dict):
+        raise ValueError("it holds Arrow's data, but it is not an annotation file")
+    found, command = values.get("format_version"), values.get("command")
+    if found != FORMAT_VERSION or not schema.equals(pa.schema(FIELDS)):
+        raise ValueError(
+            f"it has format version {found} or other columns than version {FORMAT_VERSION}, which "
+            f"this program reads: make it again with `{command or 'tools/create_data.py'}`"
+        )
+    return AnnotationMeta(**values)
 
 
 def _messages(content: pa.Buffer) -> tuple[pa.Schema, list[pa.RecordBatch], bytes | None]:

@@ -1,5 +1,6 @@
 """Camera images: loading with checks, and scaling with the matrices kept right."""
 
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,7 @@ def _decoded(content: bytes) -> np.ndarray:
 
 
 @TRANSFORMS.register_module()
+@dataclass(eq=False)
 class LoadCameraImages(BaseTransform):
     """Load the images of all cameras, naming sample and file when one is damaged.
 
@@ -92,15 +94,10 @@ class LoadCameraImages(BaseTransform):
         to_float32: Whether to convert to float32 before anything else.
     """
 
-    def __init__(self, to_float32: bool = True) -> None:
-        self.to_float32 = to_float32
+    to_float32: bool = True
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Load ``results['images']``.
-
-        Raises:
-            BrokenSampleError: If an image is missing, damaged, or of another size than its record.
-        """
+        """Load ``results['images']``; BrokenSampleError if one is not as its record says."""
         cameras, token = results["images"], results["token"]
         images = [
             read_image(camera["img_path"], f"sample {token!r}, camera {name}", camera.get("size"))

@@ -1,6 +1,7 @@
 """Training targets of map elements: resampled points and their equivalent orders."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,7 @@ def map_targets(
 
 
 @TRANSFORMS.register_module()
+@dataclass(eq=False)
 class FormatMapTargets(BaseTransform):
     """Add ``gt_instances_3d``, the training targets, from ``map_instances``.
 
@@ -89,15 +91,10 @@ class FormatMapTargets(BaseTransform):
         num_points: Points P per element.
     """
 
-    def __init__(self, num_points: int = 20) -> None:
-        self.num_points = num_points
+    num_points: int = 20
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Add the targets.
-
-        Raises:
-            ValueError: If the sample has no ground truth.
-        """
+        """Add the targets; ValueError if the sample has no ground truth."""
         if results["map_instances"] is None:
             raise ValueError(
                 f"sample {results['token']!r} has no ground truth: leave FormatMapTargets out of "

@@ -1,5 +1,6 @@
 """Segmentation targets: map elements drawn in BEV and in each camera's feature map."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -16,6 +17,7 @@ _MIN_DEPTH = 1e-7
 
 
 @TRANSFORMS.register_module()
+@dataclass(eq=False)
 class MakeBEVMask(BaseTransform):
     """Add ``gt_seg``: elements drawn in one channel, or in that of their class. (channels, H, W)
 
@@ -27,15 +29,9 @@ class MakeBEVMask(BaseTransform):
         num_classes: Number of channels; None draws all elements in one.
     """
 
-    def __init__(
-        self,
-        size: tuple[int, int] = (200, 100),
-        thickness_px: int = 3,
-        num_classes: int | None = None,
-    ) -> None:
-        self.size = tuple(size)
-        self.thickness_px = thickness_px
-        self.num_classes = num_classes
+    size: tuple[int, int] = (200, 100)
+    thickness_px: int = 3
+    num_classes: int | None = None
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Draw the mask."""
@@ -51,6 +47,7 @@ class MakeBEVMask(BaseTransform):
 
 
 @TRANSFORMS.register_module()
+@dataclass(eq=False)
 class MakePVMask(BaseTransform):
     """Add ``gt_pv_seg``: elements projected into each camera's feature map. (V, channels, h, w)
 
@@ -64,19 +61,11 @@ class MakePVMask(BaseTransform):
         num_classes: Number of channels; None draws all elements in one.
     """
 
-    def __init__(
-        self,
-        stride: int = 32,
-        pad_size_divisor: int = 32,
-        ground_z_m: float = -1.6,
-        thickness_px: int = 1,
-        num_classes: int | None = None,
-    ) -> None:
-        self.stride = stride
-        self.pad_size_divisor = pad_size_divisor
-        self.ground_z_m = ground_z_m
-        self.thickness_px = thickness_px
-        self.num_classes = num_classes
+    stride: int = 32
+    pad_size_divisor: int = 32
+    ground_z_m: float = -1.6
+    thickness_px: int = 1
+    num_classes: int | None = None
 
     def _points(self, points: np.ndarray) -> np.ndarray:
         """Return an element as homogeneous points along it. (200, 4)."""
@@ -108,11 +97,7 @@ class MakePVMask(BaseTransform):
 
 
 def channel_of(instance: MapInstance, num_classes: int | None) -> int:
-    """Return the channel that an element is drawn in.
-
-    Raises:
-        ValueError: If its label is beyond the classes.
-    """
+    """Return the channel that an element is drawn in; ValueError if that is beyond the classes."""
     if num_classes is None:
         return 0
     if not 0 <= instance.label < num_classes:

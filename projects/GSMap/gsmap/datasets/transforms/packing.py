@@ -1,5 +1,6 @@
 """Packing a sample for the model."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ _MATRIX_KEYS = ("lidar2img", "cam2img", "lidar2cam", "img_aug_matrix")
 
 
 @TRANSFORMS.register_module()
+@dataclass(eq=False)
 class PackMapInputs(BaseTransform):
     """Pack images, points, targets and metainfo as ``docs/architecture.md`` says.
 
@@ -30,15 +32,10 @@ class PackMapInputs(BaseTransform):
         with_points: Whether loaded points go to the model; they may have served for targets only.
     """
 
-    def __init__(self, with_points: bool = True) -> None:
-        self.with_points = with_points
+    with_points: bool = True
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Pack the sample.
-
-        Raises:
-            BrokenSampleError: If an image holds NaN or infinity.
-        """
+        """Pack the sample; BrokenSampleError if an image holds NaN or infinity."""
         inputs = {}
         if "img" in results:
             inputs["img"] = self._images(results)

@@ -1,6 +1,7 @@
 """LiDAR points: sweep files, the annotation frame, and sparse depth maps for supervision."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +91,7 @@ class LoadLidarPoints(LoadPointsFromFile):
     """mmdet3d's ``LoadPointsFromFile``, with checks and for Argoverse 2's files too."""
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Load ``results['lidar_points']``.
-
-        Raises:
-            BrokenSampleError: If the sample has no LiDAR, or its file is missing or damaged.
-        """
+        """Load ``results['lidar_points']``; BrokenSampleError if that is missing or damaged."""
         if "lidar_points" not in results:
             raise BrokenSampleError(
                 f"sample {results['token']!r} has no LiDAR sweep: make the annotation file from "
@@ -114,11 +111,7 @@ class LoadLidarSweeps(LoadPointsFromMultiSweeps):
     """
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Add points of ``results['lidar_sweeps']``.
-
-        Raises:
-            BrokenSampleError: If the file of a sweep is missing or damaged.
-        """
+        """Add ``results['lidar_sweeps']``; BrokenSampleError if one is missing or damaged."""
         return _naming_sample(super().transform, results)
 
     def _load_points(self, pts_filename: str) -> np.ndarray:
@@ -148,6 +141,7 @@ class PointsToFrame(BaseTransform):
 
 
 @TRANSFORMS.register_module()
+@dataclass(eq=False)
 class MakeDepthMap(BaseTransform):
     """Add ``gt_depth``: the nearest return at each pixel in metres, 0 without one. (V, H, W)
 
@@ -158,11 +152,8 @@ class MakeDepthMap(BaseTransform):
         pad_size_divisor: To what the images are padded later.
     """
 
-    def __init__(
-        self, depth_range: tuple[float, float] = (1.0, 60.0), pad_size_divisor: int = 32
-    ) -> None:
-        self.depth_range = tuple(depth_range)
-        self.pad_size_divisor = pad_size_divisor
+    depth_range: tuple[float, float] = (1.0, 60.0)
+    pad_size_divisor: int = 32
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Project the points into each camera."""
