@@ -48,7 +48,7 @@ def test_the_path_from_gaussians_through_the_layer_to_gaussians_has_its_true_gra
 def places(layer: GaussianDecoderLayer, reference: torch.Tensor) -> torch.Tensor:
     """Return where a layer samples a map of 6 x 5 cells for one and the same query."""
     query = torch.ones(1, reference.shape[1], 8, dtype=torch.float64)
-    frames = layer.guidance.frames(reference, (6, 5))
+    frames = layer.guidance.frames(reference, torch.empty(1, 1, 6, 5))
     offsets = layer.cross_attn.offsets_in_cells(query)
     return place_samples(offsets, reference, (6, 5), frames)
 
@@ -76,7 +76,9 @@ def test_frames_act_on_metres_whatever_the_cells():
     guidance = GaussianGuidance(SPACE, 8)
     reference = torch.tensor([[[0.5, 0.5, 0.0, 0.0, math.pi / 2]]])
     offsets = torch.tensor([0.0, 1.0]).view(1, 1, 1, 1, 2)
-    turned = place_samples(offsets, reference, (6, 5), guidance.frames(reference, (6, 5)))
+    turned = place_samples(
+        offsets, reference, (6, 5), guidance.frames(reference, torch.empty(1, 1, 6, 5))
+    )
     expected = torch.tensor([0.5 - 10 / 6 / 5, 0.5]).view_as(turned)  # five columns
     torch.testing.assert_close(turned, expected, atol=1e-6, rtol=0)
     left = place_samples(offsets, reference, (6, 5))

@@ -134,7 +134,7 @@ def test_gaussians_guide_positions_and_samples_once_they_are_not_neutral():
     layer = guided.layers[0]
     neutral = torch.rand(B, N * P, 5, dtype=torch.float64)
     neutral[..., 2:] = 0
-    frames = layer.guidance.frames(neutral, (8, 6))
+    frames = layer.guidance.frames(neutral, torch.empty(1, 1, 8, 6))
     torch.testing.assert_close(frames, torch.eye(2, dtype=frames.dtype).expand_as(frames))
     position = torch.randn(B, N, C, dtype=torch.float64)
     torch.testing.assert_close(layer.guided(position, neutral), position)

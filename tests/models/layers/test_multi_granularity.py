@@ -122,10 +122,10 @@ def test_p2p_sees_the_points_of_the_layer_before_within_an_instance():
     assert influence(attention, before=True) == (True, False)
     points, before = torch.randn(2, B, N, P, C, dtype=torch.float64)
     state = Granularities(inputs()[0])
-    first = attention.interact_points(points, None, state)
-    later = attention.interact_points(points, None, state._replace(points=before))
+    first = attention.interact_points(points, 0.0, state)
+    later = attention.interact_points(points, 0.0, state._replace(points=before))
     assert not torch.allclose(first, later)
-    assert build(p2p=False).interact_points(points, None, state) is points
+    assert build(p2p=False).interact_points(points, 0.0, state) is points
 
 
 SWITCHES = [
@@ -162,7 +162,7 @@ def test_codes_and_joined_instance_change_the_points():
     assert not torch.allclose(points[0], points[2])
     plain = without(Granularities(query), position, reference, feats)
     torch.testing.assert_close(plain.points, points[2])  # a code of zero is no code
-    assert plain.point_code is None
+    assert plain.point_code == 0
 
 
 def test_wrong_numbers_of_levels_or_points_are_named():

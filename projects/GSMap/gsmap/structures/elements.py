@@ -48,22 +48,16 @@ class MapElements:
     ) -> "MapElements":
         """Build the elements of a sample from separate polylines.
 
-        Args:
-            polylines: Vertices of each element in metres, arrays or nested lists; z is dropped
-                unless all have it. N x (P, 2 or 3)
-            labels: Class index of each. (N,)
-            scores: Confidence of each. (N,)
-            scales: Standard deviations of each vertex's Gaussian in metres. N x (P, 2)
-            rotations: Angle of its first axis in radians. N x (P,)
+        Polylines are arrays or nested lists, N x (P, 2 or 3); z is dropped unless all have it. The
+        others are as in the class, labels and scores (N,), scales N x (P, 2), rotations N x (P,).
 
         Raises:
             ValueError: If the lengths disagree, the points are not (x, y[, z]), or a point or a
                 score is not finite.
         """
-        label_array = np.asarray(labels, np.int64).reshape(-1)
-        score_array = None if scores is None else np.asarray(scores, np.float64).reshape(-1)
-        values: dict[str, PerElement | None] = {"labels": label_array, "scores": score_array}
-        values |= {"scales": scales, "rotations": rotations}
+        labels = np.asarray(labels, np.int64).reshape(-1)
+        scores = None if scores is None else np.asarray(scores, np.float64).reshape(-1)
+        values = {"labels": labels, "scores": scores, "scales": scales, "rotations": rotations}
         for name, given in values.items():
             if given is not None and len(given) != len(polylines):
                 raise ValueError(
@@ -79,17 +73,12 @@ class MapElements:
         if not finite.all():
             index = np.searchsorted(offsets, finite.argmin(), side="right") - 1
             raise ValueError(f"element {index} has a point that is not finite.")
-        if score_array is not None and not np.isfinite(score_array).all():
-            index = np.isfinite(score_array).argmin()
+        if scores is not None and not np.isfinite(scores).all():
+            index = np.isfinite(scores).argmin()
             raise ValueError(f"element {index} has a score that is not finite.")
-        return cls(
-            points,
-            offsets,
-            label_array,
-            score_array,
-            _per_vertex(scales, "scales", (len(points), 2)),
-            _per_vertex(rotations, "rotations", (len(points),)),
-        )
+        scales = _per_vertex(scales, "scales", (len(points), 2))
+        rotations = _per_vertex(rotations, "rotations", (len(points),))
+        return cls(points, offsets, labels, scores, scales, rotations)
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -115,11 +104,7 @@ class MapElements:
         return self.scales is not None and self.rotations is not None
 
     def with_coordinates(self, dim: int) -> "MapElements":
-        """Return the elements with ``dim`` coordinates, 2 or 3, per vertex.
-
-        Raises:
-            ValueError: If there are vertices of fewer coordinates.
-        """
+        """Return the elements with ``dim`` coordinates a vertex; ValueError if there are fewer."""
         found = self.points.shape[1]
         if found == dim:
             return self
@@ -134,14 +119,11 @@ class MapElements:
         counts = self.num_points[rows]
         offsets = np.append(0, np.cumsum(counts))
         take = np.repeat(self.offsets[rows] - offsets[:-1], counts) + np.arange(offsets[-1])
-        return MapElements(
-            self.points[take],
-            offsets,
-            self.labels[rows],
-            None if self.scores is None else self.scores[rows],
-            None if self.scales is None else self.scales[take],
-            None if self.rotations is None else self.rotations[take],
+        scores, scales, rotations = (
+            None if values is None else values[chosen]
+            for values, chosen in ((self.scores, rows), (self.scales, take), (self.rotations, take))
         )
+        return MapElements(self.points[take], offsets, self.labels[rows], scores, scales, rotations)
 
 
 def _joined(polylines: PerElement) -> FloatArray:

@@ -15,17 +15,11 @@ AT_FLOOR = 1.1  # a Gaussian is at its floor if both sigmas are below this multi
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Ordered 2D Gaussians G = (mu, sigma, theta) (GSMap Eq. 1).
+    """Ordered 2D Gaussians G = (mu, sigma, theta) (GSMap Eq. 1)."""
 
-    Attributes:
-        means: Centres mu in metres. (..., 2)
-        scales: Standard deviations sigma along each Gaussian's own axes, in metres. (..., 2)
-        rotations: Angle theta of the first axis from +x, in radians, anticlockwise. (...)
-    """
-
-    means: Tensor
-    scales: Tensor
-    rotations: Tensor
+    means: Tensor  # centres mu in metres (..., 2)
+    scales: Tensor  # standard deviations sigma along the own axes, in metres (..., 2)
+    rotations: Tensor  # angle theta of the first axis from +x in radians, anticlockwise (...)
 
 
 @dataclass(frozen=True)
@@ -84,10 +78,7 @@ class GaussianSpace:
         """Return the Gaussians that a reference stands for, differentiable, in float32 at least.
 
         Its entries are the centre in [0, 1] (and perhaps a height), then sigma and theta before
-        their activation. (..., 5 or more) -> (...)
-
-        Raises:
-            ValueError: If the last axis holds fewer than five numbers.
+        their activation; ValueError if there are fewer than five. (..., 5 or more) -> (...)
         """
         if reference.shape[-1] < 5:
             raise ValueError(
@@ -103,20 +94,19 @@ class GaussianSpace:
     def scales(self, raw: Tensor) -> Tensor:
         """Activate sigma: zero gives ``init_scales_m``. (..., 2) -> (..., 2) metres"""
         low, high = self.min_scale_m, self.max_scale_m
-        if self.activation == "sigmoid":
-            start = [math.log((s - low) / (high - s)) for s in self.init_scales_m]
-            return low + (high - low) * (raw + raw.new_tensor(start)).sigmoid()
-        if self.activation == "softplus":
-            start = [math.log(math.expm1(s - low)) for s in self.init_scales_m]
-            return (low + F.softplus(raw + raw.new_tensor(start))).clamp(max=high)
-        start = [math.log(s - low) for s in self.init_scales_m]
-        return (low + (raw + raw.new_tensor(start)).exp()).clamp(max=high)
+        at_zero, activate = {
+            "sigmoid": (lambda s: (s - low) / (high - s), lambda x: (high - low) * x.sigmoid()),
+            "softplus": (lambda s: math.expm1(s - low), F.softplus),
+            "exp": (lambda s: s - low, torch.exp),
+        }[self.activation]
+        start = raw.new_tensor([math.log(at_zero(s)) for s in self.init_scales_m])
+        return (low + activate(raw + start)).clamp(max=high)
 
     def frames(self, reference: Tensor, invariant: bool = False) -> Tensor:
         r"""Return what turns an offset into the Gaussian's own frame, the identity at the start.
 
-        A Gaussian that is twice as long as the one that every query starts with looks twice as far
-        along that axis. With the stretch :math:`D = \mathrm{diag}(\sigma / \sigma_{init})` and the
+        One twice as long as the Gaussian that every query starts with looks twice as far along that
+        axis. With the stretch :math:`D = \mathrm{diag}(\sigma / \sigma_{init})` and the
         direction of travel :math:`\theta_0`, the matrix is :math:`R(\theta) D R(\theta_0)^T`. The
         invariant one, :math:`R(\theta) D R(\theta)^T`, is the same for theta and theta + pi, which
         are the same Gaussian. They multiply (x, y) in metres from the left. (..., D) -> (..., 2, 2)

@@ -39,10 +39,8 @@ def arc_lengths(points: Points) -> NDArray[np.float64]:
 def resample(points: Points, num_points: int) -> NDArray[np.float64]:
     """Resample a polyline at equal arc length in the plane, both end points included.
 
-    z is interpolated. (n, D) in metres -> (P, D)
-
-    Raises:
-        ValueError: If ``points`` is no polyline or ``num_points`` is below 2.
+    z is interpolated. ValueError if it is no polyline or ``num_points`` is below 2. (n, D) in
+    metres -> (P, D)
     """
     points = _check_polyline(points, num_points)
     return resample_all(points, np.array([0, len(points)]), num_points)[0]
@@ -87,20 +85,12 @@ def equivalent_orders(
 ) -> NDArray[np.float64]:
     """Return the point orders that describe the same map element ("v2" of MapTR).
 
-    An open polyline has two: as it is, and reversed. A ring has one for each of its K vertices,
-    which starts there and runs in the ring's own direction; order k starts at vertex -k. Of more
-    than P - 1 vertices, P - 1 are taken: at random if ``rng`` is given, else evenly spread.
-
-    Args:
-        points: Vertices at full resolution in metres; a ring's last equals its first. (n, D)
-        num_points: Number P of points per order, >= 2.
-        rng: Source of the random choice.
-
-    Returns:
-        Orders, resampled at equal arc length; unused rows hold ``PADDING``. (max(P - 1, 2), P, D)
-
-    Raises:
-        ValueError: If ``points`` is no polyline or ``num_points`` is below 2.
+    An open polyline has two: as it is, and reversed. A ring, whose last vertex equals its first,
+    has one for each of its K vertices, which starts there and runs in the ring's own direction;
+    order k starts at vertex -k. Of more than P - 1 vertices, P - 1 are taken: at random if ``rng``
+    is given, else evenly spread. Orders are resampled at equal arc length; unused rows hold
+    ``PADDING``. ValueError if it is no polyline or ``num_points`` is below 2. Vertices at full
+    resolution in metres (n, D) -> (max(P - 1, 2), P, D)
     """
     points = _check_polyline(points, num_points)
     slots = max(num_points - 1, 2)
@@ -110,13 +100,12 @@ def equivalent_orders(
         orders[1] = orders[0, ::-1]
         return orders
     count = len(points) - 1
-    rolls = np.arange(count)
-    if count > slots:
-        rolls = (
-            np.linspace(0, count, slots, endpoint=False).astype(np.int64)
-            if rng is None
-            else rng.choice(count, slots, replace=False)
-        )
+    if count <= slots:
+        rolls = np.arange(count)
+    elif rng is None:
+        rolls = np.linspace(0, count, slots, endpoint=False).astype(np.int64)
+    else:
+        rolls = rng.choice(count, slots, replace=False)
     orders[: len(rolls)] = _rings_from(points, num_points, -rolls % count)
     return orders
 
@@ -133,25 +122,9 @@ def clamp(points: Points, x_range: tuple[float, float], y_range: tuple[float, fl
     Ranges are in metres; entries after (x, y) are kept.
     """
     clamped = np.array(points)
-    clamped[..., 0] = np.clip(clamped[..., 0], *x_range)
-    clamped[..., 1] = np.clip(clamped[..., 1], *y_range)
+    for axis, limits in enumerate((x_range, y_range)):
+        clamped[..., axis] = np.clip(clamped[..., axis], *limits)
     return clamped
-
-
-def _segment_parameters(
-    start: Points, step: Points, x_range: tuple[float, float], y_range: tuple[float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where segments enter and leave a rectangle, in [0, 1]; enter > leave: missed. (n,)."""
-    enter, leave = np.zeros(len(start)), np.ones(len(start))
-    for axis, (low, high) in enumerate((x_range, y_range)):
-        parallel = step[:, axis] == 0
-        divisor = np.where(parallel, 1.0, step[:, axis])
-        a, b = (low - start[:, axis]) / divisor, (high - start[:, axis]) / divisor
-        inside = (start[:, axis] >= low) & (start[:, axis] <= high)
-        first = np.where(parallel, np.where(inside, 0.0, 2.0), np.minimum(a, b))
-        last = np.where(parallel, 1.0, np.maximum(a, b))
-        enter, leave = np.maximum(enter, first), np.minimum(leave, last)
-    return enter, leave
 
 
 def clip_to_box(
@@ -161,21 +134,23 @@ def clip_to_box(
 
     Direction is kept, further coordinates are interpolated, and a ring that is cut comes back as
     open pieces, none of which ends at the ring's arbitrary start. Pieces that only touch the
-    rectangle are left out. (n, D) in metres -> the pieces inside, in order, each (m >= 2, D)
-
-    Raises:
-        ValueError: If ``points`` is no polyline.
+    rectangle are left out. ValueError if it is no polyline. (n, D) in metres -> the pieces inside,
+    in order, each (m >= 2, D)
     """
     points = _check_polyline(points)
     start, step = points[:-1], np.diff(points, axis=0)
     moving = step.any(axis=-1)
     start, step = start[moving], step[moving]
-    enter, leave = _segment_parameters(start, step, x_range, y_range)
+    edges = np.array([x_range, y_range]).T[:, None]  # the lower ones, then the upper ones
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cuts = (edges - start[:, :2]) / step[:, :2]  # (2, n, 2), infinite if parallel to an edge
+    cuts = np.where(np.isnan(cuts), [[[-np.inf]], [[np.inf]]], cuts)  # on an edge, parallel to it
+    # where segments enter and leave the rectangle, in [0, 1]; enter > leave: missed
+    enter, leave = cuts.min(0).max(-1).clip(min=0), cuts.max(0).min(-1).clip(max=1)
     hits = np.flatnonzero(enter < leave)
     if not len(hits):
         return []
-    first = start[hits] + enter[hits, None] * step[hits]
-    last = start[hits] + leave[hits, None] * step[hits]
+    first, last = (start[hits] + at[hits, None] * step[hits] for at in (enter, leave))
     joined = (np.diff(hits) == 1) & (leave[hits[:-1]] == 1.0) & (enter[hits[1:]] == 0.0)
     breaks = np.flatnonzero(~joined) + 1
     ends = [0, *breaks.tolist(), len(hits)]

@@ -26,10 +26,7 @@ class MapDecoderLayer(BaseModule):
         self_attn: Config of the self-attention (`PointSelfAttention`).
         cross_attn: Config of the cross-attention (`BEVDeformableAttention`).
         guidance: Settings of `GaussianGuidance`, or None for a layer that is not guided.
-        space: How the reference stands for a Gaussian, for the guidance.
-
-    Raises:
-        ValueError: If there is guidance but the reference holds no Gaussians.
+        space: How the reference stands for a Gaussian; ValueError if guidance does not get it.
     """
 
     def __init__(
@@ -46,12 +43,10 @@ class MapDecoderLayer(BaseModule):
     ) -> None:
         super().__init__()
         shared = {"embed_dims": embed_dims, "num_heads": num_heads, "dropout": dropout}
-        self.self_attn = MODELS.build(
-            {"type": "PointSelfAttention", "num_points": num_points, **shared, **(self_attn or {})}
-        )
-        self.cross_attn = MODELS.build(
-            {"type": "BEVDeformableAttention", **shared, **(cross_attn or {})}
-        )
+        own = {"type": "PointSelfAttention", "num_points": num_points, **shared}
+        self.self_attn = MODELS.build({**own, **(self_attn or {})})
+        own = {"type": "BEVDeformableAttention", **shared}
+        self.cross_attn = MODELS.build({**own, **(cross_attn or {})})
         self.ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
         self.guidance: GaussianGuidance | None = None
@@ -72,12 +67,10 @@ class MapDecoderLayer(BaseModule):
         frames = None
         if self.guidance is not None:
             query_pos = self.guidance.position(query_pos, reference)
-            shape = (bev_feats.shape[-2], bev_feats.shape[-1])
-            frames = self.guidance.frames(reference, shape)
+            frames = self.guidance.frames(reference, bev_feats)
         query = self.norms[0](self.self_attn(query, query_pos, attn_mask))
         sampled = self.cross_attn(query + query_pos, reference, bev_feats, frames)
-        query = self.norms[1](query + sampled)
-        return self.norms[2](self.ffn(query))
+        return self.norms[2](self.ffn(self.norms[1](query + sampled)))
 
 
 @MODELS.register_module()
@@ -100,13 +93,9 @@ class GaussianDecoderLayer(MapDecoderLayer):
         embed_hidden_dims: int = 16,
         **kwargs: Any,
     ) -> None:
-        guidance = {
-            "sampling": guide_sampling,
-            "embedding": embed_gaussians,
-            "invariant": invariant_frame,
-            "hidden_dims": embed_hidden_dims,
-        }
-        super().__init__(guidance=guidance, **kwargs)
+        guidance = {"sampling": guide_sampling, "embedding": embed_gaussians}
+        more = {"invariant": invariant_frame, "hidden_dims": embed_hidden_dims}
+        super().__init__(guidance={**guidance, **more}, **kwargs)
 
 
 @MODELS.register_module()
@@ -170,17 +159,16 @@ class MapDecoder(BaseModule):
                 D) to the refined one.
             attn_mask: True where an instance may not attend to another, or None. (N, N)
 
-        Returns:
-            Of all layers, ``point_states`` (L, B, N * P, C), the refined ``references`` (L, B, N *
-            P, D), float32, and the decoder's further ``fields``.
+        Of all layers, it returns ``point_states`` (L, B, N * P, C), the refined ``references`` (L,
+        B, N * P, D), float32, and the decoder's further ``fields``.
         """
         state, reference, feats = self.start(query, reference, bev_feats)
         outputs: list[dict[str, Tensor]] = []
         for number, layer in enumerate(self.layers):
             state = layer(state, query_pos, reference, feats, attn_mask)
-            fields = self.read(state)
-            reference = refine(number, fields["point_states"], reference)
-            outputs.append({**fields, "references": reference})
+            outputs.append(self.read(state))
+            reference = refine(number, outputs[-1]["point_states"], reference)
+            outputs[-1]["references"] = reference
             if self.detach_reference:
                 reference = reference.detach()
         return {name: torch.stack([output[name] for output in outputs]) for name in outputs[0]}

@@ -38,21 +38,16 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         reference_dims: int | None = 2,
         **kwargs: Any,
     ) -> None:
-        sampling = {
-            "type": "MultiGranularityAttention",
-            "num_points": num_points,
-            "num_levels": num_levels,
-        }
+        sampling = {"type": "MultiGranularityAttention", "num_levels": num_levels}
         super().__init__(
             embed_dims,
             ffn_dims=ffn_dims,
             dropout=dropout,
             self_attn={"num_points": 1, **(self_attn or {})},
-            cross_attn={**sampling, **(cross_attn or {})},
+            cross_attn={**sampling, "num_points": num_points, **(cross_attn or {})},
             **kwargs,
         )
-        self.num_points = num_points
-        self.reference_dims = reference_dims
+        self.num_points, self.reference_dims = num_points, reference_dims
         self.point_ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
         self.point_norm = nn.LayerNorm(embed_dims)
         self.reference_code: nn.Sequential | None = None
@@ -92,7 +87,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             position = self.reference_code(by_instance[..., : self.reference_dims].flatten(2))
         frames = None
         if self.guidance is not None:  # levels halve both sides, so one frame serves all
-            frames = self.guidance.frames(reference, (feats[0].shape[-2], feats[0].shape[-1]))
+            frames = self.guidance.frames(reference, feats[0])
         position = self.guided(position, reference)
         state = self.cross_attn(state, position, by_instance, feats, frames)
         return state._replace(instances=self.norms[2](self.ffn(self.norms[1](state.instances))))
@@ -133,13 +128,8 @@ class MGMapNetDecoder(MapDecoder):
         num_levels: int = 2,
         **kwargs: Any,
     ) -> None:
-        super().__init__(
-            {"type": "MGMapNetDecoderLayer", **(layer or {})},
-            embed_dims=embed_dims,
-            num_points=num_points,
-            num_levels=num_levels,
-            **kwargs,
-        )
+        kwargs |= {"embed_dims": embed_dims, "num_points": num_points, "num_levels": num_levels}
+        super().__init__({"type": "MGMapNetDecoderLayer", **(layer or {})}, **kwargs)
         self.num_points = num_points
         # Differs from the poster: the released model's first layer adds the learned position.
         self.layers[0].reference_code = None
@@ -156,8 +146,5 @@ class MGMapNetDecoder(MapDecoder):
         """Return states and mean sampling locations of a layer."""
         assert state.points is not None
         assert state.mean_locations is not None
-        return {
-            "point_states": state.points.flatten(1, 2),
-            "instance_states": state.instances,
-            "mean_locations": state.mean_locations,
-        }
+        instances = {"instance_states": state.instances, "mean_locations": state.mean_locations}
+        return {"point_states": state.points.flatten(1, 2), **instances}

@@ -20,24 +20,23 @@ from gsmap.structures.grid import BEVGrid
 class MapDetector(Base3DDetector):
     """Image backbone and neck, BEV encoder, map head; with LiDAR, its encoder and their fusion.
 
+    Parts are configs; a part that a model does not have is None.
+
     Args:
         grid: The map: ``x_range`` and ``y_range`` in metres, optionally ``forward``; it reaches
             encoders, head, masks and coder from here.
         classes: Names of the classes.
-        map_head: Config of the head.
-        bev_encoder: Config of the cameras' BEV encoder; None for a model without cameras.
-        img_backbone: Config of the image backbone; None for a model without cameras.
-        img_neck: Config of the image neck, or None.
-        img_augment: Config of an augmentation of the normalised images in training (GridMask), or
-            None.
-        lidar_encoder: Config of the LiDAR's BEV encoder; None for a model without LiDAR.
-        bev_fuser: Config of the fusion of both, with cameras and LiDAR.
+        map_head: The head.
+        bev_encoder: The cameras' BEV encoder, on backbone and neck.
+        img_backbone: The image backbone.
+        img_neck: The image neck.
+        img_augment: An augmentation of the normalised images in training (GridMask).
+        lidar_encoder: The LiDAR's BEV encoder.
+        bev_fuser: The fusion of both, with cameras and LiDAR.
         fold_batch_norms: Whether the image backbone runs without gradients as a copy whose batch
             norms are folded into its convolutions (faster, for a second copy of its weights).
         strict_loading: Whether a checkpoint must hold every weight, by our names or upstream's, and
             nothing else; otherwise it is loaded as torch does, by our names.
-        data_preprocessor: As in mmdet3d.
-        init_cfg: As in mmengine.
 
     Raises:
         ValueError: If there is neither camera nor LiDAR, or both but no fusion.
@@ -86,10 +85,8 @@ class MapDetector(Base3DDetector):
             images = self.img_augment(images)
         # channels last is what CPU and tensor-core convolutions are fastest with
         images = images.contiguous(memory_format=torch.channels_last)
-        if self.folded_backbone is None:
-            feats = self.img_backbone(images)
-        else:
-            feats = self.folded_backbone(self.img_backbone, images)
+        folded, backbone = self.folded_backbone, self.img_backbone
+        feats = backbone(images) if folded is None else folded(backbone, images)
         if self.img_neck is not None:
             feats = self.img_neck(feats)
         return [feat.unflatten(0, (batch, -1)) for feat in feats]

@@ -38,7 +38,6 @@ class BEVMaskHead(nn.Sequential):
         pos_weight: Weight of the drawn cells in it.
         dice_weight: Weight of the dice loss of all masks together.
         num_masks: 1 for all elements in one mask, else the number of classes.
-        name: Name of its weights and of its loss.
     """
 
     feats, target = "bev_feats", "gt_seg"  # (B, C, H, W) and (B, classes or 1, H, W)
@@ -110,11 +109,8 @@ class NormedPVMaskHead(PVMaskHead):
         """Return two 3x3 convolutions with BatchNorm and a 1x1."""
         layers: list[nn.Module] = []
         for _ in range(2):
-            layers += [
-                nn.Conv2d(embed_dims, embed_dims, 3, padding=1, bias=False),
-                nn.BatchNorm2d(embed_dims),
-                nn.ReLU(True),
-            ]
+            conv = nn.Conv2d(embed_dims, embed_dims, 3, padding=1, bias=False)
+            layers += [conv, nn.BatchNorm2d(embed_dims), nn.ReLU(True)]
         return nn.Sequential(*layers, nn.Conv2d(embed_dims, num_masks, 1))
 
 
@@ -122,10 +118,7 @@ class NormedPVMaskHead(PVMaskHead):
 class DepthSupervision(nn.Module):
     """The depth of an encoder that lifts features, from ``gt_depth`` (V, H, W) of a LiDAR.
 
-    Args:
-        loss_weight: Weight of the loss.
-        name: Name of its loss.
-        kwargs: What other auxiliary heads take; not used.
+    What other auxiliary heads take, ``kwargs``, is not used.
     """
 
     def __init__(self, loss_weight: float = 3.0, name: str = "depth", **kwargs: Any) -> None:

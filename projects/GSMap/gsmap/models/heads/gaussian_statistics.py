@@ -20,12 +20,9 @@ def gaussian_statistics(
     """Summarise matched elements by class; a class without one is left out.
 
     Gaussians of the predictions (M, P), their masks, those of their ground truths (M, H, W), and
-    classes (M,); ``floor_m`` is the smallest sigma in metres.
-
-    Returns:
-        Per class ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>``
-        (medians in metres); of all ``at_floor``, the share of Gaussians whose sigmas both lie
-        within 10 % of the smallest. Scalars.
+    classes (M,); ``floor_m`` is the smallest sigma in metres. Scalars: per class
+    ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>`` (medians in
+    metres); of all ``at_floor``, the share of Gaussians whose sigmas both lie within 10 % of it.
     """
     if not len(labels):
         return {}
@@ -40,6 +37,5 @@ def gaussian_statistics(
             along, across = extents[chosen].flatten(0, 1).median(0).values
             figures[f"soft_iou/{name}"] = iou[chosen].mean()
             figures[f"sigma_along/{name}"], figures[f"sigma_across/{name}"] = along, across
-    floor = (gaussians.scales < AT_FLOOR * floor_m).all(-1)
-    figures["at_floor"] = floor.float().mean()
-    return figures
+    at_floor = (gaussians.scales < AT_FLOOR * floor_m).all(-1)
+    return {**figures, "at_floor": at_floor.float().mean()}

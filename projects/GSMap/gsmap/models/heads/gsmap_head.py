@@ -20,8 +20,7 @@ class GSMapHead(MapHead):
 
     A query's reference becomes a Gaussian (paper, Eq. 1), the decoder's layers are guided by it,
     matching adds the IoU cost of rendered masks (Eq. 9) and the losses the raster loss (Eqs. 10 and
-    12). Nothing is rendered at inference. Each of these can be switched off by itself. Arguments
-    besides those of `MapHead`:
+    12). Nothing is rendered at inference. Besides `MapHead`'s arguments:
 
     Args:
         loss_raster: Settings of the loss of the rendered masks, or None to train without it; what

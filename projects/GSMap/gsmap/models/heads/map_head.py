@@ -1,5 +1,6 @@
 """The map head, composed of parts: queries, predictions of every layer, matching, losses."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
@@ -7,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
+from mmengine.logging import print_log
 from mmengine.model import BaseModule, bias_init_with_prob
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
@@ -15,7 +17,7 @@ from gsmap.models.decoders.map_decoder import MapDecoder
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.matched import MatchedPairs
 from gsmap.models.heads.parts import by_name, check_parts
-from gsmap.models.heads.query_groups import QueryGroup, fit_instance_queries, group_mask
+from gsmap.models.heads.query_groups import QueryGroup
 from gsmap.models.layers.branches import classification_branch
 from gsmap.models.layers.deformable_attention import at_least_float32, init_matrices
 from gsmap.models.task_modules.map_assigner import MapAssigner
@@ -31,10 +33,8 @@ class MapHead(BaseModule):
     """Predict N map elements of P ordered points from BEV features, as its parts say.
 
     A query is the sum of its instance's and its point's embedding (MapTR); half of its channels are
-    position, half content. Methods are combined by their parts: a reference that the decoder
-    refines, the decoder's layers, query groups, matching costs, losses of matched pairs, auxiliary
-    heads. A loss or a cost names the fields that it reads (``reads``); what nobody offers is an
-    error when the head is built.
+    position, half content. Methods are combined by their parts. A loss or a cost names the fields
+    that it reads (``reads``); what nobody offers is an error when the head is built.
 
     Args:
         grid: The map's extent.
@@ -44,14 +44,13 @@ class MapHead(BaseModule):
         match_costs: Configs of the matching costs.
         loss_cls: Config of the classification loss, on logits and one-hot targets.
         query_groups: Settings of each `QueryGroup`; the first one predicts.
-        reference: Config of the reference (`PointReference`).
+        reference: Config of what the decoder refines (`PointReference`).
         masks: Settings of `ElementMasks`, for losses and costs that read masks.
         aux_heads: Configs of heads that only help training.
         coder: Settings of `MapCoder`.
         num_points: Points per instance P.
         embed_dims: Channels C.
         num_reg_layers: Hidden layers of each branch.
-        init_cfg: As in mmengine.
 
     Raises:
         ValueError: If a loss or a cost reads a field that nothing here offers or names a class
@@ -77,10 +76,8 @@ class MapHead(BaseModule):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.grid = grid
-        self.classes = tuple(classes)
-        self.num_points = num_points
-        self.embed_dims = embed_dims
+        self.grid, self.classes = grid, tuple(classes)
+        self.num_points, self.embed_dims = num_points, embed_dims
         self.masks = ElementMasks(grid, **(masks or {}))
         self.query_groups = [QueryGroup(**group) for group in query_groups]
         num_instances = sum(group.num for group in self.query_groups)
@@ -92,9 +89,8 @@ class MapHead(BaseModule):
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
         )
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
-        self.pts_embedding: nn.Embedding | None = None
-        if self.decoder.point_queries:
-            self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
+        points = nn.Embedding(num_points, 2 * embed_dims) if self.decoder.point_queries else None
+        self.pts_embedding = points
         self.cls_branches = nn.ModuleList(
             classification_branch(embed_dims, num_reg_layers, len(self.classes))
             for _ in range(decoder["num_layers"])
@@ -126,19 +122,35 @@ class MapHead(BaseModule):
             both = both[: self.query_groups[0].num]
         if self.pts_embedding is not None:
             both = (both[:, None] + self.pts_embedding.weight).flatten(0, 1)
-        position, content = both.split(self.embed_dims, -1)
-        return position, content
+        return both[:, : self.embed_dims], both[:, self.embed_dims :]
 
     def attention_mask(self) -> Tensor | None:
         """Return which instances may not attend to each other: those of two groups. (N, N)"""
         if not self.training or len(self.query_groups) == 1:
             return None
-        return group_mask(self.query_groups, self.instance_embedding.weight.device)
+        device = self.instance_embedding.weight.device
+        sizes = torch.tensor([group.num for group in self.query_groups], device=device)
+        owner = torch.arange(len(sizes), device=device).repeat_interleave(sizes)
+        return owner[:, None] != owner
 
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
-        """Fit the instance queries of a checkpoint with another number of further queries."""
-        key = f"{prefix}instance_embedding.weight"
-        fit_instance_queries(state, key, self.instance_embedding.weight, self.query_groups[0].num)
+        """Fit a checkpoint's instance queries (N, 2 C) to the model's, in place.
+
+        The first ones, which predict, are taken as they are. Surplus further queries are cut off;
+        missing ones keep their initial values. A log line says so.
+        """
+        key, own = f"{prefix}instance_embedding.weight", self.instance_embedding.weight
+        loaded, predicting = state.get(key), self.query_groups[0].num
+        if loaded is None or len(loaded) < predicting or loaded.shape == own.shape:
+            return
+        kept = loaded[: len(own)]
+        state[key] = torch.cat([kept, own.detach()[len(kept) :].to(kept)])
+        print_log(
+            f"{key}: the checkpoint has {len(loaded)} instance queries, the model {len(own)}; the "
+            f"{predicting} that predict are taken, the further ones cut off or left as new.",
+            "current",
+            logging.WARNING,
+        )
 
     def forward(self, bev_outputs: dict[str, Tensor]) -> dict[str, Tensor]:
         """Predict the elements after every decoder layer from ``bev_feats`` (B, C, H, W).
@@ -150,14 +162,8 @@ class MapHead(BaseModule):
         """
         bev_feats = bev_outputs["bev_feats"]
         query_pos, query = (part.expand(len(bev_feats), -1, -1) for part in self.queries())
-        decoded = self.decoder(
-            query,
-            query_pos,
-            self.reference.start(query_pos),
-            bev_feats,
-            self.reference.refine,
-            self.attention_mask(),
-        )
+        start, refine, mask = self.reference.start, self.reference.refine, self.attention_mask()
+        decoded = self.decoder(query, query_pos, start(query_pos), bev_feats, refine, mask)
         by_point = (-1, self.num_points)
         fields = {name: decoded[name] for name in self.decoder.fields}
         if "instance_states" not in fields:
@@ -196,11 +202,8 @@ class MapHead(BaseModule):
         """Prepare the ground truth and return the losses of every decoder layer and query group.
 
         Ground truth is, per sample, ``labels_3d`` (K,), ``pts`` (K, P, 2), ``pts_shifts`` (K, S, P,
-        2) in metres, and for masks ``polylines`` (K, M, 2).
-
-        Returns:
-            The last layer's losses under their names, the others' with the prefix ``d<layer>.``;
-            those of a further query group end in its name.
+        2) in metres, and for masks ``polylines`` (K, M, 2). The last layer's losses have their
+        names, the others' the prefix ``d<layer>.``; those of a further query group end in its name.
 
         Raises:
             FloatingPointError: If a matching cost is not finite.
@@ -219,10 +222,10 @@ class MapHead(BaseModule):
         shared = {k: v for k, v in outputs.items() if k == "bev_feats"}
         start = 0
         for group in self.query_groups:
-            chosen = slice(start, start + group.num)
-            own = {k: v[:, :, chosen] for k, v in outputs.items() if k.startswith("all_")}
+            end = start + group.num
+            own = {k: v[:, :, start:end] for k, v in outputs.items() if k.startswith("all_")}
             yield group, own | shared
-            start += group.num
+            start = end
 
     def group_losses(
         self,
@@ -236,10 +239,8 @@ class MapHead(BaseModule):
         last = len(outputs["all_cls_scores"]) - 1
         suffix = f"_{group.name}" if group.name else ""
         for layer in range(last + 1):
-            predictions = self.layer_predictions(outputs, layer)
-            pairs = self.match(
-                predictions, gts, batch_img_metas, group.repeats, outputs.get("bev_feats")
-            )
+            predictions, feats = self.layer_predictions(outputs, layer), outputs.get("bev_feats")
+            pairs = self.match(predictions, gts, batch_img_metas, group.repeats, feats)
             prefix = "" if layer == last else f"d{layer}."
             for name, value in self.layer_losses(group, pairs, layer == last).items():
                 weight = group.weight if name.startswith("loss_") else 1.0
@@ -250,8 +251,8 @@ class MapHead(BaseModule):
         """Return one sample's ground truth as costs and losses read it.
 
         It has ``labels`` (K,), normalised ``pts_shifts`` (K, S, P, 2) and, in the annotated order,
-        ``first_pts`` (K, P, 2); where something reads them, ``rasters`` (K, h, w) for matching and
-        ``masks`` (K, H, W) at full resolution.
+        ``first_pts`` (K, P, 2); where they are read, ``rasters`` (K, h, w) for matching and
+        ``masks`` (K, H, W).
         """
         gt = InstanceData(
             labels=gt_instances.labels_3d,
@@ -268,8 +269,8 @@ class MapHead(BaseModule):
         """Return a layer's predictions, per sample, as costs and losses read them.
 
         They have ``scores`` (N, classes), normalised ``pts`` (N, P, 2), ``references`` (N, P, D),
-        whatever else the decoder gives (``all_<name>``), and, where a cost reads them, ``rasters``
-        (N, h, w) without gradient.
+        what else the decoder gives, and, where a cost reads them, ``rasters`` (N, h, w) without
+        gradient.
         """
         names = {"all_cls_scores": "scores", "all_pts_preds": "pts", "all_references": "references"}
         fields = {
@@ -303,18 +304,16 @@ class MapHead(BaseModule):
     ) -> dict[str, Tensor]:
         """Return the losses of one layer's predictions."""
         losses: dict[str, Tensor] = {}
-        first = group is self.query_groups[0]
+        first, avg_factor = group is self.query_groups[0], pairs.avg_factor
         if group.has("cls"):
             # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
             one_hot = F.one_hot(pairs.query_labels() + 1, len(self.classes) + 1)[:, 1:]
-            losses["loss_cls"] = self.loss_cls(
-                pairs.query_scores(), one_hot, avg_factor=pairs.avg_factor
-            )
+            losses["loss_cls"] = self.loss_cls(pairs.query_scores(), one_hot, avg_factor=avg_factor)
         for name, loss in self.losses.items():
             late = is_last or not getattr(loss, "last_layer_only", False)
             if late and group.has(name) and (first or not getattr(loss, "first_group_only", False)):
                 values = [pairs[field] for field in cast(Any, loss).reads]
-                losses[f"loss_{name}"] = loss(*values, avg_factor=pairs.avg_factor)
+                losses[f"loss_{name}"] = loss(*values, avg_factor=avg_factor)
         if is_last and first:
             losses.update(self.statistics(pairs))
         return losses
@@ -327,17 +326,16 @@ class MapHead(BaseModule):
         self, bev_outputs: dict[str, Tensor], batch_data_samples: Sequence[Det3DDataSample]
     ) -> list[InstanceData]:
         """Run the head and return its detections."""
-        return self.predict_by_feat(
-            self(bev_outputs), [sample.metainfo for sample in batch_data_samples]
-        )
+        metas = [sample.metainfo for sample in batch_data_samples]
+        return self.predict_by_feat(self(bev_outputs), metas)
 
     def predict_by_feat(
         self, outputs: dict[str, Tensor], batch_img_metas: Sequence[dict[str, Any]]
     ) -> list[InstanceData]:
-        """Decode the last layer's predictions.
+        """Decode the last layer's predictions, best first.
 
-        They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,) and ``pts`` (M, P, 2) in
-        metres, best first, and what else the reference decodes.
+        They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,), ``pts`` (M, P, 2) in metres
+        and what else the reference decodes.
         """
         results = []
         last = zip(outputs["all_cls_scores"][-1], outputs["all_references"][-1], strict=True)

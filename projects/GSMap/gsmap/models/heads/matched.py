@@ -26,16 +26,13 @@ AFTER_MATCHING = frozenset(
 class MatchedPairs:
     """Fields of the M matched pairs of a batch, made when they are first read.
 
-    ``pred.<name>`` is a field of the predictions, ``gt.<name>`` one of the ground truths, samples
-    concatenated. Besides the samples' own fields: ``pred.pts_m``, ``gt.pts_m`` in metres (M, P, 2);
-    ``gt.pts``, normalised, in the matched order (M, P, 2); ``pred.masks``, rendered from the
-    Gaussians, and ``gt.masks`` (M, H, W); ``gt.samples``, the sample's number in the batch (M,);
-    ``gt.inds``, the ground truth's number in its sample (M,); ``gt.counts``, each sample's number
-    of pairs, Python integers; ``bev_feats`` of the batch (B, C, H, W). Predictions of one layer,
-    prepared ground truths and their matches are given per sample.
-
-    Attributes:
-        avg_factor: Matched elements in the batch, averaged over ranks, at least 1. ()
+    ``pred.<name>`` is a field of the predictions of one layer, ``gt.<name>`` one of the ground
+    truths, samples concatenated. Besides the samples' own fields: ``pred.pts_m``, ``gt.pts_m`` in
+    metres (M, P, 2); ``gt.pts``, normalised, in the matched order (M, P, 2); ``pred.masks``,
+    rendered from the Gaussians, and ``gt.masks`` (M, H, W); ``gt.samples``, the sample's number in
+    the batch (M,); ``gt.inds``, the ground truth's number in its sample (M,); ``gt.counts``, each
+    sample's number of pairs, Python integers; ``bev_feats`` of the batch (B, C, H, W).
+    ``avg_factor`` is the number of pairs, averaged over ranks, at least 1. ()
     """
 
     def __init__(
@@ -83,12 +80,12 @@ class MatchedPairs:
             return self._masks.render(gaussians, self._masks.grid)
         if field == "gt.masks" and self._masks.source == "points":
             return self._masks.draw(self["gt.pts_m"], self["gt.labels"], self._masks.grid)
-        if field == "gt.samples":
-            counts = torch.tensor(self["gt.counts"])
-            samples = torch.arange(len(counts)).repeat_interleave(counts)
-            return samples.to(self.avg_factor.device)
         if field == "gt.inds":
             return torch.cat([match.gt_inds for match in self.matches])
+        if field == "gt.samples":
+            return torch.cat(
+                [m.gt_inds.new_full(m.gt_inds.shape, i) for i, m in enumerate(self.matches)]
+            )
         side, name = field.split(".")
         pairs = list(zip(self._sides[side], self.matches, strict=True))
         if field == "gt.pts":

@@ -1,6 +1,6 @@
 """What a head refuses when it is built: parts that do not fit together."""
 
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Sequence, Set
 from typing import TYPE_CHECKING, Any
 
 from torch import nn
@@ -39,11 +39,17 @@ def check_parts(head: "MapHead") -> set[str]:
                 f"query group {group.name!r} names losses {unknown}; there are {names}."
             )
     costs, losses = head.assigner.match_costs, list(head.losses.values())
-    _check_classes(head, [*losses, *costs])
+    named = {"masks.filled_classes": head.masks.filled_classes}
+    for part in [*losses, *costs]:
+        if hasattr(part, "renderer"):
+            named[f"{type(part).__name__}.polygon_classes"] = part.renderer.polygon_classes
+    for name, indices in named.items():
+        if any(not 0 <= index < len(head.classes) for index in indices):
+            raise ValueError(
+                f"{name} must be indices of {list(head.classes)}, got {tuple(indices)}."
+            )
     pred = {"scores", "instance_states", *head.reference.fields, *head.decoder.fields}
-    offered = (
-        {"bev_feats"} | {f"pred.{name}" for name in pred} | {f"gt.{name}" for name in GT_FIELDS}
-    )
+    offered = {"bev_feats", *(f"pred.{x}" for x in pred), *(f"gt.{x}" for x in GT_FIELDS)}
     where = f"{type(head.reference).__name__}, the decoder and the ground truth"
     read = _fields_read(costs, offered - AFTER_MATCHING, f"before the matching, {where}")
     return read | _fields_read(losses, offered, where)
@@ -56,28 +62,13 @@ def _refuse_twins(names: Sequence[str], what: str) -> None:
         raise ValueError(f"two {what} have one name, {twins[0]!r}; there are {list(names)}.")
 
 
-def _fields_read(parts: Iterable[Any], offered: Set[str], where: str) -> set[str]:
+def _fields_read(parts: Sequence[Any], offered: Set[str], where: str) -> set[str]:
     """Return the fields that losses or costs read; refuse those that are not offered."""
-    read: set[str] = set()
-    for part in parts:
-        own = set(getattr(part, "reads", ()))
-        missing = sorted(own - offered)
-        if missing:
+    reads = {type(part).__name__: set(getattr(part, "reads", ())) for part in parts}
+    for name, own in reads.items():
+        if own - offered:
             raise ValueError(
-                f"{type(part).__name__} reads {missing}, which {where} do not offer; there are "
+                f"{name} reads {sorted(own - offered)}, which {where} do not offer; there are "
                 f"{sorted(offered)}."
             )
-        read |= own
-    return read
-
-
-def _check_classes(head: "MapHead", parts: Iterable[Any]) -> None:
-    """Refuse masks, losses and costs that fill or render as polygons what is no class."""
-    named = {"masks.filled_classes": head.masks.filled_classes}
-    for part in parts:
-        if hasattr(part, "renderer"):
-            named[f"{type(part).__name__}.polygon_classes"] = part.renderer.polygon_classes
-    classes = list(head.classes)
-    for name, indices in named.items():
-        if any(not 0 <= index < len(classes) for index in indices):
-            raise ValueError(f"{name} must be indices of {classes}, got {tuple(indices)}.")
+    return set().union(*reads.values())

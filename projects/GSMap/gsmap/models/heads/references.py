@@ -47,8 +47,7 @@ class PointReference(nn.Module):
     Raises:
         ValueError: If ``coords`` is not 2 or 3, a height lacks its range, or that is empty.
 
-    Attributes:
-        fields: Names of what a loss or a cost may read of a prediction.
+    ``fields`` are what a loss or a cost may read of a prediction.
     """
 
     fields: ClassVar[frozenset[str]] = frozenset({"pts", "pts_m", "references"})
@@ -109,10 +108,8 @@ class PointReference(nn.Module):
     def norm(self, points_m: Tensor) -> Tensor:
         """Bring points in metres to [0, 1]; the inverse of :meth:`metres`.
 
-        A height outside ``z_range`` becomes the nearest one in it, as in MapTRv2.
-
-        Raises:
-            ValueError: If the points have no height and the reference has.
+        A height outside ``z_range`` becomes the nearest one in it, as in MapTRv2. ValueError if the
+        points have no height and the reference has.
         """
         if points_m.shape[-1] < self.coords:
             raise ValueError(
@@ -136,12 +133,12 @@ class GaussianReference(PointReference):
     """A Gaussian per query: its centre is the point, sigma and theta follow it (GSMap Eq. 1).
 
     What it adds to points starts neutral: every query has the same Gaussian, every layer leaves it.
+    The points may have a height, the Gaussians lie in the plane. Besides `PointReference`'s:
 
     Args:
         mlp: Predict sigma and theta by branches like the points' (GSMap Eq. 8) in place of one
             linear layer each.
-        space: Settings of `GaussianSpace`: ``min_scale_m`` and so on. The other arguments are those
-            of the points, which may have a height; the Gaussians lie in the plane.
+        space: Settings of `GaussianSpace`: ``min_scale_m`` and so on.
     """
 
     fields = PointReference.fields | {"masks", "rasters"}

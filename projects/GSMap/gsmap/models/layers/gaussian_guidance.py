@@ -27,9 +27,7 @@ class GaussianGuidance(nn.Module):
         hidden_dims: int = 16,
     ) -> None:
         super().__init__()
-        self.space = space
-        self.sampling = sampling
-        self.invariant = invariant
+        self.space, self.sampling, self.invariant = space, sampling, invariant
         self.embedding = mlp(6, hidden_dims, embed_dims) if embedding else None
         self.init_weights()
 
@@ -44,14 +42,14 @@ class GaussianGuidance(nn.Module):
             return query_pos
         return query_pos + self.embedding(self.space.describe(reference))
 
-    def frames(self, reference: Tensor, shape: tuple[int, int]) -> Tensor | None:
+    def frames(self, reference: Tensor, feats: Tensor) -> Tensor | None:
         """Return what turns sampling offsets in cells into each Gaussian's frame, or None.
 
         The matrices (B, Q, 2, 2) of references (B, Q, D) multiply offsets (x, y) in cells of the
-        sampled map, of ``shape`` rows and columns, from the left.
+        sampled map (B, C, H, W) from the left.
         """
         if not self.sampling:
             return None
-        cell_m = reference.new_tensor(self.space.grid.resized(*shape).pixel_size_m)
+        cell_m = reference.new_tensor(self.space.grid.resized(*feats.shape[-2:]).pixel_size_m)
         # The frames act on metres; brought to cells, the identity stays the identity bit by bit.
         return self.space.frames(reference, self.invariant) * (cell_m / cell_m[:, None])

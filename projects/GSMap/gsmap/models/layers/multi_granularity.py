@@ -23,7 +23,7 @@ class Granularities(NamedTuple):
 
     instances: Tensor  # (B, N, C)
     points: Tensor | None = None  # none before the first layer (B, N, P, C)
-    point_code: Tensor | None = None  # position code, none without codes (B, N, P, C)
+    point_code: Tensor | float = 0.0  # position code (B, N, P, C), 0 without codes
     mean_locations: Tensor | None = None  # of each point's samples (B, N, P, 2)
 
 
@@ -43,9 +43,6 @@ class PerPointSampling(SamplingAttention):
         num_samples: Samples per head, level and point K.
         num_levels: Levels of BEV features.
         kwargs: ``embed_dims`` C, ``num_heads`` and ``dropout`` as in :class:`SamplingAttention`.
-
-    Raises:
-        ValueError: If ``embed_dims`` is not divisible by ``num_heads``.
     """
 
     def __init__(
@@ -66,10 +63,8 @@ class PerPointSampling(SamplingAttention):
 
         Points and their code are those of the layer before. Instances have a position (B, N, C),
         points references (B, N, P, D) and frames (B, N * P, 2, 2), as in `place_samples`; features
-        are levels x (B, C, H, W), the finest first.
-
-        Raises:
-            ValueError: If the numbers of levels or points are not the module's.
+        are levels x (B, C, H, W), the finest first. ValueError if the numbers of levels or points
+        are not the module's.
         """
         samples = self.look(state.instances + position, reference, feats, frames)
         updated = self.update(state, feats, samples)
@@ -103,8 +98,8 @@ class PerPointSampling(SamplingAttention):
         offsets = self.offsets_in_cells(query).unflatten(-2, self.layout)
         offsets = offsets.permute(3, 0, 1, 4, 2, 5, 6).flatten(2, 3)  # (levels, B, N P, heads, K,2)
         locations = [
-            place_samples(by_level, reference.flatten(1, 2), (height, width), frames)
-            for by_level, (*_, height, width) in zip(offsets, (f.shape for f in feats), strict=True)
+            place_samples(by_level, reference.flatten(1, 2), (f.shape[-2], f.shape[-1]), frames)
+            for by_level, f in zip(offsets, feats, strict=True)
         ]
         logits = at_least_float32(self.attention_weights(query))
         logits = logits.unflatten(-1, (self.num_heads, *self.layout))
@@ -121,15 +116,12 @@ class PerPointSampling(SamplingAttention):
 
         Weights have the locations' shape without its last entry. (B, Q, levels, heads, C / heads)
         """
-        seen = [
-            deformable_sample(
-                self.values(level_feats.flatten(2).transpose(1, 2)),
-                (level_feats.shape[-2], level_feats.shape[-1]),
-                locations[:, :, level],
-                weights[:, :, level],
+        seen = []
+        for level, f in enumerate(feats):
+            value, shape = self.values(f.flatten(2).transpose(1, 2)), (f.shape[-2], f.shape[-1])
+            seen.append(
+                deformable_sample(value, shape, locations[:, :, level], weights[:, :, level])
             )
-            for level, level_feats in enumerate(feats)
-        ]
         return torch.stack(seen, 2).unflatten(-1, (self.num_heads, -1))
 
 
@@ -224,10 +216,10 @@ class MultiGranularityAttention(PerPointSampling):
         instances = torch.einsum("bnplh,bnplhc->bnhc", shares, by_head)
         return instances.flatten(2), by_head.mean(3).flatten(3)
 
-    def codes(self, samples: Samples) -> tuple[Tensor | None, Tensor | None]:
-        """Return the position codes of points (B, N, P, C) and instances (B, N, C)."""
+    def codes(self, samples: Samples) -> tuple[Tensor | float, Tensor | float]:
+        """Return the position codes of points (B, N, P, C) and instances (B, N, C), 0 for none."""
         locations = samples.locations.mean((3, 4))  # (B, N, P, K, 2)
-        point_code = instance_code = None
+        point_code = instance_code = 0.0
         # Differs from the poster's MLP(S, W): the released model codes their product.
         if self.point_code is not None:
             weighted = locations * samples.point_weights.mean((3, 4))[..., None]
@@ -237,27 +229,29 @@ class MultiGranularityAttention(PerPointSampling):
             instance_code = self.instance_code(weighted.flatten(2))
         return point_code, instance_code
 
-    def interact_points(self, points: Tensor, code: Tensor | None, before: Granularities) -> Tensor:
+    def interact_points(
+        self, points: Tensor, code: Tensor | float, before: Granularities
+    ) -> Tensor:
         """Let points attend to their instance's, now and in the layer before. (B, N, P, C)"""
         if self.p2p is None:
             return points
-        value, query = points, add_code(points, code)
-        key = query
+        value = points
+        query = key = points + code
         # Differs from the poster, whose later layers attend to the points of the layer before only.
         if before.points is not None:
             value = torch.cat([before.points, value], 2)  # (B, N, 2 P, C)
-            key = torch.cat([add_code(before.points, before.point_code), key], 2)
+            key = torch.cat([before.points + before.point_code, key], 2)
         flat = [x.flatten(0, 1) for x in (points, query, key, value)]
         return self.p2p(*flat).unflatten(0, points.shape[:2])
 
     def interact_instances(
-        self, points: Tensor, code: Tensor | None, instances: Tensor, instance_code: Tensor | None
+        self, points: Tensor, code: Tensor | float, instances: Tensor, instance_code: Tensor | float
     ) -> Tensor:
         """Let all points of a sample attend to its aggregated instance queries. (B, N, P, C)"""
         if self.p2i is None:
             return points
-        query, key = add_code(points, code), add_code(instances, instance_code)
-        attended = self.p2i(points.flatten(1, 2), query.flatten(1, 2), key, instances)
+        query, key = (points + code).flatten(1, 2), instances + instance_code
+        attended = self.p2i(points.flatten(1, 2), query, key, instances)
         return attended.unflatten(1, points.shape[1:3])
 
 
@@ -275,8 +269,3 @@ class Interaction(nn.Module):
         """Update the content (B, Q, C) from keys and values (B, S, C). -> (B, Q, C)"""
         attended = self.attn(query, key, value, need_weights=False)[0]
         return self.norms[1](self.ffn(self.norms[0](content + self.dropout(attended))))
-
-
-def add_code(query: Tensor, code: Tensor | None) -> Tensor:
-    """Return the queries with their position code, if there is one."""
-    return query if code is None else query + code

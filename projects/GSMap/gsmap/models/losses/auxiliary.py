@@ -5,22 +5,12 @@ from torch import Tensor
 
 
 def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, float]) -> Tensor:
-    """Turn sparse depth images into the class targets of a depth net.
+    """Return the depth bin of each block of ``stride`` x ``stride`` pixels, -1 for none, int64.
 
-    A block of ``stride`` x ``stride`` pixels takes its nearest return. Bin 0 starts at ``low``; a
-    block whose nearest return lies in front of ``low`` or beyond the last bin has no target, even
-    if a further one would.
-
-    Args:
-        depth_m: Depth along the optical axis in metres, 0 where there is no return. (..., H, W)
-        stride: Pixels per feature pixel.
-        depth_range: ``(low, high, step)`` in metres.
-
-    Returns:
-        Bin of each block, -1 for none, int64. (..., H / stride, W / stride)
-
-    Raises:
-        ValueError: If the image size is no multiple of ``stride``.
+    A block takes its nearest return. Bin 0 of ``(low, high, step)`` starts at ``low``; a block
+    whose nearest return lies in front of it or beyond the last bin has no target, even if a further
+    one would. ValueError if the size is no multiple of ``stride``. Depth along the optical axis in
+    metres, 0 without a return (..., H, W) -> (..., H / stride, W / stride)
     """
     height, width = depth_m.shape[-2:]
     if height % stride or width % stride:
@@ -31,8 +21,7 @@ def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, fl
     blocks = depth_m.unflatten(-1, (-1, stride)).unflatten(-3, (-1, stride))  # (..., h, s, w, s)
     nearest = torch.where(blocks == 0, torch.inf, blocks).amin((-3, -1))  # (..., h, w)
     position = (nearest - (low - step)) / step
-    num_bins = num_depth_bins(depth_range)
-    valid = (position >= 1) & (position < num_bins + 1)
+    valid = (position >= 1) & (position < num_depth_bins(depth_range) + 1)
     return torch.where(valid, position, 0).long() - 1
 
 

@@ -47,10 +47,9 @@ class ElementRenderer:
 
     def render(self, points: Tensor, is_polygon: Tensor) -> Tensor:
         """Return masks of elements whose vertices are normalised. (n, P, 2), (n,) -> (n, H, W)"""
-        height, width = self.size
-        pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
+        pixels = points[..., :2] * points.new_tensor(self.size).flip(0)
         softness = self.line_softness, self.polygon_softness
-        return soft_rasters(pixels, height, width, is_polygon, *softness, self.distance)
+        return soft_rasters(pixels, *self.size, is_polygon, *softness, self.distance)
 
 
 def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
@@ -69,10 +68,8 @@ def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
 class RenderedDiceLoss(nn.Module):
     """Dice loss between softly rendered predictions and ground truths (MapVR, section 4.3).
 
-    Args:
-        loss_weight: Weight of the loss.
-        size: Rows and columns of the rasters.
-        rendering: Further settings of `ElementRenderer`.
+    ``size`` are rows and columns of the rasters, ``rendering`` further settings of
+    `ElementRenderer`.
     """
 
     name = "dice"

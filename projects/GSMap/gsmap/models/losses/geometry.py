@@ -6,6 +6,7 @@ element has an edge from its last point to its first, open lines too.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -74,12 +75,9 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
 
 
 class EuclideanLoss(nn.Module):
-    """GeMap's Euclidean loss of matched elements: their shapes and their relations.
+    """GeMap's Euclidean loss of matched elements, of their shapes and of their relations.
 
-    Args:
-        loss_weight: Weight of the loss (lambda in the supplement's Table A1).
-        shape_weight: Weight of the shapes in it.
-        relation_weight: Weight of the relations in it.
+    ``loss_weight`` is the lambda of the supplement's Table A1; the other weights are within it.
     """
 
     name = "euclidean"
@@ -93,17 +91,11 @@ class EuclideanLoss(nn.Module):
         self.shape_weight, self.relation_weight = shape_weight, relation_weight
 
     def forward(
-        self,
-        pred: Tensor,
-        target: Tensor,
-        counts: Sequence[int],
-        avg_factor: float | Tensor | None = None,
+        self, pred: Tensor, target: Tensor, counts: Sequence[int], avg_factor: Any = None
     ) -> Tensor:
-        """Return the weighted loss, 0 with a gradient of 0 if nothing is matched.
+        """Return the weighted loss of its parts, which are means: ``avg_factor`` does not count.
 
-        Its parts are means: ``avg_factor`` does not divide them. Points are normalised to [0, 1],
-        sample after sample, of ``counts`` matches each, in the matched order; heights are left out.
-        2 x (M, P, 2 or 3) -> ()
+        Arguments as of `euclidean_relation_loss`; heights are left out. 2 x (M, P, 2 or 3) -> ()
         """
         with torch.autocast(pred.device.type, enabled=False):
             dtype = torch.promote_types(pred.dtype, torch.float32)

@@ -15,11 +15,7 @@ def check_same_points(pred: Tensor, target: Tensor) -> None:
 
 
 class PointsLoss(nn.Module):
-    """L1 distance of the points of matched pairs (MapTR Eq. 6, GSMap Eq. 11).
-
-    Args:
-        loss_weight: Weight of the loss: GSMap's lambda_v.
-    """
+    """L1 distance of the points of matched pairs (MapTR Eq. 6, GSMap Eq. 11: weight lambda_v)."""
 
     name = "pts"
     reads: tuple[str, ...] = ("pred.pts", "gt.pts")
@@ -29,10 +25,9 @@ class PointsLoss(nn.Module):
         self.loss_weight = loss_weight
 
     def forward(self, pred: Tensor, target: Tensor, avg_factor: float | Tensor) -> Tensor:
-        """Return the weighted sum over ``avg_factor``, of points in the same units and order.
+        """Return the weighted sum over ``avg_factor``, of normalised points in the same order.
 
-        Points are normalised, (M, P, 2 or 3) each; without any the loss is zero. ValueError if the
-        shapes disagree.
+        ValueError if the shapes disagree. 2 x (M, P, 2 or 3) -> ()
         """
         check_same_points(pred, target)
         return self.loss_weight * ((pred - target).abs().sum() / avg_factor)
@@ -62,33 +57,26 @@ class DirectionLoss(PointsLoss):
         super().__init__(loss_weight)
 
     def forward(self, pred: Tensor, target: Tensor, avg_factor: float | Tensor) -> Tensor:
-        """Return the weighted sum over ``avg_factor``. 2 x (M, P, 2 or 3) -> ()
-
-        Points are in metres, so that x and y weigh the same. ValueError if the shapes disagree.
-        """
+        """Return the weighted sum of points in metres: x and y weigh the same. As `PointsLoss`."""
         check_same_points(pred, target)
         turns = _sum_of_turns(pred.diff(dim=1), target.diff(dim=1))
         return self.loss_weight * (turns / avg_factor)
 
 
-class SelfDirectionLoss(nn.Module):
+class SelfDirectionLoss(PointsLoss):
     """One minus the cosine between consecutive edges of a prediction (MapVR Eq. 4).
 
     It keeps predictions from folding back where nothing but their rendering is supervised. Both
     edges of a pair get a gradient; a ring's last edge and its first are no pair.
-
-    Args:
-        loss_weight: Weight of the loss.
     """
 
     name = "dir"
     reads = ("pred.pts_m",)
 
     def __init__(self, loss_weight: float = 0.002) -> None:
-        super().__init__()
-        self.loss_weight = loss_weight
+        super().__init__(loss_weight)
 
-    def forward(self, pred: Tensor, avg_factor: float | Tensor) -> Tensor:
+    def forward(self, pred: Tensor, avg_factor: float | Tensor) -> Tensor:  # type: ignore[override]
         """Return the weighted sum over ``avg_factor`` of points in metres. (M, P, 2 or 3) -> ()"""
         # Differs from MapVR Eq. (4), which sums the cosines: their sign would reward folding.
         edges = pred.diff(dim=1)

@@ -9,17 +9,11 @@ from gsmap.structures.grid import BEVGrid
 
 
 class Detections(NamedTuple):
-    """The best detections of one sample, highest score first.
+    """The best detections of one sample, highest score first. (M,) each"""
 
-    Attributes:
-        scores: Confidence in [0, 1]. (M,)
-        labels: Class index. (M,)
-        query_inds: The query of each; one query may appear with several classes. (M,)
-    """
-
-    scores: Tensor
-    labels: Tensor
-    query_inds: Tensor
+    scores: Tensor  # confidence in [0, 1]
+    labels: Tensor  # class index
+    query_inds: Tensor  # the query of each; one may appear with several classes
 
 
 class MapCoder:
@@ -46,10 +40,8 @@ class MapCoder:
             raise ValueError(f"max_num must be >= 1, got {max_num}.")
         if margin_m is not None and margin_m <= 0:
             raise ValueError(f"margin_m must be > 0, got {margin_m}.")
-        self.grid = grid
-        self.max_num = max_num
-        self.margin_m = margin_m
-        self.score_threshold = score_threshold
+        self.grid, self.max_num = grid, max_num
+        self.margin_m, self.score_threshold = margin_m, score_threshold
 
     def decode(self, scores: Tensor, pts: Tensor) -> Detections:
         """Select at most ``max_num`` detections; index ``pts`` with their ``query_inds``.
@@ -69,8 +61,7 @@ class MapCoder:
 
     def best(self, scores: Tensor) -> Detections:
         """Return the best pairs of query and class, wherever they lie. (N, classes)"""
-        num_classes = scores.shape[-1]
         flat = scores.float().sigmoid().flatten()
         best, index = flat.topk(min(self.max_num, len(flat)))
-        query = torch.div(index, num_classes, rounding_mode="floor")
-        return Detections(best, index % num_classes, query)
+        query = torch.div(index, scores.shape[-1], rounding_mode="floor")
+        return Detections(best, index % scores.shape[-1], query)

@@ -47,12 +47,8 @@ class OrderedPointsCost:
 class IoUCost:
     """Cost of the overlap of the rasters that the head has rendered (GSMap Eq. 9).
 
-    Args:
-        weight: Weight of the cost.
-        kind: ``"iou"``: 1 - sum min / sum max; ``"dice"``: MapVR's dice loss.
-
-    Raises:
-        ValueError: If ``kind`` is unknown.
+    It is, times ``weight``, with ``kind`` ``"iou"`` 1 - sum min / sum max, with ``"dice"`` MapVR's
+    dice loss. ValueError if ``kind`` is unknown.
     """
 
     reads = ("pred.rasters", "gt.rasters")
@@ -60,18 +56,13 @@ class IoUCost:
     def __init__(self, weight: float = 1.0, kind: str = "iou") -> None:
         if kind not in ("iou", "dice"):
             raise ValueError(f"kind must be 'iou' or 'dice', got {kind!r}.")
-        self.weight = weight
-        self.kind = kind
+        self.weight, self.kind = weight, kind
 
     @torch.no_grad()
     def __call__(
         self, pred_instances: InstanceData, gt_instances: InstanceData, img_meta: Any = None
     ) -> Tensor:
-        """Compare ``rasters`` (N, h, w) with ``rasters`` (K, h, w), without gradient. (N, K)
-
-        Raises:
-            ValueError: If either has no ``rasters``.
-        """
+        """Compare ``rasters`` (N, h, w) and (K, h, w); ValueError if either has none. (N, K)"""
         for name, instances in (("pred_instances", pred_instances), ("gt_instances", gt_instances)):
             if "rasters" not in instances:
                 raise ValueError(
@@ -87,10 +78,8 @@ class IoUCost:
 class RenderedDiceCost:
     """Dice loss of softly rendered points, each pair rendered as the ground truth's class (MapVR).
 
-    Args:
-        weight: Weight of the cost.
-        size: Rows and columns of the rasters.
-        rendering: Further settings of `ElementRenderer`.
+    ``size`` are rows and columns of the rasters, ``rendering`` further settings of
+    `ElementRenderer`.
     """
 
     reads = ("pred.pts", "gt.first_pts", "gt.labels")
