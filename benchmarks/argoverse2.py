@@ -5,8 +5,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from gsmap.converters.argoverse2.convert import select_logs
-from gsmap.converters.argoverse2.log import PoseTable, find_split
+from gsmap.converters.argoverse2.log import PoseTable, find_logs
 from gsmap.converters.argoverse2.map import MAP_CLASSES, Argoverse2Map
 
 _SETS = {
@@ -31,7 +30,7 @@ def measure_extraction(root: Path, split: str = "val", stride: int = 10) -> dict
         Milliseconds per frame by set of classes, milliseconds per log for its preparation, the
         number of frames, and the largest resident memory of the process in MB.
     """
-    log_dirs = select_logs(find_split(root, split))
+    log_dirs = find_logs(root, split)
     started = time.process_time()
     maps = [Argoverse2Map.from_log(log_dir) for log_dir in log_dirs]
     prepared = time.process_time() - started

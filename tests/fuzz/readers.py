@@ -361,7 +361,7 @@ class Files:
 
     def tables(self) -> list[MapSample]:
         opened = NuScenesTables(VERSION, self.work, with_sweeps=True)
-        read = SampleReader(opened, 3).read
+        read = SampleReader(opened, 3, CanBusReader(self.work)).read
         drives = [(s, scene) for scene in opened.scene for s in opened.samples_of(scene)]
         found = [read(s, scene) for s, scene in drives if LIDAR in s["data"]]
         return self.written(LIDAR_META, found)

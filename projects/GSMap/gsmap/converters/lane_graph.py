@@ -36,17 +36,12 @@ class LanePaths:
     The graph has a node for every polyline point (rounded to 1 mm, so that lanes may share nodes),
     an edge between consecutive points, and an edge from the end of each lane to the start of each
     of its successors. A path runs from a node that nothing leads to, to a node that leads nowhere,
-    without visiting a node twice.
-
-    Points that only one lane has can neither start, end nor branch a path; they are folded into the
-    edges once per map, so that a frame's search takes about one step per lane.
+    without visiting a node twice. Points that only one lane has are folded into the edges once per
+    map, so that a frame's search takes about one step per lane.
 
     Args:
-        polylines: Points of each lane's line, in metres, map frame. list of (n >= 2, 3)
+        polylines: Points of each lane's line, in metres, map frame, finite. list of (n >= 2, 3)
         links: Which lanes follow which.
-
-    Raises:
-        ValueError: If a polyline has fewer than two points, is not (n, 3) or not finite.
     """
 
     def __init__(self, polylines: Sequence[np.ndarray], links: LaneLinks) -> None:
@@ -70,16 +65,8 @@ class LanePaths:
     def simplified(self, lanes: Sequence[int]) -> np.ndarray:
         """Return every simple path through the given lanes, simplified (Douglas-Peucker, 0.2 m).
 
-        The latest answer is kept: neighbouring frames usually see the same lanes.
-
-        Args:
-            lanes: Positions of the lanes that take part, in the order of the map.
-
-        Returns:
-            3-D line strings in the map frame. (paths,)
-
-        Raises:
-            ValueError: If the lanes allow more than ``MAX_PATHS`` paths.
+        Lanes are positions, in the order of the map. The result are 3-D line strings in the map
+        frame, at most ``MAX_PATHS``. The latest is kept: neighbouring frames often see the same.
         """
         key = tuple(lanes)
         if key != self._memo[0]:

@@ -109,7 +109,7 @@ def _read(
     }
     times = {name: np.unique(content.times_ns[topic]) for name, (topic, _) in topics.items()}
     first = next((name for name in times if "front" in name.lower()), next(iter(times)))
-    wanted = times[first] if rate_hz is None else thin_out(times[first], rate_hz)
+    wanted = thin_out(times[first], rate_hz)
     nearest = nearest_images(times, wanted.tolist(), _TOLERANCE_NS)
     frames = [
         RigFrame(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import shapely
 
-from gsmap.converters.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, POSES, find_split
+from gsmap.converters.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_logs
 from gsmap.converters.argoverse2.map import COMPAT_MODES
 from gsmap.converters.argoverse2.samples import Argoverse2Options, LogSamples, read_log
 from gsmap.converters.command_line import (
@@ -20,7 +20,6 @@ from gsmap.converters.command_line import (
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
-from gsmap.utils.files import SUFFIX as PARTIAL
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 
@@ -38,7 +37,7 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     """
     summary = ConversionSummary(options.classes)
     target = options.path_of("av2", options.split)
-    log_dirs = select_logs(find_split(options.root, options.split), options.logs)
+    log_dirs = find_logs(options.root, options.split, options.logs)
     log_dirs = _drop_listed(log_dirs, options.keep_map_changes, summary)
     meta, log_dirs = _meta(options, log_dirs), options.shard.part(log_dirs)
     offsets_ns: list[int] = []
@@ -74,25 +73,6 @@ def _try_log(log_dir: Path, options: Argoverse2Options) -> LogSamples | str:
         return read_log(log_dir, options)
     except (OSError, ValueError, shapely.errors.ShapelyError) as error:
         return str(error)
-
-
-def select_logs(split_dir: Path, logs: Sequence[str] = ()) -> list[Path]:
-    """Return a split's log folders whose ids begin as asked (empty takes all), sorted.
-
-    Raises:
-        FileNotFoundError: If the split holds no log, or none that begins as asked.
-    """
-    found = sorted(
-        path
-        for path in split_dir.iterdir()
-        if path.suffix != PARTIAL and ((path / "map").is_dir() or (path / POSES).is_file())
-    )
-    for prefix in logs:
-        if not any(path.name.startswith(prefix) for path in found):
-            raise FileNotFoundError(f"no log in {split_dir} begins with {prefix!r}.")
-    if not found:
-        raise FileNotFoundError(f"no Argoverse 2 log in {split_dir}.")
-    return [path for path in found if not logs or path.name.startswith(tuple(logs))]
 
 
 def _drop_listed(

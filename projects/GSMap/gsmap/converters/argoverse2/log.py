@@ -1,17 +1,19 @@
 """The folder of one Argoverse 2 log: poses, calibration, and when each sensor fired."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.geometry.geometry import quat_to_mat
-from av2.utils.io import read_feather
 from av2.utils.synchronization_database import SynchronizationDB
 from pyarrow import feather
 
 from gsmap.datasets.errors import naming
+from gsmap.utils.files import SUFFIX as PARTIAL
 
 # The order of MapTR and MapTRv2: camera embeddings of their checkpoints depend on it.
 RING_CAMERAS = (
@@ -36,30 +38,19 @@ MAP_CHANGE_LOGS = (
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """The vehicle's poses, in the order of time.
-
-    Args:
-        timestamps_ns: Strictly ascending. (n,)
-        city_from_ego: Pose at each time. (n, 4, 4)
-    """
+    """The vehicle's poses by time, which ascends strictly. (n,), (n, 4, 4)"""
 
     timestamps_ns: np.ndarray
     city_from_ego: np.ndarray
 
     @classmethod
     def read(cls, log_dir: Path) -> "PoseTable":
-        """Read the table of a log's folder.
-
-        Raises:
-            FileNotFoundError: If the table is missing.
-            ValueError: If it is damaged or holds no finite pose.
-        """
+        """Read the table of a log's folder; ValueError if it is damaged or a pose is not finite."""
         path = log_dir / POSES
         if not path.is_file():
             raise FileNotFoundError(f"no poses at {path}: download the log again.")
         with naming(path, "download the log again"):
-            check_feather(path)
-            table = read_feather(path)
+            table = _read_feather(path)
             table = table.drop_duplicates("timestamp_ns").sort_values("timestamp_ns")
             quaternions = table[["qw", "qx", "qy", "qz"]].to_numpy(np.float64)
             translations = table[["tx_m", "ty_m", "tz_m"]].to_numpy(np.float64)
@@ -80,9 +71,11 @@ class PoseTable:
         return self.city_from_ego[row]
 
 
-def check_feather(path: Path) -> None:
-    """Raise an ``ArrowException`` if a table is damaged, which might end the process later."""
-    feather.read_table(path, memory_map=False).validate(full=True)
+def _read_feather(path: Path) -> Any:
+    """Read a table; ``ArrowException`` if it is damaged, which might end the process later."""
+    table = feather.read_table(path, memory_map=False)
+    table.validate(full=True)
+    return table.to_pandas()
 
 
 class Argoverse2Log:
@@ -108,18 +101,13 @@ class Argoverse2Log:
     def calibration(self) -> dict[str, PinholeCamera]:
         """The calibrated ring cameras by name; empty if the log has no calibration."""
         folder = self.log_dir / "calibration"
-        names = ("intrinsics.feather", "egovehicle_SE3_sensor.feather")
-        if not all((folder / name).is_file() for name in names):
+        paths = [folder / "intrinsics.feather", folder / "egovehicle_SE3_sensor.feather"]
+        if not all(path.is_file() for path in paths):
             return {}
         with naming(folder, "download the log again"):
-            for name in names:
-                check_feather(folder / name)
-            known = set(read_feather(folder / names[0])["sensor_name"])
-            return {
-                name: PinholeCamera.from_feather(self.log_dir, name)
-                for name in RING_CAMERAS
-                if name in known
-            }
+            intrinsics, _ = map(_read_feather, paths)
+            names = [name for name in RING_CAMERAS if name in set(intrinsics["sensor_name"])]
+            return {name: PinholeCamera.from_feather(self.log_dir, name) for name in names}
 
     @cached_property
     def lidar_timestamps_ns(self) -> np.ndarray:
@@ -143,16 +131,32 @@ def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> 
     return best if abs(best - wanted_ns) <= tolerance_ns else None
 
 
-def find_split(root: Path, split: str) -> Path:
-    """Return the folder of a split's logs under a data root, or under its folder ``sensor``."""
-    for folder in (root / split, root / "sensor" / split):
-        if folder.is_dir():
-            return folder
-    raise FileNotFoundError(
-        f"no folder {root / split} (nor {root / 'sensor' / split}): --root must name the folder "
-        "that holds train, val and test of the Argoverse 2 sensor data set "
-        "(https://www.argoverse.org/av2.html#download-link)."
+def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
+    """Return the folders of a split's logs whose ids begin as asked (empty takes all), sorted.
+
+    The split is a folder of the data root, or of its folder ``sensor``.
+
+    Raises:
+        FileNotFoundError: If there is no such split, or no log that begins as asked.
+    """
+    folder = next((f for f in (root / split, root / "sensor" / split) if f.is_dir()), None)
+    if folder is None:
+        raise FileNotFoundError(
+            f"no folder {root / split} (nor {root / 'sensor' / split}): --root must name the "
+            "folder that holds train, val and test of the Argoverse 2 sensor data set "
+            "(https://www.argoverse.org/av2.html#download-link)."
+        )
+    found = sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix != PARTIAL and ((path / "map").is_dir() or (path / POSES).is_file())
     )
+    for prefix in logs:
+        if not any(path.name.startswith(prefix) for path in found):
+            raise FileNotFoundError(f"no log in {folder} begins with {prefix!r}.")
+    if not found:
+        raise FileNotFoundError(f"no Argoverse 2 log in {folder}.")
+    return [path for path in found if not logs or path.name.startswith(tuple(logs))]
 
 
 def _timestamps(folder: Path, suffix: str) -> np.ndarray:

@@ -4,12 +4,12 @@ Whatever does not depend on the vehicle's pose is done once per log; a frame the
 vectorised geometry calls. ``docs/argoverse2.md`` states both sets of rules.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 import shapely
-from av2.map.lane_segment import LaneMarkType, LaneSegment
+from av2.map.lane_segment import LaneMarkType
 from av2.map.map_api import ArgoverseStaticMap
 
 from gsmap.converters.argoverse2.rules import (
@@ -21,7 +21,7 @@ from gsmap.converters.argoverse2.rules import (
     merge_parallel,
     merge_until_stable,
 )
-from gsmap.converters.lane_graph import ROUND_DECIMALS, LaneLinks, LanePaths, link_lanes
+from gsmap.converters.lane_graph import ROUND_DECIMALS, LanePaths, link_lanes
 from gsmap.converters.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.errors import naming
@@ -50,22 +50,6 @@ def find_map(log_dir: Path) -> Path:
     return found[0]
 
 
-class _LaneSide:
-    """The left or right boundaries of a log's lanes: their paths, and the lane beyond each."""
-
-    def __init__(self, lanes: Sequence[LaneSegment], side: str, links: LaneLinks) -> None:
-        position = {segment.id: i for i, segment in enumerate(lanes)}
-        ids = [getattr(segment, f"{side}_neighbor_id") for segment in lanes]
-        boundaries = [getattr(segment, f"{side}_lane_boundary").xyz for segment in lanes]
-        self.paths = LanePaths(boundaries, links)
-        beyond = [NO_LANE if i is None else position.get(i, OUTSIDE) for i in ids]
-        self.neighbours = np.array(beyond, dtype=np.int64)  # (lanes,)
-
-    def dividing(self, lanes: np.ndarray) -> np.ndarray:
-        """Return those of the given lanes that name a neighbour on this side."""
-        return lanes[self.neighbours[lanes] != NO_LANE]
-
-
 class Argoverse2Map:
     """A log's map, as the official API reads it, prepared for cutting out what the vehicle sees."""
 
@@ -76,8 +60,14 @@ class Argoverse2Map:
         )
         self._lanes = GeometryLayer([shapely.Polygon(s.polygon_boundary) for s in lanes])
         self._is_intersection = np.array([s.is_intersection for s in lanes], dtype=bool)
-        self._left = _LaneSide(lanes, "left", links)
-        self._right = _LaneSide(lanes, "right", links)
+        position = {s.id: i for i, s in enumerate(lanes)}
+        self._sides, self._beyond = [], []  # lines on the left and on the right, lanes beyond these
+        for side in ("left", "right"):
+            lines = [getattr(s, f"{side}_lane_boundary").xyz for s in lanes]
+            self._sides.append(LanePaths(lines, links))
+            ids = [getattr(s, f"{side}_neighbor_id") for s in lanes]
+            beyond = [NO_LANE if i is None else position.get(i, OUTSIDE) for i in ids]
+            self._beyond.append(np.array(beyond, dtype=np.int64))
         centres = [static_map.get_lane_segment_centerline(s.id) for s in lanes]
         self._centre = LanePaths([line.round(ROUND_DECIMALS) for line in centres], links)
         markings = [m for s in lanes for m in (s.left_lane_marking, s.right_lane_marking)]
@@ -119,17 +109,14 @@ class Argoverse2Map:
         x_range: tuple[float, float] = RANGES["ego"][0],
         y_range: tuple[float, float] = RANGES["ego"][1],
     ) -> dict[str, list[np.ndarray]]:
-        """Return the map elements around the vehicle, in its frame (x forward, y left, z up).
+        """Return the vertices of the map elements around the vehicle, by class. each (n, 3)
 
         Args:
             city_from_ego: Pose of the vehicle. (4, 4)
             classes: Which of ``MAP_CLASSES`` to extract.
             compat: ``maptrv2`` or ``maptr``: whose rules.
-            x_range: Smallest and largest x (forward) in metres.
-            y_range: Smallest and largest y (left) in metres.
-
-        Returns:
-            For each class, the vertices of its elements in metres. list of (n, 3)
+            x_range: Smallest and largest x (forward) in the vehicle's frame, in metres.
+            y_range: Smallest and largest y (left) in the vehicle's frame, in metres.
 
         Raises:
             ValueError: If a class or the rules are unknown, or the pose is malformed.
@@ -149,12 +136,12 @@ class Argoverse2Map:
     def _dividers(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Lines between neighbouring lanes outside intersections (MapTRv2)."""
         lanes = lanes[~self._is_intersection[lanes]]
-        left, right = self._left.dividing(lanes), self._right.dividing(lanes)
+        left, right = (lanes[beyond[lanes] != NO_LANE] for beyond in self._beyond)
         # two lanes share each line: it is taken once, from the lane on its right if that is in view
-        right = right[~np.isin(right, self._left.neighbours[left])]
-        left = left[~np.isin(left, self._right.neighbours[right])]
-        sides = ((self._left, left), (self._right, right))
-        paths = [side.paths.simplified(lanes.tolist()) for side, lanes in sides]
+        right = right[~np.isin(right, self._beyond[0][left])]
+        left = left[~np.isin(left, self._beyond[1][right])]
+        sides = zip(self._sides, (left, right), strict=True)
+        paths = [side.simplified(lanes.tolist()) for side, lanes in sides]
         return drop_duplicates(clip_lines(np.concatenate(paths), patch))
 
     def _centerlines(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:

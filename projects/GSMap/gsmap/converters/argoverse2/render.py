@@ -17,8 +17,7 @@ from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 from av2.utils.io import read_feather
 
-from gsmap.converters.argoverse2.convert import select_logs
-from gsmap.converters.argoverse2.log import POSES, RING_CAMERAS, Argoverse2Log, find_split
+from gsmap.converters.argoverse2.log import POSES, RING_CAMERAS, Argoverse2Log, find_logs
 from gsmap.converters.argoverse2.map import find_map
 from gsmap.converters.argoverse2.samples import thin_out
 from gsmap.converters.argoverse2.scene import make_scene
@@ -125,11 +124,10 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
     if not log.calibration and options.calibration is not None:
         source = Argoverse2Log(options.calibration)
     if len(source.calibration) < len(RING_CAMERAS):
-        missing = "no calibration of the ring cameras (--calibration-from names another log)"
-        raise ValueError(missing)
-    times = log.poses.timestamps_ns
-    if options.rate_hz is not None:
-        times = thin_out(times, options.rate_hz)
+        raise ValueError(
+            "no calibration of the ring cameras (--calibration-from names another log)"
+        )
+    times = thin_out(log.poses.timestamps_ns, options.rate_hz)
     if options.max_frames is not None and len(times) > options.max_frames:
         times = times[np.linspace(0, len(times) - 1, options.max_frames).round().astype(int)]
     take = _prepare(log, source.calibration, times, options.scale)
@@ -211,10 +209,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, command: str) -> str:
     """Render as the command line asks and return the summary."""
-    split_dir = find_split(arguments.root, arguments.split)
-    log = arguments.calibration_from
-    calibration = select_logs(split_dir, [log])[0] if log else None
+    place, log = (arguments.root, arguments.split), arguments.calibration_from
+    calibration = find_logs(*place, [log])[0] if log else None
     options = options_from(RenderOptions, arguments, command, calibration=calibration)
-    log_dirs = arguments.shard.part(select_logs(split_dir, arguments.logs))
+    log_dirs = arguments.shard.part(find_logs(*place, arguments.logs))
     out = arguments.out / (arguments.out_split or arguments.split)
     return render_logs(log_dirs, out, options, arguments.workers)

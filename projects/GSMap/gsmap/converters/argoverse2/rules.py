@@ -76,11 +76,8 @@ def merge_parallel(pieces: np.ndarray, owner: np.ndarray) -> np.ndarray:
     """Unite crossings whose bounding boxes touch and whose long sides are parallel.
 
     Each crossing that is still alone takes in all later lone ones that fit it: carriageway by
-    carriageway mapped crossings of one road become one.
-
-    Args:
-        pieces: Polygons in the vehicle's frame. (pieces,)
-        owner: Ascending; pieces with the same owner are one crossing. (pieces,)
+    carriageway mapped crossings of one road become one. ``owner`` ascends; polygons with the same
+    owner are one crossing. (pieces,), (pieces,) -> (polygons,)
     """
     crossings = shapely.multipolygons(pieces, indices=np.unique(owner, return_inverse=True)[1])
     bounds = shapely.bounds(crossings)

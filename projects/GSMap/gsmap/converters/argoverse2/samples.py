@@ -106,16 +106,16 @@ def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
         times, kind = log.image_timestamps_ns[RING_CAMERAS[0]], f"images of {RING_CAMERAS[0]}"
     if len(times) == 0:
         raise ValueError(f"no {kind} (--at poses:10 needs neither sweeps nor images)")
-    return times if options.rate_hz is None else thin_out(times, options.rate_hz)
+    return thin_out(times, options.rate_hz)
 
 
-def thin_out(times_ns: np.ndarray, rate_hz: float) -> np.ndarray:
+def thin_out(times_ns: np.ndarray, rate_hz: float | None) -> np.ndarray:
     """Keep the first of ascending times, then each that follows the latest kept after a period.
 
     Half the sensor's own period is tolerated, so that 10 Hz with jitter thins out to every fourth
-    at 2.5 Hz, and what is already slower stays whole. (n,) -> (m,)
+    at 2.5 Hz, and what is already slower stays whole. Without a rate all stay. (n,) -> (m,)
     """
-    if len(times_ns) < 2:
+    if len(times_ns) < 2 or rate_hz is None:
         return times_ns
     least_gap = 1e9 / rate_hz - np.median(np.diff(times_ns)) / 2
     kept = [int(times_ns[0])]

@@ -86,19 +86,12 @@ DROPPED = {
 
 @dataclass
 class Conversion:
-    """What a config becomes.
+    """What a config becomes."""
 
-    Attributes:
-        base: Our config that it is nearest to, below ``configs``.
-        settings: Dotted names of ours with their values.
-        steps: Settings of pipeline steps, by the type of the step.
-        unplaced: What has no place in ours: dotted name and value.
-    """
-
-    base: str
-    settings: dict[str, Any]
-    steps: dict[str, dict[str, Any]]
-    unplaced: list[str]
+    base: str  # our config that it is nearest to, below configs
+    settings: dict[str, Any]  # by dotted names of ours
+    steps: dict[str, dict[str, Any]]  # settings of pipeline steps, by their type
+    unplaced: list[str]  # what has no place in ours: dotted name and value
 
 
 def convert_upstream(names: dict[str, Any]) -> Conversion:

@@ -1,5 +1,6 @@
 """Vehicle signals of the nuScenes CAN bus expansion, in MapTR's layout of 18 numbers."""
 
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -32,24 +33,7 @@ class CanBusReader:
 
     def __init__(self, dataroot: Path) -> None:
         self.available = (dataroot / "can_bus").is_dir()
-        self._dataroot = dataroot
-        self._scene, self._times, self._measured = "", np.empty(0), np.empty((0, 9))
-
-    def _open(self, scene: str) -> None:
-        from nuscenes.can_bus.can_bus_api import NuScenesCanBus
-
-        self._scene, messages = scene, []
-        path = self._dataroot / f"can_bus/{scene}_pose.json"
-        with naming(path, "unpack the CAN bus expansion again"):
-            if path.is_file():
-                api = NuScenesCanBus(dataroot=str(self._dataroot))
-                if int(scene[-4:]) not in api.can_blacklist:  # scenes whose signals are unreliable
-                    messages = api.get_messages(scene, "pose", print_warnings=False)
-            self._times = np.array([message["utime"] for message in messages], np.int64)
-            rows = [[*m["accel"], *m["rotation_rate"], *m["vel"]] for m in messages]
-            self._measured = np.array(rows, np.float64).reshape(-1, 9)
-            if not np.isfinite(self._measured).all():
-                raise ValueError("a number is not finite")
+        self._messages = lru_cache(maxsize=1)(partial(_read_messages, dataroot))
 
     def signals(self, scene: str, timestamp_ns: int, global_from_ego: np.ndarray) -> np.ndarray:
         """Return the vehicle's pose (4, 4) with the latest message, as ``pose_signals`` says. (18,)
@@ -58,9 +42,26 @@ class CanBusReader:
             ValueError: If the scene's file is damaged.
         """
         values = pose_signals(global_from_ego)
-        if self.available and scene != self._scene:
-            self._open(scene)
-        latest = int(np.searchsorted(self._times, timestamp_ns // 1000, side="right")) - 1
+        times_us, measured = self._messages(scene)
+        latest = int(np.searchsorted(times_us, timestamp_ns // 1000, side="right")) - 1
         if latest >= 0:
-            values[7:16] = self._measured[latest]
+            values[7:16] = measured[latest]
         return values
+
+
+def _read_messages(dataroot: Path, scene: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return times in microseconds (n,) and what was measured (n, 9), if a scene has a file."""
+    path, messages = dataroot / f"can_bus/{scene}_pose.json", []
+    with naming(path, "unpack the CAN bus expansion again"):
+        if path.is_file():
+            from nuscenes.can_bus.can_bus_api import NuScenesCanBus
+
+            api = NuScenesCanBus(dataroot=str(dataroot))
+            if int(scene[-4:]) not in api.can_blacklist:  # scenes whose signals are unreliable
+                messages = api.get_messages(scene, "pose", print_warnings=False)
+        times_us = np.array([message["utime"] for message in messages], np.int64)
+        rows = [[*m["accel"], *m["rotation_rate"], *m["vel"]] for m in messages]
+        measured = np.array(rows, np.float64).reshape(-1, 9)
+        if not np.isfinite(measured).all():
+            raise ValueError("a number is not finite")
+    return times_us, measured

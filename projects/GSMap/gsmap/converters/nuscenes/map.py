@@ -40,21 +40,13 @@ CENTERLINE_STEP_M = 0.5
 
 @dataclass
 class MapLayers:
-    """The geometries of one map in its global frame; plain enough to hand to another process.
+    """The geometries of one map in its global frame; plain enough to hand to another process."""
 
-    Args:
-        lines: Lines by layer. each (n,) of LineString
-        polygons: Valid polygons by layer or class. each (n,) of Polygon
-        skipped: How many elements were left out, by reason.
-        centerlines: Centre line of each lane and lane connector. each (n, 3)
-        links: Which of these lead into which.
-    """
-
-    lines: dict[str, np.ndarray]
-    polygons: dict[str, np.ndarray]
-    skipped: Counter[str]
-    centerlines: list[np.ndarray] = field(default_factory=list)
-    links: LaneLinks = ()
+    lines: dict[str, np.ndarray]  # by layer, each (n,) of LineString
+    polygons: dict[str, np.ndarray]  # valid ones by layer or class, each (n,) of Polygon
+    skipped: Counter[str]  # how many elements were left out, by reason
+    centerlines: list[np.ndarray] = field(default_factory=list)  # of lanes and connectors, (n, 3)
+    links: LaneLinks = ()  # which of these lead into which
 
 
 def _read_lines(nusc_map: "NuScenesMap", layer: str, skipped: Counter[str]) -> np.ndarray:

@@ -107,11 +107,6 @@ class NuScenesTables:
     million ``sample_data`` records a tenth remains (a fifth with sweeps), and with them their
     poses. Each sample's ``data`` holds the tokens of its key frames by channel.
 
-    Args:
-        version: Version folder, such as ``v1.0-trainval``.
-        dataroot: Data root.
-        with_sweeps: Whether to keep LiDAR sweeps between key frames.
-
     Raises:
         FileNotFoundError: If a table is missing.
         ValueError: If a table is damaged or a record points to one that there is not.
@@ -227,17 +222,9 @@ def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
 
 
 class SampleReader:
-    """Turn rows of the tables into samples, without ground truth.
+    """Turn rows of the tables into samples, without ground truth."""
 
-    Args:
-        tables: The opened tables.
-        max_sweeps: How many earlier LiDAR sweeps a sample lists at most.
-        can_bus: The vehicle's signals; None leaves them unknown.
-    """
-
-    def __init__(
-        self, tables: NuScenesTables, max_sweeps: int, can_bus: CanBusReader | None = None
-    ) -> None:
+    def __init__(self, tables: NuScenesTables, max_sweeps: int, can_bus: CanBusReader) -> None:
         self._tables, self._max_sweeps, self._can_bus = tables, max_sweeps, can_bus
 
     def _global_from(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
@@ -251,10 +238,7 @@ class SampleReader:
         lidar = self._tables.get("sample_data", sample["data"][LIDAR])
         global_from_frame, calibration = self._global_from(lidar)
         ego_from_frame, timestamp_ns = pose_of(calibration), sample["timestamp"] * 1000
-        signals = None
-        if self._can_bus is not None:
-            pose = global_from_frame @ invert_rigid(ego_from_frame)
-            signals = self._can_bus.signals(scene["name"], timestamp_ns, pose)
+        global_from_ego = global_from_frame @ invert_rigid(ego_from_frame)
         names = [name for name in CAMERAS if name in sample["data"]]
         return MapSample(
             token=sample["token"],
@@ -265,7 +249,7 @@ class SampleReader:
             global_from_frame=global_from_frame,
             lidar=LidarRecord(lidar["filename"], np.eye(4), self._sweeps(lidar, global_from_frame)),
             ego_from_frame=ego_from_frame,
-            can_bus=signals,
+            can_bus=self._can_bus.signals(scene["name"], timestamp_ns, global_from_ego),
         )
 
     def _camera(self, name: str, token: str, global_from_frame: np.ndarray) -> CameraRecord:
