@@ -190,10 +190,9 @@ def _check_range(sample: MapSample, meta: AnnotationMeta) -> None:
 
 def _dim(entries: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> int:
     """Return how many coordinates the points of the first element have."""
-    annotations = (info["annotation"] for info in entries if "annotation" in info)
-    lines = (line for found in annotations for name in classes for line in found[name])
-    first = next(lines, np.empty((0, 2)))
-    return min(np.shape(first)[-1], 3)
+    known = (info["annotation"] for info in entries if "annotation" in info)
+    lines = (line for annotation in known for name in classes for line in annotation[name])
+    return min(np.shape(next(lines, np.empty((0, 2))))[-1], 3)
 
 
 def convert_infos(

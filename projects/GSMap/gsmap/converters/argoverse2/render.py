@@ -76,7 +76,7 @@ def _prepare(
 
     It takes the name of a camera and a row's time in the pose table.
     """
-    track = np.array([log.poses.at(t)[:2, 3] for t in times_ns.tolist()])  # type: ignore[index]
+    track = log.poses.city_from_ego[np.isin(log.poses.timestamps_ns, times_ns), :2, 3]
     bounds = (*(track.min(0) - VIEW_M).tolist(), *(track.max(0) + VIEW_M).tolist())
     static_map = ArgoverseStaticMap.from_json(find_map(log.log_dir))
     try:
@@ -98,9 +98,7 @@ def _prepare(
         city_from_cam = log.poses.at(timestamp_ns) @ cameras[name].ego_SE3_cam.transform_matrix
         camera = Camera(*pinholes[name], np.linalg.inv(city_from_cam))
         image = renderer.render_camera(camera, [], rng)
-        encoded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        assert encoded, image.shape
-        return data.tobytes()
+        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
     return take
 
@@ -181,16 +179,13 @@ def render_logs(
 
     Returns what was rendered and what was left out, for people.
     """
-    lines, pictures, rendered = [], 0, 0
     render = partial(_try_log, out=out, options=options)
     results = ordered_map(render, log_dirs, min(workers, max(len(log_dirs), 1)), timeout_s=3600.0)
     with Progress(log_dirs, desc="av2-render", unit="logs") as logs:
-        for log_dir, result in zip(logs, results, strict=True):
-            if isinstance(result, str):
-                lines.append(f"log {log_dir.name} left out: {result}")
-            else:
-                rendered, pictures = rendered + 1, pictures + result
-    return "\n".join([f"{pictures} pictures of {rendered} logs in {out}", *lines])
+        done = {log_dir.name: result for log_dir, result in zip(logs, results, strict=True)}
+    counts = [result for result in done.values() if isinstance(result, int)]
+    lines = [f"log {name} left out: {why}" for name, why in done.items() if isinstance(why, str)]
+    return "\n".join([f"{sum(counts)} pictures of {len(counts)} logs in {out}", *lines])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

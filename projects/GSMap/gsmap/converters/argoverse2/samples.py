@@ -90,11 +90,7 @@ def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -
 
 
 def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
-    """Return when the samples of a log are, in nanoseconds, ascending. (n,)
-
-    Raises:
-        ValueError: If the log lacks the sensor data that ``options.at`` asks for.
-    """
+    """Return when samples are, in nanoseconds, ascending; ValueError if sensor data lack. (n,)"""
     if options.pose_stride is not None:
         return log.poses.timestamps_ns[:: options.pose_stride]
     missing = [name for name in RING_CAMERAS if name not in log.calibration]
@@ -161,7 +157,7 @@ def _cameras(
     log: Argoverse2Log, timestamp_ns: int, city_from_ego: np.ndarray, options: Argoverse2Options
 ) -> Iterator[CameraRecord]:
     """Yield the image of each calibrated camera closest in time."""
-    folder = log.log_dir.relative_to(options.root).as_posix()
+    folder = (log.log_dir / "sensors/cameras").relative_to(options.root).as_posix()
     for name, camera in log.calibration.items():
         image_ns = closest_ns(log.image_timestamps_ns[name], timestamp_ns, MAX_CAMERA_OFFSET_NS)
         city_from_ego_then = None if image_ns is None else log.poses.at(image_ns)
@@ -170,15 +166,10 @@ def _cameras(
                 limit = MAX_CAMERA_OFFSET_NS / 1e6
                 raise _LeftOut(f"no image of {name} with a pose within {limit:.0f} ms")
             continue
+        path, size_px = f"{folder}/{name}/{image_ns}.jpg", (camera.width_px, camera.height_px)
         motion = np.linalg.inv(city_from_ego_then) @ city_from_ego
-        yield CameraRecord(
-            name,
-            f"{folder}/sensors/cameras/{name}/{image_ns}.jpg",
-            camera.width_px,
-            camera.height_px,
-            camera.intrinsics.K,
-            camera.ego_SE3_cam.inverse().transform_matrix @ motion,
-        )
+        cam_from_frame = camera.ego_SE3_cam.inverse().transform_matrix @ motion
+        yield CameraRecord(name, path, *size_px, camera.intrinsics.K, cam_from_frame)
 
 
 def _lidar(

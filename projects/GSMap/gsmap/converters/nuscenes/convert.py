@@ -16,13 +16,7 @@ import shapely
 
 from gsmap.converters.command_line import FileOptions, add_file_options, fingerprint, options_from
 from gsmap.converters.nuscenes.can_bus import CanBusReader
-from gsmap.converters.nuscenes.map import (
-    MAP_CLASSES,
-    NuScenesLocalMap,
-    check_classes,
-    expansion,
-    open_layers,
-)
+from gsmap.converters.nuscenes.map import MAP_CLASSES, NuScenesLocalMap, check_classes, open_layers
 from gsmap.converters.nuscenes.tables import CAMERAS, LIDAR, NuScenesTables, SampleReader
 from gsmap.converters.splits import Positions, overlap_notes, read_split_file, resolve_scenes
 from gsmap.converters.summary import ConversionSummary
@@ -153,14 +147,7 @@ class _Conversion:
         self, location: str, scenes: list[dict[str, Any]]
     ) -> Iterator[tuple[MapSample, list[MapInstance] | str]]:
         """Yield the samples of one map with their instances, or why there are none."""
-        from nuscenes.map_expansion.map_api import locations
-
         options = self.options
-        if location not in locations or not expansion(options.root, location).is_file():
-            raise FileNotFoundError(
-                f"no map expansion for {location!r} in {options.root}/maps/expansion; the devkit "
-                f"knows {', '.join(locations)}. Unpack the map expansion pack (v1.3) there."
-            )
         layers = open_layers(options.root, location, options.classes)
         for reason, count in layers.skipped.items():
             self.summary.add_problem(f"{reason} left out", location, count)

@@ -9,7 +9,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -63,11 +63,9 @@ def _read_lines(nusc_map: "NuScenesMap", layer: str, skipped: Counter[str]) -> n
 
 def _read_polygons(nusc_map: "NuScenesMap", name: str, skipped: Counter[str]) -> np.ndarray:
     """Return the polygons of a layer or class; invalid ones are counted. (n,) of Polygon."""
-    records: list[dict[str, Any]]
+    records = getattr(nusc_map, "road_segment" if name == "intersection" else name)
     if name == "intersection":
-        records = [r for r in nusc_map.road_segment if r.get("is_intersection", False)]
-    else:
-        records = getattr(nusc_map, name)
+        records = [record for record in records if record.get("is_intersection", False)]
     polygons = [nusc_map.extract_polygon(record["polygon_token"]) for record in records]
     valid = [polygon for polygon in polygons if polygon.is_valid and not polygon.is_empty]
     if len(valid) < len(polygons):
@@ -89,9 +87,15 @@ def expansion(root: Path, name: str) -> Path:
 
 def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
     """Collect the geometries that the classes need from a map of a data root, which is checked."""
-    from nuscenes.map_expansion.map_api import NuScenesMap
+    from nuscenes.map_expansion.map_api import NuScenesMap, locations
 
-    with naming(expansion(root, name), "unpack the map expansion pack (v1.3) again"):
+    path = expansion(root, name)
+    if name not in locations or not path.is_file():
+        raise FileNotFoundError(
+            f"no map expansion for {name!r} in {path.parent}; the devkit knows "
+            f"{', '.join(locations)}. Unpack the map expansion pack (v1.3) there."
+        )
+    with naming(path, "unpack the map expansion pack (v1.3) again"):
         layers = read_layers(NuScenesMap(str(root), name), classes)
         for geometries in (*layers.lines.values(), *layers.polygons.values()):
             if not np.isfinite(shapely.get_coordinates(geometries)).all():
