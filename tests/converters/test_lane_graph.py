@@ -16,7 +16,7 @@ def line(*xy: tuple[float, float]) -> np.ndarray:
 def paths(polylines: list[np.ndarray], successors: list[list[int]], lanes: list[int] | None = None):
     count = len(polylines)
     predecessors = [[j for j in range(count) if i in successors[j]] for i in range(count)]
-    links = link_lanes(range(count), predecessors, successors)
+    links = link_lanes(list(zip(range(count), predecessors, successors, strict=True)))
     simplified = LanePaths(polylines, links).simplified(range(count) if lanes is None else lanes)
     return [shapely.get_coordinates(path).tolist() for path in simplified]
 

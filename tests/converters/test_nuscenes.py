@@ -110,7 +110,7 @@ def test_centre_lines_follow_each_way_through_a_fork():
         np.array([[0, 0, 0], [0, 40, 0.0]]),
         np.array([[0, 0, 0], [10, 40, 0.0]]),
     ]
-    layers.links = link_lanes(range(3), [[], [0], [0]], [[1, 2], [], []])
+    layers.links = link_lanes([(0, [], [1, 2]), (1, [0], []), (2, [0], [])])
     town = NuScenesLocalMap(layers, ("centerline",))
     found = sorted((i.points for i in town.instances(pose(0, 0, 0))), key=lambda p: p[-1, 0])
     np.testing.assert_allclose([line[0] for line in found], [[0, -30], [0, -30]], atol=1e-9)

@@ -79,9 +79,8 @@ def add_range_options(
 
 def add_workers_option(parser: argparse.ArgumentParser) -> None:
     """Add the number of processes."""
-    parser.add_argument(
-        "--workers", type=int, default=default_workers(), help="processes (default: all cores)"
-    )
+    cores = default_workers()
+    parser.add_argument("--workers", type=int, default=cores, help="processes (default: all cores)")
 
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:

@@ -1,7 +1,8 @@
 """The lane graph of a map: which lines along lanes join to one (MapTRv2)."""
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
+from typing import Any
 
 import numpy as np
 import shapely
@@ -16,17 +17,16 @@ Edge = tuple[tuple[int, ...], int]
 LaneLinks = Sequence[Sequence[tuple[int, int]]]
 
 
-def link_lanes(
-    ids: Sequence[Hashable],
-    predecessors: Sequence[Iterable[Hashable]],
-    successors: Sequence[Iterable[Hashable]],
-) -> LaneLinks:
-    """Say by position which lanes follow one another; ids of lanes outside the map are left out."""
-    position = {lane_id: i for i, lane_id in enumerate(ids)}
+def link_lanes(lanes: Sequence[tuple[Any, Iterable[Any], Iterable[Any]]]) -> LaneLinks:
+    """Say by position which lanes follow one another: those of a map, each with its neighbours.
+
+    A lane is its id, its predecessors' ids and its successors'; ids outside the map are left out.
+    """
+    position = {lane_id: i for i, (lane_id, _, _) in enumerate(lanes)}
     return [
-        [(position[other], i) for other in before if other in position]
-        + [(i, position[other]) for other in after if other in position]
-        for i, (before, after) in enumerate(zip(predecessors, successors, strict=True))
+        [(position[other], i) for other in predecessors if other in position]
+        + [(i, position[other]) for other in successors if other in position]
+        for i, (_, predecessors, successors) in enumerate(lanes)
     ]
 
 

@@ -112,12 +112,12 @@ class Argoverse2Log:
     @cached_property
     def lidar_timestamps_ns(self) -> np.ndarray:
         """Times of the LiDAR sweeps, ascending. (n,)"""
-        return _timestamps(self.log_dir / "sensors" / "lidar", ".feather")
+        return _timestamps(self.log_dir / "sensors/lidar", ".feather")
 
     @cached_property
     def image_timestamps_ns(self) -> dict[str, np.ndarray]:
         """Times of each ring camera's images, ascending. each (n,)"""
-        folder = self.log_dir / "sensors" / "cameras"
+        folder = self.log_dir / "sensors/cameras"
         return {name: _timestamps(folder / name, ".jpg") for name in RING_CAMERAS}
 
 
@@ -146,11 +146,8 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
             "folder that holds train, val and test of the Argoverse 2 sensor data set "
             "(https://www.argoverse.org/av2.html#download-link)."
         )
-    found = sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix != PARTIAL and ((path / "map").is_dir() or (path / POSES).is_file())
-    )
+    holding = {path.parent for part in ("map", POSES) for path in folder.glob(f"*/{part}")}
+    found = sorted(path for path in holding if path.suffix != PARTIAL)
     for prefix in logs:
         if not any(path.name.startswith(prefix) for path in found):
             raise FileNotFoundError(f"no log in {folder} begins with {prefix!r}.")

@@ -55,9 +55,7 @@ class Argoverse2Map:
 
     def __init__(self, static_map: ArgoverseStaticMap) -> None:
         lanes = static_map.get_scenario_lane_segments()
-        links = link_lanes(
-            [s.id for s in lanes], [s.predecessors for s in lanes], [s.successors for s in lanes]
-        )
+        links = link_lanes([(s.id, s.predecessors, s.successors) for s in lanes])
         self._lanes = GeometryLayer([shapely.Polygon(s.polygon_boundary) for s in lanes])
         self._is_intersection = np.array([s.is_intersection for s in lanes], dtype=bool)
         position = {s.id: i for i, s in enumerate(lanes)}

@@ -16,7 +16,6 @@ RUN = (
     "runner", "evaluation", "fp16", "checkpoint_config", "log_config", "load_from",
     "resume_from", "custom_hooks", "momentum_config",
 )  # fmt: skip
-ATTENTIONS = {"MultiheadAttention": "PointSelfAttention"}
 _HEAD = "model.map_head."
 _DECODER = _HEAD + "decoder."
 _BEV = "model.bev_encoder."
@@ -179,14 +178,12 @@ def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[flo
     settings[_BEV + "num_cams"] = fields.take(f"{_TRANSFORMER}.num_cams", 6)
     settings |= fields.move(MOVED_OF_PILLARS)
     kind = fields.take(f"{_SPATIAL}.type")
-    attention = _BEV + "cross_attn."
+    ours, theirs = _BEV + "cross_attn.", _SPATIAL + "."
     if kind == "GeometrySptialCrossAttention":
-        kernel = fields.take(f"{_SPATIAL}.attention.kernel_size")
-        settings[attention + "num_heads"] = fields.take(f"{_SPATIAL}.attention.num_heads")
-        settings[attention + "kernel_size"] = tuple(kernel)
+        settings[ours + "num_heads"] = fields.take(theirs + "attention.num_heads")
+        settings[ours + "kernel_size"] = tuple(fields.take(theirs + "attention.kernel_size"))
     elif kind == "SpatialCrossAttention":
-        points = fields.take(f"{_SPATIAL}.deformable_attention.num_points", 8)
-        settings[attention + "num_points"] = points
+        settings[ours + "num_points"] = fields.take(theirs + "deformable_attention.num_points", 8)
     return kind
 
 
@@ -197,9 +194,8 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
     first, *others, cross = fields.items(f"{_LAYER}.attn_cfgs")
     kind, heads = fields.take(first + ".type"), fields.take(first + ".num_heads")
     settings[layer + "num_heads"] = heads
-    settings[layer + "self_attn.type"] = (
-        "DecoupledSelfAttention" if decoupled else ATTENTIONS.get(kind, kind)
-    )
+    ours = "PointSelfAttention" if kind == "MultiheadAttention" else kind
+    settings[layer + "self_attn.type"] = "DecoupledSelfAttention" if decoupled else ours
     fields.drop(first, "embed_dims num_ins num_pts")
     dropout = fields.section(first).get("dropout")
     for other in others:  # MapTRv2's second attention has the settings of its first
@@ -258,13 +254,12 @@ def _mapvr_settings(fields: Fields, settings: dict[str, Any]) -> None:
     pts, direction = (settings[f"{_HEAD}losses.{i}.loss_weight"] for i in (0, 1))
     fields.drop(f"{_COSTS}.rendered_mask_cost", "type")
     dice = fields.take(f"{_THEIRS}.loss_rendered_mask.weight")
-    cost = fields.take(f"{_COSTS}.rendered_mask_cost.weight")
     settings |= {
         _HEAD + "type": "MapVRHead",
         _HEAD + "points_weight": pts,
         _HEAD + "loss_direction": {"type": "SelfDirectionLoss", "loss_weight": direction},
         _HEAD + "loss_dice": {"loss_weight": dice},
-        _HEAD + "dice_cost": {"weight": cost},
+        _HEAD + "dice_cost": {"weight": fields.take(f"{_COSTS}.rendered_mask_cost.weight")},
     }
     pts_cost = settings[_HEAD + "match_costs.1.weight"]
     if pts != pts_cost:  # one weight of ours is for both

@@ -131,9 +131,9 @@ def _read_centerlines(nusc_map: "NuScenesMap", layers: MapLayers) -> None:
             continue
         layers.centerlines.append(np.pad(np.array(poses)[:, :2], ((0, 0), (0, 1))))
         tokens.append(record["token"])
-    neighbours = [nusc_map.connectivity.get(token, {}) for token in tokens]
-    before, after = ([n.get(way, []) for n in neighbours] for way in ("incoming", "outgoing"))
-    layers.links = link_lanes(tokens, before, after)
+    ways = {token: nusc_map.connectivity.get(token, {}) for token in tokens}
+    links = [(t, ways[t].get("incoming", []), ways[t].get("outgoing", [])) for t in tokens]
+    layers.links = link_lanes(links)
 
 
 class NuScenesLocalMap:
