@@ -1,6 +1,5 @@
 """A small MapTR with random weights on generated samples."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -127,12 +126,9 @@ def test_chosen_samples_come_in_their_order(inferencer, tmp_path):
     assert [s.metainfo["token"] for s in inferencer.predict(dataset, [2, 0])] == ["t2", "t0"]
 
 
-def test_predictions_are_written_and_drawn(inferencer, tmp_path):
+def test_predictions_are_vectors_and_drawn(inferencer, tmp_path):
     found = inferencer(make_samples(tmp_path, 1), tmp_path)
-    inferencer.write(tmp_path / "map.json", found)
-    (record,) = json.loads((tmp_path / "map.json").read_text())["results"]
-    assert record["sample_token"] == "t0"
-    assert len(record["vectors"][0]["pts"]) == 20
+    assert len(inferencer.vectors(found[0])[0]["pts"]) == 20
     assert figure_to_rgb(inferencer.draw(found[0], score_thr=0.0)).shape[1] == 400
 
 

@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
@@ -233,6 +234,8 @@ def _make_scene(
     root: Path, config: MiniCityConfig, towns: dict[str, Town], task: SceneTask
 ) -> Records:
     """Make a scene in one process."""
+    if parent_process() is not None:  # one of many processes, each of one thread
+        cv2.setNumThreads(1)
     return SceneMaker(config, task, towns[task.location], root).make()
 
 
@@ -247,9 +250,7 @@ def _run_scenes(
     """Make all scenes, each in one process, and return their records by scene name."""
     workers = min(default_workers() if workers is None else max(workers, 1), len(tasks))
     make = partial(_make_scene, root, config, towns)
-    # many processes of one thread; this one, if it is to do the work, stays as it is
-    prepare = cv2.setNumThreads if workers > 1 else None
-    results = ordered_map(make, tasks, workers, prepare, (1,), timeout_s=7200.0)
+    results = ordered_map(make, tasks, workers, timeout_s=7200.0)
     per_scene = len(CAMERAS) * config.samples_per_scene
     done: dict[str, Records] = {}
     with Progress(

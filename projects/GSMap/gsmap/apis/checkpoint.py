@@ -16,7 +16,7 @@ from gsmap.engine.named_models import find_checkpoint
 # what torch's reader raises on bytes that make no sense
 _DAMAGE = (
     RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, UnicodeError,
-    ArithmeticError,
+    ArithmeticError, OSError, zipfile.BadZipFile,
 )  # fmt: skip
 
 
@@ -43,7 +43,7 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
             f"{path} was not loaded: it is broken, or holds more than tensors and plain data "
             f"({reason}). If you trust its origin, save its state_dict alone and give that file."
         ) from error
-    except (*_DAMAGE, OSError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         raise ValueError(
             f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); "
             "fetch it again, or use an earlier epoch's."
@@ -63,18 +63,16 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
 
 
 def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> list[str]:
-    """Give a config the model settings that a checkpoint was trained with.
-
-    Overrides of the model's settings are taken to be meant and stay.
+    """Give a config the model settings that a checkpoint was trained with, and say which changed.
 
     Args:
         cfg: The config; its ``model`` changes.
         path: The checkpoint, checked as in `read_checked`.
-        cfg_options: Overrides that were given by hand, by dotted name.
+        cfg_options: Overrides that were given by hand, by dotted name; they stay.
 
     Returns:
-        What to tell: a line for each setting that the config had otherwise, and for each that is
-        kept against the checkpoint.
+        A line for each setting that the config had otherwise, and for each that is kept against the
+        checkpoint.
     """
     settings = read_checked(path)[1]
     if settings is None:
@@ -96,11 +94,7 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
 
 
 def load_weights(model: nn.Module, path: str | Path) -> None:
-    """Load a checkpoint into a model; every weight must be there and fit.
-
-    Args:
-        model: The model; its weights are replaced.
-        path: The checkpoint, or the name of a model.
+    """Load a checkpoint, or a model's by its name; every weight must be there and fit.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -112,8 +106,7 @@ def load_weights(model: nn.Module, path: str | Path) -> None:
         result = model.load_state_dict(state, strict=False)
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"{path} does not belong to this config: {error}") from error
-    counters = [key for key in result.missing_keys if key.endswith("num_batches_tracked")]
-    missing = [key for key in result.missing_keys if key not in counters]
+    missing = [key for key in result.missing_keys if not key.endswith("num_batches_tracked")]
     if missing or result.unexpected_keys:
         raise ValueError(
             f"{path} does not belong to this config: it lacks {listed(missing)} and has "

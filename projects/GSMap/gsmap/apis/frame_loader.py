@@ -1,68 +1,99 @@
-"""Batches of frames for inference, the broken ones set apart."""
+"""Frames for inference: absent cameras are blank, and broken frames set apart."""
 
-from collections.abc import Iterator, Sequence
+import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import torch
 from mmengine.dataset import pseudo_collate
-from torch.utils.data import DataLoader, Dataset, Subset
+from torch.utils.data import Dataset
 
-from gsmap.apis.blank_cameras import BlankCameraDataset
+from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+
+# A camera 1 km ahead of the vehicle that looks further ahead: everything in range is behind it, and
+# its frustum lies out of range. So both ways of making BEV features get nothing from it.
+_OUT_OF_SIGHT = np.array(
+    [[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, -1000.0], [0, 0, 0, 1.0]]
+)  # cam_from_frame
 
 
 @dataclass(frozen=True)
 class BrokenFrame:
-    """A frame that cannot be used.
-
-    Args:
-        token: Its token.
-        reason: Why, with the file's name.
-    """
+    """A frame that cannot be used, and why, with the file's name."""
 
     token: str
     reason: str
 
 
-class _Frames(Dataset):
-    """Frames, or what is wrong with them."""
+class FrameDataset(Dataset):
+    """Frames of a test data set, or what is wrong with them.
 
-    def __init__(self, frames: BlankCameraDataset) -> None:
-        self._frames = frames
+    Args:
+        dataset: The data set; its ``cameras`` say which ones the model expects.
+        indices: Which frames, in this order; all by default.
+        blank_cameras: Whether a camera that a frame lacks is there, but sees nothing, as long as
+            the frame has another one; else the frame is broken.
+    """
+
+    def __init__(
+        self, dataset: VectorizedMapDataset, indices: Sequence[int] | None, blank_cameras: bool
+    ) -> None:
+        self.dataset = dataset
+        self.indices = range(len(dataset)) if indices is None else indices
+        self.blank_cameras = blank_cameras
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self.indices)
 
     def __getitem__(self, index: int) -> dict[str, Any] | BrokenFrame:
+        row = self.indices[index]
         try:
-            return self._frames[index]
+            return self._frame(row)
         except (ValueError, OSError) as error:
-            return BrokenFrame(self._frames.dataset.sample(index).token, str(error))
+            return BrokenFrame(self.dataset.sample(row).token, str(error))
+
+    def _frame(self, row: int) -> dict[str, Any]:
+        """Return what the pipeline packs, with the cameras that the model expects."""
+        wanted, sample = self.dataset.cameras, self.dataset.sample(row)
+        present = {camera.name for camera in sample.cameras}
+        absent = [name for name in wanted or () if name not in present]
+        if not wanted or not absent:
+            return self.dataset[row]
+        if not self.blank_cameras or len(absent) == len(wanted):
+            raise ValueError(
+                f"sample {sample.token!r} lacks the cameras {absent}, which the model expects; it "
+                f"has {sorted(present)}. With --allow-missing-cameras (allow_missing_cameras=True) "
+                "absent ones are left blank, as long as one is there."
+            )
+        partial = copy.copy(self.dataset)
+        partial.cameras = tuple(name for name in wanted if name in present)
+        return _with_blank_cameras(partial[row], wanted)
 
 
-def _collate(items: Sequence[Any]) -> tuple[Any, list[BrokenFrame]]:
+def collate(items: Sequence[dict[str, Any] | BrokenFrame]) -> tuple[Any, list[BrokenFrame]]:
     """Put frames into one batch, None if there is none, and name the broken ones."""
     broken = [item for item in items if isinstance(item, BrokenFrame)]
     good = [item for item in items if not isinstance(item, BrokenFrame)]
     return (pseudo_collate(good) if good else None), broken
 
 
-def frame_batches(
-    frames: BlankCameraDataset, indices: Sequence[int] | None, batch_size: int, num_workers: int
-) -> Iterator[tuple[Any, list[BrokenFrame]]]:
-    """Read frames in their order.
-
-    Args:
-        frames: The frames.
-        indices: Which; all by default.
-        batch_size: Frames per batch.
-        num_workers: Processes that read images.
-
-    Yields:
-        A batch of those that can be used, None if there is none, and the others.
-    """
-    chosen: Dataset = _Frames(frames)
-    if indices is not None:
-        chosen = Subset(chosen, list(indices))
-    yield from DataLoader(
-        chosen, batch_size=batch_size, num_workers=num_workers, collate_fn=_collate
-    )
+def _with_blank_cameras(item: dict[str, Any], wanted: Sequence[str]) -> dict[str, Any]:
+    """Return an item with all wanted cameras; ``img_path`` is None for the blank ones."""
+    sample = item["data_samples"].clone()
+    meta = sample.metainfo
+    position = {name: index for index, name in enumerate(meta["cam_names"])}
+    order = [position.get(name) for name in wanted]
+    images = item["inputs"]["img"]  # (V present, 3, H, W)
+    stacked = torch.stack([torch.zeros_like(images[0]) if i is None else images[i] for i in order])
+    blank = {"cam2img": meta["cam2img"][0], "img_aug_matrix": meta["img_aug_matrix"][0]}
+    blank["lidar2cam"] = _OUT_OF_SIGHT
+    blank["lidar2img"] = blank["img_aug_matrix"] @ blank["cam2img"] @ _OUT_OF_SIGHT
+    changed = {
+        key: np.stack([value if i is None else meta[key][i] for i in order])
+        for key, value in blank.items()
+    }
+    paths = [None if i is None else meta["img_path"][i] for i in order]
+    sample.set_metainfo({**changed, "img_path": paths, "cam_names": list(wanted)})
+    return {"inputs": {**item["inputs"], "img": stacked}, "data_samples": sample}

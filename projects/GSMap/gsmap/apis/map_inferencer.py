@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from mmdet3d.registry import DATASETS, MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.config import Config
+from torch.utils.data import DataLoader
 
-from gsmap.apis.blank_cameras import BlankCameraDataset
 from gsmap.apis.checkpoint import adopt_settings, load_weights
-from gsmap.apis.frame_loader import BrokenFrame, frame_batches
+from gsmap.apis.frame_loader import BrokenFrame, FrameDataset, collate
 from gsmap.apis.rig_fit import similar_cameras
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
@@ -29,7 +29,7 @@ from gsmap.datasets.transforms.points import read_points
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.launch import read_config
 from gsmap.engine.named_models import named_models
-from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.evaluation.results_json import vectors_of
 from gsmap.inputs.frames import reframed
 from gsmap.inputs.source import InputOptions, Source, open_input
 from gsmap.visualization.map_visualizer import MapVisualizer
@@ -41,15 +41,10 @@ _LOOK_AT = 100  # samples whose cameras are an input's
 def select_samples(
     tokens: Sequence[str], wanted: Sequence[str] | None = None, max_num: int | None = None
 ) -> list[int]:
-    """Choose samples by token, and of these a number spread evenly.
-
-    Args:
-        tokens: Tokens of all samples.
-        wanted: Tokens to keep, in this order; None keeps all.
-        max_num: Largest number of samples; None keeps all.
+    """Choose samples by token, and of these at most ``max_num``, spread evenly.
 
     Returns:
-        Indices into ``tokens``.
+        Indices into ``tokens``, in the order of ``wanted`` if that is given.
 
     Raises:
         ValueError: If a wanted token is not there, or ``max_num`` is smaller than 1.
@@ -65,16 +60,21 @@ def select_samples(
 
 
 def spread_evenly(count: int, max_num: int | None = None) -> list[int]:
-    """Return at most ``max_num`` of the indices below ``count``, spread evenly.
-
-    Raises:
-        ValueError: If ``max_num`` is smaller than 1.
-    """
+    """Return at most ``max_num`` indices below ``count``; ValueError if that is less than 1."""
     if max_num is None or max_num >= count:
         return list(range(count))
     if max_num < 1:
         raise ValueError(f"max_num must be >= 1, got {max_num}.")
     return np.linspace(0, count - 1, max_num).round().astype(int).tolist()
+
+
+def _build_visualizer(cfg: Config) -> MapVisualizer:
+    """Build a visualizer with the config's options and without its backends."""
+    options = dict(cfg.get("visualizer") or {})
+    if str(options.pop("type", "MapVisualizer")).split(".")[-1] != "MapVisualizer":
+        options = {}
+    own = {k: v for k, v in options.items() if k not in ("name", "vis_backends", "save_dir")}
+    return MapVisualizer(name=f"inferencer-{id(cfg)}", **own)
 
 
 class MapInferencer:
@@ -114,25 +114,14 @@ class MapInferencer:
         self.model.eval()
         device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         names = [device] if isinstance(device, str | torch.device) else list(device)
-        self.replicas = [
-            (copy.deepcopy(self.model) if i else self.model).to(torch.device(name))
-            for i, name in enumerate(names)
-        ]
         self.devices = [torch.device(name) for name in names]
+        models = [self.model, *(copy.deepcopy(self.model) for _ in names[1:])]
+        self.replicas = [m.to(d) for m, d in zip(models, self.devices, strict=True)]
         self.amp = amp
         self._camera_embeds = getattr(self.model.bev_encoder, "cams_embeds", None)
-        self.visualizer = self._build_visualizer()
+        self.visualizer = _build_visualizer(self.cfg)
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
         self._files = 0
-
-    def _build_visualizer(self) -> MapVisualizer:
-        """Build a visualizer with the config's options and without its backends."""
-        options = dict(self.cfg.get("visualizer") or {})
-        kind = str(options.pop("type", "MapVisualizer")).split(".")[-1]
-        options = options if kind == "MapVisualizer" else {}
-        for name in ("name", "vis_backends", "save_dir"):
-            options.pop(name, None)
-        return MapVisualizer(name=f"inferencer-{id(self)}", **options)
 
     def dataset(
         self,
@@ -211,10 +200,8 @@ class MapInferencer:
         if set(names) <= set(trained):
             rows = [list(trained).index(name) for name in names]
         else:
-            sample = max(
-                (dataset.sample(i) for i in range(min(len(dataset), _LOOK_AT))),
-                key=lambda sample: len(sample.cameras),
-            )
+            first = (dataset.sample(i) for i in range(min(len(dataset), _LOOK_AT)))
+            sample = max(first, key=lambda sample: len(sample.cameras))
             rows = similar_cameras(sample, dataset.metainfo["frame"], names, trained)
         for replica, device in zip(self.replicas, self.devices, strict=True):
             embeds = self._camera_embeds.detach()[rows].to(device)
@@ -242,14 +229,9 @@ class MapInferencer:
 
     @staticmethod
     def lidar_points(dataset: VectorizedMapDataset, index: int) -> np.ndarray | None:
-        """Return a sample's LiDAR points in the annotation frame, in metres, if it has a sweep.
+        """Return a sample's LiDAR points (x, y, z), if it has a sweep. (n, 3)
 
-        Args:
-            dataset: From ``dataset()``.
-            index: Index of the sample.
-
-        Returns:
-            Points (x, y, z). (n, 3)
+        They are in the annotation frame, in metres.
 
         Raises:
             FileNotFoundError: If the sweep's file does not exist.
@@ -292,8 +274,8 @@ class MapInferencer:
             ValueError: If a file of a sample is missing or damaged, or a camera is absent.
         """
         dataset = self._fit_cameras(dataset, allow_missing_cameras)
-        frames = BlankCameraDataset(dataset, allow_missing_cameras)
-        batches = frame_batches(frames, indices, batch_size, num_workers)
+        frames = FrameDataset(dataset, indices, allow_missing_cameras)
+        batches = DataLoader(frames, batch_size, num_workers=num_workers, collate_fn=collate)
         with ExitStack() as stack:
             pools = [stack.enter_context(ThreadPoolExecutor(1)) for _ in self.replicas]
             pending: deque[Future] = deque()
@@ -322,17 +304,6 @@ class MapInferencer:
         """Return a predicted sample's ``vectors`` of the results JSON."""
         found = elements_of_predictions(data_sample.pred_instances_3d)
         return vectors_of(found, self.visualizer.dataset_meta["classes"])
-
-    def write(self, path: str | Path, data_samples: Sequence[Det3DDataSample]) -> None:
-        """Write predictions as JSON, in the form that ``tools/test.py --out`` writes.
-
-        Args:
-            path: File to write.
-            data_samples: Samples from ``predict``.
-        """
-        samples = ((str(sample.metainfo["token"]), self.vectors(sample)) for sample in data_samples)
-        classes = list(self.visualizer.dataset_meta["classes"])
-        write_results(path, sorted(samples), {"classes": classes})
 
     def draw(self, data_sample: Det3DDataSample, **options: Any) -> Figure:
         """Compose a predicted sample's picture; options as in ``MapVisualizer.draw_sample``."""

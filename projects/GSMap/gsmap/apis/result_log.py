@@ -4,7 +4,6 @@ import fcntl
 import json
 import logging
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from gsmap.evaluation.results_json import write_results
@@ -62,12 +61,7 @@ class ResultLog:
         except OSError:  # a file system without locks
             _LOGGER.warning("%s cannot be locked: take care that one process writes it.", self.path)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._file.close()
 
     def _note(self, line: dict[str, Any]) -> None:
@@ -89,13 +83,9 @@ class ResultLog:
         self._append({"sample_token": token, "broken": reason})
 
     def finish(self, meta: dict[str, Any]) -> int:
-        """Write the result file, in the order of tokens, and remove this one.
+        """Write the result file, in the order of tokens, remove this one, and count the frames.
 
-        Args:
-            meta: What to say about the file.
-
-        Returns:
-            How many frames it holds.
+        ``meta`` is what to say about the file.
         """
         places: list[tuple[str, int]] = []
         with self.path.open("rb") as file:

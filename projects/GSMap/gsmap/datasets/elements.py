@@ -31,13 +31,10 @@ def elements_of_targets(instances: Any) -> MapElements:
 
 
 def elements_of_predictions(instances: Any) -> MapElements:
-    """Convert ``pred_instances_3d``.
+    """Convert ``pred_instances_3d``; ValueError if a point or a score is not finite.
 
     It has ``pts`` (N, P, 2) in metres, ``labels_3d`` (N,), ``scores_3d`` (N,) and, where there are
     Gaussians, ``scales`` (N, P, 2) in metres and ``rotations`` (N, P).
-
-    Raises:
-        ValueError: If a point or a score is not finite.
     """
     points, labels, scores = (_array(instances[k]) for k in ("pts", "labels_3d", "scores_3d"))
     gaussians = {k: _array(instances[k]) for k in ("scales", "rotations") if k in instances}

@@ -8,13 +8,7 @@ from PIL import Image, UnidentifiedImageError
 def image_size(file: Path, where: str) -> tuple[int, int]:
     """Return an image's width and height in pixels; its pixels are not read.
 
-    Args:
-        file: The image.
-        where: Sample and camera, for the message.
-
-    Raises:
-        FileNotFoundError: If it is missing.
-        ValueError: If it is not an image.
+    Messages begin with ``where``: FileNotFoundError without the file, ValueError if it is no image.
     """
     if not file.is_file():
         raise FileNotFoundError(f"{where}: no image at {file}; paths are relative to data_root.")

@@ -157,15 +157,11 @@ class VectorizedMapDataset(BaseDataset):
         return [instance.label for instance in self.sample(idx).instances or []]
 
     def get_data_info(self, idx: int) -> dict[str, Any]:
-        """Return a sample as the pipeline takes it.
+        """Return a sample as the pipeline takes it; BrokenSampleError if a camera is absent.
 
-        Returns:
-            Keys of mmdet3d's multi-view pipelines (``images``, ``lidar_points``, ``lidar_sweeps``,
-            ``timestamp``), the keys of the packed metainfo, ``dim`` and ``map_instances``: the
-            elements at full resolution with ``dim`` coordinates per point, or None.
-
-        Raises:
-            BrokenSampleError: If a camera that the config asks for is absent.
+        It has the keys of mmdet3d's multi-view pipelines (``images``, ``lidar_points``,
+        ``lidar_sweeps``, ``timestamp``), those of the packed metainfo, ``dim`` and
+        ``map_instances``: the elements at full resolution with ``dim`` coordinates per point.
         """
         entry = super().get_data_info(idx)
         sample = self.annotations[entry["row"]]
@@ -174,18 +170,13 @@ class VectorizedMapDataset(BaseDataset):
             instances = [MapInstance(i.label, i.points[:, :dim]) for i in instances]
         info: dict[str, Any] = {
             "sample_idx": entry["sample_idx"],
-            "token": sample.token,
-            "scene": sample.scene,
-            "map_name": sample.map_name,
-            "timestamp_ns": sample.timestamp_ns,
+            **{key: getattr(sample, key) for key in ("token", "scene", "map_name", "timestamp_ns")},
+            **{key: self._metainfo[key] for key in ("x_range", "y_range", "dim")},
             "seconds": self.annotations.seconds_into_scene[entry["row"]],
             "timestamp": sample.timestamp_ns / 1e9,
             "lidar2global": sample.global_from_frame,
             "lidar2ego": sample.ego_from_frame,
             "can_bus": np.zeros(CAN_BUS_SIZE),
-            "x_range": self.annotations.meta.x_range,
-            "y_range": self.annotations.meta.y_range,
-            "dim": dim,
             "images": self._images(sample, entry),
             "map_instances": instances,
             "eval_ann_info": None,

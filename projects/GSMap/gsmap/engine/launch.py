@@ -147,7 +147,14 @@ def load_config(args: argparse.Namespace) -> Config:
         cfg.work_dir = str(Path("work_dirs") / Path(args.config).stem)
     check_config(cfg)
     if args.launcher == "pytorch" and not torch.cuda.is_available():
-        join_on_cpu(cfg)
+        # mmengine would choose a CUDA device first, and wrap the model with its number
+        torch.distributed.init_process_group("gloo")
+        cfg.model_wrapper_cfg = {
+            "type": "MMDistributedDataParallel",
+            "device_ids": None,
+            "find_unused_parameters": cfg.get("find_unused_parameters", False),
+            "broadcast_buffers": False,
+        }
     return cfg
 
 
@@ -156,40 +163,20 @@ def newest_checkpoint(work_dir: str | Path) -> Path | None:
 
     A damaged one is named and passed over; None if there is none.
     """
-    numbered = {
-        int(match[1]): path
+    numbers = {
+        path: int(match[1])
         for path in Path(work_dir).glob("*.pth")
         if (match := re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name))
     }
-    for number in sorted(numbered, reverse=True):
-        if is_whole(numbered[number]):
-            return numbered[number]
-        print_log(f"{numbered[number]} is damaged and is passed over.", level=logging.WARNING)
+    for path in sorted(numbers, key=numbers.__getitem__, reverse=True):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                if archive.testzip() is None:
+                    return path
+        except zipfile.BadZipFile:
+            pass
+        print_log(f"{path} is damaged and is passed over.", level=logging.WARNING)
     return None
-
-
-def is_whole(checkpoint: Path) -> bool:
-    """Whether a checkpoint's archive is complete and every part has its checksum."""
-    try:
-        with zipfile.ZipFile(checkpoint) as archive:
-            return archive.testzip() is None
-    except zipfile.BadZipFile:
-        return False
-
-
-def join_on_cpu(cfg: Config) -> None:
-    """Let the processes of torchrun work together without a GPU, which mmengine takes for granted.
-
-    The process group is made here, as mmengine would first choose a CUDA device, and the model is
-    wrapped without device numbers.
-    """
-    torch.distributed.init_process_group("gloo")
-    cfg.model_wrapper_cfg = {
-        "type": "MMDistributedDataParallel",
-        "device_ids": None,
-        "find_unused_parameters": cfg.get("find_unused_parameters", False),
-        "broadcast_buffers": False,
-    }
 
 
 def check_config(cfg: Config) -> None:
@@ -200,7 +187,15 @@ def check_config(cfg: Config) -> None:
             underscore), or a learning-rate schedule ends at another epoch than the training.
     """
     _check_keys(cfg)
-    _check_schedule(cfg)
+    end = (cfg.get("train_cfg") or {}).get("max_epochs")
+    for scheduler in cfg.get("param_scheduler") or []:
+        last = scheduler.get("T_max")
+        if end is not None and last is not None and scheduler.get("by_epoch", True) and last != end:
+            raise ValueError(
+                f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {last}: set "
+                "both train_cfg.max_epochs and param_scheduler's T_max (a schedule is one base "
+                "file)."
+            )
     optimizer = ((cfg.get("optim_wrapper") or {}).get("optimizer") or {}).get("type")
     runner = cfg.get("runner_type", "Runner")
     # mmengine goes on without an optimizer that it does not know
@@ -218,16 +213,3 @@ def _check_keys(cfg: Config) -> None:
             continue
         hint = nearest(key, KNOWN_KEYS) or "; names of a config's own values start with '_'."
         raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")
-
-
-def _check_schedule(cfg: Config) -> None:
-    train_cfg = cfg.get("train_cfg") or {}
-    end = train_cfg.get("max_epochs")
-    for scheduler in cfg.get("param_scheduler") or []:
-        last = scheduler.get("T_max")
-        if end is not None and last is not None and scheduler.get("by_epoch", True) and last != end:
-            raise ValueError(
-                f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {last}: set "
-                "both train_cfg.max_epochs and param_scheduler's T_max (a schedule is one base "
-                "file)."
-            )

@@ -57,13 +57,8 @@ def find_config(config: str | Path) -> Path:
     """
     if Path(config).is_file():
         return Path(config)
-    model = named_models().get(str(config))
-    if model is None:
-        raise FileNotFoundError(
-            f"There is no config file {config}, and no model of that name{_hint(config)}; configs "
-            "are in configs/ and projects/GSMap/configs/."
-        )
-    return REPO / model.config
+    remedy = "; configs are in configs/ and projects/GSMap/configs/"
+    return REPO / _named(config, "config file", remedy).config
 
 
 def find_checkpoint(checkpoint: str | Path) -> Path:
@@ -75,11 +70,7 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
     """
     if Path(checkpoint).is_file():
         return Path(checkpoint)
-    model = named_models().get(str(checkpoint))
-    if model is None:
-        raise FileNotFoundError(
-            f"There is no checkpoint {checkpoint}, and no model of that name{_hint(checkpoint)}."
-        )
+    model = _named(checkpoint, "checkpoint")
     if not model.file.is_file():
         remedy = f"fetch it from {model.address}" if model.address else "check it out again"
         raise FileNotFoundError(
@@ -97,7 +88,7 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
     """Return the checkpoint that a command tests: the one given, or that of a named model.
 
     Raises:
-        FileNotFoundError: If it does not exist (see `find_checkpoint`).
+        FileNotFoundError: If it does not exist.
         ValueError: If none is given with a config file.
     """
     if checkpoint is None and Path(config).is_file():
@@ -105,9 +96,14 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
     return find_checkpoint(config if checkpoint is None else checkpoint)
 
 
-def _hint(name: str | Path) -> str:
-    """Name the nearest model, or all that ship."""
-    close = difflib.get_close_matches(Path(name).stem, named_models(), n=1, cutoff=0.7)
-    if close:
-        return f" (did you mean {close[0]}?)"
-    return f" ({', '.join(name for name, m in named_models().items() if not m.address)} ship)"
+def _named(name: str | Path, what: str, remedy: str = "") -> NamedModel:
+    """Return a model by its name, or raise an error with the nearest, or with all that ship."""
+    models = named_models()
+    if str(name) not in models:
+        close = difflib.get_close_matches(Path(name).stem, models, n=1, cutoff=0.7)
+        shipped = ", ".join(model.name for model in models.values() if not model.address)
+        hint = f"did you mean {close[0]}?" if close else f"{shipped} ship"
+        raise FileNotFoundError(
+            f"There is no {what} {name}, and no model of that name ({hint}){remedy}."
+        )
+    return models[str(name)]

@@ -48,11 +48,12 @@ class RunSummaryHook(Hook):
         frozen = sum(size for size, trained in sizes if not trained)
         note = f", {frozen / 1e6:.2f} M of them frozen" if frozen else ""
         kind = f"{type(model).__name__} with {type(getattr(model, 'map_head', None)).__name__}"
+        start = runner._load_from or "the config's initial weights"
         device = next(model.parameters()).device
         log_dir = getattr(runner, "log_dir", None) or runner._log_dir  # FlexibleRunner's is public
         lines = {
             "model": f"{kind}, {sum(size for size, _ in sizes) / 1e6:.2f} M parameters{note}",
-            "start": _start(runner),
+            "start": f"goes on after iteration {runner.iter}" if runner.iter else f"from {start}",
             **_data(runner),
             "length": _length(runner),
             "runs on": f"{device}, {torch.get_num_threads()} threads; torch {torch.__version__}, "
@@ -63,18 +64,6 @@ class RunSummaryHook(Hook):
         runner.logger.info(f"This run{text}")
 
 
-def _start(runner: Runner) -> str:
-    """Say where the weights come from."""
-    if runner.iter:
-        return f"goes on after iteration {runner.iter}"
-    return f"from {runner._load_from}" if runner._load_from else "from the config's initial weights"
-
-
-def _innermost(dataset: Any) -> Any:
-    """Return the data set that wrappers, such as ``RepeatDataset``, are around."""
-    return _innermost(dataset.dataset) if hasattr(dataset, "dataset") else dataset
-
-
 def _data(runner: Runner) -> dict[str, str]:
     """Describe the data: how many samples, cameras, range and classes."""
     loaders = {"training": runner.train_dataloader}
@@ -82,7 +71,9 @@ def _data(runner: Runner) -> dict[str, str]:
         loaders["validation"] = runner.val_dataloader
     lines = {}
     for name, loader in loaders.items():
-        dataset = _innermost(loader.dataset)
+        dataset = loader.dataset
+        while hasattr(dataset, "dataset"):  # a wrapper, such as RepeatDataset
+            dataset = dataset.dataset
         file = getattr(dataset, "ann_file", type(dataset).__name__)
         lines[name] = f"{len(loader.dataset)} samples of {file}"
     if not hasattr(dataset, "sample"):

@@ -163,12 +163,6 @@ class _End:
 def output_file(text: str) -> Path:
     """Read an argument that names what a command writes, before it begins to work.
 
-    Args:
-        text: The word.
-
-    Returns:
-        The path.
-
     Raises:
         OSError: If it is a folder, or no file can be made there.
     """

@@ -5,14 +5,10 @@ from types import ModuleType
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
-    """Import a module that comes with an extra of this package.
-
-    Args:
-        module: Name of the module.
-        extra: Name of the extra, as in ``pip install -e .[EXTRA]``.
+    """Import a module that comes with an extra of this package (``pip install -e .[EXTRA]``).
 
     Raises:
-        RuntimeError: If the module is not installed; the message names the extra.
+        RuntimeError: If it is not installed.
     """
     try:
         return importlib.import_module(module)

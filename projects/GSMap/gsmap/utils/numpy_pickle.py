@@ -15,31 +15,23 @@ import numpy as np
 _CODE = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,4}")
 _STATE_PARTS = {int, str, type(None)}
 _MAX_DIMS = 8
-_LAST_CHARACTER = 0x10FFFF
+_LARGEST = {"b": 1, "U": 0x10FFFF}  # of booleans and characters, as integers
 
 
 class CheckedDtype:
-    """A dtype in a pickle: the ``dtype`` of a plain type, in either byte order.
+    """A dtype in a pickle: a number, boolean or string, in either byte order.
 
     Args:
         code: numpy's short name, such as ``f8``.
         *options: What numpy writes besides (alignment, copy); of no meaning for plain types.
-
-    Raises:
-        pickle.UnpicklingError: If it is not a number, boolean or string.
     """
 
     __slots__ = ("dtype",)
 
-    dtype: np.dtype[Any]
-
-    def __new__(cls, code: Any = None, *options: Any) -> "CheckedDtype":
-        """Make the dtype; its byte order may follow as state."""
+    def __init__(self, code: Any = None, *options: Any) -> None:
         if not isinstance(code, str) or not _CODE.fullmatch(code):
             raise pickle.UnpicklingError(f"it holds values of dtype {code!r}, not plain ones")
-        new = super().__new__(cls)
-        new.dtype = np.dtype(code)
-        return new
+        self.dtype: np.dtype[Any] = np.dtype(code)
 
     def __setstate__(self, state: Any) -> None:
         plain = isinstance(state, tuple) and {type(part) for part in state} <= _STATE_PARTS
@@ -52,14 +44,10 @@ class CheckedDtype:
 
 
 class CheckedArray(np.ndarray):
-    """An array in a pickle; saved again, it is an ordinary one.
-
-    Raises:
-        pickle.UnpicklingError: If it is made with arguments, or its content does not fit its shape.
-    """
+    """An array in a pickle, made empty before its content; saved again, it is an ordinary one."""
 
     def __new__(cls, *arguments: Any) -> "CheckedArray":
-        """Make an empty array, whose content follows as state."""
+        """Make an empty array."""
         if arguments:
             raise pickle.UnpicklingError("it makes an array in a way of its own")
         return super().__new__(cls, (0,), np.int8)
@@ -74,25 +62,16 @@ class CheckedArray(np.ndarray):
         whole = isinstance(shape, tuple) and all(type(n) is int and n >= 0 for n in shape)
         if not whole or len(shape) > _MAX_DIMS:
             raise pickle.UnpicklingError(f"an array has the shape {shape!r}")
-        if math.prod(shape) * checked.dtype.itemsize != len(data):
-            raise pickle.UnpicklingError(
-                f"an array of shape {shape} and dtype {checked.dtype} has {len(data)} bytes"
-            )
-        _check_content(checked.dtype, data)
-        super().__setstate__((1, shape, checked.dtype, bool(fortran), data))
+        dtype = checked.dtype
+        if math.prod(shape) * dtype.itemsize != len(data):
+            raise pickle.UnpicklingError(f"an array {shape} of {dtype} has {len(data)} bytes")
+        integers = {"b": "u1", "U": np.dtype("u4").newbyteorder(dtype.byteorder)}.get(dtype.kind)
+        if integers and data and np.frombuffer(data, integers).max() > _LARGEST[dtype.kind]:
+            raise pickle.UnpicklingError(f"an array holds bytes that are no {dtype}")
+        super().__setstate__((1, shape, dtype, bool(fortran), data))
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         return np.asarray(self).__reduce_ex__(protocol)
-
-
-def _check_content(dtype: np.dtype, data: bytes) -> None:
-    """Refuse bytes that are no value of the dtype: booleans beyond 1, characters beyond Unicode."""
-    largest = {"b": 1, "U": _LAST_CHARACTER}.get(dtype.kind)
-    if largest is None or not data:
-        return
-    order = ">" if dtype.byteorder == ">" else "<"
-    if np.frombuffer(data, "u1" if dtype.kind == "b" else f"{order}u4").max() > largest:
-        raise pickle.UnpicklingError(f"an array holds bytes that are no {dtype}")
 
 
 def _array(kind: Any, *_placeholder: Any) -> CheckedArray:

@@ -19,12 +19,11 @@ class CameraRecord:
     Args:
         name: Channel name, such as ``CAM_FRONT``.
         path: Image file, relative to the data root, with forward slashes.
-        width: Image width in pixels.
-        height: Image height in pixels.
+        width: Width in pixels.
+        height: Height in pixels.
         intrinsics: Pinhole matrix in pixels. (3, 3)
         cam_from_frame: Transform from the annotation frame at the sample's time to the camera (z
-            forward) at the time of the image: the vehicle's motion between the two is included. (4,
-            4)
+            forward) at the image's time, with the vehicle's motion in between. (4, 4)
     """
 
     name: str
@@ -156,10 +155,9 @@ class AnnotationMeta:
         if self.dim not in (2, 3):
             raise ValueError(f"dim must be 2 or 3, got {self.dim!r}.")
         names = self.classes if isinstance(self.classes, (list, tuple)) else ()
-        if not names or not all(isinstance(n, str) and n for n in names):
-            raise ValueError(f"classes must be names, at least one, got {self.classes!r}.")
-        if len(set(names)) != len(names):
-            raise ValueError(f"classes must be different names, got {self.classes!r}.")
+        named = all(isinstance(name, str) and name for name in names)
+        if not (named and 0 < len(names) == len(set(names))):
+            raise ValueError(f"classes must be names, different ones, got {self.classes!r}.")
         object.__setattr__(self, "classes", tuple(names))
         for name, usual in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):
             given = getattr(self, name)

@@ -74,13 +74,9 @@ def schema_of(meta: AnnotationMeta) -> pa.Schema:
 def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]:
     """Return a sample, or a record in it, as the nested values of an Arrow row.
 
-    Args:
-        record: The sample.
-        meta: Metadata of the file: its frame, and coordinates per point.
-        where: What messages begin with.
-
     Raises:
-        ValueError: If a matrix or an element has another shape, or holds no numbers.
+        ValueError: If a matrix or an element has another shape, or holds no numbers; the message
+            begins with ``where``.
     """
     where += f"sample {record.token!r}: " if isinstance(record, MapSample) else ""
     where += f"{record.name}: " if isinstance(record, CameraRecord) else ""
@@ -130,12 +126,9 @@ def matrices_of(array: pa.FixedSizeListArray, *shape: int) -> np.ndarray:
 
 
 def decoder_of(array: pa.Array, dim: int, name: str = "") -> Callable[[int], Any]:
-    """Return what makes the record of a row, or a part of one, from a valid array.
+    """Return what makes the record of a row, or its field ``name``, from a valid array.
 
-    Args:
-        array: Structs, lists or values of the file's types.
-        dim: Coordinates per point.
-        name: Name of the array's field.
+    Points have ``dim`` coordinates.
     """
     decode = _decoder_of(array, dim, name)
     if not array.null_count:

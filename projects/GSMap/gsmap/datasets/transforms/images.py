@@ -125,10 +125,7 @@ class ScaleImages(BaseTransform):
 
     Args:
         scale: Factor, > 0; sizes are rounded down, and the matrices take the exact ratio of each
-            axis.
-
-    Raises:
-        ValueError: If ``scale`` is not positive.
+            axis. ValueError if it is not positive.
     """
 
     def __init__(self, scale: float) -> None:

@@ -50,7 +50,6 @@ def map_targets(
     slots = max(num_points - 1, 2)
     points = np.empty((len(instances), num_points, dim))
     orders = np.empty((len(instances), slots, num_points, dim))
-    boxes = np.empty((len(instances), 2, 2))
     longest = max((len(instance.points) for instance in instances), default=2)
     polylines = np.empty((len(instances), longest, 2))
     closed = np.empty(len(instances), bool)
@@ -63,15 +62,14 @@ def map_targets(
         line = instance.points[:, :dim].astype(np.float64)
         orders[i] = equivalent_orders(line, num_points, rng)
         points[i] = resample(line, num_points)
-        boxes[i] = bounding_boxes(line).reshape(2, 2)
         polylines[i, : len(line)] = line[:, :2]
         polylines[i, len(line) :] = line[-1, :2]
         closed[i] = is_closed(instance.points[:, :dim])
     unused = orders == PADDING
-    metres = {"pts": points, "pts_shifts": orders, "boxes": boxes, "polylines": polylines}
+    metres = {"pts": points, "pts_shifts": orders, "polylines": polylines}
     targets = {name: clamp(array, x_range, y_range) for name, array in metres.items()}
     targets["pts_shifts"][unused] = PADDING
-    targets["boxes"] = targets["boxes"].reshape(-1, 4)
+    targets["boxes"] = bounding_boxes(targets["polylines"])
     return InstanceData(
         labels_3d=torch.tensor([instance.label for instance in instances], dtype=torch.int64),
         closed=torch.from_numpy(closed),
