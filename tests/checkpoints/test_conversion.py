@@ -21,7 +21,6 @@ from gsmap.apis.checkpoint import load_weights, read_weights
 from gsmap.checkpoints.convert import (
     convert_state,
     ours_from_upstream,
-    read_checkpoint,
     upstream_from_ours,
 )
 from gsmap.checkpoints.key_map import KEY_MAPS, MAPTR, MAPTR_BEVFORMER, find_key_map
@@ -149,7 +148,7 @@ def test_a_file_of_something_else_is_refused(tmp_path):
     path = tmp_path / "other.pth"
     torch.save({"state_dict": {"epoch": 3}}, path)
     with pytest.raises(ValueError, match="holds no state dict of tensors"):
-        read_checkpoint(path)
+        read_weights(path)
 
 
 def test_a_training_checkpoint_converts_without_its_auxiliary_heads(tmp_path):
@@ -174,7 +173,7 @@ def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch,
     tool = str(REPO / "tools/convert_checkpoint.py")
     runpy.run_path(tool, run_name="__main__")
     assert "maptr: gsmap to upstream" in capsys.readouterr().out
-    upstream, _ = read_checkpoint(target)
+    upstream = read_weights(target)
     assert all(torch.equal(upstream[MAPTR.to_upstream(key)], state[key]) for key in state)
     with pytest.raises(SystemExit) as left:
         runpy.run_path(tool, run_name="__main__")

@@ -1,4 +1,3 @@
-import json
 import os
 import pickle
 import signal
@@ -18,9 +17,8 @@ from mmengine.runner import Runner
 from mmengine.runner.checkpoint import save_checkpoint
 
 import gsmap.registered  # noqa: F401
-from gsmap.checkpoints.convert import read_checkpoint
+from gsmap.apis.checkpoint import read_checked
 from gsmap.checkpoints.safe_globals import mmengine_globals
-from gsmap.checkpoints.settings import MODEL_SETTINGS
 from gsmap.engine.checkpoint_hook import AtomicCheckpointHook, AtomicLocalBackend
 
 
@@ -205,8 +203,8 @@ def test_the_best_of_the_validations_is_kept(tmp_path):
 
 def test_a_checkpoint_holds_the_models_settings_and_no_text_that_runs(tmp_path):
     learn(tmp_path, 1)
-    _, meta = read_checkpoint(tmp_path / "epoch_1.pth")
-    assert json.loads(meta[MODEL_SETTINGS]) == {"type": "Learner", "size": [1, 2]}
+    _, settings = read_checked(tmp_path / "epoch_1.pth")
+    assert settings == {"type": "Learner", "size": [1, 2]}
     poisoned = torch.load(tmp_path / "epoch_1.pth", weights_only=False)
     poisoned["meta"]["config"] = f"open({str(tmp_path / 'proof')!r}, 'w')"
     torch.save(poisoned, tmp_path / "epoch_1.pth")

@@ -3,13 +3,16 @@
 import json
 import pickle
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from mmengine.config import Config
 from torch import Tensor, nn
 
-from gsmap.checkpoints.convert import listed, read_checkpoint
+from gsmap.checkpoints.convert import listed
+from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import MODEL_SETTINGS, differences, plain
 from gsmap.engine.named_models import find_checkpoint
 
@@ -35,7 +38,10 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
     """
     path = find_checkpoint(path)
     try:
-        state, meta = read_checkpoint(path)
+        with torch.serialization.safe_globals(mmengine_globals()):
+            checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
+        state = checkpoint.get("state_dict", checkpoint) if isinstance(checkpoint, Mapping) else {}
+        meta = (checkpoint.get("meta") if state is not checkpoint else None) or {}
         settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
     except pickle.UnpicklingError as error:
         reason = str(error).split(". ")[0]
@@ -48,13 +54,15 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
             f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); "
             "fetch it again, or use an earlier epoch's."
         ) from error
+    if not state or not all(isinstance(value, Tensor) for value in state.values()):
+        raise ValueError(f"{path} holds no state dict of tensors.")
     broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
     if broken:
         raise ValueError(
             f"{path} holds NaN or infinite weights ({listed(broken)}): the training that wrote it "
             "had failed; use an earlier epoch's."
         )
-    return state, settings
+    return {key.removeprefix("module."): value for key, value in state.items()}, settings
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:

@@ -126,14 +126,11 @@ class Run:
         test += ["--metrics-out", str(self.folder / "metrics.json")]
         train = ["--work-dir", str(self.folder), "--resume"]
         train += ["--launcher", "pytorch"] if self.processes > 1 else []
-        options = ["--cfg-options", *self.options]
-        python = [sys.executable, "-u"]
+        options, python = ["--cfg-options", *self.options], [sys.executable, "-u"]
+        words = {"train": [*train, *options], "test": [str(self.checkpoint), *test, *options]}
         return {
-            "train": [*python, str(REPO / "tools/train.py"), self.config, *train, *options],
-            "test": [
-                *(*python, str(REPO / "tools/test.py"), self.config, str(self.checkpoint)),
-                *(*test, *options),
-            ],
+            stage: [*python, str(REPO / f"tools/{stage}.py"), self.config, *own]
+            for stage, own in words.items()
         }
 
 
@@ -163,10 +160,6 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
 
     On a CPU a run has a process a core, as far as these share a step's samples evenly; on a GPU
     one. Batch statistics are those of a process's samples.
-
-    Args:
-        entries: Configs to compare.
-        protocol: What their runs share.
 
     Returns:
         The runs, seed by seed.

@@ -110,11 +110,7 @@ def _config(folder: Path) -> Config:
 
 
 def check_one_test_set(results: Sequence[Result]) -> None:
-    """Refuse results of different samples or ground truth.
-
-    Raises:
-        ValueError: If the numbers of samples or of elements differ.
-    """
+    """Raise a ValueError if the results' numbers of samples or of elements differ."""
     counts = [
         (r.folder, {k: v for k, v in r.figures.items() if k.endswith(("num_gts", "num_samples"))})
         for r in results
@@ -129,14 +125,10 @@ def check_one_test_set(results: Sequence[Result]) -> None:
 
 
 def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator:
-    """Return the rules of both metrics for an annotation file, with some changed.
+    """Return the rules of both metrics for an annotation file, which says classes and range.
 
-    Args:
-        annotations: The file; it says classes and range.
-        changes: Fields of ``ChamferConfig``, ``RasterConfig`` or ``MapEvaluator``.
-
-    Raises:
-        ValueError: If there is no such field.
+    ``changes`` are fields of ``ChamferConfig``, ``RasterConfig`` or ``MapEvaluator``; ValueError if
+    there is no such field.
     """
     meta = AnnotationFile(annotations).meta
     own: dict[str, Any] = {"classes": meta.classes, "grid": BEVGrid(meta.x_range, meta.y_range)}
@@ -201,15 +193,9 @@ def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[
 
 
 def markdown(results: Sequence[Result], title: str, command: str) -> str:
-    """Write the tables of a comparison.
+    """Write the tables of a comparison in Markdown: figures, paired differences, cost, runs.
 
-    Args:
-        results: All runs, those that failed as well; differences are to the first one's config.
-        title: What was compared, under which rules.
-        command: The command that made it.
-
-    Returns:
-        Markdown: figures, paired differences, cost, runs.
+    Runs that failed are there, too. Differences are to the config of the first result.
     """
     names = list(dict.fromkeys(r.name for r in results))
     columns = _columns(results)
@@ -227,10 +213,11 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
         [name, str(len(of[columns[0]])), *(_cell(of[key], 100, "+.1f") for key in columns)]
         for name, of in paired.items()
     ]
-    runs = [
-        [r.name, str(r.seed), r.state, str(r.folder), r.record.get("machine", "-"), _load(r.record)]
-        for r in results
-    ]
+    runs = []
+    for r in results:
+        at = [f"{r.record[k]:.1f}" for k in ("load_at_start", "load_at_end") if k in r.record]
+        where = [str(r.folder), r.record.get("machine", "-"), " to ".join(at) or "-"]
+        runs.append([r.name, str(r.seed), r.state, *where])
     parts = [
         f"# {title}\n\n`{command}`\n",
         "AP in percent, mean and standard deviation over seeds.\n",
@@ -247,21 +234,10 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
     return "\n".join(parts)
 
 
-def _load(record: Mapping[str, Any]) -> str:
-    """Write the machine's load at a run's start and end."""
-    keys = ("load_at_start", "load_at_end")
-    return " to ".join(f"{record[key]:.1f}" for key in keys if key in record) or "-"
-
-
 def as_json(results: Sequence[Result], title: str, command: str) -> str:
     """Write all figures of a comparison."""
-    runs = [
-        {
-            **{key: getattr(r, key) for key in ("name", "seed", "state", "figures", "costs")},
-            **{"folder": str(r.folder), "record": r.record},
-        }
-        for r in results
-    ]
+    keys = ("name", "seed", "state", "figures", "costs", "record")
+    runs = [{key: getattr(r, key) for key in keys} | {"folder": str(r.folder)} for r in results]
     content = {"title": title, "command": command, "differences": differences_to_first(results)}
     return json.dumps({**content, "runs": runs}, indent=1)
 
@@ -292,12 +268,8 @@ def apply_rescoring(
 ) -> dict[str, list[MetricReport]]:
     """Score again what the curves need: one run of each config, or all runs if rules change.
 
-    Args:
-        results: All runs; with changed rules their figures become the new ones.
-        changes: As in `evaluator_for`.
-
-    Returns:
-        The reports of each config's first run that is done, by its name.
+    With changed rules (`evaluator_for`) the results' figures become the new ones. Returns the
+    reports of each config's first run that is done, by its name.
     """
     reports: dict[str, list[MetricReport]] = {}
     for result in results:

@@ -74,8 +74,8 @@ _DECODER_LAYER = "pts_bbox_head.transformer.decoder.layers.{i}."
 _OUR_ENCODER_LAYER = "bev_encoder.layers.{i}."
 _LAYER = "map_head.decoder.layers.{i}."
 
-_IMAGE_RULES = _rules("", "", "img_backbone. img_neck.")
-_HEAD_RULES = (
+_COMMON_RULES = (
+    *_rules("", "", "img_backbone. img_neck."),
     *_rules(_HEAD, "map_head.", "instance_embedding. pts_embedding. cls_branches."),
     *_rules(_HEAD, "map_head.reference.", "reg_branches.=branches."),
     *_rules(_TRANSFORMER, "map_head.reference.", "reference_points.=initial."),
@@ -86,8 +86,7 @@ _DECODER_RULES = _rules(
     "attentions.0.attn.=self_attn. attentions.1.=cross_attn. ffns.0.=ffn. norms.",
 )
 _BEV_QUERY_RULES = (
-    *_IMAGE_RULES,
-    *_HEAD_RULES,
+    *_COMMON_RULES,
     *_DECODER_RULES,
     *_rules(_HEAD, "bev_encoder.", "bev_embedding. positional_encoding."),
     *_rules(_TRANSFORMER, "bev_encoder.", "level_embeds cams_embeds can_bus_mlp."),
@@ -109,8 +108,7 @@ MAPTR_BEVFORMER = KeyMap(
 )
 
 _LIFTED_RULES = (
-    *_IMAGE_RULES,
-    *_HEAD_RULES,
+    *_COMMON_RULES,
     *_rules(_HEAD, "map_head.aux_heads.", "seg_head.=seg. pv_seg_head.=pv_seg."),
     *_rules(_ENCODER, "bev_encoder.", "depth_net. downsample."),
 )

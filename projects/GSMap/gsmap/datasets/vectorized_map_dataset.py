@@ -13,6 +13,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CAN_BUS_SIZE, LidarRecord, MapInstance, MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.rigid import rigid
 
 _BROKEN = ("raise", "skip")
 
@@ -222,11 +223,9 @@ class VectorizedMapDataset(BaseDataset):
         sweeps = []
         for sweep in lidar.sweeps:
             # mmdet3d computes points @ R - t with R, t out of "lidar2sensor"
-            matrix = np.eye(4)
-            matrix[:3, :3] = sweep.frame_from_lidar[:3, :3].T
-            matrix[:3, 3] = -sweep.frame_from_lidar[:3, 3]
+            rotation, shift = sweep.frame_from_lidar[:3, :3], sweep.frame_from_lidar[:3, 3]
             path = str(Path(self.data_root, sweep.path))
-            points = {"lidar_path": path, "lidar2sensor": matrix}
+            points = {"lidar_path": path, "lidar2sensor": rigid(rotation.T, -shift)}
             sweeps.append({"lidar_points": points, "timestamp": sweep.timestamp_ns / 1e9})
         return {
             "lidar_points": {"lidar_path": str(Path(self.data_root, lidar.path))},

@@ -5,6 +5,7 @@ from mmengine.hooks import Hook
 from mmengine.runner import Runner
 
 _FIGURE = "train/at_floor"
+_WINDOW, _TOO_MANY = 50, 0.5
 
 
 @HOOKS.register_module()
@@ -14,22 +15,16 @@ class GaussianHealthHook(Hook):
     GSMap's head logs ``at_floor``, the share of Gaussians whose sigmas both lie within 10 % of the
     smallest; a model without Gaussians logs none, and the hook is silent.
 
-    Args:
-        threshold: Share from which it warns.
-        window: Iterations that the share is averaged over.
+    The share is that of the latest 50 iterations, and half of all is too many.
     """
-
-    def __init__(self, threshold: float = 0.5, window: int = 50) -> None:
-        self.threshold = threshold
-        self.window = window
 
     def after_train_epoch(self, runner: Runner) -> None:
         """Look at the latest iterations."""
         history = runner.message_hub.log_scalars.get(_FIGURE)
         if history is None:
             return
-        share = history.mean(self.window)
-        if share >= self.threshold:
+        share = history.mean(_WINDOW)
+        if share >= _TOO_MANY:
             runner.logger.warning(
                 f"{100 * share:.0f} % of the Gaussians of matched predictions are at their "
                 "smallest size: their masks are dots, which teach nothing. Use "

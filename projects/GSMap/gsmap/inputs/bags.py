@@ -14,7 +14,7 @@ from gsmap.converters.argoverse2.samples import thin_out
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import naming
 from gsmap.inputs.rig import PoseAt, PoseTrack, RigCamera, RigFrame, nearest_images, rig_samples
-from gsmap.structures.rigid import invert_rigid
+from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import write_bytes
 
@@ -101,8 +101,7 @@ def _read(
 ) -> tuple[list[MapSample], bool]:
     topics = _camera_topics(bag)
     content = _first_pass(bag, topics)
-    ground = np.eye(4)
-    ground[2, 3] = ground_z_m
+    ground = rigid(np.eye(3), (0, 0, ground_z_m))
     vehicle = _vehicle_frame(content, vehicle_frame)
     rig = {
         topic: _camera(name, topic, content, vehicle, ground) for name, (topic, _) in topics.items()
@@ -168,10 +167,8 @@ def _stamp_ns(header: Any) -> int:
 
 def _matrix(place: Any, turn: Any) -> np.ndarray:
     """Return a pose of a message. (4, 4)"""
-    pose = np.eye(4)
-    pose[:3, 3] = place.x, place.y, place.z
-    pose[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
-    return pose
+    rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    return rigid(rotation, (place.x, place.y, place.z))
 
 
 def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:

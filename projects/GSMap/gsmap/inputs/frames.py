@@ -5,15 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from gsmap.datasets.annotations.record import MapSample
-from gsmap.structures.rigid import invert_rigid
+from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.visualization.frame_view import FRAME_VIEWS
 
 
 def _raised(height_m: float) -> np.ndarray:
     """Return the transform that adds a height. (4, 4)"""
-    shift = np.eye(4)
-    shift[2, 3] = height_m
-    return shift
+    return rigid(np.eye(3), (0, 0, height_m))
 
 
 # From the annotation frame to the ground below the rear axle (x ahead, y left, z up), as data sets

@@ -16,7 +16,7 @@ from gsmap.datasets.errors import BrokenSampleError, naming
 from gsmap.datasets.image_size import image_size
 from gsmap.datasets.transforms.images import read_image
 from gsmap.inputs.rig import PoseTrack, RigCamera, RigFrame, nearest_images, rig_samples
-from gsmap.structures.rigid import invert_rigid, is_rigid
+from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
 from gsmap.utils.files import write_bytes
 
 NAMES = ("calibration.yaml", "calibration.yml", "calibration.json")
@@ -51,8 +51,7 @@ def read_image_folder(file: Path, frames_dir: Path) -> tuple[list[MapSample], bo
         _require_keys(content, _KEYS, "a calibration file")
         if not isinstance(content.get("cameras"), dict) or not content["cameras"]:
             raise ValueError("`cameras` must map names to cameras, at least one")
-        ground = np.eye(4)
-        ground[2, 3] = float(content.get("ground_z_m", 0.0))
+        ground = rigid(np.eye(3), (0, 0, float(content.get("ground_z_m", 0.0))))
         rig, images = [], {}
         for name, camera in content["cameras"].items():
             with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
@@ -139,14 +138,12 @@ def _mounting(camera: Mapping[str, Any]) -> np.ndarray:
         if pose.shape != (4, 4) or not is_rigid(pose):
             raise ValueError("vehicle_from_camera must be a rotation with a translation, 4 x 4")
         return pose
-    pose = np.eye(4)
-    pose[:3, 3] = np.array(camera["position_m"], np.float64)
     if "quaternion_wxyz" in camera:
-        pose[:3, :3] = _turn(camera["quaternion_wxyz"])
+        rotation = _turn(camera["quaternion_wxyz"])
     else:
         turn = Rotation.from_euler("ZYX", camera["yaw_pitch_roll_deg"], degrees=True)
-        pose[:3, :3] = turn.as_matrix() @ _AHEAD
-    return pose
+        rotation = turn.as_matrix() @ _AHEAD
+    return rigid(rotation, camera["position_m"])
 
 
 def _turn(wxyz: Sequence[Any]) -> np.ndarray:
@@ -221,10 +218,8 @@ def _read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> P
             if "frame" in row and row["frame"] not in time_of:
                 continue
             times.append(time_of[row["frame"]] if "frame" in row else int(row["timestamp_ns"]))
-            pose = np.eye(4)
-            pose[:3, 3] = [float(row[axis]) for axis in "xyz"]
-            pose[:3, :3] = _turn([row[f"q{axis}"] for axis in "wxyz"])
-            poses.append(pose @ ground)
+            turn = _turn([row[f"q{axis}"] for axis in "wxyz"])
+            poses.append(rigid(turn, [float(row[axis]) for axis in "xyz"]) @ ground)
         return PoseTrack(times, poses)
 
 

@@ -3,7 +3,15 @@
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import NDArray
+
+
+def rigid(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> NDArray[np.float64]:
+    """Return a rotation (3, 3) and a translation (3,) as one transform. (4, 4)"""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, translation
+    return transform
 
 
 def invert_rigid(transform: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
