@@ -23,9 +23,6 @@ OPSET = 18
 class ExportedDetector(nn.Module):
     """A `MapDetector` of cameras as a function of tensors alone, for one sample.
 
-    Args:
-        model: The detector.
-
     Raises:
         ValueError: If the model reads LiDAR.
     """
@@ -117,10 +114,17 @@ def export_onnx(
     proto = program.model_proto
     for part in (proto.graph, *proto.graph.node):  # stack traces of the machine that exported
         del part.metadata_props[:]
-    metadata = {
+    head = model.map_head
+    metadata = {  # for `OnnxInferencer`
         "format": FORMAT,
         "image_size": list(image_size),
-        **_metadata(exported, cameras, frame),
+        "classes": list(head.classes),
+        "x_range": list(head.grid.x_range),
+        "y_range": list(head.grid.y_range),
+        "frame": frame,
+        "cameras": list(cameras),
+        "margin_m": head.coder.margin_m,
+        "score_threshold": head.coder.score_threshold,
     }
     onnx.helper.set_model_props(proto, {METADATA_KEY: json.dumps(metadata)})
     onnx.checker.check_model(proto)
@@ -128,13 +132,9 @@ def export_onnx(
 
 
 def halve_onnx(path: str | Path, out: str | Path) -> None:
-    """Write an ONNX file whose convolutions work in half precision.
+    """Write a file of `export_onnx` anew, with convolutions that work in half precision.
 
     They are nearly all of the arithmetic. What places and scores elements stays in float32.
-
-    Args:
-        path: File of `export_onnx`.
-        out: File to write.
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
@@ -163,27 +163,21 @@ def halve_onnx(path: str | Path, out: str | Path) -> None:
 def quantize_onnx(
     path: str | Path, out: str | Path, inputs: Iterable[dict[str, NDArray[np.float32]]]
 ) -> None:
-    """Write an ONNX file whose convolutions work in 8 bits, calibrated on samples.
+    """Write a file of `export_onnx` anew, with convolutions in 8 bits, calibrated on samples.
 
-    Args:
-        path: File of `export_onnx`.
-        out: File to write.
-        inputs: Inputs of the graph for some samples, as `OnnxInferencer.prepare` returns them.
-
-    Raises:
-        ValueError: If there are no samples.
+    ``inputs`` are those of the graph for some samples, as `OnnxInferencer.prepare` returns them;
+    ValueError if there are none.
     """
     from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
+
+    samples = iter(inputs)
 
     class Samples(CalibrationDataReader):
         """Hands over one sample at a time."""
 
-        def __init__(self) -> None:
-            self.samples = iter(inputs)
-
         def get_next(self) -> dict[str, NDArray[np.float32]] | None:
             """Return the next sample's inputs, or None after the last."""
-            return next(self.samples, None)
+            return next(samples, None)
 
     with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
         quantized = Path(folder, "int8.onnx")
@@ -202,12 +196,7 @@ def quantize_onnx(
 def graph_inputs(
     inferencer: OnnxInferencer, dataset: Any, indices: Iterable[int]
 ) -> Iterator[tuple[str, dict[str, NDArray[np.float32]]]]:
-    """Yield token and inputs of some samples of a data set.
-
-    Args:
-        inferencer: The exported model.
-        dataset: A data set of the project with its test pipeline.
-        indices: Which samples.
+    """Yield token and inputs of some samples of a data set with its test pipeline.
 
     Raises:
         ValueError: If images or matrices are not those of the file's cameras.
@@ -264,20 +253,6 @@ def _translations() -> dict[Any, Any]:
         return op.Squeeze(sums, one), offsets, offsets, offsets
 
     return {torch.ops.aten.embedding_bag.padding_idx: embedding_bag}
-
-
-def _metadata(exported: ExportedDetector, cameras: Sequence[str], frame: str) -> dict[str, Any]:
-    """Return what a file says of itself, for `OnnxInferencer`."""
-    head = exported.model.map_head
-    return {
-        "classes": list(head.classes),
-        "x_range": list(head.grid.x_range),
-        "y_range": list(head.grid.y_range),
-        "frame": frame,
-        "cameras": list(cameras),
-        "margin_m": head.coder.margin_m,
-        "score_threshold": head.coder.score_threshold,
-    }
 
 
 def _reason(error: BaseException) -> str:

@@ -130,7 +130,7 @@ class MapInferencer:
         allow_missing_cameras: bool = False,
         **options: Any,
     ) -> VectorizedMapDataset:
-        """Open samples as the config's test data set.
+        """Open samples as the config's test data set, with its pipeline.
 
         Samples of another annotation frame are seen from the config's. If none of their cameras is
         one of the config's, all of theirs take part, however many.
@@ -141,9 +141,6 @@ class MapInferencer:
                 config's where an annotation file lies apart from its images.
             allow_missing_cameras: Whether an info file may name images that do not exist.
             **options: Further fields of ``InputOptions``.
-
-        Returns:
-            The data set, with the test pipeline.
 
         Raises:
             FileNotFoundError: If a file does not exist.

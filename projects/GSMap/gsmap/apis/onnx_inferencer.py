@@ -140,19 +140,10 @@ class OnnxInferencer:
             keep = ((points >= low - margin) & (points <= high + margin)).all((1, 2))
         if threshold is not None:
             keep &= outputs["scores"] > threshold
-        gaussians = {
-            name: outputs[name][keep] for name in ("scales", "rotations") if name in outputs
-        }
-        return MapElements.from_polylines(
-            outputs["points"][keep], outputs["labels"][keep], outputs["scores"][keep], **gaussians
-        )
+        kept = {name: values[keep] for name, values in outputs.items()}
+        return MapElements.from_polylines(kept.pop("points"), **kept)
 
     def write(self, path: str | Path, samples: Iterable[tuple[str, MapElements]]) -> None:
-        """Write predictions as JSON, in the form that ``tools/test.py --out`` writes.
-
-        Args:
-            path: File to write.
-            samples: Token and elements of each sample.
-        """
+        """Write each sample's token and elements as ``tools/test.py --out`` does."""
         vectors = ((token, vectors_of(found, self.classes)) for token, found in samples)
         write_results(path, vectors, {"classes": list(self.classes)})

@@ -25,11 +25,8 @@ def similar_cameras(
     Args:
         sample: A sample.
         frame: Its annotation frame.
-        names: Its cameras; those that it lacks get the first.
-        trained: The model's cameras.
-
-    Returns:
-        An index into ``trained`` for each name.
+        names: Its cameras; one that it lacks counts as looking ahead.
+        trained: The model's cameras; the result has an index into these for each name.
 
     Raises:
         ValueError: If it is not known where the model's cameras look.

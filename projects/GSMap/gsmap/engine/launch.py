@@ -132,11 +132,8 @@ def _naming(what: object) -> Iterator[None]:
 def load_config(args: argparse.Namespace) -> Config:
     """Read ``args.config``, apply the command-line options to it, and check the result.
 
-    Without a GPU several processes talk through gloo, whatever the config says.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        ValueError: If the config cannot mean what was intended (see `check_config`).
+    Without a GPU several processes talk through gloo, whatever the config says. Errors are those of
+    `read_config` and `check_config`.
     """
     os.environ.setdefault("LOCAL_RANK", str(args.local_rank))
     cfg = read_config(args.config, args.cfg_options)
@@ -159,10 +156,7 @@ def load_config(args: argparse.Namespace) -> Config:
 
 
 def newest_checkpoint(work_dir: str | Path) -> Path | None:
-    """Return the newest whole checkpoint of a run, whatever its ``last_checkpoint`` says.
-
-    A damaged one is named and passed over; None if there is none.
-    """
+    """Return the newest whole checkpoint of a run, or None; a damaged one is named and left."""
     numbers = {
         path: int(match[1])
         for path in Path(work_dir).glob("*.pth")

@@ -21,13 +21,7 @@ class MapLogProcessor(LogProcessor):
     """
 
     def get_log_after_iter(self, runner: Runner, batch_idx: int, mode: str) -> tuple[dict, str]:
-        """Return all figures of an iteration, and a log line with the last layer's losses alone.
-
-        Args:
-            runner: The runner.
-            batch_idx: Index of the batch.
-            mode: ``train``, ``val`` or ``test``.
-        """
+        """Return all figures of an iteration, and a log line with the last layer's losses alone."""
         figures, line = super().get_log_after_iter(runner, batch_idx, mode)
         head, _, rest = line.partition("]  ")
         items = [item for item in rest.split("  ") if item and not _MINOR.match(item)]

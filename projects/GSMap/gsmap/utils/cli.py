@@ -108,9 +108,6 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
         command: Returns what to print, or None.
         heed_kill: Whether ``kill`` lets the clean-up run; processes that wait for each other had
             better die at once.
-
-    Raises:
-        SystemExit: If the command fails or is interrupted.
     """
     logging.raiseExceptions = False  # a log file on a full disk is no reason for tracebacks
     end = _End()

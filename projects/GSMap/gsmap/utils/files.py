@@ -22,14 +22,8 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
 
     Until then it is ``PATH.<pid>.<host>.partial``, which any exception removes. What a killed
     writer left behind goes when anything is written to the same folder. A reader sees the old file
-    or the new one. A device or a pipe, such as ``/dev/null``, is written to as it is.
-
-    Args:
-        path: File to write; parent folders are made.
-        mode: ``w`` for text in UTF-8, ``wb`` for bytes.
-
-    Yields:
-        The open file.
+    or the new one. A device or a pipe, such as ``/dev/null``, is written to as it is. Parent
+    folders are made; text is UTF-8.
     """
     path = Path(path)
     encoding = None if "b" in mode else "utf-8"

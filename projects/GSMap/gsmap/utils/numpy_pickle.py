@@ -21,9 +21,7 @@ _LARGEST = {"b": 1, "U": 0x10FFFF}  # of booleans and characters, as integers
 class CheckedDtype:
     """A dtype in a pickle: a number, boolean or string, in either byte order.
 
-    Args:
-        code: numpy's short name, such as ``f8``.
-        *options: What numpy writes besides (alignment, copy); of no meaning for plain types.
+    What numpy writes beside its short name (alignment, copy) means nothing for such types.
     """
 
     __slots__ = ("dtype",)

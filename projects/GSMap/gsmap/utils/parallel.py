@@ -75,7 +75,7 @@ def ordered_map(
     workers: int,
     timeout_s: float = 600.0,
 ) -> Iterator[Result]:
-    """Apply a function to tasks in worker processes and yield the results in order.
+    """Apply a function to tasks in worker processes and yield each one's result, in order.
 
     At most three tasks per worker are under way, so that neither tasks nor results pile up. With
     one worker everything runs in this process. Whatever ends it early, such as an error or Ctrl-C,
@@ -86,9 +86,6 @@ def ordered_map(
         tasks: Its arguments, picklable; drawn as they are needed.
         workers: Number of processes, >= 1.
         timeout_s: Longest time that one result may take, in seconds.
-
-    Yields:
-        One result per task.
 
     Raises:
         ValueError: If ``workers`` is below 1.

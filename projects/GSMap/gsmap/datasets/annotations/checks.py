@@ -45,24 +45,17 @@ class _Checks:
         if pa.types.is_struct(array.type):
             for part in array.type:
                 self.walk(array.field(part.name), part.name, rows, where + _PLACES.get(name, ""))
-        elif pa.types.is_nested(array.type):
-            self.walk_list(array, name, rows, where)
+        elif pa.types.is_list(array.type):
+            lengths = np.diff(array.offsets.to_numpy())
+            if lengths.sum() != len(array.values):
+                raise ValueError(f"{where}{name} has items that belong to no sample.")
+            if pa.types.is_struct(array.type.value_type):
+                self.walk(array.values, f"{name}[]", np.repeat(rows, lengths), where)
         if name in _RULES:
             rule, wrong = _RULES[name]
             good = rule(array, rows, self.meta)
             value = None if good.all() else array[int(np.argmin(good))].as_py()
             self.require(good, rows, where + name + wrong.format(value, self.meta))
-
-    def walk_list(self, array: pa.Array, name: str, rows: np.ndarray, where: str) -> None:
-        """Check the items of a list."""
-        if pa.types.is_list(array.type):
-            lengths = np.diff(array.offsets.to_numpy())
-            if lengths.sum() != len(array.values):
-                raise ValueError(f"{where}{name} has items that belong to no sample.")
-        if pa.types.is_struct(array.type.value_type):
-            self.walk(array.values, f"{name}[]", np.repeat(rows, lengths), where)
-        elif array.values.null_count:
-            raise ValueError(f"a number of {where}{name} is missing.")
 
     def require(self, good: np.ndarray, rows: np.ndarray, wrong: str) -> None:
         """Raise an error that names the sample of the first item that is not good."""
@@ -99,7 +92,7 @@ def _are_elements(lists: pa.ListArray, _rows: np.ndarray, meta: AnnotationMeta) 
     """Say which elements have two finite points or more."""
     counts = np.diff(lists.offsets.to_numpy())
     good = (counts % meta.dim == 0) & (counts >= 2 * meta.dim)
-    finite = np.isfinite(lists.values.to_numpy())
+    finite = np.isfinite(lists.values.to_numpy(zero_copy_only=False))
     if not finite.all():
         good[np.repeat(np.arange(len(counts)), counts)[~finite]] = False
     return good

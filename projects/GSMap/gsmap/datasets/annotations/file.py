@@ -174,9 +174,6 @@ class AnnotationFile(Sequence[MapSample]):
     Pickling hands on the path alone, so that each worker process maps the same pages; it does not
     check them again.
 
-    Args:
-        path: The file.
-
     Raises:
         FileNotFoundError: If it does not exist.
         ValueError: If it is not a whole annotation file of this format version, its checksum does
