@@ -63,7 +63,8 @@ class CheckedArray(np.ndarray):
         dtype = checked.dtype
         if math.prod(shape) * dtype.itemsize != len(data):
             raise pickle.UnpicklingError(f"an array {shape} of {dtype} has {len(data)} bytes")
-        integers = {"b": "u1", "U": np.dtype("u4").newbyteorder(dtype.byteorder)}.get(dtype.kind)
+        order = ">" if dtype.byteorder == ">" else "<"
+        integers = {"b": "u1", "U": f"{order}u4"}.get(dtype.kind)
         if integers and data and np.frombuffer(data, integers).max() > _LARGEST[dtype.kind]:
             raise pickle.UnpicklingError(f"an array holds bytes that are no {dtype}")
         super().__setstate__((1, shape, dtype, bool(fortran), data))
