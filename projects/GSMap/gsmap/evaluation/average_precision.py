@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsmap.structures.elements import BoolArray, FloatArray
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
 _RECALL_POINTS = np.linspace(0.0, 1.0, 101)
 
@@ -40,18 +40,16 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
     return float(np.append(envelope, 0.0)[at].mean())
 
 
-def reliability(
-    scores: FloatArray, hits: BoolArray, num_bins: int = 10
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compare scores in [0, 1] with the share of predictions that match, in bins of equal width.
+def reliability(scores: FloatArray, hits: BoolArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Compare scores in [0, 1] with the share of predictions that match, in ten equal bins.
 
     Mean score, share of matches and number of predictions of each bin that is not empty.
-    2 x (N,) -> 3 x (<= num_bins,)
+    2 x (N,) -> 3 x (<= 10,)
     """
-    bins = np.clip((scores * num_bins).astype(np.int64), 0, num_bins - 1)
+    bins = np.clip((scores * 10).astype(np.int64), 0, 9)
     _, bins, counts = np.unique(bins, return_inverse=True, return_counts=True)
     total, found = np.bincount(bins, weights=scores), np.bincount(bins, weights=hits)
-    return total / counts, found / counts, counts.astype(np.float64)
+    return total / counts, found / counts, counts
 
 
 def calibration_error(scores: FloatArray, hits: BoolArray) -> float:

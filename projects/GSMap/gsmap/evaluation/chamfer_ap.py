@@ -3,8 +3,7 @@
 Rules (equal to MapTR's evaluator): every line is resampled to 100 points; a prediction looks only
 at its nearest ground truth and matches if the distance is within the threshold and no prediction
 with a higher score has taken it; pairs whose 4 m wide strips do not touch never match. With
-heights the distances are those in space, as in MapTRv2's; lines are resampled and strips touch in
-the plane.
+heights, distances are in space, as in MapTRv2's; lines are resampled and strips touch in the plane.
 """
 
 import math
@@ -51,7 +50,7 @@ class ChamferConfig:
     def __post_init__(self) -> None:
         thresholds = tuple(sorted(round(float(t), 6) for t in self.thresholds))
         object.__setattr__(self, "thresholds", thresholds)
-        if not (self.classes and thresholds and all(0 < t < math.inf for t in thresholds)):
+        if not (self.classes and thresholds and 0 < thresholds[0] <= thresholds[-1] < math.inf):
             raise ValueError(
                 "classes and thresholds must not be empty and thresholds must be > 0 m, got "
                 f"{self.classes} and {thresholds}."
@@ -151,8 +150,7 @@ def match_chamfer(
 def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> MetricReport:
     """Compute AP_chamfer from the matches of all samples, in any order; a token counts once.
 
-    A class without ground truth counts as 0 in ``mAP``, as in MapTR, but not in the mean per
-    threshold.
+    A class without ground truth counts as 0 in ``mAP``, as in MapTR, but in no mean per threshold.
     """
     classes, thresholds = config.classes, config.thresholds
     records, detections = gather(matches, dict.fromkeys(classes, thresholds))

@@ -26,13 +26,10 @@ Evaluation = tuple[list[MetricReport], list[str]]
 def read_ground_truth(
     path: str | Path, classes: Sequence[str], shard: Shard = WHOLE
 ) -> tuple[dict[str, MapElements], Counter[str]]:
-    """Read a shard of ground truth: our annotation file, or MapTR's and MapVR's JSON (``*.json``).
-
-    Returns what ``read_samples`` does.
+    """Read a shard of ground truth: an annotation file, or MapTR's JSON; as ``read_samples`` does.
 
     Raises:
-        ValueError: If an annotation file lacks one of the classes, or a sample has no ground truth;
-            or as ``read_samples``.
+        ValueError: If an annotation file lacks one of the classes, or a sample has no ground truth.
     """
     if Path(path).suffix.lower() == ".json":
         everything, ignored = read_samples(path, GROUND_TRUTH_KEY, classes)

@@ -38,9 +38,8 @@ class GaussianMetric(BaseMetric):
     def process(self, data_batch: Any, data_samples: Sequence[dict[str, Any]]) -> None:
         """Measure the samples of a batch.
 
-        They have ``token``, ``x_range`` and ``y_range`` in metres, ``eval_ann_info`` (``polylines``
-        K x (n, 2), ``labels``) and ``pred_instances_3d`` (``scores_3d``, ``labels_3d`` (N,),
-        ``pts``, ``scales`` (N, P, 2), ``rotations`` (N, P), ``min_scale_m``).
+        They have ``token``, ``x_range`` and ``y_range`` in metres, ``eval_ann_info`` and
+        ``pred_instances_3d`` (docs/architecture.md), the latter with ``min_scale_m``.
         """
         for sample in data_samples:
             measured = sample.get("eval_ann_info") and "scales" in sample["pred_instances_3d"]
@@ -71,18 +70,16 @@ class GaussianMetric(BaseMetric):
         """Return the soft IoU of every matched pair of one class. (n,)"""
         if not len(masks) or not lines:
             return np.empty(0)
-        longest = max(len(line) for line in lines)
-        padded = [np.pad(line[:, :2], ((0, longest - len(line)), (0, 0)), "edge") for line in lines]
-        vertices = torch.from_numpy(np.stack(padded).astype(np.float32))
-        iou = pairwise_soft_iou(masks, draw_polylines(vertices, grid, LINE_WIDTH_M)).numpy()
+        vertices = (torch.from_numpy(line[None, :, :2].astype(np.float32)) for line in lines)
+        truth = torch.cat([draw_polylines(line, grid, LINE_WIDTH_M) for line in vertices])
+        iou = pairwise_soft_iou(masks, truth).numpy()
         return iou[linear_sum_assignment(-iou)]
 
     def compute_metrics(self, results: list[tuple[str, Any]]) -> dict[str, float]:
         """Average over all samples and print a table.
 
-        Returns:
-            Per class ``soft_iou/<name>``, ``sigma_along/<name>`` and ``sigma_across/<name>``
-            (medians in metres), and ``at_floor``, a share; empty without Gaussians.
+        Returns per class ``soft_iou/<name>``, ``sigma_along/<name>`` and ``sigma_across/<name>``
+        (medians in metres), and ``at_floor``, a share; nothing without Gaussians.
         """
         samples = [measured for _, measured in sorted(dict(results).items()) if measured]
         if not samples:

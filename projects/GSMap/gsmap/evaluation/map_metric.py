@@ -15,7 +15,6 @@ from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import flat_metrics, format_table
 from gsmap.evaluation.results_json import vectors_of, write_results
-from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 
 
@@ -32,7 +31,6 @@ class MapMetric(BaseMetric):
         eval: Metrics to compute: ``chamfer``, ``raster``; may be empty if only ``out_file`` is
             wanted.
         thresholds: Thresholds of AP_chamfer in metres.
-        polygon_classes: Classes that AP_raster fills.
         out_file: Where to write the predictions in MapTR's JSON form, or None.
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
 
@@ -46,7 +44,6 @@ class MapMetric(BaseMetric):
         self,
         eval: Sequence[str] = METRIC_NAMES,
         thresholds: Sequence[float] = CHAMFER_THRESHOLDS,
-        polygon_classes: Sequence[str] = AREA_CLASSES,
         out_file: str | None = None,
         **kwargs: Any,
     ) -> None:
@@ -55,7 +52,6 @@ class MapMetric(BaseMetric):
             raise ValueError(f"eval must name metrics of {METRIC_NAMES}, got {list(eval)}.")
         self.eval = tuple(eval)
         self.thresholds = tuple(thresholds)
-        self.polygon_classes = tuple(polygon_classes)
         self.out_file = out_file
 
     def _meta(self, key: str) -> Any:
@@ -76,14 +72,14 @@ class MapMetric(BaseMetric):
             chamfer = ChamferConfig(classes, self.thresholds, dim=dim)
         if "raster" in self.eval:
             grid = BEVGrid(self._meta("x_range"), self._meta("y_range"))
-            raster = RasterConfig(classes, grid, self.polygon_classes)
+            raster = RasterConfig(classes, grid)
         return MapEvaluator(chamfer, raster)
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
         """Match one batch and keep its matches.
 
-        Samples have ``token``, ``pred_instances_3d`` (``pts``, ``scores_3d``, ``labels_3d``) and,
-        if a metric is asked for, ``eval_ann_info`` (``polylines``, ``labels``).
+        Samples have ``token``, ``pred_instances_3d`` and, if a metric is asked for,
+        ``eval_ann_info``, as ``datasets/elements.py`` reads them.
         """
         for sample in data_samples:
             token = str(sample["token"])

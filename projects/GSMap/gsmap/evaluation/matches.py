@@ -66,9 +66,9 @@ def ranked_predictions(
     min_score: float = -np.inf,
     max_num: int | None = None,
 ) -> IntArray:
-    """Choose the predictions that count: lines of known classes with ``min_score`` or more.
+    """Return which predictions count, in descending order of score, at most N of each class. (n,)
 
-    Returns the positions in descending order of score, of each class at most ``max_num``. (<= N,)
+    They are lines of known classes with ``min_score`` or more.
     """
     scores = predictions.confidence
     rows = np.flatnonzero((predictions.num_points >= 2) & (scores >= min_score))
@@ -85,14 +85,10 @@ def gather(
 
     No figure depends on repeats, order or processes: a token counts once, and equal scores keep
     the order of the tokens, then the order within the sample. (The reference evaluators leave it to
-    an unstable sort, in AP_chamfer, or to the order of the file, in AP_raster.)
+    an unstable sort, in AP_chamfer, or to the order of the file, in AP_raster.) ``thresholds`` are
+    those of each class, by its name, in the order of the labels. C x (T,)
 
-    Args:
-        matches: Records of the samples, in any order.
-        thresholds: Those of each class, by its name, in the order of the labels. C x (T,)
-
-    Returns:
-        One record per token, sorted, and the ranked predictions of each class.
+    Returns one record per token, sorted, and the ranked predictions of each class.
     """
     unique = {record.token: record for record in reversed(list(matches))}
     records = [unique[token] for token in sorted(unique)]

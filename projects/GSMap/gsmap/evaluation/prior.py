@@ -1,8 +1,7 @@
 """The "same map everywhere" prior: the best fixed set of elements, fitted on a training set.
 
 A network that has learnt to look at its images must beat it. Each element is predicted, with the
-same score, in every sample; the set is chosen greedily so that AP_chamfer on the training set is
-as high as it gets.
+same score, in every sample; the set is chosen greedily for AP_chamfer on the training set.
 """
 
 from collections.abc import Sequence
@@ -112,10 +111,10 @@ def fit_prior(
 ) -> MapElements:
     """Fit the fixed set of elements that scores best on a training set.
 
-    At every step the element is added whose new matches raise the area under the precision-recall
-    curve the most (precision times recall of the new matches, each class by its own count of ground
-    truths); its score rises with the share of samples in which it is a new match. An element is a
-    ground truth of the training set, moved to the mean of what it matches where that helps.
+    Each step adds the element whose new matches raise the area under the precision-recall curve the
+    most (precision times recall of the new matches, each class by its own count of ground truths);
+    its score rises with the share of samples in which it is a new match. An element is a ground
+    truth of the training set, moved to the mean of what it matches where that helps.
 
     Args:
         truth: Ground truth of each training sample.

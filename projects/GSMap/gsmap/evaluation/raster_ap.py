@@ -24,7 +24,6 @@ MIN_SCORE = 0.05
 MAX_PREDICTIONS = 100  # of a class and sample
 RECALL_LIMITS = (1, 10, 100)
 NUSCENES_GRID = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
-_COCO_SLACK = 1.0 - 1e-10  # COCO lowers a threshold of 1, so that equal masks match
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
 
 
@@ -124,7 +123,7 @@ def match_raster(
     gt = rasterize(ground_truth.select(gt_index), config)
     labels = predictions.labels[rows], gt_labels[gt_index]
     ious = kernels.mask_ious(pred, gt, *labels)
-    thresholds = np.minimum(list(config.thresholds.values()), _COCO_SLACK)
+    thresholds = np.array(list(config.thresholds.values()))
     matched = assign(ious, thresholds[labels[0]])
     matched_iou = np.pad(ious, ((0, 0), (0, 1)), constant_values=np.nan)  # column -1: no match
     quality = matched_iou[np.arange(len(rows)), matched[:, 0]]
