@@ -26,7 +26,11 @@ def main() -> None:
     subparsers = parser.add_subparsers(required=True)
     asked_for = COMMANDS.keys() & set(sys.argv[1:2])
     for name in sorted(asked_for or COMMANDS):
-        importlib.import_module(f"benchmarks.{COMMANDS[name]}").add_parser(subparsers)
+        module = importlib.import_module(f"benchmarks.{COMMANDS[name]}")
+        text = str(module.__doc__)
+        command = subparsers.add_parser(name, help=text.splitlines()[0], description=text)
+        module.add_arguments(command)
+        command.set_defaults(run=module.run)
     args = parser.parse_args()
     args.run(args)
 

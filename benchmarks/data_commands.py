@@ -42,10 +42,8 @@ def memory(args: argparse.Namespace) -> dict[str, float]:
     return measure_memory(args.root, args.version, tuple(args.copies))
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``data`` with its own."""
-    parser = subparsers.add_parser("data", help=__doc__)
-    parser.set_defaults(run=run)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
     commands = parser.add_subparsers(required=True)
     command = commands.add_parser("loading", help="open and read a file of many samples")
     command.add_argument("annotations", type=Path)

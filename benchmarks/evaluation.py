@@ -43,9 +43,8 @@ class Run:
     peak_mib: float
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``eval``."""
-    parser = subparsers.add_parser("eval", help=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
     parser.add_argument(
         "--frames",
         type=Path,
@@ -68,7 +67,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="the map in metres; generated lines grow with it",
     )
     parser.add_argument("--out", type=Path, help="write the tables to this file, too")
-    parser.set_defaults(run=run)
 
 
 def generated_frames(

@@ -7,26 +7,14 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.fps import predict_once
+from benchmarks.fps import frame_cost
 from benchmarks.measure import Cost, measure
-from benchmarks.model import (
-    add_model_arguments,
-    build,
-    image_shape,
-    in_fresh_processes,
-    random_batch,
-    report,
-)
+from benchmarks.model import add_arguments, in_fresh_processes, model_and_batch, report
 from gsmap.apis.export import export_onnx
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.structures.calibration import calibration_arrays
 
-
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``export``."""
-    parser = subparsers.add_parser("export", help=__doc__)
-    add_model_arguments(parser)
-    parser.set_defaults(run=run)
+__all__ = ["add_arguments", "run"]
 
 
 def run(args: argparse.Namespace) -> None:
@@ -38,7 +26,7 @@ def run(args: argparse.Namespace) -> None:
     if args.device != "cpu" or args.fp16:
         raise ValueError("benchmarks export measures single precision on the CPU.")
     jobs = [(path, args) for path in args.configs]
-    in_torch, in_onnx = (in_fresh_processes(task, jobs) for task in (torch_cost, onnx_cost))
+    in_torch, in_onnx = (in_fresh_processes(task, jobs) for task in (frame_cost, onnx_cost))
     report(
         args,
         ["model", "torch, s", "ONNX Runtime, s", "ratio", "torch, wall s", "ONNX Runtime, wall s"],
@@ -52,23 +40,15 @@ def run(args: argparse.Namespace) -> None:
     )
 
 
-def torch_cost(path: str, args: argparse.Namespace) -> Cost:
-    """Measure a config's way from images to decoded elements in torch."""
-    model = build(path, args).eval()
-    inputs, samples = random_batch(model, 1, image_shape(path, args), "cpu")
-    predict = partial(predict_once, model, inputs, samples, args)
-    return measure(predict, torch.device("cpu"), args.repeats)
-
-
 def onnx_cost(path: str, args: argparse.Namespace) -> Cost:
-    """Measure the same way in ONNX Runtime; the file's own reading is not counted."""
-    model = build(path, args).eval()
-    shape = image_shape(path, args)
-    inputs, samples = random_batch(model, 1, shape, "cpu")
+    """Measure a config's way in ONNX Runtime; the file's own reading is not counted."""
+    model, inputs, samples = model_and_batch(path, args)
     arrays = calibration_arrays(samples[0].metainfo, model.bev_encoder.calibration)
     arrays["images"] = inputs["imgs"][0].numpy()
+    cameras, _, height, width = arrays["images"].shape
+    names = [f"camera {i}" for i in range(cameras)]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "model.onnx")
-        export_onnx(model, file, [f"camera {i}" for i in range(shape[0])], shape[1:])
+        export_onnx(model.eval(), file, names, (height, width))
         exported = OnnxInferencer(file, num_threads=args.threads)
     return measure(partial(exported.run, arrays), torch.device("cpu"), args.repeats)

@@ -1,29 +1,14 @@
 """Frames per second of whole models, batch 1."""
 
 import argparse
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
-from mmdet3d.structures import Det3DDataSample
 
 from benchmarks.measure import MIB, Cost, measure
-from benchmarks.model import (
-    add_model_arguments,
-    build,
-    image_shape,
-    in_fresh_processes,
-    random_batch,
-    report,
-)
+from benchmarks.model import add_arguments, in_fresh_processes, model_and_batch, report
 
-
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``fps``."""
-    parser = subparsers.add_parser("fps", help=__doc__)
-    add_model_arguments(parser)
-    parser.set_defaults(run=run)
+__all__ = ["add_arguments", "run"]
 
 
 def run(args: argparse.Namespace) -> None:
@@ -48,20 +33,12 @@ def run(args: argparse.Namespace) -> None:
 
 def frame_cost(path: str, args: argparse.Namespace) -> Cost:
     """Measure a config's way from images to decoded elements."""
-    model = build(path, args)
+    model, inputs, samples = model_and_batch(path, args)
     model.eval()
-    inputs, samples = random_batch(model, 1, image_shape(path, args), args.device)
-    predict = partial(predict_once, model, inputs, samples, args)
+
+    @torch.no_grad()
+    def predict() -> None:
+        with torch.autocast(args.device, torch.float16, enabled=args.fp16):
+            model.predict(inputs, samples)
+
     return measure(predict, torch.device(args.device), args.repeats)
-
-
-@torch.no_grad()
-def predict_once(
-    model: Any,
-    inputs: dict[str, torch.Tensor],
-    samples: list[Det3DDataSample],
-    args: argparse.Namespace,
-) -> None:
-    """Run a model from images to decoded elements."""
-    with torch.autocast(args.device, torch.float16, enabled=args.fp16):
-        model.predict(inputs, samples)

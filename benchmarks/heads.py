@@ -39,9 +39,8 @@ class Task:
     seed: int
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``heads``."""
-    parser = subparsers.add_parser("heads", help=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("config", type=Path, help="config of backbone, encoder and data")
     parser.add_argument("checkpoint", help="of that config, or the name of a model")
     parser.add_argument(
@@ -59,7 +58,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="train new heads on the features, not trained ones",
     )
     parser.add_argument("--workers", type=int, default=1, help="runs at the same time")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -29,12 +29,10 @@ REDUCTIONS = {
 }
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``masks``."""
-    parser = subparsers.add_parser("masks", help=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("--seeds", type=int, default=64, help="random errors that are averaged")
     parser.add_argument("--out", type=Path, help="write the tables to this file, too")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -1,11 +1,10 @@
 """How much memory the nuScenes conversion takes as the data set grows."""
 
 import json
-import os
+import multiprocessing
 import resource
-import subprocess
-import sys
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -82,20 +81,9 @@ def _add_sweeps(tables: dict[str, list[dict[str, Any]]]) -> None:
 
 
 def peak_of_conversion(root: Path, version: str, out_dir: Path) -> float:
-    """Convert a data root in a fresh process and return its peak memory in MB."""
-    code = (
-        "import sys; from benchmarks.memory import convert_and_print_peak as run;run(*sys.argv[1:])"
-    )
-    command = [sys.executable, "-c", code, str(root), version, str(out_dir)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=dict(os.environ))
-    return float(done.stdout)
-
-
-def convert_and_print_peak(root: str, version: str, out_dir: str) -> None:
-    """Convert in this process and write the peak of its memory in MB to standard output."""
-    convert_nuscenes(NuScenesOptions(Path(root), version, out_dir=Path(out_dir)))
-    peak_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    sys.stdout.write(f"{peak_kb / 1024}\n")
+    """Convert a data root in this process and return the peak of its memory in MB."""
+    convert_nuscenes(NuScenesOptions(root, version, out_dir=out_dir))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def measure_memory(root: Path, version: str, copies: tuple[int, int]) -> dict[str, float]:
@@ -115,7 +103,9 @@ def measure_memory(root: Path, version: str, copies: tuple[int, int]) -> dict[st
         with tempfile.TemporaryDirectory() as folder:
             target = Path(folder, "root")
             samples.append(tile_tables(root, version, target, number))
-            peaks.append(peak_of_conversion(target, version, Path(folder, "out")))
+            with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+                work = pool.submit(peak_of_conversion, target, version, Path(folder, "out"))
+            peaks.append(work.result())
     growth = (peaks[1] - peaks[0]) / (samples[1] - samples[0])
     return {
         "samples_small": samples[0],

@@ -15,13 +15,11 @@ from minicity.cli import image_size
 from minicity.generate import generate
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``minicity``."""
-    parser = subparsers.add_parser("minicity", help=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("--image-size", type=image_size, default=[(800, 450)], nargs="+")
     parser.add_argument("--scenes", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:

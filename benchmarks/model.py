@@ -17,7 +17,7 @@ from benchmarks.measure import Cost, markdown_table
 from gsmap.engine.launch import read_config
 
 
-def add_model_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add which models to measure, and how."""
     parser.add_argument("configs", nargs="+", help="configs; ratios refer to the first")
     parser.add_argument(
@@ -83,13 +83,17 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
     return len(dataset.cameras), height, width
 
 
-def random_batch(
-    model: Any, batch: int, shape: tuple[int, int, int], device: str, elements: int = 15
-) -> tuple[dict[str, torch.Tensor], list[Det3DDataSample]]:
-    """Make normalised images of cameras in a ring, and straight elements as ground truth."""
+def model_and_batch(
+    path: str, args: argparse.Namespace, batch: int = 1, raster: str = "", elements: int = 15
+) -> tuple[Any, dict[str, torch.Tensor], list[Det3DDataSample]]:
+    """Build a config's model as ``build`` does, and random inputs for it.
+
+    They are normalised images of cameras in a ring, and straight elements as ground truth.
+    """
+    model, shape = build(path, args, raster), image_shape(path, args)
     generator = torch.Generator().manual_seed(0)
     cameras, *size = shape
-    images = torch.randn(batch, cameras, 3, *size, generator=generator).to(device)
+    images = torch.randn(batch, cameras, 3, *size, generator=generator).to(args.device)
     eyes = np.stack([np.eye(4)] * cameras)
     metainfo = {"token": "random", "lidar2img": ring_of_cameras(*shape), "cam2img": eyes}
     metainfo |= {"lidar2cam": eyes, "img_aug_matrix": eyes, "lidar2ego": np.eye(4)}
@@ -106,10 +110,10 @@ def random_batch(
             pts=pts,
             pts_shifts=torch.stack([pts, pts.flip(1)], 1),
             polylines=pts,
-        ).to(device)
+        ).to(args.device)
         add_auxiliary_targets(sample, model, shape, generator)
-        samples.append(sample.to(device))
-    return {"imgs": images}, samples
+        samples.append(sample.to(args.device))
+    return model, {"imgs": images}, samples
 
 
 def add_auxiliary_targets(

@@ -11,33 +11,29 @@ from typing import Any
 
 import torch
 
-from benchmarks.model import add_model_arguments, build, image_shape, random_batch
+from benchmarks.model import add_arguments, model_and_batch
 
-
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``profile``."""
-    parser = subparsers.add_parser("profile", help=__doc__.splitlines()[0], description=__doc__)
-    add_model_arguments(parser)
-    parser.set_defaults(run=run)
+__all__ = ["add_arguments", "run"]
 
 
 def run(args: argparse.Namespace) -> None:
     """Time the parts of every config's model and print them."""
     for config in args.configs:
-        shape = image_shape(config, args)
-        parts = profile(build(config, args).eval(), shape, args)
+        parts, (cameras, height, width) = profile(config, args)
         backbone = parts["image backbone"]
         parts["total"] = sum(parts.values())
-        print(f"{config}, {shape[0]} cameras of {shape[1]} x {shape[2]}, {args.threads} threads")
+        print(f"{config}, {cameras} cameras of {height} x {width}, {args.threads} threads")
         for part, seconds in parts.items():
             print(f"  {part:<22}{seconds:>8.3f} s {seconds / backbone:>7.3f} of the backbone")
 
 
 @torch.no_grad()
-def profile(model: Any, shape: tuple[int, int, int], args: argparse.Namespace) -> dict[str, float]:
-    """Return the CPU (on a GPU: wall) seconds of every part, fastest of all repeats."""
-    inputs, samples = random_batch(model, 1, shape, args.device)
-    samples[0].set_metainfo({"batch_input_shape": shape[1:]})
+def profile(path: str, args: argparse.Namespace) -> tuple[dict[str, float], list[int]]:
+    """Return the seconds of every part, fastest of all repeats, and cameras, rows and columns."""
+    model, inputs, samples = model_and_batch(path, args)
+    model.eval()
+    cameras, _, *size = inputs["imgs"][0].shape
+    samples[0].set_metainfo({"batch_input_shape": tuple(size)})
     images = inputs["imgs"][0].contiguous(memory_format=torch.channels_last)
     on_gpu = args.device != "cpu"
     clock = time.perf_counter if on_gpu else time.process_time
@@ -58,4 +54,4 @@ def profile(model: Any, shape: tuple[int, int, int], args: argparse.Namespace) -
             features = [feature.unflatten(0, (1, -1)) for feature in features]
             bev = timed("BEV encoder", model.bev_encoder, features, [samples[0].metainfo])
             timed("map head", model.map_head.predict, bev, samples)
-    return {part: min(values[1:]) for part, values in times.items()}
+    return {part: min(values[1:]) for part, values in times.items()}, [cameras, *size]

@@ -29,9 +29,8 @@ FLOOR_DENSITY = 1e-6  # pixels where a Gaussian is below need no exponential
 Gaussians = tuple[Tensor, Tensor, Tensor]
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``raster``."""
-    parser = subparsers.add_parser("raster", help=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument(
@@ -39,7 +38,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, help="write the tables to this file, too")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

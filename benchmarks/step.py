@@ -1,34 +1,22 @@
 """Time and memory of a training step: forward, losses and backward."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
-from mmdet3d.structures import Det3DDataSample
 
+from benchmarks import model as models
 from benchmarks.measure import MIB, Cost, measure
-from benchmarks.model import (
-    add_model_arguments,
-    build,
-    image_shape,
-    in_fresh_processes,
-    random_batch,
-    report,
-)
 from gsmap.engine.launch import read_config
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the subcommand ``step``."""
-    parser = subparsers.add_parser("step", help=__doc__)
-    add_model_arguments(parser)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    models.add_arguments(parser)
     parser.add_argument("--batch", type=int, default=1)
     parser.add_argument(
         "--rasters", nargs="+", default=["200x100"], metavar="HxW", help="of GSMap's loss"
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -37,10 +25,10 @@ def run(args: argparse.Namespace) -> None:
     for path in args.configs:
         sizes = args.rasters if "GSMap" in read_config(path).model.map_head.type else [""]
         tasks += [(path, args, raster) for raster in sizes]
-    costs = [cost for _, cost in in_fresh_processes(step_cost, tasks)]
+    costs = [cost for _, cost in models.in_fresh_processes(step_cost, tasks)]
     seconds = [cost.time_s(torch.device(args.device)) for cost in costs]
     peaks = [cost.peak_bytes for cost in costs]
-    report(
+    models.report(
         args,
         ["model", "raster", "s a step", "ratio", "peak memory (MiB)", "ratio"],
         [
@@ -55,20 +43,8 @@ def run(args: argparse.Namespace) -> None:
 
 def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     """Measure a config's training step, with another raster size if one is given."""
-    model = build(path, args, raster)
+    model, inputs, samples = models.model_and_batch(path, args, args.batch, raster)
     model.train()
-    inputs, samples = random_batch(model, args.batch, image_shape(path, args), args.device)
-    step = training_step(model, inputs, samples, args)
-    return measure(step, torch.device(args.device), args.repeats)
-
-
-def training_step(
-    model: Any,
-    inputs: dict[str, torch.Tensor],
-    samples: list[Det3DDataSample],
-    args: argparse.Namespace,
-) -> Callable[[], None]:
-    """Return a function that runs forward, losses and backward once."""
 
     def step() -> None:
         model.zero_grad(set_to_none=True)
@@ -76,4 +52,4 @@ def training_step(
             losses = model.loss(inputs, samples)
         sum(losses.values()).backward()
 
-    return step
+    return measure(step, torch.device(args.device), args.repeats)

@@ -8,9 +8,9 @@ def test_the_command_writes_a_table_per_reduction_and_band_and_one_of_misses(tmp
     monkeypatch.setattr(masks, "SCALES_M", (0.25,))
     monkeypatch.setattr(masks, "LENGTHS_M", (10.0,))
     parser = argparse.ArgumentParser()
-    masks.add_parser(parser.add_subparsers())
-    args = parser.parse_args(f"masks --seeds 2 --out {tmp_path / 'out.md'}".split())
-    args.run(args)
+    masks.add_arguments(parser)
+    args = parser.parse_args(f"--seeds 2 --out {tmp_path / 'out.md'}".split())
+    masks.run(args)
     report = (tmp_path / "out.md").read_text()
     along, across = masks.push("both", 0.75, 1.0, 0.25, seeds=2)
     assert f"| 1 m | {1e3 * along:+.2f} / {1e3 * across:+.2f} |" in report

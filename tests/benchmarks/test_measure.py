@@ -78,11 +78,11 @@ def test_command_writes_its_tables(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(raster, "TRAINING_SIZE", (16, 8))
     monkeypatch.setattr(raster, "RATE_REPEATS", 1)
     parser = argparse.ArgumentParser()
-    raster.add_parser(parser.add_subparsers())
+    raster.add_arguments(parser)
     out = tmp_path / "table.md"
     threads = torch.get_num_threads()
-    args = parser.parse_args(f"raster --instances 8 --repeats 1 --threads 1 --out {out}".split())
-    args.run(args)
+    args = parser.parse_args(f"--instances 8 --repeats 1 --threads 1 --out {out}".split())
+    raster.run(args)
     torch.set_num_threads(threads)
     text = out.read_text()
     assert "| 16 x 8 | 1 x 0.4 |" in text

@@ -1,5 +1,6 @@
 import argparse
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -10,15 +11,12 @@ from benchmarks.model import image_shape
 REPO = Path(__file__).resolve().parents[2]
 
 
-def run(*arguments: str) -> None:
+def run(command: ModuleType, *arguments: str) -> None:
     parser = argparse.ArgumentParser()
-    subparsers = parser.add_subparsers(required=True)
-    for module in (fps, profile, step):
-        module.add_parser(subparsers)
+    command.add_arguments(parser)
     args = parser.parse_args([*arguments, "--size", "64", "96", "--repeats", "1"])
-    threads = torch.get_num_threads()
-    args.threads = threads
-    args.run(args)
+    args.threads = torch.get_num_threads()
+    command.run(args)
 
 
 def cells(printed: str) -> list[list[str]]:
@@ -44,10 +42,10 @@ def test_images_are_as_large_as_the_configs(config, shape):
 
 
 def test_frames_per_second_are_those_of_the_time(capsys):
-    run("fps", str(REPO / "configs/maptr/maptr_r18_nano_110e.py"))
-    ((name, seconds, ratio, wall, fps, peak),) = cells(capsys.readouterr().out)
+    run(fps, str(REPO / "configs/maptr/maptr_r18_nano_110e.py"))
+    ((name, seconds, ratio, wall, per_second, peak),) = cells(capsys.readouterr().out)
     assert name == "maptr_r18_nano_110e"
-    assert float(fps) == pytest.approx(1 / float(wall), rel=0.1)
+    assert float(per_second) == pytest.approx(1 / float(wall), rel=0.1)
     assert float(seconds) > 0
     assert float(peak) > 0
     assert ratio == "1.000"
@@ -55,7 +53,7 @@ def test_frames_per_second_are_those_of_the_time(capsys):
 
 def test_a_step_is_measured_for_every_raster_of_gsmap(capsys):
     run(
-        "step", str(REPO / "projects/GSMap/configs/gsmap_maptr_r50_24e.py"),
+        step, str(REPO / "projects/GSMap/configs/gsmap_maptr_r50_24e.py"),
         "--rasters", "64x32", "80x40",
     )  # fmt: skip
     rows = cells(capsys.readouterr().out)
@@ -64,7 +62,7 @@ def test_a_step_is_measured_for_every_raster_of_gsmap(capsys):
 
 
 def test_the_parts_of_a_forward_pass_add_up(capsys):
-    run("profile", str(REPO / "configs/maptr/maptr_r18_nano_110e.py"))
+    run(profile, str(REPO / "configs/maptr/maptr_r18_nano_110e.py"))
     lines = [line.rsplit(" s ", 1) for line in capsys.readouterr().out.splitlines()[1:]]
     seconds = {line[0].rsplit(None, 1)[0].strip(): float(line[0].split()[-1]) for line in lines}
     assert list(seconds) == ["image backbone", "image neck", "BEV encoder", "map head", "total"]
