@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -67,91 +68,37 @@ class Lighting:
     streaks: int
 
 
-@dataclass(frozen=True)
-class _Weather:
-    """How often a kind of weather comes, and what `Lighting` it gives."""
-
-    share: float
-    ambient: float
-    direct: float
-    gain: BGR
-    sky_top: BGR
-    haze: BGR
-    haze_m: float
-    noise: float
-    shadow: float = 0.0
-    wet: float = 0.0
-
-
-WEATHERS = {
-    "clear": _Weather(
-        share=0.5,
-        ambient=0.62,
-        direct=0.5,
-        shadow=0.42,
-        gain=(1.08, 1.1, 1.12),
-        sky_top=(205, 150, 95),
-        haze=(225, 205, 185),
-        haze_m=320,
-        noise=2.0,
-    ),
-    "cloudy": _Weather(
-        share=0.24,
-        ambient=0.88,
-        direct=0.12,
-        gain=(1.02, 1.0, 0.98),
-        sky_top=(190, 182, 175),
-        haze=(212, 208, 204),
-        haze_m=220,
-        noise=2.5,
-    ),
-    "dusk": _Weather(
-        share=0.13,
-        ambient=0.8,
-        direct=0.25,
-        gain=(0.52, 0.5, 0.62),
-        sky_top=(140, 95, 90),
-        haze=(120, 150, 215),
-        haze_m=260,
-        noise=4.5,
-    ),
-    "rain": _Weather(
-        share=0.13,
-        ambient=0.9,
-        direct=0.08,
-        gain=(0.74, 0.72, 0.7),
-        sky_top=(165, 160, 155),
-        haze=(200, 196, 192),
-        haze_m=110,
-        wet=0.55,
-        noise=4.0,
-    ),
+# What each kind of weather gives `Lighting`, a column a kind, and how often it comes
+WEATHERS = ("clear", "cloudy", "dusk", "rain")
+SHARES = (0.5, 0.24, 0.13, 0.13)
+_LOOKS: dict[str, tuple[Any, ...]] = {
+    "ambient": (0.62, 0.88, 0.8, 0.9),
+    "direct": (0.5, 0.12, 0.25, 0.08),
+    "shadow": (0.42, 0.0, 0.0, 0.0),
+    "sky_top": ((205, 150, 95), (190, 182, 175), (140, 95, 90), (165, 160, 155)),
+    "haze": ((225, 205, 185), (212, 208, 204), (120, 150, 215), (200, 196, 192)),
+    "haze_m": (320, 220, 260, 110),
+    "wet": (0.0, 0.0, 0.0, 0.55),
+    "noise": (2.0, 2.5, 4.5, 4.0),
 }
+_GAINS = ((1.08, 1.1, 1.12), (1.02, 1.0, 0.98), (0.52, 0.5, 0.62), (0.74, 0.72, 0.7))
 
 
 def random_lighting(rng: np.random.Generator) -> Lighting:
     """Draw the light of a scene: mostly clear or cloudy, sometimes dusk or rain."""
-    shares = [weather.share for weather in WEATHERS.values()]
-    name = str(rng.choice(list(WEATHERS), p=shares))
-    weather, clear = WEATHERS[name], name == "clear"
+    name = str(rng.choice(WEATHERS, p=SHARES))
+    kind, clear = WEATHERS.index(name), name == "clear"
     azimuth, bright = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(*BRIGHTNESS))
     elevation = float(rng.uniform(*CLEAR_ELEVATION_RAD)) if clear else VEILED_ELEVATION_RAD
     warm = float(rng.uniform(*CLEAR_WARMTH)) if clear else 0.0
     level = np.cos(elevation)
-    blue, green, red = weather.gain
+    blue, green, red = _GAINS[kind]
     return Lighting(
         weather=name,
         sun=np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]),
-        ambient=weather.ambient,
-        direct=weather.direct,
-        shadow=weather.shadow,
         gain=(bright * (blue - warm), bright * green, bright * (red + warm)),
-        sky_top=weather.sky_top,
-        haze=weather.haze,
-        haze_m=weather.haze_m,
-        wet=weather.wet,
-        noise=weather.noise,
         streaks=int(rng.integers(*RAIN_STREAKS)) if name == "rain" else 0,
+        **{field: values[kind] for field, values in _LOOKS.items()},
     )
 
 
