@@ -17,13 +17,7 @@ import cv2
 
 from gsmap.utils.parallel import default_workers, ordered_map
 from gsmap.utils.progress import Progress
-from minicity.config import (
-    TRAIN_LOCATIONS,
-    VAL_LOCATIONS,
-    VERSION,
-    MiniCityConfig,
-    make_token,
-)
+from minicity.config import TRAIN_LOCATIONS, VAL_LOCATIONS, VERSION, MiniCityConfig, make_token
 from minicity.map_expansion import write_map
 from minicity.rig import CAMERAS, ego_from_lidar, quaternion
 from minicity.scene import Records, SceneMaker, SceneTask
@@ -201,14 +195,10 @@ def _fill(root: Path, config: MiniCityConfig, workers: int | None, progress: boo
 
 def _add_fixed_tables(tables: dict[str, list[dict[str, Any]]], config: MiniCityConfig) -> None:
     """The tables that are the same for all scenes."""
-    for name in CATEGORIES:
-        tables["category"].append(
-            {"token": make_token("category", name), "name": name, "description": ""}
-        )
-    for name in ATTRIBUTES:
-        tables["attribute"].append(
-            {"token": make_token("attribute", name), "name": name, "description": ""}
-        )
+    for table, names in (("category", CATEGORIES), ("attribute", ATTRIBUTES)):
+        for name in names:
+            token = make_token(table, name)
+            tables[table].append({"token": token, "name": name, "description": ""})
     for level, share in enumerate(("0-40", "40-60", "60-80", "80-100"), start=1):
         tables["visibility"].append({"token": str(level), "level": f"v{share}", "description": ""})
     lidar_pose = ego_from_lidar()

@@ -18,17 +18,12 @@ from minicity.config import MiniCityConfig, make_rng, make_token
 from minicity.curves import Array
 from minicity.lidar import footprint_array, scan, vehicle_footprints
 from minicity.lighting import Lighting, random_lighting
-from minicity.meshes import (
-    FrozenMesh,
-    Mesh,
-    add_building,
-    add_pole,
-    add_tree,
-)
+from minicity.meshes import FrozenMesh, Mesh, add_building, add_pole, add_tree
 from minicity.paint import make_scene_map
 from minicity.renderer import SceneRenderer
 from minicity.rig import (
     CAMERAS,
+    CameraMount,
     ego_from_lidar,
     mounted_camera,
     quaternion,
@@ -94,6 +89,9 @@ class SceneMaker:
     def _token(self, *parts: object) -> str:
         return make_token(self.config.seed, self.task.name, *parts)
 
+    def _add(self, table: str, **record: Any) -> None:
+        self.records[table].append(record)
+
     def _make_renderer(self) -> SceneRenderer:
         times = np.linspace(-0.1, self.duration_s, 12)
         track = np.array([self.ego.pose(float(t))[:2] for t in times])
@@ -118,17 +116,16 @@ class SceneMaker:
         self._add_scene(samples)
         for k, token in enumerate(samples):
             time_s = k * SAMPLE_PERIOD_S
-            self.records["sample"].append(
-                {
-                    "token": token,
-                    "timestamp": self.timestamp_us(time_s),
-                    "prev": samples[k - 1] if k else "",
-                    "next": samples[k + 1] if k + 1 < len(samples) else "",
-                    "scene_token": self._token("scene"),
-                }
+            self._add(
+                "sample",
+                token=token,
+                timestamp=self.timestamp_us(time_s),
+                prev=samples[k - 1] if k else "",
+                next=samples[k + 1] if k + 1 < len(samples) else "",
+                scene_token=self._token("scene"),
             )
             for mount in CAMERAS:
-                self._take_picture(k, mount.channel, samples)
+                self._take_picture(k, mount, samples)
             cloud = self._sweep(k, 0, samples)
             self._annotate(k, token, cloud)
             if k + 1 < len(samples):
@@ -146,49 +143,41 @@ class SceneMaker:
         return FIRST_TIMESTAMP_US + self.task.index * 60_000_000 + round(time_s * 1e6)
 
     def _add_scene(self, samples: list[str]) -> None:
-        self.records["log"].append(
-            {
-                "token": self._token("log"),
-                "logfile": f"minicity-{self.config.seed}-{self.task.name}",
-                "vehicle": "minicity",
-                "date_captured": "2020-09-13",
-                "location": self.task.location,
-            }
+        self._add(
+            "log",
+            token=self._token("log"),
+            logfile=f"minicity-{self.config.seed}-{self.task.name}",
+            vehicle="minicity",
+            date_captured="2020-09-13",
+            location=self.task.location,
         )
-        self.records["scene"].append(
-            {
-                "token": self._token("scene"),
-                "log_token": self._token("log"),
-                "nbr_samples": len(samples),
-                "first_sample_token": samples[0],
-                "last_sample_token": samples[-1],
-                "name": self.task.name,
-                "description": f"MiniCity, {self.lighting.weather}",
-            }
+        self._add(
+            "scene",
+            token=self._token("scene"),
+            log_token=self._token("log"),
+            nbr_samples=len(samples),
+            first_sample_token=samples[0],
+            last_sample_token=samples[-1],
+            name=self.task.name,
+            description=f"MiniCity, {self.lighting.weather}",
         )
 
-    def _add_data(self, data: dict[str, Any], channel: str, time_s: float) -> None:
+    def _add_data(self, channel: str, time_s: float, **data: Any) -> None:
         """Add a sample_data record and the ego pose of its moment."""
-        pose, token = self.ego_pose(time_s), data["token"]
-        self.records["ego_pose"].append(
-            {
-                "token": token,
-                "timestamp": self.timestamp_us(time_s),
-                "rotation": quaternion(pose),
-                "translation": pose[:3, 3].tolist(),
-            }
-        )
-        self.records["sample_data"].append(
-            {
-                **data,
-                "ego_pose_token": token,
-                "calibrated_sensor_token": make_token(self.config.seed, "calibration", channel),
-                "timestamp": self.timestamp_us(time_s),
-            }
+        pose, token, timestamp = self.ego_pose(time_s), data["token"], self.timestamp_us(time_s)
+        rotation, translation = quaternion(pose), pose[:3, 3].tolist()
+        moment = {"token": token, "timestamp": timestamp}
+        self._add("ego_pose", **moment, rotation=rotation, translation=translation)
+        self._add(
+            "sample_data",
+            **data,
+            ego_pose_token=token,
+            calibrated_sensor_token=make_token(self.config.seed, "calibration", channel),
+            timestamp=timestamp,
         )
 
-    def _take_picture(self, k: int, channel: str, samples: list[str]) -> None:
-        mount = next(m for m in CAMERAS if m.channel == channel)
+    def _take_picture(self, k: int, mount: CameraMount, samples: list[str]) -> None:
+        channel = mount.channel
         time_s = k * SAMPLE_PERIOD_S + mount.delay_ms * 1e-3
         width, height = self.config.image_width, self.config.image_height
         camera = mounted_camera(mount, width, height, self.ego_pose(time_s))
@@ -199,19 +188,17 @@ class SceneMaker:
         if not cv2.imwrite(str(self.root / name), image, parameters):
             raise OSError(f"could not write {self.root / name}: is the disk full?")
         self._add_data(
-            {
-                "token": self._token("data", channel, k),
-                "sample_token": samples[k],
-                "fileformat": "jpg",
-                "is_key_frame": True,
-                "height": height,
-                "width": width,
-                "filename": name,
-                "prev": self._token("data", channel, k - 1) if k else "",
-                "next": self._token("data", channel, k + 1) if k + 1 < len(samples) else "",
-            },
             channel,
             time_s,
+            token=self._token("data", channel, k),
+            sample_token=samples[k],
+            fileformat="jpg",
+            is_key_frame=True,
+            height=height,
+            width=width,
+            filename=name,
+            prev=self._token("data", channel, k - 1) if k else "",
+            next=self._token("data", channel, k + 1) if k + 1 < len(samples) else "",
         )
 
     def _stem(self, channel: str, time_s: float) -> str:
@@ -229,19 +216,17 @@ class SceneMaker:
         name = f"{folder}/LIDAR_TOP/{self._stem('LIDAR_TOP', time_s)}.pcd.bin"
         cloud.tofile(self.root / name)
         self._add_data(
-            {
-                "token": self._token("data", "LIDAR_TOP", k, j),
-                "sample_token": samples[k if j == 0 else k + 1],
-                "fileformat": "pcd",
-                "is_key_frame": j == 0,
-                "height": 0,
-                "width": 0,
-                "filename": name,
-                "prev": "",
-                "next": "",
-            },
             "LIDAR_TOP",
             time_s,
+            token=self._token("data", "LIDAR_TOP", k, j),
+            sample_token=samples[k if j == 0 else k + 1],
+            fileformat="pcd",
+            is_key_frame=j == 0,
+            height=0,
+            width=0,
+            filename=name,
+            prev="",
+            next="",
         )
         return cloud
 
@@ -264,27 +249,23 @@ class SceneMaker:
             length, width, height = vehicle.size
             half_turn = vehicle.yaw_rad / 2
             person = vehicle.category.startswith("human")
-            attribute = (
-                "pedestrian.standing"
-                if person
-                else ("vehicle.moving" if vehicle.speed > 0 else "vehicle.parked")
-            )
-            self.records["sample_annotation"].append(
-                {
-                    "token": self._token("annotation", vehicle.identity, k),
-                    "sample_token": sample,
-                    "instance_token": self._token("instance", vehicle.identity),
-                    "visibility_token": "4",
-                    "attribute_tokens": [make_token("attribute", attribute)],
-                    "translation": vehicle.center.tolist(),
-                    "size": [width, length, height],
-                    "rotation": [math.cos(half_turn), 0.0, 0.0, math.sin(half_turn)],
-                    "prev": "",
-                    "next": "",
-                    "num_lidar_pts": struck,
-                    "num_radar_pts": 0,
-                    "category": vehicle.category,
-                }
+            state = "standing" if person else ("moving" if vehicle.speed > 0 else "parked")
+            attribute = f"{'pedestrian' if person else 'vehicle'}.{state}"
+            self._add(
+                "sample_annotation",
+                token=self._token("annotation", vehicle.identity, k),
+                sample_token=sample,
+                instance_token=self._token("instance", vehicle.identity),
+                visibility_token="4",
+                attribute_tokens=[make_token("attribute", attribute)],
+                translation=vehicle.center.tolist(),
+                size=[width, length, height],
+                rotation=[math.cos(half_turn), 0.0, 0.0, math.sin(half_turn)],
+                prev="",
+                next="",
+                num_lidar_pts=struck,
+                num_radar_pts=0,
+                category=vehicle.category,
             )
 
     def _link_annotations(self) -> None:
@@ -295,14 +276,13 @@ class SceneMaker:
         for token, boxes in by_instance.items():
             for before, after in pairwise(boxes):
                 before["next"], after["prev"] = after["token"], before["token"]
-            self.records["instance"].append(
-                {
-                    "token": token,
-                    "category_token": make_token("category", boxes[0]["category"]),
-                    "nbr_annotations": len(boxes),
-                    "first_annotation_token": boxes[0]["token"],
-                    "last_annotation_token": boxes[-1]["token"],
-                }
+            self._add(
+                "instance",
+                token=token,
+                category_token=make_token("category", boxes[0]["category"]),
+                nbr_annotations=len(boxes),
+                first_annotation_token=boxes[0]["token"],
+                last_annotation_token=boxes[-1]["token"],
             )
         for box in self.records["sample_annotation"]:
             del box["category"]

@@ -202,11 +202,8 @@ def raster_picture(rasters: np.ndarray, labels: np.ndarray, style: MapStyle) -> 
     return picture.clip(0, 1)
 
 
-def _draw_rasters(ax: Axes, panel: BEVPanel, view: FrameView, style: MapStyle) -> None:
+def _draw_rasters(ax: Axes, picture: np.ndarray, view: FrameView) -> None:
     """Draw the rendered masks in place of the ground."""
-    assert panel.elements is not None
-    assert panel.rasters is not None
-    picture = raster_picture(panel.rasters, panel.elements.labels, style)
     if view.forward == "x":
         picture = picture.transpose(1, 0, 2)[:, ::-1]  # row = x, column = -y
     extent = (*ax.get_xlim(), *ax.get_ylim())
@@ -232,7 +229,7 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
     lines = [view.display_from_frame(line) for line in elements.polylines]
     colours = [MATCH_COLOURS[fate] for fate in fates] or style.colours(elements.labels)
     if panel.rasters is not None:
-        _draw_rasters(ax, panel, view, style)
+        _draw_rasters(ax, raster_picture(panel.rasters, elements.labels, style), view)
     if panel.gaussians and elements.has_gaussians:
         _draw_gaussians(ax, elements, view, style)
     if panel.lines:

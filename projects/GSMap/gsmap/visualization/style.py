@@ -17,12 +17,7 @@ CLASS_TITLES = {
     "centerline": "centre line",
 }
 # Where predictions are coloured by what they match instead of by class.
-MATCH_COLOURS = {
-    "hit": "#00A39A",
-    "false": "#FF3B30",
-    "found": "#8E8E93",
-    "missed": "#AF52DE",
-}
+MATCH_COLOURS = {"hit": "#00A39A", "false": "#FF3B30", "found": "#8E8E93", "missed": "#AF52DE"}
 TRUTH_OPACITY = {"found": 0.4, "missed": 0.75}
 FALSE_DASHES = (0, (3, 1.5))  # as matplotlib has them
 # Of runs and methods in plots; none is a class's or a match's colour.
