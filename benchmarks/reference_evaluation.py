@@ -16,12 +16,7 @@ from scipy.ndimage import grey_dilation
 from scipy.spatial.distance import cdist
 
 from gsmap.evaluation.average_precision import area_ap, interpolated_ap
-from gsmap.evaluation.raster_ap import (
-    MAX_PREDICTIONS,
-    MIN_SCORE,
-    RasterConfig,
-    pixels_from_metres,
-)
+from gsmap.evaluation.raster_ap import MAX_PREDICTIONS, MIN_SCORE, RasterConfig, pixels_from_metres
 from gsmap.structures.elements import MapElements
 
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth

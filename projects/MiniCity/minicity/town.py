@@ -9,14 +9,7 @@ from shapely.geometry import Polygon
 from minicity.config import make_rng
 from minicity.curves import Array, rectangle
 from minicity.junctions import Connector, Junction, make_connectors, make_junction
-from minicity.network import (
-    MARGIN_M,
-    MIN_ROAD_M,
-    PITCH_M,
-    make_chains,
-    make_nodes,
-    make_roads,
-)
+from minicity.network import MARGIN_M, MIN_ROAD_M, PITCH_M, make_chains, make_nodes, make_roads
 from minicity.roads import CROSSING_GAP_M, STOP_LINE_M, Lane, Road
 
 MAX_SIDE = 8
