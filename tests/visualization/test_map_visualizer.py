@@ -141,10 +141,12 @@ def test_scene_and_time_name_a_picture(tmp_path):
 
 def test_predictions_are_chosen_by_score_and_drawn_in_its_order(tmp_path):
     sample = make_sample(tmp_path)
-    found = predicted_elements(sample, score_thr=0.5)
-    assert found.labels.tolist() == [2, 0]
-    np.testing.assert_allclose(found.polylines[1], sample.pred_instances_3d.pts[0])
-    np.testing.assert_allclose(found.scales[:4], sample.pred_instances_3d.scales[2])
+    found = predicted_elements(sample)
+    assert found.labels.tolist() == [1, 2, 0]
+    np.testing.assert_allclose(found.polylines[2], sample.pred_instances_3d.pts[0])
+    np.testing.assert_allclose(found.scales[4:8], sample.pred_instances_3d.scales[2])
+    figure = make_visualizer("chosen", panels=["prediction"]).draw_sample(sample, score_thr=0.5)
+    assert labels(figure) == ["divider", "road boundary"]
 
 
 def test_ground_truth_falls_back_to_the_training_targets(tmp_path):

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -172,14 +171,13 @@ def compose_figure(
     size_in = _WIDTH / DPI, (bottom + _MARGIN / 2) / DPI
     scale = width_px / _WIDTH  # boxes are laid out for one width and the dots per inch follow
     figure = Figure(figsize=size_in, dpi=DPI * scale, facecolor="white")
-    with matplotlib.rc_context({"font.family": style.font_family}):
-        maps = [camera_elements, *(panel.elements for panel in panels)]
-        _draw_header(figure, title, _legend_lines(maps, panels, style), style)
-        for camera, box in zip(chain(*rows), camera_boxes, strict=True):
-            size_px = max(round(box[2] * scale), 1), max(round(box[3] * scale), 1)
-            draw_camera(_add_axes(figure, box), camera, camera_elements, view, style, size_px)
-        for panel, box in zip(panels, panel_boxes, strict=True):
-            draw_bev(_add_axes(figure, box), panel, grid, view, style)
+    maps = [camera_elements, *(panel.elements for panel in panels)]
+    _draw_header(figure, title, _legend_lines(maps, panels, style), style)
+    for camera, box in zip(chain(*rows), camera_boxes, strict=True):
+        size_px = max(round(box[2] * scale), 1), max(round(box[3] * scale), 1)
+        draw_camera(_add_axes(figure, box), camera, camera_elements, view, style, size_px)
+    for panel, box in zip(panels, panel_boxes, strict=True):
+        draw_bev(_add_axes(figure, box), panel, grid, view, style)
     return figure
 
 

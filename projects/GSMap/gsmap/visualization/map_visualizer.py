@@ -53,7 +53,7 @@ def ground_truth_elements(data_sample: Any) -> MapElements | None:
     return elements_of_targets(instances) if "pts" in instances else None
 
 
-def predicted_elements(data_sample: Any, score_thr: float = 0.0) -> MapElements | None:
+def predicted_elements(data_sample: Any) -> MapElements | None:
     """Read a ``Det3DDataSample``'s predictions, the most confident last, to be drawn on top.
 
     It is None if there are no ``pred_instances_3d``.
@@ -62,8 +62,7 @@ def predicted_elements(data_sample: Any, score_thr: float = 0.0) -> MapElements 
     if "pts" not in instances:
         return None
     found = elements_of_predictions(instances)
-    order = np.argsort(found.confidence, kind="stable")
-    return found.select(order[found.confidence[order] >= score_thr])
+    return found.select(np.argsort(found.confidence, kind="stable"))
 
 
 @VISUALIZERS.register_module()
@@ -229,11 +228,10 @@ class MapVisualizer(Visualizer):
         meta = data_sample.metainfo
         truth = ground_truth_elements(data_sample)
         threshold = self.score_thr if score_thr is None else score_thr
-        found = predicted_elements(data_sample, threshold)
-        note = "no elements"
-        everything = predicted_elements(data_sample)
-        if everything:
-            note = f"no score reaches {threshold:g} (highest {everything.confidence.max():.2g})"
+        found, note = predicted_elements(data_sample), "no elements"
+        if found:
+            note = f"no score reaches {threshold:g} (highest {found.confidence.max():.2g})"
+            found = found.select(found.confidence >= threshold)
         return compose_figure(
             self.cameras(meta, images),
             self._bev_panels(truth, found, points, note),

@@ -1,4 +1,4 @@
-"""Colours, widths and fonts that all pictures share."""
+"""Colours and widths that all pictures share."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -40,7 +40,6 @@ class MapStyle:
     Args:
         classes: Class names in label order.
         closed_classes: Names of the classes that are areas, filled faintly.
-        font_family: Font of all text.
         bev_line_pt: Line width in bird's-eye view, in points.
         camera_line_pt: Line width over an image 10 m away, in points; nearer is thicker.
         halo: Colour of the edge that keeps lines legible over an image.
@@ -53,7 +52,6 @@ class MapStyle:
 
     classes: Sequence[str] = ("divider", "ped_crossing", "boundary")
     closed_classes: Sequence[str] = AREA_CLASSES
-    font_family: str = "DejaVu Sans"
     bev_line_pt: float = 1.6
     camera_line_pt: float = 1.7
     halo: str = "#101418"
