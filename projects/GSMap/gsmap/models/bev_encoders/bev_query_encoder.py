@@ -71,25 +71,19 @@ class BEVEncoderLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
 
     def forward(
-        self,
-        query: Tensor,
-        query_pos: Tensor,
-        centres: Tensor,
-        bev_shape: tuple[int, int],
-        img_feats: Tensor,
-        projection: PillarProjection,
+        self, query: Tensor, query_pos: Tensor, grid: BEVGrid, feats: Tensor, seen: PillarProjection
     ) -> Tensor:
-        """Update the BEV queries. (B, Q, C) -> (B, Q, C)
+        """Update the queries of the grid's cells from image features that have their embeddings.
 
-        Cell centres (B, Q, 2) are [0, 1] over the grid of ``bev_shape`` rows and columns; image
-        features (B, V, C, h, w) have their embeddings; ``projection`` says where pillars fall.
+        (B, Q, C), (1, Q, C), (B, V, C, h, w) and where the pillars fall -> (B, Q, C)
         """
+        centres = grid.norm_from_metres(grid.pixel_centres(feats.device)).view(1, -1, 2)
         # Differs from upstream for batches: it pairs the query of sample floor(b / 2) with sample b
         # here.
         pair = torch.cat([query, query + query_pos], -1)  # (B, Q, 2 C)
-        bev = query.transpose(1, 2).unflatten(-1, bev_shape)  # (B, C, H, W)
+        bev = query.transpose(1, 2).unflatten(-1, (grid.height, grid.width))  # (B, C, H, W)
         query = self.norms[0](query + self.self_attn(pair, centres, bev))
-        query = self.norms[1](query + self.dropout(self.cross_attn(query, img_feats, projection)))
+        query = self.norms[1](query + self.dropout(self.cross_attn(query, feats, seen)))
         return self.norms[2](self.ffn(query))
 
 
@@ -108,9 +102,6 @@ class BEVQueryEncoder(CameraEncoder):
         num_layers: Number of layers.
         layer_cfg: Further arguments of :class:`BEVEncoderLayer`.
         num_cams: Number of cameras V.
-        num_feature_levels: Rows of the level embedding; only the first is used, as there is one
-            level.
-        init_cfg: As in mmengine.
     """
 
     calibration = ("img_from_frame", "can_bus")
@@ -125,7 +116,6 @@ class BEVQueryEncoder(CameraEncoder):
         num_layers: int = 1,
         layer_cfg: dict | None = None,
         num_cams: int = 6,
-        num_feature_levels: int = 4,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
@@ -135,7 +125,7 @@ class BEVQueryEncoder(CameraEncoder):
         self.positional_encoding = LearnedPositionalEncoding(
             embed_dims // 2, self.grid.height, self.grid.width
         )
-        self.level_embeds = nn.Parameter(torch.empty(num_feature_levels, embed_dims))
+        self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))  # only the first is used
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
         self.can_bus_mlp = nn.Sequential(
             nn.Linear(NUM_CAN_BUS, embed_dims // 2),
@@ -162,35 +152,26 @@ class BEVQueryEncoder(CameraEncoder):
     ) -> dict[str, Tensor]:
         """Return ``bev_feats``, from ``img_from_frame`` (B, V, 4, 4) and ``can_bus`` (B, 18).
 
-        Raises:
-            ValueError: If the number of cameras is not the configured one.
+        ValueError if the number of cameras is not the configured one.
         """
         if feats.shape[1] != len(self.cams_embeds):
             raise ValueError(
                 f"the encoder is built for {len(self.cams_embeds)} cameras, got {feats.shape[1]}."
             )
         feats = feats + (self.cams_embeds + self.level_embeds[0])[:, :, None, None].to(feats.dtype)
-        query, query_pos = self.initial_queries(calibration["can_bus"], feats)
-        projection = self.project(calibration["img_from_frame"], img_shape)
-        centres = self.grid.norm_from_metres(self.grid.pixel_centres(feats.device)).view(1, -1, 2)
-        bev_shape = (self.grid.height, self.grid.width)
+        bev_shape = self.grid.height, self.grid.width
+        motion = self.can_bus_mlp(calibration["can_bus"])
+        query = self.bev_embedding.weight[None] + motion[:, None]  # (B, Q, C)
+        query_pos = self.positional_encoding(feats.new_zeros(1, *bev_shape))
+        query_pos = query_pos.flatten(2).transpose(1, 2)  # (1, Q, C)
+        seen = self.project(calibration["img_from_frame"], img_shape)
         for layer in self.layers:
-            query = layer(
-                query, query_pos, centres.expand(len(query), -1, -1), bev_shape, feats, projection
-            )
+            query = layer(query, query_pos, self.grid, feats, seen)
         return {"bev_feats": query.transpose(1, 2).unflatten(-1, bev_shape)}
-
-    def initial_queries(self, can_bus: Tensor, feats: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the cells' queries, the vehicle's motion added, and positions. 2 x (B, Q, C)"""
-        query = self.bev_embedding.weight[None] + self.can_bus_mlp(can_bus)[:, None]
-        mask = feats.new_zeros(1, self.grid.height, self.grid.width)
-        query_pos = self.positional_encoding(mask).flatten(2).transpose(1, 2)  # (1, Q, C)
-        return query, query_pos
 
     def project(self, img_from_frame: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
         """Project every cell's pillar into every camera."""
         # Differs from upstream for batches: it takes the set of seen cells from the first sample
         # for all.
-        device = img_from_frame.device
-        points = pillar_points(self.grid, self.z_range, self.num_heights, device)
-        return project_pillars(points, img_from_frame, img_shape)
+        pillars = self.grid, self.z_range, self.num_heights, img_from_frame.device
+        return project_pillars(pillar_points(*pillars), img_from_frame, img_shape)

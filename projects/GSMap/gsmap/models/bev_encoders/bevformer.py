@@ -20,11 +20,8 @@ class SpatialCrossAttention(SamplingAttention):
     Args:
         embed_dims: Channels C.
         num_heads: Number of heads.
-        num_points: Samples per head, S; a multiple of ``num_heights``.
+        num_points: Samples per head, S; ValueError if it is no multiple of ``num_heights``.
         num_heights: Points per pillar, Z.
-
-    Raises:
-        ValueError: If ``num_points`` is not a multiple of ``num_heights``.
     """
 
     def __init__(
@@ -52,12 +49,8 @@ class SpatialCrossAttention(SamplingAttention):
             cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
             centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
             locations = centres[:, None] + offsets[sample, cell]  # (T, heads, S, 2)
-            seen = sample_map(
-                value[sample, view][None],
-                (height, width),
-                locations[None],
-                weights[sample, cell][None],
-            )
+            inputs = value[sample, view][None], (height, width), locations[None]
+            seen = sample_map(*inputs, weights[sample, cell][None])
             summed[sample] = summed[sample].index_add(0, cell, seen[0])
         count = projection.visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])

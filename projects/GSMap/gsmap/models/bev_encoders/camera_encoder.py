@@ -14,41 +14,25 @@ from gsmap.structures.calibration import calibration_arrays
 def stack_calibration(
     img_metas: Sequence[dict[str, Any]], names: Sequence[str], device: torch.device
 ) -> dict[str, Tensor]:
-    """Stack what an encoder reads of the samples, see `calibration_arrays`. (B, ...) each
-
-    Raises:
-        ValueError: If a sample lacks a field.
-    """
+    """Stack what an encoder reads of the samples, see `calibration_arrays`. (B, ...) each"""
     arrays = [calibration_arrays(meta, names) for meta in img_metas]
-    return {
-        name: torch.as_tensor(np.stack([each[name] for each in arrays]), device=device)
-        for name in names
-    }
+    stacks = {name: np.stack([each[name] for each in arrays]) for name in names}
+    return {name: torch.as_tensor(stack, device=device) for name, stack in stacks.items()}
 
 
 class CameraEncoder(BaseModule):
-    """A BEV encoder of camera features.
+    """A BEV encoder of camera features."""
 
-    Attributes:
-        calibration: What it reads of a sample, names of `calibration_arrays`.
-    """
-
-    calibration: tuple[str, ...]
+    calibration: tuple[str, ...]  # what it reads of a sample, names of `calibration_arrays`
 
     def forward(
         self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]
     ) -> dict[str, Any]:
-        """Encode camera features into BEV features.
+        """Return ``bev_feats`` (B, C, H, W), row 0 at the smallest y, and what else `encode` does.
 
-        Args:
-            mlvl_feats: Image features; the first level is used. List of (B, V, C, h, w)
-            img_metas: Per sample ``batch_input_shape`` and what the calibration is read from.
-
-        Returns:
-            ``bev_feats`` (B, C, H, W), row 0 at the smallest y, and what else `encode` returns.
-
-        Raises:
-            ValueError: If a sample lacks a field, or has another number of cameras.
+        Of the image features, a list of (B, V, C, h, w), the first level is used. Samples have
+        ``batch_input_shape`` and what the calibration is read from; ValueError if one lacks a field
+        or has another number of cameras.
         """
         feats = mlvl_feats[0]
         calibration = stack_calibration(img_metas, self.calibration, feats.device)

@@ -54,9 +54,9 @@ class ASPP(nn.Module):
     def __init__(self, channels: int, mid_channels: int) -> None:
         super().__init__()
         self.aspp1 = _conv_bn_relu(channels, mid_channels, 1)
-        self.aspp2 = _conv_bn_relu(channels, mid_channels, 3, dilation=6)
-        self.aspp3 = _conv_bn_relu(channels, mid_channels, 3, dilation=12)
-        self.aspp4 = _conv_bn_relu(channels, mid_channels, 3, dilation=18)
+        self.aspp2, self.aspp3, self.aspp4 = (
+            _conv_bn_relu(channels, mid_channels, 3, dilation) for dilation in (6, 12, 18)
+        )
         self.global_avg_pool = nn.Sequential(
             nn.AdaptiveAvgPool2d(1),
             nn.Conv2d(channels, mid_channels, 1, bias=False),
@@ -102,9 +102,9 @@ class CameraAwareDepthNet(nn.Module):
         )
 
     def forward(self, feats: Tensor, camera_vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict depth logits (n, D, h, w) and context features (n, C, h, w) of n cameras.
+        """Predict depth logits (n, D, h, w) and context (n, C, h, w) of features (n, C_in, h, w).
 
-        They come with features (n, C_in, h, w) and `frustum.camera_vector` each (n, 22).
+        Each camera has its `frustum.camera_vector` (n, 22).
         """
         vectors = self.bn(camera_vectors)
         feats = self.reduce_conv(feats)

@@ -22,11 +22,7 @@ def frustum_points(
         feature_size: Height h and width w of the feature map.
         depths_m: Along the optical axis. (D,)
 
-    Returns:
-        Points (x, y, z) in metres. (..., D, h, w, 3)
-
-    Raises:
-        ValueError: If ``frame_from_img`` does not hold 4 x 4 matrices.
+    ValueError if ``frame_from_img`` does not hold 4 x 4 matrices. -> (..., D, h, w, 3) in metres
     """
     if frame_from_img.shape[-2:] != (4, 4):
         raise ValueError(
@@ -43,16 +39,11 @@ def frustum_points(
 
 
 def camera_vector(cam2img: Tensor, img_aug_matrix: Tensor, ego_from_cam: Tensor) -> Tensor:
-    """Write a camera's parameters as the 22 numbers that MapTRv2's depth net reads.
+    """Write a camera's parameters as the 22 numbers that MapTRv2's depth net reads. (..., 22)
 
-    Args:
-        cam2img: Intrinsics of the original image, in pixels. (..., >= 3, >= 3)
-        img_aug_matrix: Image augmentation, acting on (u * d, v * d, d, 1): scale and rotation in
-            the upper left, translation in pixels in the third column. (..., 4, 4)
-        ego_from_cam: Pose of the camera in the ego vehicle, in metres. (..., 4, 4)
-
-    Returns:
-        fx, fy, cx, cy; a00, a01, tx, a10, a11, ty; then the upper three rows of the pose. (..., 22)
+    fx, fy, cx, cy of the original image in pixels (..., >= 3, >= 3); a00, a01, tx, a10, a11, ty of
+    the augmentation, which acts on (u * d, v * d, d, 1), translation in pixels in the third column
+    (..., 4, 4); the upper three rows of the camera's pose in the vehicle, in metres (..., 4, 4).
     """
     intrinsics = [cam2img[..., 0, 0], cam2img[..., 1, 1], cam2img[..., 0, 2], cam2img[..., 1, 2]]
     augmentation = img_aug_matrix[..., :2, :3].flatten(-2)

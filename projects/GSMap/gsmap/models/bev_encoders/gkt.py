@@ -44,12 +44,9 @@ class GeometryKernelAttention(nn.Module):
     the number of cameras that see the cell.
 
     Args:
-        embed_dims: Channels C.
+        embed_dims: Channels C; ValueError if they are not divisible by ``num_heads``.
         num_heads: Number of heads; head m looks at pillar height m.
-        kernel_size: Rows and columns of the kernel, both odd.
-
-    Raises:
-        ValueError: If a kernel size is even or ``embed_dims`` is not divisible by ``num_heads``.
+        kernel_size: Rows and columns of the kernel; ValueError if they are not odd.
     """
 
     offsets: Tensor
@@ -64,8 +61,7 @@ class GeometryKernelAttention(nn.Module):
             raise ValueError(
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
             )
-        self.num_heads = num_heads
-        self.num_heights = num_heads
+        self.num_heads = self.num_heights = num_heads
         self.register_buffer("offsets", kernel_offsets(kernel_size), persistent=False)
         self.attention_weights = nn.Linear(embed_dims, num_heads * len(self.offsets))
         self.value_proj = nn.Linear(embed_dims, embed_dims)
@@ -86,10 +82,7 @@ class GeometryKernelAttention(nn.Module):
         batch, num_queries = query.shape[:2]
         num_views, (height, width) = img_feats.shape[1], img_feats.shape[-2:]
         value = self.value_proj(img_feats.flatten(3).transpose(2, 3))  # (B, V, h * w, C)
-        weights = (
-            self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1)).softmax(-1)
-        )
-
+        weights = self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1))
         sample, view, cell = projection.visible.nonzero(as_tuple=True)  # T pairs that see
         uv = projection.uv[sample, view, cell]  # (T, heads, 2)
         pixels = kernel_cells(uv, self.offsets, (height, width))  # (T, heads, S)
@@ -97,8 +90,7 @@ class GeometryKernelAttention(nn.Module):
         head = torch.arange(self.num_heads, device=query.device).view(1, -1, 1)
         rows = (image * (height * width) + pixels) * self.num_heads + head
         table = value.float().reshape(-1, value.shape[-1] // self.num_heads)
-        out = sum_rows(table, rows, weights[sample, cell]).flatten(1)  # (T, C)
-
+        out = sum_rows(table, rows, weights.softmax(-1)[sample, cell]).flatten(1)  # (T, C)
         target = sample * num_queries + cell
         summed = out.new_zeros(batch * num_queries, out.shape[-1]).index_add(0, target, out)
         count = projection.visible.sum(1).clamp(min=1)  # (B, Q)

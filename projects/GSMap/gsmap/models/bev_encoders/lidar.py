@@ -27,9 +27,8 @@ class LidarEncoder(BaseModule):
         middle_encoder: Config of what spreads the voxels over the plane.
         backbone: Config of the 2D backbone, or None.
         neck: Config of the neck, or None; its first output is used.
-        bev_pixel_m: Side of a cell of the output in metres, or its sizes along x and y; the
-            features are interpolated to it.
-        init_cfg: As in mmengine.
+        bev_pixel_m: Side of a cell of the output, to which the features are interpolated, in
+            metres, or its sizes along x and y.
     """
 
     def __init__(
@@ -54,21 +53,16 @@ class LidarEncoder(BaseModule):
         """Encode the voxels of a batch to BEV features (B, C, H, W), row 0 at the smallest y.
 
         They are ``voxels`` (M, points, channels), ``num_points`` (M,) and ``coors`` (M, 4): sample,
-        z, y, x.
-
-        Raises:
-            RuntimeError: If a sparse encoder is to run on the CPU without spconv, or to train
-                there, which spconv cannot do.
+        z, y, x. RuntimeError if a sparse encoder is to run on the CPU without spconv, or to train
+        there, which spconv cannot do.
         """
         coors = voxels["coors"]
         if isinstance(self.middle_encoder, SparseEncoder) and not coors.is_cuda:
             self._check_sparse_on_cpu()
         points = self.voxel_encoder(voxels["voxels"], voxels["num_points"], coors)
         feats = self.middle_encoder(points, coors, batch_size)
-        if self.backbone is not None:
-            feats = self.backbone(feats)
-        if self.neck is not None:
-            feats = self.neck(feats)
+        for part in (self.backbone, self.neck):
+            feats = feats if part is None else part(feats)
         feats = feats[0] if isinstance(feats, (list, tuple)) else feats
         if feats.shape[-2:] != self.bev_size:
             feats = F.interpolate(feats, self.bev_size, mode="bilinear", align_corners=False)
@@ -95,9 +89,8 @@ class ConvFuser(ConvModule):
     def __init__(
         self, camera_channels: int, lidar_channels: int, out_channels: int, **kwargs: Any
     ) -> None:
-        kwargs = {"kernel_size": 3, "padding": 1, "bias": False, **kwargs}
-        kwargs.setdefault("norm_cfg", {"type": "BN"})
-        super().__init__(camera_channels + lidar_channels, out_channels, **kwargs)
+        defaults = {"kernel_size": 3, "padding": 1, "bias": False, "norm_cfg": {"type": "BN"}}
+        super().__init__(camera_channels + lidar_channels, out_channels, **{**defaults, **kwargs})
 
     def forward(self, camera_feats: Tensor, lidar_feats: Tensor) -> Tensor:
         """Fuse both, of one size. 2 x (B, C, H, W) -> (B, C, H, W)"""

@@ -29,14 +29,10 @@ class LSSEncoder(CameraEncoder):
         z_range: Lowest and highest z in metres; it is one layer.
         bev_pixel_m: Side of a cell of the output in metres, or its sizes along x and y.
         embed_dims: Channels C of image and BEV features.
-        depth_range: ``(low, high, step)`` of the depth bins in metres.
+        depth_range: ``(low, high, step)`` of the depth bins in metres; ValueError if there is none.
         camera_aware: Whether the depth net reads the cameras' parameters (MapTRv2) or is one
             convolution (the BEVPool variant of MapTR).
         aspp_channels: Channels of each branch of the camera-aware depth head's pyramid.
-        init_cfg: As in mmengine.
-
-    Raises:
-        ValueError: If ``depth_range`` holds no bin.
     """
 
     def __init__(
@@ -55,7 +51,7 @@ class LSSEncoder(CameraEncoder):
         self.cells = self.grid.resized(2 * self.grid.height, 2 * self.grid.width)
         self.z_range = (float(z_range[0]), float(z_range[1]))
         low, high, step = (float(x) for x in depth_range)
-        self.depth_range = (low, high, step)
+        self.depth_range = low, high, step
         self.num_bins = num_depth_bins(self.depth_range)
         self.camera_aware = camera_aware
         self.calibration = ("frame_from_img", *(CAMERA_MATRICES if camera_aware else ()))
@@ -81,9 +77,8 @@ class LSSEncoder(CameraEncoder):
     ) -> dict[str, Any]:
         """Encode features, with ``frame_from_img`` and, camera-aware, ``CAMERA_MATRICES``.
 
-        Returns:
-            ``bev_feats`` (B, C, H, W); ``depth``, the probability of each depth bin (B, V, D, h,
-            w), and their ``depth_range``; ``img_feats``, the image features used (B, V, C, h, w).
+        Beside ``bev_feats`` (B, C, H, W) there are ``depth``, the probability of each depth bin (B,
+        V, D, h, w), its ``depth_range``, and ``img_feats``, the features used (B, V, C, h, w).
         """
         vectors = None
         if self.camera_aware:
@@ -96,15 +91,10 @@ class LSSEncoder(CameraEncoder):
         with torch.autocast(feats.device.type, enabled=False):
             kernel = cast(Tensor, self.downsample[0].weight)
             bev = bev_pool_conv3x3(depth, context, indices, self.cells, kernel.float())
-        return {
-            "bev_feats": self.downsample[1:](bev),
-            "depth": depth,
-            "depth_range": self.depth_range,
-            "img_feats": feats,
-        }
+        lifted = {"depth": depth, "depth_range": self.depth_range, "img_feats": feats}
+        return {"bev_feats": self.downsample[1:](bev), **lifted}
 
     def points(self, frame_from_img: Tensor, img_shape: tuple[int, int], feats: Tensor) -> Tensor:
         """Return every feature pixel at every depth, in metres. (B, V, D, h, w, 3)"""
         depths = torch.arange(*self.depth_range, device=feats.device)
-        height, width = feats.shape[-2:]
-        return frustum_points(frame_from_img, img_shape, (height, width), depths)
+        return frustum_points(frame_from_img, img_shape, (feats.shape[-2], feats.shape[-1]), depths)

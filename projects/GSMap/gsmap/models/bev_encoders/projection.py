@@ -28,11 +28,10 @@ def pillar_points(
     # matters.
     cols = torch.linspace(0.5, grid.width - 0.5, grid.width, device=device) / grid.width
     rows = torch.linspace(0.5, grid.height - 0.5, grid.height, device=device) / grid.height
-    depth_m = z_range[1] - z_range[0]
     heights = torch.linspace(0.5 / num_heights, 1 - 0.5 / num_heights, num_heights, device=device)
     x = cols * grid.extent_m[0] + grid.x_range[0]
     y = rows * grid.extent_m[1] + grid.y_range[0]
-    z = heights * depth_m + z_range[0]
+    z = heights * (z_range[1] - z_range[0]) + z_range[0]
     y, x, z = torch.meshgrid(y, x, z, indexing="ij")
     return torch.stack([x, y, z, torch.ones_like(x)], -1).flatten(0, 1)
 
@@ -45,9 +44,8 @@ def project_pillars(
     ``img_shape`` are rows and columns of the padded image.
     """
     with torch.autocast(points.device.type, enabled=False):
-        projected = torch.matmul(
-            img_from_frame[:, :, None, None].float(), points[..., None].float()
-        )[..., 0]
+        matrices = img_from_frame[:, :, None, None].float()
+        projected = torch.matmul(matrices, points[..., None].float())[..., 0]
     depth = projected[..., 2]
     uv = projected[..., :2] / depth.clamp(min=_MIN_DEPTH_M)[..., None]
     uv = uv / uv.new_tensor([img_shape[1], img_shape[0]])

@@ -1,6 +1,6 @@
 """Auxiliary heads: masks in bird's-eye and camera view, depth. They only help training.
 
-Each has a ``name`` and ``loss(bev_outputs, batch_data_samples)``; predictions do not run them.
+Each has a ``name`` and ``loss(bev_outputs, samples)``; predictions do not run them.
 """
 
 from collections.abc import Sequence
@@ -14,18 +14,18 @@ from torch import Tensor, nn
 from gsmap.models.losses.auxiliary import depth_bins, depth_loss
 from gsmap.models.losses.segmentation import class_mask_losses
 
+Samples = Sequence[Det3DDataSample]
 
-def _stack_targets(
-    batch_data_samples: Sequence[Det3DDataSample], name: str, device: torch.device
-) -> Tensor:
+
+def _stack_targets(samples: Samples, name: str, device: torch.device) -> Tensor:
     """Stack a training target of all samples, which must have it. (B, ...)"""
-    for sample in batch_data_samples:
+    for sample in samples:
         if name not in sample:
             raise ValueError(
                 f"sample {sample.metainfo.get('token')!r} has no {name}: add its transform to the "
                 "training pipeline, or remove its loss from the model."
             )
-    return torch.stack([torch.as_tensor(s.get(name)) for s in batch_data_samples]).to(device)
+    return torch.stack([torch.as_tensor(sample.get(name)) for sample in samples]).to(device)
 
 
 @MODELS.register_module()
@@ -64,12 +64,10 @@ class BEVMaskHead(nn.Sequential):
             nn.Conv2d(embed_dims, num_masks, 1),
         )
 
-    def loss(
-        self, bev_outputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> Tensor:
+    def loss(self, bev_outputs: dict[str, Any], samples: Samples) -> Tensor:
         """Return the weighted loss on the encoder's features."""
         feats = bev_outputs[self.feats]
-        target = _stack_targets(batch_data_samples, self.target, feats.device)
+        target = _stack_targets(samples, self.target, feats.device)
         target = target.reshape(-1, *target.shape[-3:])
         if self.num_masks == 1:
             target = target.amax(1, keepdim=True)
@@ -125,11 +123,9 @@ class DepthSupervision(nn.Module):
         super().__init__()
         self.loss_weight, self.name = loss_weight, name
 
-    def loss(
-        self, bev_outputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> Tensor:
+    def loss(self, bev_outputs: dict[str, Any], samples: Samples) -> Tensor:
         """Return the loss on ``depth`` (B, V, D, h, w), probabilities of ``depth_range``'s bins."""
         probs, depth_range = bev_outputs["depth"], bev_outputs["depth_range"]
-        target = _stack_targets(batch_data_samples, "gt_depth", probs.device)
+        target = _stack_targets(samples, "gt_depth", probs.device)
         bins = depth_bins(target, target.shape[-1] // probs.shape[-1], depth_range)
         return self.loss_weight * depth_loss(probs, bins)

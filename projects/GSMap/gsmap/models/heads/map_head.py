@@ -26,6 +26,10 @@ from gsmap.structures.grid import BEVGrid
 
 _PRIOR_PROBABILITY = 0.01
 PARTS = dict[str, Any]
+Tensors = dict[str, Tensor]
+Samples = Sequence[Det3DDataSample]
+Instances = Sequence[InstanceData]
+Metas = Sequence[dict[str, Any]]
 
 
 @MODELS.register_module()
@@ -152,13 +156,12 @@ class MapHead(BaseModule):
             logging.WARNING,
         )
 
-    def forward(self, bev_outputs: dict[str, Tensor]) -> dict[str, Tensor]:
+    def forward(self, bev_outputs: Tensors) -> Tensors:
         """Predict the elements after every decoder layer from ``bev_feats`` (B, C, H, W).
 
-        Returns:
-            ``all_cls_scores`` logits (L, B, N, classes), ``all_pts_preds`` normalised (L, B, N, P,
-            2 or 3) and ``all_references`` (L, B, N, P, D), float32; ``all_instance_states`` (L, B,
-            N, C) and the decoder's further ``fields``; ``states`` (L, B, N * P, C), ``bev_feats``.
+        ``all_cls_scores`` are logits (L, B, N, classes), ``all_pts_preds`` normalised (L, B, N, P,
+        2 or 3), with ``all_references`` (L, B, N, P, D), float32; ``all_instance_states`` (L, B, N,
+        C) and the decoder's further ``fields``; ``states`` (L, B, N * P, C); ``bev_feats``.
         """
         bev_feats = bev_outputs["bev_feats"]
         query_pos, query = (part.expand(len(bev_feats), -1, -1) for part in self.queries())
@@ -180,25 +183,15 @@ class MapHead(BaseModule):
             "bev_feats": bev_feats,
         }
 
-    def loss(
-        self, bev_outputs: dict[str, Tensor], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> dict[str, Tensor]:
+    def loss(self, bev_outputs: Tensors, samples: Samples) -> Tensors:
         """Run the head and return its losses, those of the auxiliary heads included."""
-        losses = self.loss_by_feat(
-            self(bev_outputs),
-            [sample.gt_instances_3d for sample in batch_data_samples],
-            [sample.metainfo for sample in batch_data_samples],
-        )
+        gts, metas = [s.gt_instances_3d for s in samples], [s.metainfo for s in samples]
+        losses = self.loss_by_feat(self(bev_outputs), gts, metas)
         for name, head in self.aux_heads.items():
-            losses[f"loss_{name}"] = cast(Any, head).loss(bev_outputs, batch_data_samples)
+            losses[f"loss_{name}"] = cast(Any, head).loss(bev_outputs, samples)
         return losses
 
-    def loss_by_feat(
-        self,
-        outputs: dict[str, Tensor],
-        batch_gt_instances: Sequence[InstanceData],
-        batch_img_metas: Sequence[dict[str, Any]],
-    ) -> dict[str, Tensor]:
+    def loss_by_feat(self, outputs: Tensors, gt_instances: Instances, metas: Metas) -> Tensors:
         """Prepare the ground truth and return the losses of every decoder layer and query group.
 
         Ground truth is, per sample, ``labels_3d`` (K,), ``pts`` (K, P, 2), ``pts_shifts`` (K, S, P,
@@ -208,16 +201,14 @@ class MapHead(BaseModule):
         Raises:
             FloatingPointError: If a matching cost is not finite.
         """
-        losses: dict[str, Tensor] = {}
+        losses: Tensors = {}
         with torch.autocast(outputs["all_pts_preds"].device.type, enabled=False):
-            gts = [self.prepare_gt(gt) for gt in batch_gt_instances]
+            gts = [self.prepare_gt(gt) for gt in gt_instances]
             for group, own in self.split_groups(outputs):
-                losses.update(self.group_losses(group, own, gts, batch_img_metas))
+                losses.update(self.group_losses(group, own, gts, metas))
         return losses
 
-    def split_groups(
-        self, outputs: dict[str, Tensor]
-    ) -> Iterator[tuple[QueryGroup, dict[str, Tensor]]]:
+    def split_groups(self, outputs: Tensors) -> Iterator[tuple[QueryGroup, Tensors]]:
         """Yield each query group with its predictions, ``all_*`` (L, B, N of the group, ...)."""
         shared = {k: v for k, v in outputs.items() if k == "bev_feats"}
         start = 0
@@ -228,19 +219,15 @@ class MapHead(BaseModule):
             start = end
 
     def group_losses(
-        self,
-        group: QueryGroup,
-        outputs: dict[str, Tensor],
-        gts: Sequence[InstanceData],
-        batch_img_metas: Sequence[dict[str, Any]],
-    ) -> dict[str, Tensor]:
+        self, group: QueryGroup, outputs: Tensors, gts: Instances, metas: Metas
+    ) -> Tensors:
         """Return every layer's losses of one query group."""
-        losses: dict[str, Tensor] = {}
+        losses: Tensors = {}
         last = len(outputs["all_cls_scores"]) - 1
         suffix = f"_{group.name}" if group.name else ""
         for layer in range(last + 1):
             predictions, feats = self.layer_predictions(outputs, layer), outputs.get("bev_feats")
-            pairs = self.match(predictions, gts, batch_img_metas, group.repeats, feats)
+            pairs = self.match(predictions, gts, metas, group.repeats, feats)
             prefix = "" if layer == last else f"d{layer}."
             for name, value in self.layer_losses(group, pairs, layer == last).items():
                 weight = group.weight if name.startswith("loss_") else 1.0
@@ -265,7 +252,7 @@ class MapHead(BaseModule):
             gt.masks = self.masks.draw_sample(gt_instances, self.masks.grid)
         return gt
 
-    def layer_predictions(self, outputs: dict[str, Tensor], layer: int) -> list[InstanceData]:
+    def layer_predictions(self, outputs: Tensors, layer: int) -> list[InstanceData]:
         """Return a layer's predictions, per sample, as costs and losses read them.
 
         They have ``scores`` (N, classes), normalised ``pts`` (N, P, 2), ``references`` (N, P, D),
@@ -286,24 +273,20 @@ class MapHead(BaseModule):
 
     def match(
         self,
-        predictions: Sequence[InstanceData],
-        gts: Sequence[InstanceData],
-        batch_img_metas: Sequence[dict[str, Any]],
+        predictions: Instances,
+        gts: Instances,
+        metas: Metas,
         repeats: int = 1,
         bev_feats: Tensor | None = None,
     ) -> MatchedPairs:
         """Match every sample's predictions with its ground truth."""
-        matches = [
-            self.assigner.assign(prediction, gt, meta, repeats)
-            for prediction, gt, meta in zip(predictions, gts, batch_img_metas, strict=True)
-        ]
+        samples = zip(predictions, gts, metas, strict=True)
+        matches = [self.assigner.assign(*sample, repeats) for sample in samples]
         return MatchedPairs(predictions, gts, matches, self.reference, self.masks, bev_feats)
 
-    def layer_losses(
-        self, group: QueryGroup, pairs: MatchedPairs, is_last: bool
-    ) -> dict[str, Tensor]:
+    def layer_losses(self, group: QueryGroup, pairs: MatchedPairs, is_last: bool) -> Tensors:
         """Return the losses of one layer's predictions."""
-        losses: dict[str, Tensor] = {}
+        losses: Tensors = {}
         first, avg_factor = group is self.query_groups[0], pairs.avg_factor
         if group.has("cls"):
             # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
@@ -318,20 +301,15 @@ class MapHead(BaseModule):
             losses.update(self.statistics(pairs))
         return losses
 
-    def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:
+    def statistics(self, pairs: MatchedPairs) -> Tensors:
         """Return figures to log beside the losses; their names do not start with ``loss``."""
         return {}
 
-    def predict(
-        self, bev_outputs: dict[str, Tensor], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> list[InstanceData]:
+    def predict(self, bev_outputs: Tensors, samples: Samples) -> list[InstanceData]:
         """Run the head and return its detections."""
-        metas = [sample.metainfo for sample in batch_data_samples]
-        return self.predict_by_feat(self(bev_outputs), metas)
+        return self.predict_by_feat(self(bev_outputs), [sample.metainfo for sample in samples])
 
-    def predict_by_feat(
-        self, outputs: dict[str, Tensor], batch_img_metas: Sequence[dict[str, Any]]
-    ) -> list[InstanceData]:
+    def predict_by_feat(self, outputs: Tensors, metas: Metas) -> list[InstanceData]:
         """Decode the last layer's predictions, best first.
 
         They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,), ``pts`` (M, P, 2) in metres

@@ -18,15 +18,14 @@ class MapVRHead(MapHead):
 
     Matched points are rendered softly, as lines or as polygons by their class, and compared by the
     dice loss; matching does the same on coarser rasters. Points weigh less than in MapTR, and the
-    direction loss asks for straight predictions instead of the ground truth's directions. Arguments
-    besides those of `MapHead`:
+    direction loss asks for straight predictions instead of the ground truth's directions. Besides
+    `MapHead`'s arguments:
 
     Args:
-        losses: Configs of the losses of the head that this one extends; of these, `PointsLoss` gets
-            another weight, `DirectionLoss` is replaced.
-        match_costs: Configs of its matching costs; `OrderedPointsCost` gets another weight.
+        losses: As in `MapHead`; `PointsLoss` gets another weight, `DirectionLoss` is replaced.
+        match_costs: As in `MapHead`; `OrderedPointsCost` gets another weight.
         loss_dice: Settings of the dice loss, or None to train without it.
-        dice_cost: Settings of the matching cost of the same, or None to match without it.
+        dice_cost: Settings of its matching cost, or None to match without it.
         loss_direction: Config of the direction loss, or None to train without one.
         points_weight: Weight of the points in losses and in matching.
         polygons: Names of the classes that are rendered as filled polygons; None: those that are

@@ -12,11 +12,7 @@ class PatchMerging(nn.Module):
         self.reduction = nn.Linear(4 * embed_dims, embed_dims, bias=False)
 
     def forward(self, feats: Tensor) -> Tensor:
-        """Halve a map. (B, C, H, W) -> (B, C, H / 2, W / 2)
-
-        Raises:
-            ValueError: If a side is odd.
-        """
+        """Halve a map; ValueError if a side is odd. (B, C, H, W) -> (B, C, H / 2, W / 2)"""
         height, width = feats.shape[-2:]
         if height % 2 or width % 2:
             raise ValueError(f"a BEV level needs even sides to be halved, got {height} x {width}.")
@@ -28,11 +24,7 @@ class PatchMerging(nn.Module):
 
 
 class BEVPyramid(nn.Module):
-    """BEV features, and the same at half the resolution, a quarter and so on.
-
-    Raises:
-        ValueError: If there is no level; one level adds nothing.
-    """
+    """BEV features, and the same at half the resolution and so on; ValueError without a level."""
 
     def __init__(self, embed_dims: int = 256, num_levels: int = 2) -> None:
         super().__init__()

@@ -31,14 +31,9 @@ def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights
     if not has_compiled_op(value):
         return deformable_sample(value, shape, locations, weights)
     shapes = torch.tensor([shape], device=value.device)
-    return MultiScaleDeformableAttnFunction.apply(
-        value.contiguous(),
-        shapes,
-        shapes.new_zeros(1),
-        locations[:, :, :, None].contiguous(),
-        weights[:, :, :, None].contiguous(),
-        _IM2COL_STEP,
-    )
+    samples = locations[:, :, :, None].contiguous(), weights[:, :, :, None].contiguous()
+    arguments = value.contiguous(), shapes, shapes.new_zeros(1), *samples, _IM2COL_STEP
+    return MultiScaleDeformableAttnFunction.apply(*arguments)
 
 
 def place_samples(
@@ -61,14 +56,11 @@ class SamplingAttention(nn.Module):
     They are those of mmcv's ``MultiScaleDeformableAttention`` for one level.
 
     Args:
-        embed_dims: Channels C of the map and of the output.
+        embed_dims: Channels C of map and output; ValueError if ``num_heads`` does not divide them.
         num_heads: Number of heads.
         num_points: Samples per head and query, S.
         query_dims: Channels of the query; None means ``embed_dims``.
         dropout: Dropout on the output.
-
-    Raises:
-        ValueError: If ``embed_dims`` is not divisible by ``num_heads``.
     """
 
     def __init__(
@@ -85,8 +77,7 @@ class SamplingAttention(nn.Module):
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
             )
         query_dims = query_dims or embed_dims
-        self.num_heads = num_heads
-        self.num_points = num_points
+        self.num_heads, self.num_points = num_heads, num_points
         self.sampling_offsets = nn.Linear(query_dims, num_heads * num_points * 2)
         self.attention_weights = nn.Linear(query_dims, num_heads * num_points)
         self.value_proj = nn.Linear(embed_dims, embed_dims)
@@ -140,9 +131,8 @@ class BEVDeformableAttention(SamplingAttention):
         locations = place_samples(self.offsets_in_cells(query), reference, shape, frames)
         weights = self.weights(query)
         # Projection and sampling commute: projecting after it pays when few cells are looked at.
-        if weights.numel() * _CORNERS < tokens[..., 0].numel() * self.num_heads and not (
-            has_compiled_op(tokens)
-        ):
+        few = weights.numel() * _CORNERS < tokens[..., 0].numel() * self.num_heads
+        if few and not has_compiled_op(tokens):
             sampled = self._sample_then_project(tokens, shape, locations, weights)
         else:
             sampled = sample_map(self.values(tokens), shape, locations, weights)

@@ -9,20 +9,15 @@ from torch import Tensor, nn
 class GridMask(nn.Module):
     """Black out a regular grid of squares in all images of a batch (Chen et al., 2020).
 
-    Args:
-        prob: Probability of a batch to be masked.
-        ratio: Side of a kept square over the period of the grid, in (0, 1).
-
-    Raises:
-        ValueError: If an argument is out of its range.
+    ``prob``, in [0, 1], is the probability of a batch to be masked, ``ratio``, in (0, 1), the side
+    of a kept square over the period of the grid; else ValueError.
     """
 
     def __init__(self, prob: float = 0.7, ratio: float = 0.5) -> None:
         super().__init__()
         if not 0 <= prob <= 1 or not 0 < ratio < 1:
             raise ValueError(f"prob must be in [0, 1] and ratio in (0, 1), got {prob} and {ratio}.")
-        self.prob = prob
-        self.ratio = ratio
+        self.prob, self.ratio = prob, ratio
 
     def forward(self, images: Tensor) -> Tensor:
         """Mask the images, or return them as they are. (V, 3, H, W)"""

@@ -114,8 +114,7 @@ class GeometryDecoupledAttention(nn.Module):
     ) -> Tensor:
         """Let points attend to other instances, then within theirs; there is no position.
 
-        Raises:
-            ValueError: If the queries are not two or more instances of P points.
+        ValueError if the queries are not two or more instances of P points.
         """
         batch, count = query.shape[:2]
         if count % self.num_points or count < 2 * self.num_points:

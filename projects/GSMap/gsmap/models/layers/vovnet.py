@@ -67,7 +67,7 @@ class OneShotAggregation(nn.Module):
 
 @MODELS.register_module()
 class VoVNet(BaseModule):
-    """VoVNetV2 with effective squeeze and excitation.
+    """VoVNetV2 with effective squeeze and excitation; ValueError for another depth or index.
 
     Args:
         depth: 19, 39, 57 or 99.
@@ -75,10 +75,6 @@ class VoVNet(BaseModule):
             image's size.
         frozen_stages: Train none of the stem (0) and the first so many stages; -1 trains all.
         norm_eval: Keep the statistics of batch norms.
-        init_cfg: As in mmengine.
-
-    Raises:
-        ValueError: If ``depth`` or an index is not one of these.
     """
 
     def __init__(
@@ -97,8 +93,8 @@ class VoVNet(BaseModule):
                 "out_indices must lie in 0 to 3 and frozen_stages in -1 to 4, got "
                 f"{tuple(out_indices)} and {frozen_stages}."
             )
-        self.out_indices, self.frozen_stages = tuple(out_indices), frozen_stages
-        self.norm_eval = norm_eval
+        self.out_indices = tuple(out_indices)
+        self.frozen_stages, self.norm_eval = frozen_stages, norm_eval
         first, second, channels = STEM_CHANNELS
         stem = _convolution("stem_1", 3, first, 3, 2) + _convolution("stem_2", first, second, 3)
         stem += _convolution("stem_3", second, channels, 3, 2)
