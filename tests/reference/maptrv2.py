@@ -14,7 +14,7 @@ from torch import Tensor
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakeBEVMask, MakePVMask
 from gsmap.models.bev_encoders.camera_encoder import stack_calibration
-from gsmap.models.bev_encoders.frustum import camera_vector
+from gsmap.models.bev_encoders.depth_net import camera_vector
 from gsmap.models.bev_encoders.lss import CAMERA_MATRICES
 from gsmap.models.heads.map_head import MapHead
 from gsmap.models.losses.auxiliary import depth_bins

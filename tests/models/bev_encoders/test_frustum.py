@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from gsmap.models.bev_encoders.frustum import camera_vector, frustum_points
+from gsmap.models.bev_encoders.depth_net import camera_vector
+from gsmap.models.bev_encoders.projection import frustum_points
 
 
 def camera_looking_along_y() -> torch.Tensor:

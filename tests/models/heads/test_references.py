@@ -4,7 +4,7 @@ import pytest
 import torch
 from head_cases import ALONG_X, ALONG_Y, CLASSES
 
-from gsmap.models.heads.gaussian_statistics import gaussian_statistics
+from gsmap.models.heads.gsmap_head import gaussian_statistics
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.references import GaussianReference, PointReference, refine_reference
 from gsmap.structures.gaussians import Gaussians

@@ -82,33 +82,22 @@ class BEVGrid:
             )
         return self.resized(height, width)
 
-    def _affine(
-        self, points: Array, scale: tuple[float, float], shift: tuple[float, float]
-    ) -> Array:
-        """Return ``points * scale + shift`` on (x, y); further entries (z) are kept. (..., >= 2)"""
-        if points.shape[-1] < 2:
-            raise ValueError(f"points must end in (x, y), got shape {tuple(points.shape)}.")
-        if isinstance(points, np.ndarray):
-            xy = points[..., :2] * np.asarray(scale) + np.asarray(shift)
-            return np.concatenate([xy, points[..., 2:]], -1).astype(points.dtype, copy=False)
-        import torch
-
-        x, y = points[..., 0] * scale[0] + shift[0], points[..., 1] * scale[1] + shift[1]
-        return torch.cat([torch.stack([x, y], -1), points[..., 2:]], -1)
-
     def norm_from_metres(self, points: Array) -> Array:
         """Map metres to [0, 1] over the extent. (..., 2)"""
-        (w, h), x0, y0 = self.extent_m, self.x_range[0], self.y_range[0]
-        return self._affine(points, (1 / w, 1 / h), (-x0 / w, -y0 / h))
-
-    def metres_from_norm(self, points: Array) -> Array:
-        """Map [0, 1] over the extent to metres. (..., 2)"""
-        return self._affine(points, self.extent_m, (self.x_range[0], self.y_range[0]))
+        return self._in_units(points, self.extent_m)
 
     def px_from_metres(self, points: Array) -> Array:
         """Map metres to continuous pixels (u along x, v along y), centres at + 0.5. (..., 2)"""
-        (dx, dy), x0, y0 = self.pixel_size_m, self.x_range[0], self.y_range[0]
-        return self._affine(points, (1 / dx, 1 / dy), (-x0 / dx, -y0 / dy))
+        return self._in_units(points, self.pixel_size_m)
+
+    def metres_from_norm(self, points: Array) -> Array:
+        """Map [0, 1] over the extent to metres. (..., 2)"""
+        return _affine(points, self.extent_m, (self.x_range[0], self.y_range[0]))
+
+    def _in_units(self, points: Array, sizes_m: tuple[float, float]) -> Array:
+        """Measure points from the lower corner in units of given sizes. (..., 2)"""
+        shift = -self.x_range[0] / sizes_m[0], -self.y_range[0] / sizes_m[1]
+        return _affine(points, (1 / sizes_m[0], 1 / sizes_m[1]), shift)
 
     def pixel_centres(
         self, device: "torch.device | str | None" = None, dtype: "torch.dtype | None" = None
@@ -121,3 +110,16 @@ class BEVGrid:
         x = x0 + dx * (torch.arange(self.width, device=device, dtype=dtype) + 0.5)
         y = y0 + dy * (torch.arange(self.height, device=device, dtype=dtype) + 0.5)
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+
+
+def _affine(points: Array, scale: tuple[float, float], shift: tuple[float, float]) -> Array:
+    """Return ``points * scale + shift`` on (x, y); further entries (z) are kept. (..., >= 2)"""
+    if points.shape[-1] < 2:
+        raise ValueError(f"points must end in (x, y), got shape {tuple(points.shape)}.")
+    if isinstance(points, np.ndarray):
+        xy = points[..., :2] * np.asarray(scale) + np.asarray(shift)
+        return np.concatenate([xy, points[..., 2:]], -1).astype(points.dtype, copy=False)
+    import torch
+
+    x, y = points[..., 0] * scale[0] + shift[0], points[..., 1] * scale[1] + shift[1]
+    return torch.cat([torch.stack([x, y], -1), points[..., 2:]], -1)

@@ -28,6 +28,19 @@ def _camera_mlp(channels: int) -> nn.Sequential:
     return nn.Sequential(OrderedDict(fc1=first, relu=nn.ReLU(), fc2=second))
 
 
+def camera_vector(cam2img: Tensor, img_aug_matrix: Tensor, ego_from_cam: Tensor) -> Tensor:
+    """Write a camera's parameters as the 22 numbers that MapTRv2's depth net reads. (..., 22)
+
+    fx, fy, cx, cy of the original image in pixels (..., >= 3, >= 3); a00, a01, tx, a10, a11, ty of
+    the augmentation, which acts on (u * d, v * d, d, 1), translation in pixels in the third column
+    (..., 4, 4); the upper three rows of the camera's pose in the vehicle, in metres (..., 4, 4).
+    """
+    intrinsics = [cam2img[..., 0, 0], cam2img[..., 1, 1], cam2img[..., 0, 2], cam2img[..., 1, 2]]
+    augmentation = img_aug_matrix[..., :2, :3].flatten(-2)
+    pose = ego_from_cam[..., :3, :].flatten(-2)
+    return torch.cat([torch.stack(intrinsics, -1), augmentation, pose], -1)
+
+
 class SEGate(nn.Module):
     """Squeeze-and-excitation gate: features scaled per channel by a sigmoid of an embedding."""
 
@@ -104,7 +117,7 @@ class CameraAwareDepthNet(nn.Module):
     def forward(self, feats: Tensor, camera_vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Predict depth logits (n, D, h, w) and context (n, C, h, w) of features (n, C_in, h, w).
 
-        Each camera has its `frustum.camera_vector` (n, 22).
+        Each camera has its `camera_vector` (n, 22).
         """
         vectors = self.bn(camera_vectors)
         feats = self.reduce_conv(feats)

@@ -8,8 +8,8 @@ from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.bev_encoders.camera_encoder import CameraEncoder
-from gsmap.models.bev_encoders.depth_net import CameraAwareDepthNet, PlainDepthNet
-from gsmap.models.bev_encoders.frustum import camera_vector, frustum_points
+from gsmap.models.bev_encoders.depth_net import CameraAwareDepthNet, PlainDepthNet, camera_vector
+from gsmap.models.bev_encoders.projection import frustum_points
 from gsmap.models.losses.auxiliary import num_depth_bins
 from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
 from gsmap.structures.grid import BEVGrid

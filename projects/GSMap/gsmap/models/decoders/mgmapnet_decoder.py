@@ -54,20 +54,9 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         if reference_dims is not None:
             self.reference_code = mlp(num_points * reference_dims, embed_dims, embed_dims)
 
-    def forward(  # type: ignore[override]
-        self,
-        state: Granularities,
-        query_pos: Tensor,
-        reference: Tensor,
-        feats: Sequence[Tensor],
-        attn_mask: Tensor | None = None,
-    ) -> Granularities:
-        """Update the queries that the layer before left.
-
-        As in `MapDecoderLayer`, but that instances have the position (B, N, C) and the features
-        have levels, the finest first.
-        """
-        state = self.update_instances(state, query_pos, reference, feats, attn_mask)
+    def forward(self, state: Granularities, *inputs: Any) -> Granularities:  # type: ignore[override]
+        """Update the queries that the layer before left; inputs as of `update_instances`."""
+        state = self.update_instances(state, *inputs)
         return state._replace(points=self.point_norm(self.point_ffn(state.points)))
 
     def update_instances(
@@ -78,7 +67,11 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         feats: Sequence[Tensor],
         attn_mask: Tensor | None,
     ) -> Granularities:
-        """Run both attentions and the instances' network; the points' own network is to come."""
+        """Run both attentions and the instances' network; the points' own network is to come.
+
+        As in `MapDecoderLayer`, but that instances have the position (B, N, C) and the features
+        have levels, the finest first.
+        """
         attended = self.self_attn(state.instances, self.guided(query_pos, reference), attn_mask)
         state = state._replace(instances=self.norms[0](attended))
         by_instance = reference.unflatten(1, (-1, self.num_points))  # (B, N, P, D)

@@ -3,14 +3,15 @@
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.heads.gaussian_statistics import gaussian_statistics
 from gsmap.models.heads.map_head import PARTS, MapHead
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.matched import MatchedPairs
 from gsmap.models.heads.parts import switched
+from gsmap.structures.gaussians import AT_FLOOR, Gaussians, extents_along_line
 from gsmap.structures.grid import BEVGrid
 
 
@@ -66,11 +67,40 @@ class GSMapHead(MapHead):
         """Return what says whether the Gaussians live (see `gaussian_statistics`)."""
         if "pred.masks" not in self._reads:
             return {}
-        return gaussian_statistics(
-            self.reference.gaussians(pairs["pred.references"]),
-            pairs["pred.masks"],
-            pairs["gt.masks"],
-            pairs["gt.labels"],
-            self.classes,
-            self.reference.space.floor_m,
-        )
+        gaussians = self.reference.gaussians(pairs["pred.references"])
+        masks, labels = (pairs["pred.masks"], pairs["gt.masks"]), pairs["gt.labels"]
+        floor_m = self.reference.space.floor_m
+        return gaussian_statistics(gaussians, *masks, labels, self.classes, floor_m)
+
+
+@torch.no_grad()
+def gaussian_statistics(
+    gaussians: Gaussians,
+    rendered: Tensor,
+    masks: Tensor,
+    labels: Tensor,
+    class_names: Sequence[str],
+    floor_m: float,
+) -> dict[str, Tensor]:
+    """Summarise matched elements by class; a class without one is left out.
+
+    Gaussians of the predictions (M, P), their masks, those of their ground truths (M, H, W), and
+    classes (M,); ``floor_m`` is the smallest sigma in metres. Scalars: per class
+    ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>`` (medians in
+    metres); of all ``at_floor``, the share of Gaussians whose sigmas both lie within 10 % of it.
+    """
+    if not len(labels):
+        return {}
+    overlap = torch.minimum(rendered, masks).sum((1, 2))
+    union = rendered.sum((1, 2)) + masks.sum((1, 2)) - overlap
+    iou = overlap / union.clamp(min=1e-6)
+    extents = extents_along_line(gaussians)  # (M, P, 2)
+    figures = {}
+    for label, name in enumerate(class_names):
+        chosen = labels == label
+        if chosen.any():
+            along, across = extents[chosen].flatten(0, 1).median(0).values
+            figures[f"soft_iou/{name}"] = iou[chosen].mean()
+            figures[f"sigma_along/{name}"], figures[f"sigma_across/{name}"] = along, across
+    at_floor = (gaussians.scales < AT_FLOOR * floor_m).all(-1)
+    return {**figures, "at_floor": at_floor.float().mean()}

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -17,7 +18,6 @@ from gsmap.models.decoders.map_decoder import MapDecoder
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.matched import MatchedPairs
 from gsmap.models.heads.parts import by_name, check_parts
-from gsmap.models.heads.query_groups import QueryGroup
 from gsmap.models.layers.branches import classification_branch
 from gsmap.models.layers.deformable_attention import at_least_float32, init_matrices
 from gsmap.models.task_modules.map_assigner import MapAssigner
@@ -30,6 +30,38 @@ Tensors = dict[str, Tensor]
 Samples = Sequence[Det3DDataSample]
 Instances = Sequence[InstanceData]
 Metas = Sequence[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class QueryGroup:
+    """Instance queries that are matched together; no group attends to another.
+
+    Args:
+        num: Instance queries.
+        name: Suffix of its losses; empty for the group that predicts.
+        repeats: How often each ground truth may be matched (k in MapTRv2).
+        weight: Weight of its losses (lambda in MapTRv2).
+        losses: Names of the losses that it has; None means all.
+
+    Raises:
+        ValueError: If a number is not positive.
+    """
+
+    num: int
+    name: str = ""
+    repeats: int = 1
+    weight: float = 1.0
+    losses: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.num < 1 or self.repeats < 1:
+            raise ValueError(
+                f"a query group needs num >= 1 and repeats >= 1, got {self.num} and {self.repeats}."
+            )
+
+    def has(self, loss: str) -> bool:
+        """Return whether the group has a loss."""
+        return self.losses is None or loss in self.losses
 
 
 @MODELS.register_module()

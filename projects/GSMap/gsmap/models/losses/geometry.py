@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gsmap.models.losses.points import check_same_points
+from gsmap.models.losses.points import check_same_shape
 
 NORM_EPS = 1e-6  # added to the product of two lengths: an edge may be a single point
 
@@ -44,7 +44,7 @@ def euclidean_shape_loss(pred: Tensor, target: Tensor) -> Tensor:
     Normalised points in the same order, 2 x (M, P, 2); zero without matches. ValueError if the
     shapes disagree.
     """
-    check_same_points(pred, target)
+    check_same_shape(pred=pred, target=target)
     if not len(pred):
         return pred.sum() * 0
     return (shape_features(pred) - shape_features(target)).abs().sum(0).mean()
@@ -59,7 +59,7 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
     Normalised points, sample after sample and in the same order, 2 x (M, P, 2), and the matches of
     each sample; zero where none has two. ValueError if shapes disagree or counts do not add up.
     """
-    check_same_points(pred, target)
+    check_same_shape(pred=pred, target=target)
     if sum(counts) != len(pred):
         raise ValueError(f"counts must add up to {len(pred)} matches, got {list(counts)}.")
     pairs, shares, first = [], [], 0

@@ -6,11 +6,12 @@ from torch import Tensor, nn
 _EPS = 1e-12
 
 
-def check_same_points(pred: Tensor, target: Tensor) -> None:
-    """Raise ValueError if points are not those of the same elements."""
-    if pred.shape != target.shape:
+def check_same_shape(**both: Tensor) -> None:
+    """Raise ValueError if two tensors differ in shape; their names are those in the message."""
+    (of, first), (name, second) = both.items()
+    if first.shape != second.shape:
         raise ValueError(
-            f"target must have shape {tuple(pred.shape)} of pred, got {tuple(target.shape)}."
+            f"{name} must have shape {tuple(first.shape)} of {of}, got {tuple(second.shape)}."
         )
 
 
@@ -29,7 +30,7 @@ class PointsLoss(nn.Module):
 
         ValueError if the shapes disagree. 2 x (M, P, 2 or 3) -> ()
         """
-        check_same_points(pred, target)
+        check_same_shape(pred=pred, target=target)
         return self.loss_weight * ((pred - target).abs().sum() / avg_factor)
 
 
@@ -58,7 +59,7 @@ class DirectionLoss(PointsLoss):
 
     def forward(self, pred: Tensor, target: Tensor, avg_factor: float | Tensor) -> Tensor:
         """Return the weighted sum of points in metres: x and y weigh the same. As `PointsLoss`."""
-        check_same_points(pred, target)
+        check_same_shape(pred=pred, target=target)
         turns = _sum_of_turns(pred.diff(dim=1), target.diff(dim=1))
         return self.loss_weight * (turns / avg_factor)
 

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from gsmap.models.layers.branches import mlp
 from gsmap.models.losses.dice import dice_loss
+from gsmap.models.losses.points import check_same_shape
 
 PAIRINGS = ("matched", "released")
 
@@ -21,7 +22,7 @@ def class_mask_losses(
     cross-entropy; dice is a mean over samples. ValueError if the shapes disagree.
     2 x (B, classes, H, W) -> (), ()
     """
-    _check_shapes(logits, targets)
+    check_same_shape(logits=logits, targets=targets)
     logits, targets = logits.float(), targets.float()
     weight = torch.tensor(pos_weight, device=logits.device)
     cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
@@ -36,19 +37,11 @@ def instance_mask_losses(
     Masks in [0, 1], of any dtype, 2 x (M, H, W); an instance's cross-entropy is the mean over its
     cells; zero without matches. ValueError if the shapes disagree.
     """
-    _check_shapes(logits, targets)
+    check_same_shape(logits=logits, targets=targets)
     logits, targets = logits.float(), targets.float()
     cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, reduction="none")
     dice = dice_loss(logits.sigmoid(), targets)
     return cross_entropy.mean((1, 2)).sum() / avg_factor, dice.sum() / avg_factor
-
-
-def _check_shapes(logits: Tensor, targets: Tensor) -> None:
-    """Raise if masks are not compared with those of the same shape."""
-    if logits.shape != targets.shape:
-        raise ValueError(
-            f"targets must have shape {tuple(logits.shape)} of logits, got {tuple(targets.shape)}."
-        )
 
 
 class InstanceMaskLoss(nn.Module):
