@@ -15,11 +15,15 @@ AT_FLOOR = 1.1  # a Gaussian is at its floor if both sigmas are below this multi
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Ordered 2D Gaussians G = (mu, sigma, theta) (GSMap Eq. 1)."""
+    """Ordered 2D Gaussians G = (mu, sigma, theta) (GSMap Eq. 1).
 
-    means: Tensor  # centres mu in metres (..., 2)
-    scales: Tensor  # standard deviations sigma along the own axes, in metres (..., 2)
-    rotations: Tensor  # angle theta of the first axis from +x in radians, anticlockwise (...)
+    Centres mu in metres (..., 2), standard deviations sigma along their own axes in metres (..., 2)
+    and the angle theta of the first axis from +x in radians, anticlockwise (...).
+    """
+
+    means: Tensor
+    scales: Tensor
+    rotations: Tensor
 
 
 @dataclass(frozen=True)
@@ -105,11 +109,10 @@ class GaussianSpace:
     def frames(self, reference: Tensor, invariant: bool = False) -> Tensor:
         r"""Return what turns an offset into the Gaussian's own frame, the identity at the start.
 
-        One twice as long as the Gaussian that every query starts with looks twice as far along that
-        axis. With the stretch :math:`D = \mathrm{diag}(\sigma / \sigma_{init})` and the
-        direction of travel :math:`\theta_0`, the matrix is :math:`R(\theta) D R(\theta_0)^T`. The
-        invariant one, :math:`R(\theta) D R(\theta)^T`, is the same for theta and theta + pi, which
-        are the same Gaussian. They multiply (x, y) in metres from the left. (..., D) -> (..., 2, 2)
+        With the stretch :math:`D = \mathrm{diag}(\sigma / \sigma_{init})` and the direction of
+        travel :math:`\theta_0`, the matrix is :math:`R(\theta) D R(\theta_0)^T`. The invariant one,
+        :math:`R(\theta) D R(\theta)^T`, is the same for theta and theta + pi, which are the same
+        Gaussian. They multiply (x, y) in metres from the left. (..., D) -> (..., 2, 2)
         """
         gaussians = self.decode(reference)
         start = self.scales(gaussians.scales.new_zeros(2))

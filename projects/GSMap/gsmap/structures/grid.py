@@ -69,8 +69,7 @@ class BEVGrid:
     def rasterized(self, pixel_m: float | Sequence[float]) -> "BEVGrid":
         """Return the same extent in pixels of a side in metres, or of sizes along x and y.
 
-        Raises:
-            ValueError: If the pixels do not divide the extent.
+        ValueError if the pixels do not divide the extent.
         """
         sizes = (pixel_m, pixel_m) if isinstance(pixel_m, (int, float)) else tuple(pixel_m)
         counts = [extent / size for extent, size in zip(self.extent_m, sizes, strict=True)]
@@ -105,10 +104,9 @@ class BEVGrid:
         """Return the centre (x, y) of every pixel in metres, float32 by default. (H, W, 2)"""
         import torch
 
-        dtype = dtype or torch.float32
-        (dx, dy), x0, y0 = self.pixel_size_m, self.x_range[0], self.y_range[0]
-        x = x0 + dx * (torch.arange(self.width, device=device, dtype=dtype) + 0.5)
-        y = y0 + dy * (torch.arange(self.height, device=device, dtype=dtype) + 0.5)
+        dtype, (dx, dy) = dtype or torch.float32, self.pixel_size_m
+        x = self.x_range[0] + dx * (torch.arange(self.width, device=device, dtype=dtype) + 0.5)
+        y = self.y_range[0] + dy * (torch.arange(self.height, device=device, dtype=dtype) + 0.5)
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
 
 

@@ -70,16 +70,6 @@ def resample_all(
     return resampled
 
 
-def _rings_from(
-    points: Points, num_points: int, starts: NDArray[np.integer[Any]]
-) -> NDArray[np.float64]:
-    """Resample a ring at equal arc length from several (S,) of its vertices. (S, P, D)"""
-    twice = np.concatenate([points, points[1:]])  # a second lap, so that no distance wraps around
-    along = arc_lengths(twice)
-    laps = along[starts][:, None] + np.linspace(0.0, along[len(points) - 1], num_points)  # (S, P)
-    return np.stack([np.interp(laps, along, column) for column in twice.T], -1)
-
-
 def equivalent_orders(
     points: Points, num_points: int, rng: np.random.Generator | None = None
 ) -> NDArray[np.float64]:
@@ -106,7 +96,10 @@ def equivalent_orders(
         rolls = np.linspace(0, count, slots, endpoint=False).astype(np.int64)
     else:
         rolls = rng.choice(count, slots, replace=False)
-    orders[: len(rolls)] = _rings_from(points, num_points, -rolls % count)
+    twice = np.concatenate([points, points[1:]])  # a second lap, so that no distance wraps around
+    along = arc_lengths(twice)
+    laps = along[-rolls % count, None] + np.linspace(0.0, along[count], num_points)
+    orders[: len(rolls)] = np.stack([np.interp(laps, along, column) for column in twice.T], -1)
     return orders
 
 
@@ -122,8 +115,7 @@ def clamp(points: Points, x_range: tuple[float, float], y_range: tuple[float, fl
     Ranges are in metres; entries after (x, y) are kept.
     """
     clamped = np.array(points)
-    for axis, limits in enumerate((x_range, y_range)):
-        clamped[..., axis] = np.clip(clamped[..., axis], *limits)
+    clamped[..., :2] = np.clip(clamped[..., :2], *np.transpose([x_range, y_range]))
     return clamped
 
 
@@ -144,7 +136,8 @@ def clip_to_box(
     edges = np.array([x_range, y_range]).T[:, None]  # the lower ones, then the upper ones
     with np.errstate(divide="ignore", invalid="ignore"):
         cuts = (edges - start[:, :2]) / step[:, :2]  # (2, n, 2), infinite if parallel to an edge
-    cuts = np.where(np.isnan(cuts), [[[-np.inf]], [[np.inf]]], cuts)  # on an edge, parallel to it
+    along_edge = (step[:, :2] == 0) & np.isnan(cuts)
+    cuts = np.where(along_edge, [[[-np.inf]], [[np.inf]]], cuts)
     # where segments enter and leave the rectangle, in [0, 1]; enter > leave: missed
     enter, leave = cuts.min(0).max(-1).clip(min=0), cuts.max(0).min(-1).clip(max=1)
     hits = np.flatnonzero(enter < leave)
