@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -14,6 +15,9 @@ from torch import Tensor
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
 from gsmap.models.layers.folded_backbone import FoldedBackbone
 from gsmap.structures.grid import BEVGrid
+
+Inputs = dict[str, Any]
+Samples = Sequence[Det3DDataSample]
 
 
 @MODELS.register_module()
@@ -79,7 +83,6 @@ class MapDetector(Base3DDetector):
         """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
         if self.img_backbone is None:
             raise ValueError("the model has no img_backbone, so it takes no images.")
-        batch = len(imgs)
         images = imgs.flatten(0, 1)
         if self.training and self.img_augment is not None:
             images = self.img_augment(images)
@@ -89,60 +92,48 @@ class MapDetector(Base3DDetector):
         feats = backbone(images) if folded is None else folded(backbone, images)
         if self.img_neck is not None:
             feats = self.img_neck(feats)
-        return [feat.unflatten(0, (batch, -1)) for feat in feats]
+        return [feat.unflatten(0, (len(imgs), -1)) for feat in feats]
 
-    def extract_feat(
-        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> dict[str, Tensor]:
+    def extract_feat(self, batch_inputs: Inputs, samples: Samples) -> dict[str, Tensor]:
         """Return the BEV encoder's outputs: ``bev_feats`` (B, C, H, W) and what its losses need."""
         outputs: dict[str, Tensor] = {}
         if self.bev_encoder is not None:
             imgs = batch_inputs["imgs"]
             shape = {"batch_input_shape": tuple(imgs.shape[-2:])}
-            img_metas = [{**sample.metainfo, **shape} for sample in batch_data_samples]
-            outputs = self.bev_encoder(self.extract_img_feats(imgs), img_metas)
+            metas = [{**sample.metainfo, **shape} for sample in samples]
+            outputs = self.bev_encoder(self.extract_img_feats(imgs), metas)
         if self.lidar_encoder is not None:
-            feats = self.lidar_encoder(batch_inputs["voxels"], len(batch_data_samples))
+            feats = self.lidar_encoder(batch_inputs["voxels"], len(samples))
             if self.bev_fuser is not None:
                 feats = self.bev_fuser(outputs["bev_feats"], feats)
             outputs = {**outputs, "bev_feats": feats}
         return outputs
 
-    def loss(
-        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> dict[str, Tensor]:
-        """Return all losses of a batch.
-
-        Raises:
-            FloatingPointError: If a cost or a loss is not finite; the message names the samples.
-        """
-        outputs = self.extract_feat(batch_inputs, batch_data_samples)
-        losses = self.map_head.loss(outputs, batch_data_samples)
+    def loss(self, batch_inputs: Inputs, samples: Samples) -> dict[str, Tensor]:
+        """Return all losses; FloatingPointError, with the samples, if one is not finite."""
+        outputs = self.extract_feat(batch_inputs, samples)
+        losses = self.map_head.loss(outputs, samples)
         # mmengine reads each loss anyway: no new synchronisation
         means = torch.stack([loss.detach().float().mean() for loss in losses.values()])
         finite = torch.isfinite(means).tolist()
         bad = [name for name, good in zip(losses, finite, strict=True) if not good]
         if bad:
-            tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
+            tokens = [sample.metainfo.get("token", "unknown") for sample in samples]
             raise FloatingPointError(
                 f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
                 "truth, then at the learning rate and at the loss scale of mixed precision."
             )
         return losses
 
-    def predict(
-        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> list[Det3DDataSample]:
+    def predict(self, batch_inputs: Inputs, samples: Samples) -> list[Det3DDataSample]:
         """Add ``pred_instances_3d``, as the head's ``predict`` returns them, to the samples."""
-        outputs = self.extract_feat(batch_inputs, batch_data_samples)
-        results = self.map_head.predict(outputs, batch_data_samples)
-        return self.add_pred_to_datasample(batch_data_samples, results)
+        outputs = self.extract_feat(batch_inputs, samples)
+        results = self.map_head.predict(outputs, samples)
+        return self.add_pred_to_datasample(samples, results)
 
-    def _forward(
-        self, batch_inputs: dict[str, Any], batch_data_samples: Sequence[Det3DDataSample]
-    ) -> dict[str, Tensor]:
+    def _forward(self, batch_inputs: Inputs, samples: Samples) -> dict[str, Tensor]:
         """Return the head's raw outputs."""
-        return self.map_head(self.extract_feat(batch_inputs, batch_data_samples))
+        return self.map_head(self.extract_feat(batch_inputs, samples))
 
     def _dump_init_info(self) -> None:
         """Log how each weight was initialised, which takes hundreds of lines, to debug only."""
@@ -153,17 +144,9 @@ class MapDetector(Base3DDetector):
     def _load_from_state_dict(
         self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        """Accept upstream's names, then require every key to match, with ``strict_loading``.
-
-        Raises:
-            ValueError: If a key is missing, left over or of another shape.
-        """
+        """Accept upstream's names; with ``strict_loading`` ValueError if a key does not match."""
         if self.strict_loading:
-            adapt_state(
-                state_dict,
-                self.state_dict(prefix=prefix),
-                prefix,
-                neutral_keys(self, prefix),
-                lambda state: self.map_head.fit_state(state, f"{prefix}map_head."),
-            )
+            own, neutral = self.state_dict(prefix=prefix), neutral_keys(self, prefix)
+            fit = partial(self.map_head.fit_state, prefix=f"{prefix}map_head.")
+            adapt_state(state_dict, own, prefix, neutral, fit)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

@@ -16,8 +16,7 @@ class GeMapHead(MapHead):
     """The map head with GeMap's parts as defaults, on whatever else it is made of.
 
     On a MapTR config this is GeMap with its simple objective, on MapTRv2 with its full one.
-
-    Arguments besides those of `MapHead`:
+    Besides `MapHead`'s arguments:
 
     Args:
         loss_euclidean: Settings of `EuclideanLoss`, or None to train without it.

@@ -56,9 +56,14 @@ class MapVRHead(MapHead):
         dropout: float = 0.0,
         **kwargs: Any,
     ) -> None:
+        unknown = sorted(set(polygons or ()) - set(classes))
+        if unknown:
+            raise ValueError(f"polygons must be classes of {list(classes)}, got {unknown}.")
+        areas = AREA_CLASSES if polygons is None else polygons
+        indices = tuple(index for index, name in enumerate(classes) if name in areas)
         masks = {"pixel_m": 60 / 256, "cost_pixel_m": 60 / 128, **(masks or {})}
         rasters = ElementMasks(grid, **masks)
-        shared = {"polygon_classes": _indices(polygons, classes), **(rendering or {})}
+        shared = {"polygon_classes": indices, **(rendering or {})}
         size, cost_size = ((g.height, g.width) for g in (rasters.grid, rasters.cost_grid))
         kept = [loss for loss in losses if loss["type"] != "DirectionLoss"]
         losses = [
@@ -79,15 +84,6 @@ class MapVRHead(MapHead):
             masks=masks,
             **kwargs,
         )
-
-
-def _indices(names: Sequence[str] | None, classes: Sequence[str]) -> tuple[int, ...]:
-    """Return the indices of classes by name; None stands for those that are areas."""
-    unknown = sorted(set(names or ()) - set(classes))
-    if unknown:
-        raise ValueError(f"polygons must be classes of {list(classes)}, got {unknown}.")
-    chosen = AREA_CLASSES if names is None else names
-    return tuple(index for index, name in enumerate(classes) if name in chosen)
 
 
 def _weighted(parts: Sequence[PARTS], kind: str, name: str, weight: float) -> list[PARTS]:

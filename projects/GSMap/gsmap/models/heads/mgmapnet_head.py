@@ -17,9 +17,7 @@ QUERY_GROUPS: tuple[PARTS, ...] = ({"num": 100}, {"name": "one2many", "num": 600
 
 @MODELS.register_module()
 class MGMapHead(MapHead):
-    """The map head with MGMapNet's parts as defaults, on whatever else it is made of.
-
-    Arguments besides those of `MapHead`:
+    """The map head with MGMapNet's parts as defaults. Besides `MapHead`'s arguments:
 
     Args:
         decoder: Config of the decoder; one of another type becomes `MGMapNetDecoder`, its layers
@@ -41,24 +39,19 @@ class MGMapHead(MapHead):
         embed_dims: int = 256,
         **kwargs: Any,
     ) -> None:
+        if decoder.get("type") != DECODER:  # another's attentions go
+            others = ("type", "self_attn", "cross_attn")
+            layer = {k: v for k, v in decoder.get("layer", {}).items() if k not in others}
+            decoder = {**decoder, "type": DECODER, "layer": layer}
         mean_loc = switched("SamplingLocationLoss", loss_mean_loc)
         ins_seg = switched("InstanceMaskLoss", loss_ins_seg, embed_dims=embed_dims)
         pixel_m = max(ElementMasks(grid, **(masks or {})).grid.pixel_size_m)
         super().__init__(
             grid=grid,
-            decoder=_mgmapnet_decoder(decoder),
+            decoder=decoder,
             losses=[*losses, *mean_loc, *ins_seg],
             query_groups=query_groups,
             masks={"line_width_m": LINE_PX * pixel_m, **(masks or {})},
             embed_dims=embed_dims,
             **kwargs,
         )
-
-
-def _mgmapnet_decoder(decoder: PARTS) -> PARTS:
-    """Return a decoder's config as MGMapNet's, without the attentions of another."""
-    if decoder.get("type") == DECODER:
-        return decoder
-    others = ("type", "self_attn", "cross_attn")
-    layer = {k: v for k, v in decoder.get("layer", {}).items() if k not in others}
-    return {**decoder, "type": DECODER, "layer": layer}

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from gsmap.models.layers import branches
 from gsmap.models.layers.deformable_attention import at_least_float32
+from gsmap.models.losses.points import check_same_shape
 from gsmap.structures.gaussians import Gaussians, GaussianSpace
 from gsmap.structures.grid import BEVGrid
 
@@ -22,11 +23,7 @@ def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Ten
     (GSMap Eq. 1: sigma, theta before their activation) add up. The result is at least float32.
     ValueError if the shapes disagree. (..., D), (..., D) -> (..., D)
     """
-    if reference.shape != offsets.shape:
-        raise ValueError(
-            f"offsets must have shape {tuple(reference.shape)} of reference, got "
-            f"{tuple(offsets.shape)}."
-        )
+    check_same_shape(reference=reference, offsets=offsets)
     reference, offsets = at_least_float32(reference), at_least_float32(offsets)
     points = inverse_sigmoid(reference[..., :coords], eps=1e-5) + offsets[..., :coords]
     return torch.cat([points.sigmoid(), reference[..., coords:] + offsets[..., coords:]], -1)
@@ -68,8 +65,7 @@ class PointReference(nn.Module):
             )
         if z_range is not None and not z_range[0] < z_range[1]:
             raise ValueError(f"z_range must be (low, high) with low < high, got {z_range}.")
-        self.grid = grid
-        self.coords = coords
+        self.grid, self.coords = grid, coords
         self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
         self.initial = nn.Linear(embed_dims, coords)
         self.branches = nn.ModuleList(
@@ -188,9 +184,8 @@ class GaussianReference(PointReference):
 
     def offsets(self, layer: int, states: Tensor) -> Tensor:
         """Return a layer's change of the Gaussians (Eq. 8). (..., C) -> (..., D)"""
-        centres = super().offsets(layer, states)
         shapes = at_least_float32(self.gaussian_branches[layer](states))
-        return torch.cat([centres, shapes], -1)
+        return torch.cat([super().offsets(layer, states), shapes], -1)
 
     def gaussians(self, references: Tensor) -> Gaussians:
         """Return the Gaussians that references (..., D) stand for, centres in the plane."""
@@ -199,5 +194,5 @@ class GaussianReference(PointReference):
     def decode(self, references: Tensor) -> dict[str, Tensor]:
         """Add the Gaussians' ``scales`` (N, P, 2) in metres and ``rotations`` (N, P) in radians."""
         gaussians = self.gaussians(references)
-        fields = super().decode(references)
-        return {**fields, "scales": gaussians.scales, "rotations": gaussians.rotations}
+        shapes = {"scales": gaussians.scales, "rotations": gaussians.rotations}
+        return super().decode(references) | shapes
