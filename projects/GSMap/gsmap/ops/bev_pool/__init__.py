@@ -24,10 +24,7 @@ def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) 
     Args:
         points_m: Points (x, y, z) in metres, in the frame of ``grid``. (..., 3)
         grid: The cells.
-        z_range: Lowest and highest z in metres of the one layer of cells.
-
-    Raises:
-        ValueError: If points do not end in (x, y, z) or ``z_range`` is empty.
+        z_range: Lowest and highest z in metres of the one layer of cells; ValueError if empty.
     """
     if points_m.shape[-1] != 3:
         raise ValueError(f"points_m must end in (x, y, z), got shape {tuple(points_m.shape)}.")
@@ -70,10 +67,8 @@ def bev_pool_conv3x3(
 
     Both steps are linear, so the kernel's nine matrices (O, C, 3, 3) can be applied to the few
     context vectors instead of the many cells: at MapTRv2's size (2,250 pixels, 80,000 cells) this
-    is 35 times less arithmetic. The other arguments are those of `bev_pool`. -> (B, O, H, W)
-
-    Raises:
-        ValueError: If the shapes disagree.
+    is 35 times less arithmetic. The other arguments are those of `bev_pool`; ValueError if the
+    shapes disagree. -> (B, O, H, W)
     """
     _check_shapes(probs, context, cells)
     if weight.dim() != 4 or weight.shape[1:] != (context.shape[2], 3, 3):

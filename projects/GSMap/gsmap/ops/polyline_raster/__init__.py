@@ -32,14 +32,13 @@ def draw_polylines(
 ) -> Tensor:
     """Draw the masks of ground-truth polylines, in [0, 1], without gradient. (K, H, W)
 
-    A pixel takes the share that the shape covers of it, measured across the nearest edge. All are
-    drawn at once on their own device, at least in float32.
+    A pixel takes the share that the shape covers of it, measured across the nearest edge. Masks
+    are on the polylines' device, at least float32.
 
     Args:
         polylines: Vertices in metres, in the frame of ``grid``. (K, P, 2)
         grid: The raster.
-        width_m: Width of a line in metres. The default is close to what AP_raster draws (5 pixels
-            of 0.125 m).
+        width_m: Width of a line in metres; AP_raster draws 5 pixels of 0.125 m.
         filled: Which polylines are filled as polygons (to their vertices, without the line's
             width), bool; all are drawn as lines without it. (K,)
         backend: As in `choose_backend`, without ``"triton"``.

@@ -36,9 +36,8 @@ def _edge_blocks(
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Cut edges (K, E, 2) into blocks (K, b, 1, 1, 2), each with its first edge's index."""
     size = max(1, BLOCK_VALUES // max(1, math.prod(shape)))
-    for first in range(0, starts.shape[1], size):
-        block = slice(first, first + size)
-        yield first, starts[:, block, None, None], ends[:, block, None, None]
+    for i in range(0, starts.shape[1], size):
+        yield i, starts[:, i : i + size, None, None], ends[:, i : i + size, None, None]
 
 
 def _segment_distance(pixels: Tensor, start: Tensor, end: Tensor, eps: float) -> Tensor:

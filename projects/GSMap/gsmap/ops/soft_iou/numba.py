@@ -3,8 +3,7 @@
 """Fused CPU kernel (numba): the sum of minima of every pair of masks.
 
 A target is 0 almost everywhere, and so is the minimum: each target's pixels that are not 0 are
-listed once, and every prediction is read at those alone. Rows of predictions are shared out among
-threads; a sum runs in a fixed order in one thread, so two runs give the same bits.
+listed once, and every prediction is read at those alone. A sum runs in a fixed order in one thread.
 """
 
 import numpy as np

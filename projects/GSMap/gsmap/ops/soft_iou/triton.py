@@ -3,8 +3,7 @@
 """Triton kernel: the sum of minima of every pair of masks.
 
 A program owns one pair and walks over its pixels in blocks, one partial sum per lane, added up at
-the end: no atomics, so two runs give the same bits. Masks are small (20 kB at 100 x 50), so all but
-the first read of each comes from the cache; no (N, K, pixels) tensor exists.
+the end: no atomics, so two runs give the same bits.
 """
 
 import torch
