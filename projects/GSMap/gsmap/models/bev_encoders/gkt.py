@@ -31,8 +31,7 @@ def kernel_cells(uv: Tensor, offsets: Tensor, shape: tuple[int, int]) -> Tensor:
 def border_pixels(position: Tensor, shape: tuple[int, int]) -> Tensor:
     """Return row-major indices of pixels (x, y), moved onto the map. (..., 2) -> (...)"""
     height, width = shape
-    cols = position[..., 0].clamp(0, width - 1)
-    rows = position[..., 1].clamp(0, height - 1)
+    cols, rows = position[..., 0].clamp(0, width - 1), position[..., 1].clamp(0, height - 1)
     return (rows * width + cols).long()
 
 

@@ -93,9 +93,9 @@ class GaussianDecoderLayer(MapDecoderLayer):
         embed_hidden_dims: int = 16,
         **kwargs: Any,
     ) -> None:
-        guidance = {"sampling": guide_sampling, "embedding": embed_gaussians}
-        more = {"invariant": invariant_frame, "hidden_dims": embed_hidden_dims}
-        super().__init__(guidance={**guidance, **more}, **kwargs)
+        guidance: dict[str, Any] = {"sampling": guide_sampling, "embedding": embed_gaussians}
+        guidance |= {"invariant": invariant_frame, "hidden_dims": embed_hidden_dims}
+        super().__init__(guidance=guidance, **kwargs)
 
 
 @MODELS.register_module()

@@ -47,7 +47,8 @@ class ElementRenderer:
 
     def render(self, points: Tensor, is_polygon: Tensor) -> Tensor:
         """Return masks of elements whose vertices are normalised. (n, P, 2), (n,) -> (n, H, W)"""
-        pixels = points[..., :2] * points.new_tensor(self.size).flip(0)
+        height, width = self.size
+        pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
         softness = self.line_softness, self.polygon_softness
         return soft_rasters(pixels, *self.size, is_polygon, *softness, self.distance)
 
