@@ -17,9 +17,8 @@ class MapVRHead(MapHead):
     """The map head with MapVR's parts as defaults, on whatever decoder and references there are.
 
     Matched points are rendered softly, as lines or as polygons by their class, and compared by the
-    dice loss; matching does the same on coarser rasters. Points weigh less than in MapTR, and the
-    direction loss asks for straight predictions instead of the ground truth's directions. Besides
-    `MapHead`'s arguments:
+    dice loss, in matching on coarser rasters. Points weigh less than in MapTR, and predictions
+    shall be straight in place of the ground truth's directions. Besides `MapHead`'s arguments:
 
     Args:
         losses: As in `MapHead`; `PointsLoss` gets another weight, `DirectionLoss` is replaced.
@@ -28,15 +27,12 @@ class MapVRHead(MapHead):
         dice_cost: Settings of its matching cost, or None to match without it.
         loss_direction: Config of the direction loss, or None to train without one.
         points_weight: Weight of the points in losses and in matching.
-        polygons: Names of the classes that are rendered as filled polygons; None: those that are
-            areas (`AREA_CLASSES`).
+        polygons: Names of the classes that are rendered as filled polygons, ValueError for what is
+            no class; None: those that are areas (`AREA_CLASSES`).
         rendering: Further settings of `ElementRenderer`, for loss and cost.
         masks: Sizes of pixels as in `ElementMasks`: 256 x 128 and, for matching, 128 x 64 on a map
             of 60 x 30 m.
         dropout: Dropout in the decoder's layers.
-
-    Raises:
-        ValueError: If ``polygons`` names what is no class.
     """
 
     def __init__(

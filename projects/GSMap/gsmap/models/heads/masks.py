@@ -20,7 +20,7 @@ class ElementMasks:
     Args:
         grid: The map's extent.
         pixel_m: Side of a pixel of the losses' masks in metres, or its sizes along x and y; by
-            default a 200th of the map's longer side, 0.3 m for 60 m.
+            default a 200th of the map's longer side.
         cost_pixel_m: The same for matching; by default a 128th.
         line_width_m: Width of a line in the ground-truth mask, in metres.
         filled_classes: Classes whose ground-truth mask is filled; the others are bands.

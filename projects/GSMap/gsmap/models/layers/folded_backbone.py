@@ -12,12 +12,9 @@ class FoldedBackbone:
     """Runs a backbone; in inference a copy whose batch norms are part of its convolutions.
 
     With fixed statistics a batch norm is a scale and a shift per channel, which the convolution
-    before it can do by itself; what is saved is one pass over every feature map. The copy, as large
-    as the backbone, is made when it is first needed, made again when a weight has changed, and
-    dropped in training. The backbone itself, and so every checkpoint, stays as it is.
-
-    Only ResNets are folded: mmcv's folding takes each norm to follow the convolution registered
-    before it, which other backbones need not keep.
+    before it can do by itself. The copy is made when it is first needed or a weight has changed,
+    and dropped in training. The backbone, and so every checkpoint, stays as it is. Only ResNets are
+    folded: mmcv's folding takes each norm to follow the convolution registered before it.
     """
 
     def __init__(self) -> None:

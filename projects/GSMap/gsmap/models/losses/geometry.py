@@ -54,10 +54,9 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
     """Return the L1 distance of the relations between the elements of each sample.
 
     A sample with n matches adds the sum over its pairs of elements, each taken once, divided by
-    (n * P)^2: by all pairs of points, also those of an element with itself. Samples add up.
-
-    Normalised points, sample after sample and in the same order, 2 x (M, P, 2), and the matches of
-    each sample; zero where none has two. ValueError if shapes disagree or counts do not add up.
+    (n * P)^2: by all pairs of points, also those of an element with itself. Normalised points,
+    sample after sample and in the same order, 2 x (M, P, 2), and the matches of each sample; zero
+    where none has two. ValueError if shapes disagree or counts do not add up.
     """
     check_same_shape(pred=pred, target=target)
     if sum(counts) != len(pred):

@@ -21,12 +21,9 @@ class MapCoder:
 
     Args:
         grid: The map's extent.
-        max_num: Largest number of detections per sample.
-        margin_m: How far beyond the map a point may lie, in metres; None keeps all.
+        max_num: Largest number of detections per sample; ValueError if it is not positive.
+        margin_m: How far beyond the map a point may lie, in metres, > 0; None keeps all.
         score_threshold: Smallest score to keep; None keeps all.
-
-    Raises:
-        ValueError: If ``max_num`` or ``margin_m`` is not positive.
     """
 
     def __init__(
