@@ -92,6 +92,7 @@ def _drop_listed(
 
 
 def _meta(options: Argoverse2Options, log_dirs: Iterable[Path]) -> AnnotationMeta:
+    """Describe the file: what it holds, and what it was made from."""
     sizes = {
         f"{log_dir.name}/{path.name}": path.stat().st_size
         for log_dir in log_dirs

@@ -37,9 +37,10 @@ JPEG_QUALITY = 90
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How logs are rendered: the options of the command; None for a rate or a number is all.
+    """How logs are rendered: the options of ``tools/create_data.py av2-render``.
 
-    The log in the folder ``calibration`` lends its own to logs that have none.
+    ``scale`` is in (0, 1], ``rate_hz`` > 0 in pictures per second; None, as of ``max_frames``, is
+    all. The log in the folder ``calibration`` lends its own to logs that have none.
     """
 
     rate_hz: float | None = 2.0

@@ -30,7 +30,10 @@ from gsmap.datasets.errors import naming
 
 @dataclass(frozen=True)
 class Argoverse2Options(FileOptions):
-    """What to convert and how: the options of the command; ``logs`` may be how ids begin."""
+    """What to convert and how: the options of ``tools/create_data.py av2``.
+
+    Of ``rate_hz`` samples per second, None takes all; ``poses:N`` of ``at`` needs no sensor data.
+    """
 
     _: KW_ONLY
     split: str = "val"

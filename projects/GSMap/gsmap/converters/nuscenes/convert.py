@@ -34,7 +34,7 @@ _FRAMES_PER_WORKER = 500  # a process takes about as long to start as these take
 
 @dataclass(frozen=True)
 class NuScenesOptions(FileOptions):
-    """What to convert and how: the options of ``add_arguments``.
+    """What to convert and how: the options of ``tools/create_data.py nuscenes``.
 
     Without ``split_file``, ``<root>/<version>/splits.json`` counts if it is there, else the
     official splits.

@@ -13,7 +13,7 @@ from pyquaternion import Quaternion
 
 from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
-from gsmap.structures.rigid import invert_rigid
+from gsmap.structures.rigid import invert_rigid, rigid
 
 CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
@@ -214,11 +214,9 @@ def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
 
     The rotation is a quaternion (w, x, y, z), or in info files a matrix.
     """
-    pose = np.eye(4)
     turned = np.asarray(record[f"{prefix}rotation"], np.float64)
-    pose[:3, :3] = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
-    pose[:3, 3] = np.asarray(record[f"{prefix}translation"], np.float64).reshape(3)
-    return pose
+    rotation = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
+    return rigid(rotation, np.asarray(record[f"{prefix}translation"], np.float64).reshape(3))
 
 
 class SampleReader:
