@@ -19,13 +19,10 @@ NUM_CAMS = 6
 
 def small_config() -> dict:
     """Return MiniCity's MapTR with few channels, queries and cells."""
-    cfg = Config.fromfile(
-        CONFIGS / "_base_/models/maptr_r18_minicity.py", import_custom_modules=False
-    )
+    cfg = Config.fromfile(CONFIGS / "maptr/maptr_r18_minicity.py", import_custom_modules=False)
+    del cfg.model.map_head["aux_heads"]
     heads = {"num_heads": 4, "ffn_dims": 16}
     overrides = {
-        "grid": {"x_range": [-15.0, 15.0], "y_range": [-30.0, 30.0]},
-        "classes": ["divider", "ped_crossing", "boundary"],
         "img_backbone": {"base_channels": 8},
         "img_neck": {"in_channels": [16, 32, 64], "out_channels": [8, 4, 4]},
         "bev_encoder": {

@@ -24,12 +24,10 @@ from gsmap.structures.grid import BEVGrid
 
 REPO = Path(__file__).resolve().parents[1]
 BASELINES = REPO / "configs"
-LEAVES = sorted(
-    path
-    for folder in (BASELINES, REPO / "projects/GSMap/configs")
-    for path in folder.rglob("*.py")
-    if "_base_" not in path.parts
+CONFIGS = sorted(
+    path for folder in (BASELINES, REPO / "projects/GSMap/configs") for path in folder.rglob("*.py")
 )
+LEAVES = [path for path in CONFIGS if "_base_" not in path.parts]
 names = pytest.mark.parametrize("path", LEAVES, ids=lambda path: path.stem)
 
 
@@ -48,11 +46,25 @@ def distinct(paths: list[Path]) -> list[Path]:
     return list(chosen.values())
 
 
+def depth(path: Path) -> int:
+    """Return how many files there are in the longest chain of a config, itself included."""
+    bases = Config._get_base_files(str(path))
+    return 1 + max((depth(path.parent / base) for base in bases), default=0)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: str(path.relative_to(REPO)))
+def test_configs_inherit_at_most_three_deep(path):
+    assert depth(path) <= (1 if "_base_" in path.parts else 3)
+
+
 @names
 def test_a_leaf_is_short_and_passes_the_checks_of_the_tools(path):
     code = [line for line in path.read_text().splitlines() if not line.startswith("#")]
     assert len([line for line in code if line.strip()]) <= 20
-    check_config(load(path))
+    cfg = load(path)
+    check_config(cfg)
+    cfg.train_cfg.max_epochs += 1  # the learning rate follows
+    check_config(cfg)
 
 
 def coordinates(cfg: Config) -> int:

@@ -160,7 +160,6 @@ def options_of(folder: Path, budget: Budget) -> list[str]:
         f"train_dataloader.dataset.data_root={train}",
         f"train_cfg.max_epochs={budget.epochs}",
         f"train_cfg.val_interval={max(1, budget.epochs // 4)}",
-        f"param_scheduler.1.T_max={budget.epochs}",
         "randomness.seed=0",
     ]
 

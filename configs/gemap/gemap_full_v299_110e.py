@@ -1,20 +1,11 @@
 # GeMap with its full objective on nuScenes, V2-99, 110 epochs, 3 x 8 samples per step. Its ImageNet weights are
 # detectron2's vovnet99_ese, to be put where `checkpoint` says.
-_base_ = [
-    '../_base_/datasets/nuscenes_depth_seg.py',
-    '../_base_/models/gemap_full_r50.py',
-    '../_base_/schedules/cosine_110e.py',
-    '../_base_/default_runtime.py',
-]
+_base_ = './gemap_full_r50_110e.py'
 
 model = dict(
-    grid=_base_.grid,
-    classes=_base_.classes,
     img_backbone=dict(
-        _delete_=True, type='VoVNet', depth=99, out_indices=(3,), norm_eval=True,
-        frozen_stages=-1,
+        _delete_=True, type='VoVNet', depth=99, out_indices=(3,), norm_eval=True, frozen_stages=-1,
         init_cfg=dict(type='Pretrained', checkpoint='ckpts/vovnet99_ese_detectron2.pth', prefix='backbone.bottom_up')),
     img_neck=dict(in_channels=[1024]))
-optim_wrapper = dict(optimizer=dict(weight_decay=0.03))
 train_dataloader = dict(batch_size=3)
 auto_scale_lr = dict(base_batch_size=24)

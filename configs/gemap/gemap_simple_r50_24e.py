@@ -1,8 +1,9 @@
 # GeMap with its simple objective on nuScenes, ResNet-50, 24 epochs, 4 x 8 samples per step.
-_base_ = '../maptr/maptr_r50_24e.py'
+_base_ = [
+    '../_base_/datasets/nuscenes.py', '../_base_/models/maptr_r50.py', '../_base_/models/gemap.py',
+    '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
+]
+_base_.model.merge(_base_._gemap)
 
-model = dict(
-    map_head=dict(
-        type='GeMapHead',
-        decoder=dict(layer=dict(self_attn=dict(type='GeometryDecoupledAttention')))))
+model = dict(grid=_base_.grid, classes=_base_.classes)
 optim_wrapper = dict(optimizer=dict(weight_decay=0.03))

@@ -1,8 +1,6 @@
 # MapTR with LiDAR alone (PointPillars) on nuScenes, 24 epochs.
-_base_ = [
-    '../_base_/datasets/nuscenes_lidar.py',
-    '../_base_/models/maptr_pointpillars.py',
-    '../_base_/schedules/cosine_24e.py',
-    '../_base_/default_runtime.py',
-]
-model = dict(grid=_base_.grid, classes=_base_.classes)
+_base_ = './maptr_r50_pointpillars_24e.py'
+
+model = dict(
+    img_augment=None, img_backbone=None, img_neck=None, bev_encoder=None, bev_fuser=None,
+    lidar_encoder=dict(neck=dict(out_channels=[64, 96, 96])))

@@ -1,8 +1,4 @@
 # A small MapTR with LiDAR alone for MiniCity.
-_base_ = [
-    '../_base_/datasets/minicity_lidar.py',
-    '../_base_/models/maptr_pointpillars_minicity.py',
-    '../_base_/schedules/minicity.py',
-    '../_base_/default_runtime.py',
-]
-model = dict(grid=_base_.grid, classes=_base_.classes)
+_base_ = './maptr_r18_pointpillars_minicity.py'
+
+model = dict(img_augment=None, img_backbone=None, img_neck=None, bev_encoder=None, bev_fuser=None)

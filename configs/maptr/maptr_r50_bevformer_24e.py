@@ -1,8 +1,7 @@
 # MapTR with BEVFormer's encoder on nuScenes, 24 epochs.
-_base_ = [
-    '../_base_/datasets/nuscenes.py',
-    '../_base_/models/maptr_r50_bevformer.py',
-    '../_base_/schedules/cosine_24e.py',
-    '../_base_/default_runtime.py',
-]
-model = dict(grid=_base_.grid, classes=_base_.classes)
+_base_ = './maptr_r50_24e.py'
+
+model = dict(
+    bev_encoder=dict(
+        cross_attn=dict(
+            _delete_=True, type='SpatialCrossAttention', num_heads=8, num_points=8, num_heights=4)))

@@ -1,8 +1,7 @@
 # MapTR on depth-pooled BEV features on nuScenes, 24 epochs.
-_base_ = [
-    '../_base_/datasets/nuscenes.py',
-    '../_base_/models/maptr_r50_bevpool.py',
-    '../_base_/schedules/cosine_24e.py',
-    '../_base_/default_runtime.py',
-]
-model = dict(grid=_base_.grid, classes=_base_.classes)
+_base_ = './maptr_r50_24e.py'
+
+model = dict(
+    bev_encoder=dict(
+        _delete_=True, type='LSSEncoder', z_range=(-10.0, 10.0), bev_pixel_m=0.3, embed_dims=256,
+        depth_range=(1.0, 35.0, 0.5), camera_aware=False))

@@ -1,8 +1,11 @@
 # MapTR with cameras and LiDAR (PointPillars) on nuScenes, 24 epochs.
 _base_ = [
-    '../_base_/datasets/nuscenes_lidar.py',
-    '../_base_/models/maptr_r50_pointpillars.py',
-    '../_base_/schedules/cosine_24e.py',
-    '../_base_/default_runtime.py',
+    '../_base_/datasets/nuscenes.py', '../_base_/models/maptr_r50.py', '../_base_/models/pointpillars.py',
+    '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
 ]
+_base_.model.merge(_base_._pointpillars)
+
 model = dict(grid=_base_.grid, classes=_base_.classes)
+train_dataloader = dict(dataset=dict(pipeline=_base_._lidar))
+val_dataloader = dict(dataset=dict(pipeline=_base_._lidar_test))
+test_dataloader = val_dataloader

@@ -1,5 +1,5 @@
-# MapTR with a parallel segmentation branch, the baseline of MapVR's Table 5e, which names neither classes nor weight: all
-# classes in one mask, as in MapTRv2.
+# MapTR with a parallel segmentation branch, the baseline of MapVR's Table 5e, which names neither classes nor weight:
+# all classes in one mask, as in MapTRv2.
 _base_ = '../maptr/maptr_r50_24e.py'
 
 _pipeline = _base_.train_dataloader.dataset.pipeline

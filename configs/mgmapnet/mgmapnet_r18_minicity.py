@@ -1,12 +1,18 @@
 # A small MGMapNet for MiniCity, trained from scratch on two CPU cores with LiDAR depth.
 _base_ = [
-    '../_base_/datasets/minicity_depth_seg.py',
-    '../_base_/models/mgmapnet_r18_minicity.py',
-    '../_base_/schedules/minicity.py',
-    '../_base_/default_runtime.py',
+    '../_base_/datasets/minicity.py', '../_base_/models/maptr_r50.py', '../_base_/models/minicity.py',
+    '../_base_/models/maptrv2.py', '../_base_/models/mgmapnet.py',
+    '../_base_/schedules/minicity.py', '../_base_/default_runtime.py',
 ]
+_base_.model.merge(_base_._minicity)
+_base_.model.merge(_base_._maptrv2)
+_base_.model.merge(_base_._maptrv2_minicity)
+_base_.model.merge(_base_._mgmapnet)
 
+model = dict(
+    grid=_base_.grid, classes=_base_.classes, bev_encoder=dict(bev_pixel_m=1.25),  # two levels need even sides
+    map_head=dict(
+        query_groups=[dict(num=40), dict(name='one2many', num=60, repeats=6, weight=1.0)],
+        decoder=dict(num_layers=2, layer=dict(num_heads=4, ffn_dims=256, dropout=0.0)), masks=dict(pixel_m=0.625)))
 _mask = dict(type='MakeBEVMask', size=(48, 24), num_classes=3)
-_steps = _base_.train_dataloader.dataset.pipeline
-model = dict(grid=_base_.grid, classes=_base_.classes)
-train_dataloader = dict(dataset=dict(pipeline=[*_steps[:6], _mask, *_steps[7:]]))
+train_dataloader = dict(dataset=dict(pipeline=[*_base_._depth_seg[:6], _mask, *_base_._depth_seg[7:]]))

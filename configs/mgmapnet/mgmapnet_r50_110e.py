@@ -1,11 +1,4 @@
 # MGMapNet on nuScenes as released: ResNet-50, 110 epochs, 8 x 2 samples per step.
-_base_ = [
-    '../_base_/datasets/nuscenes_depth_seg.py',
-    '../_base_/models/mgmapnet_r50.py',
-    '../_base_/schedules/cosine_110e.py',
-    '../_base_/default_runtime.py',
-]
-model = dict(grid=_base_.grid, classes=_base_.classes)
-train_dataloader = dict(batch_size=2)
-optim_wrapper = dict(optimizer=dict(lr=4e-4))
-auto_scale_lr = dict(base_batch_size=16)
+_base_ = './mgmapnet_r50_24e.py'
+
+train_cfg = dict(max_epochs=110)

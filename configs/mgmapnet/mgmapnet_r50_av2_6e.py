@@ -1,11 +1,17 @@
 # MGMapNet on Argoverse 2, 6 epochs, 8 x 2 samples per step; neither epochs nor rate were published.
 _base_ = [
-    '../_base_/datasets/av2_seg.py',
-    '../_base_/models/mgmapnet_r50_av2.py',
-    '../_base_/schedules/cosine_6e.py',
-    '../_base_/default_runtime.py',
+    '../_base_/datasets/av2.py', '../_base_/models/maptr_r50.py', '../_base_/models/maptrv2.py',
+    '../_base_/models/mgmapnet.py',
+    '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
 ]
-model = dict(grid=_base_.grid, classes=_base_.classes)
-train_dataloader = dict(batch_size=2)
+_base_.model.merge(_base_._maptrv2)
+_base_.model.merge(_base_._mgmapnet)
+
+model = dict(
+    grid=_base_.grid, classes=_base_.classes,
+    bev_encoder=dict(z_range=(-5.0, 3.0)),
+    map_head=dict(aux_heads=_base_._mgmapnet.map_head.aux_heads[:2]))
+train_dataloader = dict(batch_size=2, dataset=dict(pipeline=_base_._seg))
 optim_wrapper = dict(optimizer=dict(lr=4e-4))
 auto_scale_lr = dict(base_batch_size=16)
+train_cfg = dict(max_epochs=6)

@@ -16,18 +16,17 @@ from gsmap.inputs.frames import reframed
 from gsmap.inputs.source import Source
 from gsmap.visualization.figure import figure_to_rgb
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "_base_"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 NAMES = ("CAM_FRONT", "CAM_BACK")
 
 
 def make_config():
-    cfg = Config.fromfile(CONFIGS / "models" / "maptr_r18_minicity.py")
-    cfg.merge_from_dict(Config.fromfile(CONFIGS / "default_runtime.py").to_dict())
+    cfg = Config.fromfile(CONFIGS / "_base_/default_runtime.py")
+    cfg.model = Config.fromfile(CONFIGS / "maptr/maptr_r18_minicity.py").model
+    del cfg.model.map_head["aux_heads"]
     cfg.merge_from_dict(
         {
             "model.bev_encoder.num_cams": 2,
-            "model.grid": {"x_range": [-15.0, 15.0], "y_range": [-30.0, 30.0]},
-            "model.classes": ["divider", "ped_crossing", "boundary"],
             "model.bev_encoder.bev_pixel_m": 6.0,
             "model.img_backbone.base_channels": 8,
             "model.img_neck.in_channels": [16, 32, 64],

@@ -15,7 +15,10 @@ from PIL import Image
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.errors import BrokenSampleError
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs/_base_/datasets"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+MINICITY = "_base_/datasets/minicity"
+DEPTH_AND_MASKS = "maptrv2/maptrv2_r50_24e"
+SWEEPS = "maptr/maptr_r50_pointpillars_24e"
 CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 )  # fmt: skip
@@ -52,7 +55,7 @@ def copied_root(minicity_root: Path, minicity_annotations: dict[str, Path], tmp_
 def test_a_training_sample_is_packed_as_the_contract_says(
     build, minicity_root, minicity_annotations
 ):
-    data = build(**dataset_config("minicity", "train_dataloader", minicity_root))[0]
+    data = build(**dataset_config(MINICITY, "train_dataloader", minicity_root))[0]
     meta, truth = data["data_samples"].metainfo, data["data_samples"].gt_instances_3d
     assert data["inputs"]["img"].shape == (6, 3, 90, 160)
     assert data["inputs"]["img"].dtype == torch.float32
@@ -89,7 +92,7 @@ def test_two_coordinates_of_a_file_of_three_are_those_of_a_file_of_two(
     build, minicity_root, minicity_annotations, with_heights
 ):
     """Reading heights as further points of the plane would give an mAP of 0."""
-    config = dataset_config("nuscenes_depth_seg", "train_dataloader", minicity_root)
+    config = dataset_config(DEPTH_AND_MASKS, "train_dataloader", minicity_root)
     flat, high = build(**config), build(**{**config, "ann_file": str(with_heights)})
     for index in range(len(flat)):
         np.random.seed(index)  # noqa: NPY002 - draws the orders of long rings
@@ -107,7 +110,7 @@ def test_two_coordinates_of_a_file_of_three_are_those_of_a_file_of_two(
 
 
 def test_three_coordinates_reach_targets_and_evaluation(build, minicity_root, with_heights):
-    config = dataset_config("minicity", "train_dataloader", minicity_root, dim=3)
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root, dim=3)
     dataset = build(**{**config, "ann_file": str(with_heights)})
     sample = dataset[0]["data_samples"]
     targets = sample.gt_instances_3d
@@ -129,7 +132,7 @@ def test_a_file_of_two_coordinates_is_refused_for_three(build, minicity_annotati
 
 
 def test_lidar_points_meet_their_depths_in_the_cameras(build, minicity_root, minicity_annotations):
-    config = dataset_config("nuscenes_depth_seg", "train_dataloader", minicity_root)
+    config = dataset_config(DEPTH_AND_MASKS, "train_dataloader", minicity_root)
     data = build(**config)[0]["data_samples"]
     depth, lidar2img = data.gt_depth, data.metainfo["lidar2img"][0]
     assert depth.shape == (6, 128, 224)  # 112 x 200, padded to multiples of 32
@@ -149,7 +152,7 @@ def test_lidar_points_meet_their_depths_in_the_cameras(build, minicity_root, min
 
 
 def test_sweeps_lie_where_the_key_frame_does(build, minicity_root, minicity_annotations):
-    config = dataset_config("nuscenes_lidar", "val_dataloader", minicity_root)
+    config = dataset_config(SWEEPS, "val_dataloader", minicity_root)
     points = build(**config)[1]["inputs"]["points"]
     now, before = points[points[:, 4] == 0], points[points[:, 4] > 0]
     assert len(before) > 100
@@ -194,7 +197,7 @@ def test_camera_subset_and_indices(build, minicity_root, minicity_annotations):
 
 
 def test_it_pickles_small_for_workers(build, minicity_root, minicity_annotations):
-    dataset = build(**dataset_config("minicity", "val_dataloader", minicity_root))
+    dataset = build(**dataset_config(MINICITY, "val_dataloader", minicity_root))
     data = pickle.dumps(dataset)
     assert len(data) < 10_000
     assert pickle.loads(data).sample(1).token == dataset.sample(1).token
@@ -204,8 +207,8 @@ def test_it_repeats_and_goes_through_workers(build, minicity_root, minicity_anno
     from mmdet3d.registry import DATASETS
     from mmengine.runner import Runner
 
-    loader = Config.fromfile(CONFIGS / "minicity.py").train_dataloader
-    dataset = dataset_config("minicity", "train_dataloader", minicity_root)
+    loader = Config.fromfile(CONFIGS / f"{MINICITY}.py").train_dataloader
+    dataset = dataset_config(MINICITY, "train_dataloader", minicity_root)
     loader.dataset = {"type": "RepeatDataset", "times": 3, "dataset": dataset}
     assert len(DATASETS.build(loader.dataset)) == 6
     batches = list(Runner.build_dataloader(loader, seed=0))
@@ -221,7 +224,7 @@ def test_it_tests_without_ground_truth_and_refuses_to_train(
     for sample in samples:
         sample.instances = None
     write_annotations(tmp_path / "bare.arrow", file.meta, samples)
-    config = dataset_config("minicity", "val_dataloader", minicity_root)
+    config = dataset_config(MINICITY, "val_dataloader", minicity_root)
     config.ann_file = str(tmp_path / "bare.arrow")
     packed = build(**config)[0]["data_samples"]
     assert packed.metainfo["eval_ann_info"] is None
@@ -258,7 +261,7 @@ def test_what_does_not_fit_is_refused(build, minicity_annotations, option, messa
 
 
 def test_missing_truncated_and_foreign_images_are_named(build, copied_root):
-    dataset = build(**dataset_config("minicity", "val_dataloader", copied_root))
+    dataset = build(**dataset_config(MINICITY, "val_dataloader", copied_root))
     path = copied_root / dataset.sample(0).cameras[1].path
     name, token = dataset.sample(0).cameras[1].name, dataset.sample(0).token
     path.with_name("whole.jpg").write_bytes(content := path.read_bytes())
@@ -288,7 +291,7 @@ def test_missing_truncated_and_foreign_images_are_named(build, copied_root):
 
 
 def test_missing_and_truncated_points_are_named(build, copied_root):
-    dataset = build(**dataset_config("nuscenes_depth_seg", "train_dataloader", copied_root))
+    dataset = build(**dataset_config(DEPTH_AND_MASKS, "train_dataloader", copied_root))
     path = copied_root / dataset.sample(0).lidar.path
     path.write_bytes(path.read_bytes()[:-6])
     with pytest.raises(BrokenSampleError, match=f"{dataset.sample(0).token}.*copy it again"):
@@ -299,7 +302,7 @@ def test_missing_and_truncated_points_are_named(build, copied_root):
 
 
 def test_a_missing_earlier_sweep_is_named_with_the_remedy(build, copied_root):
-    dataset = build(**dataset_config("nuscenes_lidar", "val_dataloader", copied_root))
+    dataset = build(**dataset_config(SWEEPS, "val_dataloader", copied_root))
     sample = dataset.sample(1)
     path = copied_root / sample.lidar.sweeps[0].path
     message = f"{sample.token}.*no earlier LiDAR sweep at {path}.*--max-sweeps 0"
@@ -308,7 +311,7 @@ def test_a_missing_earlier_sweep_is_named_with_the_remedy(build, copied_root):
 
 
 def test_broken_samples_are_skipped_and_counted_on_demand(build, copied_root):
-    config = dataset_config("minicity", "train_dataloader", copied_root, broken_samples="skip")
+    config = dataset_config(MINICITY, "train_dataloader", copied_root, broken_samples="skip")
     dataset = build(**config)
     token = dataset.sample(0).token
     (copied_root / dataset.sample(0).cameras[0].path).unlink()
@@ -325,7 +328,7 @@ def test_an_absent_camera_is_named(build, minicity_annotations, minicity_root, t
     samples = list(file)
     del samples[0].cameras[0]
     write_annotations(tmp_path / "five.arrow", file.meta, samples)
-    config = dataset_config("minicity", "val_dataloader", minicity_root)
+    config = dataset_config(MINICITY, "val_dataloader", minicity_root)
     config.ann_file = str(tmp_path / "five.arrow")
     with pytest.raises(BrokenSampleError, match=f"{samples[0].token}.*no camera 'CAM_FRONT'"):
         build(**config)[0]
@@ -337,7 +340,7 @@ def test_nan_in_an_image_is_named(build, minicity_annotations, minicity_root):
         results["img"][2][5, 7, 1] = np.nan
         return results
 
-    config = dataset_config("minicity", "val_dataloader", minicity_root)
+    config = dataset_config(MINICITY, "val_dataloader", minicity_root)
     dataset = build(**{**config, "pipeline": [*config.pipeline[:-1], poison, config.pipeline[-1]]})
     with pytest.raises(BrokenSampleError, match="CAM_FRONT_LEFT: the image holds NaN"):
         dataset[0]

@@ -23,9 +23,10 @@ def parse(*arguments):
 
 def test_options_override_and_the_work_folder_takes_the_config_name(tmp_path):
     path = tmp_path / "tiny.py"
-    path.write_text("train_dataloader = dict(batch_size=4)\n")
+    path.write_text("_four = 4\ntrain_dataloader = dict(batch_size=_four)\n")
     cfg = load_config(parse(str(path), "--cfg-options", "train_dataloader.batch_size=1"))
     assert cfg.train_dataloader.batch_size == 1
+    assert "_four" not in cfg  # nor in what a run writes
     assert cfg.work_dir == "work_dirs/tiny"
     assert load_config(parse(str(path), "--work-dir", "elsewhere")).work_dir == "elsewhere"
 

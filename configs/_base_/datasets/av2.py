@@ -1,36 +1,59 @@
 # Argoverse 2, seven ring cameras at 0.3 of their size (padded to one size first), ground truth of
 # 60 x 30 m in the ego frame. `python tools/create_data.py av2 --root data/av2 --split train --rate 2.5hz`, and
 # the same for val, make the annotation files: every fourth sweep, as in MapTR's evaluation.
-_base_ = './nuscenes.py'
-
 data_root = 'data/av2/'
 _file_size = (2048, 2048)  # of the image files, width and height, with the padding
+# the one place of range and classes: leaves hand them to the model
 grid = dict(x_range=[-30.0, 30.0], y_range=[-15.0, 15.0])  # metres; travel is along the longer side
+classes = ['divider', 'ped_crossing', 'boundary']
 
-_load = [dict(type='LoadCameraImages'), dict(type='ScaleImages', scale=0.3)]
+_load = dict(type='LoadCameraImages')
+_scale = dict(type='ScaleImages', scale=0.3)
+_photometric = dict(
+    type='MultiViewWrapper',
+    transforms=[dict(type='PhotoMetricDistortion3D')],
+    override_aug_config=False,  # each camera its own, as in MapTR
+    collected_keys=[])
+_targets = dict(type='FormatMapTargets', num_points=20)
+_pack = dict(type='PackMapInputs')
+
+_workers = dict(num_workers=4, persistent_workers=True)
 _dataset = dict(
-    data_root=data_root,
-    grid=grid,
-    frame='ego',
+    type='VectorizedMapDataset', data_root=data_root, classes=classes, grid=grid, frame='ego',
     cameras=[
         'ring_front_center', 'ring_front_right', 'ring_front_left', 'ring_rear_right', 'ring_rear_left',
         'ring_side_right', 'ring_side_left'
     ])
-
 train_dataloader = dict(
     batch_size=6,
+    **_workers,
+    sampler=dict(type='DefaultSampler', shuffle=True),
     dataset=dict(
         **_dataset,
         ann_file='gsmap_av2_train.arrow',
-        pipeline=[
-            *_load,
-            _base_._photometric,
-            dict(type='FormatMapTargets', num_points=20),
-            dict(type='PackMapInputs'),
-        ]))
+        split='train',
+        pipeline=[_load, _scale, _photometric, _targets, _pack]))
 val_dataloader = dict(
+    batch_size=1,
+    **_workers,
+    sampler=dict(type='DefaultSampler', shuffle=False),
     dataset=dict(
-        **_dataset,
-        ann_file='gsmap_av2_val.arrow',
-        pipeline=[*_load, dict(type='PackMapInputs')]))
+        **_dataset, ann_file='gsmap_av2_val.arrow', split='val', test_mode=True, pipeline=[_load, _scale, _pack]))
 test_dataloader = val_dataloader
+
+# Pipelines for leaves to choose. MapTRv2 learns from BEV and camera masks besides map elements, and from the depth of
+# the LiDAR sweep that each sample names (docs/argoverse2.md).
+_masks = [
+    dict(type='MakeBEVMask', size=(100, 200), num_classes=3),
+    dict(type='MakePVMask', stride=32, ground_z_m=-0.3, num_classes=3),  # the origin is the rear axle
+]
+_seg = [_load, _scale, _photometric, _targets, *_masks, _pack]
+_depth_seg = [
+    _load,
+    dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5),
+    dict(type='PointsToFrame'),
+    _scale, _photometric, _targets,
+    dict(type='MakeDepthMap'),
+    *_masks,
+    dict(type='PackMapInputs', with_points=False),
+]

@@ -1,53 +1,55 @@
-# nuScenes, six cameras at half size, ground truth of 60 x 30 m in the LIDAR_TOP frame. The other data sets say what
-# differs. `python tools/create_data.py nuscenes --root data/nuscenes` makes the annotation files.
+# nuScenes, six cameras at half size, ground truth of 60 x 30 m in the LIDAR_TOP frame.
+# `python tools/create_data.py nuscenes --root data/nuscenes` makes the annotation files.
 data_root = 'data/nuscenes/'
 _file_size = (1600, 900)  # of the image files, width and height
 # the one place of range and classes: leaves hand them to the model
 grid = dict(x_range=[-15.0, 15.0], y_range=[-30.0, 30.0])  # metres; travel is along the longer side
 classes = ['divider', 'ped_crossing', 'boundary']
 
+_load = dict(type='LoadCameraImages')
+_scale = dict(type='ScaleImages', scale=0.5)
 _photometric = dict(
     type='MultiViewWrapper',
     transforms=[dict(type='PhotoMetricDistortion3D')],
     override_aug_config=False,  # each camera its own, as in MapTR
     collected_keys=[])
-_load = dict(type='LoadCameraImages')
-_scale = dict(type='ScaleImages', scale=0.5)
+_targets = dict(type='FormatMapTargets', num_points=20)
+_pack = dict(type='PackMapInputs')
+
+_workers = dict(num_workers=4, persistent_workers=True)
 _dataset = dict(
-    type='VectorizedMapDataset',
-    data_root=data_root,
-    classes=classes,
-    grid=grid,
-    frame='lidar',
+    type='VectorizedMapDataset', data_root=data_root, classes=classes, grid=grid, frame='lidar',
     cameras=[
         'CAM_FRONT', 'CAM_FRONT_RIGHT', 'CAM_FRONT_LEFT', 'CAM_BACK', 'CAM_BACK_LEFT', 'CAM_BACK_RIGHT'
     ])
-
 train_dataloader = dict(
     batch_size=4,
-    num_workers=4,
-    persistent_workers=True,
+    **_workers,
     sampler=dict(type='DefaultSampler', shuffle=True),
     dataset=dict(
         **_dataset,
         ann_file='gsmap_nuscenes_train.arrow',
         split='train',
-        pipeline=[
-            _load,
-            _photometric,
-            _scale,
-            dict(type='FormatMapTargets', num_points=20),
-            dict(type='PackMapInputs'),
-        ]))
+        pipeline=[_load, _photometric, _scale, _targets, _pack]))
 val_dataloader = dict(
     batch_size=1,
-    num_workers=4,
-    persistent_workers=True,
+    **_workers,
     sampler=dict(type='DefaultSampler', shuffle=False),
     dataset=dict(
-        **_dataset,
-        ann_file='gsmap_nuscenes_val.arrow',
-        split='val',
-        test_mode=True,
-        pipeline=[_load, _scale, dict(type='PackMapInputs')]))
+        **_dataset, ann_file='gsmap_nuscenes_val.arrow', split='val', test_mode=True, pipeline=[_load, _scale, _pack]))
 test_dataloader = val_dataloader
+
+# Pipelines for leaves to choose. MapTRv2 learns from LiDAR depth, BEV and camera masks besides map elements.
+_points = dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5)
+_depth_seg = [
+    _load, _points, _scale, _photometric, _targets,
+    dict(type='MakeDepthMap'),
+    dict(type='MakeBEVMask', size=(200, 100), num_classes=3),
+    dict(type='MakePVMask', stride=32, num_classes=3),
+    dict(type='PackMapInputs', with_points=False),
+]
+# Models with LiDAR see ten sweeps.
+_sweeps = dict(
+    type='LoadLidarSweeps', sweeps_num=9, use_dim=[0, 1, 2, 3, 4], pad_empty_sweeps=True, remove_close=True)
+_lidar = [_load, _points, _sweeps, _photometric, _scale, _targets, _pack]
+_lidar_test = [_load, _points, dict(_sweeps, test_mode=True), _scale, _pack]

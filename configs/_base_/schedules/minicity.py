@@ -1,7 +1,5 @@
 # MiniCity from scratch on two CPU cores: every weight learns at the same rate, short warm-up, cosine decay per
 # iteration.
-_epochs = 12
-
 optim_wrapper = dict(
     type='OptimWrapper',
     optimizer=dict(type='AdamW', lr=6e-4, weight_decay=0.01, fused=True),
@@ -11,11 +9,10 @@ param_scheduler = [
     dict(
         type='CosineAnnealingLR',
         by_epoch=True,
-        T_max=_epochs,
         eta_min_ratio=1e-2,
         convert_to_iter_based=True),
 ]
-train_cfg = dict(type='EpochBasedTrainLoop', max_epochs=_epochs, val_interval=_epochs)
+train_cfg = dict(type='EpochBasedTrainLoop', max_epochs=12, val_interval=12)
 val_cfg = dict()
 test_cfg = dict()
 auto_scale_lr = dict(enable=False, base_batch_size=2)

@@ -1,8 +1,8 @@
 # The small GSMap on four samples of MiniCity, trained and tested on the same four: can it learn them by heart?
-_base_ = './gsmap_maptr_r18_minicity.py'
+_base_ = '../../../configs/maptr/maptr_r18_minicity.py'
 
+model = dict(map_head=dict(type='GSMapHead'))
 _four = dict(indices=4)
-_epochs = 500
 optim_wrapper = dict(optimizer=dict(lr=1.2e-3))
 train_dataloader = dict(batch_size=4, dataset=_four)
 val_dataloader = dict(
@@ -10,8 +10,8 @@ val_dataloader = dict(
 test_dataloader = val_dataloader
 param_scheduler = [
     dict(type='LinearLR', start_factor=0.1, by_epoch=False, begin=0, end=50),
-    dict(type='CosineAnnealingLR', by_epoch=True, T_max=_epochs, eta_min_ratio=1e-2),
+    dict(type='CosineAnnealingLR', by_epoch=True, eta_min_ratio=1e-2),
 ]
-train_cfg = dict(max_epochs=_epochs, val_interval=100)
+train_cfg = dict(max_epochs=500, val_interval=100)
 default_hooks = dict(
     checkpoint=dict(interval=100, max_keep_ckpts=1), logger=dict(interval=1))

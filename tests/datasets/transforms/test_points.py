@@ -21,7 +21,7 @@ from gsmap.converters.argoverse2.samples import Argoverse2Options
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.transforms.points import LoadLidarPoints, LoadLidarSweeps, read_points
 
-CONFIGS = Path(__file__).resolve().parents[3] / "configs/_base_/datasets"
+CONFIG = Path(__file__).resolve().parents[3] / "configs/maptrv2/maptrv2_r50_av2_depth_6e.py"
 GROUND_Z_M = -0.25  # exact in float16
 LOAD = {"coord_type": "LIDAR", "load_dim": 5, "use_dim": 5}
 
@@ -61,7 +61,7 @@ def depth_data(root: Path, **options) -> torch.utils.data.Dataset:
     """Convert a root and open it with the data set of MapTRv2 with depth."""
     init_default_scope("mmdet3d")
     convert_argoverse2(Argoverse2Options(root, rate_hz=None, **options))
-    config = Config.fromfile(CONFIGS / "av2_depth_seg.py").train_dataloader.dataset
+    config = Config.fromfile(CONFIG).train_dataloader.dataset
     config.update(data_root=str(root), ann_file="gsmap_av2_val.arrow", split="val")
     return DATASETS.build(config)
 

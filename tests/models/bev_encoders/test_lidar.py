@@ -16,14 +16,14 @@ from model_cases import (
 from gsmap.models.bev_encoders.lidar import ConvFuser, LidarEncoder
 from gsmap.structures.grid import BEVGrid
 
-BASE = "_base_/models/maptr_r18_pointpillars_minicity.py"
+CONFIG = "maptr/maptr_r18_pointpillars_minicity.py"
 GRID = BEVGrid((-15, 15), (-30, 30))
 LINE = straight_elements(((-5.0, -20.0), (-5.0, 20.0)))
 
 
 @pytest.fixture(scope="module")
 def config():
-    cfg = Config.fromfile(CONFIGS / BASE, import_custom_modules=False).model
+    cfg = Config.fromfile(CONFIGS / CONFIG, import_custom_modules=False).model
     cfg.lidar_encoder.bev_pixel_m = 5.0
     cfg.bev_fuser.update(camera_channels=16, out_channels=16)
     return cfg
@@ -108,7 +108,7 @@ def test_combinations_that_mean_nothing_are_refused(config):
 
 
 def test_a_sparse_encoder_without_its_package_says_so(monkeypatch):
-    path = CONFIGS / "_base_/models/maptr_r50_second.py"
+    path = CONFIGS / "maptr/maptr_r50_second_24e.py"
     cfg = Config.fromfile(path, import_custom_modules=False)
     monkeypatch.setattr("gsmap.models.bev_encoders.lidar.IS_SPCONV2_AVAILABLE", False)
     encoder = MODELS.build({**cfg.model.lidar_encoder, "grid": GRID})

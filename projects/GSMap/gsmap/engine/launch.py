@@ -132,6 +132,7 @@ def _naming(what: object) -> Iterator[None]:
 def load_config(args: argparse.Namespace) -> Config:
     """Read ``args.config``, apply the command-line options to it, and check the result.
 
+    The config's own values (``_name``) are left out: a run's log and config show what counts.
     Without a GPU several processes talk through gloo, whatever the config says. Errors are those of
     `read_config` and `check_config`.
     """
@@ -143,6 +144,8 @@ def load_config(args: argparse.Namespace) -> Config:
     elif cfg.get("work_dir") is None:
         cfg.work_dir = str(Path("work_dirs") / Path(args.config).stem)
     check_config(cfg)
+    for name in [name for name in cfg if name.startswith("_")]:
+        cfg.pop(name)  # a config's own values have done their work
     if args.launcher == "pytorch" and not torch.cuda.is_available():
         # mmengine would choose a CUDA device first, and wrap the model with its number
         torch.distributed.init_process_group("gloo")

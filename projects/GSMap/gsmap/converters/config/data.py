@@ -104,7 +104,7 @@ def schedule_settings(fields: Fields) -> dict[str, Any]:
     epochs = fields.take("total_epochs", None)
     epochs = fields.take("runner.max_epochs", epochs)
     if epochs is not None:
-        settings |= {"param_scheduler.1.T_max": epochs, "train_cfg.max_epochs": epochs}
+        settings["train_cfg.max_epochs"] = epochs
     scale = fields.take("fp16.loss_scale", None)
     if scale is not None:
         settings |= {"optim_wrapper.type": "AmpOptimWrapper", "optim_wrapper.loss_scale": scale}

@@ -1,8 +1,6 @@
-# MGMapNet with ResNet-50, as released for nuScenes: MapTRv2's encoder, one query per element whose points share its
+# What MGMapNet changes in MapTRv2 (maptrv2.py), as released for nuScenes: one query per element whose points share its
 # samples, two BEV levels, masks of classes and of instances (docs/mgmapnet.md).
-_base_ = './maptrv2_r50.py'
-
-model = dict(
+_mgmapnet = dict(
     map_head=dict(
         type='MGMapHead',
         query_groups=[dict(num=100), dict(name='one2many', num=600, repeats=6, weight=1.0)],

@@ -1,8 +1,6 @@
-# MapTR with cameras and LiDAR as in MapTR's fusion config: SECOND's sparse encoder on voxels of 0.1 x 0.1 x 0.2 m,
-# fused by one convolution. It trains on a GPU; with the package spconv it tests on a CPU too.
-_base_ = './maptr_r50.py'
-
-model = dict(
+# LiDAR beside the cameras of maptr_r50.py as in MapTR's fusion config: SECOND's sparse encoder on voxels of
+# 0.1 x 0.1 x 0.2 m, fused by one convolution. It trains on a GPU; with the package spconv it tests on a CPU too.
+_second = dict(
     data_preprocessor=dict(
         voxel=True,
         voxel_layer=dict(

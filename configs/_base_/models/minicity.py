@@ -1,11 +1,9 @@
-# A small MapTR that learns MiniCity from scratch on two CPU cores: narrow ResNet-18, features at stride 8, 128 channels,
-# BEV cells of 1.2 m, two decoder layers. Scale it here.
-_base_ = './maptr_r50.py'
-
+# What makes maptr_r50.py small enough to learn MiniCity from scratch on two CPU cores: narrow ResNet-18, features at
+# stride 8, 128 channels, BEV cells of 1.2 m, two decoder layers. Scale it here.
 _dim = 128  # channels of BEV features and queries
 _width = 24  # channels of the first backbone stage; ResNet-18 has 64
 
-model = dict(
+_minicity = dict(
     img_augment=None,
     img_backbone=dict(
         depth=18,

@@ -1,10 +1,9 @@
-# MapTR with cameras and LiDAR: PointPillars of 0.15 m, fused with the cameras' BEV features by one convolution.
-_base_ = './maptr_r50.py'
-
+# LiDAR beside the cameras of maptr_r50.py: PointPillars of 0.15 m, fused with the cameras' BEV features by one
+# convolution.
 _pc_range = [-15.0, -30.0, -2.0, 15.0, 30.0, 2.0]
 _voxel_size = [0.15, 0.15, 4.0]
 
-model = dict(
+_pointpillars = dict(
     data_preprocessor=dict(
         voxel=True,
         voxel_layer=dict(
@@ -37,3 +36,15 @@ model = dict(
         bev_pixel_m=0.3),
     bev_fuser=dict(
         type='ConvFuser', camera_channels=256, lidar_channels=384, out_channels=256))
+
+# Its sizes for MiniCity, after those of minicity.py: pillars of 0.6 m.
+_pointpillars_minicity = dict(
+    data_preprocessor=dict(
+        voxel_layer=dict(voxel_size=[0.6, 0.6, 4.0], max_voxels=(5000, 5000))),
+    lidar_encoder=dict(
+        voxel_encoder=dict(feat_channels=[32], voxel_size=[0.6, 0.6, 4.0]),
+        middle_encoder=dict(in_channels=32, output_shape=[100, 50]),
+        backbone=dict(in_channels=32, layer_nums=[3], layer_strides=[2], out_channels=[64]),
+        neck=dict(in_channels=[64], upsample_strides=[1], out_channels=[128]),
+        bev_pixel_m=1.2),
+    bev_fuser=dict(camera_channels=128, lidar_channels=128, out_channels=128))

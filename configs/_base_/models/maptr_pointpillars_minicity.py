@@ -1,5 +1,0 @@
-# The small MapTR of MiniCity with LiDAR alone.
-_base_ = './maptr_r18_pointpillars_minicity.py'
-
-model = dict(
-    img_augment=None, img_backbone=None, img_neck=None, bev_encoder=None, bev_fuser=None)
