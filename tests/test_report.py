@@ -2,13 +2,12 @@ import base64
 import hashlib
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import run_python
 from report_case import CLASSES, FRAMES, STRANGE, write_case
 
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -165,8 +164,7 @@ def test_gaussians_are_read_where_all_vectors_have_them(case, tmp_path):
 
 
 def run_report(*arguments):
-    command = [sys.executable, str(REPO / "tools/report.py"), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return run_python("tools/report.py", *arguments)
 
 
 def test_the_command_writes_the_page_and_says_its_size(case, tmp_path):

@@ -1,7 +1,6 @@
 """Exported models in ONNX Runtime: the same map elements as in torch."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from model_cases import build_small, ring_of_cameras
+from processes import run_python
 
 from gsmap.apis.export import (
     ExportedDetector,
@@ -161,13 +161,7 @@ model.write("out.json", [("a", elements)])
 others = {"torch", "mmengine", "mmcv", "mmdet", "mmdet3d", "cv2", "onnx", "pyarrow", "shapely"}
 print(sorted(others & set(sys.modules)))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(exported.path)],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python("-c", script, exported.path, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "[]"
     (expected,) = inferencer.predict(dataset, [0])

@@ -1,12 +1,12 @@
 import argparse
 import os
 import platform
-import subprocess
 import sys
 import time
 
 import pytest
 import torch
+from processes import run_python
 
 from benchmarks import raster
 from benchmarks.measure import Cost, markdown_table, measure
@@ -38,9 +38,8 @@ def test_peak_is_what_a_call_had_in_use_at_once():
 
     In a process of its own: what ran before decides whether freed pages go back at once.
     """
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", PEAKS]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    paths = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = run_python("-c", PEAKS, env=paths, check=True)
     one, two = (float(line) for line in done.stdout.split())
     # pages that the process touches beside the tensors: a few MiB
     assert abs(one - 64) < 8

@@ -2,8 +2,6 @@
 
 import errno
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ from argoverse2_road import (
     write_map,
     write_poses,
 )
+from processes import run_python
 
 from benchmarks.argoverse2 import measure_extraction
 from gsmap.converters.argoverse2.convert import convert_argoverse2
@@ -241,9 +240,8 @@ def test_nothing_left_to_write_is_an_error_that_says_why(tmp_path):
 
 def test_the_tool_converts_and_names_its_command(tmp_path):
     write_log(tmp_path / "val" / "log-a")
-    command = [sys.executable, "tools/create_data.py", "av2", "--root", str(tmp_path)]
-    command += ["--split", "val", "--rate", "2hz", "--dim", "3", "--workers", "1"]
-    done = subprocess.run(command, cwd=REPO, capture_output=True, text=True, check=False)
+    words = "--split", "val", "--rate", "2hz", "--dim", 3, "--workers", 1
+    done = run_python("tools/create_data.py", "av2", "--root", tmp_path, *words)
     assert done.returncode == 0, done.stderr
     assert "samples: val 2" in done.stdout
     meta = AnnotationFile(tmp_path / "gsmap_av2_val.arrow").meta

@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 import tarfile
 from collections import Counter
 from dataclasses import replace
@@ -12,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from processes import run_python
 
 from gsmap.converters.export import export_json
 from gsmap.converters.lane_graph import link_lanes
@@ -268,16 +267,11 @@ def test_extended_classes_are_closed_rings(options: NuScenesOptions, tmp_path: P
 
 
 def test_the_command_reports_and_fails_in_words(minicity_root: Path, tmp_path: Path):
-    def run(*arguments: str) -> subprocess.CompletedProcess:
-        command = [sys.executable, str(REPO / "tools/create_data.py"), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=False)
-
-    done = run(
-        "nuscenes", "--root", str(minicity_root), "--out-dir", str(tmp_path), "--workers", "1"
-    )
+    tool = "tools/create_data.py", "nuscenes", "--root"
+    done = run_python(*tool, minicity_root, "--out-dir", tmp_path, "--workers", 1)
     assert "samples: " in done.stdout
     assert AnnotationFile(tmp_path / "gsmap_minicity_val.arrow").meta.command.startswith("python ")
-    failed = run("nuscenes", "--root", str(tmp_path))
+    failed = run_python(*tool, tmp_path)
     assert failed.returncode != 0
     assert failed.stderr.startswith("error: no version")
     assert "Traceback" not in failed.stderr

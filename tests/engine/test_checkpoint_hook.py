@@ -15,6 +15,7 @@ from mmengine.logging import MessageHub
 from mmengine.model import BaseModel
 from mmengine.runner import Runner
 from mmengine.runner.checkpoint import save_checkpoint
+from processes import run_python
 
 import gsmap.registered  # noqa: F401
 from gsmap.apis.checkpoint import read_checked
@@ -38,7 +39,7 @@ def test_an_import_changes_nothing_of_mmengine_and_torch():
         "assert HistoryBuffer not in torch.serialization.get_safe_globals()\n"
         "assert type(get_file_backend('a.pth')) is LocalBackend\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True, check=False)
+    done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
 
 

@@ -2,13 +2,12 @@
 
 import importlib.util
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from golden_data import CLASSES, EVALUATOR
+from processes import run_python
 
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSample
@@ -94,7 +93,7 @@ def test_prior_is_fitted_on_one_file_and_scored_on_another(files, tmp_path, caps
 
 def test_the_command_starts_without_torch():
     code = "import sys, gsmap.evaluation.prior; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+    run_python("-c", code, check=True)
 
 
 def test_two_workers_give_the_same_digits(tmp_path):
@@ -118,8 +117,8 @@ def test_command_with_two_processes_writes_the_same_file(tmp_path, form):
     written = []
     for workers in ("1", "2"):
         out = tmp_path / f"{workers}.json"
-        tool = [sys.executable, str(REPO / "tools/evaluate.py"), str(results), str(truth)]
-        subprocess.run([*tool, "--workers", workers, "--out", str(out)], check=True, timeout=300)
+        words = "tools/evaluate.py", results, truth, "--workers", workers, "--out", out
+        run_python(*words, check=True)
         written.append(out.read_bytes())
     assert written[0] == written[1]
 

@@ -1,11 +1,10 @@
 """No file runs code: crafted pickles are read in processes of their own, and leave no marker."""
 
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
 import pytest
+from processes import run_python
 
 from fuzz.attacks import corpus
 
@@ -15,8 +14,7 @@ HARMLESS = {"open", "system", "exec", "eval", "makedirs", "nested", "key", "tofi
 
 def read_all(reader: str, folder: Path) -> dict[str, str]:
     """Read every file of a folder in one process; how each ended, by its name."""
-    command = [sys.executable, str(SCRIPT), reader, str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    done = run_python(SCRIPT, reader, folder, timeout=120)
     assert done.returncode == 0, f"{done.stdout[-300:]}\n{done.stderr[-2000:]}"
     return dict(line.split(": ", 1) for line in done.stdout.splitlines())
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from nuscenes import NuScenes
 from nuscenes.utils.splits import create_splits_scenes
+from processes import run_python
 
 from minicity import generate as generate_module
 from minicity.config import TRAIN_LOCATIONS, VAL_LOCATIONS, MiniCityConfig
@@ -170,14 +171,7 @@ from pathlib import Path
 from minicity.generate import generate
 generate(root=Path({str(root)!r}), scenes=2, seed=0, image_size=(64, 36), samples_per_scene=1)
 """
-    done = subprocess.run(
-        [sys.executable, "-"],
-        input=program,
-        text=True,
-        capture_output=True,
-        timeout=120,
-        check=False,
-    )
+    done = run_python("-", input=program, timeout=120)
     assert done.returncode == 1
     assert "RuntimeError: a worker process died" in done.stderr
     assert not list(tmp_path.iterdir())

@@ -14,6 +14,7 @@ from gaussian_cases import (
     random_gaussians,
     render_with_gradients,
 )
+from processes import run_python
 
 from benchmarks.measure import measure
 from gsmap.ops import backends, gaussian_raster
@@ -258,14 +259,8 @@ def test_triton_kernels_equal_the_float64_reference_in_the_interpreter(cases):
     """A process of its own: Triton reads ``TRITON_INTERPRET`` when it is imported."""
     pytest.importorskip("triton")
     paths = [str(Path(__file__).parent), str(Path(gaussian_raster.__file__).parents[3])]
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(paths)}
-    result = subprocess.run(
-        [sys.executable, "-c", TRITON_SCRIPT, *sorted(cases)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    environment = {"TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(paths)}
+    result = run_python("-c", TRITON_SCRIPT, *sorted(cases), env=environment)
     assert result.returncode == 0, result.stderr
 
 

@@ -2,11 +2,11 @@
 
 import os
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from processes import run_python
 from tensorboard import default
 
 from gsmap.__main__ import main
@@ -46,11 +46,8 @@ def test_a_broken_plugin_of_another_package_does_not_stop_tensorboard(tmp_path, 
         default.get_dynamic_plugins()  # what the usual command does
     logs = tmp_path / "logs"
     logs.mkdir()
-    done = subprocess.run(
-        [sys.executable, "tools/watch.py", "--logdir", str(logs), "--inspect"],
-        cwd=REPO, env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
-        text=True, capture_output=True, check=False,
-    )  # fmt: skip
+    paths = {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = run_python("tools/watch.py", "--logdir", logs, "--inspect", env=paths)
     assert (done.returncode, "No event files found" in done.stdout) == (0, True), done.stderr
 
 

@@ -1,8 +1,6 @@
 """Every row of the papers' tables: its config loads, its overrides change it, its model builds."""
 
 import argparse
-import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -10,6 +8,7 @@ import pytest
 import torch
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
+from processes import run_python
 
 from gsmap.engine.launch import add_config_options, check_config, read_config
 from tools.compare import command_of, figures_of, read_tables
@@ -104,12 +103,10 @@ def test_commands_and_figures_of_a_row_by_hand():
 
 
 def test_the_command_lists_and_names_what_there_is():
-    command = [sys.executable, "tools/compare.py", "--list", "--tables"]
-    run = subprocess.run(
-        [*command, "GeMap Table A3*"], cwd=REPO, text=True, capture_output=True, check=True
-    )
+    words = "tools/compare.py", "--list", "--tables"
+    run = run_python(*words, "GeMap Table A3*", check=True)
     assert "  12: chamfer/mAP 47.9" in run.stdout
     assert "model.map_head.decoder.num_layers=12" in run.stdout
-    bad = subprocess.run([*command, "X"], cwd=REPO, text=True, capture_output=True, check=False)
+    bad = run_python(*words, "X")
     assert bad.returncode == 2
     assert "no table is named 'X'; there are: GSMap Table 1" in bad.stderr

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import run_python
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -41,11 +42,12 @@ def ranks(folder: Path) -> list[int]:
 
 @pytest.mark.slow
 def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_config, tmp_path):
-    command = [sys.executable, "tools/compare.py", f"good={tiny_config}", "--seeds", "1"]
-    command += ["--budget", "2", "--batch", "2", "--out", str(tmp_path)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    words = ["tools/compare.py", f"good={tiny_config}", "--seeds", "1"]
+    words += ["--budget", "2", "--batch", "2", "--out", str(tmp_path)]
+    threads = {"OMP_NUM_THREADS": "1"}
     folder = tmp_path / "good/seed_0"
-    with subprocess.Popen(command, cwd=REPO, env=environment) as comparison:
+    command = [sys.executable, *words]
+    with subprocess.Popen(command, cwd=REPO, env={**os.environ, **threads}) as comparison:
         while not (folder / "epoch_1.pth").exists() and comparison.poll() is None:
             time.sleep(0.02)
         comparison.send_signal(signal.SIGKILL)
@@ -56,9 +58,7 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
     assert not ranks(folder)  # training died with it
 
     bad = f"bad={tiny_config},optim_wrapper.optimizer.lr=-1.0"
-    done = subprocess.run(
-        [*command, bad], cwd=REPO, env=environment, text=True, capture_output=True, check=False
-    )
+    done = run_python(*words, bad, env=threads)
     assert done.returncode == 2
     assert "error: bad/seed_0 did not end" in done.stderr
     assert "runs done" in done.stderr
@@ -77,7 +77,7 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
     assert (tmp_path / "comparison_precision_recall.png").exists()
 
     rules = ["--rescore", "thresholds=[0.2,0.5]", "ground_truth_points=20"]
-    subprocess.run([*command, *rules], cwd=REPO, env=environment, check=True)
+    run_python(*words, *rules, env=threads, check=True)
     figures = json.loads((tmp_path / "rescored.json").read_text())["runs"][0]["figures"]
     assert {key for key in figures if key.startswith("chamfer/divider/AP@")} == {
         "chamfer/divider/AP@0.2",

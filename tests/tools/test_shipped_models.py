@@ -1,17 +1,14 @@
 """The models that ship score what they should on towns that they have not seen."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from processes import run_python
 
 from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from minicity.generate import generate
 
-REPO = Path(__file__).resolve().parents[2]
 # mAP_chamfer, mAP_raster of these 30 samples; those of 400 are in models/README.md
 FIGURES = {"gsmap_r18_minicity": (0.3723, 0.1315), "maptr_r18_minicity": (0.4428, 0.1636)}
 
@@ -30,12 +27,8 @@ def towns(tmp_path_factory) -> Path:
 def test_a_shipped_model_scores_its_figures(name, towns, tmp_path):
     """Measured once, of the same seed; floats of another machine may tip a pair or two."""
     metrics = tmp_path / "metrics.json"
-    done = subprocess.run(
-        [sys.executable, "tools/test.py", name, "--work-dir", str(tmp_path), "--metrics-out",
-         str(metrics), "--data-root", str(towns)],
-        cwd=REPO, env={**os.environ, "OMP_NUM_THREADS": "1"}, text=True, capture_output=True,
-        check=False,
-    )  # fmt: skip
+    words = "--work-dir", tmp_path, "--metrics-out", metrics, "--data-root", towns
+    done = run_python("tools/test.py", name, *words, env={"OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr[-3000:]
     figures = json.loads(metrics.read_text())
     found = (figures["chamfer/mAP"], figures["raster/mAP"])

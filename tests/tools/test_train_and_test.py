@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from mmengine.runner import FlexibleRunner
+from processes import run_python
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tools.train import main as train
@@ -192,10 +193,7 @@ def test_the_config_chooses_the_runner(tiny_config, tmp_path, monkeypatch):
 
 
 def test_a_missing_checkpoint_is_named(tiny_config):
-    done = subprocess.run(
-        [sys.executable, "tools/test.py", str(tiny_config), "nowhere.pth"],
-        cwd=REPO, env=environment(), text=True, capture_output=True, check=False,
-    )  # fmt: skip
+    done = run_python("tools/test.py", tiny_config, "nowhere.pth", env=environment())
     assert done.returncode == 2
     assert done.stderr == (
         "error: There is no checkpoint nowhere.pth, and no model of that name (gsmap_r18_minicity, "

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from processes import run_python
 
 from gsmap.utils.parallel import ordered_map
 
@@ -98,14 +99,7 @@ def test_a_program_that_cannot_be_imported_anew_ends_in_words():
         "from gsmap.utils.parallel import ordered_map\n"
         "print(list(ordered_map(functools.partial(operator.contains, bytes(10**6)), [1, 2], 2)))"
     )
-    done = subprocess.run(
-        [sys.executable, "-"],
-        input=program,
-        text=True,
-        capture_output=True,
-        timeout=60,
-        check=False,
-    )
+    done = run_python("-", input=program, timeout=60)
     assert done.returncode == 1
     assert "RuntimeError: a worker process died" in done.stderr
 
