@@ -69,6 +69,9 @@ def elements(*lines, labels=None) -> InstanceData:
     return straight_elements(*lines, labels=labels, num_points=P)
 
 
+LANES = elements(((-3, -20), (-3, 20)), ((3, -20), (4, 20)), labels=[0, 2])
+
+
 def along_y(*xs: float) -> list:
     """Return lines of 40 m along y, at these x."""
     return [((x, -20), (x, 20)) for x in xs]

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import torch
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
@@ -11,6 +10,7 @@ from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
 
 import gsmap.registered  # noqa: F401
+from benchmarks.model import ring_of_cameras
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 IMAGE_SHAPE = (64, 96)
@@ -50,21 +50,6 @@ def build_small(seed: int = 0, **overrides) -> torch.nn.Module:
     return model
 
 
-def ring_of_cameras() -> np.ndarray:
-    """Return the projections of level cameras that look outward, 90 degrees wide. (V, 4, 4)"""
-    height, width = IMAGE_SHAPE
-    intrinsics = np.eye(4)
-    intrinsics[:3, :3] = [[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]]
-    matrices = []
-    for angle in np.arange(NUM_CAMS) * (2 * np.pi / NUM_CAMS):
-        camera = np.eye(4)
-        camera[0, :2] = np.cos(angle), np.sin(angle)
-        camera[1, :3] = 0, 0, -1
-        camera[2, :3] = -np.sin(angle), np.cos(angle), 0
-        matrices.append(intrinsics @ camera)
-    return np.stack(matrices)
-
-
 def straight_elements(*lines, labels=None, num_points: int = 20) -> InstanceData:
     """Return the targets of straight lines ((x0, y0), (x1, y1)) in metres, two orders each."""
     ends = torch.tensor(lines, dtype=torch.float32).view(-1, 2, 2)
@@ -87,7 +72,10 @@ def make_samples(*ground_truths: InstanceData) -> list[Det3DDataSample]:
     samples = []
     for number, ground_truth in enumerate(ground_truths):
         sample = Det3DDataSample(
-            metainfo={"token": f"token-{number}", "lidar2img": ring_of_cameras()}
+            metainfo={
+                "token": f"token-{number}",
+                "lidar2img": ring_of_cameras(NUM_CAMS, *IMAGE_SHAPE),
+            }
         )
         sample.gt_instances_3d = ground_truth
         samples.append(sample)

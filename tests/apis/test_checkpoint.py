@@ -2,21 +2,12 @@ import json
 
 import pytest
 import torch
+from fuzz.attacks import Calls
 from mmengine.config import Config
 from torch import nn
 
 from gsmap.apis.checkpoint import adopt_settings, load_weights, read_weights
 from gsmap.checkpoints.settings import MODEL_SETTINGS, differences
-
-
-class Attack:
-    """Would create a file when unpickled without protection."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
 
 
 def save(path, content):
@@ -52,7 +43,7 @@ def test_other_size_is_named(tmp_path):
 def test_checkpoint_that_would_run_code_is_refused_and_nothing_runs(tmp_path):
     path = save(
         tmp_path / "attack.pth",
-        {"state_dict": {"w": torch.ones(1)}, "x": Attack(tmp_path / "proof")},
+        {"state_dict": {"w": torch.ones(1)}, "x": Calls(open, str(tmp_path / "proof"), "w")},
     )
     with pytest.raises(ValueError, match=r"attack.pth was not loaded: .*save its state_dict alone"):
         read_weights(path)

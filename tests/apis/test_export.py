@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from model_cases import build_small, ring_of_cameras
+from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from processes import run_python
 
+from benchmarks.model import ring_of_cameras
 from gsmap.apis.export import (
     ExportedDetector,
     export_onnx,
@@ -254,7 +255,8 @@ def small_inputs(exported, count=2):
     """Return random images of a ring of cameras."""
     generator = np.random.default_rng(0)
     images = generator.integers(0, 255, (count, 6, 64, 96, 3), dtype=np.uint8)
-    return [exported.prepare(each, {"lidar2img": ring_of_cameras()}) for each in images]
+    lidar2img = ring_of_cameras(NUM_CAMS, *IMAGE_SHAPE)
+    return [exported.prepare(each, {"lidar2img": lidar2img}) for each in images]
 
 
 def test_half_precision_and_8_bits_stay_close(small, tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz.attacks import Calls
 from pyquaternion import Quaternion
 
 from gsmap.converters.infos import convert_infos
@@ -171,12 +172,9 @@ def test_truth_beyond_the_range_is_refused_until_the_range_is_given(known, tmp_p
     np.testing.assert_allclose(file[0].instances[0].points, far["divider"][0])
 
 
-class RunsCode:
-    def __reduce__(self):
-        return os.system, ("touch /tmp/gsmap_was_here",)
-
-
-@pytest.mark.parametrize("content", [{"infos": [RunsCode()]}, {"infos": [Path("/")]}])
+@pytest.mark.parametrize(
+    "content", [{"infos": [Calls(os.system, "touch /tmp/gsmap_was_here")]}, {"infos": [Path("/")]}]
+)
 def test_a_pickle_that_runs_code_is_refused_unrun(content, tmp_path):
     marker = Path("/tmp/gsmap_was_here")
     marker.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from fuzz.attacks import Calls
 from mmengine.evaluator import BaseMetric, Evaluator
 from mmengine.fileio import get_file_backend
 from mmengine.logging import MessageHub
@@ -72,27 +73,17 @@ def test_a_message_hub_comes_back_with_weights_only(tmp_path):
     np.testing.assert_array_equal(history.data[0], [3.0, 2.0, 1.0])
 
 
-class Malicious:
-    def __reduce__(self):
-        return os.system, ("touch pwned",)
-
-
 def test_code_in_a_checkpoint_does_not_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    torch.save({"state_dict": Malicious()}, "bad.pth")
+    torch.save({"state_dict": Calls(os.system, "touch pwned")}, "bad.pth")
     with pytest.raises(pickle.UnpicklingError, match="Weights only load failed"):
         torch.load("bad.pth")
     assert not (tmp_path / "pwned").exists()
 
 
-class LooksUp:
-    def __reduce__(self):
-        return getattr, (np.dtype, "__init__")
-
-
 @pytest.mark.usefixtures("safe_globals")
 def test_a_checkpoint_may_not_look_up_anything_else(tmp_path):
-    torch.save({"state_dict": LooksUp()}, tmp_path / "bad.pth")
+    torch.save({"state_dict": Calls(getattr, np.dtype, "__init__")}, tmp_path / "bad.pth")
     with pytest.raises(pickle.UnpicklingError, match="must not look up '__init__'"):
         torch.load(tmp_path / "bad.pth")
 

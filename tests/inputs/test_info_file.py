@@ -4,19 +4,10 @@ from collections import OrderedDict
 import cv2
 import numpy as np
 import pytest
+from fuzz.attacks import Calls
 
 from gsmap.datasets.plain_pickle import load_plain_pickle
 from gsmap.inputs.info_file import read_info_file
-
-
-class Attack:
-    """Runs a function when it is unpickled by the ordinary unpickler."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
 
 
 def make_info(folder, cameras=("CAM_FRONT", "CAM_BACK"), **changes):
@@ -65,7 +56,7 @@ def test_plain_containers_and_numpy_values_are_read(tmp_path):
 def test_pickle_that_would_run_code_is_refused_and_nothing_runs(tmp_path):
     target = tmp_path / "proof"
     path = tmp_path / "attack.pkl"
-    path.write_bytes(pickle.dumps({"data_list": [Attack(target)]}))
+    path.write_bytes(pickle.dumps({"data_list": [Calls(open, str(target), "w")]}))
     with pytest.raises(ValueError, match=r"attack.pkl .*asks for io.open"):
         load_plain_pickle(path)
     assert not target.exists()

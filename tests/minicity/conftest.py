@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from nuscenes.nuscenes import NuScenes
 
 from minicity.generate import generate
 
@@ -16,3 +17,8 @@ def small_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         root, scenes=3, seed=28, image_size=SIZE, samples_per_scene=2, workers=0, progress=False
     )
     return root
+
+
+@pytest.fixture(scope="session")
+def nusc(small_root: Path) -> NuScenes:
+    return NuScenes("v1.0-trainval", str(small_root), verbose=False)

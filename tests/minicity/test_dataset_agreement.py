@@ -23,11 +23,6 @@ LOCATIONS = (
 
 
 @pytest.fixture(scope="module")
-def nusc(small_root: Path) -> NuScenes:
-    return NuScenes("v1.0-trainval", str(small_root), verbose=False)
-
-
-@pytest.fixture(scope="module")
 def maps(small_root: Path) -> dict[str, NuScenesMap]:
     return {name: NuScenesMap(str(small_root), name) for name in LOCATIONS}
 

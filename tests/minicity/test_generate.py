@@ -28,11 +28,6 @@ def digests(root: Path) -> dict[str, str]:
     return {str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
-@pytest.fixture(scope="module")
-def nusc(small_root: Path) -> NuScenes:
-    return NuScenes("v1.0-trainval", str(small_root), verbose=False)
-
-
 def test_devkit_finds_every_sensor_file_of_every_sample(nusc: NuScenes) -> None:
     assert len(nusc.sample) == 6
     for sample in nusc.sample:

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from head_cases import HEAD, along_y, bev, build_head, elements, with_layer
+from head_cases import HEAD, LANES, along_y, bev, build_head, elements, with_layer
 
 from gsmap.models.layers.self_attention import DecoupledSelfAttention, GeometryDecoupledAttention
 from gsmap.models.losses.geometry import EuclideanLoss
@@ -11,7 +11,6 @@ MAPTRV2 = {
     "decoder": with_layer(HEAD, self_attn={"type": "DecoupledSelfAttention"}),
     "query_groups": [{"num": 4}, {"name": "one2many", "num": 6, "repeats": 2}],
 }
-LANES = elements(((-3, -20), (-3, 20)), ((3, -20), (4, 20)), labels=[0, 2])
 
 
 @pytest.mark.parametrize("base", [HEAD, MAPTRV2], ids=["maptr", "maptrv2"])

@@ -5,6 +5,7 @@ from head_cases import (
     ALONG_Y,
     GSMAP,
     HEAD,
+    LANES,
     MASKS,
     along_y,
     bev,
@@ -22,7 +23,6 @@ from gsmap.structures.grid import BEVGrid
 SIX = {"query_groups": [{"num": 6}]}
 MAPTR, GSMAP = {**HEAD, **SIX}, {**GSMAP, **SIX}
 DECOUPLED = with_layer(HEAD, self_attn={"type": "DecoupledSelfAttention"})
-LANES = elements(((-3, -20), (-3, 20)), ((3, -20), (4, 20)), labels=[0, 2])
 EMPTY = elements()
 
 

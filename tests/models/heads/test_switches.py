@@ -5,6 +5,7 @@ import torch
 from head_cases import (
     GSMAP,
     HEAD,
+    LANES,
     MASKS,
     N,
     along_y,
@@ -17,7 +18,6 @@ from head_cases import (
     with_layer,
 )
 
-LANES = elements(((-3, -20), (-3, 20)), ((3, -20), (4, 20)), labels=[0, 2])
 SQUARE = elements(((-4, -4), (4, -4)), labels=[1])
 SQUARE.polylines = torch.tensor([[[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-4, -4]]])
 
