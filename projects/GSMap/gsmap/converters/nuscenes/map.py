@@ -184,18 +184,15 @@ class NuScenesLocalMap:
         ]
 
     def _polylines(self, name: str, patch: LocalPatch) -> list[Points]:
-        if name == "divider":
-            return self._cut(self._lines.near(patch), patch)
         if name == "boundary":
             return self._outlines.cut(patch, OUTLINE_MARGIN_M)
-        if name == "centerline":
+        if name in self._areas:
+            pieces = shapely.intersection(self._areas[name].near(patch), patch.polygon)
+            merged = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
+            return vertices_of(rings_of(merged[shapely.get_type_id(merged) == POLYGON]), 2)
+        if name == "divider":
+            lines = self._lines.near(patch)
+        else:
             near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
-            paths = self._lane_paths.simplified(near.tolist())
-            return self._cut(shapely.force_2d(paths), patch)
-        pieces = shapely.intersection(self._areas[name].near(patch), patch.polygon)
-        merged = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
-        return vertices_of(rings_of(merged[shapely.get_type_id(merged) == POLYGON]), 2)
-
-    def _cut(self, lines: np.ndarray, patch: LocalPatch) -> list[Points]:
-        """Return the parts of lines inside the patch, in the frame. each (n, 2)."""
+            lines = shapely.force_2d(self._lane_paths.simplified(near.tolist()))
         return vertices_of(patch.to_local(patch.lines_inside(lines)), 2)
