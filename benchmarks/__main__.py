@@ -17,6 +17,7 @@ COMMANDS = {
     "parameters": "parameters",
     "profile": "profile",
     "raster": "raster",
+    "shape": "shape",
     "step": "step",
 }
 
