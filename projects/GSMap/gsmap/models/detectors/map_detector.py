@@ -94,46 +94,46 @@ class MapDetector(Base3DDetector):
             feats = self.img_neck(feats)
         return [feat.unflatten(0, (len(imgs), -1)) for feat in feats]
 
-    def extract_feat(self, batch_inputs: Inputs, samples: Samples) -> dict[str, Tensor]:
+    def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return the BEV encoder's outputs: ``bev_feats`` (B, C, H, W) and what its losses need."""
         outputs: dict[str, Tensor] = {}
         if self.bev_encoder is not None:
             imgs = batch_inputs["imgs"]
             shape = {"batch_input_shape": tuple(imgs.shape[-2:])}
-            metas = [{**sample.metainfo, **shape} for sample in samples]
+            metas = [{**sample.metainfo, **shape} for sample in batch_data_samples]
             outputs = self.bev_encoder(self.extract_img_feats(imgs), metas)
         if self.lidar_encoder is not None:
-            feats = self.lidar_encoder(batch_inputs["voxels"], len(samples))
+            feats = self.lidar_encoder(batch_inputs["voxels"], len(batch_data_samples))
             if self.bev_fuser is not None:
                 feats = self.bev_fuser(outputs["bev_feats"], feats)
             outputs = {**outputs, "bev_feats": feats}
         return outputs
 
-    def loss(self, batch_inputs: Inputs, samples: Samples) -> dict[str, Tensor]:
+    def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return all losses; FloatingPointError, with the samples, if one is not finite."""
-        outputs = self.extract_feat(batch_inputs, samples)
-        losses = self.map_head.loss(outputs, samples)
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        losses = self.map_head.loss(outputs, batch_data_samples)
         # mmengine reads each loss anyway: no new synchronisation
         means = torch.stack([loss.detach().float().mean() for loss in losses.values()])
         finite = torch.isfinite(means).tolist()
         bad = [name for name, good in zip(losses, finite, strict=True) if not good]
         if bad:
-            tokens = [sample.metainfo.get("token", "unknown") for sample in samples]
+            tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
             raise FloatingPointError(
                 f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
                 "truth, then at the learning rate and at the loss scale of mixed precision."
             )
         return losses
 
-    def predict(self, batch_inputs: Inputs, samples: Samples) -> list[Det3DDataSample]:
+    def predict(self, batch_inputs: Inputs, batch_data_samples: Samples) -> list[Det3DDataSample]:
         """Add ``pred_instances_3d``, as the head's ``predict`` returns them, to the samples."""
-        outputs = self.extract_feat(batch_inputs, samples)
-        results = self.map_head.predict(outputs, samples)
-        return self.add_pred_to_datasample(samples, results)
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        results = self.map_head.predict(outputs, batch_data_samples)
+        return self.add_pred_to_datasample(batch_data_samples, results)
 
-    def _forward(self, batch_inputs: Inputs, samples: Samples) -> dict[str, Tensor]:
+    def _forward(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return the head's raw outputs."""
-        return self.map_head(self.extract_feat(batch_inputs, samples))
+        return self.map_head(self.extract_feat(batch_inputs, batch_data_samples))
 
     def _dump_init_info(self) -> None:
         """Log how each weight was initialised, which takes hundreds of lines, to debug only."""

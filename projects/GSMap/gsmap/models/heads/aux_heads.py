@@ -64,10 +64,10 @@ class BEVMaskHead(nn.Sequential):
             nn.Conv2d(embed_dims, num_masks, 1),
         )
 
-    def loss(self, bev_outputs: dict[str, Any], samples: Samples) -> Tensor:
+    def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> Tensor:
         """Return the weighted loss on the encoder's features."""
         feats = bev_outputs[self.feats]
-        target = _stack_targets(samples, self.target, feats.device)
+        target = _stack_targets(batch_data_samples, self.target, feats.device)
         target = target.reshape(-1, *target.shape[-3:])
         if self.num_masks == 1:
             target = target.amax(1, keepdim=True)
@@ -123,9 +123,9 @@ class DepthSupervision(nn.Module):
         super().__init__()
         self.loss_weight, self.name = loss_weight, name
 
-    def loss(self, bev_outputs: dict[str, Any], samples: Samples) -> Tensor:
+    def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> Tensor:
         """Return the loss on ``depth`` (B, V, D, h, w), probabilities of ``depth_range``'s bins."""
         probs, depth_range = bev_outputs["depth"], bev_outputs["depth_range"]
-        target = _stack_targets(samples, "gt_depth", probs.device)
+        target = _stack_targets(batch_data_samples, "gt_depth", probs.device)
         bins = depth_bins(target, target.shape[-1] // probs.shape[-1], depth_range)
         return self.loss_weight * depth_loss(probs, bins)

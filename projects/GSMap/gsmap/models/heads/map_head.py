@@ -215,15 +215,18 @@ class MapHead(BaseModule):
             "bev_feats": bev_feats,
         }
 
-    def loss(self, bev_outputs: Tensors, samples: Samples) -> Tensors:
+    def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
         """Run the head and return its losses, those of the auxiliary heads included."""
-        gts, metas = [s.gt_instances_3d for s in samples], [s.metainfo for s in samples]
+        gts = [sample.gt_instances_3d for sample in batch_data_samples]
+        metas = [sample.metainfo for sample in batch_data_samples]
         losses = self.loss_by_feat(self(bev_outputs), gts, metas)
         for name, head in self.aux_heads.items():
-            losses[f"loss_{name}"] = cast(Any, head).loss(bev_outputs, samples)
+            losses[f"loss_{name}"] = cast(Any, head).loss(bev_outputs, batch_data_samples)
         return losses
 
-    def loss_by_feat(self, outputs: Tensors, gt_instances: Instances, metas: Metas) -> Tensors:
+    def loss_by_feat(
+        self, outputs: Tensors, batch_gt_instances: Instances, batch_img_metas: Metas
+    ) -> Tensors:
         """Prepare the ground truth and return the losses of every decoder layer and query group.
 
         Ground truth is, per sample, ``labels_3d`` (K,), ``pts`` (K, P, 2), ``pts_shifts`` (K, S, P,
@@ -235,9 +238,9 @@ class MapHead(BaseModule):
         """
         losses: Tensors = {}
         with torch.autocast(outputs["all_pts_preds"].device.type, enabled=False):
-            gts = [self.prepare_gt(gt) for gt in gt_instances]
+            gts = [self.prepare_gt(gt) for gt in batch_gt_instances]
             for group, own in self.split_groups(outputs):
-                losses.update(self.group_losses(group, own, gts, metas))
+                losses.update(self.group_losses(group, own, gts, batch_img_metas))
         return losses
 
     def split_groups(self, outputs: Tensors) -> Iterator[tuple[QueryGroup, Tensors]]:
@@ -337,11 +340,12 @@ class MapHead(BaseModule):
         """Return figures to log beside the losses; their names do not start with ``loss``."""
         return {}
 
-    def predict(self, bev_outputs: Tensors, samples: Samples) -> list[InstanceData]:
+    def predict(self, bev_outputs: Tensors, batch_data_samples: Samples) -> list[InstanceData]:
         """Run the head and return its detections."""
-        return self.predict_by_feat(self(bev_outputs), [sample.metainfo for sample in samples])
+        metas = [sample.metainfo for sample in batch_data_samples]
+        return self.predict_by_feat(self(bev_outputs), metas)
 
-    def predict_by_feat(self, outputs: Tensors, metas: Metas) -> list[InstanceData]:
+    def predict_by_feat(self, outputs: Tensors, batch_img_metas: Metas) -> list[InstanceData]:
         """Decode the last layer's predictions, best first.
 
         They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,), ``pts`` (M, P, 2) in metres
