@@ -52,6 +52,14 @@ def test_the_guided_attention_is_as_large_as_maptrs_and_drops_as_much():
     assert shapes[0] == shapes[1]
 
 
+def test_the_points_get_another_weight_in_loss_and_matching():
+    head, lighter = (build_head(GSMAP, **kw) for kw in ({}, {"points_weight": 1.0}))
+    assert (head.losses["pts"].loss_weight, lighter.losses["pts"].loss_weight) == (5.0, 1.0)
+    costs = [[cost.weight for cost in h.assigner.match_costs] for h in (head, lighter)]
+    assert costs[0][1:] == [5.0, 2.0]
+    assert costs[1] == [costs[0][0], 1.0, 2.0]
+
+
 def test_the_older_form_of_a_gsmap_config_builds_the_same_head():
     """The README's lines name every part; the head's own defaults are these."""
     older = build_head(

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsmap.models.heads.map_head import PARTS, MapHead
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.matched import MatchedPairs
-from gsmap.models.heads.parts import switched
+from gsmap.models.heads.parts import switched, weighted
 from gsmap.structures.gaussians import AT_FLOOR, Gaussians, extents_along_line
 from gsmap.structures.grid import BEVGrid
 
@@ -27,6 +27,8 @@ class GSMapHead(MapHead):
         loss_raster: Settings of the loss of the rendered masks, or None to train without it; what
             they leave out is as by default.
         iou_cost: The same of the matching cost of the rendered masks.
+        points_weight: Weight of the points in losses and in matching (the paper's lambda_v), or
+            None to leave those of ``losses`` and ``match_costs``.
         reference: Settings of `GaussianReference`; its smallest sigma is half a pixel of the masks
             by default.
     """
@@ -39,6 +41,7 @@ class GSMapHead(MapHead):
         match_costs: Sequence[PARTS],
         loss_raster: PARTS | None = {"loss_weight": 10.0},  # noqa: B006
         iou_cost: PARTS | None = {"weight": 2.0},  # noqa: B006
+        points_weight: float | None = None,
         masks: PARTS | None = None,
         reference: PARTS | None = None,
         **kwargs: Any,
@@ -53,6 +56,8 @@ class GSMapHead(MapHead):
             "min_scale_m": smallest,
             "init_scales_m": (max(1.0, 3 * smallest), max(0.4, 1.5 * smallest)),
         }
+        losses = weighted(losses, "PointsLoss", "loss_weight", points_weight)
+        match_costs = weighted(match_costs, "OrderedPointsCost", "weight", points_weight)
         super().__init__(
             grid=grid,
             decoder={**decoder, "layer": {**guided, **decoder.get("layer", {})}},

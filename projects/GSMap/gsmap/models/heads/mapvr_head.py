@@ -7,7 +7,7 @@ from mmdet3d.registry import MODELS
 
 from gsmap.models.heads.map_head import PARTS, MapHead
 from gsmap.models.heads.masks import ElementMasks
-from gsmap.models.heads.parts import switched
+from gsmap.models.heads.parts import switched, weighted
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 
@@ -63,12 +63,12 @@ class MapVRHead(MapHead):
         size, cost_size = ((g.height, g.width) for g in (rasters.grid, rasters.cost_grid))
         kept = [loss for loss in losses if loss["type"] != "DirectionLoss"]
         losses = [
-            *_weighted(kept, "PointsLoss", "loss_weight", points_weight),
+            *weighted(kept, "PointsLoss", "loss_weight", points_weight),
             *switched("SelfDirectionLoss", loss_direction),
             *switched("RenderedDiceLoss", loss_dice, size=size, **shared),
         ]
         match_costs = [
-            *_weighted(match_costs, "OrderedPointsCost", "weight", points_weight),
+            *weighted(match_costs, "OrderedPointsCost", "weight", points_weight),
             *switched("RenderedDiceCost", dice_cost, size=cost_size, **shared),
         ]
         super().__init__(
@@ -80,8 +80,3 @@ class MapVRHead(MapHead):
             masks=masks,
             **kwargs,
         )
-
-
-def _weighted(parts: Sequence[PARTS], kind: str, name: str, weight: float) -> list[PARTS]:
-    """Return configs of parts, with another weight in those of one type."""
-    return [{**part, name: weight} if part["type"] == kind else part for part in parts]

@@ -22,6 +22,15 @@ def switched(kind: str, settings: dict[str, Any] | None, **defaults: Any) -> lis
     return [] if settings is None else [{"type": kind, **defaults, **settings}]
 
 
+def weighted(
+    parts: Sequence[dict[str, Any]], kind: str, name: str, weight: float | None
+) -> list[dict[str, Any]]:
+    """Return configs of parts, with another weight in those of one type unless it is None."""
+    if weight is None:
+        return list(parts)
+    return [{**part, name: weight} if part["type"] == kind else part for part in parts]
+
+
 def check_parts(head: "MapHead") -> set[str]:
     """Return the fields (``pred.<name>``, ``gt.<name>``) that a head's losses and costs read.
 
