@@ -1,7 +1,7 @@
 """How straight predicted lines are: what neither metric sees.
 
-AP_chamfer and AP_raster compare sets of points and pixels. A line whose points run back and forth along
-its ground truth scores as well as one that follows it.
+AP_chamfer and AP_raster compare sets of points and pixels. A line whose points run back and forth
+along its ground truth scores as well as one that follows it.
 """
 
 import argparse
