@@ -45,7 +45,8 @@ class VectorizedMapDataset(BaseDataset):
             another one in its place, and counts and logs it (in training only).
         max_refetch: How many samples in a row may be skipped.
         indices: Of the samples that are left, the first N, the last -N, or the listed ones.
-        **options: ``lazy_init`` and ``serialize_data`` of mmengine's ``BaseDataset``.
+        lazy_init: As in mmengine's ``BaseDataset``.
+        serialize_data: As in mmengine's ``BaseDataset``.
 
     Raises:
         FileNotFoundError: If there is no annotation file.
@@ -69,7 +70,8 @@ class VectorizedMapDataset(BaseDataset):
         broken_samples: str = "raise",
         max_refetch: int = 100,
         indices: int | Sequence[int] | None = None,
-        **options: bool,
+        lazy_init: bool = False,
+        serialize_data: bool = True,
     ) -> None:
         if broken_samples not in _BROKEN:
             raise ValueError(f"broken_samples must be one of {_BROKEN}, got {broken_samples!r}.")
@@ -102,7 +104,8 @@ class VectorizedMapDataset(BaseDataset):
             test_mode=test_mode,
             max_refetch=max_refetch,
             indices=indices,
-            **options,
+            lazy_init=lazy_init,
+            serialize_data=serialize_data,
         )
 
     def load_data_list(self) -> list[dict[str, int]]:
