@@ -69,8 +69,10 @@ def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
 class RenderedDiceLoss(nn.Module):
     """Dice loss between softly rendered predictions and ground truths (MapVR, section 4.3).
 
-    ``size`` are rows and columns of the rasters, ``rendering`` further settings of
-    `ElementRenderer`.
+    Args:
+        loss_weight: Weight of the loss.
+        size: Rows H and columns W of the rasters.
+        rendering: Further settings of `ElementRenderer`.
     """
 
     name = "dice"

@@ -76,7 +76,10 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
 class EuclideanLoss(nn.Module):
     """GeMap's Euclidean loss of matched elements, of their shapes and of their relations.
 
-    ``loss_weight`` is the lambda of the supplement's Table A1; the other weights are within it.
+    Args:
+        loss_weight: Weight of the whole (lambda of the supplement's Table A1).
+        shape_weight: Weight of the shapes within it.
+        relation_weight: Weight of the relations within it.
     """
 
     name = "euclidean"

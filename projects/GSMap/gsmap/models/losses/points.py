@@ -16,7 +16,11 @@ def check_same_shape(**both: Tensor) -> None:
 
 
 class PointsLoss(nn.Module):
-    """L1 distance of the points of matched pairs (MapTR Eq. 6, GSMap Eq. 11: weight lambda_v)."""
+    """L1 distance of the points of matched pairs (MapTR Eq. 6, GSMap Eq. 11).
+
+    Args:
+        loss_weight: Weight of the loss (lambda_v).
+    """
 
     name = "pts"
     reads: tuple[str, ...] = ("pred.pts", "gt.pts")
@@ -49,6 +53,9 @@ class DirectionLoss(PointsLoss):
     """One minus the cosine between the edges of matched pairs (MapTR Eq. 7).
 
     Closed shapes need no extra edge: their last point is their first.
+
+    Args:
+        loss_weight: Weight of the loss.
     """
 
     name = "dir"
@@ -64,20 +71,24 @@ class DirectionLoss(PointsLoss):
         return self.loss_weight * (turns / avg_factor)
 
 
-class SelfDirectionLoss(PointsLoss):
+class SelfDirectionLoss(nn.Module):
     """One minus the cosine between consecutive edges of a prediction (MapVR Eq. 4).
 
     It keeps predictions from folding back where nothing but their rendering is supervised. Both
     edges of a pair get a gradient; a ring's last edge and its first are no pair.
+
+    Args:
+        loss_weight: Weight of the loss.
     """
 
     name = "dir"
     reads = ("pred.pts_m",)
 
     def __init__(self, loss_weight: float = 0.002) -> None:
-        super().__init__(loss_weight)
+        super().__init__()
+        self.loss_weight = loss_weight
 
-    def forward(self, pred: Tensor, avg_factor: float | Tensor) -> Tensor:  # type: ignore[override]
+    def forward(self, pred: Tensor, avg_factor: float | Tensor) -> Tensor:
         """Return the weighted sum over ``avg_factor`` of points in metres. (M, P, 2 or 3) -> ()"""
         # Differs from MapVR Eq. (4), which sums the cosines: their sign would reward folding.
         edges = pred.diff(dim=1)

@@ -47,10 +47,16 @@ def instance_mask_losses(
 class InstanceMaskLoss(nn.Module):
     """Masks of matched instances, by the product of their states and the BEV features (MGMapNet).
 
-    ``loss_weight`` is that of the cross-entropy. With ``pairing`` ``"matched"`` each query is
-    compared with the mask of its own ground truth; with ``"released"``, as in MGMapNet's released
-    code, the i-th matched query with the i-th ground truth, which is right only if the matching
-    happens to be sorted. ValueError if it is unknown.
+    Args:
+        embed_dims: Channels C of the states and of the BEV features.
+        loss_weight: Weight of the cross-entropy.
+        dice_weight: Weight of the dice loss.
+        pairing: ``"matched"`` compares each query with the mask of its own ground truth;
+            ``"released"``, as MGMapNet's released code, the i-th matched query with the i-th ground
+            truth, which is right only if the matching happens to be sorted.
+
+    Raises:
+        ValueError: If ``pairing`` is unknown.
     """
 
     name = "ins_seg"

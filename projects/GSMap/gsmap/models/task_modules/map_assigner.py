@@ -22,8 +22,12 @@ class MapMatch(NamedTuple):
 class MapAssigner:
     """Hungarian assignment under summed costs, then each pair's point order (MapTR Eqs. 3-5).
 
-    A cost is called with predictions, ground truth and the meta dict and returns (N, K). ValueError
-    if there is none.
+    Args:
+        match_costs: Configs of the costs. Each is called with predictions, ground truth and the
+            meta dict and returns (N, K).
+
+    Raises:
+        ValueError: If there is no cost.
     """
 
     def __init__(self, match_costs: Sequence[dict[str, Any]]) -> None:

@@ -29,7 +29,11 @@ def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
 
 @TASK_UTILS.register_module()
 class OrderedPointsCost:
-    """L1 distance to the closest equivalent point order (MapTR Eq. 5), times a weight."""
+    """L1 distance to the closest equivalent point order (MapTR Eq. 5).
+
+    Args:
+        weight: Weight of the cost.
+    """
 
     reads = ("pred.pts", "gt.pts_shifts")
 
@@ -47,8 +51,12 @@ class OrderedPointsCost:
 class IoUCost:
     """Cost of the overlap of the rasters that the head has rendered (GSMap Eq. 9).
 
-    It is, times ``weight``, with ``kind`` ``"iou"`` 1 - sum min / sum max, with ``"dice"`` MapVR's
-    dice loss. ValueError if ``kind`` is unknown.
+    Args:
+        weight: Weight of the cost.
+        kind: ``"iou"`` for 1 - sum min / sum max, ``"dice"`` for MapVR's dice loss.
+
+    Raises:
+        ValueError: If ``kind`` is unknown.
     """
 
     reads = ("pred.rasters", "gt.rasters")
@@ -78,8 +86,10 @@ class IoUCost:
 class RenderedDiceCost:
     """Dice loss of softly rendered points, each pair rendered as the ground truth's class (MapVR).
 
-    ``size`` are rows and columns of the rasters, ``rendering`` further settings of
-    `ElementRenderer`.
+    Args:
+        weight: Weight of the cost.
+        size: Rows H and columns W of the rasters.
+        rendering: Further settings of `ElementRenderer`.
     """
 
     reads = ("pred.pts", "gt.first_pts", "gt.labels")
