@@ -1,7 +1,4 @@
-"""Every reader of files with something whole to read, and what of its results can be checked.
-
-One list of all readers, over 400 lines: a reader that is missing would not be seen in several.
-"""
+"""Every reader of files with something whole to read, and what of its results can be checked."""
 
 import json
 import pickle
@@ -23,7 +20,7 @@ from mmdet3d.registry import DATASETS
 from mmengine.config import Config
 from pyarrow.feather import write_feather
 
-from fuzz import mutations
+from fuzz import contents, mutations
 from gsmap.apis.checkpoint import read_weights
 from gsmap.converters.argoverse2.samples import Argoverse2Options, read_log
 from gsmap.converters.custom import from_records
@@ -131,93 +128,6 @@ def _implausible_sample(sample: MapSample) -> str:
     return "" if all(np.isfinite(k).all() for k in calibrations) else "calibration not finite"
 
 
-def info_v2(sample: MapSample) -> dict[str, Any]:
-    """Return mmdet3d's info file of a sample."""
-    images = {
-        c.name: {"img_path": c.path, "cam2img": c.intrinsics.tolist(),
-                 "lidar2cam": c.cam_from_frame.tolist()}
-        for c in sample.cameras
-    }  # fmt: skip
-    lidar = {"lidar2ego": sample.ego_from_frame.tolist(), "lidar_path": sample.lidar.path}
-    pose = sample.global_from_frame @ np.linalg.inv(sample.ego_from_frame)
-    entry = {"token": "t", "timestamp": 1.5, "images": images, "lidar_points": lidar,
-             "ego2global": pose, "sample_idx": 0}  # fmt: skip
-    return {"metainfo": {}, "data_list": [entry]}
-
-
-def info_of_maptr(sample: MapSample) -> dict[str, Any]:
-    """Return MapTRv2's info file of a sample."""
-
-    def sensor(path: str, frame_from_sensor: np.ndarray) -> dict[str, Any]:
-        return {
-            "data_path": path,
-            "sensor2lidar_rotation": frame_from_sensor[:3, :3],
-            "sensor2lidar_translation": frame_from_sensor[:3, 3].tolist(),
-            "timestamp": 5,
-        }
-
-    lines: dict[str, list[Any]] = {name: [] for name in LIDAR_META.classes}
-    for instance in sample.instances:
-        lines[LIDAR_META.classes[instance.label]].append(instance.points.astype(float).tolist())
-    entry = {
-        "token": "t", "timestamp": 7, "map_location": "town", "scene_token": "s",
-        "lidar_path": sample.lidar.path, "can_bus": np.zeros(18), "annotation": lines,
-        "lidar2ego_translation": [0.0, 0.0, 1.8], "lidar2ego_rotation": [1.0, 0.0, 0.0, 0.0],
-        "ego2global_translation": [5.0, 6.0, 0.0], "ego2global_rotation": [1.0, 0.0, 0.0, 0.0],
-        "sweeps": [sensor(s.path, s.frame_from_lidar) for s in sample.lidar.sweeps],
-        "cams": {
-            c.name: sensor(c.path, np.linalg.inv(c.cam_from_frame))
-            | {"cam_intrinsic": c.intrinsics.tolist()}
-            for c in sample.cameras
-        },
-    }  # fmt: skip
-    return {"infos": [entry], "metadata": {"version": "x"}}
-
-
-def info_of_argoverse2(sample: MapSample) -> dict[str, Any]:
-    """Return MapTRv2's info file of a sample of Argoverse 2."""
-    turn = {"e2g_translation": [5.0, 6.0, 0.0], "e2g_rotation": [1.0, 0.0, 0.0, 0.0]}
-    lines: dict[str, list[Any]] = {name: [] for name in EGO_META.classes}
-    for instance in sample.instances:  # along x, as the range is
-        points = instance.points[:, ::-1].astype(float).tolist()
-        lines[EGO_META.classes[instance.label]].append(points)
-    cameras = {
-        c.name: {"img_fpath": c.path, "intrinsics": c.intrinsics.tolist(),
-                 "extrinsics": c.cam_from_frame.tolist(), **turn}
-        for c in sample.cameras
-    }  # fmt: skip
-    entry = {"token": "t", "log_id": "l", "timestamp": 7, "lidar_path": sample.lidar.path,
-             "cams": cameras, "annotation": lines, **turn}  # fmt: skip
-    return {"samples": [entry]}
-
-
-def own_calibration(sample: MapSample) -> dict[str, Any]:
-    """Return a calibration file for the images of a sample."""
-    cameras = {
-        c.name: {"images": c.path, "intrinsics": c.intrinsics.tolist(),
-                 "vehicle_from_camera": np.linalg.inv(c.cam_from_frame).tolist()}
-        for c in sample.cameras
-    }  # fmt: skip
-    return {"cameras": cameras, "ground_z_m": 0.1}
-
-
-def own_record(sample: MapSample) -> dict[str, Any]:
-    """Return a sample as a plain record."""
-    cameras = [
-        {"name": c.name, "path": c.path, "width": c.width, "height": c.height,
-         "intrinsics": c.intrinsics.tolist(), "cam_from_frame": c.cam_from_frame.tolist()}
-        for c in sample.cameras
-    ]  # fmt: skip
-    lines = [{"label": i.label, "points": i.points.tolist()} for i in sample.instances]
-    return {"token": "t", "cameras": cameras, "instances": lines, "timestamp_ns": 5}
-
-
-def _written(work: Path, meta: AnnotationMeta, samples: Any) -> list[MapSample]:
-    """Write samples, as every converter does at its end, and read them."""
-    write_annotations(work / "written.arrow", meta, samples)
-    return list(AnnotationFile(work / "written.arrow"))
-
-
 class Files:
     """A folder with a whole file for each reader.
 
@@ -246,10 +156,12 @@ class Files:
         made = {
             "annotation file, its bytes": lambda: self.annotations(byte, exact=True),
             "annotation file, its values": lambda: self.annotations(mutations.damaged_rows),
-            "info file of mmdet3d": lambda: self.pickle("v2.pkl", info_v2, read_info_file),
-            "info file of MapTRv2": lambda: self.pickle("maptr.pkl", info_of_maptr, self.infos),
+            "info file of mmdet3d": lambda: self.pickle("v2.pkl", contents.info_v2, read_info_file),
+            "info file of MapTRv2": lambda: self.pickle(
+                "maptr.pkl", contents.info_of_maptr, self.infos
+            ),
             "info file of MapTRv2, Argoverse 2": lambda: self.pickle(
-                "av2.pkl", info_of_argoverse2, self.infos
+                "av2.pkl", contents.info_of_argoverse2, self.infos
             ),
             "own records": self.records,
             "calibration of own images": self.calibration,
@@ -297,7 +209,7 @@ class Files:
         return list(AnnotationFile(self.work / "infos.arrow"))
 
     def records(self) -> Reader:
-        path = self.put("own.pkl", pickle.dumps(own_record(self.sample)))
+        path = self.put("own.pkl", pickle.dumps(contents.own_record(self.sample)))
 
         def read() -> list[MapSample]:
             records = [pickle.loads(path.read_bytes())]
@@ -307,7 +219,7 @@ class Files:
         return Reader(path, read, (mutations.damaged_pickle,))
 
     def calibration(self) -> Reader:
-        content = json.dumps(own_calibration(self.sample)).encode()
+        content = json.dumps(contents.own_calibration(self.sample)).encode()
         path = self.put("calibration.json", content)
 
         def read() -> list[MapSample]:

@@ -1,0 +1,88 @@
+"""One sample as the files of other programs and of users hold it, for the readers of such files."""
+
+from typing import Any
+
+import numpy as np
+
+from gsmap.datasets.annotations.record import CLASSES, MapSample
+
+
+def info_v2(sample: MapSample) -> dict[str, Any]:
+    """Return mmdet3d's info file of a sample."""
+    images = {
+        c.name: {"img_path": c.path, "cam2img": c.intrinsics.tolist(),
+                 "lidar2cam": c.cam_from_frame.tolist()}
+        for c in sample.cameras
+    }  # fmt: skip
+    lidar = {"lidar2ego": sample.ego_from_frame.tolist(), "lidar_path": sample.lidar.path}
+    pose = sample.global_from_frame @ np.linalg.inv(sample.ego_from_frame)
+    entry = {"token": "t", "timestamp": 1.5, "images": images, "lidar_points": lidar,
+             "ego2global": pose, "sample_idx": 0}  # fmt: skip
+    return {"metainfo": {}, "data_list": [entry]}
+
+
+def info_of_maptr(sample: MapSample) -> dict[str, Any]:
+    """Return MapTRv2's info file of a sample."""
+
+    def sensor(path: str, frame_from_sensor: np.ndarray) -> dict[str, Any]:
+        return {
+            "data_path": path,
+            "sensor2lidar_rotation": frame_from_sensor[:3, :3],
+            "sensor2lidar_translation": frame_from_sensor[:3, 3].tolist(),
+            "timestamp": 5,
+        }
+
+    lines: dict[str, list[Any]] = {name: [] for name in CLASSES}
+    for instance in sample.instances:
+        lines[CLASSES[instance.label]].append(instance.points.astype(float).tolist())
+    entry = {
+        "token": "t", "timestamp": 7, "map_location": "town", "scene_token": "s",
+        "lidar_path": sample.lidar.path, "can_bus": np.zeros(18), "annotation": lines,
+        "lidar2ego_translation": [0.0, 0.0, 1.8], "lidar2ego_rotation": [1.0, 0.0, 0.0, 0.0],
+        "ego2global_translation": [5.0, 6.0, 0.0], "ego2global_rotation": [1.0, 0.0, 0.0, 0.0],
+        "sweeps": [sensor(s.path, s.frame_from_lidar) for s in sample.lidar.sweeps],
+        "cams": {
+            c.name: sensor(c.path, np.linalg.inv(c.cam_from_frame))
+            | {"cam_intrinsic": c.intrinsics.tolist()}
+            for c in sample.cameras
+        },
+    }  # fmt: skip
+    return {"infos": [entry], "metadata": {"version": "x"}}
+
+
+def info_of_argoverse2(sample: MapSample) -> dict[str, Any]:
+    """Return MapTRv2's info file of a sample of Argoverse 2."""
+    turn = {"e2g_translation": [5.0, 6.0, 0.0], "e2g_rotation": [1.0, 0.0, 0.0, 0.0]}
+    lines: dict[str, list[Any]] = {name: [] for name in CLASSES}
+    for instance in sample.instances:  # along x, as the range is
+        points = instance.points[:, ::-1].astype(float).tolist()
+        lines[CLASSES[instance.label]].append(points)
+    cameras = {
+        c.name: {"img_fpath": c.path, "intrinsics": c.intrinsics.tolist(),
+                 "extrinsics": c.cam_from_frame.tolist(), **turn}
+        for c in sample.cameras
+    }  # fmt: skip
+    entry = {"token": "t", "log_id": "l", "timestamp": 7, "lidar_path": sample.lidar.path,
+             "cams": cameras, "annotation": lines, **turn}  # fmt: skip
+    return {"samples": [entry]}
+
+
+def own_calibration(sample: MapSample) -> dict[str, Any]:
+    """Return a calibration file for the images of a sample."""
+    cameras = {
+        c.name: {"images": c.path, "intrinsics": c.intrinsics.tolist(),
+                 "vehicle_from_camera": np.linalg.inv(c.cam_from_frame).tolist()}
+        for c in sample.cameras
+    }  # fmt: skip
+    return {"cameras": cameras, "ground_z_m": 0.1}
+
+
+def own_record(sample: MapSample) -> dict[str, Any]:
+    """Return a sample as a plain record."""
+    cameras = [
+        {"name": c.name, "path": c.path, "width": c.width, "height": c.height,
+         "intrinsics": c.intrinsics.tolist(), "cam_from_frame": c.cam_from_frame.tolist()}
+        for c in sample.cameras
+    ]  # fmt: skip
+    lines = [{"label": i.label, "points": i.points.tolist()} for i in sample.instances]
+    return {"token": "t", "cameras": cameras, "instances": lines, "timestamp_ns": 5}
