@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from gsmap.converters.argoverse2.log import PoseTable, find_logs
+from gsmap.converters.argoverse2.log import Argoverse2Log, find_logs
 from gsmap.converters.argoverse2.map import MAP_CLASSES, Argoverse2Map
 
 _SETS = {
@@ -37,7 +37,7 @@ def measure_extraction(root: Path, split: str = "val", stride: int = 10) -> dict
     frames = [
         (log_map, pose)
         for log_map, log_dir in zip(maps, log_dirs, strict=True)
-        for pose in PoseTable.read(log_dir).city_from_ego[::stride]
+        for pose in list(Argoverse2Log(log_dir).poses.values())[::stride]
     ]
 
     def per_frame(extract: Callable[..., object]) -> float:

@@ -1,7 +1,6 @@
 """The folder of one Argoverse 2 log: poses, calibration, and when each sensor fired."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from av2.utils.synchronization_database import SynchronizationDB
 from pyarrow import feather
 
 from gsmap.datasets.errors import naming
+from gsmap.structures.rigid import rigid
 from gsmap.utils.files import SUFFIX as PARTIAL
 
 # The order of MapTR and MapTRv2: camera embeddings of their checkpoints depend on it.
@@ -36,17 +36,28 @@ MAP_CHANGE_LOGS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class PoseTable:
-    """The vehicle's poses by time, which ascends strictly. (n,), (n, 4, 4)"""
+def _read_feather(path: Path) -> Any:
+    """Read a table; ``ArrowException`` if it is damaged, which might end the process later."""
+    table = feather.read_table(path, memory_map=False)
+    table.validate(full=True)
+    return table.to_pandas()
 
-    timestamps_ns: np.ndarray
-    city_from_ego: np.ndarray
 
-    @classmethod
-    def read(cls, log_dir: Path) -> "PoseTable":
-        """Read the table of a log's folder; ValueError if it is damaged or a pose is not finite."""
-        path = log_dir / POSES
+class Argoverse2Log:
+    """One log's folder, named by its id, read on demand."""
+
+    def __init__(self, log_dir: Path) -> None:
+        self.log_dir, self.log_id = log_dir, log_dir.name
+
+    @cached_property
+    def poses(self) -> dict[int, np.ndarray]:
+        """The vehicle's poses in the city by time, which ascends. each (4, 4)
+
+        Raises:
+            FileNotFoundError: If there is no table of them.
+            ValueError: If it is damaged or a pose is not finite.
+        """
+        path = self.log_dir / POSES
         if not path.is_file():
             raise FileNotFoundError(f"no poses at {path}: download the log again.")
         with naming(path, "download the log again"):
@@ -58,38 +69,8 @@ class PoseTable:
             good &= np.isfinite(translations).all(1)
             if not good.all() or len(table) == 0:
                 raise ValueError(f"it holds {int((~good).sum())} bad of {len(table)} poses")
-        poses = np.tile(np.eye(4), (len(table), 1, 1))
-        poses[:, :3, :3] = quat_to_mat(quaternions)
-        poses[:, :3, 3] = translations
-        return cls(table["timestamp_ns"].to_numpy(np.int64), poses)
-
-    def at(self, timestamp_ns: int) -> np.ndarray | None:
-        """Return the pose at exactly this time, or None where the table has no such row. (4, 4)"""
-        row = int(np.searchsorted(self.timestamps_ns, timestamp_ns))
-        if row == len(self.timestamps_ns) or self.timestamps_ns[row] != timestamp_ns:
-            return None
-        return self.city_from_ego[row]
-
-
-def _read_feather(path: Path) -> Any:
-    """Read a table; ``ArrowException`` if it is damaged, which might end the process later."""
-    table = feather.read_table(path, memory_map=False)
-    table.validate(full=True)
-    return table.to_pandas()
-
-
-class Argoverse2Log:
-    """One log's folder, named by its id, read on demand; a FileNotFoundError if it is not there."""
-
-    def __init__(self, log_dir: Path) -> None:
-        if not log_dir.is_dir():
-            raise FileNotFoundError(f"no log folder {log_dir}.")
-        self.log_dir, self.log_id = log_dir, log_dir.name
-
-    @cached_property
-    def poses(self) -> PoseTable:
-        """The vehicle's poses."""
-        return PoseTable.read(self.log_dir)
+            times = table["timestamp_ns"].to_numpy(np.int64).tolist()
+        return dict(zip(times, map(rigid, quat_to_mat(quaternions), translations), strict=True))
 
     @cached_property
     def city(self) -> str:

@@ -95,7 +95,7 @@ def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -
 def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
     """Return when samples are, in nanoseconds, ascending; ValueError if sensor data lack. (n,)"""
     if options.pose_stride is not None:
-        return log.poses.timestamps_ns[:: options.pose_stride]
+        return np.array(list(log.poses))[:: options.pose_stride]
     missing = [name for name in RING_CAMERAS if name not in log.calibration]
     if missing:
         which = ", ".join(missing) if log.calibration else "the ring cameras"
@@ -132,7 +132,7 @@ def _sample(
     log: Argoverse2Log, log_map: Argoverse2Map | None, timestamp_ns: int, options: Argoverse2Options
 ) -> MapSample:
     """Make the sample at a time, or raise ``_LeftOut``."""
-    city_from_ego = log.poses.at(timestamp_ns)
+    city_from_ego = log.poses.get(timestamp_ns)
     if city_from_ego is None:
         raise _LeftOut("no pose at the sample's time")
     sample = MapSample(
@@ -163,7 +163,7 @@ def _cameras(
     folder = (log.log_dir / "sensors/cameras").relative_to(options.root).as_posix()
     for name, camera in log.calibration.items():
         image_ns = closest_ns(log.image_timestamps_ns[name], timestamp_ns, MAX_CAMERA_OFFSET_NS)
-        city_from_ego_then = None if image_ns is None else log.poses.at(image_ns)
+        city_from_ego_then = None if image_ns is None else log.poses.get(image_ns)
         if city_from_ego_then is None:
             if options.pose_stride is None:
                 limit = MAX_CAMERA_OFFSET_NS / 1e6
@@ -181,13 +181,13 @@ def _lidar(
     """Return the closest sweep and the ones before it; sweeps are stored in the ego frame."""
     times = log.lidar_timestamps_ns
     sweep_ns = closest_ns(times, timestamp_ns, MAX_LIDAR_OFFSET_NS)
-    if sweep_ns is None or log.poses.at(sweep_ns) is None:
+    if sweep_ns is None or sweep_ns not in log.poses:
         return None
     folder = log.log_dir.relative_to(options.root).as_posix()
     last = int(np.searchsorted(times, sweep_ns))
     sweep, *earlier = (
-        SweepRecord(f"{folder}/sensors/lidar/{time}.feather", time, ego_from_city @ pose)
+        SweepRecord(f"{folder}/sensors/lidar/{time}.feather", time, ego_from_city @ log.poses[time])
         for time in times[max(last - options.max_sweeps, 0) : last + 1][::-1].tolist()
-        if (pose := log.poses.at(time)) is not None
+        if time in log.poses
     )
     return LidarRecord(sweep.path, sweep.frame_from_lidar, earlier)
