@@ -17,7 +17,6 @@ def test_split_files_are_checked(tmp_path: Path):
         ("[", "not JSON"),
         ('["a"]', "must look like"),
         ('{"train": "a"}', "must look like"),
-        ('{"train": ["a"], "val": ["a"]}', "scene a is in both train and val"),
     ]:
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -31,6 +30,9 @@ def test_scenes_resolve_by_name_or_token_in_the_data_set_s_order():
     resolved, missing = resolve_scenes({"train": ["two", "t1"], "val": ["three", "x"]}, names)
     assert resolved == {"train": ["one", "two"], "val": ["three"]}
     assert missing == ["x"]
+    for first, second in (("one", "one"), ("one", "t1")):
+        with pytest.raises(ValueError, match="scene one is in both train and val"):
+            resolve_scenes({"train": [first], "val": [second]}, names)
 
 
 def test_overlap_counts_validation_positions_near_training_on_the_same_map():

@@ -1,9 +1,7 @@
 """Which scenes belong to which split, and whether splits overlap on the ground."""
 
 import json
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,7 @@ Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
 def read_split_file(path: Path) -> dict[str, list[str]]:
     """Read a split file: JSON, an object with a list of scene names or tokens for each split.
 
-    It is the format of the nuScenes devkit's own ``splits.json``. No scene may be in two splits.
+    It is the format of the nuScenes devkit's own ``splits.json``.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no split file at {path}.")
@@ -32,11 +30,6 @@ def read_split_file(path: Path) -> dict[str, list[str]]:
         raise ValueError(
             f'split file {path} must look like {{"train": ["scene-0001", ...], "val": [...]}}.'
         )
-    owner: dict[str, str] = {}
-    for split, scenes in splits.items():
-        for scene in scenes:
-            if owner.setdefault(scene, split) != split:
-                raise ValueError(f"{path}: scene {scene} is in both {owner[scene]} and {split}.")
     return splits
 
 
@@ -53,17 +46,20 @@ def resolve_scenes(
         Names by split, in the data set's order, and the entries that the data set does not have.
 
     Raises:
-        ValueError: If a scene is in two splits, once by name and once by token.
+        ValueError: If a scene is in two splits, by its name or its token.
     """
     known = {name: name for name in names.values()} | dict(names)
-    chosen = {split: {known[e] for e in entries if e in known} for split, entries in splits.items()}
-    uses = Counter(chain.from_iterable(chosen.values()))
-    twice = sorted(name for name, count in uses.items() if count > 1)
-    if twice:
-        raise ValueError(f"scenes {twice} are in more than one split.")
-    missing = [entry for entries in splits.values() for entry in entries if entry not in known]
-    resolved = {s: [n for n in names.values() if n in found] for s, found in chosen.items()}
-    return resolved, missing
+    split_of: dict[str, str] = {}
+    missing = []
+    for split, entries in splits.items():
+        for entry in entries:
+            if entry not in known:
+                missing.append(entry)
+            elif split_of.setdefault(known[entry], split) != split:
+                other = split_of[known[entry]]
+                raise ValueError(f"scene {known[entry]} is in both {other} and {split}.")
+    found = {split: [n for n in names.values() if split_of.get(n) == split] for split in splits}
+    return found, missing
 
 
 def overlap_share(
