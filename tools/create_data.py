@@ -1,8 +1,8 @@
 #!/usr/bin/env python
 """Make data and annotation files: ``python tools/create_data.py COMMAND --help``.
 
-Each command is a module of the package with ``add_arguments(parser)`` and ``run(arguments,
-command)``. It is imported only when needed.
+Each command is a module of the package with ``add_arguments(parser)`` and ``run(arguments)``, where
+``arguments.command`` is the command line. It is imported only when needed.
 """
 
 import argparse
@@ -44,7 +44,8 @@ def make() -> str | None:
         return run_on_ray(arguments, sys.argv)
     module, _ = COMMANDS[arguments.command]
     words = without_options(sys.argv, "--shard")  # the whole is made by the same command
-    return importlib.import_module(module).run(arguments, shlex.join(["python", *words]))
+    arguments.command = shlex.join(["python", *words])
+    return importlib.import_module(module).run(arguments)
 
 
 if __name__ == "__main__":

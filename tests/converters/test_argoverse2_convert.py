@@ -116,7 +116,7 @@ def test_every_nth_pose_needs_neither_sensors_nor_calibration(tmp_path):
     assert [s.timestamp_ns for s in file] == times[::10].tolist()
     assert file[0].cameras == []
     assert file[0].lidar is None
-    export_json(file.path, tmp_path / "out.json")
+    export_json([file.path], tmp_path / "out.json")
     frames = json.loads((tmp_path / "out.json").read_text())["frames"]
     assert [(f["log"], f["row"]) for f in frames] == [("log-a", 0), ("log-a", 10), ("log-a", 20)]
     assert sorted(v["label"] for v in frames[0]["vectors"]) == [0, 1, 2, 2]

@@ -35,9 +35,8 @@ def square(x: float, y: float, size: float) -> shapely.Polygon:
 
 
 def local_map(classes: tuple[str, ...], **layers: list) -> NuScenesLocalMap:
-    names = ("road_divider", "lane_divider")
-    lines = {name: np.array(layers.get(name, []), object) for name in names}
-    polygons = {n: np.array(g, object) for n, g in layers.items() if n not in names}
+    lines = layers.pop("road_divider", [])
+    polygons = {name: np.array(geometries, object) for name, geometries in layers.items()}
     for name in classes:
         if name not in ("divider", "boundary"):
             polygons.setdefault(name, np.empty(0, object))
@@ -103,7 +102,7 @@ def test_an_island_inside_stays_a_ring_however_its_chunks_fall():
 
 def test_centre_lines_follow_each_way_through_a_fork():
     """One lane splits into two connectors: two paths, both cut at the patch's upper edge."""
-    layers = MapLayers({}, {}, Counter())
+    layers = MapLayers([], {}, Counter())
     layers.centerlines = [
         np.array([[0, -40, 0], [0, 0, 0.0]]),
         np.array([[0, 0, 0], [0, 40, 0.0]]),
@@ -201,7 +200,7 @@ def test_a_scene_both_sides_is_warned_of_or_refused(options: NuScenesOptions, tm
     tables = json.loads((options.root / options.version / "scene.json").read_text())
     own = tmp_path / "own.json"
     own.write_text(json.dumps({"train": [tables[0]["name"]], "val": [tables[0]["token"]]}))
-    with pytest.raises(ValueError, match="more than one split"):
+    with pytest.raises(ValueError, match="is in both train and val"):
         convert_nuscenes(replace(options, split_file=own))
     own.write_text(json.dumps({"train": ["scene-9999"]}))
     with pytest.raises(ValueError, match=r"none of the split's scenes"):

@@ -17,7 +17,8 @@ def main() -> str:
         module.add_arguments(command)
         command.set_defaults(run=module.run)
     arguments: argparse.Namespace = parser.parse_args()
-    return arguments.run(arguments, shlex.join(["python", "-m", "minicity", *sys.argv[1:]]))
+    arguments.command = shlex.join(["python", "-m", "minicity", *sys.argv[1:]])
+    return arguments.run(arguments)
 
 
 if __name__ == "__main__":

@@ -30,16 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
 
 
-def run(arguments: argparse.Namespace, command: str) -> str:
-    """Generate the data set and say where it lies.
-
-    Args:
-        arguments: Parsed arguments.
-        command: The command line as typed.
-
-    Returns:
-        A line for the user.
-    """
+def run(arguments: argparse.Namespace) -> str:
+    """Generate the data set and say where it lies, and by which ``command`` it was made."""
     made = generate(
         arguments.root,
         arguments.scenes,
@@ -52,4 +44,5 @@ def run(arguments: argparse.Namespace, command: str) -> str:
     )
     if not made:
         return f"MiniCity at {arguments.root} is complete already (same arguments): skipped."
-    return f"MiniCity written to {arguments.root} (version {VERSION}); made by: {command}"
+    made_by = arguments.command
+    return f"MiniCity written to {arguments.root} (version {VERSION}); made by: {made_by}"

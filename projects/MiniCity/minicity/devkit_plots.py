@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sample", type=int, default=0, help="number of the key frame")
 
 
-def run(arguments: argparse.Namespace, _command: str = "") -> str:
+def run(arguments: argparse.Namespace) -> str:
     """Draw the sensors of a key frame, its LiDAR in the front camera, and the map around it.
 
     Args:

@@ -88,7 +88,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_workers_option(parser)
 
 
-def run(arguments: argparse.Namespace, command: str) -> str:
+def run(arguments: argparse.Namespace) -> str:
     """Check as the command line asks and say what is right."""
-    del command
     return check_files(arguments.annotations, arguments.data_root, arguments.workers)

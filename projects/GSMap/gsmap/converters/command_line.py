@@ -104,13 +104,11 @@ def parse_rate(text: str) -> float | None:
     return rate
 
 
-def options_from(
-    kind: type[Options], arguments: argparse.Namespace, command: str, **more: Any
-) -> Options:
+def options_from(kind: type[Options], arguments: argparse.Namespace, **more: Any) -> Options:
     """Build a dataclass of options from the arguments that have the names of its fields.
 
     Lists become tuples; ``more`` are fields that come before the arguments.
     """
-    given = vars(arguments) | {"command": command} | more
+    given = vars(arguments) | more
     names = {field.name for field in fields(kind)} & given.keys()  # type: ignore[arg-type]
     return kind(**{n: tuple(v) if isinstance(v := given[n], list) else v for n in names})

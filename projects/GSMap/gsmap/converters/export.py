@@ -39,7 +39,7 @@ def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
     }
 
 
-def export_json(annotations: Path | Sequence[Path], target: Path) -> int:
+def export_json(annotations: Sequence[Path], target: Path) -> int:
     """Write the ground truth of one data set's annotation files as one JSON, when it is whole.
 
     Returns the number of samples written.
@@ -48,8 +48,7 @@ def export_json(annotations: Path | Sequence[Path], target: Path) -> int:
         ValueError: If a sample has no ground truth, or the files differ in data set, frame, classes
             or range.
     """
-    paths = [annotations] if isinstance(annotations, Path) else list(annotations)
-    files = [AnnotationFile(path) for path in paths]
+    files = [AnnotationFile(path) for path in annotations]
     meta = files[0].meta
     names = ("dataset", "frame", "classes", "x_range", "y_range")
     same = {name: getattr(meta, name) for name in names}
@@ -88,8 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("target", type=output_file, help="JSON file to write")
 
 
-def run(arguments: argparse.Namespace, command: str) -> str:
+def run(arguments: argparse.Namespace) -> str:
     """Export as the command line asks and say how much was written."""
-    del command
     count = export_json(arguments.annotations, arguments.target)
     return f"{count} samples written to {arguments.target}"

@@ -259,9 +259,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shard_options(parser)
 
 
-def run(arguments: argparse.Namespace, command: str) -> str:
+def run(arguments: argparse.Namespace) -> str:
     """Convert as the command line asks and return the summary."""
     split = arguments.split or arguments.infos.stem.rsplit("_", 1)[-1]
-    more = {"split": split, "classes": tuple(arguments.classes), "command": command}
-    names = ("infos", "target", "data_root", "x_range", "y_range", "shard")
+    more = {"split": split, "classes": tuple(arguments.classes)}
+    names = ("infos", "target", "data_root", "x_range", "y_range", "command", "shard")
     return convert_infos(**{name: getattr(arguments, name) for name in names} | more).text()

@@ -131,8 +131,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_file_options(parser, "ego", max_sweeps=0)
 
 
-def run(arguments: argparse.Namespace, command: str) -> str:
+def run(arguments: argparse.Namespace) -> str:
     """Convert as the command line asks and return the summary."""
     classes = (*CLASSES, "centerline") if arguments.centerline else CLASSES
-    options = options_from(Argoverse2Options, arguments, command, classes=classes)
+    options = options_from(Argoverse2Options, arguments, classes=classes)
     return convert_argoverse2(options).text()

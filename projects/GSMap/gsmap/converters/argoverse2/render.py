@@ -77,7 +77,7 @@ def _prepare(
 
     It takes the name of a camera and a row's time in the pose table.
     """
-    track = log.poses.city_from_ego[np.isin(log.poses.timestamps_ns, times_ns), :2, 3]
+    track = np.array([log.poses[time][:2, 3] for time in times_ns.tolist()])  # (n, 2)
     bounds = (*(track.min(0) - VIEW_M).tolist(), *(track.max(0) + VIEW_M).tolist())
     static_map = ArgoverseStaticMap.from_json(find_map(log.log_dir))
     try:
@@ -96,7 +96,7 @@ def _prepare(
     )
 
     def take(name: str, timestamp_ns: int) -> bytes:
-        city_from_cam = log.poses.at(timestamp_ns) @ cameras[name].ego_SE3_cam.transform_matrix
+        city_from_cam = log.poses[timestamp_ns] @ cameras[name].ego_SE3_cam.transform_matrix
         camera = Camera(*pinholes[name], np.linalg.inv(city_from_cam))
         image = renderer.render_camera(camera, [], rng)
         return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
@@ -126,7 +126,7 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         raise ValueError(
             "no calibration of the ring cameras (--calibration-from names another log)"
         )
-    times = thin_out(log.poses.timestamps_ns, options.rate_hz)
+    times = thin_out(np.array(list(log.poses)), options.rate_hz)
     if options.max_frames is not None and len(times) > options.max_frames:
         times = times[np.linspace(0, len(times) - 1, options.max_frames).round().astype(int)]
     take = _prepare(log, source.calibration, times, options.scale)
@@ -203,11 +203,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shard_options(parser)
 
 
-def run(arguments: argparse.Namespace, command: str) -> str:
+def run(arguments: argparse.Namespace) -> str:
     """Render as the command line asks and return the summary."""
     place, log = (arguments.root, arguments.split), arguments.calibration_from
     calibration = find_logs(*place, [log])[0] if log else None
-    options = options_from(RenderOptions, arguments, command, calibration=calibration)
+    options = options_from(RenderOptions, arguments, calibration=calibration)
     log_dirs = arguments.shard.part(find_logs(*place, arguments.logs))
     out = arguments.out / (arguments.out_split or arguments.split)
     return render_logs(log_dirs, out, options, arguments.workers)

@@ -231,9 +231,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_file_options(parser, "lidar", max_sweeps=10)
 
 
-def run(arguments: argparse.Namespace, command: str) -> str:
+def run(arguments: argparse.Namespace) -> str:
     """Convert as the command line asks and return the summary."""
     is_minicity = (arguments.root / "minicity.json").is_file()  # it says so in its root
     dataset = arguments.dataset or ("minicity" if is_minicity else "nuscenes")
-    options = options_from(NuScenesOptions, arguments, command, dataset=dataset)
+    options = options_from(NuScenesOptions, arguments, dataset=dataset)
     return convert_nuscenes(options).text()

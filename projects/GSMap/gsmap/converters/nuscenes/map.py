@@ -5,9 +5,8 @@ geometry calls on what lies near.
 """
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,23 +41,23 @@ CENTERLINE_STEP_M = 0.5
 class MapLayers:
     """The geometries of one map in its global frame; plain enough to hand to another process."""
 
-    lines: dict[str, np.ndarray]  # by layer, each (n,) of LineString
+    lines: list[shapely.LineString]  # the dividers
     polygons: dict[str, np.ndarray]  # valid ones by layer or class, each (n,) of Polygon
     skipped: Counter[str]  # how many elements were left out, by reason
     centerlines: list[np.ndarray] = field(default_factory=list)  # of lanes and connectors, (n, 3)
     links: LaneLinks = ()  # which of these lead into which
 
 
-def _read_lines(nusc_map: "NuScenesMap", layer: str, skipped: Counter[str]) -> np.ndarray:
-    """Return the lines of a layer; those without two nodes are counted. (n,) of LineString."""
-    found = []
+def _read_lines(
+    nusc_map: "NuScenesMap", layer: str, skipped: Counter[str]
+) -> Iterator[shapely.LineString]:
+    """Yield the lines of a layer; those without two nodes are counted."""
     for record in getattr(nusc_map, layer):
         tokens = nusc_map.get("line", record["line_token"])["node_tokens"]
         if len(tokens) < 2:
             skipped[f"{layer} without two nodes"] += 1
         else:
-            found.append(nusc_map.extract_line(record["line_token"]))
-    return np.array(found, dtype=object)
+            yield nusc_map.extract_line(record["line_token"])
 
 
 def _read_polygons(nusc_map: "NuScenesMap", name: str, skipped: Counter[str]) -> np.ndarray:
@@ -97,7 +96,7 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
         )
     with naming(path, "unpack the map expansion pack (v1.3) again"):
         layers = read_layers(NuScenesMap(str(root), name), classes)
-        for geometries in (*layers.lines.values(), *layers.polygons.values()):
+        for geometries in (layers.lines, *layers.polygons.values()):
             if not np.isfinite(shapely.get_coordinates(geometries)).all():
                 raise ValueError("a point is not finite")
     return layers
@@ -114,8 +113,8 @@ def read_layers(nusc_map: "NuScenesMap", classes: Collection[str]) -> MapLayers:
         names |= set(SURFACE_LAYERS)
     areas = {name: _read_polygons(nusc_map, name, skipped) for name in sorted(names)}
     marked = LINE_LAYERS if "divider" in classes else ()
-    marks = {layer: _read_lines(nusc_map, layer, skipped) for layer in marked}
-    layers = MapLayers(marks, areas, skipped)
+    lines = [line for layer in marked for line in _read_lines(nusc_map, layer, skipped)]
+    layers = MapLayers(lines, areas, skipped)
     if "centerline" in classes:
         _read_centerlines(nusc_map, layers)
     return layers
@@ -161,7 +160,7 @@ class NuScenesLocalMap:
         check_classes(classes)
         self.classes = tuple(classes)
         self.x_range, self.y_range = x_range, y_range
-        self._lines = GeometryLayer(list(chain.from_iterable(layers.lines.values())))
+        self._lines = GeometryLayer(layers.lines)
         areas = set(AREA_CLASSES) & set(classes)
         self._areas = {name: GeometryLayer(layers.polygons[name]) for name in areas}
         surface = [layers.polygons[name] for name in SURFACE_LAYERS if name in layers.polygons]
