@@ -52,7 +52,7 @@ def test_the_log_line_is_short_and_the_json_log_complete(hierarchy, tmp_path):
     (line,) = [line for line in log.read_text().splitlines() if "Epoch(val)" in line]
     prefix = "val/" if hierarchy else ""
     expected = [f"{prefix}{name}: 0.2500" for name in MAIN + OTHERS]
-    assert line.split("  ")[2:-2] == expected
+    assert line.split("  ")[1:-2] == expected
     assert [item.split(": ")[0] for item in line.split("  ")[-2:]] in (
         [f"{prefix}time", f"{prefix}data_time"],
         [f"{prefix}data_time", f"{prefix}time"],
