@@ -19,7 +19,7 @@ import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.strict import neutral_keys
 from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.transforms.map_targets import map_targets
-from gsmap.engine.launch import check_config
+from gsmap.engine.launch import check_config, read_config
 from gsmap.structures.grid import BEVGrid
 
 REPO = Path(__file__).resolve().parents[1]
@@ -61,7 +61,7 @@ def test_configs_inherit_at_most_three_deep(path):
 def test_a_leaf_is_short_and_passes_the_checks_of_the_tools(path):
     code = [line for line in path.read_text().splitlines() if not line.startswith("#")]
     assert len([line for line in code if line.strip()]) <= 20
-    cfg = load(path)
+    cfg = read_config(path)
     check_config(cfg)
     cfg.train_cfg.max_epochs += 1  # the learning rate follows
     check_config(cfg)

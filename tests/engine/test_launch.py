@@ -49,7 +49,7 @@ def test_a_missing_config_is_named():
 
 def test_a_misspelt_key_is_refused_with_the_right_one():
     with pytest.raises(ValueError, match=r"'optim_wraper'; did you mean 'optim_wrapper'\?"):
-        check_config(Config({"optim_wraper": {}}))
+        read_config(Config({"optim_wraper": {}}))
 
 
 def test_a_section_that_is_none_is_refused(tmp_path):
@@ -59,9 +59,9 @@ def test_a_section_that_is_none_is_refused(tmp_path):
 
 
 def test_own_values_start_with_an_underscore():
-    check_config(Config({"_num_points": 20}))
+    read_config(Config({"_num_points": 20}))
     with pytest.raises(ValueError, match="start with '_'"):
-        check_config(Config({"zzz": 20}))
+        read_config(Config({"zzz": 20}))
 
 
 def test_a_cosine_schedule_of_another_length_is_refused():

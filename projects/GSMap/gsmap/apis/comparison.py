@@ -4,7 +4,6 @@ Each run is a work folder of ``tools/train.py`` with its test in it; nothing is 
 does not stand there, so a comparison that was killed goes on when its command is given again.
 """
 
-import hashlib
 import json
 import math
 import os
@@ -25,10 +24,12 @@ from gsmap.checkpoints.settings import differences, plain
 from gsmap.engine.checkpoint_hook import VALIDATED
 from gsmap.engine.launch import check_config, parse_options, read_config
 from gsmap.engine.named_models import REPO, find_checkpoint
+from gsmap.utils.shards import digest
 
 SETTINGS = "settings.json"  # what a run was started with; another start must agree
 RECORD = "run.json"  # machine, load, command and end of a run
 _SHOWN = 10
+_digest = cache(digest)  # of files that many runs share
 _DECIDING = ("model", "optim_wrapper", "param_scheduler", "train_cfg", "randomness", "custom_hooks")
 
 
@@ -227,12 +228,6 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
         *(entry.name, seed, folder, entry.config, (*words, *own), epochs, protocol.budget),
         *(processes, settings),
     )
-
-
-@cache
-def _digest(path: Path) -> str:
-    """Return a file's digest."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _data_of(cfg: Config) -> dict[str, Any]:

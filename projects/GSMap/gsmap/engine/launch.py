@@ -177,13 +177,12 @@ def newest_checkpoint(work_dir: str | Path) -> Path | None:
 
 
 def check_config(cfg: Config) -> None:
-    """Refuse the mistakes that the config system lets through.
+    """Refuse the mistakes in the values of a config that the config system lets through.
 
     Raises:
-        ValueError: If a top-level key is unknown (names of a config's own values must start with an
-            underscore), or a learning-rate schedule ends at another epoch than the training.
+        ValueError: If a learning-rate schedule ends at another epoch than the training, or there is
+            no such optimizer or runner.
     """
-    _check_keys(cfg)
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
     for scheduler in cfg.get("param_scheduler") or []:
         last = scheduler.get("T_max")

@@ -5,11 +5,12 @@ not ship: saved there under their name, they load like the others.
 """
 
 import difflib
-import hashlib
 import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+
+from gsmap.utils.shards import digest
 
 REPO = Path(__file__).resolve().parents[4]
 REGISTRY = REPO / "models/registry.json"
@@ -76,7 +77,7 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
         raise FileNotFoundError(
             f"There is no {model.file}, the weights of {model.name}: {remedy} and save it there."
         )
-    if model.sha256 and hashlib.sha256(model.file.read_bytes()).hexdigest() != model.sha256:
+    if model.sha256 and digest(model.file) != model.sha256:
         raise ValueError(
             f"{model.file} is damaged or another file: its sha256 is not that of {model.name} in "
             f"{REGISTRY.name}; fetch it again, or give another file by its path."

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from gsmap.datasets.annotations.record import CameraRecord, MapSample
+from gsmap.datasets.annotations.record import RANGES, CameraRecord, MapSample
 from gsmap.datasets.image_size import image_size
 from gsmap.inputs.frames import ground_from_frame
 from gsmap.structures.elements import MapElements
@@ -152,13 +152,10 @@ def calibration_figure(sample: MapSample, frame: str, data_root: Path) -> Figure
     lines = _ground_lines(frame_from_ground)
     wedges = [("cameras", _wedge(c, frame_from_ground)) for c in sample.cameras]
     style = MapStyle(classes=_LINES)
-    (x0, x1), (y0, y1) = ((-15.0, 15.0), (-30.0, 30.0))
-    if FRAME_VIEWS[frame].forward == "x":
-        (x0, x1), (y0, y1) = (y0, y1), (x0, x1)
     return compose_figure(
         camera_views(sample.cameras, data_root, sample.token, grey=True),
         [BEVPanel("From above", _elements([*lines, *wedges]))],
-        BEVGrid((x0, x1), (y0, y1)),
+        BEVGrid(*RANGES[frame]),
         FRAME_VIEWS[frame].tilted(sample.ego_from_frame),
         style,
         _elements(lines),

@@ -10,12 +10,11 @@ import numpy as np
 
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
 from gsmap.datasets.elements import elements_of_instances
+from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.report.scores import ScoredResult
-from gsmap.visualization.camera_view import CameraView, arrange_cameras
+from gsmap.visualization.camera_view import arrange_cameras, camera_title
 from gsmap.visualization.frame_view import FrameView
 
-MIN_SCORE = 0.05
-"""Predictions of a lower score are not on the page; AP_raster drops them, too."""
 _JPEG_QUALITY = 70
 
 
@@ -57,7 +56,7 @@ def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
 
 
 def found_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str, Any]]:
-    """Return a sample's predictions, in descending order of score.
+    """Return a sample's predictions that AP_raster does not drop, in descending order of score.
 
     Returns:
         Per prediction its class ``c``, score ``s``, points ``p``, the index of the ground truth
@@ -92,7 +91,7 @@ def _img_from_display(camera: CameraRecord, view: FrameView) -> np.ndarray:
     a, b, c = view.ground
     axes = np.eye(3) if view.forward == "y" else np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     lift = np.array([[1, 0, 0], [0, 1, 0], [a, b, c], [0, 0, 1]])  # (x, y, 1) -> (x, y, z, 1)
-    return camera.intrinsics @ camera.cam_from_frame[:3] @ lift @ axes
+    return camera.img_from_frame[:3] @ lift @ axes
 
 
 def thumbnail(path: Path, width_px: int) -> str:
@@ -133,20 +132,13 @@ def cameras_of(
     Raises:
         ValueError: If an image cannot be read.
     """
-    records = {camera.name: camera for camera in sample.cameras}
-    views = []
-    for camera in sample.cameras:
-        projection = np.eye(4)
-        projection[:3] = camera.intrinsics @ camera.cam_from_frame[:3]
-        blank = np.broadcast_to(np.uint8(0), (camera.height, camera.width, 3))
-        views.append(CameraView(camera.name, blank, projection))
     rows = []
-    for row in arrange_cameras(views, view):
+    for row in arrange_cameras(sample.cameras, view):
         entries = []
-        for arranged in row:
-            camera = records[arranged.name]
+        for camera in row:
             matrix = _img_from_display(camera, view)
-            entry = {"title": arranged.title, "size": [camera.width, camera.height]}
+            title, size = camera_title(camera.name), [camera.width, camera.height]
+            entry: dict[str, Any] = {"title": title, "size": size}
             entry["matrix"] = [float(f"{value:.6g}") for value in matrix.ravel()]
             entry["src"] = thumbnail(data_root / camera.path, width_px) if width_px else ""
             entries.append(entry)

@@ -13,13 +13,8 @@ from typing import Any
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.file_evaluation import read_ground_truth
-from gsmap.report.frames import (
-    MIN_SCORE,
-    cameras_of,
-    choose_frames,
-    found_of,
-    truth_of,
-)
+from gsmap.evaluation.raster_ap import MIN_SCORE
+from gsmap.report.frames import cameras_of, choose_frames, found_of, truth_of
 from gsmap.report.scores import MATCH_M, score_result
 from gsmap.report.tables import class_tables, curves, summary_table
 from gsmap.structures.grid import BEVGrid

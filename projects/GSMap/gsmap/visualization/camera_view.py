@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -54,11 +55,14 @@ class CameraView:
         """Width and height of the image."""
         return self.image.shape[1], self.image.shape[0]
 
-    @property
-    def title(self) -> str:
-        """The channel name as a reader would write it."""
-        words = self.name.lower().replace("_", " ").split()
-        return " ".join(word for word in words if word not in ("cam", "ring", "camera"))
+
+Camera = TypeVar("Camera", CameraView, CameraRecord)
+
+
+def camera_title(name: str) -> str:
+    """Return a channel's name as a reader would write it."""
+    words = name.lower().replace("_", " ").split()
+    return " ".join(word for word in words if word not in ("cam", "ring", "camera"))
 
 
 def camera_views(
@@ -84,9 +88,7 @@ def camera_views(
             if not grey:
                 raise
             image = np.full((camera.height, camera.width, 3), 128, np.uint8)
-        projection = np.eye(4)
-        projection[:3, :3] = camera.intrinsics
-        views.append(CameraView(camera.name, image, projection @ camera.cam_from_frame))
+        views.append(CameraView(camera.name, image, camera.img_from_frame))
     return views
 
 
@@ -100,21 +102,17 @@ def viewing_azimuth(img_from_frame: np.ndarray, view: FrameView) -> float:
     return float(np.arctan2(-right, ahead))
 
 
-def arrange_cameras(cameras: Sequence[CameraView], view: FrameView) -> list[list[CameraView]]:
+def arrange_cameras(cameras: Sequence[Camera], view: FrameView) -> list[list[Camera]]:
     """Arrange cameras as on the car, left to right: looking ahead in a row, looking back below.
 
     A row without cameras is left out.
     """
-    ahead: list[tuple[float, CameraView]] = []
-    back: list[tuple[float, CameraView]] = []
+    rows: tuple[list[Any], list[Any]] = [], []
     for camera in cameras:
         azimuth = viewing_azimuth(camera.img_from_frame, view)
-        if abs(azimuth) <= np.pi / 2 + 1e-3:
-            ahead.append((-azimuth, camera))
-        else:
-            back.append((azimuth % (2 * np.pi), camera))
-    rows = (sorted(row, key=lambda pair: pair[0]) for row in (ahead, back) if row)
-    return [[camera for _, camera in row] for row in rows]
+        looks_back = abs(azimuth) > np.pi / 2 + 1e-3
+        rows[looks_back].append((azimuth % (2 * np.pi) if looks_back else -azimuth, camera))
+    return [[camera for _, camera in sorted(row, key=itemgetter(0))] for row in rows if row]
 
 
 def _draw_areas(
@@ -181,5 +179,5 @@ def draw_camera(
     ax.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
     plate = {"boxstyle": "round,pad=0.3", "facecolor": (0, 0, 0, 0.5), "edgecolor": "none"}
-    title = ax.text(0.014, 0.965, camera.title, va="top", transform=ax.transAxes, zorder=8)
-    title.set(fontsize=7, color="white", bbox=plate)
+    title = ax.text(0.014, 0.965, camera_title(camera.name), transform=ax.transAxes, zorder=8)
+    title.set(fontsize=7, color="white", va="top", bbox=plate)

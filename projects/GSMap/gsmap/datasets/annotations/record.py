@@ -33,6 +33,13 @@ class CameraRecord:
     intrinsics: np.ndarray
     cam_from_frame: np.ndarray
 
+    @property
+    def img_from_frame(self) -> np.ndarray:
+        """Projection from the annotation frame to the image's pixels. (4, 4)"""
+        projection = np.eye(4)
+        projection[:3] = self.intrinsics @ self.cam_from_frame[:3]
+        return projection
+
 
 @dataclass(eq=False)
 class SweepRecord:
