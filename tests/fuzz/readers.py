@@ -32,7 +32,7 @@ from gsmap.converters.splits import read_split_file
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.datasets.transforms.images import read_image
+from gsmap.datasets.image_files import read_image
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points
 from gsmap.engine.launch import check_config, read_config
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, vectors_of, write_results

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib import colors as mcolors
 from matplotlib.transforms import Bbox
+from processes import run_python
 
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
@@ -318,3 +319,8 @@ def test_bad_arguments(tmp_path):
         CameraView("X", np.zeros((4, 4, 3)), np.eye(4))
     with pytest.raises(ValueError, match="scores must have one entry for each of the 2"):
         elements(scores=np.ones(3))
+
+
+def test_pictures_and_pages_need_neither_torch_nor_openmmlab():
+    code = "import sys, gsmap.visualization, gsmap.report.page, gsmap.maps.video\n"
+    run_python("-c", code + "assert not {'torch', 'mmengine'} & set(sys.modules)", check=True)

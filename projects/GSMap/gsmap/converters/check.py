@@ -12,6 +12,7 @@ from gsmap.converters.command_line import add_workers_option
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.image_files import read_image
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 
@@ -36,7 +37,6 @@ def _open(path: Path) -> AnnotationFile:
 
 def _broken_files(sample: MapSample, root: Path) -> list[str]:
     """Read every file that a sample names, and return what is wrong with them."""
-    from gsmap.datasets.transforms.images import read_image
     from gsmap.datasets.transforms.points import read_points
 
     where, problems = f"sample {sample.token!r}", []

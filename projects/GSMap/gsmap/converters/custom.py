@@ -21,7 +21,7 @@ from gsmap.datasets.annotations.record import (
     SweepRecord,
 )
 from gsmap.datasets.errors import naming
-from gsmap.datasets.image_size import image_size
+from gsmap.datasets.image_files import image_size
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.shards import WHOLE, Shard
 

@@ -31,7 +31,7 @@ from gsmap.datasets.annotations.record import (
     SweepRecord,
 )
 from gsmap.datasets.errors import naming
-from gsmap.datasets.image_size import image_size
+from gsmap.datasets.image_files import image_size
 from gsmap.datasets.plain_pickle import load_plain_pickle
 from gsmap.utils.cli import output_file
 from gsmap.utils.progress import Progress

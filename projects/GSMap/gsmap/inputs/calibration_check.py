@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gsmap.datasets.annotations.record import RANGES, CameraRecord, MapSample
-from gsmap.datasets.image_size import image_size
+from gsmap.datasets.image_files import image_size
 from gsmap.inputs.frames import ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid

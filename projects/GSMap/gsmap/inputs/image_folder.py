@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError, naming
-from gsmap.datasets.image_size import image_size
-from gsmap.datasets.transforms.images import read_image
+from gsmap.datasets.image_files import image_size, read_image
 from gsmap.inputs.rig import PoseTrack, RigCamera, RigFrame, nearest_images, rig_samples
 from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
 from gsmap.utils.files import write_bytes

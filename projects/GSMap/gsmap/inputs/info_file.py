@@ -9,7 +9,7 @@ import numpy as np
 from gsmap.datasets.annotations.file import check_samples
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
 from gsmap.datasets.errors import naming
-from gsmap.datasets.image_size import image_size
+from gsmap.datasets.image_files import image_size
 from gsmap.datasets.plain_pickle import load_plain_pickle
 
 _REMEDY = (

@@ -1,7 +1,7 @@
 """Pictures of maps over cameras and in bird's-eye view.
 
 ``MapVisualizer`` and ``MapVisualizationHook`` live in modules of their own that need OpenMMLab;
-what is imported here needs numpy, OpenCV and matplotlib alone.
+what is imported here needs neither that nor torch.
 """
 
 from gsmap.visualization.bev_view import BEVPanel

@@ -15,7 +15,7 @@ from matplotlib.path import Path as Outline
 
 from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.datasets.errors import BrokenSampleError
-from gsmap.datasets.transforms.images import read_image
+from gsmap.datasets.image_files import read_image
 from gsmap.structures.elements import MapElements
 from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
 from gsmap.visualization.frame_view import FrameView

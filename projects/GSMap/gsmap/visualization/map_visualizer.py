@@ -12,7 +12,7 @@ from mmengine.dist import master_only
 from mmengine.visualization import Visualizer
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_targets, elements_of_truth
-from gsmap.datasets.transforms.images import read_image
+from gsmap.datasets.image_files import read_image
 from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.elements import MapElements
