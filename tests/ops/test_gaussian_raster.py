@@ -208,11 +208,11 @@ def test_compiled_model_keeps_values_and_gradients():
 
 
 def test_operator_is_well_formed():
-    leaves = [value.requires_grad_() for value in random_gaussians(2, 3, 0.5, 3)]
-    render_gaussians(*leaves, ODD_GRID, "cpu")  # registers the operator
+    means, scales, rotations = random_gaussians(2, 3, 0.5, 3)
+    gaussians = torch.cat([means, scales, rotations[..., None]], -1).requires_grad_()
     torch.library.opcheck(
         torch.ops.gsmap.render_gaussians.default,
-        (*leaves, [-15.0, -30.0, 1.0, 2.0], 21, 33, "cpu"),
+        (gaussians, [-15.0, -30.0, 1.0, 2.0], 21, 33, "cpu"),
         test_utils=("test_schema", "test_faketensor", "test_autograd_registration"),
     )
 

@@ -22,15 +22,16 @@ SERIAL_BELOW = 1 << 16  # pixels; starting a thread costs about as much as filli
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
 
-def run_in_threads(kernel: Callable[..., None], count: int, pixels: int, *arguments: Any) -> None:
-    """Call ``kernel(*arguments, first, last)`` on slices of ``range(count)``, one a torch thread.
+def run_in_threads(kernel: Callable[..., None], pixels: int, *arguments: Any) -> None:
+    """Call ``kernel(*arguments, first, last)`` on slices of the instances, one a torch thread.
 
-    The kernel works on instances ``first`` to ``last - 1``, each from start to end in one thread,
-    so the result does not depend on the number of threads. A tensor becomes an array; one that is
-    written to must be contiguous. Threads live for one call: nothing survives into a forked
+    The kernel works on instances ``first`` to ``last - 1`` of its first argument, each from start to
+    end in one thread, so the result does not depend on the number of threads. A tensor becomes an
+    array; one that is written to must be contiguous. Threads live for one call: nothing survives into a forked
     process, and calls from several Python threads (torch's autograd engine) cannot meet.
     """
     arrays = [a.contiguous().numpy() if isinstance(a, Tensor) else a for a in arguments]
+    count = len(arrays[0])
     workers = min(torch.get_num_threads(), count)
     if workers <= 1 or count * pixels < SERIAL_BELOW:
         if count:

@@ -11,9 +11,9 @@ from gsmap.structures.grid import BEVGrid
 
 _render = fused_operator(
     "gaussian_raster.render_gaussians",
-    "Tensor means, Tensor scales, Tensor rotations, float[] frame, int height, int width",
-    lambda means, scales, rotations, frame, height, width: (len(means), height, width),
-    differentiable=3,
+    "Tensor gaussians, float[] frame, int height, int width",
+    lambda gaussians, frame, height, width: (len(gaussians), height, width),
+    differentiable=1,
 )
 
 
@@ -38,18 +38,17 @@ def render_gaussians(
         ValueError: If the shapes or devices disagree, or ``backend`` does not serve.
     """
     _check(means, scales, rotations)
-    dtype = torch.float32
-    for tensor in (means, scales, rotations):
-        dtype = torch.promote_types(dtype, tensor.dtype)
-    means, scales, rotations = means.to(dtype), scales.to(dtype), rotations.to(dtype)
+    gaussians = torch.cat([means, scales, rotations[..., None]], -1)  # (..., P, 5), the widest type
+    gaussians = gaussians.to(torch.promote_types(gaussians.dtype, torch.float32))
     with torch.autocast(means.device.type, enabled=False):
-        backend = choose_backend(backend, means)
+        backend = choose_backend(backend, gaussians)
         if backend == "reference":
-            return render_gaussians_reference(means, scales, rotations, grid)
-        flat = math.prod(means.shape[:-2]), means.shape[-2]
-        gaussians = means.reshape(*flat, 2), scales.reshape(*flat, 2), rotations.reshape(flat)
+            return render_gaussians_reference(
+                gaussians[..., :2], gaussians[..., 2:4], gaussians[..., 4], grid
+            )
+        flat = gaussians.reshape(math.prod(means.shape[:-2]), *gaussians.shape[-2:])
         frame = [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m]
-        masks = _render(*gaussians, frame, grid.height, grid.width, backend)
+        masks = _render(flat, frame, grid.height, grid.width, backend)
         return masks.reshape(*means.shape[:-2], grid.height, grid.width)
 
 
@@ -58,6 +57,7 @@ def _check(means: Tensor, scales: Tensor, rotations: Tensor) -> None:
     if means.ndim < 2 or means.shape[-1] != 2:
         raise ValueError(f"means must have shape (..., P, 2), got {tuple(means.shape)}.")
     for name, tensor, shape in (
+        ("means", means, means.shape),
         ("scales", scales, means.shape),
         ("rotations", rotations, means.shape[:-1]),
     ):
@@ -67,6 +67,5 @@ def _check(means: Tensor, scales: Tensor, rotations: Tensor) -> None:
             )
         if tensor.device != means.device:
             raise ValueError(f"{name} must be on {means.device} like means, got {tensor.device}.")
-    for name, tensor in (("means", means), ("scales", scales), ("rotations", rotations)):
         if not tensor.dtype.is_floating_point:
             raise TypeError(f"{name} must be floating point, got {tensor.dtype}.")

@@ -139,12 +139,9 @@ def _gaussian_gradient(gaussian, frame, steps, grad, trans, out):
 
 
 @njit(nogil=True, cache=True)
-def _is_finite(gaussians):
-    """Tell whether an instance's Gaussians can be rendered."""
-    for gaussian in gaussians:
-        if not np.isfinite(gaussian).all() or gaussian[2] == 0 or gaussian[3] == 0:
-            return False
-    return True
+def _can_be_rendered(gaussians):
+    """Tell whether an instance's parameters are finite, and its scales not zero."""
+    return np.isfinite(gaussians).all() and gaussians[:, 2:4].all()
 
 
 @njit(nogil=True, cache=True)
@@ -157,7 +154,7 @@ def render_forward(gaussians, frame, masks, first, last):
     steps = np.arange(masks.shape[2]).astype(np.float32)
     for n in range(first, last):
         masks[n] = 0
-        if not _is_finite(gaussians[n]):
+        if not _can_be_rendered(gaussians[n]):
             masks[n] = np.nan
             continue
         for gaussian in gaussians[n]:
@@ -170,7 +167,7 @@ def render_backward(gaussians, frame, grads, out, first, last):
     steps = np.arange(grads.shape[2]).astype(np.float32)
     trans = np.empty(grads.shape[1:], dtype=np.float32)
     for n in range(first, last):
-        if not _is_finite(gaussians[n]):
+        if not _can_be_rendered(gaussians[n]):
             out[n] = np.nan
             continue
         trans[:] = 1
@@ -180,24 +177,17 @@ def render_backward(gaussians, frame, grads, out, first, last):
             _gaussian_gradient(gaussians[n, p], frame, steps, grads[n], trans, out[n, p])
 
 
-def _pack(means, scales, rotations):
-    """Put an instance's parameters together in float64. (N, P, 5)"""
-    return torch.cat([means, scales, rotations[..., None]], -1).double()
-
-
-def render_gaussians(means, scales, rotations, frame, height, width):
-    """Render float32 Gaussians; ``frame`` as in :func:`render_forward`. (N, H, W)"""
-    masks = torch.empty(len(means), height, width, dtype=torch.float32)
-    gaussians = _pack(means, scales, rotations)
-    run_in_threads(render_forward, len(means), height * width, gaussians, tuple(frame), masks)
+def render_gaussians(gaussians, frame, height, width):
+    """Render float32 Gaussians (N, P, 5), as :func:`render_forward`. (N, H, W)"""
+    masks = torch.empty(len(gaussians), height, width, dtype=torch.float32)
+    arguments = gaussians.double(), tuple(frame), masks
+    run_in_threads(render_forward, height * width, *arguments)
     return masks
 
 
-def render_gaussians_backward(grads, means, scales, rotations, frame, height, width):
-    """Return the gradients in means, scales and rotations."""
-    gaussians = _pack(means, scales, rotations)
-    out = torch.empty_like(gaussians)
-    arguments = gaussians, tuple(frame), grads, out
-    run_in_threads(render_backward, len(means), height * width, *arguments)
-    out = out.float()
-    return out[..., :2].clone(), out[..., 2:4].clone(), out[..., 4].clone()
+def render_gaussians_backward(grads, gaussians, frame, height, width):
+    """Return the gradient in the Gaussians. (N, P, 5)"""
+    gradients = torch.empty(gaussians.shape, dtype=torch.float64)
+    arguments = gaussians.double(), tuple(frame), grads, gradients
+    run_in_threads(render_backward, height * width, *arguments)
+    return (gradients.float(),)

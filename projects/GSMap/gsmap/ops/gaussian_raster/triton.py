@@ -124,42 +124,45 @@ def _tiles(height, width):
     return math.ceil(height / TILE) * math.ceil(width / TILE)
 
 
-def _pack(means, scales, rotations):
-    """Return mean, cos, sin, 1 / sigma and half the box of each Gaussian. (N, P, 8)"""
-    reach = math.sqrt(SQUARED_REACH)
-    cos, sin = torch.cos(rotations)[..., None], torch.sin(rotations)[..., None]
-    u, v = scales[..., :1].square(), scales[..., 1:].square()
+def _prepare(gaussians):
+    """Return mean, cos, sin, 1 / sigma and half the box of each Gaussian. (N, P, 5) -> (N, P, 8)"""
+    means, scales, rotations = gaussians.split((2, 2, 1), -1)
+    reach, cos, sin = math.sqrt(SQUARED_REACH), rotations.cos(), rotations.sin()
+    u, v = scales.square().split(1, -1)
     half_x = reach * (cos.square() * u + sin.square() * v).sqrt()
     half_y = reach * (sin.square() * u + cos.square() * v).sqrt()
-    return torch.cat([means, cos, sin, scales.reciprocal(), half_x, half_y], -1).contiguous()
+    return torch.cat([means, cos, sin, scales.reciprocal(), half_x, half_y], -1)
 
 
-def render_gaussians(means, scales, rotations, frame, height, width):
-    """Render float32 Gaussians; ``frame``: smallest x and y, pixel size along both. (N, H, W)"""
-    masks = means.new_empty(len(means), height, width)
-    if len(means):
-        with torch.cuda.device_of(means):
-            launch = forward_kernel[_tiles(height, width), len(means)]
-            gaussians = _pack(means, scales, rotations)
-            launch(gaussians, masks, means.shape[1], *frame, height, width, TILE=TILE, num_warps=4)
+def render_gaussians(gaussians, frame, height, width):
+    """Render float32 Gaussians: mean x, y, scale u, v, rotation. (N, P, 5) -> (N, H, W)
+
+    ``frame`` is the smallest x and y and the pixel's size along both.
+    """
+    masks = gaussians.new_empty(len(gaussians), height, width)
+    if len(gaussians):
+        with torch.cuda.device_of(gaussians):
+            launch = forward_kernel[_tiles(height, width), len(gaussians)]
+            arguments = _prepare(gaussians), masks, gaussians.shape[1], *frame, height, width
+            launch(*arguments, TILE=TILE, num_warps=4)
     return masks
 
 
-def render_gaussians_backward(grads, means, scales, rotations, frame, height, width):
-    """Return the gradients in means, scales and rotations."""
-    instances, count = rotations.shape
-    if not rotations.numel():
-        return torch.zeros_like(means), torch.zeros_like(scales), torch.zeros_like(rotations)
+def render_gaussians_backward(grads, gaussians, frame, height, width):
+    """Return the gradient in the Gaussians. (N, P, 5)"""
+    instances, count, _ = gaussians.shape
+    if not gaussians.numel():
+        return (torch.zeros_like(gaussians),)
     tiles = _tiles(height, width)
-    moments = means.new_empty(instances, tiles, count, 5)
-    gaussians = _pack(means, scales, rotations)
-    arguments = gaussians, grads.contiguous(), moments, count, *frame, height, width
-    with torch.cuda.device_of(means):
+    moments = gaussians.new_empty(instances, tiles, count, 5)
+    prepared = _prepare(gaussians)
+    arguments = prepared, grads.contiguous(), moments, count, *frame, height, width
+    with torch.cuda.device_of(gaussians):
         backward_kernel[tiles, instances](*arguments, TILE=TILE, num_warps=4)
-    cos, sin, inv_u, inv_v = gaussians[..., 2:6].unbind(-1)
+    cos, sin, inv_u, inv_v = prepared[..., 2:6].unbind(-1)
+    scale_u, scale_v = gaussians[..., 2:4].unbind(-1)
     m_u, m_v, m_uu, m_uv, m_vv = moments.sum(1).unbind(-1)  # in units of sigma
     m_u, m_v = m_u * inv_u, m_v * inv_v
-    grad_means = torch.stack([cos * m_u - sin * m_v, sin * m_u + cos * m_v], -1)
-    grad_scales = torch.stack([m_uu * inv_u, m_vv * inv_v], -1)
-    scale_u, scale_v = scales.unbind(-1)
-    return grad_means, grad_scales, m_uv * (scale_u * inv_v - scale_v * inv_u)
+    turn = m_uv * (scale_u * inv_v - scale_v * inv_u)
+    shift = cos * m_u - sin * m_v, sin * m_u + cos * m_v
+    return (torch.stack([*shift, m_uu * inv_u, m_vv * inv_v, turn], -1),)

@@ -112,20 +112,19 @@ def _measure(squared, nearest):
 
 
 @njit(nogil=True, cache=True)
-def soft_forward(rings, polygons, frame, reach, eps, softness, nearest, masks, first, last):
+def soft_forward(rings, polygons, reach, softness, nearest, masks, first, last):
     """Write exp(-D / s), or a sigmoid of +-D / s for polygons; NaN for a vertex not finite.
 
-    Closed float32 rings (N, V, 2) are in the unit of ``frame``: smallest x and y, and the pixel's
-    size along both. ``reach``, beyond which a mask is 0 or 1, and ``softness`` s are of lines and
-    polygons; ``eps`` is added to an edge's squared length. With ``nearest`` 0, D is the squared
-    distance to the nearest edge; else D is the distance, or ``nearest`` where it is smaller, and
-    there it has no gradient.
+    Closed float32 rings (N, V, 2) are in pixels. ``reach``, beyond which a mask is 0 or 1, and
+    ``softness`` s are of lines and polygons. With ``nearest`` 0, D is the squared distance to the
+    nearest edge; else D is the distance, or ``nearest`` where it is smaller, and there it has no
+    gradient.
     """
     buffers = _buffers(masks.shape[1:])
     _, distances, owners, inside = buffers
     for n in range(first, last):
         kind = int(polygons[n])
-        if not _survey(rings[n], True, kind, frame, reach[kind], eps, buffers):
+        if not _survey(rings[n], True, kind, INTEGER_FRAME, reach[kind], LENGTH_EPS, buffers):
             masks[n] = np.nan
             continue
         for row in range(masks.shape[1]):
@@ -139,18 +138,18 @@ def soft_forward(rings, polygons, frame, reach, eps, softness, nearest, masks, f
 
 
 @njit(nogil=True, cache=True)
-def _scatter(ring, owner, x, y, eps, weight, out):
+def _scatter(ring, owner, x, y, weight, out):
     """Add weight * d(d^2) to the gradient of the two ends of a pixel's nearest edge."""
     following = owner + 1 if owner + 1 < len(ring) else 0
     x0, y0 = float(ring[owner, 0]), float(ring[owner, 1])
     ex, ey = float(ring[following, 0]) - x0, float(ring[following, 1]) - y0
     fx, fy = x - x0, y - y0
-    length2 = ex * ex + ey * ey + eps
+    length2 = ex * ex + ey * ey + LENGTH_EPS
     along = (fx * ex + fy * ey) / length2
     t = min(max(along, 0.0), 1.0)
     dx, dy = fx - t * ex, fy - t * ey
-    # eps moves t off the nearest point of an edge, so t has a gradient of its own between the ends
-    slip = 2 * t * eps / length2 if 0.0 <= along <= 1.0 else 0.0
+    # the eps moves t off the nearest point of an edge: between the ends t has a gradient of its own
+    slip = 2 * t * LENGTH_EPS / length2 if 0.0 <= along <= 1.0 else 0.0
     end_x, end_y = -2 * t * dx - slip * (fx - 2 * t * ex), -2 * t * dy - slip * (fy - 2 * t * ey)
     out[following, 0] += weight * end_x
     out[following, 1] += weight * end_y
@@ -159,15 +158,14 @@ def _scatter(ring, owner, x, y, eps, weight, out):
 
 
 @njit(nogil=True, cache=True)
-def soft_backward(rings, polygons, frame, reach, eps, softness, nearest, grads, out, first, last):
+def soft_backward(rings, polygons, reach, softness, nearest, grads, out, first, last):
     """Write to ``out`` (N, V, 2), float64, the gradient in the rings of ``grads`` (N, H, W)."""
     buffers = _buffers(grads.shape[1:])
     _, distances, owners, inside = buffers
-    x_min, y_min, step_x, step_y = frame
     for n in range(first, last):
         ring, kind = rings[n], int(polygons[n])
         out[n] = 0
-        if not _survey(ring, True, kind, frame, reach[kind], eps, buffers):
+        if not _survey(ring, True, kind, INTEGER_FRAME, reach[kind], LENGTH_EPS, buffers):
             out[n] = np.nan
             continue
         for row in range(grads.shape[1]):
@@ -182,8 +180,7 @@ def soft_backward(rings, polygons, frame, reach, eps, softness, nearest, grads, 
                 weight = grads[n, row, col] * slope / softness[kind]
                 if nearest > 0:
                     weight *= 0.5 / distance if distance > nearest else 0.0
-                x, y = x_min + (col + 0.5) * step_x, y_min + (row + 0.5) * step_y
-                _scatter(ring, owners[row, col], x, y, eps, weight, out[n])
+                _scatter(ring, owners[row, col], col, row, weight, out[n])
 
 
 @njit(nogil=True, cache=True)
@@ -210,16 +207,16 @@ def draw(polylines, filled, frame, half_width, pixel, masks, first, last):
 
 
 def _settings(softness, plain):
-    """Return the kernels' frame, reach, eps, softness and smallest distance."""
+    """Return the kernels' reach, softness and smallest distance."""
     reach = tuple(REACH * tau if plain else math.sqrt(REACH * tau) for tau in softness)
-    return INTEGER_FRAME, reach, LENGTH_EPS, tuple(softness), DISTANCE_EPS if plain else 0.0
+    return reach, tuple(softness), DISTANCE_EPS if plain else 0.0
 
 
 def soft_rasters(rings, is_polygon, height, width, softness, plain):
     """Render closed float32 rings softly; see ``soft_rasters_reference``. (n, H, W)"""
     masks = torch.empty(len(rings), height, width, dtype=torch.float32)
     arguments = rings, is_polygon, *_settings(softness, plain), masks
-    run_in_threads(soft_forward, len(rings), height * width, *arguments)
+    run_in_threads(soft_forward, height * width, *arguments)
     return masks
 
 
@@ -227,7 +224,7 @@ def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, pla
     """Return the gradient in the rings. (n, V, 2)"""
     gradients = torch.empty(rings.shape, dtype=torch.float64)
     arguments = rings, is_polygon, *_settings(softness, plain), grads, gradients
-    run_in_threads(soft_backward, len(rings), height * width, *arguments)
+    run_in_threads(soft_backward, height * width, *arguments)
     return (gradients.float(),)
 
 
@@ -235,5 +232,5 @@ def draw_polylines(polylines, filled, height, width, frame, half_width, pixel):
     """Draw float32 polylines; see ``draw_reference``. (K, H, W)"""
     masks = torch.empty(len(polylines), height, width, dtype=torch.float32)
     arguments = polylines, filled, tuple(frame), half_width, pixel, masks
-    run_in_threads(draw, len(polylines), height * width, *arguments)
+    run_in_threads(draw, height * width, *arguments)
     return masks

@@ -21,6 +21,8 @@ from gsmap.ops._numba import FASTMATH, run_in_threads
 from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
 
 ONE, TWO = np.float32(1), np.float32(2)
+C1, C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
+SEEN_FLOAT32 = np.float32(SEEN)
 
 
 @njit(nogil=True, cache=True)
@@ -96,37 +98,35 @@ def _blur(images, spans, window, padded, rows, out, out_spans):
 
 
 @njit(inline="always")
-def _ssim_terms(maps, row, col, c1, c2):
+def _ssim_terms(maps, row, col):
     """Return the blurred p and t and SSIM's two numerators and two denominators at a pixel."""
     p, t = maps[0, row, col], maps[1, row, col]
-    top_mean = TWO * p * t + c1
-    top_cov = TWO * (maps[4, row, col] - p * t) + c2
-    low_mean = p * p + t * t + c1
-    low_var = (maps[2, row, col] - p * p) + (maps[3, row, col] - t * t) + c2
+    top_mean = TWO * p * t + C1
+    top_cov = TWO * (maps[4, row, col] - p * t) + C2
+    low_mean = p * p + t * t + C1
+    low_var = (maps[2, row, col] - p * p) + (maps[3, row, col] - t * t) + C2
     return p, t, top_mean, top_cov, low_mean, low_var
 
 
 @njit(nogil=True, cache=True)
-def _dissimilarity(maps, spans, constants):
+def _dissimilarity(maps, spans):
     """Return the sum of 1 - SSIM, and on how many pixels the window sees the target, or either."""
-    c1, c2, threshold = constants
     total, target, either = 0.0, 0.0, 0.0
     for row in range(len(spans)):
         for col in range(spans[row, 0], spans[row, 1]):
-            p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(maps, row, col, c1, c2)
+            p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(maps, row, col)
             total += ONE - (top_mean * top_cov) / (low_mean * low_var)
             target += 1.0 if t > 0 else 0.0
-            either += 1.0 if max(p, t) > threshold else 0.0
+            either += 1.0 if max(p, t) > SEEN_FLOAT32 else 0.0
     return total, target, either
 
 
 @njit(nogil=True, cache=True)
-def _derivatives(maps, spans, constants, out):
+def _derivatives(maps, spans, out):
     """Fill SSIM's derivatives by the blurred p, p^2 and p t inside the spans. (3, H, W)"""
-    c1, c2, _ = constants
     for row in range(len(spans)):
         for col in range(spans[row, 0], spans[row, 1]):
-            p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(maps, row, col, c1, c2)
+            p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(maps, row, col)
             scale = ONE / (low_mean * low_var)
             ssim = top_mean * top_cov * scale
             out[0, row, col] = TWO * t * (top_cov - top_mean) * scale + TWO * p * ssim * (
@@ -154,14 +154,9 @@ def _weighted_masses(preds, targets, spans, weight):
 @njit(nogil=True, cache=True)
 def _buffers(shape, radius):
     """Return a thread's scratch: products, row pass, blurred maps, padded row, three spans."""
-    size = 5, shape[0], shape[1]
-    products, rows, maps = (
-        np.empty(size, np.float32),
-        np.empty(size, np.float32),
-        np.empty(size, np.float32),
-    )
+    images = np.empty((3, 5, shape[0], shape[1]), np.float32)
     padded = np.empty(shape[1] + 4 * radius, np.float32)
-    return products, rows, maps, padded, np.empty((3, shape[0], 2), np.int64)
+    return images[0], images[1], images[2], padded, np.empty((3, shape[0], 2), np.int64)
 
 
 @njit(nogil=True, cache=True)
@@ -182,11 +177,10 @@ def _blur_products(preds, targets, window, buffers):
 
 
 @njit(nogil=True, cache=True)
-def loss_forward(preds, targets, window, constants, weight, results, first, last):
+def loss_forward(preds, targets, window, weight, results, first, last):
     """Write some instances' sums, those of `raster_loss_sums_reference`, float64 (n, 7).
 
-    Masks (n, H, W), the window (size,) and all numbers are float32; ``constants`` are SSIM's C1 and
-    C2, and from what mean on a window sees a mask.
+    Masks (n, H, W), the window (size,) and the weight are float32.
     """
     buffers = _buffers(preds.shape[1:], len(window) // 2)
     _, _, maps, _, spans = buffers
@@ -194,19 +188,18 @@ def loss_forward(preds, targets, window, constants, weight, results, first, last
         _blur_products(preds[n], targets[n], window, buffers)
         masses = _weighted_masses(preds[n], targets[n], spans[0], weight)
         results[n, 0], results[n, 1], results[n, 3], results[n, 4] = masses
-        dissimilarity = _dissimilarity(maps, spans[1], constants)
-        results[n, 2], results[n, 5], results[n, 6] = dissimilarity
+        results[n, 2], results[n, 5], results[n, 6] = _dissimilarity(maps, spans[1])
 
 
 @njit(nogil=True, cache=True)
-def loss_backward(preds, targets, window, constants, weight, factors, grads, first, last):
+def loss_backward(preds, targets, window, weight, factors, grads, first, last):
     """Write the gradient (n, H, W) of the first three sums, each times its factor (n, 3)."""
     buffers = _buffers(preds.shape[1:], len(window) // 2)
     slopes, rows, maps, padded, spans = buffers
     for n in range(first, last):
         grads[n] = factors[n, 1]  # outside the spans w is 1, and nothing else depends on p
         _blur_products(preds[n], targets[n], window, buffers)
-        _derivatives(maps, spans[1], constants, slopes[:3])
+        _derivatives(maps, spans[1], slopes[:3])
         _blur(slopes[:3], spans[1], window, padded, rows, maps[:3], spans[2])
         for row in range(preds.shape[1]):
             for col in range(spans[2, row, 0], spans[2, row, 1]):
@@ -217,23 +210,17 @@ def loss_backward(preds, targets, window, constants, weight, factors, grads, fir
                 grads[n, row, col] = (ONE + extra) * slope - factors[n, 2] * ssim
 
 
-def _run(kernel, preds, targets, window, weight, *arguments):
-    """Run a kernel with SSIM's constants, in float32."""
-    constants = np.float32(SSIM_C1), np.float32(SSIM_C2), np.float32(SEEN)
-    settings = window.float(), constants, np.float32(weight)
-    pixels = preds.shape[1:].numel()
-    run_in_threads(kernel, len(preds), pixels, preds, targets, *settings, *arguments)
-
-
 def raster_loss_sums(preds, targets, window, weight):
     """Return the sums of `raster_loss_sums_reference`; the first three are differentiable."""
     sums = torch.empty(len(preds), 7, dtype=torch.float64)
-    _run(loss_forward, preds, targets, window, weight, sums)
+    arguments = preds, targets, window, np.float32(weight), sums
+    run_in_threads(loss_forward, preds.shape[1:].numel(), *arguments)
     return sums.float()
 
 
 def raster_loss_sums_backward(grads, preds, targets, window, weight):
     """Return the gradient in the predictions. (n, H, W)"""
     gradient = torch.empty(preds.shape, dtype=torch.float32)
-    _run(loss_backward, preds, targets, window, weight, grads[:, :3], gradient)
+    arguments = preds, targets, window, np.float32(weight), grads[:, :3], gradient
+    run_in_threads(loss_backward, preds.shape[1:].numel(), *arguments)
     return (gradient,)

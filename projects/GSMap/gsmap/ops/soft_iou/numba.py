@@ -45,6 +45,5 @@ def pairwise_minima(preds, targets):
     """Sum the minimum of every pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
     minima = torch.empty(len(preds), len(targets), dtype=torch.float32)
     starts, pixels, values = list_pixels(targets.contiguous().numpy())
-    arguments = preds, starts, pixels, values, minima
-    run_in_threads(sum_minima, len(preds), len(pixels), *arguments)
+    run_in_threads(sum_minima, len(pixels), preds, starts, pixels, values, minima)
     return minima
