@@ -170,8 +170,8 @@ def test_the_rendered_mask_is_that_of_the_predicted_gaussians():
     grid = BEVGrid((-15, 15), (-30, 30), 40, 20)
     expected = render_gaussians(result.pts, result.scales, result.rotations, grid, "reference")
     order = outputs["all_cls_scores"][-1, 0].sigmoid().flatten().topk(len(result)).indices // 3
-    gaussians = head.reference.gaussians(outputs["all_references"][-1, 0])
-    actual = head.masks.render(gaussians, head.masks.grid)[order]
+    gaussians = head.reference.space.decode(outputs["all_references"][-1, 0])
+    actual = render_gaussians(*gaussians, head.masks.grid)[order]
     torch.testing.assert_close(actual, expected, atol=1e-5, rtol=0)
 
 
@@ -234,8 +234,10 @@ def test_the_log_says_how_the_gaussians_of_each_class_live():
 
 def test_without_either_mask_nothing_is_drawn_or_rendered(monkeypatch):
     head = build_head(GSMAP, loss_raster=None, iou_cost=None)
-    for name in ("draw", "render"):
-        monkeypatch.setattr(head.masks, name, lambda *_: pytest.fail("a mask was made"))
+    for maker in ("masks.draw_polylines", "map_head.render_gaussians", "matched.render_gaussians"):
+        monkeypatch.setattr(
+            f"gsmap.models.heads.{maker}", lambda *_: pytest.fail("a mask was made")
+        )
     losses = losses_of(head, LANES)
     assert set(losses) == {f"{p}loss_{n}" for p in ("", "d0.") for n in ("cls", "pts", "dir")}
 

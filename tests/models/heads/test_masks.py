@@ -10,6 +10,7 @@ from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.losses.raster import RasterLoss
+from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
 
@@ -91,7 +92,7 @@ def fit(target_pts: torch.Tensor, mask: torch.Tensor, masks: ElementMasks) -> fl
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 60)
     raster = RasterLoss(loss_weight=10.0)
     for _ in range(60):
-        rendered = masks.render(space.decode(torch.cat([centres, shapes], -1)), masks.grid)
+        rendered = render_gaussians(*space.decode(torch.cat([centres, shapes], -1)), masks.grid)
         loss = 5 * (centres - target).abs().sum() + raster(rendered, mask)
         optimizer.zero_grad()
         loss.backward()

@@ -58,7 +58,7 @@ def test_points_reach_the_earlier_layers_branch_through_the_reference(cut):
 def test_the_literal_covariance_squares_what_is_rendered():
     head, losses, expected = switched(reference={"min_scale_m": 0.15, "literal_covariance": True})
     assert "loss_raster" in changed(losses, expected)
-    first = head.reference.gaussians(torch.zeros(1, 5)).scales
+    first = head.reference.space.decode(torch.zeros(1, 5)).scales
     torch.testing.assert_close(first, torch.tensor([[1.0, 0.16]]))
 
 
@@ -78,8 +78,8 @@ def test_another_activation_has_the_same_first_gaussian_and_another_slope(activa
     assert not changed(losses, expected)  # a new model's Gaussians are the first ones
     raw = torch.tensor([[0.5, 0.5, 1.0, 0.5, 0.0]])
     assert not torch.allclose(
-        head.reference.gaussians(raw).scales,
-        build_head(GSMAP).reference.gaussians(raw).scales,
+        head.reference.space.decode(raw).scales,
+        build_head(GSMAP).reference.space.decode(raw).scales,
     )
 
 

@@ -17,15 +17,12 @@ def differences(ours: Any, others: Any, name: str = "") -> dict[str, tuple[Any, 
 
     Returns both values by dotted name, which begins with ``name``; None is what is not there.
     """
-    parts = [
-        dict(enumerate(side)) if isinstance(side, list) else side
-        for side in (ours, others)
-        if isinstance(side, list | Mapping)
-    ]
-    if len(parts) < 2 or isinstance(ours, list) != isinstance(others, list):
+    if isinstance(ours, list) and isinstance(others, list):
+        return differences(dict(enumerate(ours)), dict(enumerate(others)), name)
+    if not (isinstance(ours, Mapping) and isinstance(others, Mapping)):
         return {} if ours == others else {name: (ours, others)}
     found: dict[str, tuple[Any, Any]] = {}
-    for key in dict.fromkeys([*parts[0], *parts[1]]):
+    for key in dict.fromkeys([*ours, *others]):
         inner = f"{name}.{key}" if name else str(key)
-        found |= differences(parts[0].get(key), parts[1].get(key), inner)
+        found |= differences(ours.get(key), others.get(key), inner)
     return found

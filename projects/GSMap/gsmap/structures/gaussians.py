@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -13,8 +14,7 @@ ACTIVATIONS = ("sigmoid", "softplus", "exp")
 AT_FLOOR = 1.1  # a Gaussian is at its floor if both sigmas are below this multiple of it
 
 
-@dataclass(frozen=True)
-class Gaussians:
+class Gaussians(NamedTuple):
     """Ordered 2D Gaussians G = (mu, sigma, theta) (GSMap Eq. 1).
 
     Centres mu in metres (..., 2), standard deviations sigma along their own axes in metres (..., 2)

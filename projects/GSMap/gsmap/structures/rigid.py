@@ -39,12 +39,8 @@ def is_rigid(transform: NDArray[np.floating[Any]], tolerance: float = 1e-3) -> N
     """
     m = np.moveaxis(transform, (-2, -1), (0, 1)).copy()  # (4, 4, ...): each entry in one piece
     (x, y, z), shift = m[:3, :3], m[:3, 3]
-    cross = (
-        x[1] * y[2] - x[2] * y[1] - z[0],
-        x[2] * y[0] - x[0] * y[2] - z[1],
-        x[0] * y[1] - x[1] * y[0] - z[2],  # of a mirror these are not zero
-    )
-    errors = (x * x).sum(0) - 1, (y * y).sum(0) - 1, (x * y).sum(0), *cross
+    mirror = np.cross(x, y, axis=0) - z
+    errors = (x * x).sum(0) - 1, (y * y).sum(0) - 1, (x * y).sum(0), *mirror
     good = np.isfinite(shift.sum(0)) & (m[3, 3] == 1) & ~m[3, :3].any(0)
     for error in errors:
         good &= np.abs(error) < tolerance

@@ -58,7 +58,16 @@ class LidarEncoder(BaseModule):
         """
         coors = voxels["coors"]
         if isinstance(self.middle_encoder, SparseEncoder) and not coors.is_cuda:
-            self._check_sparse_on_cpu()
+            if self.training and torch.is_grad_enabled():
+                raise RuntimeError(
+                    "the sparse LiDAR encoder trains on a GPU only (spconv's backward pass needs "
+                    "CUDA): on a CPU use a PointPillars config."
+                )
+            if not IS_SPCONV2_AVAILABLE:
+                raise RuntimeError(
+                    "the sparse LiDAR encoder needs a GPU or the package spconv (2.x); without "
+                    "them use a PointPillars config."
+                )
         points = self.voxel_encoder(voxels["voxels"], voxels["num_points"], coors)
         feats = self.middle_encoder(points, coors, batch_size)
         for part in (self.backbone, self.neck):
@@ -67,19 +76,6 @@ class LidarEncoder(BaseModule):
         if feats.shape[-2:] != self.bev_size:
             feats = F.interpolate(feats, self.bev_size, mode="bilinear", align_corners=False)
         return feats
-
-    def _check_sparse_on_cpu(self) -> None:
-        """Raise RuntimeError where sparse convolutions do not work on the CPU."""
-        if self.training and torch.is_grad_enabled():
-            raise RuntimeError(
-                "the sparse LiDAR encoder trains on a GPU only (spconv's backward pass needs "
-                "CUDA): on a CPU use a PointPillars config."
-            )
-        if not IS_SPCONV2_AVAILABLE:
-            raise RuntimeError(
-                "the sparse LiDAR encoder needs a GPU or the package spconv (2.x); without them "
-                "use a PointPillars config."
-            )
 
 
 @MODELS.register_module()

@@ -72,7 +72,7 @@ class GSMapHead(MapHead):
         """Return what says whether the Gaussians live (see `gaussian_statistics`)."""
         if "pred.masks" not in self._reads:
             return {}
-        gaussians = self.reference.gaussians(pairs["pred.references"])
+        gaussians = self.reference.space.decode(pairs["pred.references"])
         masks, labels = (pairs["pred.masks"], pairs["gt.masks"]), pairs["gt.labels"]
         floor_m = self.reference.space.floor_m
         return gaussian_statistics(gaussians, *masks, labels, self.classes, floor_m)

@@ -22,6 +22,7 @@ from gsmap.models.layers.branches import classification_branch
 from gsmap.models.layers.deformable_attention import at_least_float32, init_matrices
 from gsmap.models.task_modules.map_assigner import MapAssigner
 from gsmap.models.task_modules.map_coder import MapCoder
+from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.grid import BEVGrid
 
 _PRIOR_PROBABILITY = 0.01
@@ -86,7 +87,6 @@ class MapHead(BaseModule):
         coder: Settings of `MapCoder`.
         num_points: Points per instance P.
         embed_dims: Channels C.
-        num_reg_layers: Hidden layers of each branch.
 
     Raises:
         ValueError: If a loss or a cost reads a field that nothing here offers or names a class
@@ -108,7 +108,6 @@ class MapHead(BaseModule):
         coder: PARTS | None = None,
         num_points: int = 20,
         embed_dims: int = 256,
-        num_reg_layers: int = 2,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
@@ -118,8 +117,8 @@ class MapHead(BaseModule):
         self.query_groups = [QueryGroup(**group) for group in query_groups]
         num_instances = sum(group.num for group in self.query_groups)
         shared = {"embed_dims": embed_dims, "num_layers": decoder["num_layers"]}
-        point = {"type": "PointReference", "grid": grid, "num_reg_layers": num_reg_layers}
-        self.reference = MODELS.build({**point, **shared, **(reference or {})})
+        point = {"type": "PointReference", "grid": grid, **shared}
+        self.reference = MODELS.build({**point, **(reference or {})})
         handed_on = {"num_points": num_points, "space": getattr(self.reference, "space", None)}
         self.decoder: MapDecoder = MODELS.build(
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
@@ -128,7 +127,7 @@ class MapHead(BaseModule):
         points = nn.Embedding(num_points, 2 * embed_dims) if self.decoder.point_queries else None
         self.pts_embedding = points
         self.cls_branches = nn.ModuleList(
-            classification_branch(embed_dims, num_reg_layers, len(self.classes))
+            classification_branch(embed_dims, len(self.classes))
             for _ in range(decoder["num_layers"])
         )
         self.loss_cls = MODELS.build(loss_cls)
@@ -301,8 +300,8 @@ class MapHead(BaseModule):
             if name.startswith("all_")
         }
         if "pred.rasters" in self._reads:
-            gaussians = self.reference.gaussians(fields["references"].detach())
-            fields["rasters"] = self.masks.render(gaussians, self.masks.cost_grid)
+            gaussians = self.reference.space.decode(fields["references"].detach())
+            fields["rasters"] = render_gaussians(*gaussians, self.masks.cost_grid)
         batch = len(fields["scores"])
         return [InstanceData(**{k: v[i] for k, v in fields.items()}) for i in range(batch)]
 

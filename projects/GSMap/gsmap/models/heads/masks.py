@@ -1,4 +1,4 @@
-"""Masks of map elements: drawn from the ground truth, rendered from Gaussians."""
+"""Masks of map elements: their rasters, and how the ground truth is drawn."""
 
 from collections.abc import Sequence
 
@@ -6,16 +6,14 @@ import torch
 from mmengine.structures import InstanceData
 from torch import Tensor
 
-from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.polyline_raster import draw_polylines
-from gsmap.structures.gaussians import Gaussians
 from gsmap.structures.grid import BEVGrid
 
 SOURCES = ("full", "points")
 
 
 class ElementMasks:
-    """The rasters on which predictions and ground truth are compared, and how both get there.
+    """The rasters on which predictions and ground truth are compared, and how the latter is drawn.
 
     Args:
         grid: The map's extent.
@@ -70,8 +68,3 @@ class ElementMasks:
                 "with FormatMapTargets."
             )
         return self.draw(gt_instances[name], gt_instances.labels_3d, grid)
-
-    @staticmethod
-    def render(gaussians: Gaussians, grid: BEVGrid) -> Tensor:
-        """Render each instance's Gaussians to its mask (GSMap Eq. 6). (..., P) -> (..., H, W)"""
-        return render_gaussians(gaussians.means, gaussians.scales, gaussians.rotations, grid)

@@ -11,16 +11,12 @@ from torch import Tensor
 from gsmap.models.heads.masks import ElementMasks
 from gsmap.models.heads.references import PointReference
 from gsmap.models.task_modules.map_assigner import MapMatch
+from gsmap.ops.gaussian_raster import render_gaussians
 
-GT_FIELDS = (
-    "labels", "pts", "pts_m", "pts_shifts", "first_pts", "masks", "rasters", "samples", "counts",
-    "inds",
-)  # fmt: skip
+GT_FIELDS = {"gt.labels", "gt.pts_shifts", "gt.first_pts", "gt.rasters"}
 # what only matched pairs have: a loss may read it, a matching cost may not
-AFTER_MATCHING = frozenset(
-    {"pred.pts_m", "pred.masks", "bev_feats"}
-    | {f"gt.{name}" for name in ("pts", "pts_m", "masks", "samples", "counts", "inds")}
-)
+MATCHED_GT_FIELDS = {f"gt.{x}" for x in ("pts", "pts_m", "masks", "samples", "counts", "inds")}
+AFTER_MATCHING = {"pred.pts_m", "pred.masks", "bev_feats", *MATCHED_GT_FIELDS}
 
 
 class MatchedPairs:
@@ -76,8 +72,8 @@ class MatchedPairs:
         if field in ("pred.pts_m", "gt.pts_m"):
             return self._reference.metres(self[field.removesuffix("_m")])
         if field == "pred.masks":
-            gaussians = self._reference.gaussians(self["pred.references"])
-            return self._masks.render(gaussians, self._masks.grid)
+            gaussians = self._reference.space.decode(self["pred.references"])
+            return render_gaussians(*gaussians, self._masks.grid)
         if field == "gt.masks" and self._masks.source == "points":
             return self._masks.draw(self["gt.pts_m"], self["gt.labels"], self._masks.grid)
         if field == "gt.inds":

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import nn
 
-from gsmap.models.heads.matched import AFTER_MATCHING, GT_FIELDS
+from gsmap.models.heads.matched import AFTER_MATCHING, GT_FIELDS, MATCHED_GT_FIELDS
 
 if TYPE_CHECKING:
     from gsmap.models.heads.map_head import MapHead
@@ -58,7 +58,7 @@ def check_parts(head: "MapHead") -> set[str]:
                 f"{name} must be indices of {list(head.classes)}, got {tuple(indices)}."
             )
     pred = {"scores", "instance_states", *head.reference.fields, *head.decoder.fields}
-    offered = {"bev_feats", *(f"pred.{x}" for x in pred), *(f"gt.{x}" for x in GT_FIELDS)}
+    offered = {"bev_feats", *(f"pred.{x}" for x in pred), *GT_FIELDS, *MATCHED_GT_FIELDS}
     where = f"{type(head.reference).__name__}, the decoder and the ground truth"
     read = _fields_read(costs, offered - AFTER_MATCHING, f"before the matching, {where}")
     return read | _fields_read(losses, offered, where)

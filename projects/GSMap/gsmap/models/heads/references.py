@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gsmap.models.layers import branches
 from gsmap.models.layers.deformable_attention import at_least_float32
 from gsmap.models.losses.points import check_same_shape
-from gsmap.structures.gaussians import Gaussians, GaussianSpace
+from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
 
 
@@ -37,7 +37,6 @@ class PointReference(nn.Module):
         grid: The map's extent.
         embed_dims: Channels C of the states.
         num_layers: Decoder layers.
-        num_reg_layers: Hidden layers of each layer's branch.
         coords: 2, or 3 for points with height.
         z_range: Lowest and highest z in metres, for points with height.
 
@@ -54,7 +53,6 @@ class PointReference(nn.Module):
         grid: BEVGrid,
         embed_dims: int = 256,
         num_layers: int = 6,
-        num_reg_layers: int = 2,
         coords: int = 2,
         z_range: Sequence[float] | None = None,
     ) -> None:
@@ -69,13 +67,9 @@ class PointReference(nn.Module):
         self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
         self.initial = nn.Linear(embed_dims, coords)
         self.branches = nn.ModuleList(
-            branches.mlp(*[embed_dims] * (num_reg_layers + 1), coords) for _ in range(num_layers)
+            branches.mlp(embed_dims, embed_dims, embed_dims, coords) for _ in range(num_layers)
         )
-
-    @property
-    def metainfo(self) -> dict[str, float]:
-        """What the predictions' metainfo says of all of them."""
-        return {}
+        self.metainfo: dict[str, float] = {}  # of all predictions
 
     def init_weights(self) -> None:
         """Spread the first points over the map."""
@@ -146,35 +140,19 @@ class GaussianReference(PointReference):
         embed_dims: int = 256,
         num_layers: int = 6,
         mlp: bool = False,
-        num_reg_layers: int = 2,
         coords: int = 2,
         z_range: Sequence[float] | None = None,
         **space: Any,
     ) -> None:
-        super().__init__(grid, embed_dims, num_layers, num_reg_layers, coords, z_range)
+        super().__init__(grid, embed_dims, num_layers, coords, z_range)
         self.space = GaussianSpace(grid, **space)
+        self.metainfo = {"min_scale_m": self.space.floor_m}
         self.gaussian_init = nn.Linear(embed_dims, 3)
-        hidden = num_reg_layers if mlp else 0
-        self.gaussian_branches = nn.ModuleList(
-            branches.mlp(*[embed_dims] * (hidden + 1), 3) for _ in range(num_layers)
-        )
-        self.reset_gaussian_parts()
-
-    @property
-    def metainfo(self) -> dict[str, float]:
-        """What the predictions' metainfo says of all of them: the smallest Gaussian."""
-        return {"min_scale_m": self.space.floor_m}
-
-    def init_weights(self) -> None:
-        """Initialise as for points; what the Gaussians add starts neutral."""
-        super().init_weights()
-        self.reset_gaussian_parts()
-
-    def reset_gaussian_parts(self) -> None:
-        """Let every query start with the same Gaussian, and every layer leave it as it is."""
-        constant_init(self.gaussian_init, 0.0)
-        for branch in self.gaussian_branches:
-            *_, last = branch.children()
+        hidden = [embed_dims, embed_dims] if mlp else []
+        by_layer = [branches.mlp(embed_dims, *hidden, 3) for _ in range(num_layers)]
+        self.gaussian_branches = nn.ModuleList(by_layer)
+        # every query starts with the same Gaussian, and every layer leaves it as it is
+        for last in (self.gaussian_init, *(branch[-1] for branch in by_layer)):
             constant_init(last, 0.0)
 
     def start(self, query_pos: Tensor) -> Tensor:
@@ -187,12 +165,8 @@ class GaussianReference(PointReference):
         shapes = at_least_float32(self.gaussian_branches[layer](states))
         return torch.cat([super().offsets(layer, states), shapes], -1)
 
-    def gaussians(self, references: Tensor) -> Gaussians:
-        """Return the Gaussians that references (..., D) stand for, centres in the plane."""
-        return self.space.decode(references)
-
     def decode(self, references: Tensor) -> dict[str, Tensor]:
         """Add the Gaussians' ``scales`` (N, P, 2) in metres and ``rotations`` (N, P) in radians."""
-        gaussians = self.gaussians(references)
+        gaussians = self.space.decode(references)
         shapes = {"scales": gaussians.scales, "rotations": gaussians.rotations}
         return super().decode(references) | shapes

@@ -13,9 +13,9 @@ def mlp(*dims: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def classification_branch(embed_dims: int, num_layers: int, num_classes: int) -> nn.Sequential:
-    """Return a classifier of ``num_layers`` hidden layers, each with LayerNorm; it gives logits."""
+def classification_branch(embed_dims: int, num_classes: int) -> nn.Sequential:
+    """Return a classifier of two hidden layers, each with LayerNorm; it gives logits."""
     layers: list[nn.Module] = []
-    for _ in range(num_layers):
+    for _ in range(2):
         layers += [nn.Linear(embed_dims, embed_dims), nn.LayerNorm(embed_dims), nn.ReLU(True)]
     return nn.Sequential(*layers, nn.Linear(embed_dims, num_classes))

@@ -97,8 +97,6 @@ class RenderedDiceLoss(nn.Module):
         Points are normalised (n, P, 2), the ground truth's in their first order; a pair is rendered
         as its ground truth's class (n,). 0 with a gradient of 0 if nothing is matched.
         """
-        if not len(pred_points):
-            return pred_points.float().sum() * 0
         with torch.autocast(pred_points.device.type, enabled=False):
             dtype = torch.promote_types(pred_points.dtype, torch.float32)
             is_polygon = self.renderer.is_polygon(gt_labels)
@@ -106,5 +104,5 @@ class RenderedDiceLoss(nn.Module):
             with torch.no_grad():
                 targets = self.renderer.render(gt_points.to(dtype), is_polygon)
             losses = dice_loss(preds, targets)
-        count = len(pred_points) if avg_factor is None else avg_factor
+        count = max(len(pred_points), 1) if avg_factor is None else avg_factor
         return self.loss_weight * losses.sum() / count

@@ -31,10 +31,8 @@ class _MaskLoss(nn.Module):
         Rendered masks and those of their ground truths, 2 x (n, H, W); 0 with a gradient of 0 if
         nothing is matched.
         """
-        if not len(preds):
-            return preds.float().sum() * 0
-        losses = self.per_instance(preds, targets)
-        return self.loss_weight * losses.sum() / (len(preds) if avg_factor is None else avg_factor)
+        count = max(len(preds), 1) if avg_factor is None else avg_factor
+        return self.loss_weight * self.per_instance(preds, targets).sum() / count
 
 
 class RasterLoss(_MaskLoss):
