@@ -344,7 +344,7 @@ def test_gradients_are_averaged_over_ranks(tmp_path):
 
 def test_without_numba_the_reference_renders_after_a_warning(monkeypatch):
     gaussians = random_gaussians(2, 5, 0.5, 3)
-    monkeypatch.setattr(backends, "HAS_NUMBA", False)
+    monkeypatch.setitem(backends.INSTALLED, "cpu", False)
     with pytest.warns(UserWarning, match="pip install numba"):
         masks = render_gaussians(*gaussians, ODD_GRID)
     assert torch.equal(masks, render_gaussians(*gaussians, ODD_GRID, "reference"))

@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.library import CustomOpDef, custom_op
 
 PACKAGES = {"cpu": "numba", "triton": "triton"}
-HAS_NUMBA, HAS_TRITON = (find_spec(package) is not None for package in PACKAGES.values())
+DEVICES = {"cpu": "cpu", "triton": "cuda"}
+INSTALLED = {backend: find_spec(package) is not None for backend, package in PACKAGES.items()}
 
 
 def choose_backend(backend: str, tensor: Tensor, fused: Collection[str] = ("cpu", "triton")) -> str:
@@ -31,34 +32,28 @@ def choose_backend(backend: str, tensor: Tensor, fused: Collection[str] = ("cpu"
     if backend not in known:
         raise ValueError(f"backend must be one of {known}, got {backend!r}.")
     if backend == "auto":
-        return _fastest(tensor, fused)
+        serving = [name for name in fused if DEVICES[name] == tensor.device.type]
+        if tensor.dtype != torch.float32 or not serving:
+            return "reference"
+        if serving == ["cpu"] and not INSTALLED["cpu"]:
+            warnings.warn(
+                "numba is not installed: rasters are computed by the slow reference. "
+                "Install it with `pip install numba`.",
+                stacklevel=2,
+            )
+        return serving[0] if INSTALLED[serving[0]] else "reference"
     if backend == "reference":
         return backend
     if tensor.dtype != torch.float32:
         raise ValueError(
             f"backend {backend!r} computes in float32, got {tensor.dtype}: use 'reference'."
         )
-    if not (HAS_NUMBA if backend == "cpu" else HAS_TRITON):
+    if not INSTALLED[backend]:
         raise ValueError(f"backend {backend!r} needs {PACKAGES[backend]}, which is not installed.")
     interpreted = backend == "triton" and os.environ.get("TRITON_INTERPRET") == "1"
-    if tensor.device.type != {"cpu": "cpu", "triton": "cuda"}[backend] and not interpreted:
+    if tensor.device.type != DEVICES[backend] and not interpreted:
         raise ValueError(f"backend {backend!r} does not serve tensors on {tensor.device}.")
     return backend
-
-
-def _fastest(tensor: Tensor, fused: Collection[str]) -> str:
-    """Name the fastest backend that serves a tensor."""
-    if tensor.dtype != torch.float32:
-        return "reference"
-    if tensor.device.type == "cpu" and "cpu" in fused:
-        if HAS_NUMBA:
-            return "cpu"
-        warnings.warn(
-            "numba is not installed: rasters are computed by the slow reference. "
-            "Install it with `pip install numba`.",
-            stacklevel=2,
-        )
-    return "triton" if tensor.is_cuda and HAS_TRITON and "triton" in fused else "reference"
 
 
 def fused_operator(
