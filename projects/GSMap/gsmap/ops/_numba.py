@@ -25,10 +25,11 @@ FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 def run_in_threads(kernel: Callable[..., None], pixels: int, *arguments: Any) -> None:
     """Call ``kernel(*arguments, first, last)`` on slices of the instances, one a torch thread.
 
-    The kernel works on instances ``first`` to ``last - 1`` of its first argument, each from start to
-    end in one thread, so the result does not depend on the number of threads. A tensor becomes an
-    array; one that is written to must be contiguous. Threads live for one call: nothing survives into a forked
-    process, and calls from several Python threads (torch's autograd engine) cannot meet.
+    The kernel works on instances ``first`` to ``last - 1`` of its first argument, each from start
+    to end in one thread, so the result does not depend on the number of threads. A tensor becomes
+    an array; one that is written to must be contiguous. Threads live for one call: nothing survives
+    into a forked process, and calls from several Python threads (torch's autograd engine) cannot
+    meet.
     """
     arrays = [a.contiguous().numpy() if isinstance(a, Tensor) else a for a in arguments]
     count = len(arrays[0])
