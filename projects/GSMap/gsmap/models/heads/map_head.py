@@ -300,8 +300,8 @@ class MapHead(BaseModule):
             if name.startswith("all_")
         }
         if "pred.rasters" in self._reads:
-            gaussians = self.reference.space.decode(fields["references"].detach())
-            fields["rasters"] = render_gaussians(*gaussians, self.masks.cost_grid)
+            means, scales, rotations = self.reference.space.decode(fields["references"].detach())
+            fields["rasters"] = render_gaussians(means, scales, rotations, self.masks.cost_grid)
         batch = len(fields["scores"])
         return [InstanceData(**{k: v[i] for k, v in fields.items()}) for i in range(batch)]
 

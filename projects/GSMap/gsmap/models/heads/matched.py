@@ -72,8 +72,8 @@ class MatchedPairs:
         if field in ("pred.pts_m", "gt.pts_m"):
             return self._reference.metres(self[field.removesuffix("_m")])
         if field == "pred.masks":
-            gaussians = self._reference.space.decode(self["pred.references"])
-            return render_gaussians(*gaussians, self._masks.grid)
+            means, scales, rotations = self._reference.space.decode(self["pred.references"])
+            return render_gaussians(means, scales, rotations, self._masks.grid)
         if field == "gt.masks" and self._masks.source == "points":
             return self._masks.draw(self["gt.pts_m"], self["gt.labels"], self._masks.grid)
         if field == "gt.inds":
