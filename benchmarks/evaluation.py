@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.measure import markdown_table
+from benchmarks.measure import markdown_table, publish
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
@@ -255,7 +255,4 @@ def run(args: argparse.Namespace) -> None:
                 path.unlink()
     header = ["samples", "metrics", "processes", "wall s", "CPU s", "CPU ms a frame", "peak MiB"]
     parts.append(markdown_table(header, rows))
-    report = "\n".join(parts)
-    print(report)
-    if args.out:
-        args.out.write_text(report + "\n")
+    publish("\n".join(parts), args.out)

@@ -8,7 +8,7 @@ import torch
 from shapely.geometry import Polygon
 from torch import Tensor
 
-from benchmarks.measure import markdown_table
+from benchmarks.measure import markdown_table, publish
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.ops.raster_loss import raster_loss
@@ -48,10 +48,7 @@ def run(args: argparse.Namespace) -> None:
     parts += ["Loss of a miss, by the length of the element:\n", miss_table()]
     parts += ["IoU of a crossing of 10 x 4 m with the polygon of the centres that fit its mask:\n"]
     parts += [f"outline {fitted_crossing(False):.2f}, filled {fitted_crossing(True):.2f}\n"]
-    report = "\n".join(parts)
-    print(report)
-    if args.out:
-        args.out.write_text(report)
+    publish("\n".join(parts), args.out)
 
 
 def straight_line(length_m: float) -> Tensor:

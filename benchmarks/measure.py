@@ -100,3 +100,10 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> s
     """Lay out a table in markdown."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines) + "\n"
+
+
+def publish(report: str, out: Path | None) -> None:
+    """Print a report, and write it to a file if there shall be one."""
+    print(report)
+    if out:
+        out.write_text(report + "\n")

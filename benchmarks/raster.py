@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.measure import MIB, Cost, markdown_table, measure
+from benchmarks.measure import MIB, Cost, markdown_table, measure, publish
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.gaussian_raster.reference import gaussian_densities
 from gsmap.ops.polyline_raster import draw_polylines, soft_rasters
@@ -52,10 +52,7 @@ def run(args: argparse.Namespace) -> None:
         f"\nThe rest of the training path at {TRAINING_SIZE[0]} x {TRAINING_SIZE[1]} ({where}):\n",
         training_table(args),
     ]
-    report = "\n".join(parts)
-    print(report)
-    if args.out:
-        args.out.write_text(report)
+    publish("\n".join(parts), args.out)
 
 
 def random_polylines(count: int, grid: BEVGrid) -> Tensor:

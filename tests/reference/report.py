@@ -1,7 +1,8 @@
 """Rows of the comparison with reference data, and the table of them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,53 +30,40 @@ class Row:
         return bool(self.deviation <= self.tolerance)
 
 
-def _pair(ours: ArrayLike, reference: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return both as float64 arrays of one shape.
+def _of_one_shape(deviation: Callable[..., float]) -> Callable[..., float]:
+    """Hand on both arrays in float64; the deviation is infinite where their shapes differ."""
 
-    Raises:
-        ValueError: If the shapes differ.
-    """
-    ours, reference = np.asarray(ours, np.float64), np.asarray(reference, np.float64)
-    if ours.shape != reference.shape:
-        raise ValueError(f"the reference has shape {reference.shape}, ours has {ours.shape}.")
-    return ours, reference
+    @wraps(deviation)
+    def compare(ours: ArrayLike, reference: ArrayLike, *more: float) -> float:
+        ours, reference = np.asarray(ours, np.float64), np.asarray(reference, np.float64)
+        same = ours.shape == reference.shape
+        return float(deviation(ours, reference, *more)) if same else float("inf")
 
-
-def largest_difference(ours: ArrayLike, reference: ArrayLike) -> float:
-    """Return the largest absolute difference; infinite where shapes differ, zero if empty."""
-    try:
-        ours, reference = _pair(ours, reference)
-    except ValueError:
-        return float("inf")
-    return float(np.abs(ours - reference).max(initial=0.0))
+    return compare
 
 
-def largest_relative(ours: ArrayLike, reference: ArrayLike) -> float:
+@_of_one_shape
+def largest_difference(ours: np.ndarray, reference: np.ndarray) -> float:
+    """Return the largest absolute difference, zero if empty."""
+    return np.abs(ours - reference).max(initial=0.0)
+
+
+@_of_one_shape
+def largest_relative(ours: np.ndarray, reference: np.ndarray) -> float:
     """Return the largest difference over the reference's size there (at least 1e-6)."""
-    try:
-        ours, reference = _pair(ours, reference)
-    except ValueError:
-        return float("inf")
-    return float((np.abs(ours - reference) / np.maximum(np.abs(reference), 1e-6)).max(initial=0.0))
+    return (np.abs(ours - reference) / np.maximum(np.abs(reference), 1e-6)).max(initial=0.0)
 
 
-def relative_norm(ours: ArrayLike, reference: ArrayLike) -> float:
+@_of_one_shape
+def relative_norm(ours: np.ndarray, reference: np.ndarray) -> float:
     """Return the norm of the difference over the reference's norm (at least 1e-12)."""
-    try:
-        ours, reference = _pair(ours, reference)
-    except ValueError:
-        return float("inf")
-    size = float(np.linalg.norm(reference))
-    return float(np.linalg.norm(ours - reference)) / max(size, 1e-12)
+    return np.linalg.norm(ours - reference) / max(np.linalg.norm(reference), 1e-12)
 
 
-def fraction_beyond(ours: ArrayLike, reference: ArrayLike, limit: float) -> float:
-    """Return the fraction of entries that differ by more than ``limit``."""
-    try:
-        ours, reference = _pair(ours, reference)
-    except ValueError:
-        return float("inf")
-    return float(1.0 - (np.abs(ours - reference) <= limit).mean()) if ours.size else 0.0
+@_of_one_shape
+def fraction_beyond(ours: np.ndarray, reference: np.ndarray, limit: float) -> float:
+    """Return the fraction of entries that differ by more than ``limit``, zero if empty."""
+    return 1.0 - (np.abs(ours - reference) <= limit).mean() if ours.size else 0.0
 
 
 def format_table(rows: Sequence[Row]) -> str:

@@ -61,6 +61,13 @@ def elements(**extra):
     return MapElements.from_polylines(lines, np.array([0, 1]), **extra)
 
 
+def first_panel(figure):
+    """The pixels of a figure's first panel."""
+    picture, box = figure_to_rgb(figure), figure.axes[0].get_window_extent()
+    bottom = picture.shape[0] - round(box.y0)
+    return picture[bottom - round(box.height) : bottom, round(box.x0) : round(box.x1)]
+
+
 def colour_share(picture, colour):
     """Share of the pixels that have almost exactly this colour."""
     wanted = np.round(np.array(mcolors.to_rgb(colour)) * 255)
@@ -111,10 +118,7 @@ def test_cameras_project_the_height_of_points(z, row):
     points = ends if z is None else np.c_[ends, [z, z]]
     line = MapElements.from_polylines((points,), np.array([0]))
     figure = compose_figure([RIG[0]], [], GRID, VIEW, STYLE, line)
-    picture = figure_to_rgb(figure)
-    box = figure.axes[0].get_window_extent()
-    bottom = picture.shape[0] - round(box.y0)
-    window = picture[bottom - round(box.height) : bottom, round(box.x0) : round(box.x1)]
+    window = first_panel(figure)
     wanted = np.round(np.array(mcolors.to_rgb(STYLE.colour(0))) * 255)
     rows, _ = np.nonzero(np.abs(window.astype(int) - wanted).max(axis=-1) <= 3)
     assert rows.mean() / len(window) * 90 == pytest.approx(row, abs=0.5)
@@ -146,10 +150,7 @@ def test_elements_appear_in_bev_where_they_are():
         "", MapElements.from_polylines((np.array([[-14.0, 29], [-1, 29]]),), np.array([2]))
     )
     figure = compose_figure([], [panel], GRID, VIEW, STYLE)
-    picture = figure_to_rgb(figure)
-    box = figure.axes[0].get_window_extent()
-    height = picture.shape[0]
-    window = picture[round(height - box.y1) : round(height - box.y0), round(box.x0) : round(box.x1)]
+    window = first_panel(figure)
     half = window.shape[1] // 2
     top = window[: window.shape[0] // 10]
     assert colour_share(top[:, :half], STYLE.colour(2)) > 0.01
@@ -221,10 +222,7 @@ def test_raster_lies_where_its_lines_lie_in_both_frames():
         single = MapElements.from_polylines((np.zeros((2, 2)),), np.array([0]))
         panel = BEVPanel("", single, lines=False, rasters=raster)
         figure = compose_figure([], [panel], grid, FRAME_VIEWS[frame], STYLE)
-        picture = figure_to_rgb(figure)
-        box = figure.axes[0].get_window_extent()
-        bottom = picture.shape[0] - round(box.y0)
-        window = picture[bottom - round(box.height) : bottom, round(box.x0) : round(box.x1)]
+        window = first_panel(figure)
         h, w = (n // 2 for n in window.shape[:2])
         assert colour_share(window[:h, w:], STYLE.colour(0)) > 0.9
         assert colour_share(window[:h, :w], STYLE.colour(0)) < 0.02
