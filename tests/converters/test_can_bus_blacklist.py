@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from gsmap.converters.nuscenes.can_bus import CanBusReader
+from gsmap.converters.nuscenes.can_bus import read_messages, signals_at
 
 MESSAGE = {
     "utime": 1_000_000,
@@ -23,5 +23,5 @@ def test_scenes_that_the_devkit_refuses_have_no_signals(tmp_path, scene, signals
     folder = tmp_path / "can_bus"
     folder.mkdir()
     (folder / f"{scene}_pose.json").write_text(json.dumps([MESSAGE]))
-    values = CanBusReader(tmp_path).signals(scene, 2_000_000_000, np.eye(4))
+    values = signals_at(2_000_000_000, np.eye(4), read_messages(tmp_path, scene))
     np.testing.assert_array_equal(values[7:16], signals)

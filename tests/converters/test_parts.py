@@ -57,12 +57,15 @@ def test_tables_are_read_across_chunk_borders(tmp_path: Path, monkeypatch: pytes
 
 
 def test_can_bus_takes_the_latest_message(tmp_path: Path):
-    from gsmap.converters.nuscenes.can_bus import CanBusReader
+    from gsmap.converters.nuscenes.can_bus import read_messages, signals_at
+
+    def signals(scene: str, timestamp_ns: int) -> np.ndarray:
+        return signals_at(timestamp_ns, quarter_turn, read_messages(tmp_path, scene))
 
     quarter_turn = np.eye(4)
     quarter_turn[:2, :2] = [[0, -1], [1, 0]]
     quarter_turn[:3, 3] = 7, 8, 9
-    without = CanBusReader(tmp_path).signals("scene-0001", 5_000, quarter_turn)
+    without = signals("scene-0001", 5_000)
     np.testing.assert_allclose(without[:3], [7, 8, 9])
     np.testing.assert_allclose(without[3:7], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-9)
     assert (without[7:16] == 0).all()
@@ -72,9 +75,7 @@ def test_can_bus_takes_the_latest_message(tmp_path: Path):
     ]
     (tmp_path / "can_bus").mkdir()
     (tmp_path / "can_bus/scene-0001_pose.json").write_text(json.dumps(messages))
-    reader = CanBusReader(tmp_path)
-    np.testing.assert_allclose(
-        reader.signals("scene-0001", 5_999, quarter_turn)[7:16], [4, 4, 4, 0, 0, 4, 1, 2, 3]
-    )
-    assert (reader.signals("scene-0001", 3_000, quarter_turn)[7:16] == 0).all()
-    assert (reader.signals("scene-0002", 5_000, quarter_turn)[7:16] == 0).all()
+    latest = signals("scene-0001", 5_999)[7:16]
+    np.testing.assert_allclose(latest, [4, 4, 4, 0, 0, 4, 1, 2, 3])
+    assert (signals("scene-0001", 3_000)[7:16] == 0).all()
+    assert (signals("scene-0002", 5_000)[7:16] == 0).all()

@@ -25,7 +25,7 @@ from gsmap.apis.checkpoint import read_weights
 from gsmap.converters.argoverse2.samples import Argoverse2Options, read_log
 from gsmap.converters.custom import from_records
 from gsmap.converters.infos import convert_infos
-from gsmap.converters.nuscenes.can_bus import CanBusReader
+from gsmap.converters.nuscenes.can_bus import read_messages, signals_at
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables, SampleReader
 from gsmap.converters.splits import read_split_file
@@ -273,7 +273,7 @@ class Files:
 
     def tables(self) -> list[MapSample]:
         opened = NuScenesTables(VERSION, self.work, with_sweeps=True)
-        read = SampleReader(opened, 3, CanBusReader(self.work)).read
+        read = SampleReader(opened, 3).read
         drives = [(s, scene) for scene in opened.scene for s in opened.samples_of(scene)]
         found = [read(s, scene) for s, scene in drives if LIDAR in s["data"]]
         return self.written(LIDAR_META, found)
@@ -295,7 +295,11 @@ class Files:
     def can_bus(self) -> Reader:
         path = next((self.work / "can_bus").glob("*_pose.json"))
         scene = path.name.removesuffix("_pose.json")
-        return self.json(path, lambda: CanBusReader(self.work).signals(scene, 10**19, np.eye(4)))
+
+        def read() -> np.ndarray:
+            return signals_at(10**19, np.eye(4), read_messages(self.work, scene))
+
+        return self.json(path, read)
 
     def of_log(self, name: str, *damages: Any) -> Reader:
         def read() -> list[MapSample]:

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables, SampleReader
 from gsmap.datasets.annotations.record import MapSample
 
@@ -28,7 +27,7 @@ def read_nuscenes(root: Path, version: str | None = None) -> list[MapSample]:
     if version is not None and version not in found:
         raise ValueError(f"{root} holds no version {version!r}, but {found}.")
     tables = NuScenesTables(version or found[0], root, with_sweeps=True)
-    reader = SampleReader(tables, 10, CanBusReader(root))
+    reader = SampleReader(tables, max_sweeps=10)
     return [
         reader.read(record, scene)
         for scene in tables.scene

@@ -1,6 +1,5 @@
 """Vehicle signals of the nuScenes CAN bus expansion, in MapTR's layout of 18 numbers."""
 
-from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +7,9 @@ from pyquaternion import Quaternion
 
 from gsmap.datasets.annotations.record import CAN_BUS_SIZE
 from gsmap.datasets.errors import naming
+
+Messages = tuple[np.ndarray, np.ndarray]
+"""Their times in microseconds (n,), and accelerations, rotation rates and velocities (n, 9)."""
 
 
 def pose_signals(global_from_ego: np.ndarray) -> np.ndarray:
@@ -24,33 +26,25 @@ def pose_signals(global_from_ego: np.ndarray) -> np.ndarray:
     return values
 
 
-class CanBusReader:
-    """Read the ``pose`` messages of scenes from the folder ``can_bus`` of a data root.
+def signals_at(timestamp_ns: int, global_from_ego: np.ndarray, messages: Messages) -> np.ndarray:
+    """Return the vehicle's pose (4, 4) with the latest message, as ``pose_signals`` says. (18,)"""
+    values = pose_signals(global_from_ego)
+    times_us, measured = messages
+    latest = int(np.searchsorted(times_us, timestamp_ns // 1000, side="right")) - 1
+    if latest >= 0:
+        values[7:16] = measured[latest]
+    return values
 
-    Without the expansion the signals are zero, and so are those of the scenes that the devkit
-    itself refuses (161 to 176, 309 to 314).
+
+def read_messages(dataroot: Path, scene: str) -> Messages:
+    """Read the ``pose`` messages of a scene from the folder ``can_bus`` of a data root.
+
+    There are none without the expansion, and for the scenes that the devkit itself refuses (161 to
+    176, 309 to 314).
+
+    Raises:
+        ValueError: If the scene's file is damaged.
     """
-
-    def __init__(self, dataroot: Path) -> None:
-        self.available = (dataroot / "can_bus").is_dir()
-        self._messages = lru_cache(maxsize=1)(partial(_read_messages, dataroot))
-
-    def signals(self, scene: str, timestamp_ns: int, global_from_ego: np.ndarray) -> np.ndarray:
-        """Return the vehicle's pose (4, 4) with the latest message, as ``pose_signals`` says. (18,)
-
-        Raises:
-            ValueError: If the scene's file is damaged.
-        """
-        values = pose_signals(global_from_ego)
-        times_us, measured = self._messages(scene)
-        latest = int(np.searchsorted(times_us, timestamp_ns // 1000, side="right")) - 1
-        if latest >= 0:
-            values[7:16] = measured[latest]
-        return values
-
-
-def _read_messages(dataroot: Path, scene: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return times in microseconds (n,) and what was measured (n, 9), if a scene has a file."""
     path, messages = dataroot / f"can_bus/{scene}_pose.json", []
     with naming(path, "unpack the CAN bus expansion again"):
         if path.is_file():

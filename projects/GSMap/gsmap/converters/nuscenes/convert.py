@@ -15,7 +15,6 @@ import numpy as np
 import shapely
 
 from gsmap.converters.command_line import FileOptions, add_file_options, fingerprint, options_from
-from gsmap.converters.nuscenes.can_bus import CanBusReader
 from gsmap.converters.nuscenes.map import MAP_CLASSES, NuScenesLocalMap, check_classes, open_layers
 from gsmap.converters.nuscenes.tables import CAMERAS, LIDAR, NuScenesTables, SampleReader
 from gsmap.converters.splits import Positions, overlap_notes, read_split_file, resolve_scenes
@@ -116,8 +115,7 @@ class _Conversion:
         self.options = options
         self.summary = ConversionSummary(options.classes)
         self.tables = NuScenesTables(options.version, options.root, options.max_sweeps > 0)
-        self.can_bus = CanBusReader(options.root)
-        self.reader = SampleReader(self.tables, options.max_sweeps, self.can_bus)
+        self.reader = SampleReader(self.tables, options.max_sweeps)
         self.splits = _splits(options, self.tables, self.summary)
         self.positions: Positions = {split: defaultdict(list) for split in self.splits}
 
@@ -210,7 +208,7 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         for writer in writers.values():  # a full disk shows here, before any file appears
             writer.finish()
     notes = conversion.summary.notes
-    if not conversion.can_bus.available:
+    if not (options.root / "can_bus").is_dir():
         notes.append("no CAN bus expansion: acceleration, rotation rate and velocity are 0.")
     if not options.shard.count:
         notes += overlap_notes(conversion.positions)

@@ -4,6 +4,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from pyquaternion import Quaternion
 
-from gsmap.converters.nuscenes.can_bus import CanBusReader
+from gsmap.converters.nuscenes.can_bus import read_messages, signals_at
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
 from gsmap.structures.rigid import invert_rigid, rigid
 
@@ -113,7 +114,7 @@ class NuScenesTables:
     """
 
     def __init__(self, version: str, dataroot: Path, with_sweeps: bool) -> None:
-        self._folder = dataroot / version
+        self.dataroot, self._folder = dataroot, dataroot / version
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
         for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
             self._keep(table, self._read(table))
@@ -222,8 +223,9 @@ def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
 class SampleReader:
     """Turn rows of the tables into samples, without ground truth."""
 
-    def __init__(self, tables: NuScenesTables, max_sweeps: int, can_bus: CanBusReader) -> None:
-        self._tables, self._max_sweeps, self._can_bus = tables, max_sweeps, can_bus
+    def __init__(self, tables: NuScenesTables, max_sweeps: int) -> None:
+        self._tables, self._max_sweeps = tables, max_sweeps
+        self._messages = lru_cache(maxsize=1)(partial(read_messages, tables.dataroot))
 
     def _global_from(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Return global-from-sensor (4, 4) and the calibration of a sensor record."""
@@ -247,7 +249,7 @@ class SampleReader:
             global_from_frame=global_from_frame,
             lidar=LidarRecord(lidar["filename"], np.eye(4), self._sweeps(lidar, global_from_frame)),
             ego_from_frame=ego_from_frame,
-            can_bus=self._can_bus.signals(scene["name"], timestamp_ns, global_from_ego),
+            can_bus=signals_at(timestamp_ns, global_from_ego, self._messages(scene["name"])),
         )
 
     def _camera(self, name: str, token: str, global_from_frame: np.ndarray) -> CameraRecord:
