@@ -1,7 +1,6 @@
 """The nuScenes converter: the reference's vectors, splits, clear errors, counted omissions."""
 
 import json
-import shutil
 import tarfile
 from collections import Counter
 from dataclasses import replace
@@ -221,12 +220,9 @@ def test_missing_parts_are_named(options: NuScenesOptions, tmp_path: Path):
 
 
 def test_a_sample_without_lidar_is_left_out_and_one_without_a_camera_kept(
-    options: NuScenesOptions, tmp_path: Path
+    options: NuScenesOptions, damaged_root: Path
 ):
-    root = tmp_path / "damaged"
-    for folder in ("maps", "v1.0-trainval"):
-        shutil.copytree(options.root / folder, root / folder)
-    table = root / "v1.0-trainval/sample_data.json"
+    table = damaged_root / "v1.0-trainval/sample_data.json"
     records = json.loads(table.read_text())
     keys = [r for r in records if r["is_key_frame"]]
     lidar = next(r for r in keys if "LIDAR_TOP" in r["filename"])
@@ -236,21 +232,18 @@ def test_a_sample_without_lidar_is_left_out_and_one_without_a_camera_kept(
         if "CAM_BACK/" in r["filename"] and r["sample_token"] != lidar["sample_token"]
     )
     table.write_text(json.dumps([r for r in records if r not in (lidar, camera)]))
-    summary = convert_nuscenes(replace(options, root=root, max_sweeps=0))
+    summary = convert_nuscenes(replace(options, root=damaged_root, max_sweeps=0))
     assert sum(summary.samples.values()) == 3
     assert summary.problems["sample left out: no LIDAR_TOP key frame"] == 1
     assert summary.problems["CAM_BACK absent (sample kept without it)"] == 1
 
 
-def test_a_truncated_table_is_named_and_nothing_stays_behind(options, tmp_path: Path):
-    root = tmp_path / "cut"
-    for folder in ("maps", "v1.0-trainval"):
-        shutil.copytree(options.root / folder, root / folder)
-    table = root / "v1.0-trainval/ego_pose.json"
+def test_a_truncated_table_is_named_and_nothing_stays_behind(options, damaged_root: Path):
+    table = damaged_root / "v1.0-trainval/ego_pose.json"
     table.write_text(table.read_text()[:-40])
     with pytest.raises(ValueError, match=r"ego_pose.json is damaged or incomplete"):
-        convert_nuscenes(replace(options, root=root, out_dir=tmp_path / "out"))
-    assert not (tmp_path / "out").exists()
+        convert_nuscenes(replace(options, root=damaged_root))
+    assert not options.out_dir.exists()
 
 
 def test_extended_classes_are_closed_rings(options: NuScenesOptions, tmp_path: Path):

@@ -1,7 +1,6 @@
 """Damaged nuScenes roots: each ends in an error that names the file, the record and the field."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,14 +8,6 @@ from typing import Any
 import pytest
 
 from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
-
-
-@pytest.fixture
-def damaged_root(options: NuScenesOptions, tmp_path: Path) -> Path:
-    root = tmp_path / "root"
-    for folder in ("maps", "v1.0-trainval", "can_bus"):
-        shutil.copytree(options.root / folder, root / folder)
-    return root
 
 
 def change(root: Path, table: str, number: int, **fields: Any) -> list[dict]:
