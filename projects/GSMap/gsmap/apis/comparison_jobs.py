@@ -20,6 +20,7 @@ from gsmap.checkpoints.settings import plain
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
 
+_PAUSE_S = 2.0  # between two looks at the runs
 _SAID = 200  # characters of a failed run's last line
 
 
@@ -128,15 +129,12 @@ class Job:
         self._lock.close()
 
 
-def execute(
-    runs: Sequence[Run], progress: Callable[[str], None], pause_s: float = 2.0
-) -> Iterator[tuple[Run, str]]:
+def execute(runs: Sequence[Run], progress: Callable[[str], None]) -> Iterator[tuple[Run, str]]:
     """Train and test the runs that are not done, one a device.
 
     Args:
         runs: From `plan`.
-        progress: Called with one line on the whole, every ``pause_s``.
-        pause_s: Time between two looks, in seconds.
+        progress: Called with one line on the whole, every two seconds.
 
     Yields:
         Each run with its state, as it ends: ``done``, or what went wrong.
@@ -153,7 +151,7 @@ def execute(
                 free.append(job.device)
                 yield job.run, job.record["state"]
             progress(_line(runs, jobs, before, time.monotonic() - start))
-            time.sleep(pause_s if jobs else 0)
+            time.sleep(_PAUSE_S if jobs else 0)
     finally:
         for job in jobs:
             job.end("cut off")

@@ -127,7 +127,6 @@ class MapInferencer:
         self,
         source: str | Path | Source | Sequence[MapSample],
         data_root: str | Path | None = None,
-        allow_missing_cameras: bool = False,
         **options: Any,
     ) -> VectorizedMapDataset:
         """Open samples as the config's test data set, with its pipeline.
@@ -139,8 +138,7 @@ class MapInferencer:
             source: Whatever ``open_input`` reads or returns, or samples in the frame of the config.
             data_root: Folder that image paths start from; by default that of the file, or the
                 config's where an annotation file lies apart from its images.
-            allow_missing_cameras: Whether an info file may name images that do not exist.
-            **options: Further fields of ``InputOptions``.
+            **options: Further fields of ``InputOptions``, such as ``allow_missing_cameras``.
 
         Raises:
             FileNotFoundError: If a file does not exist.
@@ -150,7 +148,7 @@ class MapInferencer:
         if isinstance(source, str | Path):
             options.setdefault("frames_dir", Path(self._scratch.name) / f"frames{self._files}")
             root = None if data_root is None else Path(data_root)
-            source = open_input(source, InputOptions(root, allow_missing_cameras, **options))
+            source = open_input(source, InputOptions(root, **options))
         elif not isinstance(source, Source):
             frame = self.cfg.test_dataloader.dataset.get("frame") or "lidar"
             source = Source(source, frame, None if data_root is None else Path(data_root))

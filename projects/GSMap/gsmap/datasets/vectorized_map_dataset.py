@@ -10,8 +10,9 @@ from mmengine.dataset import BaseDataset
 from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.annotations.record import CAN_BUS_SIZE, LidarRecord, MapInstance, MapSample
+from gsmap.datasets.annotations.record import LidarRecord, MapInstance, MapSample
 from gsmap.datasets.errors import BrokenSampleError
+from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid
 
@@ -180,7 +181,7 @@ class VectorizedMapDataset(BaseDataset):
             "timestamp": sample.timestamp_ns / 1e9,
             "lidar2global": sample.global_from_frame,
             "lidar2ego": sample.ego_from_frame,
-            "can_bus": np.zeros(CAN_BUS_SIZE),
+            "can_bus": np.zeros(NUM_CAN_BUS),
             "images": self._images(sample, entry),
             "map_instances": instances,
             "eval_ann_info": None,

@@ -13,6 +13,7 @@ from gsmap.maps.truth import components, polygons_of
 from gsmap.structures.elements import FloatArray, IntArray
 
 _MAJORITY = 0.5
+_MIN_OVERLAP = 0.3  # of the smaller one: rings of different frames that are of one area
 _SIMPLIFY_M = 0.15  # a vote's outline changes from one frame's edge to another's
 
 
@@ -42,7 +43,7 @@ def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
                 scores.append(elements.confidence[i])
                 weights.append(scores[-1] / variances[part].mean())
     merged = []
-    for group in _groups(areas, np.array(frames, np.int64), config.min_overlap):
+    for group in _groups(areas, np.array(frames, np.int64)):
         merged += _voted(
             drive,
             [areas[i] for i in group],
@@ -53,9 +54,7 @@ def merge_areas(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     return [(ring, score) for ring, score in merged if score >= config.min_area_confidence]
 
 
-def _groups(
-    areas: Sequence[shapely.Geometry], frames: IntArray, min_overlap: float
-) -> list[IntArray]:
+def _groups(areas: Sequence[shapely.Geometry], frames: IntArray) -> list[IntArray]:
     """Return which areas are the same thing."""
     shapes = np.array(areas, dtype=object)
     first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
@@ -63,7 +62,7 @@ def _groups(
     first, second = first[between], second[between]
     shared = shapely.area(shapely.intersection(shapes[first], shapes[second]))
     smaller = np.minimum(shapely.area(shapes[first]), shapely.area(shapes[second]))
-    same = shared >= min_overlap * smaller
+    same = shared >= _MIN_OVERLAP * smaller
     return components(len(areas), first[same], second[same])
 
 

@@ -17,26 +17,13 @@ class MergeConfig:
 
     Args:
         gaussians: Weigh by the vertices' Gaussians where the results carry them.
-        reach_m: How far across its line a vertex looks for the same line in another frame.
-        max_turn_deg: Largest angle between two lines that may be the same.
-        step_m: Largest distance between vertices while lines are merged.
-        rounds: How many times vertices move to the mean.
         min_confidence: Vertices of lines with less are left out (``merge_lines`` defines it).
         min_area_confidence: Areas with less are left out; models find them from nearby only.
-        min_length_m: Shorter lines are left out.
-        min_overlap: Rings of different frames are of one area if they share this part of the
-            smaller one.
     """
 
     gaussians: bool = True
-    reach_m: float = 1.5
-    max_turn_deg: float = 30.0
-    step_m: float = 1.0
-    rounds: int = 3
     min_confidence: float = 0.25
     min_area_confidence: float = 0.1
-    min_length_m: float = 2.0
-    min_overlap: float = 0.3
 
     def variances(self, frame: DriveFrame) -> FloatArray:
         """Return the variance of each predicted vertex across its line, in square metres.

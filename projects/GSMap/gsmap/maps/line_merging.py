@@ -13,9 +13,15 @@ from scipy.ndimage import median_filter
 
 from gsmap.maps.config import MergeConfig
 from gsmap.maps.drive import Drive
+from gsmap.maps.drive_map import MIN_LENGTH_M
 from gsmap.maps.stitching import JOIN_M, stitch
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 from gsmap.structures.polylines import arc_lengths
+
+_REACH_M = 1.5  # how far across its line a vertex looks for the same line in another frame
+_MAX_TURN_DEG = 30.0  # between two lines that may be the same
+_STEP_M = 1.0  # largest distance between vertices while lines are merged
+_ROUNDS = 3  # how many times vertices move to the mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +85,9 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     strands = _strands(drive, label, config)
     if not len(strands.points):
         return []
-    for _ in range(config.rounds):
-        strands = _contracted(strands, _crossings(strands, config))
-    crossings = _crossings(strands, config)
+    for _ in range(_ROUNDS):
+        strands = _contracted(strands, _crossings(strands))
+    crossings = _crossings(strands)
     support = strands.scores + np.bincount(
         crossings.vertices, strands.scores[crossings.segments], len(strands.points)
     )
@@ -89,7 +95,7 @@ def merge_lines(drive: Drive, label: int, config: MergeConfig) -> list[tuple[Flo
     confidence = np.minimum(median_filter(share, 3), 1.0)  # a sharp corner's vertex meets no line
     parts = _uncovered_parts(strands, crossings, confidence, confidence >= config.min_confidence)
     merged = stitch([np.column_stack([strands.points[p], confidence[p]]) for p in parts])
-    long = [line for line in merged if arc_lengths(line)[-1] >= config.min_length_m]
+    long = [line for line in merged if arc_lengths(line)[-1] >= MIN_LENGTH_M]
     return [(line[:, :2], float(line[:, 2].mean())) for line in long]
 
 
@@ -104,7 +110,7 @@ def _strands(drive: Drive, label: int, config: MergeConfig) -> _Strands:
             along = arc_lengths(line)
             if along[-1] == 0.0:
                 continue
-            stops = np.union1d(along, np.arange(0.0, along[-1], config.step_m))
+            stops = np.union1d(along, np.arange(0.0, along[-1], _STEP_M))
             dense = np.stack([np.interp(stops, along, column) for column in line.T], axis=1)
             score = np.full(len(dense), elements.confidence[i])
             rows.append(np.column_stack([dense, np.full(len(dense), number), score]))
@@ -129,14 +135,14 @@ def _normals(strands: _Strands) -> FloatArray:
     return left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
 
 
-def _crossings(strands: _Strands, config: MergeConfig) -> _Crossings:
+def _crossings(strands: _Strands) -> _Crossings:
     """Find each vertex's line in the other frames.
 
     In every frame that is the nearest line with about the same direction, unless the vertex's own
     frame has a line that is nearer to it: lines of one frame are different things.
     """
     normals, inner, points = _normals(strands), strands.inner, strands.points
-    reach, ends = config.reach_m * normals, np.stack([points[inner], points[inner + 1]])
+    reach, ends = _REACH_M * normals, np.stack([points[inner], points[inner + 1]])
     low, high = ends.min(axis=0), ends.max(axis=0)
     tree = shapely.STRtree(shapely.box(*low.T, *high.T))
     across = shapely.box(*(points - np.abs(reach)).T, *(points + np.abs(reach)).T)
@@ -154,8 +160,8 @@ def _crossings(strands: _Strands, config: MergeConfig) -> _Crossings:
     lengths = np.linalg.norm(second - first, axis=1)
     kept = (
         (before * after <= 0.0)
-        & (np.abs(step) > np.cos(np.radians(config.max_turn_deg)) * lengths)
-        & (np.abs(distances) <= config.reach_m)
+        & (np.abs(step) > np.cos(np.radians(_MAX_TURN_DEG)) * lengths)
+        & (np.abs(distances) <= _REACH_M)
     )
     vertices, segments, distances = vertices[kept], segments[kept], distances[kept]
     same_frame = strands.frames[vertices] == strands.frames[segments]

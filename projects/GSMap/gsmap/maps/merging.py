@@ -14,8 +14,8 @@ from gsmap.maps.line_merging import merge_lines
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import MapElements
 
-SUPPRESSION_RADIUS_M = 1.0
-SUPPRESSION_SHARE = 0.5
+_RADIUS_M = 1.0  # how far apart polylines may run along each other
+_SHARE = 0.5  # of the length that may do so
 
 
 def confident(drive: Drive, min_score: float) -> Drive:
@@ -45,18 +45,14 @@ def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
     return drive_map(found)
 
 
-def suppress(
-    drive: Drive, radius_m: float = SUPPRESSION_RADIUS_M, share: float = SUPPRESSION_SHARE
-) -> MapElements:
+def suppress(drive: Drive) -> MapElements:
     """Thin the predictions of all frames out by non-maximum suppression: the plain baseline.
 
-    By falling score, a polyline is dropped if a kept one of its class runs along more than a share
-    of it.
+    By falling score, a polyline is dropped if a kept one of its class is within 1 m of more than
+    half of it.
 
     Args:
         drive: Frames with their predictions.
-        radius_m: How far apart polylines may run along each other, in metres.
-        share: The share of the length that is too much, in (0, 1].
 
     Returns:
         The kept polylines in the global frame, with their scores. (N,)
@@ -74,10 +70,10 @@ def suppress(
     ]
     rows = [rows[i] for i in np.argsort([-score for score, *_ in rows], kind="stable")]
     lines = np.array([shapely.LineString(line) for *_, line in rows], dtype=object)
-    strips = shapely.buffer(lines, radius_m)
+    strips = shapely.buffer(lines, _RADIUS_M)
     tree, kept = shapely.STRtree(strips), np.zeros(len(rows), dtype=bool)
     for i, (_, label, _) in enumerate(rows):
         near = [j for j in tree.query(lines[i]) if kept[j] and rows[j][1] == label]
         along = shapely.length(shapely.intersection(lines[i], strips[near]))
-        kept[i] = lines[i].length > 0.0 and not (along > share * lines[i].length).any()
+        kept[i] = lines[i].length > 0.0 and not (along > _SHARE * lines[i].length).any()
     return drive_map((label, line, score) for score, label, line in compress(rows, kept))

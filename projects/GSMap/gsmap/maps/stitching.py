@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from gsmap.structures.elements import FloatArray
 from gsmap.structures.polylines import arc_lengths
 
-JOIN_M = 2.0
+JOIN_M = 2.0  # widest gap that is closed
 _HEADING_M = 2.0  # an end's direction is that of its last metres
 _DISTANCE_STEP_M = 0.25  # of gaps about as wide, the straightest is closed first
 _RING_M = 10.0  # a shorter line is not closed
@@ -35,7 +35,7 @@ class _Ends:
         return cls(np.array(points).reshape(-1, 2), np.array(headings).reshape(-1, 2))
 
 
-def stitch(lines: Sequence[FloatArray], join_m: float = JOIN_M) -> list[FloatArray]:
+def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
     """Join lines at their ends, the narrowest and straightest gaps first.
 
     Two ends are joined if they are near, the line turns by less than a right angle there, and
@@ -43,7 +43,6 @@ def stitch(lines: Sequence[FloatArray], join_m: float = JOIN_M) -> list[FloatArr
 
     Args:
         lines: Open lines or rings; columns after (x, y) are carried along. each (n, D)
-        join_m: Widest gap in metres.
 
     Returns:
         The joined lines; a ring's last vertex equals its first. each (m, D)
@@ -51,7 +50,7 @@ def stitch(lines: Sequence[FloatArray], join_m: float = JOIN_M) -> list[FloatArr
     ends = _Ends.of(lines)
     closed = [bool(np.array_equal(line[0, :2], line[-1, :2])) for line in lines]
     partner: dict[int, int] = {}
-    for a, b in _candidates(ends, join_m):
+    for a, b in _candidates(ends):
         own_ends = a // 2 == b // 2
         short = own_ends and arc_lengths(lines[a // 2])[-1] < _RING_M
         if not (a in partner or b in partner or closed[a // 2] or closed[b // 2] or short):
@@ -63,11 +62,11 @@ def stitch(lines: Sequence[FloatArray], join_m: float = JOIN_M) -> list[FloatArr
     return joined
 
 
-def _candidates(ends: _Ends, join_m: float) -> list[tuple[int, int]]:
+def _candidates(ends: _Ends) -> list[tuple[int, int]]:
     """Return pairs of ends that may be joined, the best first."""
     if not len(ends.points):
         return []
-    pairs = cKDTree(ends.points).query_pairs(join_m, output_type="ndarray")
+    pairs = cKDTree(ends.points).query_pairs(JOIN_M, output_type="ndarray")
     cosine = (ends.headings[pairs[:, 0]] * ends.headings[pairs[:, 1]]).sum(axis=1)
     gap = np.linalg.norm(ends.points[pairs[:, 0]] - ends.points[pairs[:, 1]], axis=1)
     steps = np.round(gap / _DISTANCE_STEP_M)

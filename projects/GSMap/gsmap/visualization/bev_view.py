@@ -213,7 +213,7 @@ def _draw_rasters(ax: Axes, picture: np.ndarray, view: FrameView) -> None:
 
 def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: MapStyle) -> None:
     """Draw one panel of a map with the extent of ``grid``."""
-    extent, elements = display_extent(grid, view), panel.elements
+    elements = panel.elements
     fates, truth_fates = panel.fates
     _draw_ground(ax, panel.points, grid, view, style)
     ax.set_title(panel.title, fontsize=8.5, color=style.ink, pad=5)
@@ -224,7 +224,7 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
         width_pt = 2.6 * style.bev_line_pt
         draw_lines(ax, lines, panel.truth.labels, style, shades, width_pt, zorder=8)
     if not elements:
-        ax.text(0, extent[2] + 2, panel.note, fontsize=7, color=style.muted, ha="center")
+        ax.text(0, ax.get_ylim()[0] + 2, panel.note, fontsize=7, color=style.muted, ha="center")
         return
     lines = [view.display_from_frame(line) for line in elements.polylines]
     colours = [MATCH_COLOURS[fate] for fate in fates] or style.colours(elements.labels)
@@ -241,4 +241,3 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
         _draw_order(ax, lines, colours)
     if panel.scores:
         _draw_scores(ax, lines, elements.confidence, colours, view)
-    ax.set(xlim=extent[:2], ylim=extent[2:])

@@ -39,7 +39,6 @@ class MapStyle:
 
     Args:
         classes: Class names in label order.
-        closed_classes: Names of the classes that are areas, filled faintly.
         bev_line_pt: Line width in bird's-eye view, in points.
         camera_line_pt: Line width over an image 10 m away, in points; nearer is thicker.
         halo: Colour of the edge that keeps lines legible over an image.
@@ -51,7 +50,6 @@ class MapStyle:
     """
 
     classes: Sequence[str] = ("divider", "ped_crossing", "boundary")
-    closed_classes: Sequence[str] = AREA_CLASSES
     bev_line_pt: float = 1.6
     camera_line_pt: float = 1.7
     halo: str = "#101418"
@@ -75,5 +73,5 @@ class MapStyle:
         return CLASS_TITLES.get(name, name.replace("_", " "))
 
     def is_closed(self, label: int) -> bool:
-        """Whether elements of the class enclose an area."""
-        return self.classes[label] in self.closed_classes
+        """Whether elements of the class enclose an area, which is filled faintly."""
+        return self.classes[label] in AREA_CLASSES

@@ -7,7 +7,6 @@ import numpy as np
 
 FORMAT_VERSION = 1
 CLASSES = ("divider", "ped_crossing", "boundary")
-CAN_BUS_SIZE = 18
 RANGES = {"lidar": ((-15.0, 15.0), (-30.0, 30.0)), "ego": ((-30.0, 30.0), (-15.0, 15.0))}
 """The usual range of each annotation frame: smallest and largest x, and y, in metres."""
 

@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 
 from gsmap.datasets.annotations.record import (
-    CAN_BUS_SIZE,
     AnnotationMeta,
     CameraRecord,
     LidarRecord,
@@ -20,12 +19,13 @@ from gsmap.datasets.annotations.record import (
     MapSample,
     SweepRecord,
 )
+from gsmap.structures.calibration import NUM_CAN_BUS
 
 META_KEY = b"gsmap"
 _POSE, _INTRINSICS = pa.list_(pa.float64(), 16), pa.list_(pa.float64(), 9)
 _SHAPES = {
     "intrinsics": (3, 3),
-    "can_bus": (CAN_BUS_SIZE,),
+    "can_bus": (NUM_CAN_BUS,),
     **dict.fromkeys(
         ("global_from_frame", "ego_from_frame", "cam_from_frame", "frame_from_lidar"), (4, 4)
     ),
@@ -53,7 +53,7 @@ FIELDS = {
     "ego_from_frame": _POSE,
     "cameras": pa.list_(_CAMERA),
     "lidar": _LIDAR,
-    "can_bus": pa.list_(pa.float64(), CAN_BUS_SIZE),
+    "can_bus": pa.list_(pa.float64(), NUM_CAN_BUS),
     "instances": pa.list_(_INSTANCE),
 }
 _SAMPLE = pa.struct(FIELDS)
