@@ -17,7 +17,6 @@ import argparse
 import json
 import shlex
 import sys
-import time
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -38,6 +37,7 @@ from gsmap.apis.comparison_report import (
 from gsmap.engine.launch import data_root_options
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
+from gsmap.utils.progress import Progress
 from gsmap.visualization.figure import save_figure
 from gsmap.visualization.plots import plot_precision_recall
 
@@ -142,18 +142,10 @@ def slurm_commands(runs: list[Run], partition: str) -> str:
 
 
 def train(runs: list[Run]) -> None:
-    """Train and test what is not done, and say how far it is: one line on a terminal."""
-    terminal, last = sys.stderr.isatty(), -1e9
-
-    def progress(line: str) -> None:
-        nonlocal last
-        if terminal or time.monotonic() - last > 60:
-            last = time.monotonic()
-            end = "" if terminal else "\n"
-            print(f"\r\x1b[2K{line}" if terminal else line, end=end, file=sys.stderr, flush=True)
-
-    for run, state in execute(runs, progress):
-        print(f"\r\x1b[2K{run.label}: {state}" if terminal else f"{run.label}: {state}", flush=True)
+    """Train and test what is not done, and say how each run ends."""
+    for run, state in execute(runs):
+        Progress.write(f"{run.label}: {state}")
+        sys.stdout.flush()
 
 
 def tabulate(runs: list[Run], args: argparse.Namespace) -> str:

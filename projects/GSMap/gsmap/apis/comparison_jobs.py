@@ -9,7 +9,7 @@ import socket
 import subprocess
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from gsmap.apis.comparison import RECORD, SETTINGS, Run
 from gsmap.checkpoints.settings import plain
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
+from gsmap.utils.progress import Progress
 
 _PAUSE_S = 2.0  # between two looks at the runs
 _SAID = 200  # characters of a failed run's last line
@@ -129,41 +130,33 @@ class Job:
         self._lock.close()
 
 
-def execute(runs: Sequence[Run], progress: Callable[[str], None]) -> Iterator[tuple[Run, str]]:
-    """Train and test the runs that are not done, one a device.
+def execute(runs: Sequence[Run]) -> Iterator[tuple[Run, str]]:
+    """Train and test the runs that are not done, one a device, and show how far all are.
 
     Args:
         runs: From `plan`.
-        progress: Called with one line on the whole, every two seconds.
 
     Yields:
         Each run with its state, as it ends: ``done``, or what went wrong.
     """
     waiting = deque(run for run in runs if not run.done)
     free, jobs = devices(), list[Job]()
-    start, before = time.monotonic(), sum(run.position for run in runs)
-    try:
-        while waiting or jobs:
-            while waiting and free:
-                jobs.append(Job(waiting.popleft(), free.pop(0)))
-            for job in [job for job in jobs if job.ended()]:
-                jobs.remove(job)
-                free.append(job.device)
-                yield job.run, job.record["state"]
-            progress(_line(runs, jobs, before, time.monotonic() - start))
-            time.sleep(_PAUSE_S if jobs else 0)
-    finally:
-        for job in jobs:
-            job.end("cut off")
-
-
-def _line(runs: Sequence[Run], jobs: Sequence[Job], before: int, seconds: float) -> str:
-    """Tell how far all runs are, and how long the rest takes at the pace so far."""
-    position, total = sum(run.position for run in runs), sum(run.iterations for run in runs)
-    line = f"{sum(run.done for run in runs)} of {len(runs)} runs done"
-    line += "".join(f", {job.run.label} {job.stage}s" for job in jobs)
-    line += f"; iteration {position} of {total}"
-    if position > before:
-        minutes = (total - position) * seconds / (position - before) / 60
-        line += f"; about {minutes // 60:.0f} h {minutes % 60:.0f} min left"
-    return line
+    before, total = sum(run.position for run in runs), sum(run.iterations for run in runs)
+    options = {"unit": "iterations", "smoothing": 0, "disable": not waiting}
+    with Progress(initial=before, total=total, **options) as bar:
+        try:
+            while waiting or jobs:
+                while waiting and free:
+                    jobs.append(Job(waiting.popleft(), free.pop(0)))
+                for job in [job for job in jobs if job.ended()]:
+                    jobs.remove(job)
+                    free.append(job.device)
+                    yield job.run, job.record["state"]
+                stages = [f"{job.run.label} {job.stage}s" for job in jobs]
+                done = f"{sum(run.done for run in runs)} of {len(runs)} runs done"
+                bar.set_description(", ".join([done, *stages]), refresh=False)
+                bar.update(sum(run.position for run in runs) - bar.n)
+                time.sleep(_PAUSE_S if jobs else 0)
+        finally:
+            for job in jobs:
+                job.end("cut off")

@@ -6,7 +6,7 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 _PLAIN = {"mininterval": 60.0, "maxinterval": 60.0}
-_FORMAT = "{n_fmt} of {total_fmt} {unit}, {elapsed}"
+_FORMAT = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed}"
 
 
 class Progress(tqdm):
@@ -14,8 +14,8 @@ class Progress(tqdm):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if not sys.stderr.isatty():
-            title = f"{kwargs.pop('desc')}: " if kwargs.get("desc") else ""
-            kwargs |= {**_PLAIN, "bar_format": title + _FORMAT, "file": _Lines(sys.stderr)}
+            title = f"{kwargs['desc']}: " if kwargs.get("desc") else ""
+            kwargs |= {**_PLAIN, "desc": title, "bar_format": _FORMAT, "file": _Lines(sys.stderr)}
         super().__init__(*args, **kwargs)
 
 
