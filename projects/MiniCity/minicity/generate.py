@@ -1,6 +1,5 @@
 """Generates a MiniCity data set in the nuScenes format, whole or not at all."""
 
-import fcntl
 import json
 import logging
 import os
@@ -15,6 +14,7 @@ from typing import Any
 
 import cv2
 
+from gsmap.utils.files import lock
 from gsmap.utils.parallel import default_workers, ordered_map
 from gsmap.utils.progress import Progress
 from minicity.config import TRAIN_LOCATIONS, VAL_LOCATIONS, VERSION, MiniCityConfig, make_token
@@ -143,12 +143,7 @@ def _partial_folder(root: Path) -> Iterator[Path]:
     partial.mkdir(exist_ok=True)
     handle = os.open(partial, os.O_RDONLY)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RuntimeError(
-                f"another process is generating into {partial}: wait for it to end."
-            ) from error
+        lock(handle, f"another process is generating into {partial}: wait for it to end.")
         try:
             for leftover in partial.iterdir():
                 shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()

@@ -1,6 +1,5 @@
 """Runs of a comparison under way: their processes, their end, and how far the whole is."""
 
-import fcntl
 import json
 import os
 import re
@@ -17,7 +16,7 @@ import torch
 
 from gsmap.apis.comparison import RECORD, SETTINGS, Run
 from gsmap.checkpoints.settings import plain
-from gsmap.utils.files import write_text
+from gsmap.utils.files import lock, write_text
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.progress import Progress
 
@@ -56,10 +55,7 @@ class Job:
         self.device = device
         run.folder.mkdir(parents=True, exist_ok=True)
         self._lock = open(run.folder / ".lock", "w")  # noqa: SIM115 - held until the job ends
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RuntimeError(f"another process works in {run.folder}: wait for it.") from error
+        lock(self._lock, f"another process works in {run.folder}: wait for it.")
         write_text(run.folder / SETTINGS, json.dumps(plain(run.settings), indent=1))
         self.record: dict[str, Any] = {"machine": machine(), "load_at_start": os.getloadavg()[0]}
         self.record |= {k: shlex.join(command) for k, command in run.commands().items()}

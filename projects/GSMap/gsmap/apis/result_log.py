@@ -1,15 +1,13 @@
 """Predictions on their way to a result file: what a killed run goes on from."""
 
-import fcntl
 import json
-import logging
 from pathlib import Path
 from typing import Any
 
 from gsmap.evaluation.results_json import write_results
+from gsmap.utils.files import lock
 
 _SUFFIX = ".unfinished"
-_LOGGER = logging.getLogger(__name__)
 
 
 class ResultLog:
@@ -39,7 +37,8 @@ class ResultLog:
     def __enter__(self) -> "ResultLog":
         self.out.parent.mkdir(parents=True, exist_ok=True)
         self._file = self.path.open("a", encoding="utf-8")
-        self._lock()
+        held = f"another process writes {self.path}: wait for its end, or give another --out."
+        lock(self._file, held)
         content = self.path.read_bytes()
         whole = content[: content.rfind(b"\n") + 1]  # a kill may cut the last line
         if not whole.startswith(self._head.encode()):
@@ -48,18 +47,6 @@ class ResultLog:
             self._note(json.loads(line))
         self.path.write_bytes(whole)
         return self
-
-    def _lock(self) -> None:
-        """Raise a ``RuntimeError`` if another process writes the file, also on another machine."""
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            self._file.close()
-            raise RuntimeError(
-                f"another process writes {self.path}: wait for its end, or give another --out."
-            ) from error
-        except OSError:  # a file system without locks
-            _LOGGER.warning("%s cannot be locked: take care that one process writes it.", self.path)
 
     def __exit__(self, *raised: object) -> None:
         self._file.close()

@@ -1,5 +1,7 @@
 """Files that are whole or absent, whatever stops their writer."""
 
+import fcntl
+import logging
 import os
 import platform
 import re
@@ -57,6 +59,21 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     """Write a file in one step."""
     with atomic_write(path, "wb") as file:
         file.write(content)
+
+
+def lock(file: IO[Any] | int, held: str) -> None:
+    """Lock an open file or folder for as long as it is open.
+
+    Raises:
+        RuntimeError: If another process has locked it, with the text ``held``.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise RuntimeError(held) from error
+    except OSError as error:  # a file system without locks
+        text = "files cannot be locked here (%s): take care that one process works at a time."
+        logging.getLogger("gsmap").warning(text, error)
 
 
 def partial_path(path: Path) -> Path:
