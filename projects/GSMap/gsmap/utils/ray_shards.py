@@ -1,6 +1,7 @@
 """All shards of a command on a Ray cluster: the same commands, started wherever there is room."""
 
 import argparse
+import math
 import os
 import statistics
 import subprocess
@@ -118,7 +119,8 @@ class _Run:
                 del under_way[ref]
             now = time.monotonic()
             room_since = (room_since or now) if self._has_room() else None
-            if room_since and now - room_since > max(self.patience_s, *self._twice_the_longest()):
+            too_long_s = max(self.patience_s, 2 * max(self.seconds, default=math.inf))
+            if room_since and now - room_since > too_long_s:
                 late = set(under_way.values()) - again
                 again |= late
                 self.repeated += len(late)
@@ -146,9 +148,6 @@ class _Run:
             return str(error).strip().rsplit("\n", 1)[-1]
         self.seconds.append(seconds)
         return failed
-
-    def _twice_the_longest(self) -> list[float]:
-        return [2 * max(self.seconds)] if self.seconds else [float("inf")]
 
     def _has_room(self) -> bool:
         """Whether another shard could start, so that none is waiting."""
