@@ -25,10 +25,10 @@ def test_split_files_are_checked(tmp_path: Path):
     assert read_split_file(path) == {"train": ["a"], "val": []}
 
 
-def test_scenes_resolve_by_name_or_token_in_the_data_set_s_order():
+def test_scenes_resolve_by_name_or_token():
     names = {"t1": "one", "t2": "two", "t3": "three"}
-    resolved, missing = resolve_scenes({"train": ["two", "t1"], "val": ["three", "x"]}, names)
-    assert resolved == {"train": ["one", "two"], "val": ["three"]}
+    split_of, missing = resolve_scenes({"train": ["two", "t1"], "val": ["three", "x"]}, names)
+    assert split_of == {"one": "train", "two": "train", "three": "val"}
     assert missing == ["x"]
     for first, second in (("one", "one"), ("one", "t1")):
         with pytest.raises(ValueError, match="scene one is in both train and val"):

@@ -35,15 +35,15 @@ def read_split_file(path: Path) -> dict[str, list[str]]:
 
 def resolve_scenes(
     splits: Mapping[str, Collection[str]], names: Mapping[str, str]
-) -> tuple[dict[str, list[str]], list[str]]:
-    """Turn scene names or tokens, by split, into names of scenes that exist.
+) -> tuple[dict[str, str], list[str]]:
+    """Turn scene names or tokens, by split, into the split of each scene that exists.
 
     Args:
         splits: Names or tokens by split.
         names: Name of each scene of the data set, by token.
 
     Returns:
-        Names by split, in the data set's order, and the entries that the data set does not have.
+        Splits by the scene's name, and the entries that the data set does not have.
 
     Raises:
         ValueError: If a scene is in two splits, by its name or its token.
@@ -58,8 +58,7 @@ def resolve_scenes(
             elif split_of.setdefault(known[entry], split) != split:
                 other = split_of[known[entry]]
                 raise ValueError(f"scene {known[entry]} is in both {other} and {split}.")
-    found = {split: [n for n in names.values() if split_of.get(n) == split] for split in splits}
-    return found, missing
+    return split_of, missing
 
 
 def overlap_share(

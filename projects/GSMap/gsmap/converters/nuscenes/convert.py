@@ -69,8 +69,8 @@ def _check_root(root: Path, version: str) -> None:
 
 def _splits(
     options: NuScenesOptions, tables: NuScenesTables, summary: ConversionSummary
-) -> dict[str, list[str]]:
-    """Return the scenes of each split that the data set has."""
+) -> dict[str, str]:
+    """Return the split of each scene, by name; scenes that the data set lacks are noted."""
     from nuscenes.utils.splits import create_splits_scenes
 
     own = options.split_file or options.root / options.version / "splits.json"
@@ -85,16 +85,16 @@ def _splits(
             f"{own} (docs/data.md says how)."
         )
     names = {scene["token"]: scene["name"] for scene in tables.scene}
-    resolved, missing = resolve_scenes(wanted, names)
+    split_of, missing = resolve_scenes(wanted, names)
     if missing:
-        total = len(missing) + sum(len(scenes) for scenes in resolved.values())
+        total = len(missing) + len(split_of)
         summary.notes.append(f"{len(missing)} of the splits' {total} scenes are not in the tables.")
-    if not any(resolved.values()):
+    if not split_of:
         raise ValueError(
             f"none of the split's scenes is in {options.root / options.version}: it has "
             f"{sorted(names.values())[:5]}; give --split-file."
         )
-    return resolved
+    return split_of
 
 
 def _instances_of(local_map: NuScenesLocalMap, poses: np.ndarray) -> list[list[MapInstance] | str]:
@@ -116,13 +116,12 @@ class _Conversion:
         self.summary = ConversionSummary(options.classes)
         self.tables = NuScenesTables(options.version, options.root, options.max_sweeps > 0)
         self.reader = SampleReader(self.tables, options.max_sweeps)
-        self.splits = _splits(options, self.tables, self.summary)
-        self.positions: Positions = {split: defaultdict(list) for split in self.splits}
+        self.split_of = _splits(options, self.tables, self.summary)
+        self.positions: Positions = {split: defaultdict(list) for split in self.split_of.values()}
 
     def run(self, writers: dict[str, AnnotationWriter]) -> None:
         """Convert map by map, so that one map at a time is in memory."""
-        split_of = {scene: split for split, scenes in self.splits.items() for scene in scenes}
-        scenes = [scene for scene in self.tables.scene if scene["name"] in split_of]
+        scenes = [scene for scene in self.tables.scene if scene["name"] in self.split_of]
         scenes = self.options.shard.part(sorted(scenes, key=self.tables.location_of))
         with Progress(
             desc=f"{self.options.dataset} {self.options.version}", unit="samples", smoothing=0.05,
@@ -135,7 +134,7 @@ class _Conversion:
                         self.summary.add_problem(f"sample left out: {instances}", sample.token)
                         continue
                     sample.instances = instances
-                    split = split_of[sample.scene]
+                    split = self.split_of[sample.scene]
                     writers[split].write(sample)
                     self.summary.add_sample(split, sample)
                     place = sample.global_from_frame[:2, 3]
@@ -200,7 +199,7 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
     }
     with ExitStack() as stack:
         writers = {}
-        for split in [s for s, scenes in conversion.splits.items() if scenes]:
+        for split in conversion.positions:
             meta = options.meta(options.dataset, "lidar", split, **made_from)
             writer = AnnotationWriter(options.path_of(options.dataset, split), meta, options.shard)
             writers[split] = stack.enter_context(writer)
