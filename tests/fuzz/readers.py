@@ -27,7 +27,7 @@ from gsmap.converters.custom import from_records
 from gsmap.converters.infos import convert_infos
 from gsmap.converters.nuscenes.can_bus import read_messages, signals_at
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
-from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables, SampleReader
+from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables
 from gsmap.converters.splits import read_split_file
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
@@ -272,10 +272,9 @@ class Files:
         )
 
     def tables(self) -> list[MapSample]:
-        opened = NuScenesTables(VERSION, self.work, with_sweeps=True)
-        read = SampleReader(opened, 3).read
+        opened = NuScenesTables(VERSION, self.work, max_sweeps=3)
         drives = [(s, scene) for scene in opened.scene for s in opened.samples_of(scene)]
-        found = [read(s, scene) for s, scene in drives if LIDAR in s["data"]]
+        found = [opened.read(s, scene) for s, scene in drives if LIDAR in s["data"]]
         return self.written(LIDAR_META, found)
 
     def written(self, meta: AnnotationMeta, samples: list[MapSample]) -> list[MapSample]:

@@ -6,7 +6,6 @@ the ground truth too. The pickles are read without running code from them.
 """
 
 import argparse
-import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -35,7 +34,7 @@ from gsmap.datasets.image_files import image_size
 from gsmap.datasets.plain_pickle import load_plain_pickle
 from gsmap.utils.cli import output_file
 from gsmap.utils.progress import Progress
-from gsmap.utils.shards import WHOLE, Shard, add_shard_options
+from gsmap.utils.shards import WHOLE, Shard, add_shard_options, digest
 
 NUSCENES_SIZE = (1600, 900)
 _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
@@ -235,7 +234,7 @@ def convert_infos(
         x_range or RANGES[frame][0],
         y_range or RANGES[frame][1],
         dim,
-        hashlib.sha256(infos.read_bytes()).hexdigest()[:16],
+        digest(infos)[:16],
         options={"infos": infos.name},
         command=command,
     )

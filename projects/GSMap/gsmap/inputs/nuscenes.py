@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables, SampleReader
+from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables
 from gsmap.datasets.annotations.record import MapSample
 
 
@@ -26,10 +26,9 @@ def read_nuscenes(root: Path, version: str | None = None) -> list[MapSample]:
         raise ValueError(f"{root} holds several versions, {found}: name one with --version.")
     if version is not None and version not in found:
         raise ValueError(f"{root} holds no version {version!r}, but {found}.")
-    tables = NuScenesTables(version or found[0], root, with_sweeps=True)
-    reader = SampleReader(tables, max_sweeps=10)
+    tables = NuScenesTables(version or found[0], root, max_sweeps=10)
     return [
-        reader.read(record, scene)
+        tables.read(record, scene)
         for scene in tables.scene
         for record in tables.samples_of(scene)
         if LIDAR in record["data"]

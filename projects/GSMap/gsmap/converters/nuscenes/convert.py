@@ -16,7 +16,7 @@ import shapely
 
 from gsmap.converters.command_line import FileOptions, add_file_options, fingerprint, options_from
 from gsmap.converters.nuscenes.map import MAP_CLASSES, NuScenesLocalMap, check_classes, open_layers
-from gsmap.converters.nuscenes.tables import CAMERAS, LIDAR, NuScenesTables, SampleReader
+from gsmap.converters.nuscenes.tables import CAMERAS, LIDAR, NuScenesTables
 from gsmap.converters.splits import Positions, overlap_notes, read_split_file, resolve_scenes
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
@@ -114,8 +114,7 @@ class _Conversion:
     def __init__(self, options: NuScenesOptions) -> None:
         self.options = options
         self.summary = ConversionSummary(options.classes)
-        self.tables = NuScenesTables(options.version, options.root, options.max_sweeps > 0)
-        self.reader = SampleReader(self.tables, options.max_sweeps)
+        self.tables = NuScenesTables(options.version, options.root, options.max_sweeps)
         self.split_of = _splits(options, self.tables, self.summary)
         self.positions: Positions = {split: defaultdict(list) for split in self.split_of.values()}
 
@@ -168,7 +167,7 @@ class _Conversion:
             for name in CAMERAS:
                 if name not in record["data"]:
                     self.summary.add_problem(f"{name} absent (sample kept without it)", token)
-            sample = self.reader.read(record, scene)
+            sample = self.tables.read(record, scene)
             files = {f"{camera.name} image": camera.path for camera in sample.cameras}
             for name, path in {**files, LIDAR: sample.lidar.path}.items():  # type: ignore[union-attr]
                 if not (self.options.root / path).is_file():

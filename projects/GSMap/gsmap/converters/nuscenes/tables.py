@@ -1,4 +1,4 @@
-"""The tables of nuScenes-format data, without what maps do not need."""
+"""The tables of nuScenes-format data, without what maps do not need, and the samples in them."""
 
 import json
 import math
@@ -101,24 +101,35 @@ def _is_right(value: Any, kind: type | int) -> bool:
     return kind != 4 or abs(math.hypot(*value) - 1) < 1e-3  # a quaternion
 
 
+def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
+    """Return the transform of a record's ``translation`` and ``rotation``. (4, 4).
+
+    The rotation is a quaternion (w, x, y, z), or in info files a matrix.
+    """
+    turned = np.asarray(record[f"{prefix}rotation"], np.float64)
+    rotation = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
+    return rigid(rotation, np.asarray(record[f"{prefix}translation"], np.float64).reshape(3))
+
+
 class NuScenesTables:
     """The tables with the key frames of cameras and LiDAR, and LiDAR sweeps if asked for.
 
     Annotation tables and every other sensor's records are left out while reading: of trainval's 2.6
     million ``sample_data`` records a tenth remains (a fifth with sweeps), and with them their
-    poses. Each sample's ``data`` holds the tokens of its key frames by channel.
+    poses. Each sample's ``data`` holds the records of its key frames by channel.
 
     Raises:
         FileNotFoundError: If a table is missing.
         ValueError: If a table is damaged or a record points to one that there is not.
     """
 
-    def __init__(self, version: str, dataroot: Path, with_sweeps: bool) -> None:
-        self.dataroot, self._folder = dataroot, dataroot / version
+    def __init__(self, version: str, dataroot: Path, max_sweeps: int) -> None:
+        self._folder, self._max_sweeps = dataroot / version, max_sweeps
+        self._messages = lru_cache(maxsize=1)(partial(read_messages, dataroot))
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
         for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
             self._keep(table, self._read(table))
-        data = list(self._wanted_sample_data(with_sweeps))
+        data = list(self._wanted_sample_data())
         wanted = {record["ego_pose_token"] for record in data}
         self._keep("ego_pose", (r for r in self._read("ego_pose") if r["token"] in wanted))
         self._keep("sample_data", data)
@@ -127,12 +138,8 @@ class NuScenesTables:
         for record in data:
             if record["is_key_frame"]:
                 keys = self._records["sample"][record["sample_token"]]["data"]
-                keys[self._channel_of(record)] = record["token"]
+                keys[self._channel_of(record)] = record
         self.scene = list(self._records["scene"].values())
-
-    def get(self, table: str, token: str) -> dict[str, Any]:
-        """Return a record."""
-        return self._records[table][token]
 
     def _damaged(self, table: str, wrong: str) -> ValueError:
         return ValueError(f"{self._folder}/{table}.json{wrong}; download the tables again.")
@@ -172,11 +179,11 @@ class NuScenesTables:
         sensor = self._records["calibrated_sensor"][record["calibrated_sensor_token"]]
         return self._records["sensor"][sensor["sensor_token"]]["channel"]
 
-    def _wanted_sample_data(self, with_sweeps: bool) -> Iterator[dict[str, Any]]:
+    def _wanted_sample_data(self) -> Iterator[dict[str, Any]]:
         for record in self._read("sample_data"):
             self._check_link("sample_data", record, "calibrated_sensor_token")
             channel = self._channel_of(record)
-            is_sweep = channel == LIDAR and with_sweeps
+            is_sweep = channel == LIDAR and self._max_sweeps > 0
             if is_sweep or (record["is_key_frame"] and channel in (LIDAR, *CAMERAS)):
                 yield {name: record[name] for name in ("token", *_FIELDS["sample_data"])}
 
@@ -207,35 +214,17 @@ class NuScenesTables:
 
     def location_of(self, scene: dict[str, Any]) -> str:
         """Return the name of the map that a scene was driven on."""
-        return self.get("log", scene["log_token"])["location"]
-
-
-def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
-    """Return the transform of a record's ``translation`` and ``rotation``. (4, 4).
-
-    The rotation is a quaternion (w, x, y, z), or in info files a matrix.
-    """
-    turned = np.asarray(record[f"{prefix}rotation"], np.float64)
-    rotation = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
-    return rigid(rotation, np.asarray(record[f"{prefix}translation"], np.float64).reshape(3))
-
-
-class SampleReader:
-    """Turn rows of the tables into samples, without ground truth."""
-
-    def __init__(self, tables: NuScenesTables, max_sweeps: int) -> None:
-        self._tables, self._max_sweeps = tables, max_sweeps
-        self._messages = lru_cache(maxsize=1)(partial(read_messages, tables.dataroot))
+        return self._records["log"][scene["log_token"]]["location"]
 
     def _global_from(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
         """Return global-from-sensor (4, 4) and the calibration of a sensor record."""
-        calibration = self._tables.get("calibrated_sensor", data["calibrated_sensor_token"])
-        global_from_ego = pose_of(self._tables.get("ego_pose", data["ego_pose_token"]))
+        calibration = self._records["calibrated_sensor"][data["calibrated_sensor_token"]]
+        global_from_ego = pose_of(self._records["ego_pose"][data["ego_pose_token"]])
         return global_from_ego @ pose_of(calibration), calibration
 
     def read(self, sample: dict[str, Any], scene: dict[str, Any]) -> MapSample:
-        """Read a sample in the frame of its LiDAR, without instances and absent cameras."""
-        lidar = self._tables.get("sample_data", sample["data"][LIDAR])
+        """Return a sample in the frame of its LiDAR, without instances and absent cameras."""
+        lidar = sample["data"][LIDAR]
         global_from_frame, calibration = self._global_from(lidar)
         ego_from_frame, timestamp_ns = pose_of(calibration), sample["timestamp"] * 1000
         global_from_ego = global_from_frame @ invert_rigid(ego_from_frame)
@@ -243,7 +232,7 @@ class SampleReader:
         return MapSample(
             token=sample["token"],
             scene=scene["name"],
-            map_name=self._tables.location_of(scene),
+            map_name=self.location_of(scene),
             timestamp_ns=timestamp_ns,
             cameras=[self._camera(n, sample["data"][n], global_from_frame) for n in names],
             global_from_frame=global_from_frame,
@@ -252,8 +241,9 @@ class SampleReader:
             can_bus=signals_at(timestamp_ns, global_from_ego, self._messages(scene["name"])),
         )
 
-    def _camera(self, name: str, token: str, global_from_frame: np.ndarray) -> CameraRecord:
-        data = self._tables.get("sample_data", token)
+    def _camera(
+        self, name: str, data: dict[str, Any], global_from_frame: np.ndarray
+    ) -> CameraRecord:
         global_from_cam, calibration = self._global_from(data)
         return CameraRecord(
             name,
@@ -266,7 +256,7 @@ class SampleReader:
 
     def _sweeps(self, lidar: dict[str, Any], global_from_frame: np.ndarray) -> list[SweepRecord]:
         frame_from_global = invert_rigid(global_from_frame)
-        earlier = self._tables.chain("sample_data", lidar["prev"], "prev", lidar)
+        earlier = self.chain("sample_data", lidar["prev"], "prev", lidar)
         return [
             SweepRecord(
                 data["filename"],
