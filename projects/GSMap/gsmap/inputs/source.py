@@ -1,6 +1,5 @@
 """From whatever holds a recording to samples: the one entrance to the readers of this room."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,7 +116,8 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
     if logs:
         root = folder.parent if logs == [folder] else folder
         samples, left_out = read_logs(logs, root, options.rate_hz)
-        return Source(samples, "ego", root, notes=_left_out(left_out))
+        notes = tuple(f"{count} samples left out: {reason}" for reason, count in left_out.items())
+        return Source(samples, "ego", root, notes=notes)
     files = [folder / name for name in NAMES if (folder / name).is_file()]
     files = files or sorted(path for pattern in _FILES for path in folder.glob(pattern))
     if len(files) == 1:
@@ -132,7 +132,3 @@ def _lies_with_its_images(annotations: AnnotationFile) -> bool:
     """Whether the first image of an annotation file is found from the file's own folder."""
     cameras = annotations[0].cameras if len(annotations) else []
     return bool(cameras) and (annotations.path.parent / cameras[0].path).is_file()
-
-
-def _left_out(counts: Counter[str]) -> tuple[str, ...]:
-    return tuple(f"{count} samples left out: {reason}" for reason, count in counts.items())
