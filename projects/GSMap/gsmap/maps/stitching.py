@@ -1,7 +1,6 @@
 """Polylines whose ends meet become one; one that meets itself becomes a ring."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -16,25 +15,6 @@ _DISTANCE_STEP_M = 0.25  # of gaps about as wide, the straightest is closed firs
 _RING_M = 10.0  # a shorter line is not closed
 
 
-@dataclass(frozen=True)
-class _Ends:
-    """Both ends of all lines, start and end by turns: positions and outward directions."""
-
-    points: FloatArray
-    headings: FloatArray
-
-    @classmethod
-    def of(cls, lines: Sequence[FloatArray]) -> "_Ends":
-        points, headings = [], []
-        for line in lines:
-            for part in (line[:, :2], line[::-1, :2]):
-                within = shapely.line_interpolate_point(shapely.LineString(part), _HEADING_M)
-                inner = shapely.get_coordinates(within)[0]
-                points.append(part[0])
-                headings.append((part[0] - inner) / max(np.linalg.norm(part[0] - inner), 1e-9))
-        return cls(np.array(points).reshape(-1, 2), np.array(headings).reshape(-1, 2))
-
-
 def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
     """Join lines at their ends, the narrowest and straightest gaps first.
 
@@ -47,10 +27,9 @@ def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
     Returns:
         The joined lines; a ring's last vertex equals its first. each (m, D)
     """
-    ends = _Ends.of(lines)
     closed = [bool(np.array_equal(line[0, :2], line[-1, :2])) for line in lines]
     partner: dict[int, int] = {}
-    for a, b in _candidates(ends):
+    for a, b in _candidates(lines):
         own_ends = a // 2 == b // 2
         short = own_ends and arc_lengths(lines[a // 2])[-1] < _RING_M
         if not (a in partner or b in partner or closed[a // 2] or closed[b // 2] or short):
@@ -62,15 +41,24 @@ def stitch(lines: Sequence[FloatArray]) -> list[FloatArray]:
     return joined
 
 
-def _candidates(ends: _Ends) -> list[tuple[int, int]]:
-    """Return pairs of ends that may be joined, the best first."""
-    if not len(ends.points):
+def _candidates(lines: Sequence[FloatArray]) -> list[tuple[int, int]]:
+    """Return pairs of ends that may be joined, the best first; start and end of lines by turns."""
+    ends, headings = [], []  # the latter point outwards
+    for line in lines:
+        for part in (line[:, :2], line[::-1, :2]):
+            within = shapely.line_interpolate_point(shapely.LineString(part), _HEADING_M)
+            inner = shapely.get_coordinates(within)[0]
+            ends.append(part[0])
+            headings.append((part[0] - inner) / max(np.linalg.norm(part[0] - inner), 1e-9))
+    if not ends:
         return []
-    pairs = cKDTree(ends.points).query_pairs(JOIN_M, output_type="ndarray")
-    cosine = (ends.headings[pairs[:, 0]] * ends.headings[pairs[:, 1]]).sum(axis=1)
-    gap = np.linalg.norm(ends.points[pairs[:, 0]] - ends.points[pairs[:, 1]], axis=1)
+    points, outward = np.array(ends), np.array(headings)
+    pairs = cKDTree(points).query_pairs(JOIN_M, output_type="ndarray")
+    first, second = pairs.T
+    cosine = (outward[first] * outward[second]).sum(axis=1)
+    gap = np.linalg.norm(points[first] - points[second], axis=1)
     steps = np.round(gap / _DISTANCE_STEP_M)
-    order = np.lexsort((pairs[:, 1], pairs[:, 0], cosine.round(6), steps))
+    order = np.lexsort((second, first, cosine.round(6), steps))
     return [(int(a), int(b)) for a, b in pairs[order[cosine[order] < 0.0]]]
 
 
