@@ -83,6 +83,12 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
     return len(dataset.cameras), height, width
 
 
+def mask_stride(path: str) -> int:
+    """Return how many pixels of an image a cell of a config's camera masks covers."""
+    pipeline = read_config(path).train_dataloader.dataset.pipeline
+    return next((step.get("stride", 32) for step in pipeline if step.type == "MakePVMask"), 32)
+
+
 def model_and_batch(
     path: str, args: argparse.Namespace, batch: int = 1, raster: str = "", elements: int = 15
 ) -> tuple[Any, dict[str, torch.Tensor], list[Det3DDataSample]]:
@@ -90,7 +96,7 @@ def model_and_batch(
 
     They are normalised images of cameras in a ring, and straight elements as ground truth.
     """
-    model, shape = build(path, args, raster), image_shape(path, args)
+    model, shape, stride = build(path, args, raster), image_shape(path, args), mask_stride(path)
     generator = torch.Generator().manual_seed(0)
     cameras, *size = shape
     images = torch.randn(batch, cameras, 3, *size, generator=generator).to(args.device)
@@ -111,16 +117,20 @@ def model_and_batch(
             pts_shifts=torch.stack([pts, pts.flip(1)], 1),
             polylines=pts,
         ).to(args.device)
-        add_auxiliary_targets(sample, model, shape, generator)
+        add_auxiliary_targets(sample, model, shape, stride, generator)
         samples.append(sample.to(args.device))
     return model, {"imgs": images}, samples
 
 
 def add_auxiliary_targets(
-    sample: Det3DDataSample, model: Any, shape: tuple[int, int, int], generator: torch.Generator
+    sample: Det3DDataSample,
+    model: Any,
+    shape: tuple[int, int, int],
+    stride: int,
+    generator: torch.Generator,
 ) -> None:
     """Add what auxiliary heads train on: masks of every class and depth, at random."""
-    classes, stride = len(model.map_head.classes), 32
+    classes = len(model.map_head.classes)
     cells = model.bev_encoder.grid
     views, *size = shape
     features = size[0] // stride, size[1] // stride

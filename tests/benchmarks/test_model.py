@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks import fps, profile, step
-from benchmarks.model import image_shape
+from benchmarks.model import image_shape, mask_stride
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -39,6 +39,11 @@ def test_images_are_as_large_as_the_configs(config, shape):
     path = str(REPO / f"configs/{config}.py")
     assert image_shape(path, argparse.Namespace(size=None)) == shape
     assert image_shape(path, argparse.Namespace(size=[64, 96])) == (shape[0], 64, 96)
+
+
+@pytest.mark.parametrize(("config", "stride"), [("r50_24e", 32), ("r18_minicity", 16)])
+def test_camera_masks_are_as_coarse_as_the_configs(config, stride):
+    assert mask_stride(str(REPO / f"configs/maptrv2/maptrv2_{config}.py")) == stride
 
 
 def test_frames_per_second_are_those_of_the_time(capsys):
