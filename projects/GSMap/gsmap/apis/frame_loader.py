@@ -27,28 +27,23 @@ class BrokenFrame:
     reason: str
 
 
+@dataclass(eq=False)
 class FrameDataset(Dataset):
     """Frames of a test data set, or what is wrong with them.
 
     Args:
         dataset: The data set; its ``cameras`` say which ones the model expects.
-        indices: Which frames, in this order; all by default.
         blank_cameras: Whether a camera that a frame lacks is there, but sees nothing, as long as
             the frame has another one; else the frame is broken.
     """
 
-    def __init__(
-        self, dataset: VectorizedMapDataset, indices: Sequence[int] | None, blank_cameras: bool
-    ) -> None:
-        self.dataset = dataset
-        self.indices = range(len(dataset)) if indices is None else indices
-        self.blank_cameras = blank_cameras
+    dataset: VectorizedMapDataset
+    blank_cameras: bool
 
     def __len__(self) -> int:
-        return len(self.indices)
+        return len(self.dataset)
 
-    def __getitem__(self, index: int) -> dict[str, Any] | BrokenFrame:
-        row = self.indices[index]
+    def __getitem__(self, row: int) -> dict[str, Any] | BrokenFrame:
         try:
             return self._frame(row)
         except (ValueError, OSError) as error:

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from mmdet3d.registry import DATASETS, MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.config import Config
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Subset
 
 from gsmap.apis.checkpoint import adopt_settings, load_weights
 from gsmap.apis.frame_loader import BrokenFrame, FrameDataset, collate
@@ -269,8 +269,9 @@ class MapInferencer:
             ValueError: If a file of a sample is missing or damaged, or a camera is absent.
         """
         dataset = self._fit_cameras(dataset, allow_missing_cameras)
-        frames = FrameDataset(dataset, indices, allow_missing_cameras)
-        batches = DataLoader(frames, batch_size, num_workers=num_workers, collate_fn=collate)
+        frames = FrameDataset(dataset, allow_missing_cameras)
+        chosen = frames if indices is None else Subset(frames, indices)
+        batches = DataLoader(chosen, batch_size, num_workers=num_workers, collate_fn=collate)
         with ExitStack() as stack:
             pools = [stack.enter_context(ThreadPoolExecutor(1)) for _ in self.replicas]
             pending: deque[Future] = deque()

@@ -1,5 +1,6 @@
 """Draws samples while a model is validated or tested."""
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ def _visualizer(runner: Runner) -> MapVisualizer:
 
 
 @HOOKS.register_module()
+@dataclass(eq=False)
 class MapVisualizationHook(Hook):
     """Draws predictions: to ``test_out_dir`` in testing, to the backends in validation.
 
@@ -45,22 +47,15 @@ class MapVisualizationHook(Hook):
         ValueError: If ``interval`` is smaller than 1.
     """
 
-    priority = "NORMAL"
+    draw: bool = False
+    interval: int = 1
+    num_val_samples: int = 4
+    test_out_dir: str | None = None
+    _seen: int = field(default=0, init=False)
 
-    def __init__(
-        self,
-        draw: bool = False,
-        interval: int = 1,
-        num_val_samples: int = 4,
-        test_out_dir: str | None = None,
-    ):
-        if interval < 1:
-            raise ValueError(f"interval must be >= 1, got {interval}.")
-        self.draw = draw
-        self.interval = interval
-        self.num_val_samples = num_val_samples
-        self.test_out_dir = test_out_dir
-        self._seen = 0
+    def __post_init__(self) -> None:
+        if self.interval < 1:
+            raise ValueError(f"interval must be >= 1, got {self.interval}.")
 
     def after_val_iter(
         self, runner: Runner, batch_idx: int, data_batch: Any = None, outputs: Any = None

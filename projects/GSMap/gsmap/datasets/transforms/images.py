@@ -51,6 +51,7 @@ class LoadCameraImages(BaseTransform):
 
 
 @TRANSFORMS.register_module()
+@dataclass(eq=False)
 class ScaleImages(BaseTransform):
     """Resize all images and update ``lidar2img`` and ``img_aug_matrix``.
 
@@ -59,10 +60,11 @@ class ScaleImages(BaseTransform):
             axis. ValueError if it is not positive.
     """
 
-    def __init__(self, scale: float) -> None:
-        if not scale > 0:
-            raise ValueError(f"scale must be > 0, got {scale}.")
-        self.scale = scale
+    scale: float
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0:
+            raise ValueError(f"scale must be > 0, got {self.scale}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Scale ``results['img']``."""
