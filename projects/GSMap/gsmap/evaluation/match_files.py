@@ -73,14 +73,9 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
             notes += file["notes"].tolist()
             found = {name: file[name] for name in file.files}
         metrics = [name.split("/")[0] for name in found if name.endswith("/token")]
-        matches += _samples({metric: list(_records(found, metric)) for metric in metrics})
+        by_metric = zip(*(_records(found, metric) for metric in metrics), strict=True)
+        matches += [dict(zip(metrics, of_sample, strict=True)) for of_sample in by_metric]
     return evaluator.reports(matches), list(dict.fromkeys(notes))
-
-
-def _samples(by_metric: dict[str, list[FrameMatches]]) -> Iterator[SampleMatches]:
-    """Turn each metric's samples into each sample's metrics."""
-    for records in zip(*by_metric.values(), strict=True):
-        yield dict(zip(by_metric, records, strict=True))
 
 
 def _records(arrays: dict[str, Any], metric: str) -> Iterator[FrameMatches]:

@@ -68,9 +68,6 @@ class _Log:
     def _stamp(self, time_ns: int) -> Any:
         return self._messages.Timestamp(*divmod(time_ns, 10**9))
 
-    def _point(self, xyz: Sequence[float]) -> Any:
-        return self._messages.Point3(x=xyz[0], y=xyz[1], z=xyz[2])
-
     def transform(self, parent: str, child: str, pose: FloatArray, time_ns: int) -> None:
         """Log where a frame stands in its parent."""
         m, (x, y, z) = self._messages, pose[:3, 3].tolist()
@@ -116,7 +113,7 @@ class _Log:
         shapes = [
             m.LinePrimitive(
                 thickness=0.15,
-                points=[self._point(p) for p in line.tolist()],
+                points=[m.Point3(x=x, y=y, z=z) for x, y, z in line.tolist()],
                 color=self._colours[label],
             )
             for label, line in lines
