@@ -13,7 +13,7 @@ import psutil
 import shapely
 from shapely import affinity
 
-from gsmap.converters.nuscenes.map import NuScenesLocalMap, read_layers
+from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import MapInstance, MapSample
 from gsmap.structures.polylines import is_closed
@@ -186,10 +186,9 @@ def open_maps(root: Path, x_range: tuple[float, float], y_range: tuple[float, fl
     prepared, per_item = {}, {}
     for name in locations:
         if (root / f"maps/expansion/{name}.json").is_file():
-            nusc_map = NuScenesMap(str(root), name)
-            layers = read_layers(nusc_map, _CLASSES)
+            layers = open_layers(root, name, _CLASSES)
             prepared[name] = NuScenesLocalMap(layers, _CLASSES, x_range, y_range)
-            per_item[name] = PerItemGroundTruth(nusc_map, x_range, y_range)
+            per_item[name] = PerItemGroundTruth(NuScenesMap(str(root), name), x_range, y_range)
     return prepared, per_item
 
 

@@ -85,7 +85,14 @@ def expansion(root: Path, name: str) -> Path:
 
 
 def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
-    """Collect the geometries that the classes need from a map of a data root, which is checked."""
+    """Collect the geometries that the classes (of ``MAP_CLASSES``) need from a data root's map.
+
+    Lines without two nodes and invalid polygons are left out and counted.
+
+    Raises:
+        FileNotFoundError: If the map is missing or unknown.
+        ValueError: If it is damaged.
+    """
     from nuscenes.map_expansion.map_api import NuScenesMap, locations
 
     path = expansion(root, name)
@@ -94,29 +101,21 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
             f"no map expansion for {name!r} in {path.parent}; the devkit knows "
             f"{', '.join(locations)}. Unpack the map expansion pack (v1.3) there."
         )
-    with naming(path, "unpack the map expansion pack (v1.3) again"):
-        layers = read_layers(NuScenesMap(str(root), name), classes)
-        for geometries in (layers.lines, *layers.polygons.values()):
-            if not np.isfinite(shapely.get_coordinates(geometries)).all():
-                raise ValueError("a point is not finite")
-    return layers
-
-
-def read_layers(nusc_map: "NuScenesMap", classes: Collection[str]) -> MapLayers:
-    """Collect the geometries that the classes (of ``MAP_CLASSES``) need from a devkit's map.
-
-    Lines without two nodes and invalid polygons are left out and counted.
-    """
     skipped: Counter[str] = Counter()
     names = set(AREA_CLASSES) & set(classes)
     if "boundary" in classes:
         names |= set(SURFACE_LAYERS)
-    areas = {name: _read_polygons(nusc_map, name, skipped) for name in sorted(names)}
     marked = LINE_LAYERS if "divider" in classes else ()
-    lines = [line for layer in marked for line in _read_lines(nusc_map, layer, skipped)]
-    layers = MapLayers(lines, areas, skipped)
-    if "centerline" in classes:
-        _read_centerlines(nusc_map, layers)
+    with naming(path, "unpack the map expansion pack (v1.3) again"):
+        nusc_map = NuScenesMap(str(root), name)
+        areas = {area: _read_polygons(nusc_map, area, skipped) for area in sorted(names)}
+        lines = [line for layer in marked for line in _read_lines(nusc_map, layer, skipped)]
+        layers = MapLayers(lines, areas, skipped)
+        if "centerline" in classes:
+            _read_centerlines(nusc_map, layers)
+        for geometries in (layers.lines, *layers.polygons.values()):
+            if not np.isfinite(shapely.get_coordinates(geometries)).all():
+                raise ValueError("a point is not finite")
     return layers
 
 
