@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from gsmap.models.bev_encoders.camera_encoder import CameraEncoder
 from gsmap.models.bev_encoders.depth_net import CameraAwareDepthNet, PlainDepthNet, camera_vector
 from gsmap.models.bev_encoders.projection import frustum_points
+from gsmap.models.layers.deformable_attention import init_matrices
 from gsmap.models.losses.auxiliary import num_depth_bins
 from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
 from gsmap.structures.grid import BEVGrid
@@ -68,9 +69,7 @@ class LSSEncoder(CameraEncoder):
     def init_weights(self) -> None:
         """Initialise matrices and kernels as upstream's transformer does: Xavier, uniform."""
         super().init_weights()
-        for parameter in self.parameters():
-            if parameter.dim() > 1:
-                nn.init.xavier_uniform_(parameter)
+        init_matrices(self)
 
     def encode(
         self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]

@@ -97,12 +97,8 @@ class RenderedDiceLoss(nn.Module):
         Points are normalised (n, P, 2), the ground truth's in their first order; a pair is rendered
         as its ground truth's class (n,). 0 with a gradient of 0 if nothing is matched.
         """
-        with torch.autocast(pred_points.device.type, enabled=False):
-            dtype = torch.promote_types(pred_points.dtype, torch.float32)
-            is_polygon = self.renderer.is_polygon(gt_labels)
-            preds = self.renderer.render(pred_points.to(dtype), is_polygon)
-            with torch.no_grad():
-                targets = self.renderer.render(gt_points.to(dtype), is_polygon)
-            losses = dice_loss(preds, targets)
+        is_polygon = self.renderer.is_polygon(gt_labels)
+        preds = self.renderer.render(pred_points, is_polygon)
+        targets = self.renderer.render(gt_points, is_polygon)
         count = max(len(pred_points), 1) if avg_factor is None else avg_factor
-        return self.loss_weight * losses.sum() / count
+        return self.loss_weight * dice_loss(preds, targets).sum() / count

@@ -99,11 +99,9 @@ class EuclideanLoss(nn.Module):
 
         Arguments as of `euclidean_relation_loss`; heights are left out. 2 x (M, P, 2 or 3) -> ()
         """
-        with torch.autocast(pred.device.type, enabled=False):
-            dtype = torch.promote_types(pred.dtype, torch.float32)
-            pred, target = pred[..., :2].to(dtype), target[..., :2].to(dtype)  # in the plane
-            shape = euclidean_shape_loss(pred, target)
-            relation = euclidean_relation_loss(pred, target, counts)
+        pred, target = pred[..., :2], target[..., :2]  # in the plane
+        shape = euclidean_shape_loss(pred, target)
+        relation = euclidean_relation_loss(pred, target, counts)
         return self.loss_weight * (self.shape_weight * shape + self.relation_weight * relation)
 
 

@@ -66,7 +66,6 @@ class IoUCost:
             raise ValueError(f"kind must be 'iou' or 'dice', got {kind!r}.")
         self.weight, self.kind = weight, kind
 
-    @torch.no_grad()
     def __call__(
         self, pred_instances: InstanceData, gt_instances: InstanceData, img_meta: Any = None
     ) -> Tensor:
@@ -100,16 +99,13 @@ class RenderedDiceCost:
         self.weight = weight
         self.renderer = ElementRenderer(size, **rendering)
 
-    @torch.no_grad()
     def __call__(
         self, pred_instances: InstanceData, gt_instances: InstanceData, img_meta: Any = None
     ) -> Tensor:
         """Compare ``pts`` (N, P, 2) with ``first_pts`` (K, P, 2) of ``labels`` (K,). (N, K)"""
-        is_polygon = self.renderer.is_polygon(gt_instances.labels)
-        with torch.autocast(is_polygon.device.type, enabled=False):
-            preds, gts = pred_instances.pts.float(), gt_instances.first_pts.float()
-            targets = self.renderer.render(gts, is_polygon)
-            lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
-            as_lines = pairwise_dice_loss(self.renderer.render(preds, lines), targets)
-            as_polygons = pairwise_dice_loss(self.renderer.render(preds, ~lines), targets)
-            return self.weight * torch.where(is_polygon, as_polygons, as_lines)
+        preds, is_polygon = pred_instances.pts, self.renderer.is_polygon(gt_instances.labels)
+        targets = self.renderer.render(gt_instances.first_pts, is_polygon)
+        lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
+        as_lines = pairwise_dice_loss(self.renderer.render(preds, lines), targets)
+        as_polygons = pairwise_dice_loss(self.renderer.render(preds, ~lines), targets)
+        return self.weight * torch.where(is_polygon, as_polygons, as_lines)
