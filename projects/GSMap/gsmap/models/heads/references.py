@@ -149,10 +149,21 @@ class GaussianReference(PointReference):
         self.metainfo = {"min_scale_m": self.space.floor_m}
         self.gaussian_init = nn.Linear(embed_dims, 3)
         hidden = [embed_dims, embed_dims] if mlp else []
-        by_layer = [branches.mlp(embed_dims, *hidden, 3) for _ in range(num_layers)]
-        self.gaussian_branches = nn.ModuleList(by_layer)
-        # every query starts with the same Gaussian, and every layer leaves it as it is
-        for last in (self.gaussian_init, *(branch[-1] for branch in by_layer)):
+        self.gaussian_branches = nn.ModuleList(
+            branches.mlp(embed_dims, *hidden, 3) for _ in range(num_layers)
+        )
+        self.reset_gaussian_parts()
+
+    def init_weights(self) -> None:
+        """Initialise as for points; what the Gaussians add starts neutral."""
+        super().init_weights()
+        self.reset_gaussian_parts()
+
+    def reset_gaussian_parts(self) -> None:
+        """Let every query start with the same Gaussian, and every layer leave it as it is."""
+        constant_init(self.gaussian_init, 0.0)
+        for branch in self.gaussian_branches:
+            *_, last = branch.children()
             constant_init(last, 0.0)
 
     def start(self, query_pos: Tensor) -> Tensor:
