@@ -3,7 +3,7 @@
 Backbone, neck and BEV encoder are frozen and run once (the pipeline must not augment), so a run
 costs a fraction of fine-tuning the whole model. Every variant starts from the head of the
 checkpoint (or, with ``--from-scratch``, from a new one), sees the same batches in the same order,
-and is tested on the same features.
+and is tested on the same features. Its predictions, ``NAME-SEED/results.json``, are for ``shape``.
 """
 
 import argparse
@@ -32,11 +32,12 @@ _DECIDING = ("config", "checkpoint", "data_root", "iterations", "batch", "lr", "
 
 @dataclass(frozen=True)
 class Task:
-    """One run: a variant of a config's head, and a seed."""
+    """One run: a variant of a config's head, a seed, and where its predictions go."""
 
     config: Path
     options: dict[str, Any]
     seed: int
+    results: Path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,7 +77,8 @@ def run(args: argparse.Namespace) -> None:
         config, *overrides = shlex.split(text)
         changed = parse_options(overrides) if overrides else {}
         for seed in range(args.seeds):
-            tasks[name, seed] = Task(Path(config), changed, seed)
+            results = args.out / f"{name}-{seed}/results.json"
+            tasks[name, seed] = Task(Path(config), changed, seed, results)
     figures: dict[tuple[str, int], dict[str, float]] = {}
     waiting = {}
     context = multiprocessing.get_context("spawn")
@@ -171,15 +173,16 @@ def train_and_test(
         torch.nn.utils.clip_grad_norm_(head.parameters(), rates.clip_grad.max_norm)
         optimizer.step()
         schedule.step()
-    return test(model, cfg, torch.load(features["val"], weights_only=False, mmap=True))
+    data = torch.load(features["val"], weights_only=False, mmap=True)
+    return test(model, data, task.results)
 
 
 @torch.no_grad()
-def test(model: Any, cfg: Config, data: dict[str, Any]) -> dict[str, float]:
-    """Return every figure of both metrics."""
+def test(model: Any, data: dict[str, Any], results: Path) -> dict[str, float]:
+    """Write the predictions and return every figure of both metrics."""
     MMLogger.get_instance("heads", log_level="ERROR")
     model.eval()
-    metric = METRICS.build({"type": "MapMetric", "eval": METRIC_NAMES})
+    metric = METRICS.build({"type": "MapMetric", "eval": METRIC_NAMES, "out_file": str(results)})
     metric.dataset_meta = data["metainfo"]
     for feats, sample in zip(data["feats"], data["samples"], strict=True):
         found = model.map_head.predict({"bev_feats": feats[None].float()}, [sample])

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import heads
+from benchmarks.shape import line_shapes
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -31,6 +32,8 @@ def test_variants_of_a_head_are_trained_on_stored_features(
     figures = [json.loads((tmp_path / f"{name}-0.json").read_text()) for name in ("MapTR", "GSMap")]
     assert figures[0] == pytest.approx(figures[1])
     assert figures[0]["chamfer/mAP"] > 0
+    shapes = line_shapes(tmp_path / "MapTR-0/results.json", minicity_annotations["val"])
+    assert len(shapes["divider"])
     args.out, args.iterations = tmp_path / "trained", 3
     args.out.mkdir()
     for part in ("train", "val"):
