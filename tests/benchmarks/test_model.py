@@ -58,7 +58,7 @@ def test_frames_per_second_are_those_of_the_time(capsys):
 
 def test_a_step_is_measured_for_every_raster_of_gsmap(capsys):
     run(
-        step, str(REPO / "projects/GSMap/configs/gsmap_maptr_r50_24e.py"),
+        step, str(REPO / "projects/GSMap/configs/gsmap_maptr_r18_minicity.py"),
         "--rasters", "64x32", "80x40",
     )  # fmt: skip
     rows = cells(capsys.readouterr().out)
