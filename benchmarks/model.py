@@ -14,6 +14,7 @@ from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
 from benchmarks.measure import Cost, markdown_table
+from gsmap.datasets.transforms.masks import MakePVMask
 from gsmap.engine.launch import read_config
 
 
@@ -86,7 +87,8 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
 def mask_stride(path: str) -> int:
     """Return how many pixels of an image a cell of a config's camera masks covers."""
     pipeline = read_config(path).train_dataloader.dataset.pipeline
-    return next((step.get("stride", 32) for step in pipeline if step.type == "MakePVMask"), 32)
+    masks = (step for step in pipeline if step.type == "MakePVMask")
+    return next(masks, {}).get("stride", MakePVMask.stride)
 
 
 def model_and_batch(

@@ -21,6 +21,7 @@ from gsmap.converters.splits import Positions, overlap_notes, read_split_file, r
 from gsmap.converters.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
+from gsmap.datasets.errors import naming
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 
@@ -85,7 +86,8 @@ def _splits(
             f"{own} (docs/data.md says how)."
         )
     names = {scene["token"]: scene["name"] for scene in tables.scene}
-    split_of, missing = resolve_scenes(wanted, names)
+    with naming(own, "list each scene in one split"):
+        split_of, missing = resolve_scenes(wanted, names)
     if missing:
         total = len(missing) + len(split_of)
         summary.notes.append(f"{len(missing)} of the splits' {total} scenes are not in the tables.")
