@@ -87,8 +87,9 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
 def mask_stride(path: str) -> int:
     """Return how many pixels of an image a cell of a config's camera masks covers."""
     pipeline = read_config(path).train_dataloader.dataset.pipeline
-    given = (step.get("stride", MakePVMask.stride) for step in pipeline if step.type == "MakePVMask")
-    return next(given, MakePVMask.stride)
+    default = MakePVMask.stride
+    given = (step.get("stride", default) for step in pipeline if step.type == "MakePVMask")
+    return next(given, default)
 
 
 def model_and_batch(
