@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 
 import torch
-from mmcv.cnn.bricks.transformer import FFN
 from mmdet.models.layers import LearnedPositionalEncoding
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.bev_encoders.camera_encoder import CameraEncoder
 from gsmap.models.bev_encoders.projection import PillarProjection, pillar_points, project_pillars
+from gsmap.models.layers.branches import feed_forward
 from gsmap.models.layers.deformable_attention import (
     BEVDeformableAttention,
     directional_offsets,
@@ -67,7 +67,7 @@ class BEVEncoderLayer(nn.Module):
         self.self_attn = BEVSelfAttention(embed_dims, num_heads, num_points, dropout)
         self.cross_attn = MODELS.build({"embed_dims": embed_dims, **cross_attn})
         self.dropout = nn.Dropout(dropout)
-        self.ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
 
     def forward(

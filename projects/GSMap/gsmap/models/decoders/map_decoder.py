@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
-from mmcv.cnn.bricks.transformer import FFN
 from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule, ModuleList
 from torch import Tensor, nn
 
+from gsmap.models.layers.branches import feed_forward
 from gsmap.models.layers.gaussian_guidance import GaussianGuidance
 from gsmap.structures.gaussians import GaussianSpace
 
@@ -47,7 +47,7 @@ class MapDecoderLayer(BaseModule):
         self.self_attn = MODELS.build({**own, **(self_attn or {})})
         own = {"type": "BEVDeformableAttention", **shared}
         self.cross_attn = MODELS.build({**own, **(cross_attn or {})})
-        self.ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
         self.guidance: GaussianGuidance | None = None
         if guidance is not None:

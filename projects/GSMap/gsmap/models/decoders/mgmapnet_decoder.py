@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from mmcv.cnn.bricks.transformer import FFN
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.decoders.map_decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.layers.bev_pyramid import BEVPyramid
-from gsmap.models.layers.branches import mlp
+from gsmap.models.layers.branches import feed_forward, mlp
 from gsmap.models.layers.multi_granularity import Granularities
 
 
@@ -48,7 +47,7 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
             **kwargs,
         )
         self.num_points, self.reference_dims = num_points, reference_dims
-        self.point_ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
+        self.point_ffn = feed_forward(embed_dims, ffn_dims, dropout)
         self.point_norm = nn.LayerNorm(embed_dims)
         self.reference_code: nn.Sequential | None = None
         if reference_dims is not None:

@@ -2,15 +2,25 @@
 
 from itertools import pairwise
 
+from mmcv.cnn.bricks.transformer import FFN
 from torch import nn
 
 
 def mlp(*dims: int) -> nn.Sequential:
-    """Return matrices from each number of channels to the next, with ReLUs in between."""
+    """Return matrices from each number of channels to the next, with ReLUs in between.
+
+    The ReLUs are not in place: a matrix returns a view of its result, and a change of a view in
+    place costs zeros and two copies in the backward pass.
+    """
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(dims):
-        layers += [nn.Linear(inputs, outputs), nn.ReLU(True)]
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
+
+
+def feed_forward(embed_dims: int, ffn_dims: int, dropout: float) -> FFN:
+    """Return mmcv's feed-forward network with its residual; its ReLU as in `mlp`."""
+    return FFN(embed_dims, ffn_dims, act_cfg={"type": "ReLU"}, ffn_drop=dropout)
 
 
 def classification_branch(embed_dims: int, num_classes: int) -> nn.Sequential:

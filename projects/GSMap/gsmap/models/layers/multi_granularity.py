@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from mmcv.cnn.bricks.transformer import FFN
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.layers.branches import mlp
+from gsmap.models.layers.branches import feed_forward, mlp
 from gsmap.models.layers.deformable_attention import (
     SamplingAttention,
     at_least_float32,
@@ -261,7 +260,7 @@ class Interaction(nn.Module):
     def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float) -> None:
         super().__init__()
         self.attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
-        self.ffn = FFN(embed_dims, ffn_dims, ffn_drop=dropout)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(2))
         self.dropout = nn.Dropout(dropout)
 
