@@ -46,7 +46,7 @@ _depth_seg = [
     _load, _points, _scale, _photometric, _targets,
     dict(type='MakeDepthMap'),
     dict(type='MakeBEVMask', size=(50, 25), thickness_px=1, num_classes=3),
-    dict(type='MakePVMask', stride=16, num_classes=3),
+    dict(type='MakePVMask', stride=8, num_classes=3),
     dict(type='PackMapInputs', with_points=False),
 ]
 # Models with LiDAR see the points of the key frame.

@@ -22,10 +22,8 @@ _maptrv2 = dict(
             dict(type='DepthSupervision', loss_weight=3.0),
         ]))
 
-# Its sizes for MiniCity, after those of minicity.py: features at stride 16, fewer queries.
+# Its sizes for MiniCity, after those of minicity.py.
 _maptrv2_minicity = dict(
-    img_backbone=dict(strides=(1, 2, 2, 1), out_indices=(3,)),
-    img_neck=dict(in_channels=[192], out_channels=[128], upsample_strides=[1]),
     bev_encoder=dict(
         bev_pixel_m=1.2, embed_dims=128, depth_range=(1.0, 35.0, 1.0), aspp_channels=48),
     map_head=dict(
