@@ -41,7 +41,7 @@ def test_images_are_as_large_as_the_configs(config, shape):
     assert image_shape(path, argparse.Namespace(size=[64, 96])) == (shape[0], 64, 96)
 
 
-@pytest.mark.parametrize(("config", "stride"), [("r50_24e", 32), ("r18_minicity", 16)])
+@pytest.mark.parametrize(("config", "stride"), [("r50_24e", 32), ("r18_minicity", 8)])
 def test_camera_masks_are_as_coarse_as_the_configs(config, stride):
     assert mask_stride(str(REPO / f"configs/maptrv2/maptrv2_{config}.py")) == stride
 
