@@ -27,4 +27,5 @@ _maptrv2_minicity = dict(
     bev_encoder=dict(
         bev_pixel_m=1.2, embed_dims=128, depth_range=(1.0, 35.0, 1.0), aspp_channels=48),
     map_head=dict(
-        query_groups=[dict(num=20), dict(name='one2many', num=30, repeats=6, weight=1.0)]))
+        query_groups=[  # as many queries per repeat as one to one, as released
+            dict(num=20), dict(name='one2many', num=40, repeats=2, weight=1.0)]))
