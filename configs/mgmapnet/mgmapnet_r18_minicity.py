@@ -12,7 +12,8 @@ _base_.model.merge(_base_._mgmapnet)
 model = dict(
     grid=_base_.grid, classes=_base_.classes, bev_encoder=dict(bev_pixel_m=1.25),  # two levels need even sides
     map_head=dict(
-        query_groups=[dict(num=40), dict(name='one2many', num=80, repeats=2, weight=1.0)],
+        query_groups=[  # as many queries per repeat as one to one, as released
+            dict(num=40), dict(name='one2many', num=80, repeats=2, weight=1.0)],
         decoder=dict(  # interactions are four times as wide as the queries, as released
             num_layers=2,
             layer=dict(num_heads=4, ffn_dims=256, dropout=0.0, cross_attn=dict(ffn_dims=512))),
