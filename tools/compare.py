@@ -130,9 +130,10 @@ def lines(tables: list[dict[str, Any]]) -> Iterator[str]:
 
 def slurm_commands(runs: list[Run], partition: str) -> str:
     """Return a command for each run that is not done, one a line."""
-    words = sys.argv[1:]
-    del words[words.index("--slurm") : words.index("--slurm") + 2]
-    launch = ["srun", f"--partition={partition}", "--gres=gpu:1", "--ntasks=1"]
+    own = argparse.ArgumentParser(add_help=False)
+    own.add_argument("--slurm")
+    words = own.parse_known_args()[1]
+    launch = ["srun", f"--partition={partition}", "--gres=gpu:1", "--ntasks=1", "--cpus-per-task=5"]
     return "\n".join(
         shlex.join([*launch, f"--job-name={run.label}", sys.executable, sys.argv[0], *words])
         + f" --only {run.label}"

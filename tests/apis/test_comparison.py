@@ -1,10 +1,12 @@
 """Comparisons: what is refused before anything trains, and the arithmetic of the tables."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from gsmap.apis.comparison import Protocol, Run, parse_entry, plan
 from gsmap.apis.comparison_jobs import Job
@@ -82,6 +84,23 @@ def test_a_budget_is_whole_epochs_and_a_folder_one_run(tiny_config, protocol):
     message = r"seed_0 holds a run of other settings: optim_wrapper.optimizer.lr: 0.0006 and 0.001"
     with pytest.raises(ValueError, match=message):
         plan(config, replace(protocol, options=("optim_wrapper.optimizer.lr=0.001",)))
+
+
+def test_a_comparison_keeps_its_number_of_processes(tiny_config, protocol, tmp_path, monkeypatch):
+    """Runs on a GPU are tabulated on a node without one; runs on a CPU cannot go on on a GPU."""
+    config = entries(tiny_config, "a=CONFIG")
+    on_cpu = replace(protocol, out=tmp_path / "cpu")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    for gpus, at in ((1, protocol), (0, on_cpu)):
+        monkeypatch.setattr(torch.cuda, "device_count", lambda gpus=gpus: gpus)
+        (run, _) = plan(config, at)
+        assert run.processes == 2 - gpus
+        run.folder.mkdir(parents=True)
+        (run.folder / "settings.json").write_text(json.dumps(run.settings))
+    assert [run.processes for run in plan(config, protocol)] == [1, 1]
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(ValueError, match=r"a run of other settings: .*processes: 2 and 1"):
+        plan(config, on_cpu)
 
 
 def test_a_run_is_worked_on_once_at_a_time(tmp_path):

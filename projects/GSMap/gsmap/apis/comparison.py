@@ -159,8 +159,9 @@ class Protocol:
 def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     """Plan all runs and check them, before anything trains.
 
-    On a CPU a run has a process a core, as far as these share a step's samples evenly; on a GPU
-    one. Batch statistics are those of a process's samples.
+    On a GPU a run has one process; on a CPU as many as the runs that are there, and the first of
+    all one a core, as far as these share a step's samples evenly. Batch statistics are those of a
+    process's samples.
 
     Returns:
         The runs, seed by seed.
@@ -175,9 +176,7 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
         raise ValueError(f"two configs have one name: {names}; write NAME=CONFIG.")
     if protocol.init is not None:
         read_weights(protocol.init)
-    cores = len(os.sched_getaffinity(0))
-    possible = (n for n in range(cores, 0, -1) if protocol.batch % n == 0)
-    processes = 1 if torch.cuda.device_count() else next(possible)
+    processes = _processes(protocol)
     runs = [
         _plan_run(entry, seed, protocol, processes)
         for seed in range(protocol.seeds)
@@ -192,6 +191,16 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     for run in runs:
         _check_folder(run)
     return runs
+
+
+def _processes(protocol: Protocol) -> int:
+    """Return each run's number of processes, of which each gets as many samples."""
+    if torch.cuda.device_count():
+        return 1
+    possible = list(range(len(os.sched_getaffinity(0)), 0, -1))
+    there = sorted(protocol.out.glob(f"*/seed_*/{SETTINGS}"))
+    possible[:0] = [json.loads(path.read_text())["processes"] for path in there[:1]]
+    return next(n for n in possible if protocol.batch % n == 0)
 
 
 def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Run:
