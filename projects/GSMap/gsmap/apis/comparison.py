@@ -12,6 +12,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -197,9 +198,9 @@ def _processes(protocol: Protocol) -> int:
     """Return each run's number of processes, of which each gets as many samples."""
     if torch.cuda.device_count():
         return 1
-    possible = list(range(len(os.sched_getaffinity(0)), 0, -1))
-    there = sorted(protocol.out.glob(f"*/seed_*/{SETTINGS}"))
-    possible[:0] = [json.loads(path.read_text())["processes"] for path in there[:1]]
+    paths = protocol.out.glob(f"*/seed_*/{SETTINGS}")
+    there = (json.loads(path.read_text())["processes"] for path in paths)
+    possible = chain(there, range(len(os.sched_getaffinity(0)), 0, -1))
     return next(n for n in possible if protocol.batch % n == 0)
 
 
