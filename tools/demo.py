@@ -21,6 +21,7 @@ import torch
 
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
+from gsmap.utils.parallel import die_with_parent
 
 REPO = Path(__file__).resolve().parents[1]
 MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}  # that ship
@@ -88,7 +89,9 @@ class Step:
         print(f"{position} {self.title}: {shlex.join(command)}", flush=True)
         started = time.monotonic()
         environment = {**os.environ, "PYTHON": sys.executable}
-        status = subprocess.run(command, cwd=REPO, env=environment, check=False).returncode
+        status = subprocess.run(
+            command, cwd=REPO, env=environment, check=False, preexec_fn=die_with_parent
+        ).returncode
         missing = [str(product) for product in self.products if not product.exists()]
         if status or missing:
             reason = f"made no {', '.join(missing)}" if not status else f"ended with {status}"
