@@ -201,6 +201,43 @@ def test_a_missing_checkpoint_is_named(tiny_config):
     )
 
 
+SAME_BUFFERS = """
+import torch
+from mmengine.dist import all_gather
+from mmengine.hooks import Hook
+from mmengine.registry import HOOKS
+
+@HOOKS.register_module()
+class SameBuffers(Hook):
+    priority = 'VERY_LOW'
+
+    def after_train_epoch(self, runner):
+        means = {name: all_gather(value) for name, value in runner.model.named_buffers()
+                 if name.endswith('running_mean')}
+        unequal = [name for name, both in means.items() if not torch.equal(*both)]
+        runner.logger.info(f'{len(unequal)} of {len(means)} statistics differ')
+"""
+
+
+@pytest.mark.parametrize("synchronized", [True, False])
+def test_ranks_validate_with_the_same_batch_norms(synchronized, tiny_config, tmp_path):
+    without = "default_hooks = dict(sync_buffers=dict(type='IterTimerHook'))"
+    (tmp_path / "same_buffers.py").write_text(SAME_BUFFERS)
+    (tmp_path / "leaf.py").write_text(
+        f"_base_ = '{tiny_config}'\ncustom_hooks = [dict(type='SameBuffers')]\n"
+        "custom_imports = dict(imports=['gsmap.registered', 'same_buffers'])\n"
+        f"train_cfg = dict(max_epochs=1)\n{without * (not synchronized)}"
+    )
+    code, lines = end(
+        "tools/dist_train.sh", tmp_path / "leaf.py", 2, "--work-dir", tmp_path / "work",
+        path=tmp_path,
+    )  # fmt: skip
+    assert code == 0, lines
+    unequal, count = re.search(r"(\d+) of (\d+) statistics differ", "\n".join(lines)).groups()
+    assert int(count) > 0
+    assert int(unequal) == (0 if synchronized else int(count))
+
+
 DIES = """
 import os, signal
 from mmengine.hooks import Hook
