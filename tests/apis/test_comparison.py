@@ -54,6 +54,7 @@ def test_runs_are_planned_with_one_budget_seed_by_seed(tiny_config, protocol):
     ("texts", "message"),
     [
         (["a=CONFIG", "a=CONFIG"], "two configs have one name"),
+        (["a=CONFIG", "b=CONFIG,test_evaluator.eval=[raster]"], "a and b would be the same run"),
         (["nowhere.py"], "no config file nowhere.py"),
         (
             ["a=CONFIG", "b=CONFIG,test_dataloader.dataset.split=train"],

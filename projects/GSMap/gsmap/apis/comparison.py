@@ -12,7 +12,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain
+from itertools import chain, combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +31,10 @@ SETTINGS = "settings.json"  # what a run was started with; another start must ag
 RECORD = "run.json"  # machine, load, command and end of a run
 _SHOWN = 10
 _digest = cache(digest)  # of files that many runs share
-_DECIDING = ("model", "optim_wrapper", "param_scheduler", "train_cfg", "randomness", "custom_hooks")
+_DECIDING = (
+    *("model", "optim_wrapper", "param_scheduler", "train_cfg", "randomness"),
+    *("default_hooks", "custom_hooks"),
+)
 
 
 class Entry(NamedTuple):
@@ -170,7 +173,7 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
     Raises:
         FileNotFoundError: If a config, a checkpoint or a data set does not exist.
         ValueError: If names repeat, the budget is no whole number of epochs, the configs are of
-            different data, or a work folder is of other settings.
+            different data or do not differ, or a work folder is of other settings.
     """
     names = [entry.name for entry in entries]
     if len(set(names)) < len(names):
@@ -189,6 +192,12 @@ def plan(entries: Sequence[Entry], protocol: Protocol) -> list[Run]:
             f"{runs[0].label} and {run.label} are of different data",
             "compare configs of one data set, split, range and class list",
         )
+    for one, other in combinations(runs[: len(entries)], 2):
+        if not differences(one.settings, other.settings):
+            raise ValueError(
+                f"{one.name} and {other.name} would be the same run: no setting of training "
+                "differs. Leave one out, or check its overrides."
+            )
     for run in runs:
         _check_folder(run)
     return runs
