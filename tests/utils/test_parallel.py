@@ -108,17 +108,15 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path):
     """They hold its output open, so it ends when the last of them has."""
     program = tmp_path / "program.py"
     program.write_text(
-        "import time\n"
+        "import functools, os, time\n"
         "from gsmap.utils.parallel import ordered_map\n"
         "if __name__ == '__main__':\n"
-        "    results = ordered_map(print, ['ready', 'ready'], 2)\n"
+        "    say = functools.partial(os.write, 1)  # a line in one piece, print may do it in two\n"
+        "    results = ordered_map(say, [b'ready\\n', b'ready\\n'], 2)\n"
         "    next(results)\n"
         "    time.sleep(60)\n"
     )
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(
-        [sys.executable, str(program)], stdout=subprocess.PIPE, env=environment
-    ) as parent:
+    with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE) as parent:
         assert parent.stdout.readline() == b"ready\n"
         parent.send_signal(signal.SIGKILL)
         started = time.monotonic()
