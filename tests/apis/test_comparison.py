@@ -71,6 +71,22 @@ def test_bad_input_is_refused_before_anything_trains(tiny_config, protocol, text
     assert not protocol.out.exists()
 
 
+@pytest.mark.parametrize(
+    "option",
+    [
+        "train_dataloader.dataset.shuffle_images_seed=1",
+        "train_dataloader.sampler.shuffle=False",
+        "default_hooks.sync_buffers=None",
+    ],
+)
+def test_what_is_no_part_of_the_model_makes_another_run_too(tiny_config, protocol, option):
+    one, other, *_ = plan(entries(tiny_config, "a=CONFIG", f"b=CONFIG,{option}"), protocol)
+    one.folder.mkdir(parents=True)
+    (one.folder / "settings.json").write_text(json.dumps(other.settings))
+    with pytest.raises(ValueError, match="holds a run of other settings"):
+        plan(entries(tiny_config, "a=CONFIG"), protocol)
+
+
 def test_a_budget_is_whole_epochs_and_a_folder_one_run(tiny_config, protocol):
     config = entries(tiny_config, "a=CONFIG")
     with pytest.raises(ValueError, match=r"no whole number of epochs of a \(2 iterations each\)"):

@@ -240,7 +240,9 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     MODELS.build(cfg.model)
     settings = {key: plain(cfg.get(key)) for key in _DECIDING}
     settings |= {"processes": processes, "batch": protocol.batch, "data": _data_of(cfg)}
-    settings["pipeline"] = plain(cfg.train_dataloader.dataset.get("pipeline"))
+    settings["sampler"] = plain(cfg.train_dataloader.get("sampler"))
+    dataset = plain(cfg.train_dataloader.dataset)  # wherever it lies: "data" has its file's digest
+    settings["dataset"] = {k: v for k, v in dataset.items() if k not in ("data_root", "ann_file")}
     settings["init"] = init and _digest(init)
     folder = protocol.out.resolve() / entry.name / f"seed_{seed}"
     return Run(
