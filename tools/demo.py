@@ -1,9 +1,10 @@
 #!/usr/bin/env python
-"""Test a trained GSMap on MiniCity, then train one from scratch (``make demo``).
+"""Test a trained GSMap on MiniCity, then train one of your own (``make demo``).
 
 First the model that ships is tested on validation towns, and its predictions are drawn. Then a
-model is trained from scratch and compared with it. The next run skips finished steps, and an
-interrupted training continues.
+GSMap is trained on other towns, starting from the MapTR that ships (with ``--from-scratch`` another
+one from nothing), and compared with it. The next run skips finished steps, and an interrupted
+training continues.
 """
 
 import hashlib
@@ -41,22 +42,66 @@ class Budget:
         train_scenes: Scenes of MiniCity to train on.
         val_scenes: Scenes to test on, in other towns.
         samples: Key frames per scene.
-        epochs: Training epochs.
+        tuning_epochs: Epochs of a training that starts from the MapTR that ships.
+        epochs: Epochs of a training from scratch.
         image_size: Size of the images in pixels.
     """
 
     train_scenes: int
     val_scenes: int
     samples: int
+    tuning_epochs: int
     epochs: int
     image_size: str = "400x225"
 
 
 BUDGETS = {
-    "tiny": Budget(train_scenes=4, val_scenes=1, samples=2, epochs=1, image_size="200x112"),
-    "demo": Budget(train_scenes=120, val_scenes=30, samples=5, epochs=11),
-    "long": Budget(train_scenes=320, val_scenes=80, samples=5, epochs=16),
+    "tiny": Budget(4, 1, samples=2, tuning_epochs=1, epochs=1, image_size="200x112"),
+    "demo": Budget(120, 30, samples=5, tuning_epochs=4, epochs=11),
+    "long": Budget(320, 80, samples=5, tuning_epochs=4, epochs=16),
 }
+
+
+@dataclass(frozen=True)
+class Training:
+    """A model that the demo trains.
+
+    Attributes:
+        model: Its name in ``MODELS``.
+        start: What its row in the table says of its start.
+        work: Folder of its checkpoints; those of its tests begin with the same name.
+        epochs: How long it trains.
+        options: What differs from its config.
+    """
+
+    model: str
+    start: str
+    work: Path
+    epochs: int
+    options: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """Name of its row in the table."""
+        return f"{self.model} {self.start}"
+
+    def tested(self, how: str) -> Path:
+        """Return the folder of one of its tests."""
+        return self.work.with_name(f"{self.work.name}_{how}")
+
+
+def trainings(
+    names: Iterable[str], from_scratch: bool, folder: Path, budget: Budget
+) -> list[Training]:
+    """Return what is trained, in order."""
+    found = []
+    for name in names:
+        work = folder / f"{name.lower()}_tuned"
+        options = (f"load_from={MODELS['MapTR']}", "optim_wrapper.optimizer.lr=3e-4")
+        found.append(Training(name, "trained on from MapTR", work, budget.tuning_epochs, options))
+        if from_scratch:
+            found.append(Training(name, "from scratch", folder / name.lower(), budget.epochs))
+    return found
 
 
 @dataclass(frozen=True)
@@ -153,25 +198,11 @@ def prior_step(folder: Path, budget: Budget) -> Step:
     )
 
 
-def options_of(folder: Path, budget: Budget) -> list[str]:
-    """Return the overrides that all commands of models share."""
-    train, val = (str(data_root(folder, budget, split)) for split in ("train", "val"))
-    return [
-        "--data-root",
-        val,
-        "--cfg-options",
-        f"train_dataloader.dataset.data_root={train}",
-        f"train_cfg.max_epochs={budget.epochs}",
-        f"train_cfg.val_interval={max(1, budget.epochs // 4)}",
-        "randomness.seed=0",
-    ]
-
-
-def test_step(title: str, model: list[str], work: Path, *extra: str, common: list[str]) -> Step:
-    """Return what tests a model into ``work/metrics.json``."""
+def test_step(title: str, model: list[str], work: Path, root: Path, *extra: str) -> Step:
+    """Return what tests a model on the towns of ``root`` into ``work/metrics.json``."""
     metrics = work / "metrics.json"
     command = ["tools/test.py", *model, "--work-dir", str(work), "--metrics-out", str(metrics)]
-    return Step(title, [*command, *extra, *common], [metrics])
+    return Step(title, [*command, *extra, "--data-root", str(root)], [metrics])
 
 
 def drawing(work: Path) -> list[str]:
@@ -182,9 +213,9 @@ def drawing(work: Path) -> list[str]:
 
 def shipped_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
     """Yield what tests and draws a model that ships, and its report page."""
-    work, common = folder / f"shipped_{name.lower()}", options_of(folder, budget)
+    work, root = folder / f"shipped_{name.lower()}", data_root(folder, budget, "val")
     title = f"test and draw the {name} that ships"
-    yield test_step(title, [MODELS[name]], work, *drawing(work), common=common)
+    yield test_step(title, [MODELS[name]], work, root, *drawing(work))
     truth, page = str(annotations(folder, budget, "val")), work / "report.html"
     yield Step(
         f"write the report page of the {name} that ships",
@@ -193,37 +224,45 @@ def shipped_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
     )
 
 
-def model_steps(name: str, folder: Path, budget: Budget) -> Iterable[Step]:
+def training_steps(training: Training, folder: Path, budget: Budget) -> Iterable[Step]:
     """Yield what trains, tests and draws a model."""
-    config, work, common = MODELS[name], folder / name.lower(), options_of(folder, budget)
-    checkpoint = work / f"epoch_{budget.epochs}.pth"
-    training = ["--work-dir", str(work), "--resume", *common]
+    config, work, title = MODELS[training.model], training.work, training.title
+    checkpoint = work / f"epoch_{training.epochs}.pth"
+    train, val = (data_root(folder, budget, split) for split in ("train", "val"))
+    options = [
+        f"train_dataloader.dataset.data_root={train}",
+        f"train_cfg.max_epochs={training.epochs}",
+        f"train_cfg.val_interval={max(1, training.epochs // 4)}",
+        "randomness.seed=0",
+        *training.options,
+    ]
+    command = ["tools/dist_train.sh", config, str(processes()), "--work-dir", str(work), "--resume"]
     yield Step(
-        f"train {name}",
-        ["tools/dist_train.sh", config, str(processes()), *training],
+        f"train {title}",
+        [*command, "--data-root", str(val), "--cfg-options", *options],
         [checkpoint],
     )
     curves = work / "curves.png"
     yield Step(
-        f"draw losses and validations of {name}",
+        f"draw losses and validations of {title}",
         ["tools/analyze_run.py", str(work), "--out", str(curves)],
         [curves],
     )
-    model, tested = [config, str(checkpoint)], folder / f"{name.lower()}_test"
-    yield test_step(f"test and draw {name}", model, tested, *drawing(tested), common=common)
-    shuffled, shuffling = folder / f"{name.lower()}_shuffled", ("--shuffle-images", "0")
-    title = f"test {name} on images of other samples"
-    yield test_step(title, model, shuffled, *shuffling, common=common)
+    model, tested = [config, str(checkpoint)], training.tested("test")
+    yield test_step(f"test and draw {title}", model, tested, val, *drawing(tested))
+    shuffled, how = training.tested("shuffled"), ("--shuffle-images", "0")
+    yield test_step(f"test {title} on images of other samples", model, shuffled, val, *how)
 
 
-def table(folder: Path, models: Iterable[str]) -> str:
+def table(folder: Path, shipped: Iterable[str], trained: Iterable[Training]) -> str:
     """Return the figures of all models as a Markdown table."""
     rows = {"same map everywhere (prior)": folder / "prior.json"}
-    for name in models:
+    for name in shipped:
         rows[f"{name} that ships"] = folder / f"shipped_{name.lower()}/metrics.json"
-        rows[f"{name} from scratch"] = folder / f"{name.lower()}_test/metrics.json"
-        shuffled = f"{name} from scratch, images of other samples"
-        rows[shuffled] = folder / f"{name.lower()}_shuffled/metrics.json"
+    for training in trained:
+        rows[training.title] = training.tested("test") / "metrics.json"
+        others = f"{training.title}, images of other samples"
+        rows[others] = training.tested("shuffled") / "metrics.json"
     keys = [[f"{metric}/{c}/AP" for c in CLASSES] for metric in ("chamfer", "raster")]
     keys = [*keys[0], "chamfer/mAP", *keys[1], "raster/mAP"]
     head = ["model", *(key.replace("/AP", "").replace("/", " ") for key in keys)]
@@ -247,15 +286,21 @@ def main() -> None:
     parser.add_argument(
         "--models", nargs="+", choices=MODELS, default=["GSMap"], help="what to train, in order"
     )
+    parser.add_argument(
+        "--from-scratch", action="store_true", help="also train each model from nothing"
+    )
     args = parser.parse_args()
     budget, folder = BUDGETS[args.budget], Path(args.dir).resolve() / args.budget
     started = time.monotonic()
+    runs = trainings(args.models, args.from_scratch, folder, budget)
     shipped = list(data_steps(folder, budget, "val"))
     for name in args.models:
         shipped += shipped_steps(name, folder, budget)
     trained = [*data_steps(folder, budget, "train"), prior_step(folder, budget)]
-    for name in args.models:
-        trained += model_steps(name, folder, budget)
+    if "MapTR" not in args.models:  # the start of every training
+        trained += shipped_steps("MapTR", folder, budget)
+    for training in runs:
+        trained += training_steps(training, folder, budget)
     for number, step in enumerate([*shipped, *trained], 1):
         step.run(folder, f"[{number}/{len(shipped) + len(trained)}]")
         if number == len(shipped):
@@ -264,12 +309,12 @@ def main() -> None:
                 work = folder / f"shipped_{name.lower()}"
                 print(f"\n{minutes:.1f} min: what the {name} that ships sees:")
                 print(f"{first_picture(work)}\n{work / 'report.html'}\n", flush=True)
-    summary = table(folder, args.models)
-    print(f"\nAP in percent on MiniCity's validation towns, {budget.epochs} epochs\n\n{summary}\n")
+    summary = table(folder, dict.fromkeys([*args.models, "MapTR"]), runs)
+    print(f"\nAP in percent on MiniCity's validation towns\n\n{summary}\n")
     write_text(folder / "summary.md", summary + "\n")
-    for name in args.models:
-        print(f"{name} from scratch: {first_picture(folder / f'{name.lower()}_test')}")
-        print(f"its losses and validations: {folder / name.lower() / 'curves.png'}")
+    for training in runs:
+        print(f"{training.title}: {first_picture(training.tested('test'))}")
+        print(f"its losses and validations: {training.work / 'curves.png'}")
     print(f"{(time.monotonic() - started) / 60:.1f} minutes. Figures: {folder / 'summary.md'}")
     root = data_root(folder, budget, "val")
     print(NEXT.format(activate=Path(sys.prefix, "bin/activate"), root=root))

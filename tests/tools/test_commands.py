@@ -51,12 +51,21 @@ def test_a_broken_plugin_of_another_package_does_not_stop_tensorboard(tmp_path, 
     assert (done.returncode, "No event files found" in done.stdout) == (0, True), done.stderr
 
 
-def test_the_demo_validates_along_the_way_and_draws_it(tmp_path):
+def test_the_demo_trains_on_from_maptr_and_from_scratch_if_asked(tmp_path):
     demo = runpy.run_path(str(REPO / "tools/demo.py"))
-    steps = list(demo["model_steps"]("GSMap", tmp_path, demo["BUDGETS"]["demo"]))
+    budget = demo["BUDGETS"]["demo"]
+    (tuned,) = demo["trainings"](["GSMap"], False, tmp_path, budget)
+    assert demo["trainings"](["GSMap"], True, tmp_path, budget)[0] == tuned
+    scratch = demo["trainings"](["GSMap"], True, tmp_path, budget)[1]
+    steps = list(demo["training_steps"](tuned, tmp_path, budget))
     assert [step.title for step in steps[:2]] == [
-        "train GSMap",
-        "draw losses and validations of GSMap",
+        "train GSMap trained on from MapTR",
+        "draw losses and validations of GSMap trained on from MapTR",
     ]
-    assert "train_cfg.val_interval=2" in steps[0].command
-    assert steps[1].products == [tmp_path / "gsmap/curves.png"]
+    start = {"load_from=maptr_r18_minicity", "optim_wrapper.optimizer.lr=3e-4"}
+    assert start <= set(steps[0].command)
+    assert {"train_cfg.max_epochs=4", "train_cfg.val_interval=1"} <= set(steps[0].command)
+    assert steps[1].products == [tmp_path / "gsmap_tuned/curves.png"]
+    command = next(iter(demo["training_steps"](scratch, tmp_path, budget))).command
+    assert {"train_cfg.max_epochs=11", "train_cfg.val_interval=2"} <= set(command)
+    assert not start & set(command)
