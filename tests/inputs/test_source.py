@@ -188,13 +188,15 @@ def test_distorted_images_are_rectified_into_a_folder_of_their_own(tmp_path):
     }  # fmt: skip
     (drive / "calibration.yaml").write_text(yaml.safe_dump({"cameras": {"front": camera}}))
     source = open_input(drive, InputOptions(frames_dir=frames))
-    assert source.data_root == frames
-    assert [s.cameras[0].path for s in source.samples] == ["front/a.jpg", "front/b.jpg"]
+    assert source.data_root.parent == frames
+    assert [s.cameras[0].path for s in source.samples] == ["front/a.png.jpg", "front/b.png.jpg"]
     matrix = np.array([[200.0, 0, 160], [0, 200, 90], [0, 0, 1]])
     expected = cv2.undistort(cv2.merge([board] * 3), matrix, np.array([-0.3, 0.1, 0, 0]))
-    written = cv2.imread(str(frames / "front/a.jpg"))
+    written = cv2.imread(str(source.data_root / "front/a.png.jpg"))
     assert np.abs(written.astype(int) - expected).mean() < 3  # JPEG's loss
-    assert (frames / "front/b.jpg").read_bytes() == b"no image"
+    assert not (source.data_root / "front/b.png.jpg").exists()
+    (note,) = source.notes
+    assert "front/b.png is not an image" in note
 
 
 LEVEL = {"intrinsics": [100, 100, 80, 45], "position_m": [0, 0, 1], "yaw_pitch_roll_deg": [0, 0, 0]}
