@@ -230,7 +230,7 @@ def test_test_pictures_go_to_the_folder_named_by_token(tmp_path, caplog):
         }
     )
     runner = FakeRunner(make_visualizer("test-hook", width_px=300))
-    samples = [make_sample(tmp_path, cameras=1, token=f"a/{i}") for i in range(6)]
+    samples = [make_sample(tmp_path, cameras=1, token=f"a_{i}") for i in range(6)]
     hook.before_test_epoch(runner)
     for start in (0, 4):
         hook.after_test_iter(runner, 0, {}, samples[start : start + 4])
