@@ -85,38 +85,35 @@ class Recorder:
             **dict(zip(names, values, strict=True)),
         )
 
-    def image(self, camera, time_ns, content, raw=None):
+    def image(self, camera, time_ns, content, raw=None, **changed):
         header = self.header(time_ns, f"{camera.name}_optical")
         if raw is None:
             data = np.frombuffer(content, np.uint8)
-            self.send(
-                f"/{camera.name}/image_raw/compressed",
-                "sensor_msgs/msg/CompressedImage",
-                time_ns,
-                header=header,
-                format="jpeg",
-                data=data,
-            )
+            kind = "sensor_msgs/msg/CompressedImage"
+            topic = f"/{camera.name}/image_raw/compressed"
+            self.send(topic, kind, time_ns, header=header, format="jpeg", data=data)
             return
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
         image = image[..., ::-1] if raw == "rgb8" else image
         padded = np.pad(image.reshape(len(image), -1), ((0, 0), (0, 5)))  # rows have a step
-        self.send(
-            f"/{camera.name}/image_raw",
-            "sensor_msgs/msg/Image",
-            time_ns,
-            header=header,
-            height=image.shape[0],
-            width=image.shape[1],
-            encoding=raw,
-            is_bigendian=0,
-            step=padded.shape[1],
-            data=padded.ravel(),
-        )
+        fields = {
+            "header": header,
+            "height": image.shape[0],
+            "width": image.shape[1],
+            "encoding": raw,
+            "is_bigendian": 0,
+            "step": padded.shape[1],
+            "data": padded.ravel(),
+        }
+        self.send(f"/{camera.name}/image_raw", "sensor_msgs/msg/Image", time_ns, **fields | changed)
 
 
-def record(recorder, samples, root, poses="tf", raw=None, distortion=()):
-    """Write a drive: all images at their sample's time, poses 10 ms before and after each."""
+def record(recorder, samples, root, poses="tf", raw=None, distortion=(), more=None, damaged=()):
+    """Write a drive: all images at their sample's time, poses 10 ms before and after each.
+
+    ``more`` are further images of the first camera by their time in seconds: their content, or
+    changed fields of a raw image. ``damaged`` are topics that get a message of a few bytes, too.
+    """
     axle = np.eye(4)
     axle[2, 3] = AXLE_M
     with recorder:
@@ -134,3 +131,12 @@ def record(recorder, samples, root, poses="tf", raw=None, distortion=()):
                 recorder.transform("/tf_static", time_ns, "base_link", frame, base_from_cam)
                 recorder.info(camera, time_ns, distortion)
                 recorder.image(camera, time_ns, (root / camera.path).read_bytes(), raw)
+        camera = samples[0].cameras[0]
+        good = (root / camera.path).read_bytes()
+        for seconds, image in (more or {}).items():
+            at = seconds * 10**9
+            recorder.transform("/tf", at, "odom", "base_link", np.eye(4))
+            content, changed = (image, {}) if isinstance(image, bytes) else (good, image)
+            recorder.image(camera, at, content, raw, **changed)
+        for topic in damaged:
+            recorder.writer.write(recorder.connections[topic], 1, b"\0\1\0\0\1\2\3")

@@ -25,7 +25,9 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
     try:
         with Image.open(file) as image:
             return image.size
-    except (UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        if getattr(error, "errno", None):
+            raise
         raise ValueError(f"{where}: {file} is not an image; fetch it again.") from error
 
 

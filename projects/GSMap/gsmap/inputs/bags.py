@@ -97,8 +97,8 @@ def _of_rosbags() -> Iterator[None]:
     """Turn what rosbags and the parsers below it raise for a damaged bag into a ``ValueError``."""
     try:
         yield
-    except MemoryError:
-        raise
+    except MemoryError as error:
+        raise ValueError("a length in it asks for more memory than there is") from error
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise
