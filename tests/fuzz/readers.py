@@ -1,5 +1,6 @@
 """Every reader of files with something whole to read, and what of its results can be checked."""
 
+import errno
 import json
 import os
 import pickle
@@ -85,19 +86,21 @@ class Reader:
         self._deeds: list[tuple[str, str]] = []
 
     def watch(self, event: str, arguments: tuple[Any, ...]) -> None:
-        """Note what a read has no business to do: run something, or write outside its folder."""
+        """Refuse and note what a read has no business to do: run a program, or write elsewhere."""
         if not self._reading:
             return
-        if event in _RUNS:
-            self._deeds.append(("code", f"{event} {arguments}"))
+        deed = ("code", str(arguments)) if event in _RUNS else None
         writes = event in _CHANGES or (event == "open" and arguments[2] & _WRITING)
         allowed = os.path.realpath(self.out), f"{tempfile.gettempdir()}/tmp", "/dev/"
         for path in arguments[: _CHANGES.get(event, 1)] if writes else ():
-            if isinstance(path, int) or (arguments[-1] >= 0 and event != "open"):
+            if isinstance(path, int) or (event != "open" and arguments[-1] >= 0):
                 continue  # a file or a folder that is open already
             place = os.path.realpath(os.fsdecode(path))
             if not place.startswith(allowed) and "__pycache__" not in place:
-                self._deeds.append(("outside", f"{event} {place}"))
+                deed = "outside", place
+        if deed is not None:
+            self._deeds.append((deed[0], f"{event} {deed[1]}"))
+            raise PermissionError(errno.EPERM, *self._deeds[-1])
 
     def outcome(self, rng: Random) -> tuple[str, str]:
         """Read the file once damaged: what kind of end that took, and the message."""
