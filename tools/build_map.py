@@ -32,7 +32,7 @@ from gsmap.maps.truth import true_map
 from gsmap.maps.video import write_video
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
-from gsmap.utils.files import write_text
+from gsmap.utils.files import file_name, write_text
 from gsmap.visualization.figure import save_figure
 from gsmap.visualization.plots import plot_maps
 from gsmap.visualization.style import MapStyle
@@ -164,7 +164,7 @@ def main(argv: list[str] | None = None) -> str:
         start_s = time.process_time()
         merged.append(merge(drives[-1], config) if has_poses else MapElements.from_polylines())
         spent_s += time.process_time() - start_s
-        for path in write_map(args.out / scene, args, ann, drives[-1], merged[-1]):
+        for path in write_map(args.out / file_name(scene), args, ann, drives[-1], merged[-1]):
             print(f"{len(merged[-1])} elements of {len(drives[-1].frames)} frames: {path}")
     if has_truth(ann):
         score(drives, merged, ann, args.out)

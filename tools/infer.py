@@ -228,6 +228,7 @@ def main(argv: list[str] | None = None) -> str | None:
     chosen = args.shard.part(select_samples(tokens, args.token, args.max_samples))
     settings, made_from = run_settings(args), digest(dataset.annotations.path)
     run = {**settings, "input": str(args.input.resolve()), "samples": made_from}
+    run["images"] = str(source.data_root)  # its folder tells content and calibration
     log = ResultLog(args.shard.path_of(args.out), run) if args.out else nullcontext()
     with log as results:
         broken = predict(args, inferencer, dataset, chosen, results)

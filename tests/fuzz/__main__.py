@@ -1,15 +1,17 @@
 """Read damaged files, case by case in child processes, and count how each reader ends.
 
 ``PYTHONPATH=tests:tests/converters python -m fuzz --cases 5000`` prints the table of
-docs/reliability.md; ``--reader NAME`` takes the readers whose names begin so.
+docs/reliability.md; ``--reader NAME ...`` takes the readers whose names begin so.
 """
 
 import argparse
 import multiprocessing
+import os
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from multiprocessing.connection import Connection
 from pathlib import Path
 from random import Random
@@ -17,7 +19,8 @@ from random import Random
 from fuzz.readers import Files, Reader
 
 OUTCOMES = (
-    "clear", "right", "other value", "vague", "traceback", "crash", "hang", "silent",
+    "clear", "right", "other value", "vague", "traceback", "crash", "hang", "silent", "outside",
+    "code",
 )  # fmt: skip
 BAD = OUTCOMES[4:]
 LIMIT_S = 120.0  # for one case
@@ -28,8 +31,10 @@ def run_cases(
 ) -> None:
     """Run cases of one reader and send how each ends."""
     reader = make()
-    for number in numbers:
-        pipe.send(reader.outcome(Random(f"{seed} {name} {number}")))
+    sys.addaudithook(reader.watch)
+    with open(os.devnull, "w") as nothing, redirect_stdout(nothing), redirect_stderr(nothing):
+        for number in numbers:
+            pipe.send(reader.outcome(Random(f"{seed} {name} {number}")))
 
 
 def run_reader(
@@ -74,15 +79,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=5000, help="in all")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--reader", default="", help="how the names of the readers begin")
+    parser.add_argument("--reader", nargs="+", default=[""], help="how the readers' names begin")
     parser.add_argument("--data", type=Path, nargs=2, help="a MiniCity and its annotation file")
     args = parser.parse_args()
     total: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(prefix="gsmap-fuzz-") as folder:
         root, annotations = args.data or make_data(Path(folder))
         (work := Path(folder, "work")).mkdir()
         readers = Files(work, root, annotations).readers()
-        chosen = {n: make for n, make in readers.items() if n.startswith(args.reader)}
+        chosen = {n: make for n, make in readers.items() if n.startswith(tuple(args.reader))}
         print("| reader |", " | ".join(OUTCOMES), "|\n|", "--- |" * (len(OUTCOMES) + 1))
         for name, make in chosen.items():
             ends = run_reader(make, name, -(-args.cases // len(chosen)), args.seed)

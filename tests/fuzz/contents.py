@@ -1,5 +1,6 @@
 """One sample as the files of other programs and of users hold it, for the readers of such files."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,15 @@ def own_calibration(sample: MapSample) -> dict[str, Any]:
                  "vehicle_from_camera": np.linalg.inv(c.cam_from_frame).tolist()}
         for c in sample.cameras
     }  # fmt: skip
+    next(iter(cameras.values()))["distortion"] = [-0.2, 0.05, 0.0, 0.0]
     return {"cameras": cameras, "ground_z_m": 0.1}
+
+
+def own_poses(sample: MapSample) -> bytes:
+    """Return a table of poses for the images of a sample."""
+    stems = sorted({Path(camera.path).stem for camera in sample.cameras})
+    rows = [f"{stem},1.0,2.0,0.0,1.0,0.0,0.0,0.0" for stem in stems]
+    return "\n".join(["frame,x,y,z,qw,qx,qy,qz", *rows]).encode()
 
 
 def own_record(sample: MapSample) -> dict[str, Any]:

@@ -4,11 +4,14 @@ import copy
 import json
 import math
 import pickle
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import pyarrow as pa
+import yaml
 
 from gsmap.datasets.annotations.schema import FIELDS
 
@@ -16,6 +19,14 @@ ODD = (
     None, True, "", "x", "../x", "/etc/x", "1.0", -1, 0, 99, 2**40, 2**70, 1e308, -1e-9, math.nan,
     math.inf, [], {}, [1, 2], [[0.0] * 4] * 4, {"token": "x"},
 )  # fmt: skip
+HOSTILE = (
+    "/", "..", "../", "/../", "../../", "a/../../", "//", "/etc/x", "\\", ".", "~/", "\0", "\n",
+    "\x1b[2J", "$(id)", "%2e%2e/", "\u202e", "-rf ", "con:", "';", '"',
+)  # fmt: skip
+_BOMB = "a: &a [0]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n"
+    for before, name in pairwise("abcdefghijklmn")
+)
 
 
 def damaged_bytes(content: bytes, rng: Random) -> bytes:
@@ -78,29 +89,76 @@ def damaged_json(content: bytes, rng: Random) -> bytes:
     return json.dumps(damaged_value(json.loads(content), rng)).encode()
 
 
+def damaged_yaml(content: bytes, rng: Random) -> bytes:
+    """Damage a value of a YAML file, or its text."""
+    if rng.random() < 0.5:
+        signs = (
+            "\t", ":", "- ", "{", "[", "*a ", "&a ", "!!python/object/apply:os.system [x]", "? ",
+            "%", "'", "|", "<<: ", "\n ", "#", "\0", "@", "!!binary ", "1:1:1:", "[" * 3000, _BOMB,
+        )  # fmt: skip
+        text = content.decode()
+        place = rng.choice((0, rng.randrange(len(text) + 1)))
+        return (text[:place] + rng.choice(signs) + text[place:]).encode()
+    return yaml.safe_dump(damaged_value(yaml.safe_load(content), rng), sort_keys=False).encode()
+
+
+def renamed(name: str) -> Callable[[bytes, Random], bytes]:
+    """Return what gives a name that stands in a file another, hostile one of the same length."""
+
+    def damage(content: bytes, rng: Random) -> bytes:
+        new = b""
+        while len(new) < len(name):
+            new += rng.choice((rng.choice(HOSTILE), rng.choice(name))).encode()
+        if rng.random() < 0.5:
+            new = new[::-1]
+        return content.replace(name.encode(), new[: len(name)])
+
+    return damage
+
+
 def damaged_pickle(content: bytes, rng: Random) -> bytes:
     """Damage a value of a pickle."""
     return pickle.dumps(damaged_value(pickle.loads(content), rng), rng.choice((2, 4, 5)))
 
 
+def damaged_column(name: str) -> Callable[[bytes, Random], bytes]:
+    """Return what gives the texts in a column of an annotation file hostile values."""
+
+    def damage(content: bytes, rng: Random) -> bytes:
+        count = rng.choice((1, 1, 2, 30))
+        text = "".join(rng.choice((*HOSTILE, "a", "../x")) for _ in range(count))
+        rows, schema = _rows_of(content)
+        return _file_of([{**row, name: text} for row in rows], schema)
+
+    return damage
+
+
+def _rows_of(content: bytes) -> tuple[list[dict[str, Any]], pa.Schema]:
+    reader = pa.ipc.open_file(content)
+    batches = (reader.get_batch(i) for i in range(reader.num_record_batches))
+    return [row for batch in batches for row in batch.to_pylist()], reader.schema
+
+
+def _file_of(rows: list[dict[str, Any]], schema: pa.Schema) -> bytes:
+    """Return an annotation file without a checksum."""
+    columns = [pa.array([row[name] for row in rows], kind) for name, kind in FIELDS.items()]
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_file(sink, schema) as writer:
+        writer.write_batch(pa.record_batch(columns, schema=schema))
+    return sink.getvalue().to_pybytes()
+
+
 def damaged_rows(content: bytes, rng: Random) -> bytes:
     """Damage a value of an annotation file, without its checksum."""
-    reader = pa.ipc.open_file(content)
-    rows = [
-        row for i in range(reader.num_record_batches) for row in reader.get_batch(i).to_pylist()
-    ]
+    rows, schema = _rows_of(content)
     while True:
         damaged = rows
         for _ in range(rng.choice((1, 1, 3))):
             damaged = damaged_value(damaged, rng)
         try:
-            columns = [pa.array([r[name] for r in damaged], kind) for name, kind in FIELDS.items()]
+            return _file_of(damaged, schema)
         except (pa.ArrowException, OverflowError, TypeError, KeyError):
             continue  # Arrow itself does not write this
-        sink = pa.BufferOutputStream()
-        with pa.ipc.new_file(sink, reader.schema) as writer:
-            writer.write_batch(pa.record_batch(columns, schema=reader.schema))
-        return sink.getvalue().to_pybytes()
 
 
 def write(path: Path, content: bytes) -> None:

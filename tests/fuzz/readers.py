@@ -1,21 +1,27 @@
 """Every reader of files with something whole to read, and what of its results can be checked."""
 
+import errno
 import json
+import os
 import pickle
 import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 import pyarrow as pa
 import torch
 import upstream_configs
+import yaml
 from argoverse2_road import write_log
+from bag_cases import Recorder
+from bag_cases import record as record_bag
 from mmdet3d.registry import DATASETS
 from mmengine.config import Config
 from pyarrow.feather import write_feather
@@ -26,25 +32,33 @@ from gsmap.converters.argoverse2.samples import Argoverse2Options, read_log
 from gsmap.converters.custom import from_records
 from gsmap.converters.infos import convert_infos
 from gsmap.converters.nuscenes.can_bus import read_messages, signals_at
+from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables
 from gsmap.converters.splits import read_split_file
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_instances
+from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points
 from gsmap.engine.launch import check_config, read_config
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, vectors_of, write_results
+from gsmap.inputs.bags import read_bag
 from gsmap.inputs.image_folder import read_image_folder
 from gsmap.inputs.info_file import read_info_file
+from gsmap.inputs.rig import Recording
 from gsmap.structures.elements import MapElements
 from gsmap.utils.faults import in_words
+from tools.build_map import main as build_map
 from tools.convert_config import convert
 
 VERSION = "v1.0-trainval"
 LIDAR_META = AnnotationMeta("fuzz", "lidar", "train")
 EGO_META = AnnotationMeta("fuzz", "ego", "train")
+_RUNS = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "pty.spawn")
+_CHANGES = {"os.rename": 2, "os.mkdir": 1, "os.remove": 1, "os.rmdir": 1, "os.symlink": 2}
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 
 @dataclass
@@ -62,14 +76,41 @@ class Reader:
     read: Callable[[], Any]
     damages: Sequence[Callable[[bytes, Random], bytes]]
     exact: bool = False
+    out: ClassVar[Path]
+    """The only folder that a read may write to."""
 
     def __post_init__(self) -> None:
         self.content = self.path.read_bytes()
         self.right = pickle.dumps(self.read())
+        self._reading = False
+        self._deeds: list[tuple[str, str]] = []
+
+    def watch(self, event: str, arguments: tuple[Any, ...]) -> None:
+        """Refuse and note what a read has no business to do: run a program, or write elsewhere."""
+        if not self._reading:
+            return
+        deed = ("code", str(arguments)) if event in _RUNS else None
+        writes = event in _CHANGES or (event == "open" and arguments[2] & _WRITING)
+        allowed = os.path.realpath(self.out), f"{tempfile.gettempdir()}/tmp", "/dev/"
+        for path in arguments[: _CHANGES.get(event, 1)] if writes else ():
+            if isinstance(path, int) or (event != "open" and arguments[-1] >= 0):
+                continue  # a file or a folder that is open already
+            place = os.path.realpath(os.fsdecode(path))
+            if not place.startswith(allowed) and "__pycache__" not in place:
+                deed = "outside", place
+        if deed is not None:
+            self._deeds.append((deed[0], f"{event} {deed[1]}"))
+            raise PermissionError(errno.EPERM, *self._deeds[-1])
 
     def outcome(self, rng: Random) -> tuple[str, str]:
         """Read the file once damaged: what kind of end that took, and the message."""
         mutations.write(self.path, rng.choice(self.damages)(self.content, rng))
+        self._deeds.clear()
+        end = self._read_damaged()
+        return self._deeds[0] if self._deeds else end
+
+    def _read_damaged(self) -> tuple[str, str]:
+        self._reading = True
         try:
             result = self.read()
         except Exception as error:
@@ -80,6 +121,7 @@ class Reader:
             named = any(name in text for name in names)
             return ("clear" if named else "vague"), f"{type(error).__name__}: {text}"
         finally:
+            self._reading = False
             mutations.write(self.path, self.content)
         if pickle.dumps(result) == self.right:
             return "right", ""
@@ -87,8 +129,18 @@ class Reader:
         return ("silent", wrong) if wrong else ("other value", "")
 
 
+@dataclass
+class Pictures:
+    """A recording's samples, and what is wrong with the images that were made of it."""
+
+    samples: list[MapSample]
+    wrong: str
+
+
 def implausible(result: Any) -> str:
     """Say what of a result cannot be, or nothing."""
+    if isinstance(result, Pictures):
+        return result.wrong or implausible(result.samples)
     if isinstance(result, (list, tuple)):
         return next(filter(None, map(implausible, result)), "")
     if isinstance(result, dict):
@@ -141,6 +193,8 @@ class Files:
         for folder in ("maps", VERSION, "can_bus", "samples"):
             shutil.copytree(root / folder, work / folder)
         self.work = work
+        Reader.out = self.out = work / "out"
+        self.out.mkdir()
         self.sample = AnnotationFile(annotations)[0]
         self.arrow = Path(shutil.copy(annotations, work / "a.arrow"))
         self.log = work / "av2/val/log"
@@ -152,7 +206,7 @@ class Files:
                   "log")  # fmt: skip
         town = self.work / f"maps/expansion/{self.sample.map_name}.json"
         plan = self.put("splits.json", b'{"train": ["scene-0001", "b"], "val": ["scene-0003"]}')
-        byte = mutations.damaged_bytes
+        byte, camera = mutations.damaged_bytes, mutations.renamed(self.sample.cameras[0].name)
         made = {
             "annotation file, its bytes": lambda: self.annotations(byte, exact=True),
             "annotation file, its values": lambda: self.annotations(mutations.damaged_rows),
@@ -164,7 +218,20 @@ class Files:
                 "av2.pkl", contents.info_of_argoverse2, self.infos
             ),
             "own records": self.records,
-            "calibration of own images": self.calibration,
+            "calibration of own images": lambda: self.calibration(
+                "json", byte, mutations.damaged_json, mutations.damaged_json
+            ),
+            "calibration of own images, YAML": lambda: self.calibration(
+                "yaml", byte, mutations.damaged_yaml, mutations.damaged_yaml, camera
+            ),
+            "poses of own images": lambda: self.calibration("yaml", byte, poses=True),
+            "images of own cameras": self.image_of_folder,
+            "bag of ROS 1": lambda: self.bag("ros1"),
+            "bag of ROS 2, sqlite3": lambda: self.bag("sqlite"),
+            "bag of ROS 2, MCAP": lambda: self.bag("mcap"),
+            "bag of ROS 2, its metadata": lambda: self.bag("sqlite_yaml"),
+            "name of a scene": self.scene_name,
+            "name of a split": self.split_name,
             "results": self.results,
             "config": self.config,
             "config of another repository": self.upstream,
@@ -205,27 +272,96 @@ class Files:
         return Reader(path, lambda: read(path), damages)
 
     def infos(self, path: Path) -> list[MapSample]:
-        convert_infos(path, self.work / "infos.arrow", self.work, "train")
-        return list(AnnotationFile(self.work / "infos.arrow"))
+        convert_infos(path, self.out / "infos.arrow", self.work, "train")
+        return list(AnnotationFile(self.out / "infos.arrow"))
 
     def records(self) -> Reader:
         path = self.put("own.pkl", pickle.dumps(contents.own_record(self.sample)))
 
         def read() -> list[MapSample]:
             records = [pickle.loads(path.read_bytes())]
-            from_records(self.work / "own.arrow", records, LIDAR_META, self.work)
-            return list(AnnotationFile(self.work / "own.arrow"))
+            from_records(self.out / "own.arrow", records, LIDAR_META, self.work)
+            return list(AnnotationFile(self.out / "own.arrow"))
 
         return Reader(path, read, (mutations.damaged_pickle,))
 
-    def calibration(self) -> Reader:
-        content = json.dumps(contents.own_calibration(self.sample)).encode()
-        path = self.put("calibration.json", content)
+    def recorded(self, read: Callable[[Path], Recording]) -> Pictures:
+        """Read a recording and look at the images that it makes."""
+        frames = self.out / "frames"
+        shutil.rmtree(frames, ignore_errors=True)
+        found = read(frames)
+        samples, wrong = self.written(EGO_META, found.samples), []
+        made = [path.relative_to(frames) for path in frames.rglob("*") if path.is_file()]
+        wrong += [f"made {path}" for path in made if len(path.parts) != 3]
+        for camera in (camera for sample in samples for camera in sample.cameras):
+            try:
+                path = str(found.data_root / camera.path)
+                image = read_image(path, "", (camera.width, camera.height))
+                wrong += [] if image.any() else [f"{camera.path} is black"]
+            except BrokenSampleError as error:
+                wrong += [] if found.notes else [str(error)]
+        return Pictures(samples, "; ".join(wrong))
 
-        def read() -> list[MapSample]:
-            return self.written(EGO_META, read_image_folder(path, self.work / "frames")[0])
+    def calibration(self, suffix: str, *damages: Any, poses: bool = False) -> Reader:
+        values = contents.own_calibration(self.sample)
+        if poses:
+            times = self.put("poses.csv", contents.own_poses(self.sample))
+            values["poses"] = times.name
+        dump = json.dumps if suffix == "json" else partial(yaml.safe_dump, sort_keys=False)
+        path = self.put(f"calibration.{suffix}", dump(values).encode())
+        read = partial(self.recorded, partial(read_image_folder, path))
+        return Reader(times if poses else path, read, damages)
 
-        return self.json(path, read)
+    def image_of_folder(self) -> Reader:
+        path = self.put(
+            "calibration.yaml", yaml.safe_dump(contents.own_calibration(self.sample)).encode()
+        )
+        read = partial(self.recorded, partial(read_image_folder, path))
+        image = self.work / self.sample.cameras[0].path
+        return Reader(image, read, (mutations.damaged_bytes,))
+
+    def bag(self, kind: str) -> Reader:
+        """Return the reader of a bag of one sample, its raw and its compressed images in turn."""
+        recorder = Recorder(self.work / f"bag_{kind}", kind.removesuffix("_yaml"))
+        record_bag(recorder, [self.sample], self.work, raw="rgb8" if kind == "sqlite" else None,
+               distortion=(-0.2, 0.05, 0.0, 0.0, 0.0))  # fmt: skip
+        path = recorder.path
+        pattern = {"sqlite": "*.db3", "mcap": "*.mcap"}.get(kind)
+        path = next(path.glob(pattern)) if pattern else path
+        read = partial(self.recorded, lambda frames: read_bag(path, frames))
+        damaged = path / "metadata.yaml" if path.is_dir() else path
+        texts = (mutations.damaged_yaml,) if path.is_dir() else ()
+        names = mutations.renamed(self.sample.cameras[0].name)
+        return Reader(damaged, read, (mutations.damaged_bytes, names, *texts))
+
+    def scene_name(self) -> Reader:
+        """Return the reader of an annotation file, which makes maps named by its scenes."""
+        path = Path(shutil.copy(self.arrow, self.work / "scenes.arrow"))
+        results = self.work / "maps.json"
+        write_results(results, [(s.token, []) for s in AnnotationFile(path)])
+
+        def read() -> list[str]:
+            maps = self.out / "maps"
+            shutil.rmtree(maps, ignore_errors=True)
+            build_map([str(results), "--ann", str(path), "--out", str(maps)])
+            return sorted(p.name for p in maps.iterdir())
+
+        return Reader(path, read, (mutations.damaged_column("scene"),))
+
+    def split_name(self) -> Reader:
+        scenes = json.loads((self.work / VERSION / "scene.json").read_bytes())
+        splits = {"train": [scenes[0]["name"]], "val": [scene["name"] for scene in scenes[1:]]}
+        path = self.put("own_splits.json", json.dumps(splits).encode())
+        options = NuScenesOptions(
+            self.work, VERSION, dataset="minicity", split_file=path, out_dir=self.out / "splits"
+        )
+
+        def read() -> list[str]:
+            shutil.rmtree(self.out / "splits", ignore_errors=True)
+            convert_nuscenes(options)
+            return sorted(path.name for path in (self.out / "splits").iterdir())
+
+        return Reader(path, read, (mutations.renamed("train"), mutations.renamed("val")))
 
     def results(self) -> Reader:
         path = self.work / "results.json"
@@ -254,7 +390,7 @@ class Files:
 
     def upstream(self) -> Reader:
         path = self.put("upstream.py", upstream_configs.maptrv2().encode())
-        target = self.work / "ours.py"
+        target = self.out / "ours.py"
 
         def read() -> str:
             convert(path, target)
@@ -279,8 +415,8 @@ class Files:
 
     def written(self, meta: AnnotationMeta, samples: list[MapSample]) -> list[MapSample]:
         """Write samples, as every converter does at its end, and read them."""
-        write_annotations(self.work / "written.arrow", meta, samples)
-        return list(AnnotationFile(self.work / "written.arrow"))
+        write_annotations(self.out / "written.arrow", meta, samples)
+        return list(AnnotationFile(self.out / "written.arrow"))
 
     def json(self, path: Path, read: Callable[[], Any]) -> Reader:
         damages = (mutations.damaged_bytes, mutations.damaged_json, mutations.damaged_json)

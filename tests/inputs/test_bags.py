@@ -1,144 +1,19 @@
-"""Bags of ROS 1 and ROS 2, written from a drive, become the drive's samples."""
+"""Bags of ROS 1 and ROS 2 become the samples of the drive that was recorded."""
 
+import re
 import sys
+from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from scipy.spatial.transform import Rotation
+from bag_cases import AXLE_M, Recorder, record
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.inputs.frames import ground_from_frame, reframed
 from gsmap.inputs.source import InputOptions, open_input
 from gsmap.structures.rigid import invert_rigid
-
-AXLE_M = 0.3  # height of base_link above the road
-
-
-class Recorder:
-    """Writes the messages of a test into a bag of one kind."""
-
-    def __init__(self, path, kind):
-        self.ros1 = kind == "ros1"
-        self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
-        if self.ros1:
-            text = "geometry_msgs/TransformStamped[] transforms"
-            self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-            self.path = path.with_suffix(".bag")
-            self.writer = Writer1(self.path)
-        else:
-            self.path = path
-            plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-            self.writer = Writer2(path, version=9, storage_plugin=plugin)
-        self.connections = {}
-
-    def __enter__(self):
-        self.writer.open()
-        return self
-
-    def __exit__(self, *_):
-        self.writer.close()
-
-    def type(self, name):
-        return self.store.types[name]
-
-    def header(self, time_ns, frame):
-        sec, nanosec = divmod(time_ns, 10**9)
-        stamp = self.type("builtin_interfaces/msg/Time")(sec, nanosec)
-        more = {"seq": 0} if self.ros1 else {}
-        return self.type("std_msgs/msg/Header")(**more, stamp=stamp, frame_id=frame)
-
-    def send(self, topic, kind, time_ns, **fields):
-        if topic not in self.connections:
-            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
-        message = self.type(kind)(**fields)
-        write = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
-        self.writer.write(self.connections[topic], time_ns, write(message, kind))
-
-    def transform(self, topic, time_ns, parent, child, pose):
-        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
-        item = self.type("geometry_msgs/msg/TransformStamped")(
-            self.header(time_ns, parent),
-            child,
-            self.type("geometry_msgs/msg/Transform")(
-                self.type("geometry_msgs/msg/Vector3")(*pose[:3, 3].tolist()),
-                self.type("geometry_msgs/msg/Quaternion")(x, y, z, w),
-            ),
-        )
-        self.send(topic, "tf2_msgs/msg/TFMessage", time_ns, transforms=[item])
-
-    def info(self, camera, time_ns, distortion=()):
-        names = ("D", "K", "R", "P") if self.ros1 else ("d", "k", "r", "p")
-        k = camera.intrinsics
-        values = (np.array(distortion, float), k.ravel(), np.eye(3).ravel(), np.eye(3, 4).ravel())
-        roi = self.type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
-        self.send(
-            f"/{camera.name}/camera_info",
-            "sensor_msgs/msg/CameraInfo",
-            time_ns,
-            header=self.header(time_ns, f"{camera.name}_optical"),
-            height=camera.height,
-            width=camera.width,
-            distortion_model="plumb_bob",
-            binning_x=0,
-            binning_y=0,
-            roi=roi,
-            **dict(zip(names, values, strict=True)),
-        )
-
-    def image(self, camera, time_ns, content, raw=None):
-        header = self.header(time_ns, f"{camera.name}_optical")
-        if raw is None:
-            data = np.frombuffer(content, np.uint8)
-            self.send(
-                f"/{camera.name}/image_raw/compressed",
-                "sensor_msgs/msg/CompressedImage",
-                time_ns,
-                header=header,
-                format="jpeg",
-                data=data,
-            )
-            return
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-        image = image[..., ::-1] if raw == "rgb8" else image
-        padded = np.pad(image.reshape(len(image), -1), ((0, 0), (0, 5)))  # rows have a step
-        self.send(
-            f"/{camera.name}/image_raw",
-            "sensor_msgs/msg/Image",
-            time_ns,
-            header=header,
-            height=image.shape[0],
-            width=image.shape[1],
-            encoding=raw,
-            is_bigendian=0,
-            step=padded.shape[1],
-            data=padded.ravel(),
-        )
-
-
-def record(recorder, samples, root, poses="tf", raw=None, distortion=()):
-    """Write a drive: all images at their sample's time, poses 10 ms before and after each."""
-    axle = np.eye(4)
-    axle[2, 3] = AXLE_M
-    with recorder:
-        for sample in samples:
-            time_ns, ground = sample.timestamp_ns, ground_from_frame(sample, "lidar")
-            world_from_base = sample.global_from_frame @ invert_rigid(ground) @ axle
-            for shift in (-10_000_000, 10_000_000):
-                at = time_ns + shift
-                if poses == "tf":
-                    recorder.transform("/tf", at, "odom", "base_link", world_from_base)
-                    recorder.transform("/tf_static", 0, "map", "odom", np.eye(4))
-            for camera in sample.cameras:
-                base_from_cam = invert_rigid(axle) @ ground @ invert_rigid(camera.cam_from_frame)
-                frame = f"{camera.name}_optical"
-                recorder.transform("/tf_static", time_ns, "base_link", frame, base_from_cam)
-                recorder.info(camera, time_ns, distortion)
-                recorder.image(camera, time_ns, (root / camera.path).read_bytes(), raw)
 
 
 @pytest.fixture(scope="module")
@@ -194,12 +69,12 @@ def test_raw_images_and_no_pose(drive, minicity_root, tmp_path, encoding):
 def test_distorted_images_are_rectified(drive, minicity_root, tmp_path):
     recorder = Recorder(tmp_path / "drive", "sqlite")
     record(recorder, drive[:1], minicity_root, distortion=(-0.3, 0.1, 0, 0, 0))
-    (sample,) = open_input(recorder.path, options(tmp_path)).samples
-    camera = sample.cameras[0]
+    source = open_input(recorder.path, options(tmp_path))
+    camera = source.samples[0].cameras[0]
     original = next(c for c in drive[0].cameras if c.name == camera.name)
     image = cv2.imread(str(minicity_root / original.path))
     expected = cv2.undistort(image, camera.intrinsics, np.array([-0.3, 0.1, 0, 0, 0]))
-    written = cv2.imread(str(tmp_path / "frames" / camera.path)).astype(int)
+    written = cv2.imread(str(source.data_root / camera.path)).astype(int)
     assert np.abs(written - expected).mean() < 3
 
 
@@ -227,3 +102,133 @@ def test_a_damaged_bag_and_a_missing_extra_are_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(RuntimeError, match=r"`pip install -e .\[bags\]`"):
         open_input(path)
+
+
+def starting_at_0(drive, turn=0, **more):
+    """Return the first sample at time 0; cameras may have one another's images."""
+    sample, paths = drive[0], [camera.path for camera in drive[0].cameras]
+    cameras = [
+        replace(camera, path=paths[(i + turn) % len(paths)], **more)
+        for i, camera in enumerate(sample.cameras)
+    ]
+    return replace(sample, timestamp_ns=10_000_000, cameras=cameras)
+
+
+def pictures(source):
+    cameras = source.samples[0].cameras
+    return {c.name: (source.data_root / c.path).read_bytes() for c in cameras}
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+def test_two_bags_that_start_at_0_and_a_corrected_calibration_have_their_own_pictures(
+    drive, minicity_root, tmp_path, kind
+):
+    found = []
+    bent = {"distortion": (-0.3, 0.1, 0, 0, 0)}
+    for name, turn, more in (("a", 0, {}), ("b", 1, {}), ("c", 0, bent)):
+        recorder = Recorder(tmp_path / name / "drive", kind)
+        recorder.path.parent.mkdir()
+        record(recorder, [starting_at_0(drive, turn)], minicity_root, **more)
+        found.append(pictures(open_input(recorder.path, options(tmp_path))))
+    names = [camera.name for camera in drive[0].cameras]
+    for name, after in pairwise([*names, names[0]]):
+        assert found[1][name] == found[0][after] != found[0][name]
+        assert found[2][name] not in found[0].values()
+
+
+def test_frames_that_are_there_are_kept(drive, minicity_root, tmp_path):
+    recorder = Recorder(tmp_path / "drive", "sqlite")
+    record(recorder, drive[:1], minicity_root)
+    source = open_input(recorder.path, options(tmp_path))
+    first = source.data_root / source.samples[0].cameras[0].path
+    first.write_bytes(b"kept")
+    assert open_input(recorder.path, options(tmp_path)).data_root == source.data_root
+    assert first.read_bytes() == b"kept"
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.3, 0.1, 0, 0, 0)])
+def test_a_bad_image_is_noted_and_left_out_and_the_others_go_on(
+    drive, minicity_root, tmp_path, distortion
+):
+    good = (minicity_root / drive[0].cameras[0].path).read_bytes()
+    small = cv2.imencode(".jpg", np.zeros((4, 4, 3), np.uint8))[1].tobytes()
+    bad = {1: b"", 2: b"no image", 3: good[: len(good) // 2], 4: small}
+    recorder = Recorder(tmp_path / "drive", "sqlite")
+    record(recorder, [replace(drive[0], cameras=drive[0].cameras[:1])], minicity_root,
+           distortion=distortion, more=bad)  # fmt: skip
+    source = open_input(recorder.path, options(tmp_path))
+    assert len(source.samples) == 5
+    assert len(source.notes) == 4
+    for seconds, note in zip(bad, sorted(source.notes), strict=True):
+        assert f"camera 'CAM_FRONT', image at {seconds}000000000 ns" in note
+    there = [(source.data_root / s.cameras[0].path).is_file() for s in source.samples]
+    assert sorted(there) == [False] * 4 + [True]
+
+
+def test_a_raw_image_with_a_wrong_encoding_size_or_step_is_noted(drive, minicity_root, tmp_path):
+    recorder = Recorder(tmp_path / "drive", "sqlite")
+    sample = replace(drive[0], cameras=drive[0].cameras[:1])
+    record(recorder, [sample], minicity_root, raw="bgr8", more={
+        1: {"encoding": "32FC1"}, 2: {"width": 0, "height": 0, "step": 0}, 3: {"step": 7},
+        4: {"data": np.zeros(0, np.uint8)},
+    })  # fmt: skip
+    source = open_input(recorder.path, options(tmp_path))
+    assert len(source.samples) == 5
+    texts = "its frame is left out|encoding '32FC1'|its camera info says"
+    assert len([note for note in source.notes if re.search(texts, note)]) == 4
+
+
+def test_a_damaged_message_is_noted_and_left_out(drive, minicity_root, tmp_path):
+    recorder = Recorder(tmp_path / "drive", "mcap")
+    record(recorder, drive[:1], minicity_root, damaged=("/tf", "/CAM_FRONT/camera_info"))
+    source = open_input(recorder.path, options(tmp_path))
+    assert source.has_poses
+    assert [note[:20] for note in source.notes] == ["1 messages of /tf ca", "1 messages of /CAM_F"]
+
+
+@pytest.mark.parametrize(
+    ("distortion", "message"),
+    [
+        ((0.1,), "takes 4 or 5 or 8"),
+        ((0.1, 0.1, 0.1), "takes 4 or 5 or 8"),
+        ((0.1,) * 7, "takes 4 or 5 or 8"),
+        ((np.nan, 0, 0, 0, 0), "all finite"),
+        ((-300.0, 0.1, 0, 0, 0), "sees next to nothing"),
+    ],
+)
+def test_a_distortion_that_cannot_be_is_named(drive, minicity_root, tmp_path, distortion, message):
+    recorder = Recorder(tmp_path / "drive", "sqlite")
+    record(recorder, drive[:1], minicity_root, distortion=distortion)
+    with pytest.raises(ValueError, match=f"drive cannot be used: camera 'CAM_.*{message}"):
+        open_input(recorder.path, options(tmp_path))
+    assert not (tmp_path / "frames").exists()
+
+
+def test_a_camera_info_without_a_size_is_named(drive, minicity_root, tmp_path):
+    recorder = Recorder(tmp_path / "drive", "sqlite")
+    record(recorder, [starting_at_0(drive, width=0, height=0)], minicity_root)
+    with pytest.raises(ValueError, match=r"camera 'CAM_.*has images of \(0, 0\) pixels"):
+        open_input(recorder.path, options(tmp_path))
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+def test_a_bag_that_is_cut_or_overwritten_is_named(drive, minicity_root, tmp_path, kind):
+    recorder = Recorder(tmp_path / "drive", kind)
+    record(recorder, drive[:1], minicity_root)
+    suffix = {"ros1": "bag", "sqlite": "db3", "mcap": "mcap"}[kind]
+    (path,) = tmp_path.rglob(f"*.{suffix}")
+    content, options_ = path.read_bytes(), options(tmp_path)
+    middle = len(content) // 2
+    overwritten = content[:middle] + b"\xff" * 9000 + content[middle + 9000 :]
+    for damaged in (content[:middle], content[:99], b"", overwritten):
+        path.write_bytes(damaged)
+        said = trouble(path, options_)
+        assert path.name in said or "ns: its message is truncated or damaged" in said
+
+
+def trouble(path, options):
+    """Return what a reader says of a damaged bag."""
+    try:
+        return " ".join(open_input(path, options).notes)
+    except ValueError as error:
+        return str(error)

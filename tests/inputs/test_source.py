@@ -2,6 +2,7 @@
 
 import json
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -188,13 +189,15 @@ def test_distorted_images_are_rectified_into_a_folder_of_their_own(tmp_path):
     }  # fmt: skip
     (drive / "calibration.yaml").write_text(yaml.safe_dump({"cameras": {"front": camera}}))
     source = open_input(drive, InputOptions(frames_dir=frames))
-    assert source.data_root == frames
-    assert [s.cameras[0].path for s in source.samples] == ["front/a.jpg", "front/b.jpg"]
+    assert source.data_root.parent == frames
+    assert [s.cameras[0].path for s in source.samples] == ["front/a.png.jpg", "front/b.png.jpg"]
     matrix = np.array([[200.0, 0, 160], [0, 200, 90], [0, 0, 1]])
     expected = cv2.undistort(cv2.merge([board] * 3), matrix, np.array([-0.3, 0.1, 0, 0]))
-    written = cv2.imread(str(frames / "front/a.jpg"))
+    written = cv2.imread(str(source.data_root / "front/a.png.jpg"))
     assert np.abs(written.astype(int) - expected).mean() < 3  # JPEG's loss
-    assert (frames / "front/b.jpg").read_bytes() == b"no image"
+    assert not (source.data_root / "front/b.png.jpg").exists()
+    (note,) = source.notes
+    assert "front/b.png is not an image" in note
 
 
 LEVEL = {"intrinsics": [100, 100, 80, 45], "position_m": [0, 0, 1], "yaw_pitch_roll_deg": [0, 0, 0]}
@@ -229,6 +232,84 @@ def test_a_mirrored_mounting_is_named(tmp_path):
     (tmp_path / "calibration.yaml").write_text(yaml.safe_dump({"cameras": {"front": camera}}))
     with pytest.raises(ValueError, match=r"'front'.* mirrors .*two axes are swapped"):
         open_input(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cameras: [", "it is no YAML"),
+        ("cameras:\n\tfront: 1", "it is no YAML"),
+        ("cameras: *nobody", "it is no YAML"),
+        ("a: 'open", "it is no YAML"),
+        ("!!python/object/apply:os.system [ls]", "it is no YAML"),
+        ("a: &a {x: 1}\nb: {<<: *a}", "it is no YAML"),
+        ("[" * 3000, "Recursion"),
+        ("a: &a [0]\n" + "".join(
+            f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in pairwise("abcdefghijk")
+        ), "more than 100000 values"),
+        ("cameras: {}\nrate_hz: 0", "at least one"),
+        ("", "must be a mapping"),
+    ],
+)  # fmt: skip
+def test_what_is_no_calibration_in_yaml_is_named(tmp_path, text, message):
+    (tmp_path / "calibration.yaml").write_text(text)
+    with pytest.raises(ValueError, match=rf"calibration\.yaml cannot be used: .*{message}"):
+        open_input(tmp_path)
+
+
+def folder_of(drive, camera=None, value=99, **more):
+    """Write a folder with one distorted camera and its grey image."""
+    (drive / "front").mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(drive / "front/0.png"), np.full((90, 160, 3), value, np.uint8))
+    content = {"cameras": {"front": LEVEL | {"distortion": [-0.2, 0.05, 0, 0]} | (camera or {})}}
+    (drive / "calibration.yaml").write_text(yaml.safe_dump(content | more))
+    return drive
+
+
+def test_two_folders_of_one_name_and_a_corrected_calibration_have_their_own_pictures(tmp_path):
+    options = InputOptions(frames_dir=tmp_path / "frames")
+
+    def picture(**given):
+        source = open_input(folder_of(tmp_path / "drive", **given), options)
+        image = cv2.imread(str(source.data_root / source.samples[0].cameras[0].path))
+        return source.data_root, int(image[45, 80, 0]), image.tobytes()
+
+    first = picture()
+    assert picture() == first
+    assert picture(value=9)[1] == pytest.approx(9, abs=2)
+    bent = picture(camera={"distortion": [0.3, 0, 0, 0]})
+    assert bent[0] != first[0]
+    assert bent[2] != first[2]
+
+
+@pytest.mark.parametrize(
+    ("camera", "more", "message"),
+    [
+        ({"distortion": [0.1]}, {}, "takes 4 or 5 or 8"),
+        ({"distortion": [0.1] * 3}, {}, "takes 4 or 5 or 8"),
+        ({"distortion": [0.1] * 7}, {}, "takes 4 or 5 or 8"),
+        ({"distortion": [float("nan"), 0, 0, 0]}, {}, "all finite"),
+        ({"distortion": [1e9, 0, 0, 0]}, {}, "sees next to nothing"),
+        ({"distortion": [0.1] * 5, "distortion_model": "fisheye"}, {}, "takes 4 numbers"),
+        ({"size_px": [0, 0]}, {}, r"images of \(0, 0\) pixels"),
+        ({}, {"rate_hz": 0}, "rate_hz must be > 0"),
+        ({}, {"max_time_difference_ms": -1}, "max_time_difference_ms >= 0"),
+    ],
+)
+def test_values_that_cannot_be_are_named_and_no_picture_is_made(tmp_path, camera, more, message):
+    folder_of(tmp_path / "drive", camera, **more)
+    with pytest.raises(ValueError, match=rf"calibration\.yaml.* cannot be used: .*{message}"):
+        open_input(tmp_path / "drive", InputOptions(frames_dir=tmp_path / "frames"))
+    assert not (tmp_path / "frames").exists()
+
+
+def test_a_bad_first_image_does_not_end_the_run(tmp_path):
+    drive = folder_of(tmp_path / "drive")
+    (drive / "front/-.png").write_bytes(b"")
+    source = open_input(drive, InputOptions(frames_dir=tmp_path / "frames"))
+    assert [camera.width for s in source.samples for camera in s.cameras] == [160, 160]
+    (note,) = source.notes
+    assert "front/-.png is not an image" in note
 
 
 def test_what_is_no_input_is_named(tmp_path):

@@ -9,7 +9,7 @@ import textwrap
 
 import pytest
 
-from gsmap.utils.files import atomic_write, write_bytes, write_text
+from gsmap.utils.files import atomic_write, file_name, write_bytes, write_text
 
 
 def test_text_and_bytes_are_written_and_folders_made(tmp_path):
@@ -109,3 +109,20 @@ def test_what_stops_a_writer_is_said_of_the_file_that_was_asked_for(tmp_path, mo
     with pytest.raises(OSError, match=r"No space left on device: '.*/a'$"):
         write_text(tmp_path / "a", "")
     assert os.listdir(tmp_path) == ["folder"]
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "../x", "/abs/x", "a/b", "a\\b", "a\0b", ".lock", "-rf", "x" * 300]
+)
+def test_a_foreign_name_becomes_one_part_of_a_path(name, tmp_path):
+    made = file_name(name)
+    path = (tmp_path / f"{made}.json").resolve()
+    assert path.parent == tmp_path
+    write_text(path, "x")
+    assert made[0] not in ".-"
+    assert made != file_name(name + "/")
+
+
+def test_a_good_name_stays_and_two_names_never_make_one_file():
+    assert file_name("scene-0001_Straße.+=") == "scene-0001_Straße.+="
+    assert len({file_name(name) for name in ("a_b", "a/b", "a\\b", "a b", "/a_b")}) == 5

@@ -156,6 +156,15 @@ def test_pickle_hands_on_the_path_alone(tmp_path: Path):
             "appears twice",
         ),
         ({"token": ""}, "token"),
+        ({"scene": "../x"}, "scene '../x' would lead out of a folder"),
+        ({"scene": "/abs/x"}, "scene '/abs/x' would lead out of a folder"),
+        ({"map_name": "a\\..\\b"}, "map_name .* would lead out of a folder"),
+        ({"scene": "\x1b[2J"}, r"scene '\\x1b\[2J' .*control characters"),
+        ({"cameras": [CameraRecord("", "x", 1, 1, INTRINSICS, np.eye(4))]}, "name '' .*is empty"),
+        (
+            {"cameras": [CameraRecord("a/../../b", "x", 1, 1, INTRINSICS, np.eye(4))]},
+            "name 'a/../../b' .*would lead out of a folder",
+        ),
     ],
 )
 def test_a_malformed_sample_is_refused_and_leaves_nothing(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gsmap.datasets.annotations.record import CLASSES, RANGES, AnnotationMeta
+from gsmap.utils.files import file_name
 from gsmap.utils.parallel import default_workers
 from gsmap.utils.shards import WHOLE, Shard, add_shard_options
 
@@ -41,7 +42,8 @@ class FileOptions:
 
     def path_of(self, dataset: str, split: str) -> Path:
         """Return where a split goes: ``gsmap_<dataset>_<split><tag>.arrow``."""
-        return (self.out_dir or self.root) / f"gsmap_{dataset}_{split}{self.tag}.arrow"
+        name = file_name(f"gsmap_{dataset}_{split}{self.tag}")
+        return (self.out_dir or self.root) / f"{name}.arrow"
 
 
 def fingerprint(sizes: Mapping[str, int], contents: Iterable[Path] = ()) -> str:

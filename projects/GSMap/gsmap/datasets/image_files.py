@@ -25,14 +25,14 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
     try:
         with Image.open(file) as image:
             return image.size
-    except UnidentifiedImageError as error:
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+        if getattr(error, "errno", None):
+            raise
         raise ValueError(f"{where}: {file} is not an image; fetch it again.") from error
 
 
 def read_image(path: str, where: str, size: tuple[int, int] | None = None) -> np.ndarray:
     """Read an image file and make sure that it is whole and what its record says.
-
-    Of a JPEG even a decoder's warning counts: OpenCV paints what is missing grey and says nothing.
 
     Args:
         path: The file.
@@ -48,7 +48,16 @@ def read_image(path: str, where: str, size: tuple[int, int] | None = None) -> np
     file = Path(path)
     if not file.is_file():
         raise BrokenSampleError(f"{where}: no image at {path}; is data_root right?")
-    content = file.read_bytes()
+    return decode_image(file.read_bytes(), path, where, size)
+
+
+def decode_image(
+    content: bytes, path: str, where: str, size: tuple[int, int] | None = None
+) -> np.ndarray:
+    """Decode the content of an image file, as ``read_image`` does.
+
+    Of a JPEG even a decoder's warning counts: OpenCV paints what is missing grey and says nothing.
+    """
     try:
         found = _size(content)
         image = _decoded(content) if size in (None, found) else None

@@ -1,22 +1,32 @@
 """Samples of a bag: images, camera info, transforms and poses of ROS 1 or ROS 2 (also MCAP)."""
 
+import hashlib
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gsmap.converters.argoverse2.samples import thin_out
-from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import naming
-from gsmap.inputs.rig import PoseAt, PoseTrack, RigCamera, RigFrame, nearest_images, rig_samples
+from gsmap.datasets.image_files import decode_image
+from gsmap.inputs.rig import (
+    PoseAt,
+    PoseTrack,
+    Recording,
+    RigCamera,
+    RigFrame,
+    nearest_images,
+    rig_samples,
+    rotation_of,
+)
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.extras import import_extra
-from gsmap.utils.files import write_bytes
+from gsmap.utils.files import file_name, write_bytes
 
 _IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 _INFO, _ODOMETRY = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"
@@ -50,19 +60,20 @@ def read_bag(
     rate_hz: float | None = 2.0,
     vehicle_frame: str | None = None,
     ground_z_m: float = 0.0,
-) -> tuple[list[MapSample], bool]:
+) -> Recording:
     """Read the samples of a bag, in the frame ``ego``, and write their images as files.
+
+    A message that cannot be read is left out and noted. An image that cannot be decoded is noted
+    and not written, so that its frame is known to be broken.
 
     Args:
         path: The bag.
-        frames_dir: Folder for the images; those that are there are kept.
+        frames_dir: Folder for folders of images; that of a bag is named by its content, and images
+            that are there are kept.
         rate_hz: Samples per second of the first camera; None takes all of its images.
         vehicle_frame: Frame of the vehicle (x ahead, y left, z up) in the bag's transforms;
             ``base_footprint`` or ``base_link`` by default.
         ground_z_m: Height of the road in that frame.
-
-    Returns:
-        The samples, with paths relative to ``frames_dir``, and whether they have poses.
 
     Raises:
         RuntimeError: If ``rosbags`` is not installed; the message names the extra.
@@ -72,11 +83,37 @@ def read_bag(
     typesys = import_extra("rosbags.typesys", "bags")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     with naming(path, "see docs/inference.md"):
+        with _of_rosbags():
+            bag = highlevel.AnyReader([path], default_typestore=store)
+            bag.open()
         try:
-            with highlevel.AnyReader([path], default_typestore=store) as bag:
-                return _read(bag, path, frames_dir, rate_hz, vehicle_frame, ground_z_m)
-        except highlevel.AnyReaderError as error:
-            raise ValueError(str(error)) from error
+            return _read(bag, path, frames_dir, rate_hz, vehicle_frame, ground_z_m)
+        finally:
+            bag.close()
+
+
+@contextmanager
+def _of_rosbags() -> Iterator[None]:
+    """Turn what rosbags and the parsers below it raise for a damaged bag into a ``ValueError``."""
+    try:
+        yield
+    except MemoryError as error:
+        raise ValueError("a length in it asks for more memory than there is") from error
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno:
+            raise
+        raise ValueError(str(error) or type(error).__name__) from error
+
+
+def _messages(bag: Any, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
+    """Yield the messages of some connections: connection, time in nanoseconds, content."""
+    found = iter(bag.messages(connections)) if connections else iter(())
+    while True:
+        with _of_rosbags():
+            message = next(found, None)
+        if message is None:
+            return
+        yield message
 
 
 @dataclass
@@ -89,6 +126,8 @@ class _Content:
     transforms: dict[str, tuple[str, list[int], list[np.ndarray]]] = field(default_factory=dict)
     static: set[str] = field(default_factory=set)
     odometry: tuple[list[int], list[np.ndarray]] = field(default_factory=lambda: ([], []))
+    digest: Any = field(default_factory=hashlib.sha256)
+    unread: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
 
 
 def _read(
@@ -98,7 +137,7 @@ def _read(
     rate_hz: float | None,
     vehicle_frame: str | None,
     ground_z_m: float,
-) -> tuple[list[MapSample], bool]:
+) -> Recording:
     topics = _camera_topics(bag)
     content = _first_pass(bag, topics)
     ground = rigid(np.eye(3), (0, 0, ground_z_m))
@@ -114,13 +153,19 @@ def _read(
         RigFrame(
             f"{path.stem}_{time_ns}",
             time_ns,
-            {name: (f"{name}/{t}.jpg", t) for name, t in found.items()},
+            {name: (f"{file_name(name)}/{t}.jpg", t) for name, t in found.items()},
         )
         for time_ns, found in zip(wanted.tolist(), nearest, strict=True)
     ]
     pose_at = _pose_at(content, vehicle, ground)
-    _write_images(bag, rig, frames, frames_dir)
-    return rig_samples(path.stem, list(rig.values()), frames, pose_at), pose_at is not None
+    samples = rig_samples(path.stem, list(rig.values()), frames, pose_at)
+    root = frames_dir / f"{file_name(path.stem)}-{content.digest.hexdigest()[:16]}"
+    notes = [
+        f"{len(reasons)} messages of {topic} cannot be read and are left out: {reasons[0]}"
+        for topic, reasons in content.unread.items()
+    ]
+    notes += _write_images(bag, rig, frames, root)
+    return Recording(samples, root, pose_at is not None, tuple(notes))
 
 
 def _listing(bag: Any) -> str:
@@ -167,8 +212,10 @@ def _stamp_ns(header: Any) -> int:
 
 def _matrix(place: Any, turn: Any) -> np.ndarray:
     """Return a pose of a message. (4, 4)"""
-    rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
-    return rigid(rotation, (place.x, place.y, place.z))
+    pose = rigid(rotation_of((turn.w, turn.x, turn.y, turn.z)), (place.x, place.y, place.z))
+    if not np.isfinite(pose).all():
+        raise ValueError(f"a position is not finite: {pose[:3, 3].tolist()}")
+    return pose
 
 
 def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:
@@ -180,22 +227,31 @@ def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:
     images = {topic for topic, _ in topics.values()}
     kinds = (*_TRANSFORMS, _ODOMETRY)
     chosen = [c for c in bag.connections if c.topic in images | set(topic_of) or c.msgtype in kinds]
-    for connection, _, raw in bag.messages(chosen):
-        topic, message = connection.topic, bag.deserialize(raw, connection.msgtype)
-        if topic in images:
-            content.times_ns[topic].append(_stamp_ns(message.header))
-            content.frame_ids.setdefault(topic, message.header.frame_id)
-        elif topic in topic_of:
-            content.infos |= {t: message for t in topic_of[topic] if t not in content.infos}
-        elif connection.msgtype == _ODOMETRY:
-            pose = message.pose.pose
-            content.odometry[0].append(_stamp_ns(message.header))
-            content.odometry[1].append(_matrix(pose.position, pose.orientation))
-        else:
-            _add_transforms(content, message.transforms, topic.endswith("tf_static"))
+    for connection, time_ns, raw in _messages(bag, chosen):
+        topic, kind = connection.topic, connection.msgtype
+        content.digest.update(f"{topic} {kind} {len(raw)}\n".encode())
+        content.digest.update(raw)
+        try:
+            with naming(f"the message at {time_ns} ns", "it is damaged"):
+                with _of_rosbags():
+                    message = bag.deserialize(raw, kind)
+                if topic in images:
+                    content.times_ns[topic].append(_stamp_ns(message.header))
+                    content.frame_ids.setdefault(topic, message.header.frame_id)
+                elif topic in topic_of:
+                    content.infos |= {t: message for t in topic_of[topic] if t not in content.infos}
+                elif kind == _ODOMETRY:
+                    pose, at_ns = message.pose.pose, _stamp_ns(message.header)
+                    content.odometry[1].append(_matrix(pose.position, pose.orientation))
+                    content.odometry[0].append(at_ns)
+                else:
+                    _add_transforms(content, message.transforms, topic.endswith("tf_static"))
+        except ValueError as error:
+            content.unread[topic].append(str(error))
     for name, (topic, info) in topics.items():
         if topic not in content.infos or topic not in content.frame_ids:
-            raise ValueError(f"camera {name!r} has no message on {topic} or {info}")
+            reason = next((content.unread[t][0] for t in (topic, info) if content.unread[t]), "")
+            raise ValueError(f"camera {name!r} has no message on {topic} or {info}. {reason}")
     return content
 
 
@@ -203,12 +259,14 @@ def _add_transforms(content: _Content, transforms: Sequence[Any], is_static: boo
     """Keep transforms, of static ones the first."""
     for item in transforms:
         child, parent = item.child_frame_id.lstrip("/"), item.header.frame_id.lstrip("/")
+        time_ns = _stamp_ns(item.header)
+        pose = _matrix(item.transform.translation, item.transform.rotation)
         if is_static:
             content.static.add(child)
         _, times, poses = content.transforms.setdefault(child, (parent, [], []))
         if not is_static or not times:
-            times.append(_stamp_ns(item.header))
-            poses.append(_matrix(item.transform.translation, item.transform.rotation))
+            times.append(time_ns)
+            poses.append(pose)
 
 
 def _vehicle_frame(content: _Content, wanted: str | None) -> str:
@@ -292,8 +350,8 @@ def _pose_at(content: _Content, vehicle: str, ground: np.ndarray) -> PoseAt | No
 
 def _write_images(
     bag: Any, rig: Mapping[str, RigCamera], frames: Sequence[RigFrame], frames_dir: Path
-) -> None:
-    """Write the images of frames that are not there yet."""
+) -> list[str]:
+    """Write the images of frames that are not there yet; say which cannot be used, and why."""
     missing = {
         (name, time_ns): frames_dir / path
         for frame in frames
@@ -301,34 +359,45 @@ def _write_images(
         if not (frames_dir / path).is_file()
     }
     chosen = [c for c in bag.connections if c.topic in rig]
-    for connection, _, raw in bag.messages(chosen) if missing else ():
-        message, camera = bag.deserialize(raw, connection.msgtype), rig[connection.topic]
-        target = missing.pop((camera.name, _stamp_ns(message.header)), None)
+    unusable = []
+    for connection, _, raw in _messages(bag, chosen) if missing else ():
+        camera = rig[connection.topic]
+        try:
+            with _of_rosbags():
+                message = bag.deserialize(raw, connection.msgtype)
+                target = missing.pop((camera.name, _stamp_ns(message.header)), None)
+        except ValueError:
+            continue  # the first pass has named it
         if target is not None:
-            _write_image(message, camera, target)
+            where = f"camera {camera.name!r}, image at {target.stem} ns"
+            try:
+                with naming(where, "its frame is left out"):
+                    _write_image(message, camera, target, where)
+            except (ValueError, cv2.error) as error:
+                unusable.append(str(error))
+    return unusable
 
 
-def _write_image(message: Any, camera: RigCamera, target: Path) -> None:
-    """Write a message's image as JPEG; one that cannot be decoded goes along, to be named later."""
+def _write_image(message: Any, camera: RigCamera, target: Path, where: str) -> None:
+    """Write a message's image as JPEG."""
     if hasattr(message, "encoding"):
-        camera.write_image(target, _raw_image(message))
+        camera.write_image(target, _raw_image(message, camera.size_px))
         return
-    content = np.asarray(message.data, np.uint8)
-    if not camera.is_distorted and content[:2].tobytes() == b"\xff\xd8":
-        write_bytes(target, content.tobytes())
-        return
-    image = cv2.imdecode(content, cv2.IMREAD_COLOR)
-    if image is None:
-        write_bytes(target, content.tobytes())
-    else:
+    content = np.asarray(message.data, np.uint8).tobytes()
+    image = decode_image(content, "its message", where, camera.size_px)
+    if camera.is_distorted or not content.startswith(b"\xff\xd8"):
         camera.write_image(target, image)
+    else:
+        write_bytes(target, content)
 
 
-def _raw_image(message: Any) -> np.ndarray:
+def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
     """Return an uncompressed image, BGR. (H, W, 3)"""
-    encoding = message.encoding
+    encoding, found = message.encoding, (message.width, message.height)
     if encoding not in _TO_BGR:
-        raise ValueError(f"images have the encoding {encoding!r}; known are {sorted(_TO_BGR)}")
+        raise ValueError(f"it has the encoding {encoding!r}; known are {sorted(_TO_BGR)}")
+    if found != size_px:
+        raise ValueError(f"it has {found} pixels, and its camera info says {size_px}")
     channels = _CHANNELS.get(encoding, 1)
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
     image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)

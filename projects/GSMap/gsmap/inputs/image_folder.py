@@ -1,11 +1,14 @@
 """Samples of a folder of images with one calibration file (docs/inference.md)."""
 
 import csv
+import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import yaml
@@ -14,9 +17,17 @@ from scipy.spatial.transform import Rotation
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError, naming
 from gsmap.datasets.image_files import image_size, read_image
-from gsmap.inputs.rig import PoseTrack, RigCamera, RigFrame, nearest_images, rig_samples
+from gsmap.inputs.rig import (
+    PoseTrack,
+    Recording,
+    RigCamera,
+    RigFrame,
+    nearest_images,
+    rig_samples,
+    rotation_of,
+)
 from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
-from gsmap.utils.files import write_bytes
+from gsmap.utils.files import file_name
 
 NAMES = ("calibration.yaml", "calibration.yml", "calibration.json")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
@@ -27,26 +38,24 @@ _CAMERA_KEYS = {
 }  # fmt: skip
 # A camera's axes (right, down, ahead) in a vehicle's (ahead, left, up).
 _AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+_MOST_VALUES = 100_000  # in a calibration file
 _TIME = re.compile(r"(?:^|\D)(\d{10}(?:\d{3}|\d{6}|\d{9})?)(?:\.(\d{1,9}))?$")
 
 
-def read_image_folder(file: Path, frames_dir: Path) -> tuple[list[MapSample], bool, Path]:
+def read_image_folder(file: Path, frames_dir: Path) -> Recording:
     """Read the samples that a calibration file describes, in the frame ``ego``.
 
     Args:
         file: The calibration file, YAML or JSON. Its paths start from its folder.
-        frames_dir: Folder for images without their distortion, made where a camera has one.
-
-    Returns:
-        The samples, whether they have poses, and the folder that their paths start from.
+        frames_dir: Folder for folders of images without their distortion, made where a camera has
+            one; a folder is named by its images' content and the calibration.
 
     Raises:
         FileNotFoundError: If a camera has no image, or there is no file of poses.
         ValueError: If the file is malformed; the message names the camera.
     """
     with naming(file, "see docs/inference.md"):
-        text = file.read_text(encoding="utf-8")
-        content = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
+        content = _content(file)
         _require_keys(content, _KEYS, "a calibration file")
         if not isinstance(content.get("cameras"), dict) or not content["cameras"]:
             raise ValueError("`cameras` must map names to cameras, at least one")
@@ -59,19 +68,50 @@ def read_image_folder(file: Path, frames_dir: Path) -> tuple[list[MapSample], bo
                 rig.append(_camera(str(name), camera, ground, images[str(name)]))
         rate_hz = float(content.get("rate_hz", 10.0))
         tolerance_ns = round(float(content.get("max_time_difference_ms", 50.0)) * 1e6)
+        if not 0 < rate_hz < np.inf or tolerance_ns < 0:
+            raise ValueError("rate_hz must be > 0, and max_time_difference_ms >= 0")
         frames, time_of = _frames(images, rate_hz, tolerance_ns, file)
         pose_at = None
         if content.get("poses"):
             pose_at = _read_poses(file.parent / content["poses"], time_of, ground).at
-        root = file.parent
+        scene, root, notes = file.parent.resolve().name, file.parent, []
+        samples = rig_samples(scene, rig, frames, pose_at)
         if any(camera.is_distorted for camera in rig):
-            root = frames_dir
-            frames = [_rectified(frame, rig, file.parent, root) for frame in frames]
-        return (
-            rig_samples(file.parent.resolve().name, rig, frames, pose_at),
-            pose_at is not None,
-            root,
-        )
+            root = frames_dir / f"{file_name(scene)}-{_digest(file, frames)}"
+            notes = [_rectify(sample, rig, file.parent, root) for sample in samples]
+        return Recording(samples, root, pose_at is not None, tuple(chain(*notes)))
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads YAML without merge keys (``<<``), which can stand for any number of entries."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Leave merge keys, to which an error is raised."""
+
+
+def _content(file: Path) -> Any:
+    """Read a calibration file's values."""
+    text = file.read_text(encoding="utf-8")
+    try:
+        content = json.loads(text) if file.suffix == ".json" else yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise ValueError(f"it is no YAML: {error}") from error
+    values = [content]
+    for value in values:  # aliases of YAML stand for any number of them
+        values += value.values() if isinstance(value, dict) else ()
+        values += value if isinstance(value, list) else ()
+        if len(values) > _MOST_VALUES:
+            raise ValueError(f"it holds more than {_MOST_VALUES} values")
+    return content
+
+
+def _digest(file: Path, frames: Sequence[RigFrame]) -> str:
+    """Return a digest of a calibration file and all images of frames."""
+    total = hashlib.sha256(file.read_bytes())
+    for frame in frames:
+        for path, _ in frame.images.values():
+            total.update(f"{path}\n".encode() + (file.parent / path).read_bytes())
+    return total.hexdigest()[:16]
 
 
 def _require_keys(value: Any, known: set[str], what: str) -> None:
@@ -89,7 +129,7 @@ def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> list[Path]
     if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
         raise ValueError(f"images must lie below the calibration file's folder, got {pattern!r}")
     found = place.iterdir() if place.is_dir() else folder.glob(pattern)
-    paths = sorted(path for path in found if path.suffix.lower() in _SUFFIXES)
+    paths = sorted(p for p in found if p.suffix.lower() in _SUFFIXES and p.is_file())
     if not paths:
         raise FileNotFoundError(
             f"camera {name!r} has no image at {place}: `images` names a file, a folder or a "
@@ -108,7 +148,7 @@ def _camera(
         given = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     if given.shape != (3, 3):
         raise ValueError(f"intrinsics must be [fx, fy, cx, cy] or 3 x 3, got {given.shape}")
-    width, height = camera.get("size_px") or image_size(images[0], f"camera {name!r}")
+    width, height = camera.get("size_px") or _size_of(images, f"camera {name!r}")
     return RigCamera(
         name,
         given,
@@ -117,6 +157,14 @@ def _camera(
         np.array(camera.get("distortion", ()), np.float64),
         str(camera.get("distortion_model", "")),
     )
+
+
+def _size_of(images: Sequence[Path], where: str) -> tuple[int, int]:
+    """Return the size of the first image that is whole enough to tell it."""
+    for path in images[:-1]:
+        with suppress(ValueError):
+            return image_size(path, where)
+    return image_size(images[-1], where)
 
 
 def _mounting(camera: Mapping[str, Any]) -> np.ndarray:
@@ -138,19 +186,11 @@ def _mounting(camera: Mapping[str, Any]) -> np.ndarray:
             raise ValueError("vehicle_from_camera must be a rotation with a translation, 4 x 4")
         return pose
     if "quaternion_wxyz" in camera:
-        rotation = _turn(camera["quaternion_wxyz"])
+        rotation = rotation_of(camera["quaternion_wxyz"])
     else:
         turn = Rotation.from_euler("ZYX", camera["yaw_pitch_roll_deg"], degrees=True)
         rotation = turn.as_matrix() @ _AHEAD
     return rigid(rotation, camera["position_m"])
-
-
-def _turn(wxyz: Sequence[Any]) -> np.ndarray:
-    """Return the rotation of a quaternion, which must have length 1. (3, 3)"""
-    w, x, y, z = (float(value) for value in wxyz)
-    if not abs(np.linalg.norm([w, x, y, z]) - 1) < 1e-2:
-        raise ValueError(f"a quaternion must have length 1, got {[w, x, y, z]}")
-    return Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
 def _time_ns(stem: str) -> int | None:
@@ -213,27 +253,38 @@ def _read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> P
         raise FileNotFoundError(f"There is no file of poses {path}.")
     times, poses = [], []
     with naming(path, "see docs/inference.md"), path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
+        for row in _rows(file):
             if "frame" in row and row["frame"] not in time_of:
                 continue
             times.append(time_of[row["frame"]] if "frame" in row else int(row["timestamp_ns"]))
-            turn = _turn([row[f"q{axis}"] for axis in "wxyz"])
+            turn = rotation_of([row[f"q{axis}"] for axis in "wxyz"])
             poses.append(rigid(turn, [float(row[axis]) for axis in "xyz"]) @ ground)
         return PoseTrack(times, poses)
 
 
-def _rectified(frame: RigFrame, rig: Sequence[RigCamera], root: Path, target: Path) -> RigFrame:
-    """Write a frame's images without distortion; a damaged one goes along, to be named later."""
-    images = {}
-    for camera in (camera for camera in rig if camera.name in frame.images):
-        path, time_ns = frame.images[camera.name]
-        images[camera.name] = f"{camera.name}/{Path(path).stem}.jpg", time_ns
-        written = target / images[camera.name][0]
-        if written.is_file():
+def _rows(file: TextIO) -> Iterator[dict[str, str]]:
+    """Yield the rows of a CSV file by their columns."""
+    try:
+        yield from csv.DictReader(file)
+    except csv.Error as error:
+        raise ValueError(f"it is no CSV: {error}") from error
+
+
+def _rectify(sample: MapSample, rig: Sequence[RigCamera], root: Path, target: Path) -> list[str]:
+    """Write a sample's images without distortion, and make it point to them.
+
+    Returns which cannot be used, and why; they are not written, so that the sample is known to be
+    broken.
+    """
+    unusable, by_name = [], {camera.name: camera for camera in rig}
+    for record in sample.cameras:
+        camera, source = by_name[record.name], root / record.path
+        record.path = f"{file_name(record.name)}/{file_name(source.name)}.jpg"
+        if (target / record.path).is_file():
             continue
         try:
-            image = read_image(str(root / path), f"camera {camera.name}", camera.size_px)
-            camera.write_image(written, image)
-        except BrokenSampleError:
-            write_bytes(written, (root / path).read_bytes())
-    return RigFrame(frame.token, frame.time_ns, images)
+            image = read_image(str(source), f"camera {record.name!r}", camera.size_px)
+            camera.write_image(target / record.path, image)
+        except BrokenSampleError as error:
+            unusable.append(str(error))
+    return unusable

@@ -3,13 +3,15 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from gsmap.converters.argoverse2.log import closest_ns
-from gsmap.datasets.annotations.record import CameraRecord, MapSample
+from gsmap.datasets.annotations.file import check_samples
+from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapSample
 from gsmap.inputs.frames import sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.files import write_bytes
@@ -17,6 +19,8 @@ from gsmap.utils.files import write_bytes
 PoseAt = Callable[[int], np.ndarray | None]
 FISHEYE_MODELS = ("equidistant", "fisheye")
 PLAIN_MODELS = ("plumb_bob", "rational_polynomial", "radtan", "")
+_COUNTS = dict.fromkeys(PLAIN_MODELS, (4, 5, 8, 12, 14)) | dict.fromkeys(FISHEYE_MODELS, (4,))
+_LEAST_SEEN, _GRID = 0.1, 16  # share of a rectified image, looked at on so many pixels squared
 
 
 @dataclass
@@ -31,6 +35,10 @@ class RigCamera:
         size_px: Width and height of its images.
         distortion: OpenCV's coefficients; none for a pinhole camera. (n,)
         model: Their model, as ROS names it.
+
+    Raises:
+        ValueError: If its size is not positive, or images cannot be rectified with such
+            coefficients.
     """
 
     name: str
@@ -41,11 +49,32 @@ class RigCamera:
     model: str = ""
 
     def __post_init__(self) -> None:
-        if self.is_distorted and self.model not in (*FISHEYE_MODELS, *PLAIN_MODELS):
-            known = [name for name in (*PLAIN_MODELS, *FISHEYE_MODELS) if name]
+        if min(self.size_px) < 1:
+            raise ValueError(f"camera {self.name!r} has images of {self.size_px} pixels, not > 0.")
+        if self.is_distorted:
+            self._check_distortion()
+
+    def _check_distortion(self) -> None:
+        where = f"camera {self.name!r}"
+        if self.model not in _COUNTS:
             raise ValueError(
-                f"camera {self.name!r} has the distortion model {self.model!r}; known are {known}: "
-                "rectify its images first."
+                f"{where} has the distortion model {self.model!r}; known are "
+                f"{list(filter(None, _COUNTS))}: rectify its images first."
+            )
+        numbers, counts = self.distortion, _COUNTS[self.model]
+        if self.model in FISHEYE_MODELS and not np.any(numbers[4:]):
+            self.distortion = numbers = numbers[:4]  # some drivers add zeros
+        if numbers.shape not in [(count,) for count in counts] or not np.isfinite(numbers).all():
+            raise ValueError(
+                f"{where} has the distortion {numbers.tolist()!r:.80}; the model "
+                f"{self.model or 'plumb_bob'} takes {' or '.join(map(str, counts))} numbers, all "
+                "finite."
+            )
+        if not self._share_seen() > _LEAST_SEEN:
+            raise ValueError(
+                f"{where} sees next to nothing without its distortion {numbers.tolist()!r:.80}: "
+                "intrinsics must be in pixels of these images, and the distortion of the model "
+                f"{self.model or 'plumb_bob'}."
             )
 
     @property
@@ -53,19 +82,53 @@ class RigCamera:
         """Whether its images must be rectified before a model sees them."""
         return bool(np.any(self.distortion))
 
+    def _share_seen(self) -> float:
+        """Return which share of a rectified image lies in the original, about."""
+        lens = cv2.fisheye if self.model in FISHEYE_MODELS else cv2
+        width, height = self.size_px
+        small = np.diag([_GRID / width, _GRID / height, 1.0]) @ self.intrinsics
+        x, y = lens.initUndistortRectifyMap(
+            self.intrinsics, self.distortion, np.eye(3), small, (_GRID, _GRID), cv2.CV_32FC1
+        )
+        return float(((x >= 0) & (x < width) & (y >= 0) & (y < height)).mean())
+
     def rectified(self, image: np.ndarray) -> np.ndarray:
         """Return an image as the camera without distortion would have seen it. (H, W, 3)"""
         if self.model in FISHEYE_MODELS:
-            coefficients = np.asarray(self.distortion[:4], np.float64)
             return cv2.fisheye.undistortImage(
-                image, self.intrinsics, coefficients, Knew=self.intrinsics
+                image, self.intrinsics, self.distortion, Knew=self.intrinsics
             )
-        return cv2.undistort(image, self.intrinsics, np.asarray(self.distortion, np.float64))
+        return cv2.undistort(image, self.intrinsics, self.distortion)
 
     def write_image(self, path: Path, image: np.ndarray) -> None:
         """Write an image, BGR, as JPEG, without its distortion. (H, W, 3)"""
         image = self.rectified(image) if self.is_distorted else image
         write_bytes(path, cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a reader of a recording returns.
+
+    Args:
+        samples: The samples, in the frame ``ego``.
+        data_root: Folder that their paths start from.
+        has_poses: Whether the vehicle's pose is known.
+        notes: What could not be read.
+    """
+
+    samples: list[MapSample]
+    data_root: Path
+    has_poses: bool
+    notes: tuple[str, ...] = ()
+
+
+def rotation_of(wxyz: Iterable[Any]) -> np.ndarray:
+    """Return the rotation of a quaternion, which must have length 1. (3, 3)"""
+    w, x, y, z = (float(value) for value in wxyz)
+    if not abs(np.linalg.norm([w, x, y, z]) - 1) < 1e-2:
+        raise ValueError(f"a quaternion must have length 1, got {[w, x, y, z]}")
+    return Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
 class PoseTrack:
@@ -154,6 +217,9 @@ def rig_samples(
         frames: What they saw.
         pose_at: Pose of the ground below the vehicle at a time; frames for which it has none are
             left out. None where no pose is known.
+
+    Raises:
+        ValueError: If a value cannot be, such as a name that leads out of a folder.
     """
     samples = []
     for frame in frames:
@@ -173,4 +239,5 @@ def rig_samples(
                 CameraRecord(camera.name, path, *camera.size_px, camera.intrinsics, cam_from_ground)
             )
         samples.append(sample_in_vehicle(frame.token, scene, frame.time_ns, cameras, pose))
+    check_samples(samples, AnnotationMeta("recording", "ego", "test"))
     return samples

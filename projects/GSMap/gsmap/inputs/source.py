@@ -29,7 +29,8 @@ class InputOptions:
         allow_missing_cameras: Whether an info file may name images that do not exist.
         version: Version folder of a nuScenes-format root; the only one by default.
         rate_hz: Samples per second of Argoverse 2 logs and bags; None takes all.
-        frames_dir: Folder for images that have to be made: a bag's, and those of distorted cameras.
+        frames_dir: Folder for images that have to be made, a bag's and those of distorted cameras,
+            in a folder for each input.
         vehicle_frame: The vehicle's frame in a bag; ``base_footprint`` or ``base_link`` by default.
         vehicle_ground_z_m: Height of the road in that frame.
     """
@@ -82,14 +83,14 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
     if not path.exists():
         raise FileNotFoundError(f"There is no input {path}.")
     if is_bag(path):
-        samples, has_poses = read_bag(
+        drive = read_bag(
             path,
             options.frames_dir,
             options.rate_hz,
             options.vehicle_frame,
             options.vehicle_ground_z_m,
         )
-        return Source(samples, "ego", options.frames_dir, has_poses)
+        return Source(drive.samples, "ego", drive.data_root, drive.has_poses, drive.notes)
     if path.is_dir():
         return _open_folder(path, options)
     if path.suffix == ".arrow":
@@ -103,8 +104,8 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
         samples = read_info_file(path, root, options.allow_missing_cameras)
         return Source(samples, "lidar", root)
     if path.suffix in (".yaml", ".yml", ".json"):
-        samples, has_poses, root = read_image_folder(path, options.frames_dir)
-        return Source(samples, "ego", root, has_poses)
+        drive = read_image_folder(path, options.frames_dir)
+        return Source(drive.samples, "ego", drive.data_root, drive.has_poses, drive.notes)
     raise ValueError(f"{path} is no input: it must be {KINDS}.")
 
 

@@ -1,6 +1,7 @@
 """Files that are whole or absent, whatever stops their writer."""
 
 import fcntl
+import hashlib
 import logging
 import os
 import platform
@@ -16,6 +17,21 @@ SUFFIX = ".partial"
 _END = f".{platform.node()}{SUFFIX}"  # another machine's writers on a shared disk cannot be judged
 _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
+_LONGEST_NAME = 100  # bytes; a file system takes 255, with all that is appended
+
+
+def file_name(foreign: str) -> str:
+    """Make the name of a file or folder from a name that a file brings.
+
+    It is one part of a path and leads nowhere else. Letters, digits and ``_.+=-`` stay. A name that
+    has others, is empty or long, or begins with a dot or hyphen is changed and gets a digest, so
+    that two names never make one file.
+    """
+    plain = re.sub(r"[^\w.+=-]", "_", foreign).lstrip(".-").encode()[:_LONGEST_NAME]
+    name = plain.decode(errors="ignore") or "unnamed"
+    if name == foreign:
+        return name
+    return f"{name}-{hashlib.sha256(foreign.encode(errors='surrogatepass')).hexdigest()[:8]}"
 
 
 @contextmanager

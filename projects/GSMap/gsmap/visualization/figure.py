@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
-from gsmap.utils.files import atomic_write
+from gsmap.utils.files import atomic_write, file_name
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
 from gsmap.visualization.frame_view import FrameView
@@ -188,11 +188,6 @@ def figure_to_rgb(figure: Figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def picture_name(token: str, suffix: str) -> str:
-    """Return a file name made of a sample's token, without characters that a file system minds."""
-    return re.sub(r"[^\w.+=-]", "_", token) + suffix
-
-
 def sample_title(metainfo: Mapping[str, Any]) -> str:
     """Return a sample's scene, seconds into the scene, and token, as far as they are known."""
     token, seconds = str(metainfo.get("token") or ""), metainfo.get("seconds")
@@ -205,7 +200,7 @@ def sample_name(metainfo: Mapping[str, Any], suffix: str) -> str:
     name, seconds = str(metainfo.get("token") or ""), metainfo.get("seconds")
     if seconds is not None:
         name = f"{metainfo.get('scene') or 'scene'}_{seconds:07.2f}s_{name[-8:]}"
-    return picture_name(name, suffix)
+    return file_name(name) + suffix
 
 
 def save_figure(figure: Figure, path: str | Path) -> Path:

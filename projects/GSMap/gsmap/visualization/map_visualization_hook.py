@@ -9,7 +9,8 @@ from mmdet3d.registry import HOOKS
 from mmengine.hooks import Hook
 from mmengine.runner import Runner
 
-from gsmap.visualization.figure import picture_name, sample_name, save_figure
+from gsmap.utils.files import file_name
+from gsmap.visualization.figure import sample_name, save_figure
 from gsmap.visualization.map_visualizer import MapVisualizer
 
 
@@ -66,7 +67,7 @@ class MapVisualizationHook(Hook):
         stride = max(len(runner.val_dataloader) // max(self.num_val_samples, 1), 1)
         if batch_idx % stride or batch_idx // stride >= self.num_val_samples:
             return
-        name = picture_name(f"val_{outputs[0].metainfo['token']}", "")
+        name = file_name(f"val_{outputs[0].metainfo['token']}")
         points = _points(data_batch, 0)
         _visualizer(runner).add_datasample(name, None, outputs[0], step=runner.iter, points=points)
 

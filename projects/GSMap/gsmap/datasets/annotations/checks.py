@@ -12,7 +12,7 @@ from gsmap.structures.rigid import is_rigid
 
 _OPTIONAL = {"lidar", "can_bus", "instances", "ego_from_frame"}
 _PLACES = {"cameras[]": "camera's ", "lidar": "LiDAR ", "sweeps[]": "sweep's "}
-_OUTSIDE = r"^$|^/|\\|\x00|(^|/)\.\.(/|$)"  # of a data root, with forward slashes
+_OUTSIDE = r"^$|^/|[\\\x00-\x1f]|(^|/)\.\.(/|$)"  # of a data root, with forward slashes
 
 
 def check_batch(batch: pa.RecordBatch, meta: AnnotationMeta) -> None:
@@ -20,6 +20,7 @@ def check_batch(batch: pa.RecordBatch, meta: AnnotationMeta) -> None:
 
     Labels are among the classes, points and calibration finite, transforms rigid (proper rotations
     to 1e-3), focal lengths and image sizes positive, and paths relative and inside the data root.
+    Names of scenes, maps and cameras must lead nowhere else, either, if a path is made of them.
 
     Raises:
         ValueError: If a value is wrong or missing; the message names the sample.
@@ -75,17 +76,18 @@ def _are_inside(paths: pa.StringArray, *_of: object) -> np.ndarray:
     text = b"" if paths.buffers()[2] is None else paths.buffers()[2].to_pybytes()
     starts = np.frombuffer(paths.buffers()[1], np.int32, len(paths) + 1)[:-1]
     # a look at the bytes is enough for nearly all files, and much faster than an expression
-    plain = not any(part in text for part in (b"..", b"\\", b"\0"))
-    if plain and (np.frombuffer(text + b"/", np.uint8)[starts] != ord("/")).all():
+    letters = np.frombuffer(text + b"/", np.uint8)
+    plain = b".." not in text and b"\\" not in text and (letters >= ord(" ")).all()
+    if plain and (letters[starts] != ord("/")).all():
         return np.ones(len(paths), bool)
     return ~pc.match_substring_regex(paths, _OUTSIDE).to_numpy(zero_copy_only=False)
 
 
-def _are_unique(names: pa.StringArray, rows: np.ndarray, _meta: AnnotationMeta) -> np.ndarray:
-    """Say which cameras have a name of their own in their sample."""
+def _are_own_names(names: pa.StringArray, rows: np.ndarray, _meta: AnnotationMeta) -> np.ndarray:
+    """Say which cameras have a good name of their own in their sample."""
     encoded = names.dictionary_encode()
     each = rows * len(encoded.dictionary) + encoded.indices.to_numpy()
-    return np.bincount(each)[each] == 1
+    return (np.bincount(each)[each] == 1) & _are_inside(names)
 
 
 def _are_elements(lists: pa.ListArray, _rows: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
@@ -103,8 +105,14 @@ _TRANSFORM = (
     " is no rigid transform: it must be finite, with a rotation and 0, 0, 0, 1 below",
 )
 _SIZE = lambda numbers, *_: numbers.to_numpy() > 0, " {0}: the size is not positive"
+_NAME = (
+    lambda texts, *_: pc.equal(texts, "").to_numpy(zero_copy_only=False) | _are_inside(texts),
+    " {0!r} would lead out of a folder or has control characters: give it a plain name",
+)
 _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
     "token": (lambda texts, *_: pc.not_equal(texts, "").to_numpy(False), " is empty"),
+    "scene": _NAME,
+    "map_name": _NAME,
     "global_from_frame": _TRANSFORM,
     "ego_from_frame": _TRANSFORM,
     "cam_from_frame": _TRANSFORM,
@@ -113,7 +121,10 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
         lambda arrays, *_: np.isfinite(matrices_of(arrays, 18)).all(-1),
         " holds NaN or infinity",
     ),
-    "name": (_are_unique, " {0!r} appears twice"),
+    "name": (
+        _are_own_names,
+        " {0!r} appears twice, is empty, would lead out of a folder or has control characters",
+    ),
     "path": (
         _are_inside,
         " must be relative to the data root, with forward slashes and without '..', got {0!r}",
