@@ -10,7 +10,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from processes import REPO, run_python
+from mmengine.hooks import Hook
+from mmengine.registry import HOOKS
+from processes import REPO
+
+import tools.train
+from gsmap.engine.run_log import MapRunner
+from gsmap.models.heads.map_head import MapHead
+from gsmap.utils.cli import run_command
 
 ENVIRONMENT = {"PYTHON": sys.executable, "PORT": "29614", "OMP_NUM_THREADS": "1"}
 LONG = ["--cfg-options", "train_cfg.max_epochs=500", "train_cfg.val_interval=500"]
@@ -36,21 +43,33 @@ def children(pid: int) -> list[int]:
     return [int(n) for n in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def test_a_work_folder_has_one_training(tiny_config, tmp_path):
-    with training(tiny_config, tmp_path) as first:
-        before = sorted(os.listdir(tmp_path))
-        second = run_python(
-            "tools/train.py", tiny_config, "--work-dir", tmp_path, *LONG, env=ENVIRONMENT
-        )
-        assert second.returncode == 2
-        assert re.fullmatch(
-            rf"error: {tmp_path} is in use by process {first.pid} on \S+ since [\d: -]+: wait for "
-            r"its end, or give another --work-dir\.\n",
-            second.stderr,
-        )
-        assert len([name for name in before if name.startswith("20")]) == 1  # folders of runs
-        assert len(list(tmp_path.glob("20*"))) == 1
-        first.kill()
+@pytest.fixture
+def train(monkeypatch):
+    """Run ``tools/train.py`` in this process with the words that are given."""
+
+    def run(*words: object) -> None:
+        monkeypatch.setattr(sys, "argv", ["train.py", *map(str, words)])
+        run_command(tools.train.main, heed_kill=False)
+
+    return run
+
+
+def test_a_work_folder_has_one_training(tiny_config, tmp_path, train, monkeypatch, capsys):
+    words = tiny_config, "--work-dir", tmp_path
+
+    def second(runner: MapRunner) -> None:
+        with pytest.raises(SystemExit) as left:
+            train(*words)
+        assert left.value.code == 2
+
+    monkeypatch.setattr(MapRunner, "train", second)
+    train(*words)
+    assert re.fullmatch(
+        rf"error: {tmp_path} is in use by process {os.getpid()} on \S+ since [\d: -]+: wait for "
+        r"its end, or give another --work-dir\.\n",
+        capsys.readouterr().err,
+    )
+    assert len(list(tmp_path.glob("20*"))) == 1  # the first one's log
 
 
 def test_a_rank_that_hangs_is_named_within_the_timeout(tiny_config, tmp_path):
@@ -70,31 +89,57 @@ def test_a_rank_that_hangs_is_named_within_the_timeout(tiny_config, tmp_path):
     assert re.match(rf"error: rank 1 \(process {ranks[1]} on \S+, at .*\) does not answer; ", said)
     assert f"timeout is {limit_s:g}" in said
     assert "Traceback" not in rest
-    assert rest.splitlines()[-1].startswith("error: rank 0 ended with 2 (its own words stand above)")
+    assert rest.splitlines()[-1].startswith(
+        "error: rank 0 ended with 2 (its own words stand above)"
+    )
     assert launcher.returncode == 2
 
 
+@HOOKS.register_module()
+class Diverge(Hook):
+    """Spoils the last step of the second epoch."""
+
+    def before_train_iter(self, runner, batch_idx, data_batch=None):
+        if runner.iter == 3:
+            runner.optim_wrapper.param_groups[0]["lr"] = float("inf")
+
+
 def test_a_run_that_diverges_says_what_to_lower_and_resumes_from_the_last_good(
-    tiny_config, tmp_path
+    tiny_config, tmp_path, train, capsys
 ):
-    train = ["tools/train.py", tiny_config, "--work-dir", tmp_path, "--resume", "--cfg-options"]
-    epochs = "train_cfg.max_epochs={}"
-    assert run_python(*train, epochs.format(1), env=ENVIRONMENT).returncode == 0
-    (tmp_path / "rate.py").write_text(
-        "from mmengine.hooks import Hook\nfrom mmengine.registry import HOOKS\n"
-        "@HOOKS.register_module()\nclass Rate(Hook):\n"
-        "    def before_train_iter(self, runner, batch_idx, data_batch=None):\n"
-        "        if runner.iter == 3:  # the last of the second epoch\n"
-        "            runner.optim_wrapper.param_groups[0]['lr'] = 1e30\n"
+    words = tiny_config, "--work-dir", tmp_path, "--resume", "--cfg-options"
+    with pytest.raises(SystemExit) as left:
+        train(*words, "custom_hooks.1.type=Diverge")
+    assert left.value.code == 2
+    good = tmp_path / "epoch_1.pth"
+    assert re.fullmatch(
+        r"error: weights are NaN or infinite \(.+\), so they are not saved. The training has "
+        r"diverged at iteration 4: start it from its last good checkpoint with a lower learning "
+        rf"rate than inf \(--work-dir NEW --cfg-options load_from={good} "
+        r"optim_wrapper.optimizer.lr=\.\.\.\)\.\n",
+        capsys.readouterr().err,
     )
-    (tmp_path / "leaf.py").write_text(
-        f"_base_ = '{tiny_config}'\ncustom_hooks = [dict(type='Rate')]\n"
-        "custom_imports = dict(imports=['gsmap.registered', 'rate'])\n"
+    assert not (tmp_path / "epoch_2.pth").exists()
+    state = torch.load(good, weights_only=False)
+    next(iter(state["state_dict"].values())).fill_(torch.nan)
+    torch.save(state, bad := tmp_path / "epoch_2.pth")  # of an earlier version
+    train(*words, "train_cfg.max_epochs=2")
+    said = capsys.readouterr().out
+    assert re.search(rf"{bad} holds NaN or infinite weights .* It is passed over\.", said)
+    assert "goes on after iteration 2" in said
+
+
+def test_losses_that_are_not_finite_are_one_line(tiny_config, tmp_path, train, capsys, monkeypatch):
+    def broken(*_: object) -> dict[str, torch.Tensor]:
+        return {"loss_pts": torch.tensor(torch.nan)}
+
+    monkeypatch.setattr(MapHead, "loss", broken)
+    with pytest.raises(SystemExit) as left:
+        train(tiny_config, "--work-dir", tmp_path)
+    assert left.value.code == 2
+    assert re.fullmatch(
+        r"error: losses \['loss_pts'\] are not finite; .*: start it again with a lower learning "
+        r"rate than 0\.\d+ \(--work-dir NEW --cfg-options optim_wrapper.optimizer.lr=\.\.\.\)\.\n",
+        capsys.readouterr().err,
     )
-    paths = os.pathsep.join([str(tmp_path), os.environ["PYTHONPATH"]])
-    train[1] = tmp_path / "leaf.py"
-    done = run_python(*train, epochs.format(4), env=ENVIRONMENT | {"PYTHONPATH": paths})
-    assert done.returncode == 2, done.stderr
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    print(line)
-    assert sorted(path.name for path in tmp_path.glob("*.pth")) == ["epoch_1.pth"]
+    assert not list(tmp_path.glob("*.pth"))

@@ -80,15 +80,15 @@ class MapRunner(Runner):
 
 
 def _what_to_lower(runner: Runner) -> str:
-    """Say how to go on after a divergence; on resuming, the learning rate is the checkpoint's."""
+    """Say how to go on after a divergence; ``--resume`` keeps the learning rate."""
     last = newest_checkpoint(runner.work_dir)
-    lr = float(runner.optim_wrapper.get_lr()["lr"][0])
+    group = runner.optim_wrapper.param_groups[0]
     amp = isinstance(runner.optim_wrapper, AmpOptimWrapper)
     return (
-        f"The training has diverged at iteration {runner.iter}: start "
-        f"{'from its last good checkpoint' if last else 'again'} with a lower learning rate (now "
-        f"{lr:.2g}){' or without --amp' if amp else ''}: --cfg-options "
-        f"{f'load_from={last} ' if last else ''}optim_wrapper.optimizer.lr={lr / 3:.1g}"
+        f"The training has diverged at iteration {runner.iter}: start it "
+        f"{'from its last good checkpoint' if last else 'again'} with a lower learning rate than "
+        f"{group.get('initial_lr', group['lr']):g}{' or without --amp' if amp else ''} (--work-dir "
+        f"NEW --cfg-options {f'load_from={last} ' if last else ''}optim_wrapper.optimizer.lr=...)."
     )
 
 
