@@ -2,6 +2,8 @@
 """Train a model: ``python tools/train.py CONFIG``."""
 
 import argparse
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 
 from mmdet3d.registry import RUNNERS
 from mmengine.config import Config
@@ -11,6 +13,7 @@ from gsmap.engine.launch import add_common_arguments, load_config, newest_checkp
 from gsmap.engine.named_models import find_checkpoint
 from gsmap.engine.run_log import MapRunner
 from gsmap.utils.cli import CommandParser, is_first_rank, run_command
+from gsmap.utils.files import lock_folder
 
 
 def parse_args() -> argparse.Namespace:
@@ -35,7 +38,7 @@ def parse_args() -> argparse.Namespace:
 def choose_start(cfg: Config, resume: str | None) -> None:
     """Say what the run goes on from or starts from, and check that file."""
     if resume == "auto":
-        newest = newest_checkpoint(cfg.work_dir)
+        newest = newest_checkpoint(cfg.work_dir, read_weights)
         if newest is None and is_first_rank():
             print(f"{cfg.work_dir} holds no checkpoint: the run starts at its beginning.")
         resume = newest
@@ -44,6 +47,14 @@ def choose_start(cfg: Config, resume: str | None) -> None:
     if cfg.load_from and "://" not in str(cfg.load_from):
         cfg.load_from = str(find_checkpoint(cfg.load_from))
         read_weights(cfg.load_from)
+
+
+def writes_alone(work_dir: str) -> AbstractContextManager:
+    """Keep a work folder for this run alone; the first rank does it for all."""
+    if not is_first_rank():
+        return nullcontext()
+    advice = "wait for its end, or give another --work-dir"
+    return lock_folder(Path(work_dir), ".training", advice)
 
 
 def main() -> None:
@@ -56,9 +67,10 @@ def main() -> None:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
             raise ValueError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")
         cfg.auto_scale_lr.enable = True
-    choose_start(cfg, args.resume)
-    runner = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
-    runner.from_cfg(cfg).train()
+    with writes_alone(cfg.work_dir):
+        choose_start(cfg, args.resume)
+        runner = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
+        runner.from_cfg(cfg).train()
 
 
 if __name__ == "__main__":

@@ -123,7 +123,7 @@ def test_a_comparison_keeps_its_number_of_processes(tiny_config, protocol, tmp_p
 def test_a_run_is_worked_on_once_at_a_time(tmp_path):
     run = Run("a", 0, tmp_path / "a", "a.py", (), 1, 1, 1, {})
     job = Job(run, None)  # there is no a.py: it fails at once
-    with pytest.raises(RuntimeError, match="another process works in"):
+    with pytest.raises(RuntimeError, match="is in use by"):
         Job(run, None)
     job.end("cut off")
     assert json.loads((run.folder / "run.json").read_text())["state"] == "cut off"

@@ -13,6 +13,7 @@ from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.checkpoint_hook import AtomicLocalBackend
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, write_results
+from gsmap.utils.files import SUFFIX
 
 SPLITS = [f"gsmap_minicity_{split}.arrow" for split in ("train", "val")]
 
@@ -31,7 +32,7 @@ def score(_: Path, out: Path) -> None:
 
 def check(out: Path) -> list[str]:
     """Read each file that has its name, and return these names."""
-    found = sorted(path.name for path in out.iterdir() if path.suffix != ".partial")
+    found = sorted(path.name for path in out.iterdir() if path.suffix != SUFFIX)
     for name in found:
         if name.endswith(".arrow"):
             assert len(list(AnnotationFile(out / name))) == 2

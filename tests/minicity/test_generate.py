@@ -173,7 +173,7 @@ generate(root=Path({str(root)!r}), scenes=2, seed=0, image_size=(64, 36), sample
 
 
 def test_a_second_run_into_the_same_root_is_refused(tmp_path: Path) -> None:
-    partial = tmp_path / "root.partial"
+    partial = tmp_path / "root.gsmap-partial"
     partial.mkdir()
     handle = os.open(partial, os.O_RDONLY)
     fcntl.flock(handle, fcntl.LOCK_EX)
@@ -185,7 +185,7 @@ def test_a_second_run_into_the_same_root_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_killed_run_leaves_no_root_and_the_next_one_completes(tmp_path: Path) -> None:
-    root, partial = tmp_path / "root", tmp_path / "root.partial"
+    root, partial = tmp_path / "root", tmp_path / "root.gsmap-partial"
     script = (
         "from minicity.generate import generate\n"
         f"generate({str(root)!r}, 2, 4, (128, 72), samples_per_scene=40, workers=2)\n"

@@ -11,6 +11,7 @@ from mmdet3d.registry import MODELS
 
 from gsmap.engine.launch import read_config
 from gsmap.utils.cli import run_command
+from gsmap.utils.files import SUFFIX
 
 COMMANDS = {
     "create_data": "make",
@@ -190,4 +191,4 @@ def test_bad_input_ends_in_one_line(case, folder, minicity_annotations, monkeypa
     assert len(said) == 1
     assert expected in said[0]
     assert len(said[0]) < 1000  # ten lines of a terminal
-    assert not {path.name for path in {*folder.rglob("*")} - before if path.suffix == ".partial"}
+    assert not {path.name for path in {*folder.rglob("*")} - before if path.suffix == SUFFIX}

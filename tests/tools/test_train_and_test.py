@@ -67,7 +67,7 @@ def test_a_killed_training_goes_on_where_it_stopped(trained):
     epochs = [n for n in (1, 2, 3) if f"Epoch(train)  [{n}]" in log or f"Epoch(train) [{n}]" in log]
     assert epochs == list(range(first, 4))
     assert (trained / "epoch_3.pth").exists()
-    assert not list(trained.glob("*.partial"))  # nothing half-written is left
+    assert not list(trained.glob("*partial"))  # nothing half-written is left
 
 
 def test_training_shows_pictures_on_tensorboard(trained):

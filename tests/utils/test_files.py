@@ -1,15 +1,24 @@
 import errno
+import fcntl
 import os
-import platform
 import signal
 import stat
 import subprocess
 import sys
-import textwrap
+import time
+from pathlib import Path
 
 import pytest
 
-from gsmap.utils.files import atomic_write, file_name, write_bytes, write_text
+from gsmap.utils.files import (
+    SUFFIX,
+    atomic_write,
+    file_name,
+    lock_folder,
+    partial_path,
+    write_bytes,
+    write_text,
+)
 
 
 def test_text_and_bytes_are_written_and_folders_made(tmp_path):
@@ -35,7 +44,7 @@ def test_the_old_file_stays_until_the_block_ends(tmp_path):
     with atomic_write(path) as file:
         file.write("new")
         assert path.read_text() == "old"
-        assert [p for p in os.listdir(tmp_path) if p.endswith(".partial")]
+        assert [p for p in os.listdir(tmp_path) if p.endswith(SUFFIX)]
     assert path.read_text() == "new"
 
 
@@ -55,37 +64,111 @@ def test_an_exception_keeps_the_old_file_and_leaves_nothing_behind(error, tmp_pa
     assert os.listdir(tmp_path) == ["a"]
 
 
+WRITES = """
+import platform, sys, time
+from gsmap.utils.files import atomic_write
+platform.node = lambda: "same"  # as in containers
+with atomic_write(sys.argv[1]) as file:
+    file.write("half")
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+
+
+def writing(path: Path, *before: str) -> subprocess.Popen:
+    """Start a process that has opened a file and does not end; words to go before its command."""
+    command = [*before, sys.executable, "-c", WRITES, str(path)]
+    writer = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert writer.stdout.readline() == b"ready\n"
+    return writer
+
+
+def leftovers(folder: Path) -> list[str]:
+    return [name for name in os.listdir(folder) if name.endswith(SUFFIX)]
+
+
 def test_what_a_killed_writer_left_goes_with_the_next_write_and_nothing_else(tmp_path):
     path = tmp_path / "a"
-    code = textwrap.dedent(
-        f"""
-        import time
-        from gsmap.utils.files import atomic_write
-        with atomic_write({str(path)!r}) as file:
-            file.write("half")
-            print("ready", flush=True)
-            time.sleep(60)
-        """
-    )
-    host = platform.node()
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as writer:
-        assert writer.stdout.readline() == b"ready\n"
+    with writing(path) as writer:
+        (half,) = leftovers(tmp_path)
         write_text(path, "beside a living writer")
-        assert (tmp_path / f"a.{writer.pid}.{host}.partial").exists()
-        writer.send_signal(signal.SIGKILL)
-    (tmp_path / f"folder.{writer.pid}.{host}.partial").mkdir()
-    (old := tmp_path / "e.999999999.there.partial").touch()
-    os.utime(old, (0, 0))
+        assert leftovers(tmp_path) == [half]
+        writer.kill()
+    (tmp_path / half.replace("a.", "folder.")).mkdir()
+    foreign = half[: half.index("-") - 8] + "0" * 8 + half[half.index("-") :]  # another machine's
+    (rested := tmp_path / f"rested_{foreign}").touch()
+    os.utime(rested, (0, 0))
     others = {
-        f"b.1.{host}.partial",
-        "a.partial",
-        f"a.x.{host}.partial",
-        "a.999999999.there.partial",
+        foreign,
+        "film.mp4.123.partial",  # a download
+        "a.999999999.here.partial",
+        f"a{SUFFIX}",
+        f"a.123{SUFFIX}",
     }
     for name in others:
         (tmp_path / name).touch()
+        if name != foreign:
+            os.utime(tmp_path / name, (0, 0))
     write_text(tmp_path / "d", "whole")  # any file of that folder
     assert set(os.listdir(tmp_path)) == {"a", "d", *others}
+
+
+def test_containers_of_one_name_leave_each_others_files_alone(tmp_path):
+    """In a process namespace of its own a writer's number means nothing here."""
+    space = ["unshare", "--user", "--map-root-user", "--pid", "--fork", "--kill-child"]
+    if subprocess.run([*space, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("no process namespaces here")
+    with writing(tmp_path / "a", *space) as writer:
+        (half,) = leftovers(tmp_path)
+        with writing(tmp_path / "b", *space) as other:
+            assert half in leftovers(tmp_path)
+            other.kill()
+        write_text(tmp_path / "c", "")
+        assert half in leftovers(tmp_path)
+        writer.kill()
+
+
+def test_without_locks_nothing_is_removed_by_guess(tmp_path, monkeypatch):
+    with writing(tmp_path / "a") as writer:
+        writer.kill()
+    (half,) = leftovers(tmp_path)
+
+    def none(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    write_text(tmp_path / "b", "")
+    assert set(os.listdir(tmp_path)) == {half, "b"}
+
+
+def test_a_file_that_is_removed_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+    touch, made = Path.touch, []
+
+    def swept(path: Path, **options: bool) -> None:
+        touch(path, **options)
+        made.append(path)
+        if len(made) == 1:
+            path.unlink()
+
+    with partial_path(tmp_path / "a", swept) as left:
+        assert left == made[1] != made[0]
+
+
+def test_a_folder_is_for_one_process_and_says_whose(tmp_path):
+    here, (said, says) = tmp_path / "new", os.pipe()
+    with lock_folder(here, ".lock", "wait"):
+        worker = os.fork()  # one that outlives the block
+        if worker == 0:
+            os.write(says, b"started")
+            time.sleep(60)
+            os._exit(0)
+        who = f"new is in use by process {os.getpid()} on"
+        with pytest.raises(RuntimeError, match=rf"{who} \S+ since 20[\d: -]+: wait."):
+            lock_folder(here, ".lock", "wait")
+        assert os.read(said, 7) == b"started"
+    lock_folder(here, ".lock", "wait").close()
+    os.kill(worker, signal.SIGKILL)
+    os.waitpid(worker, 0)
 
 
 def test_a_device_or_a_pipe_is_written_to_and_stays_what_it_is(tmp_path):

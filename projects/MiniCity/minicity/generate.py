@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 
-from gsmap.utils.files import lock
+from gsmap.utils.files import SUFFIX, try_lock
 from gsmap.utils.parallel import default_workers, ordered_map
 from gsmap.utils.progress import Progress
 from minicity.config import TRAIN_LOCATIONS, VAL_LOCATIONS, VERSION, MiniCityConfig, make_token
@@ -139,17 +139,23 @@ def is_complete(root: Path, config: MiniCityConfig) -> bool:
 def _partial_folder(root: Path) -> Iterator[Path]:
     """A locked folder beside ``root`` to write into, gone afterwards unless it was renamed."""
     root.parent.mkdir(parents=True, exist_ok=True)
-    partial = root.with_name(f"{root.name}.partial")
+    partial = root.with_name(f"{root.name}{SUFFIX}")
     partial.mkdir(exist_ok=True)
     handle = os.open(partial, os.O_RDONLY)
     try:
-        lock(handle, f"another process is generating into {partial}: wait for it to end.")
+        locked = try_lock(handle)
+        if not locked and (locked is False or any(partial.iterdir())):
+            raise RuntimeError(
+                f"another process is generating into {partial}: wait for its end, or, if there is "
+                "none and this disk has no locks, remove that folder."
+            )
         try:
             for leftover in partial.iterdir():
                 shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
             yield partial
-        finally:
+        except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
+            raise
     finally:
         os.close(handle)
 

@@ -1,7 +1,7 @@
 """Annotation files: what is written comes back, and a wrong or half file is refused."""
 
+import os
 import pickle
-import platform
 import resource
 from dataclasses import replace
 from pathlib import Path
@@ -184,7 +184,12 @@ def test_a_failed_rewrite_keeps_the_old_file(tmp_path: Path):
 
 
 def test_leftovers_of_a_killed_writer_are_removed(tmp_path: Path):
-    (tmp_path / f"a.arrow.999999999.{platform.node()}.partial").write_bytes(b"half")
+    writer = AnnotationWriter(tmp_path / "a.arrow", META)
+    if (pid := os.fork()) == 0:
+        writer.__enter__()
+        os._exit(0)  # without its end, as if it was killed
+    os.waitpid(pid, 0)
+    assert len(list(tmp_path.iterdir())) == 1
     with AnnotationWriter(tmp_path / "a.arrow", META) as writer:
         writer.write(sample())
     assert [p.name for p in tmp_path.iterdir()] == ["a.arrow"]

@@ -16,7 +16,7 @@ import torch
 
 from gsmap.apis.comparison import RECORD, SETTINGS, Run
 from gsmap.checkpoints.settings import plain
-from gsmap.utils.files import lock, write_text
+from gsmap.utils.files import lock_folder, write_text
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.progress import Progress
 
@@ -53,9 +53,7 @@ class Job:
     def __init__(self, run: Run, device: str | None) -> None:
         self.run = run
         self.device = device
-        run.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = open(run.folder / ".lock", "w")  # noqa: SIM115 - held until the job ends
-        lock(self._lock, f"another process works in {run.folder}: wait for it.")
+        self._lock = lock_folder(run.folder, ".lock", "wait for its end")
         write_text(run.folder / SETTINGS, json.dumps(plain(run.settings), indent=1))
         self.record: dict[str, Any] = {"machine": machine(), "load_at_start": os.getloadavg()[0]}
         self.record |= {k: shlex.join(command) for k, command in run.commands().items()}

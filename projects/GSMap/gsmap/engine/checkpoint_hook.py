@@ -10,6 +10,7 @@ from mmengine.fileio import LocalBackend, register_backend
 from mmengine.hooks import CheckpointHook
 from mmengine.runner import EpochBasedTrainLoop, Runner
 
+from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
 from gsmap.utils.files import write_bytes, write_text
@@ -52,7 +53,17 @@ class AtomicCheckpointHook(CheckpointHook):
         checkpoint.get("meta", {}).pop("config", None)
 
     def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
-        """Note the model's settings."""
+        """Note the model's settings.
+
+        Raises:
+            FloatingPointError: If a weight is not finite; such a checkpoint is of no use.
+        """
+        state = checkpoint["state_dict"]
+        broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
+        if broken:
+            raise FloatingPointError(
+                f"weights are NaN or infinite ({listed(broken)}), so they are not saved."
+            )
         settings = plain(runner.cfg.model.to_dict())
         checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
 

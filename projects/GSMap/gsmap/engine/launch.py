@@ -7,8 +7,9 @@ import os
 import re
 import traceback
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from mmengine.runner import Runner
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.engine.named_models import find_config
+from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.utils.faults import nearest, registered
 from gsmap.utils.parallel import die_with_parent
 
@@ -151,7 +153,8 @@ def load_config(args: argparse.Namespace) -> Config:
         die_with_parent()  # torchrun killed with SIGKILL cannot stop its ranks
     if args.launcher == "pytorch" and not torch.cuda.is_available():
         # mmengine would choose a CUDA device first, and wrap the model with its number
-        torch.distributed.init_process_group("gloo")
+        timeout = timedelta(seconds=rank_timeout_s(cfg))
+        torch.distributed.init_process_group("gloo", timeout=timeout)
         cfg.model_wrapper_cfg = {
             "type": "MMDistributedDataParallel",
             "device_ids": None,
@@ -161,21 +164,47 @@ def load_config(args: argparse.Namespace) -> Config:
     return cfg
 
 
-def newest_checkpoint(work_dir: str | Path) -> Path | None:
-    """Return the newest whole checkpoint of a run, or None; a damaged one is named and left."""
+def rank_timeout_s(cfg: Config) -> float:
+    """Return how long ranks wait for each other, in seconds.
+
+    Raises:
+        ValueError: If ``env_cfg.dist_cfg.timeout`` is no positive number.
+    """
+    timeout_s = cfg.get("env_cfg", {}).get("dist_cfg", {}).get("timeout", TIMEOUT_S)
+    if not isinstance(timeout_s, int | float) or not timeout_s > 0:
+        raise ValueError(
+            f"{cfg.filename}: env_cfg.dist_cfg.timeout must be seconds > 0, got {timeout_s!r:.60}."
+        )
+    return timeout_s
+
+
+def newest_checkpoint(
+    work_dir: str | Path, read: Callable[[Path], object] | None = None
+) -> Path | None:
+    """Return the newest good checkpoint of a run, or None; others are named and left.
+
+    Args:
+        work_dir: Its work folder.
+        read: Raises ``ValueError`` for a checkpoint that is whole but cannot be used.
+    """
     numbers = {
         path: int(match[1])
         for path in Path(work_dir).glob("*.pth")
         if (match := re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name))
     }
     for path in sorted(numbers, key=numbers.__getitem__, reverse=True):
+        reason = f"{path} is damaged"
         try:
             with zipfile.ZipFile(path) as archive:
                 if archive.testzip() is None:
+                    if read is not None:
+                        read(path)
                     return path
         except zipfile.BadZipFile:
             pass
-        print_log(f"{path} is damaged and is passed over.", level=logging.WARNING)
+        except ValueError as error:
+            reason = str(error)
+        print_log(f"{reason} It is passed over.", level=logging.WARNING)
     return None
 
 

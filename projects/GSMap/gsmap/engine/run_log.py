@@ -1,6 +1,8 @@
 """A training log that opens with what matters, in a few lines."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -8,7 +10,12 @@ from mmdet3d.registry import HOOKS
 from mmengine.hooks import Hook
 from mmengine.logging import MMLogger
 from mmengine.model import is_model_wrapper
+from mmengine.optim import AmpOptimWrapper
 from mmengine.runner import EpochBasedTrainLoop, Runner
+from torch import nn
+
+from gsmap.engine.launch import newest_checkpoint, rank_timeout_s
+from gsmap.engine.rank_watch import RankWatch
 
 # How mmengine's long records begin, and those that say nothing about the run
 _DUMPS = (
@@ -27,14 +34,62 @@ def _lower_dumps(record: logging.LogRecord) -> bool:
 class MapRunner(Runner):
     """mmengine's runner with a short log: environment, config and hooks only with ``DEBUG``.
 
-    The whole config stands in the work folder in any case.
+    The whole config stands in the work folder in any case. A rank that does not answer ends a run
+    within ``env_cfg.dist_cfg.timeout``.
     """
+
+    _watch: RankWatch | None = None
 
     def build_logger(self, *args: Any, **kwargs: Any) -> MMLogger:
         """Build mmengine's logger, which tells its dumps only if ``log_level`` is ``DEBUG``."""
         logger = super().build_logger(*args, **kwargs)
         logger.addFilter(_lower_dumps)
         return logger
+
+    def train(self) -> nn.Module:
+        """Train; where losses or weights are no longer finite, say what to lower.
+
+        Raises:
+            FloatingPointError: If they are not.
+        """
+        try:
+            with self._watched():
+                return super().train()
+        except FloatingPointError as error:
+            raise FloatingPointError(f"{error} {_what_to_lower(self)}") from error
+
+    def test(self) -> dict:
+        """Test."""
+        with self._watched():
+            return super().test()
+
+    def call_hook(self, fn_name: str, **kwargs: Any) -> None:
+        """Call all hooks, and note that this rank goes on."""
+        if self._watch:
+            self._watch.step(f"{fn_name}, iteration {self.iter}")
+        super().call_hook(fn_name, **kwargs)
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        """Watch for ranks that do not answer."""
+        if self.world_size == 1:
+            yield
+            return
+        with RankWatch(rank_timeout_s(self.cfg)) as self._watch:
+            yield
+
+
+def _what_to_lower(runner: Runner) -> str:
+    """Say how to go on after a divergence; ``--resume`` keeps the learning rate."""
+    last = newest_checkpoint(runner.work_dir)
+    group = runner.optim_wrapper.param_groups[0]
+    amp = isinstance(runner.optim_wrapper, AmpOptimWrapper)
+    return (
+        f"The training has diverged at iteration {runner.iter}: start it "
+        f"{'from its last good checkpoint' if last else 'again'} with a lower learning rate than "
+        f"{group.get('initial_lr', group['lr']):g}{' or without --amp' if amp else ''} (--work-dir "
+        f"NEW --cfg-options {f'load_from={last} ' if last else ''}optim_wrapper.optimizer.lr=...)."
+    )
 
 
 @HOOKS.register_module()

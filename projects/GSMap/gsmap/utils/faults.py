@@ -34,7 +34,7 @@ _NO_PEER = re.compile(r"gloo.*(closed|reset) by peer|NCCL.*remote process", re.D
 _UNEXPECTED = re.compile(r"([\w.]+)\(\) got an unexpected keyword argument '(\w+)'")
 _IN_WORKER = "Original Traceback (most recent call last)"  # in texts of torch's DataLoader
 _BUILDER = "build_from_cfg"  # mmengine's function that makes an object from a config's settings
-_CHECKS = ValueError, TypeError, KeyError, RuntimeError
+_CHECKS = ValueError, TypeError, KeyError, RuntimeError, FloatingPointError
 _SLIPS = (
     *_CHECKS, IndexError, AttributeError, AssertionError, ArithmeticError, NotImplementedError,
     ImportError,

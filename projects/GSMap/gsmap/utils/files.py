@@ -6,15 +6,18 @@ import logging
 import os
 import platform
 import re
+import secrets
 import shutil
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Literal
 
-SUFFIX = ".partial"
-_END = f".{platform.node()}{SUFFIX}"  # another machine's writers on a shared disk cannot be judged
+SUFFIX = ".gsmap-partial"  # no other program's name
+_BOOT = Path("/proc/sys/kernel/random/boot_id")  # the same for all containers of a machine
+_MACHINE = _BOOT.read_text()[:8] if _BOOT.exists() else secrets.token_hex(4)
+_OURS = re.compile(rf".+\.([0-9a-f]{{8}})-[0-9a-f]{{8}}{re.escape(SUFFIX)}", re.DOTALL)
 _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
 _LONGEST_NAME = 100  # bytes; a file system takes 255, with all that is appended
@@ -38,10 +41,9 @@ def file_name(foreign: str) -> str:
 def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
     """Open a file that takes its name only when the block ends well.
 
-    Until then it is ``PATH.<pid>.<host>.partial``, which any exception removes. What a killed
-    writer left behind goes when anything is written to the same folder. A reader sees the old file
-    or the new one. A device or a pipe, such as ``/dev/null``, is written to as it is. Parent
-    folders are made; text is UTF-8.
+    Until then it is another file beside it (`partial_path`), which any exception removes. A reader
+    sees the old file or the new one. A device or a pipe, such as ``/dev/null``, is written to as it
+    is. Parent folders are made; text is UTF-8.
     """
     path = Path(path)
     encoding = None if "b" in mode else "utf-8"
@@ -50,19 +52,16 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
             yield file
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = partial_path(path)
     try:
-        with partial.open(mode, encoding=encoding) as file:
+        with partial_path(path) as made, made.open(mode, encoding=encoding) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(partial, path)
+            os.replace(made, path)
     except OSError as error:
-        if error.errno and str(error.filename or partial) == str(partial):
+        if error.errno and (not error.filename or _OURS.fullmatch(str(error.filename))):
             raise type(error)(error.errno, error.strerror, str(path)) from error
         raise
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -77,45 +76,101 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         file.write(content)
 
 
-def lock(file: IO[Any] | int, held: str) -> None:
+@contextmanager
+def partial_path(path: Path, make: Callable[[Path], object] = Path.touch) -> Iterator[Path]:
+    """Make an empty file or folder beside ``path``, which the block fills and gives that name.
+
+    It is ``PATH.<machine>-<random>.gsmap-partial``, locked while the block runs, and goes with its
+    end. Those of killed writers in that folder go first: who gets their lock may remove them.
+    """
+    _remove_leftovers(path.parent)
+    while True:
+        made = path.with_name(f"{path.name}.{_MACHINE}-{secrets.token_hex(4)}{SUFFIX}")
+        make(made)
+        with suppress(FileNotFoundError):  # removed by another writer that locked it first
+            handle = _open(made)
+            if try_lock(handle) is not False and made.exists():
+                break
+            os.close(handle)
+    try:
+        yield made
+    finally:
+        _remove(made)
+        os.close(handle)
+
+
+def try_lock(file: IO[Any] | int) -> bool | None:
     """Lock an open file or folder for as long as it is open.
+
+    Returns:
+        False if another process has locked it, None if the file system has no locks.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def lock(file: IO[Any] | int, held: str) -> None:
+    """Lock an open file or folder for as long as it is open; warn where there are no locks.
 
     Raises:
         RuntimeError: If another process has locked it, with the text ``held``.
     """
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise RuntimeError(held) from error
-    except OSError as error:  # a file system without locks
-        text = "files cannot be locked here (%s): take care that one process works at a time."
-        logging.getLogger("gsmap").warning(text, error)
+    if (locked := try_lock(file)) is False:
+        raise RuntimeError(held)
+    if locked is None:
+        text = "files cannot be locked here: take care that one process works at a time."
+        logging.getLogger("gsmap").warning(text)
 
 
-def partial_path(path: Path) -> Path:
-    """Return where a file or folder is made before it takes its name.
+def lock_folder(folder: Path, name: str, advice: str) -> IO[str]:
+    """Keep a folder for this process alone until the file that is returned is closed.
 
-    What killed writers left in that folder is removed.
+    Args:
+        folder: The folder; it is made.
+        name: Name of a file in it, for the lock and for who holds it.
+        advice: What to do if another process has it.
+
+    Raises:
+        RuntimeError: If another process has it; its number, its machine and since when.
     """
-    for name in os.listdir(path.parent):
-        stale = path.parent / name
-        if name.endswith(SUFFIX) and _is_stale(stale):
-            shutil.rmtree(stale, True) if stale.is_dir() else stale.unlink(missing_ok=True)
-    return path.with_name(f"{path.name}.{os.getpid()}{_END}")
+    folder.mkdir(parents=True, exist_ok=True)
+    file = open(folder / name, "a+", encoding="utf-8")  # noqa: SIM115 - held by the caller
+    os.register_at_fork(after_in_child=file.close)  # workers must not hold it for a killed parent
+    file.seek(0)
+    lock(file, f"{folder} is in use by {file.read(200) or 'another process'}: {advice}.")
+    file.truncate(0)
+    file.write(f"process {os.getpid()} on {platform.node()} since {time.strftime('%F %T')}")
+    file.flush()
+    return file
 
 
-def _is_stale(partial: Path) -> bool:
-    """Whether a writer is dead: its process is none here, or on another machine it rested a day."""
-    name, own = partial.name, partial.name.endswith(_END)
-    found = re.fullmatch(r".+\.(\d+)", name[: -len(_END)]) if own else None
-    if found and Path("/proc/self").exists():  # without /proc there is no way to tell
-        return not Path("/proc", found[1]).exists()
-    if own or not re.fullmatch(rf".+\.\d+\..+{re.escape(SUFFIX)}", name):
-        return False
-    try:
-        return time.time() - partial.stat().st_mtime > _DAY_S
-    except FileNotFoundError:
-        return False
+def _remove_leftovers(folder: Path) -> None:
+    """Remove what killed writers left; another machine's, whose lock may not reach, after a day."""
+    for name in os.listdir(folder):
+        if not (found := _OURS.fullmatch(name)):
+            continue
+        with suppress(OSError):  # it has gone meanwhile, or is another user's
+            handle = _open(folder / name)
+            try:
+                rested_s = time.time() - os.fstat(handle).st_mtime
+                if (found[1] == _MACHINE or rested_s > _DAY_S) and try_lock(handle):
+                    _remove(folder / name)
+            finally:
+                os.close(handle)
+
+
+def _open(path: Path) -> int:
+    """Open a file or folder to lock it; network disks lock files only for who may write."""
+    return os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def _is_special(path: Path) -> bool:

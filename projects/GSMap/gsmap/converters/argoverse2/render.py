@@ -131,22 +131,18 @@ def render_log(log_dir: Path, out_dir: Path, options: RenderOptions) -> int:
         times = times[np.linspace(0, len(times) - 1, options.max_frames).round().astype(int)]
     take = _prepare(log, source.calibration, times, options.scale)
     out_dir.parent.mkdir(parents=True, exist_ok=True)
-    partial_dir = partial_path(out_dir)
-    try:
+    with partial_path(out_dir, Path.mkdir) as partial_dir:
         _copy_log(log_dir, source, partial_dir, options.scale)
         for timestamp_ns in times.tolist():
             for name in RING_CAMERAS:
                 path = partial_dir / f"sensors/cameras/{name}/{timestamp_ns}.jpg"
                 path.write_bytes(take(name, timestamp_ns))
         os.rename(partial_dir, out_dir)
-    finally:
-        shutil.rmtree(partial_dir, ignore_errors=True)
     return len(times) * len(RING_CAMERAS)
 
 
 def _copy_log(log_dir: Path, source: Argoverse2Log, target: Path, scale: float) -> None:
     """Copy map and poses, write the calibration of the scaled cameras, make the image folders."""
-    target.mkdir(parents=True)
     shutil.copytree(log_dir / "map", target / "map", copy_function=shutil.copyfile)
     shutil.copyfile(log_dir / POSES, target / POSES)
     (target / "calibration").mkdir()
