@@ -83,6 +83,16 @@ def damaged_pickle(content: bytes, rng: Random) -> bytes:
     return pickle.dumps(damaged_value(pickle.loads(content), rng), rng.choice((2, 4, 5)))
 
 
+def damaged_metadata(content: bytes, rng: Random) -> bytes:
+    """Damage what an exported model says of itself."""
+    import onnx
+
+    model = onnx.load_from_string(content)
+    text = model.metadata_props[0].value.encode()
+    model.metadata_props[0].value = damaged_json(text, rng).decode()
+    return model.SerializeToString()
+
+
 def damaged_rows(content: bytes, rng: Random) -> bytes:
     """Damage a value of an annotation file, without its checksum."""
     reader = pa.ipc.open_file(content)
