@@ -50,6 +50,7 @@ class OnnxInferencer:
             raise FileNotFoundError(f"There is no ONNX file {path}; tools/export.py writes one.")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = num_threads
+        options.log_severity_level = 4  # what fails is raised as well
         try:
             self.session = onnxruntime.InferenceSession(
                 str(path), options, providers=list(providers)
