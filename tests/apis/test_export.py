@@ -11,6 +11,7 @@ from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from processes import run_python
 
 from benchmarks.model import ring_of_cameras
+from fuzz.contents import exported_model
 from gsmap.apis.export import (
     ExportedDetector,
     export_onnx,
@@ -122,6 +123,27 @@ def test_every_method_and_encoder_predicts_as_in_torch(case, annotations, tmp_pa
     assert scores < SCORES
     assert metres < POINTS_M
     assert found.has_gaussians == ("GSMap" in case)
+    (_, inputs), *_ = graph_inputs(exported, dataset, [0])
+    inputs = looking_away(inputs)
+    found = exported.run(inputs)
+    with torch.no_grad():
+        tensors = map(torch.from_numpy, inputs.values())
+        scores, _, points, *_ = ExportedDetector(inferencer.model).eval()(*tensors)
+    assert len(scores) > 50
+    np.testing.assert_allclose(found["scores"], scores, atol=SCORES)
+    np.testing.assert_allclose(found["points"], points, atol=POINTS_M)
+
+
+def looking_away(inputs):
+    """Return the inputs of cameras that see no cell of the map."""
+    far = np.eye(4, dtype=np.float32)
+    far[:3, 3] = 1e4
+    away = {
+        "img_from_frame": np.zeros_like,  # no point is before the camera
+        "frame_from_img": lambda matrices: far @ matrices,
+        "ego_from_cam": lambda matrices: far @ matrices,
+    }
+    return {name: away.get(name, np.array)(array) for name, array in inputs.items()}
 
 
 def test_the_shipped_model_predicts_as_in_torch(shipped):
@@ -192,7 +214,7 @@ def test_wrong_images_and_matrices_are_named(shipped):
 
 def test_other_files_and_an_absent_package_are_named(tmp_path, monkeypatch):
     import onnx
-    from onnx import TensorProto, helper
+    from onnx import TensorProto, helper, numpy_helper
 
     with pytest.raises(FileNotFoundError, match=r"no ONNX file .*gone.onnx"):
         OnnxInferencer(tmp_path / "gone.onnx")
@@ -207,6 +229,32 @@ def test_other_files_and_an_absent_package_are_named(tmp_path, monkeypatch):
     path.write_bytes(b"no model")
     with pytest.raises(ValueError, match=r"other.onnx cannot be run by ONNX Runtime"):
         OnnxInferencer(path)
+    model = onnx.load_from_string(exported_model())
+    for text, message in (
+        ("{", "JSONDecodeError"),
+        ("[]", "TypeError"),
+        (json.dumps({"format": 1}), "KeyError"),
+        (model.metadata_props[0].value.replace('"left"', "7"), "cameras must be names"),
+        (model.metadata_props[0].value.replace('["left", "right"]', '["left"]'), "its graph is"),
+        (model.metadata_props[0].value.replace("-15.0", "15.0"), "x_range must be"),
+        (model.metadata_props[0].value.replace(" 5.0,", ' "5",'), "TypeError"),
+    ):
+        model.metadata_props[0].value = text
+        onnx.save(model, path)
+        with pytest.raises(ValueError, match=f"other.onnx does not say .*{message}"):
+            OnnxInferencer(path)
+        model = onnx.load_from_string(exported_model())
+    model.graph.initializer[1].CopyFrom(numpy_helper.from_array(np.array([7, -1]), "shape"))
+    onnx.save(model, path)
+    cameras = np.zeros((2, 4, 6, 3), np.uint8), {"lidar2img": np.stack([np.eye(4)] * 2)}
+    with pytest.raises(ValueError, match=r"other.onnx cannot be run \(.*export it again"):
+        OnnxInferencer(path)(*cameras)
+    model.CopyFrom(onnx.load_from_string(exported_model()))
+    labels = numpy_helper.from_array(np.full(10, 3), "classes")
+    model.graph.initializer[4].CopyFrom(labels)
+    onnx.save(model, path)
+    with pytest.raises(ValueError, match=r"other.onnx gave no map elements \(a label is none"):
+        OnnxInferencer(path)(*cameras)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(RuntimeError, match=r"onnxruntime is not installed: .*\[onnx\]"):
         OnnxInferencer(path)

@@ -1,5 +1,6 @@
 """One sample as the files of other programs and of users hold it, for the readers of such files."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,50 @@ def info_of_argoverse2(sample: MapSample) -> dict[str, Any]:
     entry = {"token": "t", "log_id": "l", "timestamp": 7, "lidar_path": sample.lidar.path,
              "cams": cameras, "annotation": lines, **turn}  # fmt: skip
     return {"samples": [entry]}
+
+
+def exported_model() -> bytes:
+    """Return a tiny model with the inputs, outputs and metadata of an exported one."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    rng = np.random.default_rng(0)
+    weights = {
+        "kernel": rng.normal(size=(5, 3, 3, 3)).astype(np.float32),
+        "shape": np.array([10, -1]),
+        "matrix": rng.normal(size=(8, 4)).astype(np.float32),
+        "elements": np.array([10, 2, 2]),
+        "classes": np.arange(10) % len(CLASSES),
+    }
+    nodes = [
+        helper.make_node("Conv", ["images", "kernel"], ["features"]),
+        helper.make_node("Reshape", ["features", "shape"], ["flat"]),
+        helper.make_node("Sigmoid", ["flat"], ["likely"]),
+        helper.make_node("MatMul", ["likely", "matrix"], ["corners"]),
+        helper.make_node("Reshape", ["corners", "elements"], ["points"]),
+        helper.make_node("ReduceMean", ["likely"], ["means"], axes=[1], keepdims=0),
+        helper.make_node("ReduceMax", ["img_from_frame"], ["most"], keepdims=0),
+        helper.make_node("Div", ["means", "most"], ["scores"]),
+        helper.make_node("Identity", ["classes"], ["labels"]),
+    ]
+    numbers = TensorProto.FLOAT
+    shapes = {"images": [2, 3, 4, 6], "img_from_frame": [2, 4, 4]}
+    inputs = [helper.make_tensor_value_info(n, numbers, shape) for n, shape in shapes.items()]
+    outputs = [
+        helper.make_tensor_value_info("scores", numbers, [10]),
+        helper.make_tensor_value_info("labels", TensorProto.INT64, [10]),
+        helper.make_tensor_value_info("points", numbers, [10, 2, 2]),
+    ]
+    stored = [numpy_helper.from_array(array, name) for name, array in weights.items()]
+    graph = helper.make_graph(nodes, "map", inputs, outputs, stored)
+    opset = [helper.make_opsetid("", 17)]
+    model = helper.make_model(graph, ir_version=8, opset_imports=opset)
+    metadata = {
+        "format": 1, "image_size": [4, 6], "classes": CLASSES, "x_range": [-15.0, 15.0],
+        "y_range": [-30.0, 30.0], "frame": "lidar", "cameras": ["left", "right"],
+        "margin_m": 5.0, "score_threshold": None,
+    }  # fmt: skip
+    helper.set_model_props(model, {"gsmap": json.dumps(metadata)})
+    return model.SerializeToString()
 
 
 def own_calibration(sample: MapSample) -> dict[str, Any]:

@@ -148,6 +148,16 @@ def _file_of(rows: list[dict[str, Any]], schema: pa.Schema) -> bytes:
     return sink.getvalue().to_pybytes()
 
 
+def damaged_metadata(content: bytes, rng: Random) -> bytes:
+    """Damage what an exported model says of itself."""
+    import onnx
+
+    model = onnx.load_from_string(content)
+    text = model.metadata_props[0].value.encode()
+    model.metadata_props[0].value = damaged_json(text, rng).decode()
+    return model.SerializeToString()
+
+
 def damaged_rows(content: bytes, rng: Random) -> bytes:
     """Damage a value of an annotation file, without its checksum."""
     rows, schema = _rows_of(content)

@@ -1,14 +1,17 @@
 """Every reader of files with something whole to read, and what of its results can be checked."""
 
+import contextlib
 import errno
+import io
 import json
 import os
 import pickle
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from random import Random
 from typing import Any, ClassVar
@@ -28,6 +31,7 @@ from pyarrow.feather import write_feather
 
 from fuzz import contents, mutations
 from gsmap.apis.checkpoint import read_weights
+from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.converters.argoverse2.samples import Argoverse2Options, read_log
 from gsmap.converters.custom import from_records
 from gsmap.converters.infos import convert_infos
@@ -36,6 +40,7 @@ from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.converters.nuscenes.tables import LIDAR, NuScenesTables
 from gsmap.converters.splits import read_split_file
+from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_instances
@@ -43,15 +48,23 @@ from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points
 from gsmap.engine.launch import check_config, read_config
+from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.evaluator import MapEvaluator
+from gsmap.evaluation.match_files import SHARD_KIND as MATCHES
+from gsmap.evaluation.match_files import write_matches
+from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, vectors_of, write_results
+from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.inputs.bags import read_bag
 from gsmap.inputs.image_folder import read_image_folder
 from gsmap.inputs.info_file import read_info_file
 from gsmap.inputs.rig import Recording
 from gsmap.structures.elements import MapElements
 from gsmap.utils.faults import in_words
+from gsmap.utils.shards import Shard, digest
 from tools.build_map import main as build_map
 from tools.convert_config import convert
+from tools.merge import main as merge
 
 VERSION = "v1.0-trainval"
 LIDAR_META = AnnotationMeta("fuzz", "lidar", "train")
@@ -210,6 +223,7 @@ class Files:
         made = {
             "annotation file, its bytes": lambda: self.annotations(byte, exact=True),
             "annotation file, its values": lambda: self.annotations(mutations.damaged_rows),
+            "annotation file, overwritten in use": lambda: self.in_use(byte),
             "info file of mmdet3d": lambda: self.pickle("v2.pkl", contents.info_v2, read_info_file),
             "info file of MapTRv2": lambda: self.pickle(
                 "maptr.pkl", contents.info_of_maptr, self.infos
@@ -233,6 +247,9 @@ class Files:
             "name of a scene": self.scene_name,
             "name of a split": self.split_name,
             "results": self.results,
+            "manifest of annotations": lambda: self.shards(ANNOTATIONS, 2),
+            "manifest of results": lambda: self.shards(RESULTS, 2),
+            "manifest of matches": lambda: self.shards(MATCHES, 1),
             "config": self.config,
             "config of another repository": self.upstream,
             "image, JPEG": lambda: self.image(".jpg"),
@@ -249,6 +266,8 @@ class Files:
             "LiDAR sweep, Argoverse 2": self.feather,
             "checkpoint": self.weights,
         }
+        if find_spec("onnx") and find_spec("onnxruntime"):
+            made["exported model"] = self.exported
         for name in tables:
             path = self.work / VERSION / f"{name}.json"
             made[f"nuScenes table {name}"] = partial(self.json, path, self.tables)
@@ -265,6 +284,19 @@ class Files:
             return list(file)
 
         return Reader(self.arrow, read, damages, exact)
+
+    def in_use(self, *damages: Any) -> Reader:
+        used, whole = self.work / "used.arrow", self.arrow.read_bytes()
+        path = self.put("other.arrow", whole)
+
+        def read() -> list[MapSample]:
+            used.write_bytes(whole)
+            file = AnnotationFile(used)
+            used.write_bytes(path.read_bytes())
+            os.utime(used, ns=(1, 1))  # a clock of coarse ticks may give the time that it had
+            return list(file)
+
+        return Reader(path, read, damages, exact=True)
 
     def pickle(self, name: str, content: Callable[[MapSample], Any], read: Any) -> Reader:
         path = self.put(name, pickle.dumps(content(self.sample)))
@@ -372,6 +404,41 @@ class Files:
             return read_samples(path, RESULTS_KEY, LIDAR_META.classes)[0]
 
         return self.json(path, read)
+
+    def shards(self, kind: str, count: int) -> Reader:
+        elements = elements_of_instances(self.sample.instances)
+        results = [(token, vectors_of(elements, LIDAR_META.classes)) for token in "ab"]
+        evaluator = MapEvaluator(
+            ChamferConfig(LIDAR_META.classes), RasterConfig(LIDAR_META.classes)
+        )
+        target = self.work / f"whole of {kind}"
+        for shard in (Shard(index, count) for index in range(count)):
+            sample = replace(self.sample, token=str(shard.index))
+            if kind == ANNOTATIONS:
+                write_annotations(target, LIDAR_META, [sample], shard)
+            elif kind == RESULTS:
+                write_results(shard.path_of(target), results[shard.index :: count])
+                shard.seal(target, kind, "", {"model": "m"}, 1)
+            else:
+                matches = [evaluator.match(sample.token, elements, elements)]
+                write_matches(target, shard, matches, [], evaluator, "")
+
+        def read() -> str:
+            with contextlib.redirect_stdout(io.StringIO()):
+                merge([str(target)])
+            return digest(target)
+
+        path = Shard(0, count).path_of(target)
+        return self.json(path.with_name(f"{path.name}.manifest"), read)
+
+    def exported(self) -> Reader:
+        path = self.put("model.onnx", contents.exported_model())
+        images = np.random.default_rng(0).integers(0, 255, (2, 4, 6, 3), np.uint8)
+
+        def read() -> MapElements:
+            return OnnxInferencer(path)(images, {"lidar2img": np.stack([np.eye(4)] * 2)})
+
+        return Reader(path, read, (mutations.damaged_bytes, mutations.damaged_metadata))
 
     def config(self) -> Reader:
         file = Path(__file__).resolve().parents[2] / "configs/_base_/datasets/minicity.py"

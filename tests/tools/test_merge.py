@@ -191,6 +191,32 @@ def test_figures(scored, tmp_path, metrics, capsys):
     assert len(set(tables)) == 1
 
 
+GRID = {"x_range": [-15, 15], "y_range": [-30, 30]}
+
+
+@pytest.mark.parametrize(
+    ("rules", "message"),
+    [
+        ({"chamfer": None, "raster": None}, "tells no rules of metrics .*at least one"),
+        ({"chamfer": {"classes": [["a"]]}}, "tells no rules of metrics .*classes must be names"),
+        ({"chamfer": []}, "tells no rules of metrics"),
+        ({"chamfer": {"classes": ["divider"]}}, "holds no matches by the rules .*shapes"),
+        ({"chamfer": {"classes": list(CLASSES), "thresholds": [1]}}, "holds no matches by the"),
+        ({"raster": {"classes": list(CLASSES), "grid": GRID}}, "holds no matches .*'raster'"),
+    ],
+)
+def test_forged_rules_of_figures_are_refused(rules, message, scored, tmp_path):
+    target = tmp_path / "metrics.json"
+    evaluate([*map(str, scored), "--eval", "chamfer", "--out", str(target), "--shard", "0/1"])
+    path = tmp_path / "metrics.00000-of-00001.json.manifest"
+    manifest = json.loads(path.read_text())
+    manifest["options"]["evaluator"] |= rules
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(ValueError, match=message):
+        merge([str(target)])
+    assert not target.exists()
+
+
 def test_figures_of_results_that_lie_in_shards(predictions, minicity_annotations, tmp_path):
     for path in predictions.parent.glob("map.*-of-*"):
         shutil.copy(path, tmp_path)

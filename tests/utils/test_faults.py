@@ -1,5 +1,8 @@
 """What exceptions say to a user: the machine's, a file's, a config's, a data loader's worker's."""
 
+import os
+import signal
+
 import pytest
 import torch
 from mmengine import Registry
@@ -104,3 +107,18 @@ class Broken(torch.utils.data.Dataset):
 )
 def test_a_worker_of_a_data_loader_says_what_it_met(error, text):
     assert said(lambda: next(iter(DataLoader(Broken(error), num_workers=1)))) == text
+
+
+class Shortened(torch.utils.data.Dataset):
+    """A data set whose file ends before the memory that it is mapped to."""
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, index: int) -> None:
+        os.kill(os.getpid(), signal.SIGBUS)
+
+
+def test_a_bus_error_of_a_worker_is_no_want_of_memory():
+    text = said(lambda: next(iter(DataLoader(Shortened(), num_workers=1))))
+    assert text.startswith("bus error of a data loader's worker: a data file was shortened while")

@@ -60,8 +60,8 @@ def rename_as_the_third(target: Path) -> None:
         shutil.copy(part(target, 0, suffix), part(target, 2, suffix))
 
 
-def change(target: Path, **entries) -> None:
-    manifest = part(target, 1, ".manifest")
+def change(where: Path, **entries) -> None:
+    manifest = part(where, 1, ".manifest")
     manifest.write_text(json.dumps(json.loads(manifest.read_text()) | entries))
 
 
@@ -74,6 +74,13 @@ def change(target: Path, **entries) -> None:
         (lambda t: part(t, 1, ".manifest").write_text("{"), r"manifest is damaged"),
         (lambda t: change(t, options=[]), r"manifest is damaged"),
         (lambda t: change(t, shard="1"), r"manifest is damaged"),
+        (lambda t: change(t, shard=True), r"manifest is damaged"),
+        (lambda t: change(t, of=10**12), r"manifest is damaged .*\['shard', 'of', 'samples'\]"),
+        (lambda t: change(t, of=-3), r"manifest is damaged"),
+        (lambda t: change(t, shard=3), r"manifest is damaged"),
+        (lambda t: change(t, samples=None), r"manifest is damaged .*\['samples'\]"),
+        (lambda t: change(t, kind=["results"]), r"manifest is damaged .*\['kind'\]"),
+        (lambda t: change(t, target="../val.json"), r"manifest is damaged"),
         (rename_as_the_third, "is another shard by its manifest: 0 of 3"),
         (lambda t: change(t, version="0"), r"different work, by version \("),
         (lambda t: change(t, input="other"), r"different work, by input \('digest', 'other'\)"),

@@ -113,7 +113,7 @@ def test_three_dimensional_points(tmp_path: Path):
     )
 
 
-def test_pickle_hands_on_the_path_alone(tmp_path: Path):
+def test_pickle_hands_on_the_path_and_checksums_alone(tmp_path: Path):
     write_annotations(tmp_path / "a.arrow", META, [sample(i) for i in range(100)])
     data = pickle.dumps(AnnotationFile(tmp_path / "a.arrow"))
     assert len(data) < 500
@@ -308,6 +308,72 @@ def test_swapped_blocks_are_noticed(tmp_path: Path):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"checksum|not a whole"):
         AnnotationFile(path)
+
+
+def overwrite(path: Path, at: int) -> None:
+    """Write noise into a file in place, as a copy over it does."""
+    with path.open("r+b") as file:
+        file.seek(at)
+        file.write(b"\x55" * 64)
+    os.utime(path, ns=(1, 1))  # a clock of coarse ticks may give the time that it had
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+def test_a_file_that_shrinks_or_grows_in_use_is_named(sealed: bool, tmp_path: Path):
+    """Memory behind the end of a mapped file must not be touched: that ends the process."""
+    path = tmp_path / "a.arrow"
+    write_annotations(path, META, [sample(i) for i in range(100)])
+    if not sealed:
+        arrow(path, lambda columns: columns)
+    for size in (4096, path.stat().st_size + 1):
+        content = path.read_bytes()
+        file = AnnotationFile(path)
+        worker = pickle.loads(pickle.dumps(file))
+        os.truncate(path, size)
+        reads = (file.instance_counts, lambda f=file: f[99], lambda f=worker: f[99])
+        for read in reads:
+            with pytest.raises(ValueError, match=r"a.arrow was changed while .* `make it`"):
+                read()
+        path.write_bytes(content)
+
+
+def test_parts_overwritten_in_use_are_noticed_when_they_are_read(tmp_path: Path):
+    path = tmp_path / "a.arrow"
+    write_annotations(path, META, [sample(i) for i in range(600)])
+    file = AnnotationFile(path)
+    assert_same(file[599], sample(599))
+    worker = pickle.loads(pickle.dumps(file))
+    overwrite(path, path.stat().st_size // 2)
+    for reader in (file, worker):
+        for number in (0, 255, 512, 599):
+            assert_same(reader[number], sample(number))
+        for number in (256, 511, -300):
+            with pytest.raises(ValueError, match="was changed while it was in use"):
+                reader[number]
+        with pytest.raises(ValueError, match="was changed while it was in use"):
+            reader.column("token")
+
+
+def test_a_new_time_alone_or_the_same_file_again_is_no_change(tmp_path: Path):
+    path = tmp_path / "a.arrow"
+    write_annotations(path, META, [sample(i) for i in range(3)])
+    file = AnnotationFile(path)
+    os.utime(path, ns=(1, 1))
+    assert_same(file[2], sample(2))
+    write_annotations(path, META, [sample(i) for i in range(3)])
+    assert_same(pickle.loads(pickle.dumps(file))[2], sample(2))
+
+
+def test_a_worker_of_a_run_refuses_another_file_of_the_same_name(tmp_path: Path):
+    path = tmp_path / "a.arrow"
+    write_annotations(path, META, [sample(i) for i in range(3)])
+    handed_on = pickle.dumps(AnnotationFile(path))
+    write_annotations(path, META, [sample(i) for i in range(4)])
+    with pytest.raises(ValueError, match="was replaced after this run had opened it"):
+        pickle.loads(handed_on)
+    write_annotations(path, META, [sample(i, map_name="city") for i in range(3)])  # as long
+    with pytest.raises(ValueError, match="was changed while it was in use"):
+        pickle.loads(handed_on)[0]
 
 
 def test_meta_refuses_bad_values():

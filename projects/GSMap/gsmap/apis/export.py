@@ -247,9 +247,10 @@ def _translations() -> dict[Any, Any]:
         if mode != 0 or weights is None or include_last_offset:
             raise NotImplementedError("embedding_bag other than weighted sums in bags of one size")
         one = op.Constant(value_ints=[1])
-        bags = op.Concat(op.Shape(offsets), op.Constant(value_ints=[-1]), axis=0)
-        weights = op.Unsqueeze(op.Reshape(weights, bags), one)
-        sums = op.MatMul(weights, op.Gather(table, op.Reshape(rows, bags)))
+        size = op.Div(op.Shape(rows), op.Max(op.Shape(offsets), one))  # -1 fails without any bag
+        bags = op.Concat(op.Shape(offsets), size, axis=0)
+        weights = op.Unsqueeze(op.Reshape(weights, bags, allowzero=1), one)
+        sums = op.MatMul(weights, op.Gather(table, op.Reshape(rows, bags, allowzero=1)))
         return op.Squeeze(sums, one), offsets, offsets, offsets
 
     return {torch.ops.aten.embedding_bag.padding_idx: embedding_bag}

@@ -15,6 +15,7 @@ from gsmap.utils.extras import import_extra
 
 METADATA_KEY = "gsmap"
 FORMAT = 1
+_OUTPUTS = {"scores", "labels", "points"}
 
 
 class OnnxInferencer:
@@ -49,6 +50,7 @@ class OnnxInferencer:
             raise FileNotFoundError(f"There is no ONNX file {path}; tools/export.py writes one.")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = num_threads
+        options.log_severity_level = 4  # what fails is raised as well
         try:
             self.session = onnxruntime.InferenceSession(
                 str(path), options, providers=list(providers)
@@ -58,18 +60,26 @@ class OnnxInferencer:
                 f"{path} cannot be run by ONNX Runtime {onnxruntime.__version__} "
                 f"({error!s:.300}): export it again, or install a newer onnxruntime."
             ) from error
-        found = self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
-        self.metadata: dict[str, Any] = json.loads(found or "{}")
-        if self.metadata.get("format") != FORMAT:
+        try:
+            found = self.session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+            self.metadata: dict[str, Any] = json.loads(found or "{}")
+            if self.metadata["format"] != FORMAT:
+                raise ValueError("another format")
+            _check_metadata(self.metadata)
+            self._outputs = [value.name for value in self.session.get_outputs()]
+            images, *calibration = self.session.get_inputs()
+            shape = [len(self.metadata["cameras"]), 3, *self.metadata["image_size"]]
+            if images.shape != shape or not _OUTPUTS <= set(self._outputs):
+                raise ValueError("its graph is not the one that its metadata tell of")
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(
-                f"{path} does not say that tools/export.py of this version wrote it: export the "
-                "model again."
-            )
+                f"{path} does not say that tools/export.py of this version wrote it ({error!r}): "
+                "export the model again."
+            ) from error
         self.classes: tuple[str, ...] = tuple(self.metadata["classes"])
         self.cameras: tuple[str, ...] = tuple(self.metadata["cameras"])
         self.image_size: tuple[int, int] = tuple(self.metadata["image_size"])
-        self._calibration = [value.name for value in self.session.get_inputs()[1:]]
-        self._outputs = [value.name for value in self.session.get_outputs()]
+        self._calibration = [value.name for value in calibration]
 
     def __call__(
         self, images: Sequence[NDArray[Any]] | NDArray[Any], meta: Mapping[str, Any]
@@ -127,11 +137,36 @@ class OnnxInferencer:
                 )
 
     def run(self, inputs: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[Any]]:
-        """Return the outputs of the graph by name, wherever the elements lie."""
-        return dict(zip(self._outputs, self.session.run(self._outputs, inputs), strict=True))
+        """Return the outputs of the graph by name, wherever the elements lie.
+
+        Raises:
+            ValueError: If ONNX Runtime cannot run the graph on these inputs.
+        """
+        try:
+            values = self.session.run(self._outputs, inputs)
+        except Exception as error:  # onnxruntime's errors have no common class of their own
+            raise ValueError(
+                f"{self.path} cannot be run ({error!s:.300}): if the inputs are those of its "
+                "cameras, the file is damaged; export it again."
+            ) from error
+        return dict(zip(self._outputs, values, strict=True))
 
     def elements(self, outputs: Mapping[str, NDArray[Any]]) -> MapElements:
-        """Keep the elements that lie on the map or close to it and score enough."""
+        """Keep the elements that lie on the map or close to it and score enough.
+
+        Raises:
+            ValueError: If the outputs are no map elements.
+        """
+        try:
+            return self._kept(outputs)
+        except (ValueError, TypeError, IndexError) as error:
+            raise ValueError(
+                f"{self.path} gave no map elements ({error}): if the images are whole, the file "
+                "is damaged; export it again."
+            ) from error
+
+    def _kept(self, outputs: Mapping[str, NDArray[Any]]) -> MapElements:
+        """Select among the elements."""
         margin, threshold = self.metadata["margin_m"], self.metadata["score_threshold"]
         keep = np.ones(len(outputs["scores"]), dtype=bool)
         if margin is not None:
@@ -141,9 +176,26 @@ class OnnxInferencer:
         if threshold is not None:
             keep &= outputs["scores"] > threshold
         kept = {name: values[keep] for name, values in outputs.items()}
+        if not np.isin(kept["labels"], range(len(self.classes))).all():
+            raise ValueError(f"a label is none of the {len(self.classes)} classes")
         return MapElements.from_polylines(kept.pop("points"), **kept)
 
     def write(self, path: str | Path, samples: Iterable[tuple[str, MapElements]]) -> None:
         """Write each sample's token and elements as ``tools/test.py --out`` does."""
         vectors = ((token, vectors_of(found, self.classes)) for token, found in samples)
         write_results(path, vectors, {"classes": list(self.classes)})
+
+
+def _check_metadata(metadata: Mapping[str, Any]) -> None:
+    """Raise an error unless a file's metadata are such as `export_onnx` writes."""
+    for name in ("classes", "cameras"):
+        names = metadata[name]
+        if not (isinstance(names, list) and names and all(isinstance(n, str) for n in names)):
+            raise ValueError(f"{name} must be names, got {names!r:.80}")
+    for name in ("x_range", "y_range"):
+        low, high = metadata[name]
+        if not -np.inf < low < high < np.inf:
+            raise ValueError(f"{name} must be (low, high), got {metadata[name]!r:.80}")
+    for name in ("margin_m", "score_threshold"):
+        if metadata[name] is not None and not np.isfinite(metadata[name]):
+            raise ValueError(f"{name} must be a number, got {metadata[name]!r:.80}")

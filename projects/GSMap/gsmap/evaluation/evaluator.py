@@ -64,6 +64,18 @@ class MapEvaluator:
             found["raster"] = match_raster(predictions, ground_truth, self.raster, token)
         return found
 
+    def require_fitting(self, found: SampleMatches) -> None:
+        """Raise ValueError unless matches that come from elsewhere fit the rules."""
+        wanted = {}
+        if self.chamfer:
+            wanted["chamfer"] = len(self.chamfer.thresholds)
+        if self.raster:
+            wanted["raster"] = len(next(iter(self.raster.thresholds.values())))
+        for name in wanted.keys() | found.keys():
+            shapes = (found[name].matched_gt.shape[1:], found[name].num_gts.shape)
+            if shapes != ((wanted[name],), (len(self.classes),)):
+                raise ValueError(f"{name}: shapes {shapes} for {self.classes}")
+
     def match_all(self, samples: Iterable[Sample]) -> list[SampleMatches]:
         """Match several samples."""
         return [self.match(*sample) for sample in samples]

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from gsmap.utils.files import atomic_write
 from gsmap.utils.shards import Shard, ShardFile
 
 SHARD_KIND = "matches"
+_FAULTS = KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError
 _FIELDS = [field.name for field in fields(FrameMatches) if field.name != "token"]
 
 
@@ -64,17 +66,35 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
 
     Returns:
         A report per metric, and what the shards have to say, once each.
+
+    Raises:
+        ValueError: If a manifest tells no rules, or a shard's matches do not fit them.
     """
-    evaluator = _evaluator(shards[0].manifest["options"]["evaluator"])
+    try:
+        evaluator = _evaluator(shards[0].manifest["options"]["evaluator"])
+    except _FAULTS as error:
+        raise ValueError(
+            f"the manifest of {shards[0].path} tells no rules of metrics ({error!r}): make that "
+            "shard again."
+        ) from error
     matches: list[SampleMatches] = []
     notes: list[str] = []
     for shard in shards:
-        with np.load(shard.path) as file:
-            notes += file["notes"].tolist()
-            found = {name: file[name] for name in file.files}
-        metrics = [name.split("/")[0] for name in found if name.endswith("/token")]
-        by_metric = zip(*(_records(found, metric) for metric in metrics), strict=True)
-        matches += [dict(zip(metrics, of_sample, strict=True)) for of_sample in by_metric]
+        try:
+            with np.load(shard.path) as file:
+                notes += file["notes"].tolist()
+                found = {name: file[name] for name in file.files}
+            metrics = [name.split("/")[0] for name in found if name.endswith("/token")]
+            by_metric = zip(*(_records(found, metric) for metric in metrics), strict=True)
+            records = [dict(zip(metrics, of_sample, strict=True)) for of_sample in by_metric]
+            for of_sample in records[:1]:
+                evaluator.require_fitting(of_sample)
+        except (*_FAULTS, BadZipFile) as error:
+            raise ValueError(
+                f"{shard.path} holds no matches by the rules of its manifest ({error!r}): make "
+                "that shard again."
+            ) from error
+        matches += records
     return evaluator.reports(matches), list(dict.fromkeys(notes))
 
 
@@ -99,6 +119,9 @@ def _evaluator(options: dict[str, Any]) -> MapEvaluator:
         if values is None:
             return None
         lists = {key: tuple(v) for key, v in values.items() if isinstance(v, list)}
+        for key in {"classes", "polygon_classes"} & values.keys():
+            if not all(isinstance(name, str) for name in lists[key]):
+                raise TypeError(f"{key} must be names")
         return kind(**(values | lists | changes))
 
     grid = options["raster"] and BEVGrid(**options["raster"]["grid"])

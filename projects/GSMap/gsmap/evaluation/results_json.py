@@ -170,4 +170,7 @@ def _lines_by_token(file: Iterable[str]) -> Iterator[tuple[str, str]]:
     decoder, start = json.JSONDecoder(), len('{"sample_token":')
     for line in file:
         if line != _LAST_LINE:
-            yield decoder.raw_decode(line, start)[0], line.rstrip(",\n")
+            token, _ = decoder.raw_decode(line, start)
+            if not isinstance(token, str):
+                raise ValueError(f"{token!r:.80} is no token of a sample.")
+            yield token, line.rstrip(",\n")

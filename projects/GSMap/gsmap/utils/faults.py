@@ -92,6 +92,11 @@ def _is_raised(tracebacks: str) -> bool:
 def _of_the_machine(error: BaseException, text: str) -> str | None:
     """Speak of memory that does not suffice, and of devices and processes that are not there."""
     reason = text.strip().splitlines()[0].rstrip(".") if text.strip() else type(error).__name__
+    if isinstance(error, RuntimeError) and "signal: Bus error" in f"{text} {error.__cause__}":
+        return (
+            "bus error of a data loader's worker: a data file was shortened while it was read (end "
+            "what writes there, make it again), or /dev/shm is full (take fewer num_workers)."
+        )
     speaks = isinstance(error, (RuntimeError, OSError)) and _NO_MEMORY.search(text)
     if isinstance(error, MemoryError) or speaks:
         return (

@@ -20,6 +20,12 @@ from gsmap.utils.files import write_text
 Items = TypeVar("Items", bound=Sequence[Any])
 
 _COMMON = ("kind", "target", "of", "version", "input", "options")
+_TYPES = {  # of a manifest's entries
+    **dict.fromkeys(("kind", "target", "version", "input", "sha256"), str),
+    **dict.fromkeys(("shard", "of", "samples", "bytes"), int),
+    "options": dict,
+}
+_MOST = 99_999  # shards of a file: numbers in names have five digits
 
 
 @dataclass(frozen=True)
@@ -162,12 +168,15 @@ def read_shard(path: Path) -> ShardFile:
     beside = _manifest_path(path)
     try:
         manifest = json.loads(beside.read_text(encoding="utf-8"))
-        size, sha256, _ = manifest["bytes"], manifest["sha256"], {**manifest["options"]}
-        shard, _ = Shard(manifest["shard"], manifest["of"]), [manifest[name] for name in _COMMON]
+        wrong = [name for name, kind in _TYPES.items() if type(manifest[name]) is not kind]
+        shard = Shard(manifest["shard"], manifest["of"])
+        if wrong or not 0 <= shard.index < shard.count <= _MOST or manifest["samples"] < 0:
+            raise ValueError(f"{wrong or ['shard', 'of', 'samples']} cannot be")
         right = shard.path_of(path.with_name(manifest["target"]))
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{beside} is damaged ({error!r}): make that shard again.") from error
-    if not path.is_file() or path.stat().st_size != size or digest(path) != sha256:
+    same_size = path.is_file() and path.stat().st_size == manifest["bytes"]
+    if not same_size or digest(path) != manifest["sha256"]:
         raise ValueError(f"{path} is missing, or not what its manifest tells of: make it again.")
     if path != right:
         raise ValueError(

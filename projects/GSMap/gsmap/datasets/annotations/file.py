@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import cached_property, partial
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -171,33 +171,36 @@ def check_samples(samples: Sequence[MapSample], meta: AnnotationMeta) -> None:
 class AnnotationFile(Sequence[MapSample]):
     """Read a memory-mapped annotation file, which is checked from end to end when it is opened.
 
-    Pickling hands on the path alone, so that each worker process maps the same pages; it does not
-    check them again.
+    Pickling hands on the path and the checksums of the batches, so that each worker process maps
+    the same pages. There, and in all processes after anything has written to the file, a batch is
+    compared with its checksum when it is next read.
 
     Raises:
         FileNotFoundError: If it does not exist.
         ValueError: If it is not a whole annotation file of this format version, its checksum does
-            not fit, or a value is out of its domain (``check_batch``).
+            not fit, or a value is out of its domain (``check_batch``); when reading, if the file
+            is not the one that was checked any more.
     """
 
     sealed: bool
     """Whether the file has a checksum; those of earlier versions have none."""
-    batches: list[pa.RecordBatch]
-    """The samples as Arrow has them."""
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        self._open(check=True)
+        self._open()
 
-    def _open(self, check: bool) -> None:
+    def _open(self, sums: list[tuple[int, int]] | None = None) -> None:
+        """Map the file; check it unless its ``_sums`` are known from another process."""
         if not self.path.is_file():
             raise FileNotFoundError(
                 f"no annotation file at {self.path}: make it with tools/create_data.py (see "
                 "docs/data.md)."
             )
         try:
-            content = pa.memory_map(str(self.path)).read_buffer()
-            schema, self.batches, seal = _messages(content)
+            self._map = pa.memory_map(str(self.path))
+            self._state = self._current_state()
+            self._content = self._map.read_buffer()
+            schema, self._batches, seal, ends = _messages(self._content)
             self.meta = _meta_of(schema)
         except (pa.ArrowException, OSError, ValueError, TypeError) as error:
             raise ValueError(
@@ -206,36 +209,73 @@ class AnnotationFile(Sequence[MapSample]):
             ) from error
         self.sealed = seal is not None
         try:
-            if check:
-                self._check(content, seal)
+            # Where each message ends, and the checksum of all bytes up to there.
+            self._sums = sums or _sums(self._content, ends)
+            self._intact = set() if sums else set(range(len(self._batches)))
+            if sums is None:
+                self._check(seal)
+            elif [end for end, _ in sums] != ends:
+                raise ValueError("it was replaced after this run had opened it")
         except (pa.ArrowException, ValueError, TypeError, KeyError) as error:
             text = str(error).rstrip(".")
             raise ValueError(
                 f"{self.path} is damaged: {text}. Copy it again, or {self.remedy}"
             ) from error
-        self._decoders = [decoder_of(b.to_struct_array(), self.meta.dim) for b in self.batches]
-        self._starts = np.cumsum([0, *map(len, self.batches)])
+        self._decoders = [decoder_of(b.to_struct_array(), self.meta.dim) for b in self._batches]
+        self._starts = np.cumsum([0, *map(len, self._batches)])
 
-    def _check(self, content: pa.Buffer, seal: bytes | None) -> None:
+    def _check(self, seal: bytes | None) -> None:
         """Raise an error unless a file's bytes, rows and values are those that were written."""
         if seal is not None:
             stated = json.loads(seal)
-            found = zlib.crc32(memoryview(content)[: stated["bytes"]])
-            if found != stated["crc32"] or sum(map(len, self.batches)) != stated["rows"]:
+            found = dict(self._sums).get(stated["bytes"])
+            if found != stated["crc32"] or sum(map(len, self._batches)) != stated["rows"]:
                 raise ValueError("its checksum does not fit its content")
-        for batch in self.batches:
+        for batch in self._batches:
             batch.validate(full=True)
             check_batch(batch, self.meta)
-        tokens = pa.chunked_array([batch.column("token") for batch in self.batches], pa.string())
+        tokens = pa.chunked_array([batch.column("token") for batch in self._batches], pa.string())
         if pc.count_distinct(tokens).as_py() < len(tokens):
             raise ValueError("two samples have one token")
 
+    def _current_state(self) -> tuple[int, int, int]:
+        """Return what differs after a write to the file: its size and time; and the process."""
+        status = os.fstat(self._map.fileno())
+        return status.st_size, status.st_mtime_ns, os.getpid()
+
+    def _require_intact(self, number: int) -> None:
+        """Raise an error unless a batch still is what was checked when the file was opened.
+
+        A look at size and time goes first: memory beyond a file's end must not be touched.
+        """
+        state = self._current_state()
+        if state != self._state:
+            self._state, self._intact = state, set()
+        if number in self._intact:
+            return
+        if state[0] == self._content.size:
+            (start, before), (end, after) = self._sums[number + 1 : number + 3]
+            if zlib.crc32(memoryview(self._content)[start:end], before) == after:
+                self._intact.add(number)
+                return
+        raise ValueError(
+            f"{self.path} was changed while it was in use: end what writes there, {self.remedy} "
+            "Then go on from the last checkpoint."
+        )
+
+    @property
+    def batches(self) -> list[pa.RecordBatch]:
+        """The samples as Arrow has them."""
+        for number in range(len(self._batches)):
+            self._require_intact(number)
+        return self._batches
+
     def __getstate__(self) -> dict[str, Any]:
-        return {"path": self.path}
+        return {"path": self.path, "sums": self._sums}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.path = state["path"]
-        self._open(check=False)
+        self._open(state["sums"])
 
     @property
     def remedy(self) -> str:
@@ -267,6 +307,7 @@ class AnnotationFile(Sequence[MapSample]):
             raise IndexError(f"sample {index} of {len(self)} in {self.path}.")
         index %= len(self)
         number = int(np.searchsorted(self._starts, index, side="right")) - 1
+        self._require_intact(number)
         return self._decoders[number](index - int(self._starts[number]))
 
     def column(self, name: str) -> list[Any]:
@@ -303,15 +344,23 @@ def _meta_of(schema: pa.Schema) -> AnnotationMeta:
     return AnnotationMeta(**values)
 
 
-def _messages(content: pa.Buffer) -> tuple[pa.Schema, list[pa.RecordBatch], bytes | None]:
-    """Read a file's messages in their order: schema, batches, and the seal if there is one."""
+def _messages(
+    content: pa.Buffer,
+) -> tuple[pa.Schema, list[pa.RecordBatch], bytes | None, list[int]]:
+    """Read a file's messages in their order: schema, batches, and the seal if there is one.
+
+    Last come the ends of nothing, the schema and each batch, in bytes.
+    """
     size = content.size
     if size < len(_START) + 10 or content[: len(_START)].to_pybytes() != _START:
         raise ValueError("it does not begin as an Arrow file")
     source = pa.BufferReader(content)
     source.seek(len(_START))
     reader = pa.ipc.open_stream(source)
-    found = list(reader.iter_batches_with_custom_metadata())
+    ends, found = [0, source.tell()], []
+    for message in reader.iter_batches_with_custom_metadata():
+        ends.append(source.tell())
+        found.append(message)
     tail = content[source.tell() :].to_pybytes()
     if tail[-6:] != _END or int.from_bytes(tail[-10:-6], "little") != len(tail) - 10:
         raise ValueError("it ends too early")
@@ -319,4 +368,12 @@ def _messages(content: pa.Buffer) -> tuple[pa.Schema, list[pa.RecordBatch], byte
     batches = [batch for batch, _ in (found if seal is None else found[:-1])]
     if not all(map(len, batches)):
         raise ValueError("it has an empty part")  # as a seal with a damaged name would be
-    return reader.schema, batches, seal
+    return reader.schema, batches, seal, ends[: len(batches) + 2]
+
+
+def _sums(content: pa.Buffer, ends: Sequence[int]) -> list[tuple[int, int]]:
+    """Return the places and the checksums of all bytes before each."""
+    view, sums = memoryview(content), [(0, 0)]
+    for start, end in pairwise(ends):
+        sums.append((end, zlib.crc32(view[start:end], sums[-1][1])))
+    return sums
