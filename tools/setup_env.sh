@@ -61,7 +61,7 @@ if [ "$dev" = 1 ]; then
 fi
 [ "$ops" = 1 ] || [ "$compiled" = 0 ] || pip uninstall -q -y mmcv  # it shares its folder with mmcv-lite
 sed "s/^torch==.*/$wanted/; $([ "$ops" = 0 ] || echo '/^mmcv-lite==/d')" requirements.txt | add -r /dev/stdin "${more[@]}"
-add --no-deps --no-build-isolation -e .
+add -q --no-deps --no-build-isolation -e .
 # Where mmcv has no compiled operators, `import gsmap` puts a stand-in in place: here before anything is imported.
 echo "import gsmap" > "$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/gsmap-mmcv.pth"
 

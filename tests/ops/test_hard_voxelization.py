@@ -16,7 +16,7 @@ def voxelise(points, max_voxels, max_points):
 
 
 def test_voxels_and_points_keep_the_order_of_the_cloud():
-    """The cells of the points, in z, y, x: a (0, 5, 7), b (1, 0, 0), a, beyond, a, c (0, 3, 4), b."""
+    """Cells in z, y, x of the points: a (0, 5, 7), b (1, 0, 0), a, none, a, c (0, 3, 4), b."""
     cloud = [
         [1.9, 2.9, 0.9, 0], [-2.0, -3.0, 1.0, 1], [1.5, 2.0, -1.0, 2], [2.0, 0.0, 0.0, 3],
         [1.6, 2.5, 0.0, 4], [0.1, 0.2, 0.3, 5], [-1.6, -2.1, 2.9, 6],
