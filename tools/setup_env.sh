@@ -85,7 +85,7 @@ if [ "$ops" = 1 ] && ! has_ops; then
 fi
 
 step 4/4 "a first import"
-"$venv/bin/python" - <<'PY'
+"$venv/bin/python" -W ignore - <<'PY'
 import gsmap.registered
 import mmcv, mmcv.ops, mmdet3d, mmengine, torch
 ops = "without compiled operators" if mmcv._ext.__file__ == gsmap.mmcv_ext.__file__ else "with compiled operators"
