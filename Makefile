@@ -1,4 +1,4 @@
-.PHONY: help setup test lint format demo docs clean
+.PHONY: help setup setup-dev test lint format demo docs clean
 
 VENV ?= .venv
 PY := $(VENV)/bin/python
@@ -14,24 +14,27 @@ help:
 setup:
 	@tools/setup_env.sh $(VENV)
 
+setup-dev:
+	@GSMAP_DEV=1 tools/setup_env.sh $(VENV)
+
 # One process of one thread per core: threads that wait for each other cost more than they give. A file stays in one process.
-test: setup
+test: setup-dev
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest -n auto --dist loadfile $(ARGS)
 
-lint: setup
+lint: setup-dev
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m codespell_lib
 	$(PY) -m mypy
 
-format: setup
+format: setup-dev
 	$(PY) -m ruff check --fix .
 	$(PY) -m ruff format .
 
 demo: setup
 	$(PY) tools/demo.py $(ARGS)
 
-docs: setup
+docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 	@echo "Open site/index.html, or for the search: $(PY) -m http.server -d site"
 

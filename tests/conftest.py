@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
+import gsmap  # noqa: F401 - before mmcv.ops, which may need its stand-in
+
 REPO = Path(__file__).resolve().parents[1]
 
 
