@@ -22,8 +22,8 @@ import torch
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
+from gsmap.utils.shipped import shipped
 
-REPO = Path(__file__).resolve().parents[1]
 MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}  # that ship
 NEXT = """
 To go on in this environment:
@@ -90,7 +90,7 @@ class Step:
         started = time.monotonic()
         environment = {**os.environ, "PYTHON": sys.executable}
         status = subprocess.run(
-            command, cwd=REPO, env=environment, check=False, preexec_fn=die_with_parent
+            command, cwd=shipped(), env=environment, check=False, preexec_fn=die_with_parent
         ).returncode
         missing = [str(product) for product in self.products if not product.exists()]
         if status or missing:
