@@ -34,7 +34,7 @@ from gsmap.apis.comparison_report import (
     plot_iterations,
     read_result,
 )
-from gsmap.engine.launch import data_root_options
+from gsmap.engine.arguments import data_root_options
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.progress import Progress

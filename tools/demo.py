@@ -17,8 +17,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
@@ -107,6 +105,8 @@ def processes() -> int:
 
     On a CPU a process of one thread per core uses the cores better than threads of one process.
     """
+    import torch
+
     return torch.cuda.device_count() or len(os.sched_getaffinity(0))
 
 

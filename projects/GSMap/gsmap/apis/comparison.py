@@ -22,8 +22,9 @@ from mmengine.config import Config
 
 from gsmap.apis.checkpoint import read_weights
 from gsmap.checkpoints.settings import differences, plain
+from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
-from gsmap.engine.launch import check_config, parse_options, read_config
+from gsmap.engine.launch import check_config, read_config
 from gsmap.engine.named_models import find_checkpoint
 from gsmap.utils.shards import digest
 from gsmap.utils.shipped import shipped
