@@ -21,9 +21,9 @@ from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.results_json import write_results
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.shipped import shipped
 
 CLASSES = ("divider", "ped_crossing", "boundary")
-TOOL = Path(__file__).resolve().parents[1] / "tools" / "evaluate.py"
 Record = dict[str, Any]
 
 
@@ -148,7 +148,13 @@ def _resident_mib(pid: int) -> float:
 
 def _evaluate(files: tuple[Path, Path], metrics: list[str], grid: BEVGrid, workers: int = 1) -> Run:
     """Run the command and measure it with everything that it starts."""
-    command = [sys.executable, str(TOOL), *map(str, files), "--eval", *metrics]
+    command = [
+        sys.executable,
+        str(shipped("tools/evaluate.py")),
+        *map(str, files),
+        "--eval",
+        *metrics,
+    ]
     (x0, x1), (y0, y1) = grid.x_range, grid.y_range
     command += ["--range", *map(str, (x0, y0, x1, y1))]
     start = time.perf_counter()

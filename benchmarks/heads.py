@@ -23,7 +23,8 @@ from mmengine.logging import MMLogger
 
 from benchmarks.measure import markdown_table
 from gsmap.apis.checkpoint import load_weights
-from gsmap.engine.launch import data_root_options, parse_options, read_config
+from gsmap.engine.arguments import data_root_options, parse_options
+from gsmap.engine.launch import read_config
 from gsmap.utils.files import atomic_write
 
 METRIC_NAMES = ("chamfer", "raster")

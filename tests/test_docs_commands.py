@@ -19,7 +19,8 @@ from typing import Any
 import pytest
 
 from gsmap.apis.comparison import parse_entry
-from gsmap.engine.launch import check_config, parse_options, read_config
+from gsmap.engine.arguments import parse_options
+from gsmap.engine.launch import check_config, read_config
 
 REPO = Path(__file__).resolve().parents[1]
 PAGES = [REPO / name for name in ("README.md", "CONTRIBUTING.md", "models/README.md")]

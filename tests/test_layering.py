@@ -17,9 +17,9 @@ OPENMMLAB = {"mmengine", "mmcv", "mmdet", "mmdet3d"}
 # room -> the rooms that it may import, besides itself and outside packages
 ALLOWED = {
     "utils": set(),
-    "structures": set(),
+    "structures": {"utils"},
     "ops": {"structures", "utils"},
-    "models": {"checkpoints", "ops", "structures"},
+    "models": {"checkpoints", "ops", "structures", "utils"},
     "checkpoints": {"utils"},
     "datasets": {"structures", "utils"},
     "converters": {"datasets", "structures", "utils", "minicity"},

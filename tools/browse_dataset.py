@@ -8,15 +8,11 @@ Example: ``python tools/browse_dataset.py CONFIG --split train --num 20 --show-d
 import argparse
 from pathlib import Path
 
-from mmdet3d.registry import DATASETS
-
-from gsmap.apis.map_inferencer import spread_evenly
-from gsmap.engine.launch import add_config_options, read_config
+from gsmap.engine.arguments import add_config_options
 from gsmap.report.page import ReportOptions, report_data, write_page
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.progress import Progress
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
-from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
 
 
 def parse_args() -> argparse.Namespace:
@@ -41,6 +37,12 @@ def parse_args() -> argparse.Namespace:
 
 def main() -> str:
     args = parse_args()
+    from mmdet3d.registry import DATASETS
+
+    from gsmap.apis.map_inferencer import spread_evenly
+    from gsmap.engine.launch import read_config
+    from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
+
     cfg = read_config(args.config, args.cfg_options)
     dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
     if args.web:

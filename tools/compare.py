@@ -34,14 +34,13 @@ from gsmap.apis.comparison_report import (
     plot_iterations,
     read_result,
 )
-from gsmap.engine.launch import data_root_options
+from gsmap.engine.arguments import data_root_options
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.progress import Progress
+from gsmap.utils.shipped import shipped
 from gsmap.visualization.figure import save_figure
 from gsmap.visualization.plots import plot_precision_recall
-
-TABLES = Path(__file__).resolve().parents[1] / "configs/tables.json"
 
 
 def parse_args() -> argparse.Namespace:
@@ -90,7 +89,7 @@ def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     Raises:
         ValueError: If there is none.
     """
-    tables = json.loads(TABLES.read_text())
+    tables = json.loads(shipped("configs/tables.json").read_text())
     chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
     if not chosen:
         names = ", ".join(table["table"] for table in tables)

@@ -2,10 +2,6 @@
 
 from pathlib import Path
 
-import torch
-
-from gsmap.apis.checkpoint import read_weights
-from gsmap.checkpoints.convert import convert_state
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import atomic_write
 
@@ -17,6 +13,11 @@ def main() -> str:
     args = parser.parse_args()
     if args.target.exists():
         raise FileExistsError(f"{args.target} exists already: choose another name or remove it.")
+    import torch
+
+    from gsmap.apis.checkpoint import read_weights
+    from gsmap.checkpoints.convert import convert_state
+
     weights = read_weights(args.source)
     try:
         state, done = convert_state(weights)

@@ -10,14 +10,13 @@ from pathlib import Path
 
 from gsmap.converters.config.reader import read_assignments
 from gsmap.converters.config.upstream import convert_upstream, merge
-from gsmap.utils.cli import output_file, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_text
-
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+from gsmap.utils.shipped import shipped
 
 
 def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("source", type=Path, help="config of an original repository")
@@ -32,7 +31,7 @@ def convert(source: Path, target: Path) -> str:
         conversion = convert_upstream(settings)
     except (ValueError, TypeError, LookupError) as error:
         raise ValueError(f"{source} cannot be converted: {error}") from error
-    write_text(target, merge(conversion, CONFIGS).pretty_text)
+    write_text(target, merge(conversion, shipped("configs")).pretty_text)
     lines = [f"{target} is written: configs/{conversion.base} with the settings of {source}"]
     if conversion.unplaced:
         lines.append("not placed, see docs/migration.md:")

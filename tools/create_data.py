@@ -10,7 +10,7 @@ import importlib
 import shlex
 import sys
 
-from gsmap.utils.cli import run_command
+from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import without_options
 
@@ -30,7 +30,7 @@ COMMANDS = {
 
 def make() -> str | None:
     """Run the command that is asked for and return its report."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)

@@ -18,13 +18,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
+from gsmap.utils.shipped import shipped
 
-REPO = Path(__file__).resolve().parents[1]
 MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}  # that ship
 NEXT = """
 To go on in this environment:
@@ -135,7 +133,7 @@ class Step:
         started = time.monotonic()
         environment = {**os.environ, "PYTHON": sys.executable}
         status = subprocess.run(
-            command, cwd=REPO, env=environment, check=False, preexec_fn=die_with_parent
+            command, cwd=shipped(), env=environment, check=False, preexec_fn=die_with_parent
         ).returncode
         missing = [str(product) for product in self.products if not product.exists()]
         if status or missing:
@@ -152,6 +150,8 @@ def processes() -> int:
 
     On a CPU a process of one thread per core uses the cores better than threads of one process.
     """
+    import torch
+
     return torch.cuda.device_count() or len(os.sched_getaffinity(0))
 
 

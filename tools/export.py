@@ -13,6 +13,7 @@ import logging
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +28,11 @@ from gsmap.apis.export import (
 from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
-from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
-from gsmap.engine.launch import add_config_options
+from gsmap.engine.arguments import add_config_options
 from gsmap.utils.cli import CommandParser, output_file, run_command
+
+if TYPE_CHECKING:  # slow to import
+    from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
 
 def parse_args() -> argparse.Namespace:
@@ -73,7 +76,7 @@ def parse_args() -> argparse.Namespace:
 
 def open_samples(
     inferencer: MapInferencer, args: argparse.Namespace, source: Path | None, split: str
-) -> VectorizedMapDataset:
+) -> "VectorizedMapDataset":
     """Open an annotation file, by default that of the config's split."""
     options = inferencer.cfg[f"{split}_dataloader"].dataset
     if source is None:

@@ -12,16 +12,12 @@ import sys
 from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
-from mmdet3d.structures import Det3DDataSample
-
-from gsmap.apis.frame_loader import BrokenFrame
-from gsmap.apis.map_inferencer import MapInferencer, select_samples
 from gsmap.apis.result_log import ResultLog
 from gsmap.converters.command_line import parse_rate
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
-from gsmap.engine.launch import add_config_options
+from gsmap.engine.arguments import add_config_options
 from gsmap.engine.named_models import checkpoint_for
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.inputs.calibration_check import (
@@ -36,6 +32,13 @@ from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
+
+if TYPE_CHECKING:  # slow to import
+    from mmdet3d.structures import Det3DDataSample
+
+    from gsmap import MapInferencer
+    from gsmap.apis.frame_loader import BrokenFrame
+    from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
 _ONE_SAMPLE_HZ = 1e-4
 SKIPPED = DOUBTFUL = 1  # exit code when frames were broken, or a calibration is implausible
@@ -135,8 +138,10 @@ def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
     return warnings
 
 
-def open_model(args: argparse.Namespace) -> MapInferencer:
+def open_model(args: argparse.Namespace) -> "MapInferencer":
     """Load the model, with the options of its pictures."""
+    from gsmap import MapInferencer
+
     config, checkpoint = args.model[0], args.model[1] if len(args.model) > 1 else None
     inferencer = MapInferencer(
         config, checkpoint_for(config, checkpoint), args.device, args.cfg_options, args.amp
@@ -159,8 +164,8 @@ def run_settings(args: argparse.Namespace) -> dict[str, str]:
 
 def predict(
     args: argparse.Namespace,
-    inferencer: MapInferencer,
-    dataset: VectorizedMapDataset,
+    inferencer: "MapInferencer",
+    dataset: "VectorizedMapDataset",
     chosen: list[int],
     results: ResultLog | None,
 ) -> dict[str, str]:
@@ -173,7 +178,7 @@ def predict(
             bar.update(len(results.done))
             chosen = [index for index in chosen if tokens[index] not in results.done]
 
-        def skip(frame: BrokenFrame) -> None:
+        def skip(frame: "BrokenFrame") -> None:
             broken[frame.token] = frame.reason
             bar.write(f"broken frame skipped: {frame.reason}")
             bar.update()
@@ -194,9 +199,9 @@ def predict(
 
 def draw(
     args: argparse.Namespace,
-    inferencer: MapInferencer,
-    dataset: VectorizedMapDataset,
-    sample: Det3DDataSample,
+    inferencer: "MapInferencer",
+    dataset: "VectorizedMapDataset",
+    sample: "Det3DDataSample",
 ) -> None:
     """Draw a predicted sample into the folder of pictures."""
     token, points = str(sample.metainfo["token"]), None
@@ -222,6 +227,8 @@ def main(argv: list[str] | None = None) -> str | None:
     source = read_input(args)
     if not isinstance(source.samples, AnnotationFile):
         check_calibration(args, source)
+    from gsmap.apis.map_inferencer import select_samples
+
     inferencer = open_model(args)
     dataset = inferencer.dataset(source)
     tokens = dataset.annotations.column("token")

@@ -10,10 +10,8 @@ from pathlib import Path
 
 from mmengine.config import Config
 
-from gsmap.apis.checkpoint import adopt_settings
-from gsmap.engine.launch import add_common_arguments, load_config
+from gsmap.engine.arguments import add_common_arguments
 from gsmap.engine.named_models import checkpoint_for
-from gsmap.engine.run_log import MapRunner
 from gsmap.utils.cli import CommandParser, is_first_rank, output_file, run_command
 from gsmap.utils.files import write_text
 
@@ -75,6 +73,10 @@ def main() -> None:
     args = parse_args()
     if not args.eval and not args.out:
         raise ValueError("Nothing to do: name a metric after --eval, or a file after --out.")
+    from gsmap.apis.checkpoint import adopt_settings
+    from gsmap.engine.launch import load_config
+    from gsmap.engine.run_log import MapRunner
+
     checkpoint = checkpoint_for(args.config, args.checkpoint)
     cfg = load_config(args)
     notes = adopt_settings(cfg, checkpoint, args.cfg_options)

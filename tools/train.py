@@ -5,13 +5,10 @@ import argparse
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-from mmdet3d.registry import RUNNERS
 from mmengine.config import Config
 
-from gsmap.apis.checkpoint import read_weights
-from gsmap.engine.launch import add_common_arguments, load_config, newest_checkpoint
+from gsmap.engine.arguments import add_common_arguments
 from gsmap.engine.named_models import find_checkpoint
-from gsmap.engine.run_log import MapRunner
 from gsmap.utils.cli import CommandParser, is_first_rank, run_command
 from gsmap.utils.files import lock_folder
 
@@ -37,6 +34,9 @@ def parse_args() -> argparse.Namespace:
 
 def choose_start(cfg: Config, resume: str | None) -> None:
     """Say what the run goes on from or starts from, and check that file."""
+    from gsmap.apis.checkpoint import read_weights
+    from gsmap.engine.launch import newest_checkpoint
+
     if resume == "auto":
         newest = newest_checkpoint(cfg.work_dir, read_weights)
         if newest is None and is_first_rank():
@@ -59,6 +59,11 @@ def writes_alone(work_dir: str) -> AbstractContextManager:
 
 def main() -> None:
     args = parse_args()
+    from mmdet3d.registry import RUNNERS
+
+    from gsmap.engine.launch import load_config
+    from gsmap.engine.run_log import MapRunner
+
     cfg = load_config(args)
     if args.amp:
         cfg.optim_wrapper.type = "AmpOptimWrapper"

@@ -5,8 +5,8 @@ import pytest
 import torch
 from mmengine.config import Config
 
+from gsmap.engine.arguments import add_common_arguments
 from gsmap.engine.launch import (
-    add_common_arguments,
     check_config,
     load_config,
     newest_checkpoint,

@@ -11,14 +11,21 @@ from gsmap.apis.checkpoint import load_weights
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.engine import named_models as registry
 from gsmap.engine.launch import read_config
-from gsmap.engine.named_models import checkpoint_for, find_checkpoint, find_config, named_models
+from gsmap.engine.named_models import (
+    checkpoint_for,
+    find_checkpoint,
+    find_config,
+    list_models,
+    named_models,
+)
+from gsmap.utils.shipped import shipped
 
 SHIPPED = [name for name, model in named_models().items() if model.address is None]
 
 
 def test_every_model_has_a_config_and_says_where_its_file_is():
     for model in named_models().values():
-        assert (registry.REPO / model.config).is_file(), model.name
+        assert shipped(model.config).is_file(), model.name
         assert model.file.is_file() == (model.address is None), model.name
         assert model.address is None or model.address.startswith("https://")
 
@@ -48,6 +55,15 @@ def test_a_file_comes_before_a_name(tmp_path, monkeypatch):
     assert find_checkpoint("gsmap_r18_minicity") == Path("gsmap_r18_minicity")
 
 
+def test_a_config_is_found_by_its_path_in_the_repository_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = "configs/maptr/maptr_r18_minicity.py"
+    assert find_config(config) == shipped(config)
+    Path(config).parent.mkdir(parents=True)
+    Path(config).touch()
+    assert find_config(config) == Path(config)  # one's own comes first
+
+
 def test_a_wrong_name_gets_the_nearest_right_one():
     with pytest.raises(FileNotFoundError, match=r"minicty.*did you mean gsmap_r18_minicity\?"):
         find_config("gsmap_r18_minicty")
@@ -64,8 +80,10 @@ def test_a_model_that_does_not_ship_says_where_it_is_fetched():
 
 def test_a_damaged_file_is_refused(tmp_path, monkeypatch):
     named_models()
-    monkeypatch.setattr(registry, "REGISTRY", tmp_path / "registry.json")
-    (tmp_path / "gsmap_r18_minicity.pth").write_bytes(b"half")
+    monkeypatch.setattr(registry, "shipped", tmp_path.joinpath)
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models/gsmap_r18_minicity.pth").write_bytes(b"half")
+    assert list_models() == ["gsmap_r18_minicity"]
     with pytest.raises(ValueError, match=r"damaged or another file: its sha256"):
         find_checkpoint("gsmap_r18_minicity")
 

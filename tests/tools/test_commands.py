@@ -9,7 +9,9 @@ import pytest
 from processes import run_python
 from tensorboard import default
 
+from gsmap import __version__
 from gsmap.__main__ import main
+from gsmap.utils.cli import CommandParser
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -26,13 +28,42 @@ def test_gsmap_runs_the_tools_from_any_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert gsmap(monkeypatch, "convert_checkpoint", "gsmap_r18_minicity", "x.pth") == 2
     assert "keys that upstream's maptr does not have" in capsys.readouterr().err
+    monkeypatch.setattr(CommandParser, "program", None)  # put back after the test
     assert gsmap(monkeypatch, "create_data", "--help") == 0
-    assert "usage: create_data.py" in capsys.readouterr().out
+    assert "usage: gsmap create_data [-h]" in capsys.readouterr().out
+    assert gsmap(monkeypatch, "train", "--help") == 0
+    assert "usage: gsmap train [-h]" in capsys.readouterr().out
     assert gsmap(monkeypatch, "learn") == 2
     assert "there is no command learn; there are analyze_run, " in capsys.readouterr().err
+
+
+def test_gsmap_says_what_there_is(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["gsmap"])
     main()
-    assert {"  train", "  test", "  report"} <= set(capsys.readouterr().out.splitlines())
+    lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
+    said = {line[0]: line[1] for line in lines if len(line) == 2}
+    assert {path.stem for path in (REPO / "tools").glob("*.py")} <= set(said)
+    assert (said["train"], said["test"]) == ("Train a model", "Test a model")
+    assert said["report"].startswith("Write a page about a result file")
+    monkeypatch.setattr(sys, "argv", ["gsmap", "--version"])
+    main()
+    assert capsys.readouterr().out == f"gsmap {__version__}\n"
+
+
+# What each command may not import before it has read its words: it costs seconds.
+SLOW = {"torch", "mmdet3d", "mmcv"}
+SLOWER = {"mmdet3d.structures", "mmdet3d.models", "mmcv.ops"}
+
+
+@pytest.mark.parametrize("tool", sorted(path.name for path in (REPO / "tools").glob("*.py")))
+def test_help_comes_without_what_is_slow_to_import(tool):
+    code = "import runpy, sys; sys.argv = sys.argv[1:]\ntry: runpy.run_path(sys.argv[0], None, "
+    code += "'__main__')\nexcept SystemExit: pass\nprint('modules:', *sys.modules)"
+    done = run_python("-c", code, f"tools/{tool}", "--help")
+    text, modules = done.stdout.split("modules: ")
+    assert "usage" in text.lower(), done.stderr
+    needs_torch = tool in ("compare.py", "export.py")
+    assert not (SLOWER if needs_torch else SLOW) & set(modules.split())
 
 
 def test_a_broken_plugin_of_another_package_does_not_stop_tensorboard(tmp_path, monkeypatch):

@@ -10,7 +10,8 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from processes import run_python
 
-from gsmap.engine.launch import add_config_options, check_config, read_config
+from gsmap.engine.arguments import add_config_options
+from gsmap.engine.launch import check_config, read_config
 from tools.compare import command_of, figures_of, read_tables
 
 REPO = Path(__file__).resolve().parents[2]

@@ -1,14 +1,31 @@
 """Online vectorized HD-map construction with 2D Gaussians.
 
-Light on purpose: the mathematics in ``geometry``, ``ops``, ``losses`` and ``evaluation`` needs
-torch and numpy alone. A config registers every model, data set and metric with
+The names below are imported when they are first used (docs/library.md). ``gsmap.structures``,
+``gsmap.ops``, ``gsmap.models.losses`` and, but for its two ``*_metric.py``, ``gsmap.evaluation``
+need nothing of OpenMMLab. A config registers every model, data set and metric with
 ``custom_imports = dict(imports=['gsmap.registered'])``.
 """
 
 import sys
 
 from gsmap.mmcv_ext import MmcvExtFinder
+from gsmap.utils.lazy import lazy_names
 
 __version__ = "0.1.0"
 
 sys.meta_path.append(MmcvExtFinder)  # last: mmcv's own compiled module comes first
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "BEVGrid": "structures",
+        "MapElements": "structures",
+        "MapEvaluator": "evaluation",
+        "MapInferencer": "apis",
+        "RasterLoss": "models",
+        "list_models": "engine.named_models",
+        "load_model": "apis",
+        "render_gaussians": "ops",
+        "write_geojson": "maps",
+    },
+)

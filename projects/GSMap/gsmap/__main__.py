@@ -1,32 +1,44 @@
-"""The commands of ``tools/`` from any folder: ``gsmap train CONFIG``, ``gsmap infer INPUT ...``.
+"""The commands of ``tools/`` from any folder: ``gsmap train CONFIG``, ``gsmap infer INPUT ...``."""
 
-They belong to the repository, which an editable installation (``make setup``) leaves in its place.
-"""
-
+import ast
 import runpy
 import sys
 from pathlib import Path
 
-from gsmap.utils.cli import BAD_INPUT
+from gsmap import __version__
+from gsmap.utils.cli import BAD_INPUT, CommandParser
+from gsmap.utils.shipped import shipped
 
-TOOLS = Path(__file__).resolve().parents[3] / "tools"
+
+def _summary(tool: Path) -> str:
+    """Return the first line of a tool's docstring, without running it."""
+    text = ast.get_docstring(ast.parse(tool.read_text(encoding="utf-8"))) or ""
+    return text.split("\n")[0].partition(": ``")[0].rstrip(".")
+
+
+def _overview(tools: dict[str, Path]) -> str:
+    """Return the list of all commands."""
+    width = max(map(len, tools))
+    lines = [f"  {name:{width}}  {_summary(tool)}" for name, tool in tools.items()]
+    usage = "usage: gsmap [--help | --version] COMMAND ..."
+    return "\n".join([usage, "", *lines, "", "gsmap COMMAND --help says more.\n"])
 
 
 def main() -> None:
     """Run the tool that the first word names, as ``python tools/NAME.py`` does."""
-    commands = sorted(path.stem for path in TOOLS.glob("*.py"))
-    if not commands:
-        sys.exit(f"error: no commands in {TOOLS}: install the repository with pip install -e .")
+    tools = {path.stem: path for path in sorted(shipped("tools").glob("*.py"))}
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("-h", "--help"):
-        lines = ["usage: gsmap COMMAND ...", "", "gsmap COMMAND --help says more:", *commands]
-        sys.stdout.write("\n  ".join(lines) + "\n")
-    elif name not in commands:
-        sys.stderr.write(f"error: there is no command {name}; there are {', '.join(commands)}.\n")
+        sys.stdout.write(_overview(tools))
+    elif name == "--version":
+        sys.stdout.write(f"gsmap {__version__}\n")
+    elif name not in tools:
+        sys.stderr.write(f"error: there is no command {name}; there are {', '.join(tools)}.\n")
         sys.exit(BAD_INPUT)
     else:
+        CommandParser.program = f"gsmap {name}"
         del sys.argv[0]
-        sys.argv[0] = str(TOOLS / f"{name}.py")
+        sys.argv[0] = str(tools[name])
         runpy.run_path(sys.argv[0], run_name="__main__")
 
 

@@ -1,6 +1,7 @@
 """Weights from a checkpoint into a model, or an error that says what to do."""
 
 import json
+import logging
 import pickle
 import zipfile
 from collections.abc import Mapping
@@ -8,14 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from torch import Tensor, nn
 
 from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import MODEL_SETTINGS, differences, plain
-from gsmap.engine.named_models import find_checkpoint
+from gsmap.engine.launch import read_config
+from gsmap.engine.named_models import find_checkpoint, named_models
 
+_LOGGER = logging.getLogger(__name__)
 # what torch's reader raises on bytes that make no sense
 _DAMAGE = (
     RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, UnicodeError,
@@ -121,3 +125,37 @@ def load_weights(model: nn.Module, path: str | Path) -> None:
             f"{listed(result.unexpected_keys)} too many. Give the config that it was trained with "
             "(a copy lies beside it in the work folder)."
         )
+
+
+def load_model(
+    config: str | Path | Config,
+    checkpoint: str | Path | None = None,
+    device: str | torch.device = "cpu",
+    cfg_options: dict | None = None,
+) -> Any:
+    """Build a model and load its weights, ready to predict.
+
+    Args:
+        config: Config file, a ``Config``, or the name of a model (``list_models``).
+        checkpoint: File or name. None means the named model's; without a name, initial weights.
+        device: Where the model is.
+        cfg_options: Overrides of the config, by dotted name.
+
+    Returns:
+        The torch module, in evaluation mode; ``model.cfg`` is its config, as it was trained.
+
+    Raises:
+        FileNotFoundError: If the config or the checkpoint does not exist.
+        ValueError: If the checkpoint belongs to another architecture, or cannot be read.
+    """
+    cfg = read_config(config, cfg_options)
+    if checkpoint is None and str(config) in named_models():
+        checkpoint = str(config)
+    if checkpoint is not None:
+        for line in adopt_settings(cfg, checkpoint, cfg_options):
+            _LOGGER.warning(line)
+    model = MODELS.build(cfg.model)
+    if checkpoint is not None:
+        load_weights(model, checkpoint)
+    model.cfg = cfg
+    return model.to(device).eval()

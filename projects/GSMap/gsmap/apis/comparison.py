@@ -22,10 +22,12 @@ from mmengine.config import Config
 
 from gsmap.apis.checkpoint import read_weights
 from gsmap.checkpoints.settings import differences, plain
+from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
-from gsmap.engine.launch import check_config, parse_options, read_config
-from gsmap.engine.named_models import REPO, find_checkpoint
+from gsmap.engine.launch import check_config, read_config
+from gsmap.engine.named_models import find_checkpoint
 from gsmap.utils.shards import digest
+from gsmap.utils.shipped import shipped
 
 SETTINGS = "settings.json"  # what a run was started with; another start must agree
 RECORD = "run.json"  # machine, load, command and end of a run
@@ -134,7 +136,7 @@ class Run:
         options, python = ["--cfg-options", *self.options], [sys.executable, "-u"]
         words = {"train": [*train, *options], "test": [str(self.checkpoint), *test, *options]}
         return {
-            stage: [*python, str(REPO / f"tools/{stage}.py"), self.config, *own]
+            stage: [*python, str(shipped(f"tools/{stage}.py")), self.config, *own]
             for stage, own in words.items()
         }
 

@@ -3,14 +3,15 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from mmengine.dataset import pseudo_collate
 from torch.utils.data import Dataset
 
-from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+if TYPE_CHECKING:
+    from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
 # A camera 1 km ahead of the vehicle that looks further ahead: everything in range is behind it, and
 # its frustum lies out of range. So both ways of making BEV features get nothing from it.
@@ -37,7 +38,7 @@ class FrameDataset(Dataset):
             the frame has another one; else the frame is broken.
     """
 
-    dataset: VectorizedMapDataset
+    dataset: "VectorizedMapDataset"
     blank_cameras: bool
 
     def __len__(self) -> int:

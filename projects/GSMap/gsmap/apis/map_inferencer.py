@@ -1,7 +1,6 @@
 """A trained model on recorded samples: map elements and pictures out."""
 
 import copy
-import logging
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -9,32 +8,32 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
-from mmdet3d.registry import DATASETS, MODELS
-from mmdet3d.structures import Det3DDataSample
+from mmdet3d.registry import DATASETS
 from mmengine.config import Config
 from torch.utils.data import DataLoader, Subset
 
-from gsmap.apis.checkpoint import adopt_settings, load_weights
+from gsmap.apis.checkpoint import load_model
 from gsmap.apis.frame_loader import BrokenFrame, FrameDataset, collate
-from gsmap.apis.rig_fit import similar_cameras
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_predictions
-from gsmap.datasets.transforms.points import read_points
-from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
-from gsmap.engine.launch import read_config
-from gsmap.engine.named_models import named_models
 from gsmap.evaluation.results_json import vectors_of
 from gsmap.inputs.frames import reframed
-from gsmap.inputs.source import InputOptions, Source, open_input
-from gsmap.visualization.map_visualizer import MapVisualizer
+from gsmap.inputs.memory import Cameras, frame_in_memory
+from gsmap.structures.elements import MapElements
 
-_LOGGER = logging.getLogger(__name__)
+if TYPE_CHECKING:  # slow to import, and of no use before there is a model
+    from matplotlib.figure import Figure
+    from mmdet3d.structures import Det3DDataSample
+
+    from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+    from gsmap.inputs.source import Source
+    from gsmap.visualization.map_visualizer import MapVisualizer
+
 _LOOK_AT = 100  # samples whose cameras are an input's
 
 
@@ -68,8 +67,10 @@ def spread_evenly(count: int, max_num: int | None = None) -> list[int]:
     return np.linspace(0, count - 1, max_num).round().astype(int).tolist()
 
 
-def _build_visualizer(cfg: Config) -> MapVisualizer:
+def _build_visualizer(cfg: Config) -> "MapVisualizer":
     """Build a visualizer with the config's options and without its backends."""
+    from gsmap.visualization.map_visualizer import MapVisualizer
+
     options = dict(cfg.get("visualizer") or {})
     if str(options.pop("type", "MapVisualizer")).split(".")[-1] != "MapVisualizer":
         options = {}
@@ -102,16 +103,8 @@ class MapInferencer:
         cfg_options: dict | None = None,
         amp: bool = False,
     ):
-        self.cfg = read_config(config, cfg_options)
-        if checkpoint is None and str(config) in named_models():
-            checkpoint = str(config)
-        if checkpoint is not None:
-            for line in adopt_settings(self.cfg, checkpoint, cfg_options):
-                _LOGGER.warning(line)
-        self.model = MODELS.build(self.cfg.model)
-        if checkpoint is not None:
-            load_weights(self.model, checkpoint)
-        self.model.eval()
+        self.model = load_model(config, checkpoint, cfg_options=cfg_options)
+        self.cfg: Config = self.model.cfg
         device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         names = [device] if isinstance(device, str | torch.device) else list(device)
         self.devices = [torch.device(name) for name in names]
@@ -125,10 +118,10 @@ class MapInferencer:
 
     def dataset(
         self,
-        source: str | Path | Source | Sequence[MapSample],
+        source: "str | Path | Source | Sequence[MapSample]",
         data_root: str | Path | None = None,
         **options: Any,
-    ) -> VectorizedMapDataset:
+    ) -> "VectorizedMapDataset":
         """Open samples as the config's test data set, with its pipeline.
 
         Samples of another annotation frame are seen from the config's. If none of their cameras is
@@ -144,6 +137,8 @@ class MapInferencer:
             FileNotFoundError: If a file does not exist.
             ValueError: If a file cannot be used with this config; the message says why.
         """
+        from gsmap.inputs.source import InputOptions, Source, open_input
+
         self._files += 1
         if isinstance(source, str | Path):
             options.setdefault("frames_dir", Path(self._scratch.name) / f"frames{self._files}")
@@ -161,6 +156,7 @@ class MapInferencer:
             path = self._annotation_file(samples, frame, source.has_poses)
         settings |= {"ann_file": str(path.resolve()), "test_mode": True, "split": None, "dim": None}
         settings["cameras"] = self._cameras(samples)
+        settings["serialize_data"] = len(samples) > 1  # costs a collection of all garbage
         if source.data_root is not None:
             settings["data_root"] = str(source.data_root.resolve())
         dataset = DATASETS.build(settings)
@@ -176,8 +172,8 @@ class MapInferencer:
         return list(found)
 
     def _fit_cameras(
-        self, dataset: VectorizedMapDataset, allow_missing_cameras: bool
-    ) -> VectorizedMapDataset:
+        self, dataset: "VectorizedMapDataset", allow_missing_cameras: bool
+    ) -> "VectorizedMapDataset":
         """Leave out cameras that no sample has, and fit the model's cameras to the others.
 
         Each gets its own embedding, or that of the model's camera that looks most like it.
@@ -192,6 +188,8 @@ class MapInferencer:
             dataset.cameras = names = tuple(name for name in names if name in seen) or names
         if self._camera_embeds is None:
             return dataset
+        from gsmap.apis.rig_fit import similar_cameras
+
         if set(names) <= set(trained):
             rows = [list(trained).index(name) for name in names]
         else:
@@ -223,7 +221,7 @@ class MapInferencer:
         return path
 
     @staticmethod
-    def lidar_points(dataset: VectorizedMapDataset, index: int) -> np.ndarray | None:
+    def lidar_points(dataset: "VectorizedMapDataset", index: int) -> np.ndarray | None:
         """Return a sample's LiDAR points (x, y, z), if it has a sweep. (n, 3)
 
         They are in the annotation frame, in metres.
@@ -238,18 +236,20 @@ class MapInferencer:
         path = Path(dataset.data_root, lidar.path)
         if not path.is_file():
             raise FileNotFoundError(f"There is no LiDAR sweep {path}.")
+        from gsmap.datasets.transforms.points import read_points
+
         matrix = lidar.frame_from_lidar
         return read_points(str(path), 5)[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
 
     def predict(
         self,
-        dataset: VectorizedMapDataset,
+        dataset: "VectorizedMapDataset",
         indices: Sequence[int] | None = None,
         batch_size: int = 1,
         num_workers: int = 0,
         allow_missing_cameras: bool = False,
         on_broken: Callable[[BrokenFrame], object] | None = None,
-    ) -> Iterator[Det3DDataSample]:
+    ) -> "Iterator[Det3DDataSample]":
         """Run the model; several devices take turns.
 
         Args:
@@ -289,26 +289,76 @@ class MapInferencer:
                 yield from pending.popleft().result()
 
     @torch.no_grad()
-    def _step(self, turn: int, batch: dict[str, Any]) -> list[Det3DDataSample]:
+    def _step(self, turn: int, batch: dict[str, Any]) -> "list[Det3DDataSample]":
         """Predict a batch on one device."""
         kind = self.devices[turn].type
         half = torch.bfloat16 if kind == "cpu" else torch.float16
         with torch.autocast(kind, half, enabled=self.amp):
             return [sample.cpu() for sample in self.replicas[turn].test_step(batch)]
 
-    def vectors(self, data_sample: Det3DDataSample) -> list[dict[str, Any]]:
-        """Return a predicted sample's ``vectors`` of the results JSON."""
-        found = elements_of_predictions(data_sample.pred_instances_3d)
-        return vectors_of(found, self.visualizer.dataset_meta["classes"])
+    def predict_images(
+        self,
+        images: Cameras,
+        intrinsics: Cameras,
+        cam_from_frame: Cameras,
+        frame: str | None = None,
+        allow_missing_cameras: bool = False,
+    ) -> "Det3DDataSample":
+        """Run the model on one frame that lies in memory.
 
-    def draw(self, data_sample: Det3DDataSample, **options: Any) -> Figure:
+        Each argument of cameras maps their names to arrays, or lists arrays: then a camera is taken
+        for the model's that looks most like it, as one of another name is.
+
+        Args:
+            images: RGB, uint8, at about the size that the model was trained on. each (H, W, 3)
+            intrinsics: Pinhole matrices, in pixels. each (3, 3)
+            cam_from_frame: From the annotation frame to the camera (x right, y down, z ahead), in
+                metres. each (4, 4)
+            frame: ``lidar`` (x right, y ahead, at a roof LiDAR) or ``ego`` (x ahead, y left, on the
+                ground below the rear axle); the config's by default.
+            allow_missing_cameras: Whether cameras of the model may be absent.
+
+        Returns:
+            The sample, with ``pred_instances_3d`` on the CPU in the frame of the config.
+
+        Raises:
+            TypeError: If an image is not uint8.
+            ValueError: If an array has another shape, a matrix is none of its kind, the cameras of
+                the arguments differ, or they are not those of the model.
+        """
+        from gsmap.inputs.source import Source
+
+        config = self.cfg.test_dataloader.dataset
+        frame = frame or config.get("frame") or "lidar"
+        sample, pixels = frame_in_memory(images, intrinsics, cam_from_frame, frame)
+        foreign = set(pixels) - set(config.get("cameras") or pixels)
+        if foreign and foreign != set(pixels):
+            raise ValueError(
+                f"the model has the cameras {list(config.cameras)}, but not {sorted(foreign)}: "
+                "name all cameras as it does, or none."
+            )
+        dataset = self.dataset(Source([sample], frame, None, has_poses=False))
+        Path(dataset.ann_file).unlink()  # it is read, and a long drive has many frames
+        dataset.images_in_memory = pixels
+        (found,) = self.predict(dataset, allow_missing_cameras=allow_missing_cameras)
+        return found
+
+    def elements(self, data_sample: "Det3DDataSample") -> MapElements:
+        """Return a predicted sample's map: polylines in metres, labels, scores, Gaussians."""
+        return elements_of_predictions(data_sample.pred_instances_3d)
+
+    def vectors(self, data_sample: "Det3DDataSample") -> list[dict[str, Any]]:
+        """Return a predicted sample's ``vectors`` of the results JSON."""
+        return vectors_of(self.elements(data_sample), self.visualizer.dataset_meta["classes"])
+
+    def draw(self, data_sample: "Det3DDataSample", **options: Any) -> "Figure":
         """Compose a predicted sample's picture; options as in ``MapVisualizer.draw_sample``."""
         return self.visualizer.draw_sample(data_sample, **options)
 
     def __call__(
         self,
-        source: str | Path | Source | Sequence[MapSample],
+        source: "str | Path | Source | Sequence[MapSample]",
         data_root: str | Path | None = None,
-    ) -> list[Det3DDataSample]:
+    ) -> "list[Det3DDataSample]":
         """Predict all samples of a source; arguments as in ``dataset``."""
         return list(self.predict(self.dataset(source, data_root)))

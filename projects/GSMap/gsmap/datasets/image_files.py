@@ -31,11 +31,13 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
         raise ValueError(f"{where}: {file} is not an image; fetch it again.") from error
 
 
-def read_image(path: str, where: str, size: tuple[int, int] | None = None) -> np.ndarray:
+def read_image(
+    path: str | np.ndarray, where: str, size: tuple[int, int] | None = None
+) -> np.ndarray:
     """Read an image file and make sure that it is whole and what its record says.
 
     Args:
-        path: The file.
+        path: The file; an image that lies in memory, BGR, is returned.
         where: Sample and camera, for the message.
         size: Width and height that it must have, if they are known.
 
@@ -45,6 +47,8 @@ def read_image(path: str, where: str, size: tuple[int, int] | None = None) -> np
     Raises:
         BrokenSampleError: If it is missing, damaged, no image, of another size, or to be turned.
     """
+    if isinstance(path, np.ndarray):
+        return path
     file = Path(path)
     if not file.is_file():
         raise BrokenSampleError(f"{where}: no image at {path}; is data_root right?")

@@ -1,6 +1,6 @@
 """The data set: samples of an annotation file, with their images, for training and testing."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,7 @@ class VectorizedMapDataset(BaseDataset):
         self.cameras = None if cameras is None else tuple(cameras)
         self.broken_samples = broken_samples
         self.broken_tokens: dict[str, str] = {}
+        self.images_in_memory: Mapping[str, np.ndarray] = {}  # BGR, by camera, in place of files
         self._broken_in_a_row = 0
         self._expected = {
             "classes": None if classes is None else tuple(classes),
@@ -215,7 +216,7 @@ class VectorizedMapDataset(BaseDataset):
             image, cam2img = images[name], np.eye(4)
             cam2img[:3, :3] = cameras[name].intrinsics
             found[name] = {
-                "img_path": str(Path(self.data_root, image.path)),
+                "img_path": self.images_in_memory.get(name, str(Path(self.data_root, image.path))),
                 "size": (image.width, image.height),
                 "cam2img": cam2img,
                 "lidar2cam": cameras[name].cam_from_frame,

@@ -7,18 +7,16 @@ import os
 import re
 import traceback
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
 
 import torch
 from mmdet3d.registry import OPTIMIZERS, RUNNERS
-from mmengine.config import Config, DictAction
+from mmengine.config import Config
 from mmengine.logging import print_log
 from mmengine.registry import init_default_scope
-from mmengine.runner import Runner
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.engine.named_models import find_config
@@ -31,60 +29,15 @@ _OWN_KEYS = (
     "backend_args", "classes", "custom_imports", "data_root", "find_unused_parameters", "grid",
     "model_wrapper_cfg", "runner_type", "strategy", "vis_backends",
 )  # fmt: skip
-KNOWN_KEYS = frozenset(inspect.signature(Runner).parameters) - {"cfg"} | set(_OWN_KEYS)
-_ENDINGS = ("_cfg", "_dataloader", "default_hooks")
-_SECTIONS = {key for key in KNOWN_KEYS if key.endswith(_ENDINGS)}
-_SECTIONS |= {"model", "optim_wrapper", "randomness"}
+_SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
 
 
-def data_root_options(data_root: str | Path) -> dict[str, str]:
-    """Return the overrides, by dotted name, that take every split from one folder."""
-    splits = ("train", "val", "test")
-    return {f"{split}_dataloader.dataset.data_root": str(data_root) for split in splits}
+@cache
+def _known_keys() -> frozenset[str]:
+    """Return the top-level keys of a config; mmengine's runner is slow to import."""
+    from mmengine.runner import Runner
 
-
-class _DataRootAction(argparse.Action):
-    """Turns ``--data-root DIR`` into overrides, which those of ``--cfg-options`` outdo."""
-
-    def __call__(
-        self, parser: object, namespace: argparse.Namespace, values: Any, option: object = None
-    ) -> None:
-        namespace.data_root = values
-        given = getattr(namespace, "cfg_options", None) or {}
-        namespace.cfg_options = {**data_root_options(values), **given}
-
-
-def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--data-root`` and ``--cfg-options``; both go to `read_config` as ``cfg_options``."""
-    parser.add_argument(
-        "--data-root",
-        type=Path,
-        metavar="DIR",
-        action=_DataRootAction,
-        help="folder of the data set: annotation files, and root of the paths in them",
-    )
-    parser.add_argument(
-        "--cfg-options",
-        nargs="+",
-        action=DictAction,
-        metavar="KEY=VALUE",
-        help="override settings, e.g. train_dataloader.batch_size=2",
-    )
-
-
-def parse_options(words: Sequence[str]) -> dict[str, Any]:
-    """Read overrides ``KEY=VALUE`` as ``--cfg-options`` does."""
-    parser = argparse.ArgumentParser()
-    add_config_options(parser)
-    return parser.parse_args(["--cfg-options", *words]).cfg_options
-
-
-def add_common_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every OpenMMLab tool has."""
-    parser.add_argument("--work-dir", help="folder for logs, checkpoints and pictures")
-    add_config_options(parser)
-    parser.add_argument("--launcher", choices=["none", "pytorch", "slurm", "mpi"], default="none")
-    parser.add_argument("--local_rank", "--local-rank", type=int, default=0)
+    return frozenset(inspect.signature(Runner).parameters) - {"cfg"} | set(_OWN_KEYS)
 
 
 def read_config(config: str | Path | Config, cfg_options: dict | None = None) -> Config:
@@ -235,9 +188,10 @@ def check_config(cfg: Config) -> None:
 
 def _check_keys(cfg: Config) -> None:
     for key, value in cfg.items():
-        if key in _SECTIONS and not isinstance(value, dict | None):
+        known = key in _known_keys()
+        if known and key.endswith(_SECTIONS) and not isinstance(value, dict | None):
             raise ValueError(f"{cfg.filename}: {key} must be dict(...), got {value!r:.60}.")
-        if key in KNOWN_KEYS or key.startswith("_"):
+        if known or key.startswith("_"):
             continue
-        hint = nearest(key, KNOWN_KEYS) or "; names of a config's own values start with '_'."
+        hint = nearest(key, _known_keys()) or "; names of a config's own values start with '_'."
         raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")

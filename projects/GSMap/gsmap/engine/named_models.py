@@ -11,9 +11,7 @@ from functools import cache
 from pathlib import Path
 
 from gsmap.utils.shards import digest
-
-REPO = Path(__file__).resolve().parents[4]
-REGISTRY = REPO / "models/registry.json"
+from gsmap.utils.shipped import shipped
 
 
 @dataclass(frozen=True)
@@ -22,7 +20,7 @@ class NamedModel:
 
     Attributes:
         name: Its name.
-        config: Our config, relative to the repository.
+        config: Our config, as `shipped` takes it.
         sha256: Digest of the weights' file; None where it is not known.
         source: Who trained it.
         licence: Licence of the weights.
@@ -41,25 +39,32 @@ class NamedModel:
     @property
     def file(self) -> Path:
         """File of its weights."""
-        return REGISTRY.with_name(f"{self.name}.pth")
+        return shipped(f"models/{self.name}.pth")
 
 
 @cache
 def named_models() -> dict[str, NamedModel]:
     """Return the registry by name."""
-    return {row["name"]: NamedModel(**row) for row in json.loads(REGISTRY.read_text())}
+    rows = json.loads(shipped("models/registry.json").read_text(encoding="utf-8"))
+    return {row["name"]: NamedModel(**row) for row in rows}
+
+
+def list_models() -> list[str]:
+    """Return the names of the models whose weights are there: those that ship, and fetched ones."""
+    return [name for name, model in named_models().items() if model.file.is_file()]
 
 
 def find_config(config: str | Path) -> Path:
-    """Return a config's file, given that or the name of a model.
+    """Return a config's file, given that, its path in the repository, or the name of a model.
 
     Raises:
         FileNotFoundError: If it is neither; the message has the nearest name.
     """
-    if Path(config).is_file():
-        return Path(config)
-    remedy = "; configs are in configs/ and projects/GSMap/configs/"
-    return REPO / _named(config, "config file", remedy).config
+    for path in (Path(config), shipped(str(config))):
+        if path.is_file():
+            return path
+    remedy = f"; configs are in configs/ and projects/GSMap/configs/ of {shipped()}"
+    return shipped(_named(config, "config file", remedy).config)
 
 
 def find_checkpoint(checkpoint: str | Path) -> Path:
@@ -80,7 +85,7 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
     if model.sha256 and digest(model.file) != model.sha256:
         raise ValueError(
             f"{model.file} is damaged or another file: its sha256 is not that of {model.name} in "
-            f"{REGISTRY.name}; fetch it again, or give another file by its path."
+            "registry.json; fetch it again, or give another file by its path."
         )
     return model.file
 
@@ -102,8 +107,7 @@ def _named(name: str | Path, what: str, remedy: str = "") -> NamedModel:
     models = named_models()
     if str(name) not in models:
         close = difflib.get_close_matches(Path(name).stem, models, n=1, cutoff=0.7)
-        shipped = ", ".join(model.name for model in models.values() if not model.address)
-        hint = f"did you mean {close[0]}?" if close else f"{shipped} ship"
+        hint = f"did you mean {close[0]}?" if close else f"{', '.join(list_models())} are here"
         raise FileNotFoundError(
             f"There is no {what} {name}, and no model of that name ({hint}){remedy}."
         )

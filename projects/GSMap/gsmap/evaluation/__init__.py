@@ -1,1 +1,14 @@
 """AP_chamfer and AP_raster."""
+
+from gsmap.utils.lazy import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "ChamferConfig": "chamfer_ap",
+        "MapEvaluator": "evaluator",
+        "MapMetric": "map_metric",
+        "RasterConfig": "raster_ap",
+        "format_table": "report",
+    },
+)

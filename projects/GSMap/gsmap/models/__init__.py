@@ -1,1 +1,13 @@
 """Network parts: detectors, BEV encoders, decoders, heads, losses, matching."""
+
+from gsmap.utils.lazy import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "GSMapHead": "heads.gsmap_head",
+        "MapDetector": "detectors.map_detector",
+        "MapHead": "heads.map_head",
+        "RasterLoss": "losses.raster",
+    },
+)

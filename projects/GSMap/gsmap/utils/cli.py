@@ -30,6 +30,12 @@ class CommandParser(argparse.ArgumentParser):
     its last words if positional arguments would be missing.
     """
 
+    program: str | None = None
+    """What help calls the command; None for the script's name."""
+
+    def __init__(self, prog: str | None = None, **options: Any):
+        super().__init__(prog or self.program, **options)
+
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> Any:

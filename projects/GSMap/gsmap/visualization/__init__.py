@@ -1,22 +1,21 @@
 """Pictures of maps over cameras and in bird's-eye view.
 
-``MapVisualizer`` and ``MapVisualizationHook`` live in modules of their own that need OpenMMLab;
-what is imported here needs neither that nor torch.
+``MapVisualizer`` and ``MapVisualizationHook`` need OpenMMLab; the others not even torch.
 """
 
-from gsmap.visualization.bev_view import BEVPanel
-from gsmap.visualization.camera_view import CameraView
-from gsmap.visualization.figure import compose_figure, figure_to_rgb, save_figure
-from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
-from gsmap.visualization.style import MapStyle
+from gsmap.utils.lazy import lazy_names
 
-__all__ = [
-    "FRAME_VIEWS",
-    "BEVPanel",
-    "CameraView",
-    "FrameView",
-    "MapStyle",
-    "compose_figure",
-    "figure_to_rgb",
-    "save_figure",
-]
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "FRAME_VIEWS": "frame_view",
+        "BEVPanel": "bev_view",
+        "CameraView": "camera_view",
+        "FrameView": "frame_view",
+        "MapStyle": "style",
+        "MapVisualizer": "map_visualizer",
+        "compose_figure": "figure",
+        "figure_to_rgb": "figure",
+        "save_figure": "figure",
+    },
+)

@@ -155,17 +155,18 @@ class MapVisualizer(Visualizer):
             return []
         projections = np.asarray(metainfo["lidar2img"], dtype=np.float64)  # (V, 4, 4)
         names = metainfo.get("cam_names") or [f"camera {i}" for i in range(len(projections))]
+        found: list[Any] = list(images or ())
         if images is None:
             if metainfo.get("img_aug_matrix") is not None:
                 unscaled = np.linalg.inv(np.asarray(metainfo["img_aug_matrix"], np.float64))
                 projections = unscaled @ projections
             where = f"sample {metainfo.get('token')!r}"
-            images = [path and read_image(path, where)[..., ::-1] for path in paths or ()]
-        if len(images) != len(projections):
+            found = [None if p is None else read_image(p, where)[..., ::-1] for p in paths or ()]
+        if len(found) != len(projections):
             raise ValueError(
-                f"A sample has {len(images)} images, but {len(projections)} projections."
+                f"A sample has {len(found)} images, but {len(projections)} projections."
             )
-        triples = zip(names, images, projections, strict=True)
+        triples = zip(names, found, projections, strict=True)
         return [CameraView(*triple) for triple in triples if triple[1] is not None]
 
     def _bev_panels(
