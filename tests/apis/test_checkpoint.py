@@ -7,7 +7,8 @@ from mmengine.config import Config
 from torch import nn
 
 from gsmap.apis.checkpoint import adopt_settings, load_weights, read_weights
-from gsmap.checkpoints.settings import MODEL_SETTINGS, differences
+from gsmap.checkpoints.settings import MODEL_SETTINGS, differences, plain
+from gsmap.engine.launch import read_config
 
 
 def save(path, content):
@@ -71,25 +72,77 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, value):
         read_weights(save(tmp_path / "failed.pth", {"state_dict": state}))
 
 
-def test_a_model_is_tested_with_the_settings_of_its_checkpoint(tmp_path):
-    settings = {"head": {"floor_m": 0.15, "layers": [{"width": 2}, {"width": 3}]}, "same": [1, 2]}
-    path = save(
-        tmp_path / "a.pth",
-        {"state_dict": {"w": torch.ones(1)}, "meta": {MODEL_SETTINGS: json.dumps(settings)}},
-    )
-    config = {"head": {"floor_m": 0.234, "layers": [{"width": 2}]}, "same": (1, 2)}
-    cfg = Config({"model": config})
-    assert adopt_settings(cfg, path, {"data.size": 3}) == [
-        f"model.head.floor_m: 0.15, as {path} was trained; the config has 0.234",
-        f"model.head.layers.1: {{'width': 3}}, as {path} was trained; the config has None",
+@pytest.fixture
+def small() -> Config:
+    """The config of a small model."""
+    return read_config("configs/maptr/maptr_r18_minicity.py")
+
+
+def with_settings(path, settings):
+    meta = {MODEL_SETTINGS: json.dumps(settings)}
+    return save(path, {"state_dict": {"w": torch.ones(1)}, "meta": meta})
+
+
+def test_a_model_is_tested_with_the_settings_of_its_checkpoint(small, tmp_path):
+    settings = plain(small.model.to_dict())
+    path = with_settings(tmp_path / "a.pth", settings)
+    before = small.model
+    assert adopt_settings(small, path, {"data.size": 3}) == []
+    assert small.model is before
+    settings["map_head"]["losses"][0]["loss_weight"] = 3.0
+    settings["map_head"]["losses"].append({"type": "EuclideanLoss"})
+    settings["img_backbone"]["init_cfg"] = {"type": "Pretrained", "checkpoint": "x/y.pth"}
+    path = with_settings(tmp_path / "a.pth", settings)
+    of_losses = "model.map_head.losses"
+    trained = [
+        f"{of_losses}.0.loss_weight: 3.0, as {path} was trained; the config has 5.0",
+        f"{of_losses}.2: {{'type': 'EuclideanLoss'}}, as {path} was trained; the config has None",
     ]
-    assert cfg.model.to_dict() == settings
-    cfg = Config({"model": {**settings, "head": {**settings["head"], "floor_m": 0.5}}})
-    assert adopt_settings(cfg, path, {"model.head.floor_m": 0.5}) == [
-        f"model.head.floor_m: 0.5, as asked for; {path} was trained with 0.15"
+    assert adopt_settings(small, path, None) == trained
+    del settings["img_backbone"]["init_cfg"]  # never loaded: the checkpoint has all weights
+    assert small.model.to_dict() == settings
+    options = {f"{of_losses}.0.loss_weight": 5.0, "model.img_backbone.init_cfg": None}
+    small.merge_from_dict(options)
+    assert adopt_settings(small, path, options) == [
+        f"{of_losses}.0.loss_weight: 5.0, as asked for; {path} was trained with 3.0"
     ]
-    assert cfg.model.head.floor_m == 0.5
-    assert adopt_settings(cfg, save(path, {"w": torch.ones(1)}), None) == []
+    assert small.model.map_head.losses[0].loss_weight == 5.0
+    assert adopt_settings(small, save(path, {"w": torch.ones(1)}), None) == []
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        ("img_backbone", {"type": "mmdet.SwinTransformer"}, "img_backbone.type is 'mmdet.Swin"),
+        ("map_head", {"type": "MapHead", "num": 1}, "MapHead has no setting 'num'"),
+        ("map_head", None, "'NoneType' object is not a mapping"),
+        ("bev_encoder", {"type": "BEVQueryEncoder"}, "missing 1 required .* 'cross_attn'"),
+    ],
+)
+def test_settings_that_make_no_model_are_the_checkpoints_fault(
+    part, value, message, small, tmp_path
+):
+    settings = {**plain(small.model.to_dict()), part: value}
+    path = with_settings(tmp_path / "a.pth", settings)
+    with pytest.raises(ValueError, match=message) as raised:
+        adopt_settings(small, path, None)
+    text = str(raised.value)
+    assert text.startswith(f"{path} was not loaded: of the settings in it, ")
+    assert "maptr_r18_minicity.py" not in text
+
+
+def test_a_part_of_the_config_may_be_set_otherwise(small, tmp_path):
+    """A part that others register is built from a checkpoint where the config has it too."""
+    settings = plain(small.model.to_dict())
+    settings["img_backbone"] |= {"style": "caffe", "norm_cfg": {"type": "BN2d"}}
+    path = with_settings(tmp_path / "a.pth", settings)
+    lines = adopt_settings(small, path, None)
+    assert [line.split(":")[0] for line in lines] == [
+        "model.img_backbone.norm_cfg.type",
+        "model.img_backbone.norm_cfg.requires_grad",
+        "model.img_backbone.style",
+    ]
+    assert small.model.img_backbone.style == "caffe"
 
 
 def test_differences_of_other_kinds_are_named_whole():

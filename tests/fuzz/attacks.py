@@ -1,20 +1,25 @@
-"""Pickles that would do something when they are read: harmless stand-ins that leave a marker.
+"""Files that would do something when they are read: harmless stand-ins that leave a marker.
 
-``python attacks.py READER FOLDER`` reads one of them in a process of its own.
+``python attacks.py READER FOLDER`` reads those of a folder in a process of its own.
 """
 
+import copy
+import json
 import os
 import pickle
 import struct
 import sys
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 MARKER = "marker"
+PLANTED = "planted"  # a module of the folder, which leaves the marker when it is imported
+CONFIG = Path(__file__).resolve().parents[2] / "configs/maptr/maptr_r18_minicity.py"
 
 
 class Calls:
@@ -120,6 +125,63 @@ def corpus(folder: Path) -> dict[str, bytes]:
     return found | {name: _whole(body) for name, body in raw.items()}
 
 
+def settings_corpus(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """Return model settings that a checkpoint may hold, by what they try; writes the module."""
+    marker = str(folder / MARKER)
+    (folder / f"{PLANTED}.py").write_text(f"open({marker!r}, 'w').close()\nprint(end='')\n")
+    make = {"type": "os.makedirs", "name": marker}
+    head = settings["map_head"]
+    tried: dict[str, dict[str, Any]] = {  # img_augment is not used when a model is tested
+        "open": {"img_augment": {"type": "builtins.open", "file": marker, "mode": "w"}},
+        "popen": {"img_augment": {"type": "subprocess.Popen", "args": ["touch", marker]}},
+        "makedirs": {"img_augment": make},
+        "module": {"img_augment": {"type": PLANTED}},
+        "attribute of a module": {"img_augment": {"type": f"{PLANTED}.print"}},
+        "module behind a scope": {"img_augment": {"type": f"mmdet.{PLANTED}"}},
+        "scope": {"img_augment": {"type": "GridMask", "_scope_": PLANTED}},
+        "in a list": {"map_head": {**head, "losses": [*head["losses"], make]}},
+        "among costs": {"map_head": {**head, "match_costs": [*head["match_costs"], make]}},
+        "text that a class runs": {"map_head": {**head, "match_costs": [
+            {"type": "mmdet.CameraMotionCompensation", "warp_mode": f"open({marker!r}, 'w')"}]}},
+        "in a list of a part": {"data_preprocessor": {
+            **settings["data_preprocessor"], "batch_augments": [make]}},
+        "layer": {"img_backbone": {**settings["img_backbone"], "norm_cfg": {"type": PLANTED}}},
+        "layer of a part": {"img_neck": {**settings["img_neck"], "norm_cfg": {"type": PLANTED}}},
+        "model": {"type": "os.makedirs"},
+        "type of several": {"img_augment": {"type": ["os.makedirs"], "name": marker}},
+        "address": {"img_augment": {"type": "GridMask", "prob": "https://localhost/x"}},
+        "hidden key": {"__class__": make},
+        "unknown key": {"img_augments": {"type": "GridMask"}},
+        "endless": {"map_head": {**head, "num_points": 2**70}},
+        "no number": {"map_head": {**head, "num_points": float("nan")}},
+        "deep": {"img_augment": json.loads("[" * 300 + "]" * 300)},
+    }  # fmt: skip
+    found: dict[str, Any] = {name: {**settings, **change} for name, change in tried.items()}
+    found["model"] = {"type": "os.makedirs", "name": marker}
+    return {**found, "no settings": [make], "text": f"{PLANTED}.print"}
+
+
+def _read_settings(path: Path) -> None:
+    from gsmap.apis.map_inferencer import MapInferencer
+
+    sys.path.insert(0, str(path.parent))  # as the working folder may be
+    MapInferencer(CONFIG, path, device="cpu")
+
+
+def _build_settings(path: Path) -> None:
+    import torch
+    from mmdet3d.registry import MODELS
+
+    from gsmap.checkpoints.settings import MODEL_SETTINGS
+    from gsmap.engine.launch import read_config
+
+    sys.path.insert(0, str(path.parent))
+    read_config(CONFIG)
+    sys.modules.pop(PLANTED, None)  # to be imported by each file anew
+    settings = json.loads(torch.load(path, weights_only=True)["meta"][MODEL_SETTINGS])
+    MODELS.build(copy.deepcopy(settings))
+
+
 def _read_plain(path: Path) -> None:
     from gsmap.datasets.plain_pickle import load_plain_pickle
 
@@ -153,6 +215,8 @@ READERS: dict[str, Callable[[Path], None]] = {
     "infos": _read_infos,
     "sample": _read_sample,
     "weights": _read_weights,
+    "settings": _read_settings,
+    "settings as mmengine builds them": _build_settings,
     "python": _read_as_python_does,
 }
 
@@ -163,7 +227,8 @@ def main() -> None:
     for path in sorted(folder.glob("*.pkl")):
         print(path.stem, end=": ", flush=True)  # the last line names the one that crashes
         try:
-            reader(path)
+            with redirect_stdout(sys.stderr):  # mmengine's log
+                reader(path)
         except Exception as error:
             outcome = f"{type(error).__name__}: {error}"
         else:

@@ -1,15 +1,23 @@
-"""No file runs code: crafted pickles are read in processes of their own, and leave no marker."""
+"""No file runs code: crafted files are read in processes of their own, and leave no marker."""
 
+import json
 import zipfile
 from pathlib import Path
 
 import pytest
+import torch
 from processes import run_python
 
-from fuzz.attacks import corpus
+from fuzz.attacks import CONFIG, corpus, settings_corpus
+from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
+from gsmap.engine.launch import read_config
 
 SCRIPT = Path(__file__).with_name("attacks.py")
 HARMLESS = {"open", "system", "exec", "eval", "makedirs", "nested", "key", "tofile"}
+BUILT = {  # settings that do nothing if mmengine builds them
+    "address", "deep", "endless", "hidden key", "no number", "text", "type of several",
+    "unknown key",
+}  # fmt: skip
 
 
 def read_all(reader: str, folder: Path) -> dict[str, str]:
@@ -56,3 +64,28 @@ def test_no_checkpoint_runs_anything(container: str, tmp_path: Path):
     assert outcomes.keys() == attacks.keys()
     for name, outcome in outcomes.items():
         assert outcome.startswith("did not run, ValueError: "), f"{name}: {outcome}"
+
+
+@pytest.fixture
+def checkpoints(tmp_path: Path) -> set[str]:
+    """Write checkpoints with hostile settings into ``tmp_path``; return their names."""
+    attacks = settings_corpus(tmp_path, plain(read_config(CONFIG).model.to_dict()))
+    for name, settings in attacks.items():
+        meta = {MODEL_SETTINGS: json.dumps(settings)}
+        content = {"state_dict": {"w": torch.ones(1)}, "meta": meta}
+        torch.save(content, tmp_path / f"{name}.pkl")
+    return set(attacks)
+
+
+def test_the_settings_would_run_if_they_were_built(checkpoints: set[str], tmp_path: Path):
+    outcomes = read_all("settings as mmengine builds them", tmp_path)
+    ran = {name for name, outcome in outcomes.items() if outcome.startswith("RAN")}
+    assert ran == checkpoints - BUILT
+
+
+def test_no_settings_of_a_checkpoint_run_anything(checkpoints: set[str], tmp_path: Path):
+    outcomes = read_all("settings", tmp_path)
+    assert outcomes.keys() == checkpoints
+    for name, outcome in outcomes.items():
+        assert outcome.startswith("did not run, ValueError: "), f"{name}: {outcome}"
+        assert f"{name}.pkl was not loaded: of the settings in it" in outcome, f"{name}: {outcome}"

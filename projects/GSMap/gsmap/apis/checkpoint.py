@@ -10,21 +10,23 @@ from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
-from mmengine.config import Config
+from mmengine.config import Config, ConfigDict
 from torch import Tensor, nn
 
 from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.safe_globals import mmengine_globals
-from gsmap.checkpoints.settings import MODEL_SETTINGS, differences, plain
+from gsmap.checkpoints.settings import MODEL_SETTINGS, STARTS, checked, differences, plain
 from gsmap.engine.launch import read_config
 from gsmap.engine.named_models import find_checkpoint, named_models
+from gsmap.utils.faults import in_words
 
 _LOGGER = logging.getLogger(__name__)
 # what torch's reader raises on bytes that make no sense
 _DAMAGE = (
-    RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, UnicodeError,
+    RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, ValueError,
     ArithmeticError, OSError, zipfile.BadZipFile,
 )  # fmt: skip
+_REMEDY = "if you trust its origin, save its state_dict alone and give that file."
 
 
 def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | None]:
@@ -51,7 +53,7 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
         reason = str(error).split(". ")[0]
         raise ValueError(
             f"{path} was not loaded: it is broken, or holds more than tensors and plain data "
-            f"({reason}). If you trust its origin, save its state_dict alone and give that file."
+            f"({reason}); {_REMEDY}"
         ) from error
     except _DAMAGE as error:
         raise ValueError(
@@ -77,6 +79,8 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
 def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> list[str]:
     """Give a config the model settings that a checkpoint was trained with, and say which changed.
 
+    How training started (`STARTS`) is left out.
+
     Args:
         cfg: The config; its ``model`` changes.
         path: The checkpoint, checked as in `read_checked`.
@@ -85,24 +89,56 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
     Returns:
         A line for each setting that the config had otherwise, and for each that is kept against the
         checkpoint.
+
+    Raises:
+        ValueError: If the settings are no model's, or ask for more than a model (`checked`).
     """
     settings = read_checked(path)[1]
-    if settings is None:
-        return []
     config = plain(cfg.model.to_dict())
-    own = Config({"model": settings})
-    own.merge_from_dict({k: v for k, v in (cfg_options or {}).items() if k.startswith("model.")})
-    used = plain(own.model.to_dict())
+    if settings is None or not differences(settings, config):
+        return []
+    options = {
+        name: value
+        for name, value in (cfg_options or {}).items()
+        if name.startswith("model.") and not _is_start(name)
+    }
+    own, model = _model_of(path, settings, config, options)
+    used = plain(model.to_dict())
     lines = [
         f"{name}: {theirs}, as {path} was trained; the config has {mine}"
         for name, (theirs, mine) in differences(used, config, "model").items()
+        if not _is_start(name)
     ]
     lines += [
         f"{name}: {given}, as asked for; {path} was trained with {theirs}"
-        for name, (given, theirs) in differences(used, settings, "model").items()
+        for name, (given, theirs) in differences(used, own, "model").items()
     ]
-    cfg.model = own.model
+    if lines:
+        cfg.model = model
     return lines
+
+
+def _is_start(name: str) -> bool:
+    """Whether a dotted name is one of a setting of how training starts."""
+    return not STARTS.isdisjoint(name.split("."))
+
+
+def _model_of(
+    path: str | Path, settings: Any, config: dict[str, Any], options: dict[str, Any]
+) -> tuple[dict[str, Any], ConfigDict]:
+    """Return a checkpoint's settings, checked, and with overrides; a model can be built of both."""
+    try:
+        settings = checked(settings, config)
+        own = Config({"model": settings})
+        own.merge_from_dict(options)
+        MODELS.build(own.model)
+    except Exception as error:  # a stranger's settings may end in whatever they like
+        reason = (in_words(error) or f"{type(error).__name__}: {error}").rstrip(".")
+        raise ValueError(
+            f"{path} was not loaded: of the settings in it, {reason}. Give the config that it was "
+            f"trained with, or, {_REMEDY}"
+        ) from error
+    return settings, own.model
 
 
 def load_weights(model: nn.Module, path: str | Path) -> None:
