@@ -24,7 +24,7 @@ else
     name=$("$python" -c 'import torch; print(torch.cuda.get_device_name())') || { echo "error: no GPU here; REDUCED=1 tries the script without one"; exit 2; }
     at=(--device cuda --threads 8)
     fps=("${r50[@]}" "${at[@]}") memory=("$gsmap/gsmap_maptr_r50_24e.py" --rasters 128x64 200x100 256x128 --batch 4 "${at[@]}")
-    raster=("${at[@]}") tests=(tests/ops tests/models/heads)
+    raster=("${at[@]}") tests=(tests/ops tests/models)
     data=(--scenes 400 --samples-per-scene 5 --image-size 400x225) budget=6400 batch=4 compared=("${r18[@]}")
 fi
 

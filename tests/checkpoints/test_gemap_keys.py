@@ -7,7 +7,7 @@ import torch
 
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
 from gsmap.checkpoints.key_map import GEMAP, GEMAP_FULL, MAPTR, MAPTRV2, find_key_map
-from gsmap.models.layers.self_attention import GeometryDecoupledAttention
+from gsmap.models.gemap.attention import GeometryDecoupledAttention
 
 LAYER = "pts_bbox_head.transformer.decoder.layers.3."
 OURS = "map_head.decoder.layers.3."

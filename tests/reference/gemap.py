@@ -5,12 +5,8 @@ from collections.abc import Iterator
 import torch
 
 from gsmap.checkpoints.key_map import GEMAP
-from gsmap.models.layers.self_attention import GeometryDecoupledAttention
-from gsmap.models.losses.geometry import (
-    EuclideanLoss,
-    euclidean_relation_loss,
-    euclidean_shape_loss,
-)
+from gsmap.models.gemap.attention import GeometryDecoupledAttention
+from gsmap.models.gemap.losses import EuclideanLoss, euclidean_relation_loss, euclidean_shape_loss
 from reference.golden import Golden
 from reference.maptr import decoded_rows, head_loss_rows, state_rows
 from reference.registry import check

@@ -11,8 +11,8 @@ from scipy.optimize import linear_sum_assignment
 
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
 from gsmap.checkpoints.key_map import find_key_map
-from gsmap.models.bev_encoders.gkt import border_pixels, kernel_offsets
-from gsmap.models.heads.map_head import MapHead
+from gsmap.models.encoders.gkt import border_pixels, kernel_offsets
+from gsmap.models.maptr.head import MapHead
 from gsmap.ops.deformable_sampling import sum_rows
 from reference.golden import Golden
 from reference.registry import check

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakeBEVMask, MakePVMask
-from gsmap.models.bev_encoders.camera_encoder import stack_calibration
-from gsmap.models.bev_encoders.depth_net import camera_vector
-from gsmap.models.bev_encoders.lss import CAMERA_MATRICES
-from gsmap.models.heads.map_head import MapHead
-from gsmap.models.losses.auxiliary import depth_bins
+from gsmap.models.encoders.camera_encoder import stack_calibration
+from gsmap.models.encoders.depth_net import camera_vector
+from gsmap.models.encoders.lss import CAMERA_MATRICES
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptrv2.depth import depth_bins
 from gsmap.ops.bev_pool import cell_indices
 from reference.golden import NUM_CAMS, Golden
 from reference.maptr import bev_rows, decoded_rows, head_rows, state_rows

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import torch
 from mmengine.structures import InstanceData
 
-from gsmap.models.losses.dice import RenderedDiceLoss
-from gsmap.models.task_modules.match_costs import RenderedDiceCost
+from gsmap.models.mapvr.cost import RenderedDiceCost
+from gsmap.models.mapvr.losses import RenderedDiceLoss
 from gsmap.ops.polyline_raster import soft_rasters
 from reference.golden import Golden
 from reference.maptr import head_loss_rows

@@ -9,8 +9,8 @@ from mmengine.registry import init_default_scope
 from torch import Tensor, nn
 
 from gsmap.checkpoints.key_map import MGMAPNET
-from gsmap.models.decoders.mgmapnet_decoder import MGMapNetDecoder
-from gsmap.models.layers.multi_granularity import Granularities, MultiGranularityAttention
+from gsmap.models.mgmapnet.attention import Granularities, MultiGranularityAttention
+from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
 from reference.golden import Golden
 from reference.maptr import state_rows
 from reference.registry import check

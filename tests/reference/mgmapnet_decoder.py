@@ -11,7 +11,7 @@ from mmengine.registry import init_default_scope
 from torch import Tensor
 
 from gsmap.checkpoints.key_map import MGMAPNET
-from gsmap.models.heads.map_head import MapHead
+from gsmap.models.maptr.head import MapHead
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
 from reference.maptr import decoded_rows

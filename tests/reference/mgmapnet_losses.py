@@ -8,9 +8,9 @@ from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
-from gsmap.models.heads.aux_heads import BEVMaskHead
-from gsmap.models.heads.map_head import MapHead
-from gsmap.models.heads.masks import ElementMasks
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.masks import ElementMasks
+from gsmap.models.maptrv2.aux_heads import BEVMaskHead
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
 from reference.mgmapnet import BEV, B, GoldenParts

@@ -1,4 +1,4 @@
-"""Soft intersection over union of masks: sum(min) / sum(max)."""
+"""Overlap of soft masks: intersection over union, sum(min) / sum(max), and dice."""
 
 import torch
 from torch import Tensor
@@ -48,3 +48,16 @@ def pairwise_soft_iou(
         preds, targets = preds.detach(), targets.detach()
         minima = _pairwise_minima(preds, targets, backend)
     return minima / (preds.sum(-1)[:, None] + targets.sum(-1) - minima + eps)
+
+
+def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
+    """Return 1 - (2 sum(p t) + 1) / (sum p + sum t + 1) of pairs of masks. 2 x (n, H, W) -> (n,)"""
+    overlap = (preds * targets).sum((1, 2))
+    return 1 - (2 * overlap + 1) / (preds.sum((1, 2)) + targets.sum((1, 2)) + 1)
+
+
+def pairwise_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
+    """Dice loss of every prediction with every target. (N, H, W), (K, H, W) -> (N, K)"""
+    preds, targets = preds.flatten(1), targets.flatten(1)
+    overlap = preds @ targets.T
+    return 1 - (2 * overlap + 1) / (preds.sum(-1)[:, None] + targets.sum(-1) + 1)

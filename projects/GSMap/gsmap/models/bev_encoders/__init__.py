@@ -1,1 +1,0 @@
-"""Encoders from camera and LiDAR features to BEV features."""

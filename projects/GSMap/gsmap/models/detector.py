@@ -1,0 +1,152 @@
+"""The detector: cameras (and LiDAR) to BEV features to map elements."""
+
+import logging
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from mmdet3d.models.detectors import Base3DDetector
+from mmdet3d.registry import MODELS
+from mmdet3d.structures import Det3DDataSample
+from mmengine.logging import MMLogger
+from torch import Tensor
+
+from gsmap.checkpoints.strict import adapt_state, neutral_keys
+from gsmap.models.encoders.folded_backbone import FoldedBackbone
+from gsmap.structures.grid import BEVGrid
+
+Inputs = dict[str, Any]
+Samples = Sequence[Det3DDataSample]
+
+
+@MODELS.register_module()
+class MapDetector(Base3DDetector):
+    """Image backbone and neck, BEV encoder, map head; with LiDAR, its encoder and their fusion.
+
+    Parts are configs; a part that a model does not have is None.
+
+    Args:
+        grid: The map: ``x_range`` and ``y_range`` in metres, optionally ``forward``; it reaches
+            encoders, head, masks and coder from here.
+        classes: Names of the classes.
+        map_head: The head.
+        bev_encoder: The cameras' BEV encoder, on backbone and neck.
+        img_backbone: The image backbone.
+        img_neck: The image neck.
+        img_augment: An augmentation of the normalised images in training (GridMask).
+        lidar_encoder: The LiDAR's BEV encoder.
+        bev_fuser: The fusion of both, with cameras and LiDAR.
+        fold_batch_norms: Whether the image backbone runs without gradients as a copy whose batch
+            norms are folded into its convolutions (faster, for a second copy of its weights).
+        strict_loading: Whether a checkpoint must hold every weight, by our names or upstream's, and
+            nothing else; otherwise it is loaded as torch does, by our names.
+
+    Raises:
+        ValueError: If there is neither camera nor LiDAR, or both but no fusion.
+    """
+
+    def __init__(
+        self,
+        grid: dict,
+        classes: Sequence[str],
+        map_head: dict,
+        bev_encoder: dict | None = None,
+        img_backbone: dict | None = None,
+        img_neck: dict | None = None,
+        img_augment: dict | None = None,
+        lidar_encoder: dict | None = None,
+        bev_fuser: dict | None = None,
+        fold_batch_norms: bool = True,
+        strict_loading: bool = True,
+        data_preprocessor: dict | None = None,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(data_preprocessor=data_preprocessor, init_cfg=init_cfg)
+        self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
+        self.folded_backbone = FoldedBackbone() if fold_batch_norms else None
+        self.strict_loading = strict_loading
+        self.img_neck = MODELS.build(img_neck) if img_neck else None
+        self.img_augment = MODELS.build(img_augment) if img_augment else None
+        if not (bev_encoder or lidar_encoder):
+            raise ValueError("a model needs a bev_encoder (cameras), a lidar_encoder or both.")
+        if bool(bev_fuser) != bool(bev_encoder and lidar_encoder):
+            raise ValueError("bev_fuser belongs to a model of cameras and LiDAR, and to no other.")
+        self.grid = BEVGrid(**grid)
+        shared = {"grid": self.grid}
+        self.bev_encoder = MODELS.build({**shared, **bev_encoder}) if bev_encoder else None
+        self.lidar_encoder = MODELS.build({**shared, **lidar_encoder}) if lidar_encoder else None
+        self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
+        self.map_head = MODELS.build({**shared, "classes": classes, **map_head})
+
+    def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
+        """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
+        if self.img_backbone is None:
+            raise ValueError("the model has no img_backbone, so it takes no images.")
+        images = imgs.flatten(0, 1)
+        if self.training and self.img_augment is not None:
+            images = self.img_augment(images)
+        # channels last is what CPU and tensor-core convolutions are fastest with
+        images = images.contiguous(memory_format=torch.channels_last)
+        folded, backbone = self.folded_backbone, self.img_backbone
+        feats = backbone(images) if folded is None else folded(backbone, images)
+        if self.img_neck is not None:
+            feats = self.img_neck(feats)
+        return [feat.unflatten(0, (len(imgs), -1)) for feat in feats]
+
+    def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
+        """Return the BEV encoder's outputs: ``bev_feats`` (B, C, H, W) and what its losses need."""
+        outputs: dict[str, Tensor] = {}
+        if self.bev_encoder is not None:
+            imgs = batch_inputs["imgs"]
+            shape = {"batch_input_shape": tuple(imgs.shape[-2:])}
+            metas = [{**sample.metainfo, **shape} for sample in batch_data_samples]
+            outputs = self.bev_encoder(self.extract_img_feats(imgs), metas)
+        if self.lidar_encoder is not None:
+            feats = self.lidar_encoder(batch_inputs["voxels"], len(batch_data_samples))
+            if self.bev_fuser is not None:
+                feats = self.bev_fuser(outputs["bev_feats"], feats)
+            outputs = {**outputs, "bev_feats": feats}
+        return outputs
+
+    def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
+        """Return all losses; FloatingPointError, with the samples, if one is not finite."""
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        losses = self.map_head.loss(outputs, batch_data_samples)
+        # mmengine reads each loss anyway: no new synchronisation
+        means = torch.stack([loss.detach().float().mean() for loss in losses.values()])
+        finite = torch.isfinite(means).tolist()
+        bad = [name for name, good in zip(losses, finite, strict=True) if not good]
+        if bad:
+            tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
+            raise FloatingPointError(
+                f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
+                "truth, then at the learning rate and at the loss scale of mixed precision."
+            )
+        return losses
+
+    def predict(self, batch_inputs: Inputs, batch_data_samples: Samples) -> list[Det3DDataSample]:
+        """Add ``pred_instances_3d``, as the head's ``predict`` returns them, to the samples."""
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        results = self.map_head.predict(outputs, batch_data_samples)
+        return self.add_pred_to_datasample(batch_data_samples, results)
+
+    def _forward(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
+        """Return the head's raw outputs."""
+        return self.map_head(self.extract_feat(batch_inputs, batch_data_samples))
+
+    def _dump_init_info(self) -> None:
+        """Log how each weight was initialised, which takes hundreds of lines, to debug only."""
+        handlers = MMLogger.get_current_instance().handlers
+        if min(handler.level for handler in handlers) <= logging.DEBUG:
+            super()._dump_init_info()
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        """Accept upstream's names; with ``strict_loading`` ValueError if a key does not match."""
+        if self.strict_loading:
+            own, neutral = self.state_dict(prefix=prefix), neutral_keys(self, prefix)
+            fit = partial(self.map_head.fit_state, prefix=f"{prefix}map_head.")
+            adapt_state(state_dict, own, prefix, neutral, fit)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

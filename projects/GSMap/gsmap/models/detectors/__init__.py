@@ -1,1 +1,0 @@
-"""The detector that joins backbone, BEV encoder and head."""

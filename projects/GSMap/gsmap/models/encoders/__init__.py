@@ -1,0 +1,1 @@
+"""Encoders from camera and LiDAR features to BEV features, and image backbones."""

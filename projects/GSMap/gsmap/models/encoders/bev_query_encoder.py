@@ -1,0 +1,173 @@
+"""BEV encoder with one learned query per cell that attends to the BEV and to the cameras."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from mmdet.models.layers import LearnedPositionalEncoding
+from mmdet3d.registry import MODELS
+from torch import Tensor, nn
+
+from gsmap.models.encoders.camera_encoder import CameraEncoder
+from gsmap.models.encoders.projection import PillarProjection, pillar_points, project_pillars
+from gsmap.models.maptr.attention import BEVDeformableAttention, directional_offsets
+from gsmap.models.maptr.layers import feed_forward, init_matrices
+from gsmap.structures.calibration import NUM_CAN_BUS
+from gsmap.structures.grid import BEVGrid
+
+
+class BEVSelfAttention(BEVDeformableAttention):
+    """BEVFormer's temporal self-attention for a model without history.
+
+    Both entries of the queue are then the current queries, so the values coincide and averaging the
+    two outputs equals one attention over the samples of both with half the weight. ``num_points``
+    are the samples per head and queue entry.
+    """
+
+    num_queue = 2
+
+    def __init__(
+        self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 4, dropout: float = 0.1
+    ) -> None:
+        super().__init__(
+            embed_dims, num_heads, self.num_queue * num_points, 2 * embed_dims, dropout
+        )
+
+    def initial_offsets(self) -> Tensor:
+        """Return the offsets, in cells, the same for each queue entry. (heads, S, 2)"""
+        one = directional_offsets(self.num_heads, self.num_points // self.num_queue)
+        return one.repeat(1, self.num_queue, 1)
+
+    def weights(self, query: Tensor) -> Tensor:
+        """Return a softmax per queue entry, averaged over the queue. (B, Q, heads, S)"""
+        logits = self.attention_weights(query).float()
+        logits = logits.unflatten(-1, (self.num_heads, self.num_queue, -1))
+        return logits.softmax(-1).flatten(-2) / self.num_queue
+
+
+class BEVEncoderLayer(nn.Module):
+    """Self-attention, camera cross-attention and feed-forward, each followed by its LayerNorm.
+
+    ``num_heads`` and ``num_points`` (samples per head and queue entry) are the self-attention's.
+    """
+
+    def __init__(
+        self,
+        cross_attn: dict,
+        embed_dims: int = 256,
+        num_heads: int = 8,
+        num_points: int = 4,
+        ffn_dims: int = 512,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.self_attn = BEVSelfAttention(embed_dims, num_heads, num_points, dropout)
+        self.cross_attn = MODELS.build({"embed_dims": embed_dims, **cross_attn})
+        self.dropout = nn.Dropout(dropout)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
+
+    def forward(
+        self, query: Tensor, query_pos: Tensor, grid: BEVGrid, feats: Tensor, seen: PillarProjection
+    ) -> Tensor:
+        """Update the queries of the grid's cells from image features that have their embeddings.
+
+        (B, Q, C), (1, Q, C), (B, V, C, h, w) and where the pillars fall -> (B, Q, C)
+        """
+        centres = grid.norm_from_metres(grid.pixel_centres(feats.device)).view(1, -1, 2)
+        # Differs from upstream for batches: it pairs the query of sample floor(b / 2) with sample b
+        # here.
+        pair = torch.cat([query, query + query_pos], -1)  # (B, Q, 2 C)
+        bev = query.transpose(1, 2).unflatten(-1, (grid.height, grid.width))  # (B, C, H, W)
+        query = self.norms[0](query + self.self_attn(pair, centres, bev))
+        query = self.norms[1](query + self.dropout(self.cross_attn(query, feats, seen)))
+        return self.norms[2](self.ffn(query))
+
+
+@MODELS.register_module()
+class BEVQueryEncoder(CameraEncoder):
+    """Lift camera features to BEV with a learned query per cell.
+
+    BEVFormer without history, or GKT, according to the camera cross-attention.
+
+    Args:
+        cross_attn: Config of the camera cross-attention of every layer.
+        grid: The map's extent.
+        z_range: Lowest and highest z of the pillars in metres.
+        bev_pixel_m: Side of a cell in metres, or its sizes along x and y.
+        embed_dims: Channels C.
+        num_layers: Number of layers.
+        layer_cfg: Further arguments of :class:`BEVEncoderLayer`.
+        num_cams: Number of cameras V.
+    """
+
+    calibration = ("img_from_frame", "can_bus")
+
+    def __init__(
+        self,
+        cross_attn: dict,
+        grid: BEVGrid,
+        z_range: Sequence[float] = (-2.0, 2.0),
+        bev_pixel_m: float | Sequence[float] = 0.3,
+        embed_dims: int = 256,
+        num_layers: int = 1,
+        layer_cfg: dict | None = None,
+        num_cams: int = 6,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(init_cfg)
+        self.grid = grid.rasterized(bev_pixel_m)
+        self.z_range = (float(z_range[0]), float(z_range[1]))
+        self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)
+        self.positional_encoding = LearnedPositionalEncoding(
+            embed_dims // 2, self.grid.height, self.grid.width
+        )
+        self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))  # only the first is used
+        self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
+        self.can_bus_mlp = nn.Sequential(
+            nn.Linear(NUM_CAN_BUS, embed_dims // 2),
+            nn.ReLU(inplace=True),
+            nn.Linear(embed_dims // 2, embed_dims),
+            nn.ReLU(inplace=True),
+        )
+        self.can_bus_mlp.add_module("norm", nn.LayerNorm(embed_dims))
+        layer = {"cross_attn": cross_attn, "embed_dims": embed_dims, **(layer_cfg or {})}
+        layers = [BEVEncoderLayer(**layer) for _ in range(num_layers)]
+        self.num_heights: int = layers[0].cross_attn.num_heights
+        self.layers = nn.ModuleList(layers)
+        nn.init.normal_(self.level_embeds)
+        nn.init.normal_(self.cams_embeds)
+
+    def init_weights(self) -> None:
+        """Initialise the matrices of the layers (Xavier)."""
+        super().init_weights()
+        init_matrices(self.layers)
+        init_matrices(self.can_bus_mlp)
+
+    def encode(
+        self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
+    ) -> dict[str, Tensor]:
+        """Return ``bev_feats``, from ``img_from_frame`` (B, V, 4, 4) and ``can_bus`` (B, 18).
+
+        ValueError if the number of cameras is not the configured one.
+        """
+        if feats.shape[1] != len(self.cams_embeds):
+            raise ValueError(
+                f"the encoder is built for {len(self.cams_embeds)} cameras, got {feats.shape[1]}."
+            )
+        feats = feats + (self.cams_embeds + self.level_embeds[0])[:, :, None, None].to(feats.dtype)
+        bev_shape = self.grid.height, self.grid.width
+        motion = self.can_bus_mlp(calibration["can_bus"])
+        query = self.bev_embedding.weight[None] + motion[:, None]  # (B, Q, C)
+        query_pos = self.positional_encoding(feats.new_zeros(1, *bev_shape))
+        query_pos = query_pos.flatten(2).transpose(1, 2)  # (1, Q, C)
+        seen = self.project(calibration["img_from_frame"], img_shape)
+        for layer in self.layers:
+            query = layer(query, query_pos, self.grid, feats, seen)
+        return {"bev_feats": query.transpose(1, 2).unflatten(-1, bev_shape)}
+
+    def project(self, img_from_frame: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
+        """Project every cell's pillar into every camera."""
+        # Differs from upstream for batches: it takes the set of seen cells from the first sample
+        # for all.
+        pillars = self.grid, self.z_range, self.num_heights, img_from_frame.device
+        return project_pillars(pillar_points(*pillars), img_from_frame, img_shape)

@@ -1,0 +1,1 @@
+"""GeMap (arXiv 2312.03341): shapes and relations of elements."""

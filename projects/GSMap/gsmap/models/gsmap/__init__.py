@@ -1,0 +1,1 @@
+"""GSMap: elements as ordered Gaussians, supervised as polylines and as masks."""

@@ -1,0 +1,55 @@
+"""How one layer's Gaussians guide where the next looks (GSMap section 3.4)."""
+
+from mmengine.model import constant_init
+from torch import Tensor, nn
+
+from gsmap.models.maptr.layers import mlp
+from gsmap.structures.gaussians import GaussianSpace
+
+
+class GaussianGuidance(nn.Module):
+    """What a decoder layer takes from the Gaussians, for whichever attentions it has.
+
+    Both parts start neutral: the sampling frame is the identity and the embedding zero, so a layer
+    with the weights of a MapTR layer computes what that layer computes. The settings are those of
+    `GaussianDecoderLayer`; ``space`` says how the reference stands for a Gaussian.
+    """
+
+    neutral_keys = ("embedding.",)
+
+    def __init__(
+        self,
+        space: GaussianSpace,
+        embed_dims: int,
+        sampling: bool = True,
+        embedding: bool = True,
+        invariant: bool = False,
+        hidden_dims: int = 16,
+    ) -> None:
+        super().__init__()
+        self.space, self.sampling, self.invariant = space, sampling, invariant
+        self.embedding = mlp(6, hidden_dims, embed_dims) if embedding else None
+        self.init_weights()
+
+    def init_weights(self) -> None:
+        """Make what GSMap adds neutral."""
+        if self.embedding is not None:
+            constant_init(self.embedding[-1], 0.0)
+
+    def position(self, query_pos: Tensor, reference: Tensor) -> Tensor:
+        """Add the embedded Gaussians to the queries' position. (B, Q, C), (B, Q, D) -> (B, Q, C)"""
+        if self.embedding is None:
+            return query_pos
+        return query_pos + self.embedding(self.space.describe(reference))
+
+    def frames(self, reference: Tensor, feats: Tensor) -> Tensor | None:
+        """Return what turns sampling offsets in cells into each Gaussian's frame, or None.
+
+        The matrices (B, Q, 2, 2) of references (B, Q, D) multiply offsets (x, y) in cells of the
+        sampled map (B, C, H, W) from the left.
+        """
+        if not self.sampling:
+            return None
+        cell_m = reference.new_tensor(self.space.grid.resized(*feats.shape[-2:]).pixel_size_m)
+        # The frames act on metres; brought to cells, the identity stays the identity bit by bit.
+        return self.space.frames(reference, self.invariant) * (cell_m / cell_m[:, None])

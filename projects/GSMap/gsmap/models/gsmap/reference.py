@@ -1,0 +1,80 @@
+"""A Gaussian per query as what the decoder's layers refine (GSMap Eqs. 1, 8)."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from mmdet3d.registry import MODELS
+from mmengine.model import constant_init
+from torch import Tensor, nn
+
+from gsmap.models.maptr import layers
+from gsmap.models.maptr.references import PointReference
+from gsmap.structures.gaussians import GaussianSpace
+from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import at_least_float32
+
+
+@MODELS.register_module()
+class GaussianReference(PointReference):
+    """A Gaussian per query: its centre is the point, sigma and theta follow it (GSMap Eq. 1).
+
+    What it adds to points starts neutral: every query has the same Gaussian, every layer leaves it.
+    The points may have a height, the Gaussians lie in the plane. Besides `PointReference`'s:
+
+    Args:
+        mlp: Predict sigma and theta by branches like the points' (GSMap Eq. 8) in place of one
+            linear layer each.
+        space: Settings of `GaussianSpace`: ``min_scale_m`` and so on.
+    """
+
+    fields = PointReference.fields | {"masks", "rasters"}
+    neutral_keys = ("gaussian_init.", "gaussian_branches.")
+
+    def __init__(
+        self,
+        grid: BEVGrid,
+        embed_dims: int = 256,
+        num_layers: int = 6,
+        mlp: bool = False,
+        coords: int = 2,
+        z_range: Sequence[float] | None = None,
+        **space: Any,
+    ) -> None:
+        super().__init__(grid, embed_dims, num_layers, coords, z_range)
+        self.space = GaussianSpace(grid, **space)
+        self.metainfo = {"min_scale_m": self.space.floor_m}
+        self.gaussian_init = nn.Linear(embed_dims, 3)
+        hidden = [embed_dims, embed_dims] if mlp else []
+        self.gaussian_branches = nn.ModuleList(
+            layers.mlp(embed_dims, *hidden, 3) for _ in range(num_layers)
+        )
+        self.reset_gaussian_parts()
+
+    def init_weights(self) -> None:
+        """Initialise as for points; what the Gaussians add starts neutral."""
+        super().init_weights()
+        self.reset_gaussian_parts()
+
+    def reset_gaussian_parts(self) -> None:
+        """Let every query start with the same Gaussian, and every layer leave it as it is."""
+        constant_init(self.gaussian_init, 0.0)
+        for branch in self.gaussian_branches:
+            *_, last = branch.children()
+            constant_init(last, 0.0)
+
+    def start(self, query_pos: Tensor) -> Tensor:
+        """Return the Gaussians that the first layer starts from. (..., C) -> (..., D)"""
+        shapes = at_least_float32(self.gaussian_init(query_pos))
+        return torch.cat([super().start(query_pos), shapes], -1)
+
+    def offsets(self, layer: int, states: Tensor) -> Tensor:
+        """Return a layer's change of the Gaussians (Eq. 8). (..., C) -> (..., D)"""
+        shapes = at_least_float32(self.gaussian_branches[layer](states))
+        return torch.cat([super().offsets(layer, states), shapes], -1)
+
+    def decode(self, references: Tensor) -> dict[str, Tensor]:
+        """Add the Gaussians' ``scales`` (N, P, 2) in metres and ``rotations`` (N, P) in radians."""
+        gaussians = self.space.decode(references)
+        shapes = {"scales": gaussians.scales, "rotations": gaussians.rotations}
+        return super().decode(references) | shapes

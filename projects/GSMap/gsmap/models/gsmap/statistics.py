@@ -1,0 +1,41 @@
+"""Figures of matched Gaussians that are logged beside the losses."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsmap.structures.gaussians import AT_FLOOR, Gaussians, extents_along_line
+
+
+@torch.no_grad()
+def gaussian_statistics(
+    gaussians: Gaussians,
+    rendered: Tensor,
+    masks: Tensor,
+    labels: Tensor,
+    class_names: Sequence[str],
+    floor_m: float,
+) -> dict[str, Tensor]:
+    """Summarise matched elements by class; a class without one is left out.
+
+    Gaussians of the predictions (M, P), their masks, those of their ground truths (M, H, W), and
+    classes (M,); ``floor_m`` is the smallest sigma in metres. Scalars: per class
+    ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>`` (medians in
+    metres); of all ``at_floor``, the share of Gaussians whose sigmas both lie within 10 % of it.
+    """
+    if not len(labels):
+        return {}
+    overlap = torch.minimum(rendered, masks).sum((1, 2))
+    union = rendered.sum((1, 2)) + masks.sum((1, 2)) - overlap
+    iou = overlap / union.clamp(min=1e-6)
+    extents = extents_along_line(gaussians)  # (M, P, 2)
+    figures = {}
+    for label, name in enumerate(class_names):
+        chosen = labels == label
+        if chosen.any():
+            along, across = extents[chosen].flatten(0, 1).median(0).values
+            figures[f"soft_iou/{name}"] = iou[chosen].mean()
+            figures[f"sigma_along/{name}"], figures[f"sigma_across/{name}"] = along, across
+    at_floor = (gaussians.scales < AT_FLOOR * floor_m).all(-1)
+    return {**figures, "at_floor": at_floor.float().mean()}

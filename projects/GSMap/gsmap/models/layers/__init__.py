@@ -1,1 +1,0 @@
-"""BEV encoders and decoders."""

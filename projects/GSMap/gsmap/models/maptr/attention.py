@@ -1,0 +1,185 @@
+"""Self-attention of point queries, and deformable attention over one feature map.
+
+A self-attention is made of ``embed_dims`` channels C, ``num_heads``, ``num_points`` per instance P
+and a ``dropout``. It takes point queries, instance after instance (B, N * P, C), their position,
+and a mask, True where an instance may not attend to another (N, N) or None. It returns the queries
+with its residual; the layer normalises them.
+"""
+
+import math
+
+import torch
+from mmcv.ops import get_compiling_cuda_version
+from mmcv.ops.multi_scale_deform_attn import MultiScaleDeformableAttnFunction
+from mmdet3d.registry import MODELS
+from mmengine.model import constant_init, xavier_init
+from torch import Tensor, nn
+
+from gsmap.ops.deformable_sampling import bilinear_cells, deformable_sample, sum_rows
+from gsmap.structures.tensors import at_least_float32
+
+_IM2COL_STEP = 64
+_CORNERS = 4
+
+
+def has_compiled_op(value: Tensor) -> bool:
+    """Return whether mmcv's compiled deformable attention can run on a tensor."""
+    return value.is_cuda and get_compiling_cuda_version() != "not available"
+
+
+def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor) -> Tensor:
+    """Do what `deformable_sample` does, by mmcv's compiled op on a GPU where it was built."""
+    if not has_compiled_op(value):
+        return deformable_sample(value, shape, locations, weights)
+    shapes = torch.tensor([shape], device=value.device)
+    samples = locations[:, :, :, None].contiguous(), weights[:, :, :, None].contiguous()
+    arguments = value.contiguous(), shapes, shapes.new_zeros(1), *samples, _IM2COL_STEP
+    return MultiScaleDeformableAttnFunction.apply(*arguments)
+
+
+def place_samples(
+    offsets: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None = None
+) -> Tensor:
+    """Place samples around reference points, (x, y) in [0, 1] over the map. (B, Q, heads, S, 2)
+
+    Offsets are in cells (B, Q, heads, S, 2), turned by the frames (B, Q, 2, 2) if there are any;
+    the reference's (B, Q, D) first two entries are the point; ``shape`` is rows and columns.
+    """
+    if frames is not None:
+        offsets = torch.sum(frames[:, :, None, None] * offsets[..., None, :], -1)
+    size = offsets.new_tensor([shape[1], shape[0]])
+    return reference[:, :, None, None, :2] + offsets / size
+
+
+class SamplingAttention(nn.Module):
+    """The learned parts of deformable attention on one map.
+
+    They are those of mmcv's ``MultiScaleDeformableAttention`` for one level.
+
+    Args:
+        embed_dims: Channels C of map and output; ValueError if ``num_heads`` does not divide them.
+        num_heads: Number of heads.
+        num_points: Samples per head and query, S.
+        query_dims: Channels of the query; None means ``embed_dims``.
+        dropout: Dropout on the output.
+    """
+
+    def __init__(
+        self,
+        embed_dims: int = 256,
+        num_heads: int = 8,
+        num_points: int = 4,
+        query_dims: int | None = None,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        if embed_dims % num_heads:
+            raise ValueError(
+                f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
+            )
+        query_dims = query_dims or embed_dims
+        self.num_heads, self.num_points = num_heads, num_points
+        self.sampling_offsets = nn.Linear(query_dims, num_heads * num_points * 2)
+        self.attention_weights = nn.Linear(query_dims, num_heads * num_points)
+        self.value_proj = nn.Linear(embed_dims, embed_dims)
+        self.output_proj = nn.Linear(embed_dims, embed_dims)
+        self.dropout = nn.Dropout(dropout)
+        self.init_weights()
+
+    def init_weights(self) -> None:
+        """Let each head look in its own direction, with equal weights."""
+        constant_init(self.sampling_offsets, 0.0)
+        self.sampling_offsets.bias.data = self.initial_offsets().flatten()
+        constant_init(self.attention_weights, 0.0)
+        xavier_init(self.value_proj, distribution="uniform")
+        xavier_init(self.output_proj, distribution="uniform")
+
+    def initial_offsets(self) -> Tensor:
+        """Return the offsets, in cells, that every query starts with. (heads, S, 2)"""
+        return directional_offsets(self.num_heads, self.num_points)
+
+    def offsets_in_cells(self, query: Tensor) -> Tensor:
+        """Return the learned offsets (x, y) in cells. (B, Q, heads, S, 2)"""
+        offsets = at_least_float32(self.sampling_offsets(query))
+        return offsets.unflatten(-1, (self.num_heads, self.num_points, 2))
+
+    def weights(self, query: Tensor) -> Tensor:
+        """Return the attention weights, of sum one over a head's points. (B, Q, heads, S)"""
+        logits = at_least_float32(self.attention_weights(query))
+        return logits.unflatten(-1, (self.num_heads, self.num_points)).softmax(-1)
+
+    def values(self, tokens: Tensor) -> Tensor:
+        """Return a map's projected cells by head. (..., cells, C) -> (..., cells, heads, C')"""
+        return at_least_float32(self.value_proj(tokens)).unflatten(-1, (self.num_heads, -1))
+
+
+@MODELS.register_module()
+class BEVDeformableAttention(SamplingAttention):
+    """Multi-head deformable attention on one map; the residual is left to the caller.
+
+    Its arguments are those of :class:`SamplingAttention`.
+    """
+
+    def forward(
+        self, query: Tensor, reference: Tensor, feats: Tensor, frames: Tensor | None = None
+    ) -> Tensor:
+        """Sample the map (B, C, H, W) for each query. (B, Q, C) -> (B, Q, C)
+
+        Queries have their position; references and frames are as in `place_samples`.
+        """
+        shape = (feats.shape[-2], feats.shape[-1])
+        tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)
+        locations = place_samples(self.offsets_in_cells(query), reference, shape, frames)
+        weights = self.weights(query)
+        # Projection and sampling commute: projecting after it pays when few cells are looked at.
+        few = weights.numel() * _CORNERS < tokens[..., 0].numel() * self.num_heads
+        if few and not has_compiled_op(tokens):
+            sampled = self._sample_then_project(tokens, shape, locations, weights)
+        else:
+            sampled = sample_map(self.values(tokens), shape, locations, weights)
+        return self.dropout(self.output_proj(sampled))
+
+    def _sample_then_project(
+        self, tokens: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor
+    ) -> Tensor:
+        """Return what sampling the projected map would, by projecting each head's sample."""
+        cells, cell_weights = bilinear_cells(locations, weights, shape)
+        sample = torch.arange(len(tokens), device=tokens.device).view(-1, 1, 1, 1)
+        table = at_least_float32(tokens).reshape(-1, tokens.shape[-1])
+        sampled = sum_rows(table, sample * tokens.shape[1] + cells, cell_weights)
+        weight = self.value_proj.weight.unflatten(0, (self.num_heads, -1))  # (heads, C', C)
+        bias = self.value_proj.bias.view(self.num_heads, -1)
+        projected = torch.einsum("bqhc,hdc->bqhd", sampled, weight)
+        return (projected + cell_weights.sum(-1, keepdim=True) * bias).flatten(2)  # (B, Q, C)
+
+
+def directional_offsets(num_heads: int, num_points: int) -> Tensor:
+    """Return offsets with the heads spread over a square, sample s at s + 1. (heads, S, 2)"""
+    angles = torch.arange(num_heads, dtype=torch.float32) * (2 * math.pi / num_heads)
+    directions = torch.stack([angles.cos(), angles.sin()], -1)
+    directions = directions / directions.abs().amax(-1, keepdim=True)
+    steps = torch.arange(1, num_points + 1, dtype=torch.float32)
+    return directions[:, None] * steps[:, None]
+
+
+@MODELS.register_module()
+class PointSelfAttention(nn.MultiheadAttention):
+    """One attention over all points of all instances (MapTR)."""
+
+    def __init__(
+        self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 20, dropout: float = 0.1
+    ) -> None:
+        super().__init__(embed_dims, num_heads, dropout, batch_first=True)
+        self.num_points = num_points
+        self.output_dropout = nn.Dropout(dropout)
+
+    def forward(  # type: ignore[override]
+        self, query: Tensor, query_pos: Tensor, attn_mask: Tensor | None = None
+    ) -> Tensor:
+        """Let all points attend to each other. (B, N * P, C) -> (B, N * P, C)"""
+        if attn_mask is not None:
+            attn_mask = attn_mask.repeat_interleave(self.num_points, 0)
+            attn_mask = attn_mask.repeat_interleave(self.num_points, 1)
+        key = query + query_pos
+        attended = super().forward(key, key, query, attn_mask=attn_mask, need_weights=False)[0]
+        return query + self.output_dropout(attended)

@@ -1,0 +1,41 @@
+"""The small networks that turn states into predictions, codes and embeddings."""
+
+from itertools import pairwise
+
+from mmcv.cnn.bricks.transformer import FFN
+from torch import nn
+
+
+def mlp(*dims: int) -> nn.Sequential:
+    """Return matrices from each number of channels to the next, with ReLUs in between.
+
+    The ReLUs are not in place: a matrix returns a view of its result, and a change of a view in
+    place costs zeros and two copies in the backward pass.
+    """
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(dims):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def feed_forward(embed_dims: int, ffn_dims: int, dropout: float) -> FFN:
+    """Return mmcv's feed-forward network with its residual; its ReLU as in `mlp`."""
+    return FFN(embed_dims, ffn_dims, act_cfg={"type": "ReLU"}, ffn_drop=dropout)
+
+
+def classification_branch(embed_dims: int, num_classes: int) -> nn.Sequential:
+    """Return a classifier of two hidden layers, each with LayerNorm; it gives logits."""
+    layers: list[nn.Module] = []
+    for _ in range(2):
+        layers += [nn.Linear(embed_dims, embed_dims), nn.LayerNorm(embed_dims), nn.ReLU(True)]
+    return nn.Sequential(*layers, nn.Linear(embed_dims, num_classes))
+
+
+_SAMPLING_WEIGHTS = ("sampling_offsets.weight", "attention_weights.weight")
+
+
+def init_matrices(module: nn.Module) -> None:
+    """Initialise all matrices of a transformer (Xavier) but those that place and weigh samples."""
+    for name, parameter in module.named_parameters():
+        if parameter.dim() > 1 and not name.endswith(_SAMPLING_WEIGHTS):
+            nn.init.xavier_uniform_(parameter)

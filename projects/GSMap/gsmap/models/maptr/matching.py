@@ -1,0 +1,114 @@
+"""Assignment of predictions to annotated map elements, and MapTR's cost of points."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from mmdet3d.registry import TASK_UTILS
+from mmengine.structures import InstanceData
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+
+class MapMatch(NamedTuple):
+    """Matched pairs of one sample, sorted by query. (M,) each"""
+
+    query_inds: Tensor
+    gt_inds: Tensor  # the ground truth of each
+    order_inds: Tensor  # the closest equivalent point order of that ground truth
+
+
+class MapAssigner:
+    """Hungarian assignment under summed costs, then each pair's point order (MapTR Eqs. 3-5).
+
+    Args:
+        match_costs: Configs of the costs. Each is called with predictions, ground truth and the
+            meta dict and returns (N, K).
+
+    Raises:
+        ValueError: If there is no cost.
+    """
+
+    def __init__(self, match_costs: Sequence[dict[str, Any]]) -> None:
+        if not match_costs:
+            raise ValueError("match_costs must hold at least one cost.")
+        self.match_costs = [TASK_UTILS.build(cost) for cost in match_costs]
+
+    @torch.no_grad()
+    def assign(
+        self,
+        pred_instances: InstanceData,
+        gt_instances: InstanceData,
+        img_meta: dict[str, Any] | None = None,
+        repeats: int = 1,
+    ) -> MapMatch:
+        """Match each ground truth to ``repeats`` predictions: min(N, K * repeats) pairs.
+
+        Predictions have ``scores``, logits (N, classes), ``pts`` normalised (N, P, 2), ground
+        truths ``labels`` (K,), ``pts_shifts`` normalised (K, S, P, 2), and both what further costs
+        read. The meta dict's ``token`` names the sample in errors.
+
+        Raises:
+            FloatingPointError: If a cost (or, without ground truth, a score) is not finite.
+        """
+        device = pred_instances.scores.device
+        if len(gt_instances) == 0:
+            self._check_finite(pred_instances.scores, "class scores", img_meta)
+            return MapMatch(*(torch.empty(0, dtype=torch.long, device=device) for _ in range(3)))
+        costs = [cost(pred_instances, gt_instances, img_meta) for cost in self.match_costs]
+        total = torch.stack([cost.float() for cost in costs]).cpu()  # (costs, N, K)
+        for cost, values in zip(self.match_costs, total, strict=True):
+            self._check_finite(values, type(cost).__name__, img_meta)
+        rows, cols = linear_sum_assignment(np.tile(total.sum(0).numpy(), repeats))
+        queries = torch.from_numpy(rows).to(device)
+        gts = torch.from_numpy(cols % len(gt_instances)).to(device)
+        offsets = pred_instances.pts[queries, None] - gt_instances.pts_shifts[gts]  # (M, S, P, 2)
+        return MapMatch(queries, gts, offsets.abs().sum((-1, -2)).argmin(-1))
+
+    @staticmethod
+    def _check_finite(values: Tensor, what: str, img_meta: dict[str, Any] | None) -> None:
+        """Refuse values that the assignment cannot order."""
+        if not torch.isfinite(values).all():
+            token = (img_meta or {}).get("token", "unknown")
+            raise FloatingPointError(
+                f"{what} of sample {token!r} is not finite before the assignment: look at the "
+                "sample's images and ground truth, then at the learning rate and at the loss scale "
+                "of mixed precision."
+            )
+
+
+def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
+    """Return the summed L1 distance of every prediction to every order of every ground truth.
+
+    ValueError if the numbers of points differ. (N, P, 2), (K, S, P, 2) -> (N, K, S)
+    """
+    if pts.shape[-2:] != pts_shifts.shape[-2:]:
+        raise ValueError(
+            f"predictions of {tuple(pts.shape[-2:])} points and ground truth of "
+            f"{tuple(pts_shifts.shape[-2:])} do not fit: set the same number of points in the head "
+            "and in the pipeline."
+        )
+    num_gts, num_orders = pts_shifts.shape[:2]
+    distances = torch.cdist(pts.flatten(1), pts_shifts.flatten(0, 1).flatten(1), p=1)
+    return distances.view(len(pts), num_gts, num_orders)
+
+
+@TASK_UTILS.register_module()
+class OrderedPointsCost:
+    """L1 distance to the closest equivalent point order (MapTR Eq. 5).
+
+    Args:
+        weight: Weight of the cost.
+    """
+
+    reads = ("pred.pts", "gt.pts_shifts")
+
+    def __init__(self, weight: float = 5.0) -> None:
+        self.weight = weight
+
+    def __call__(
+        self, pred_instances: InstanceData, gt_instances: InstanceData, img_meta: Any = None
+    ) -> Tensor:
+        """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
+        return order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1) * self.weight

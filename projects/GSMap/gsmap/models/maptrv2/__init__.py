@@ -1,0 +1,1 @@
+"""MapTRv2 (arXiv 2308.05736): decoupled self-attention, auxiliary heads."""

@@ -1,0 +1,41 @@
+"""MapVR's matching cost."""
+
+from typing import Any
+
+import torch
+from mmdet3d.registry import TASK_UTILS
+from mmengine.structures import InstanceData
+from torch import Tensor
+
+from gsmap.models.mapvr.losses import ElementRenderer
+from gsmap.ops.soft_iou import pairwise_dice_loss
+
+
+@TASK_UTILS.register_module()
+class RenderedDiceCost:
+    """Dice loss of softly rendered points, each pair rendered as the ground truth's class (MapVR).
+
+    Args:
+        weight: Weight of the cost.
+        size: Rows H and columns W of the rasters.
+        rendering: Further settings of `ElementRenderer`.
+    """
+
+    reads = ("pred.pts", "gt.first_pts", "gt.labels")
+
+    def __init__(
+        self, weight: float = 10.0, size: tuple[int, int] = (128, 64), **rendering: Any
+    ) -> None:
+        self.weight = weight
+        self.renderer = ElementRenderer(size, **rendering)
+
+    def __call__(
+        self, pred_instances: InstanceData, gt_instances: InstanceData, img_meta: Any = None
+    ) -> Tensor:
+        """Compare ``pts`` (N, P, 2) with ``first_pts`` (K, P, 2) of ``labels`` (K,). (N, K)"""
+        preds, is_polygon = pred_instances.pts, self.renderer.is_polygon(gt_instances.labels)
+        targets = self.renderer.render(gt_instances.first_pts, is_polygon)
+        lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
+        as_lines = pairwise_dice_loss(self.renderer.render(preds, lines), targets)
+        as_polygons = pairwise_dice_loss(self.renderer.render(preds, ~lines), targets)
+        return self.weight * torch.where(is_polygon, as_polygons, as_lines)

@@ -1,0 +1,1 @@
+"""MGMapNet (arXiv 2410.07733): instance and point queries."""

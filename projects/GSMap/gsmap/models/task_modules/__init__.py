@@ -1,1 +1,0 @@
-"""Matching of predicted to ground-truth map elements."""

@@ -1,0 +1,66 @@
+import pytest
+import torch
+from head_cases import HEAD, LANES, along_y, bev, build_head, elements, with_layer
+
+from gsmap.models.gemap.attention import GeometryDecoupledAttention
+from gsmap.models.gemap.losses import EuclideanLoss
+from gsmap.models.maptrv2.attention import DecoupledSelfAttention
+
+GEMAP = {**HEAD, "type": "GeMapHead"}
+MAPTRV2 = {
+    **HEAD,
+    "decoder": with_layer(HEAD, self_attn={"type": "DecoupledSelfAttention"}),
+    "query_groups": [{"num": 4}, {"name": "one2many", "num": 6, "repeats": 2}],
+}
+
+
+@pytest.mark.parametrize("base", [HEAD, MAPTRV2], ids=["maptr", "maptrv2"])
+def test_gemap_is_its_attention_and_its_loss_on_either_base(base):
+    head = build_head(base, type="GeMapHead")
+    assert isinstance(head.decoder.layers[1].self_attn, GeometryDecoupledAttention)
+    assert list(head.losses) == ["pts", "dir", "euclidean"]
+    assert [group.num for group in head.query_groups] == [4]
+    outputs = head(bev(2))
+    losses = head.loss_by_feat(outputs, [LANES, elements(*along_y(-5, 0, 5))], [{}, {}])
+    assert {f"{layer}loss_euclidean" for layer in ("", "d0.")} <= set(losses)
+
+
+def test_the_loss_compares_relations_within_each_sample_only():
+    """The whole batch's loss is its shapes' mean and the samples' relations, added up."""
+    head = build_head(GEMAP)
+    outputs, truths = head(bev(2)), [LANES, elements(*along_y(-5, 0, 5))]
+    actual = head.loss_by_feat(outputs, truths, [{}, {}])["loss_euclidean"]
+    gts = [head.prepare_gt(truth) for truth in truths]
+    ((_, own),) = head.split_groups(outputs)
+    predictions = head.layer_predictions(own, 1)
+    pairs = head.match(predictions, gts, [{}, {}])
+    matched = [p.pts[m.query_inds] for p, m in zip(predictions, pairs.matches, strict=True)]
+    expected = EuclideanLoss()(torch.cat(matched), pairs["gt.pts"], [2, 3])
+    torch.testing.assert_close(actual, expected)
+    assert not torch.isclose(expected, EuclideanLoss()(torch.cat(matched), pairs["gt.pts"], [5]))
+
+
+def test_parts_of_gemap_can_be_left_out():
+    head = build_head(MAPTRV2, type="GeMapHead", decoupled=False, loss_euclidean=None)
+    assert isinstance(head.decoder.layers[0].self_attn, DecoupledSelfAttention)
+    assert list(head.losses) == ["pts", "dir"]
+    groups = [{"num": 4}, {"name": "more", "num": 6, "losses": ("cls", "pts")}]
+    both = build_head(GEMAP, query_groups=groups, one_to_many=True)
+    losses = both.loss_by_feat(both(bev()), [LANES], [{}])
+    assert "loss_euclidean" in losses
+    assert "loss_pts_more" in losses
+    assert "loss_euclidean_more" not in losses
+
+
+def test_settings_of_gemaps_attention_are_kept():
+    attention = {"type": "GeometryDecoupledAttention", "ffn_dims": 24}
+    head = build_head(GEMAP, decoder=with_layer(HEAD, self_attn=attention))
+    assert head.decoder.layers[0].self_attn.intra.ffn[0].out_features == 24
+
+
+def test_no_ground_truth_gives_only_a_classification_loss():
+    head = build_head(GEMAP)
+    losses = head.loss_by_feat(head(bev()), [elements()], [{}])
+    assert losses["loss_cls"] > 0
+    assert losses["loss_euclidean"] == losses["loss_pts"] == 0
+    sum(losses.values()).backward()

@@ -1,0 +1,117 @@
+"""Masks of elements: their sizes, their pixels, and that they fit the points beside them."""
+
+import numpy as np
+import pytest
+import torch
+from head_cases import ALONG_Y, elements
+
+import gsmap.registered  # noqa: F401
+from gsmap.datasets.annotations.record import MapInstance
+from gsmap.datasets.transforms.map_targets import map_targets
+from gsmap.models.gsmap.losses import RasterLoss
+from gsmap.models.maptr.masks import ElementMasks
+from gsmap.ops.gaussian_raster import render_gaussians
+from gsmap.structures.gaussians import GaussianSpace
+from gsmap.structures.grid import BEVGrid
+
+
+def grid_of(x_m: float, y_m: float) -> BEVGrid:
+    return BEVGrid((-x_m / 2, x_m / 2), (-y_m / 2, y_m / 2))
+
+
+@pytest.mark.parametrize(
+    ("extent", "pixel_m", "size", "cost_size"),
+    [
+        ((60, 30), None, (100, 200), (64, 128)),
+        ((30, 60), 0.3, (200, 100), (128, 64)),
+        ((100, 50), None, (100, 200), (64, 128)),
+        ((100, 50), 0.25, (200, 400), (64, 128)),
+        ((200, 100), 0.5, (200, 400), (64, 128)),
+        ((30, 60), (0.3, 0.5), (120, 100), (128, 64)),
+    ],
+)
+def test_sizes_follow_from_extent_and_pixel(extent, pixel_m, size, cost_size):
+    masks = ElementMasks(grid_of(*extent), pixel_m=pixel_m)
+    assert (masks.grid.height, masks.grid.width) == size
+    assert (masks.cost_grid.height, masks.cost_grid.width) == cost_size
+    assert masks.half_pixel_m == pytest.approx(max(masks.grid.pixel_size_m) / 2)
+
+
+@pytest.mark.parametrize("name", ["pixel_m", "cost_pixel_m"])
+def test_pixels_that_do_not_divide_the_extent_are_refused(name):
+    with pytest.raises(ValueError, match=r"pixels of 0.7 x 0.7 m do not divide .* 30 x 60 m"):
+        ElementMasks(ALONG_Y, **{name: 0.7})
+
+
+def test_lines_are_bands_and_chosen_classes_are_filled():
+    square = torch.tensor([[0.0, 0], [6, 0], [6, 6], [0, 6], [0, 0]]).repeat(2, 1, 1)
+    labels = torch.tensor([0, 1])
+    masks = ElementMasks(ALONG_Y, filled_classes=(1,))
+    line, area = masks.draw(square, labels, masks.grid).sum((1, 2)) * 0.3**2
+    assert line.item() == pytest.approx(24 * 0.75, rel=0.05)
+    assert area.item() == pytest.approx(36, rel=0.05)
+    both = ElementMasks(ALONG_Y).draw(square, labels, masks.grid)
+    assert torch.equal(both[0], both[1])
+
+
+def test_the_ground_truth_is_drawn_at_full_resolution_or_from_its_points():
+    gt = elements(((-3, -20), (-3, 20)))
+    gt.polylines = torch.tensor([[[-3.0, -20], [3, 0], [-3, 20]]])  # what five points do not show
+    full, points = (ElementMasks(ALONG_Y, source=source) for source in ("full", "points"))
+    labels = gt.labels_3d
+    assert torch.equal(full.draw_sample(gt, full.grid), full.draw(gt.polylines, labels, full.grid))
+    assert torch.equal(points.draw_sample(gt, full.grid), full.draw(gt.pts, labels, full.grid))
+
+
+def test_targets_without_polylines_are_named():
+    gt = elements(((-3, -20), (-3, 20)))
+    del gt.polylines
+    masks = ElementMasks(ALONG_Y)
+    with pytest.raises(ValueError, match=r"'full' need gt_instances_3d.polylines: .*FormatMapT"):
+        masks.draw_sample(gt, masks.grid)
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    """A crossing of 12 x 3.5 m whose matched order starts at the corner opposite to the first."""
+    corners = np.array([[-6.0, 0], [6, 0.5], [6, 4], [-6, 3.5], [-6, 0]])
+    gt = map_targets([MapInstance(1, corners)], 20, ALONG_Y.x_range, ALONG_Y.y_range)
+    matched = gt.pts_shifts[:, 2]
+    assert (matched[0, 0] - gt.pts[0, 0]).norm() > 12
+    return gt, matched
+
+
+def fit(target_pts: torch.Tensor, mask: torch.Tensor, masks: ElementMasks) -> float:
+    """Fit Gaussians to points (L1) and to a mask; return how far off a centre ends, in metres."""
+    space = GaussianSpace(ALONG_Y, min_scale_m=masks.half_pixel_m)
+    target = ALONG_Y.norm_from_metres(target_pts)
+    centres = target.clone().requires_grad_()
+    shapes = torch.zeros(1, 20, 3, requires_grad=True)
+    rates = [{"params": [centres], "lr": 4e-3}, {"params": [shapes], "lr": 0.1}]
+    optimizer = torch.optim.Adam(rates)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 60)
+    raster = RasterLoss(loss_weight=10.0)
+    for _ in range(60):
+        rendered = render_gaussians(*space.decode(torch.cat([centres, shapes], -1)), masks.grid)
+        loss = 5 * (centres - target).abs().sum() + raster(rendered, mask)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    off = ALONG_Y.metres_from_norm(centres.detach()) - target_pts
+    return off.norm(dim=-1).max().item()
+
+
+def test_a_crossings_mask_fits_its_points_whichever_order_is_matched(crossing):
+    gt, matched = crossing
+    masks = ElementMasks(ALONG_Y)
+    full, own = masks.draw_sample(gt, masks.grid), masks.draw(matched, gt.labels_3d, masks.grid)
+    assert fit(matched, full, masks) < 0.2
+    assert fit(matched, own, masks) < 0.2  # source='points'
+
+
+def test_the_mask_of_another_order_would_pull_centres_off_their_points(crossing):
+    gt, matched = crossing
+    masks = ElementMasks(ALONG_Y)
+    first = masks.draw(gt.pts, gt.labels_3d, masks.grid)
+    assert fit(matched, first, masks) > 0.5

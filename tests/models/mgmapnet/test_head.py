@@ -1,0 +1,146 @@
+"""MGMapNet's head: what it adds to a config, what its losses read, and Gaussians on its decoder."""
+
+import pytest
+import torch
+from head_cases import GSMAP, HEAD, MASKS, C, N, P, along_y, bev, build_head, elements, losses_of
+from mmdet3d.structures import Det3DDataSample
+
+from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
+
+FURTHER = {"name": "one2many", "num": 6, "repeats": 3}
+BEV = {"bev_feats": torch.randn(1, C, 8, 4, generator=torch.Generator().manual_seed(2))}
+MGMAP = {
+    **HEAD,
+    "type": "MGMapHead",
+    "query_groups": [{"num": N}, FURTHER],
+    "masks": {"pixel_m": 3.75},  # 16 x 8, twice as fine as the features
+}
+LANES = elements(*along_y(-3, 4), labels=[0, 2])
+NAMES = ["pts", "dir", "mean_loc", "ins_seg"]
+
+
+def losses(head, gt=LANES, batch=1):
+    feats = {"bev_feats": BEV["bev_feats"].expand(batch, -1, -1, -1)}
+    return head.loss_by_feat(head.train()(feats), [gt] * batch, [{"token": "a"}] * batch)
+
+
+def test_one_word_makes_mgmapnet_of_any_head():
+    decoupled = {"self_attn": {"type": "DecoupledSelfAttention"}, "cross_attn": {"num_points": 3}}
+    layer = {**HEAD["decoder"]["layer"], **decoupled}
+    head = build_head(MGMAP, decoder={"num_layers": 2, "layer": layer})
+    assert isinstance(head.decoder, MGMapNetDecoder)
+    assert list(head.losses) == NAMES
+    assert head.pts_embedding is None
+    assert head.masks.line_width_m == 3 * 3.75
+    attention = {"p2i": False, "num_samples": 3}
+    own = {"type": "MGMapNetDecoder", "num_layers": 1, "layer": {"cross_attn": attention}}
+    own["layer"]["num_heads"] = 4
+    assert build_head(MGMAP, decoder=own).decoder.layers[0].cross_attn.p2i is None
+
+
+def test_outputs_by_instance_and_by_point():
+    head = build_head(MGMAP)
+    outputs = head.train()(BEV)
+    num = N + FURTHER["num"]
+    assert outputs["all_cls_scores"].shape == (2, 1, num, 3)
+    assert outputs["all_pts_preds"].shape == (2, 1, num, P, 2)
+    assert outputs["all_mean_locations"].shape == (2, 1, num, P, 2)
+    assert outputs["all_instance_states"].shape == (2, 1, num, C)
+    assert head.eval()(BEV)["all_mean_locations"].shape == (2, 1, N, P, 2)
+
+
+def test_the_classes_come_from_the_instance_states():
+    head = build_head(MGMAP).eval()
+    outputs = head(BEV)
+    expected = head.cls_branches[1](outputs["all_instance_states"][1])
+    torch.testing.assert_close(outputs["all_cls_scores"][1], expected)
+
+
+def test_other_decoders_offer_the_mean_of_their_points_as_instance_states():
+    head = build_head(HEAD).eval()
+    outputs = head(bev())
+    means = outputs["states"].unflatten(2, (-1, P)).mean(3)
+    assert torch.equal(outputs["all_instance_states"], means)
+    part = {"type": "InstanceMaskLoss", "embed_dims": C}
+    head = build_head(HEAD, losses=[*HEAD["losses"], part], masks={"pixel_m": 3.0})
+    assert losses_of(head.train(), LANES)["loss_ins_seg"] > 0
+
+
+def test_masks_of_instances_belong_to_the_last_layer_of_the_queries_that_predict():
+    found = losses(build_head(MGMAP))
+    layers = {name for name in found if "ins_seg" in name}
+    assert layers == {"loss_ins_seg"}
+    for prefix in ("", "d0."):
+        assert {f"{prefix}loss_mean_loc", f"{prefix}loss_mean_loc_one2many"} <= set(found)
+
+
+@pytest.mark.parametrize("gt", [elements(), LANES], ids=["none", "two"])
+def test_every_parameter_is_trained(gt):
+    seg = [{"type": "BEVMaskHead", "num_masks": 3}, {"type": "NormedPVMaskHead", "num_masks": 3}]
+    head = build_head(MGMAP, aux_heads=seg).train()
+    sample = Det3DDataSample(metainfo={"token": "a"})
+    sample.gt_instances_3d = gt
+    sample.gt_seg, sample.gt_pv_seg = torch.zeros(3, 8, 4), torch.zeros(2, 3, 3, 4)
+    found = head.loss({**BEV, "img_feats": bev()["img_feats"]}, [sample])
+    sum(value for name, value in found.items() if "loss" in name).backward()
+    assert [name for name, p in head.named_parameters() if p.grad is None] == []
+    assert all(p.grad.isfinite().all() for p in head.parameters())
+
+
+def test_instance_masks_learn_the_lane_of_their_own_sample():
+    head = build_head(MGMAP, loss_ins_seg={"loss_weight": 1.0, "dice_weight": 0.0})
+    optimizer = torch.optim.Adam(head.losses["ins_seg"].parameters(), 0.1)
+    first = losses(head)["loss_ins_seg"]
+    for _ in range(20):
+        loss = losses(head)["loss_ins_seg"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert loss < 0.7 * first
+
+
+def test_parts_of_mgmapnet_can_be_left_out():
+    head = build_head(MGMAP, loss_mean_loc=None, loss_ins_seg=None)
+    assert list(head.losses) == ["pts", "dir"]
+    released = build_head(MGMAP, loss_ins_seg={"pairing": "released"})
+    assert released.losses["ins_seg"].pairing == "released"
+    assert released.losses["ins_seg"].loss_weight == 3.0
+
+
+def test_prediction_has_the_fields_of_any_head():
+    sample = Det3DDataSample(metainfo={"token": "a"})
+    (result,) = build_head(MGMAP).eval().predict(BEV, [sample])
+    assert result.pts.shape[1:] == (P, 2)
+    assert set(result.keys()) == {"pts", "scores_3d", "labels_3d"}
+
+
+def test_gaussians_on_mgmapnets_decoder():
+    layer = HEAD["decoder"]["layer"]
+    decoder = {"type": "MGMapNetDecoder", "num_layers": 2, "layer": layer}
+    parts = [*HEAD["losses"], {"type": "SamplingLocationLoss"}]
+    shared = {"decoder": decoder, "losses": parts, "query_groups": [{"num": N}, FURTHER]}
+    head = build_head(GSMAP, masks=MASKS, **shared)
+    assert all(part.guidance is not None for part in head.decoder.layers)
+    assert head(BEV)["all_references"].shape == (2, 1, N + FURTHER["num"], P, 5)
+    found = losses(head)
+    assert found["loss_raster"] > 0
+    assert found["loss_mean_loc"] > 0
+    sum(value for name, value in found.items() if "loss" in name).backward()
+    plain = {**decoder, "layer": {**layer, "guidance": None}}
+    head = build_head(GSMAP, masks=MASKS, **{**shared, "decoder": plain})
+    assert all(part.guidance is None for part in head.decoder.layers)
+
+
+def test_points_with_height_are_codes_and_predictions_of_three_numbers():
+    layer = {**HEAD["decoder"]["layer"], "reference_dims": 3}
+    decoder = {"type": "MGMapNetDecoder", "num_layers": 2, "layer": layer}
+    head = build_head(MGMAP, decoder=decoder, reference={"coords": 3, "z_range": (-5, 3)})
+    assert head.decoder.layers[1].reference_code[0].in_features == 3 * P
+    outputs = head(BEV)
+    assert outputs["all_pts_preds"].shape[-1] == 3
+    assert outputs["all_mean_locations"].shape[-1] == 2
+
+
+def test_a_loss_of_samples_needs_a_decoder_that_tells_them():
+    with pytest.raises(ValueError, match=r"SamplingLocationLoss reads \['pred.mean_locations'\]"):
+        build_head(HEAD, losses=[{"type": "SamplingLocationLoss"}])
