@@ -161,7 +161,7 @@ def _read(
     samples = rig_samples(path.stem, list(rig.values()), frames, pose_at)
     root = frames_dir / f"{file_name(path.stem)}-{content.digest.hexdigest()[:16]}"
     notes = [
-        f"{len(reasons)} messages of {topic} cannot be read and are left out: {reasons[0]}"
+        f"{len(reasons)} messages of {topic!r} cannot be read and are left out: {reasons[0]}"
         for topic, reasons in content.unread.items()
     ]
     notes += _write_images(bag, rig, frames, root)
@@ -235,17 +235,10 @@ def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:
             with naming(f"the message at {time_ns} ns", "it is damaged"):
                 with _of_rosbags():
                     message = bag.deserialize(raw, kind)
-                if topic in images:
-                    content.times_ns[topic].append(_stamp_ns(message.header))
-                    content.frame_ids.setdefault(topic, message.header.frame_id)
-                elif topic in topic_of:
+                if topic in topic_of:
                     content.infos |= {t: message for t in topic_of[topic] if t not in content.infos}
-                elif kind == _ODOMETRY:
-                    pose, at_ns = message.pose.pose, _stamp_ns(message.header)
-                    content.odometry[1].append(_matrix(pose.position, pose.orientation))
-                    content.odometry[0].append(at_ns)
                 else:
-                    _add_transforms(content, message.transforms, topic.endswith("tf_static"))
+                    _keep(content, message, topic, kind)
         except ValueError as error:
             content.unread[topic].append(str(error))
     for name, (topic, info) in topics.items():
@@ -253,6 +246,19 @@ def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:
             reason = next((content.unread[t][0] for t in (topic, info) if content.unread[t]), "")
             raise ValueError(f"camera {name!r} has no message on {topic} or {info}. {reason}")
     return content
+
+
+def _keep(content: _Content, message: Any, topic: str, kind: str) -> None:
+    """Keep an image's time, or the poses of a message."""
+    if kind in _TRANSFORMS:
+        _add_transforms(content, message.transforms, topic.endswith("tf_static"))
+    elif kind == _ODOMETRY:
+        pose, time_ns = message.pose.pose, _stamp_ns(message.header)
+        content.odometry[1].append(_matrix(pose.position, pose.orientation))
+        content.odometry[0].append(time_ns)
+    else:
+        content.times_ns[topic].append(_stamp_ns(message.header))
+        content.frame_ids.setdefault(topic, message.header.frame_id)
 
 
 def _add_transforms(content: _Content, transforms: Sequence[Any], is_static: bool) -> None:
@@ -373,7 +379,7 @@ def _write_images(
             try:
                 with naming(where, "its frame is left out"):
                     _write_image(message, camera, target, where)
-            except (ValueError, cv2.error) as error:
+            except ValueError as error:
                 unusable.append(str(error))
     return unusable
 
@@ -402,4 +408,7 @@ def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
     image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
     code = _TO_BGR[encoding]
-    return image if code is None else cv2.cvtColor(np.ascontiguousarray(image), code)
+    try:
+        return image if code is None else cv2.cvtColor(np.ascontiguousarray(image), code)
+    except cv2.error as error:
+        raise ValueError(f"OpenCV cannot convert it from {encoding}: {error.err}") from error
