@@ -3,6 +3,7 @@
 import os
 import pty
 import runpy
+import shutil
 import signal
 import sys
 import tempfile
@@ -98,6 +99,12 @@ class Data:
         model = MODELS.build(read_config(config).model)
         torch.save({"state_dict": model.state_dict()}, self.checkpoint)
 
+    def empty_folder(self) -> Path:
+        """Return a folder for what a command writes, the same each time, as files name it."""
+        shutil.rmtree(out := self.folder / "out", ignore_errors=True)
+        out.mkdir()
+        return out
+
     def commands(self, out: Path) -> dict[str, Work]:
         """Return the commands of one process; they write to a folder."""
         model = "--model", self.config, self.checkpoint, "--data-root", self.root
@@ -111,7 +118,7 @@ class Data:
             ),
             "build_map": command(
                 "build_map", self.results, "--ann", self.annotations, "--out", out,
-                "--formats", "geojson", "png", "svg",
+                "--formats", "geojson", "png",
             ),
             "train": command(
                 "train", self.config, "--work-dir", out, "--resume", "--cfg-options",

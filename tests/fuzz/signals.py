@@ -10,7 +10,6 @@ import select
 import shutil
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -89,7 +88,7 @@ def case(name: str, end: str, data: "Data") -> str:  # noqa: F821
     """Start a command, end it once all its processes are there, and say what is wrong then."""
     from fuzz.commands import start
 
-    out = Path(tempfile.mkdtemp())
+    out = data.empty_folder()
     pid, terminal = start(data.commands(out)[name])
     said, until = "", time.monotonic() + 120
     while len(descendants()) < PROCESSES[name] or not ready(name, out):
@@ -111,7 +110,6 @@ def case(name: str, end: str, data: "Data") -> str:  # noqa: F821
     if code is None:
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     partial = [path.name for path in out.rglob("*partial")]
-    shutil.rmtree(out)
     expected = BY_SIGNAL[ENDS[end][1]]
     wrong = [f"left: {', '.join(left.values())}"] * bool(left)
     wrong += [f"exit code {code}, not {expected}"] * (code != expected)
