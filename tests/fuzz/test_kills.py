@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from processes import REPO, run_python
 
 from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -113,3 +114,17 @@ def test_two_conversions_at_once_make_what_one_makes(minicity_root, tmp_path):
     assert sorted(os.listdir(both)) == SPLITS
     for name in SPLITS:
         assert (both / name).read_bytes() == (one / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_commands_that_are_killed_leave_what_they_leave_unkilled(
+    minicity_root, minicity_annotations, tiny_config
+):
+    """A part of ``python -m fuzz.kills``."""
+    paths = [str(REPO), str(REPO / "tests"), os.environ.get("PYTHONPATH", "")]
+    done = run_python(
+        "-m", "fuzz.kills", "--kills", 2, "--data", minicity_root, tiny_config,
+        env={"PYTHONPATH": os.pathsep.join(paths)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert [line.split("|")[3:5] for line in done.stdout.splitlines()[2:]] == [[" 2 ", " 2 "]] * 4

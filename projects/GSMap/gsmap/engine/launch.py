@@ -23,7 +23,7 @@ from mmengine.utils import import_modules_from_strings
 from gsmap.engine.named_models import find_config
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.utils.faults import nearest, registered
-from gsmap.utils.parallel import die_with_parent
+from gsmap.utils.parallel import LAUNCHER, die_with_parent
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 _OWN_KEYS = (
@@ -104,7 +104,8 @@ def load_config(args: argparse.Namespace) -> Config:
     for name in [name for name in cfg if name.startswith("_")]:
         cfg.pop(name)  # a config's own values have done their work
     if args.launcher == "pytorch":
-        die_with_parent()  # torchrun killed with SIGKILL cannot stop its ranks
+        # torchrun killed with SIGKILL cannot stop its ranks
+        die_with_parent(int(os.environ.pop(LAUNCHER, os.getppid())))
     if args.launcher == "pytorch" and not torch.cuda.is_available():
         # mmengine would choose a CUDA device first, and wrap the model with its number
         timeout = timedelta(seconds=rank_timeout_s(cfg))

@@ -4,12 +4,16 @@ Ctrl-C is left to the ranks to report. A rank that dies, however that happens, e
 """
 
 import logging
+import os
 import signal
 import sys
 
 from torch.distributed.elastic.multiprocessing.api import SignalException
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 from torch.distributed.run import main
+
+from gsmap.utils.cli import ENDING
+from gsmap.utils.parallel import LAUNCHER
 
 
 def reason(error: ChildFailedError) -> tuple[str, int]:
@@ -28,6 +32,8 @@ def reason(error: ChildFailedError) -> tuple[str, int]:
 if __name__ == "__main__":
     for part in ("agent.server.api", "multiprocessing.api"):  # torch gives each a level of its own
         logging.getLogger(f"torch.distributed.elastic.{part}").setLevel(logging.CRITICAL)
+    os.environ[LAUNCHER] = str(os.getpid())
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)  # also for the ranks
     try:
         main()
     except SignalException as error:  # the ranks have had the same signal, and rank 0 has spoken

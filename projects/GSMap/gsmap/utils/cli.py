@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.utils.faults import in_words
+from gsmap.utils.parallel import die_with_parent
 
 BAD_INPUT = 2  # exit code, as argparse's for bad arguments
+ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 CLEAN_UP_S = 5.0  # how long further Ctrl-C are not answered
 _LISTS = ("?", "*", "+")
 
@@ -107,7 +109,9 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
 
     A file that cannot be read, understood or written, and whatever a ``raise`` statement says, end
     with ``error: ...`` and exit code 2 (`faults.in_words`); Ctrl-C with one line and 130; ``kill``
-    with 143; each after the clean-up of half-written files. A slip in the code keeps its traceback,
+    with 143, and the end of its terminal with 129; each after the clean-up of half-written files.
+    Whoever started the command may have blocked these signals: they are let through, also to its
+    workers, and forked ones die with it. A slip in the code keeps its traceback,
     and with the environment variable ``GSMAP_TRACEBACK`` every error does.
 
     Args:
@@ -117,10 +121,13 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     """
     logging.raiseExceptions = False  # a log file on a full disk is no reason for tracebacks
     end = _End()
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
+    os.register_at_fork(after_in_child=die_with_parent)
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background
         signal.signal(signal.SIGINT, end)
-    if heed_kill:
-        signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGTERM, end if heed_kill else signal.SIG_DFL)
+    if heed_kill and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup wants it
+        signal.signal(signal.SIGHUP, end)
     try:
         report = command()
         if report is not None:

@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+LAUNCHER = "GSMAP_LAUNCHER"  # variable with the number of torchrun's process, for its ranks
+_PRCTL = ctypes.CDLL(None).prctl  # found before a fork, which may happen within a lock
 
 
 def default_workers() -> int:
@@ -23,9 +25,11 @@ def default_workers() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def die_with_parent() -> None:
-    """Have Linux kill this process when its parent dies, however that dies."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+def die_with_parent(parent: int | None = None) -> None:
+    """Have Linux kill this process when its parent, of that number, dies, however it dies."""
+    _PRCTL(1, signal.SIGKILL)
+    if parent is not None and os.getppid() != parent:  # it is dead already
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 class _Worker:
