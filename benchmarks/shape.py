@@ -16,7 +16,7 @@ from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.file_evaluation import match_samples, read_ground_truth
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import FloatArray
+from gsmap.structures.elements import FloatArray, MapElements
 
 MIN_SCORE = 0.2
 FOLD_DEG = 90.0  # a vertex that turns by more leads back
@@ -54,7 +54,9 @@ def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
     annotated, _ = read_ground_truth(truth, config.classes)
     names = [name for name in config.classes if name not in AREA_CLASSES]
     shapes: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
-    for matches in match_samples(predicted, annotated, MapEvaluator(config, None)):
+    nothing = MapElements.from_polylines()
+    pairs = [(token, predicted.get(token, nothing), true) for token, true in annotated.items()]
+    for matches in match_samples(pairs, MapEvaluator(config, None)):
         found = matches["chamfer"]
         truths = annotated[found.token].polylines
         lines = predicted[found.token].polylines if len(found.labels) else []

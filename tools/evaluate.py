@@ -25,7 +25,12 @@ from gsmap.evaluation.chamfer_ap import (
     ChamferConfig,
 )
 from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
-from gsmap.evaluation.file_evaluation import Evaluation, evaluate_files, match_files
+from gsmap.evaluation.file_evaluation import (
+    Evaluation,
+    SamplePairs,
+    evaluate_files,
+    match_samples,
+)
 from gsmap.evaluation.match_files import write_matches
 from gsmap.evaluation.prior import evaluate_prior
 from gsmap.evaluation.raster_ap import RasterConfig
@@ -165,8 +170,10 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
         results, source = args.results, digest(args.results)
     else:  # of results in shards, too, the same one is enough
         source = digest_of_common(read_shard(results))
-    rules = evaluator, args.workers, args.allow_mismatch, args.shard
-    matches, notes = match_files(results, args.ground_truth, *rules)
+    rules = evaluator.classes, args.allow_mismatch, args.shard
+    pairs = SamplePairs(results, args.ground_truth, *rules)
+    matches = list(match_samples(pairs, evaluator, args.workers))
+    notes = pairs.notes(evaluator.counts_heights)
     source += digest(args.ground_truth)
     path = write_matches(args.out, args.shard, matches, notes, evaluator, source)
     return f"{len(matches)} samples matched: {path}"

@@ -8,6 +8,7 @@ from gsmap.evaluation.chamfer_ap import (
     nearest_by_chamfer,
 )
 from gsmap.evaluation.chamfer_kernels import chamfer_distance
+from gsmap.evaluation.matches import MatchTable
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import resample_all
 
@@ -46,7 +47,7 @@ def test_hand_worked_ap():
     matches = match_chamfer(pred, gt, CONFIG, "a")
     assert matches.pred_index.tolist() == [1, 2, 0]
     assert matches.matched_gt.tolist() == [[0, 0, 0], [-1, 1, 1], [-1, -1, -1]]
-    metrics = chamfer_report([matches], CONFIG).metrics
+    metrics = chamfer_report(MatchTable([matches]), CONFIG).metrics
     assert metrics["chamfer/divider/AP@0.5"] == 0.5
     assert metrics["chamfer/divider/AP@1.0"] == 1.0
     assert metrics["chamfer/divider/recall@0.5"] == 0.5
@@ -66,7 +67,7 @@ def test_precision_envelope_lifts_an_early_miss():
     pred = MapElements.from_polylines(
         [upright(4.0), upright(0.0), upright(8.0)], [0] * 3, [0.9, 0.8, 0.7]
     )
-    metrics = chamfer_report([match_chamfer(pred, gt, CONFIG)], CONFIG).metrics
+    metrics = chamfer_report(MatchTable([match_chamfer(pred, gt, CONFIG)]), CONFIG).metrics
     assert metrics["chamfer/divider/AP@0.5"] == pytest.approx(2 / 3)
 
 
@@ -89,7 +90,7 @@ def test_error_of_a_match_that_exists_at_the_tight_threshold_only():
     pred = MapElements.from_polylines([upright(1.2), upright(0.1)], [0, 0], [0.9, 0.8])
     matches = match_chamfer(pred, gt, CONFIG)
     assert matches.matched_gt.tolist() == [[-1, -1, 0], [0, 0, -1]]
-    metrics = chamfer_report([matches], CONFIG).metrics
+    metrics = chamfer_report(MatchTable([matches]), CONFIG).metrics
     assert metrics["chamfer/divider/error_m@0.5"] == pytest.approx(0.1)
     assert metrics["chamfer/divider/error_m@1.5"] == pytest.approx(1.2)
 
@@ -109,7 +110,7 @@ def test_equal_scores_keep_their_order():
     """At 0.5 m the first of two equal scores misses: precision 0, 1/2."""
     gt = MapElements.from_polylines([upright(0.0)], [0])
     pred = MapElements.from_polylines([upright(0.9), upright(0.1)], [0, 0], [0.5, 0.5])
-    metrics = chamfer_report([match_chamfer(pred, gt, CONFIG)], CONFIG).metrics
+    metrics = chamfer_report(MatchTable([match_chamfer(pred, gt, CONFIG)]), CONFIG).metrics
     assert metrics["chamfer/divider/AP@0.5"] == 0.5
     assert metrics["chamfer/divider/AP@1.0"] == 1.0  # the first takes the line, the second misses
 
@@ -162,7 +163,7 @@ def test_an_error_of_height_misses_near_thresholds_and_hits_far_ones():
     """
     gt = MapElements.from_polylines([sloped(0.0, 0.0, 2.0)], [0])
     pred = MapElements.from_polylines([sloped(0.0, 1.2, 3.2)], [0], [0.9])
-    metrics = chamfer_report([match_chamfer(pred, gt, IN_SPACE)], IN_SPACE).metrics
+    metrics = chamfer_report(MatchTable([match_chamfer(pred, gt, IN_SPACE)]), IN_SPACE).metrics
     assert metrics["chamfer/divider/AP@1.0"] == 0.0
     assert metrics["chamfer/divider/AP@1.5"] == 1.0
     assert metrics["chamfer/divider/error_m@1.5"] == pytest.approx(1.2)

@@ -12,6 +12,7 @@ from gsmap.evaluation.chamfer_ap import (
     match_chamfer,
     nearest_by_chamfer,
 )
+from gsmap.evaluation.matches import MatchTable
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, rasterize
 from gsmap.evaluation.raster_kernels import mask_ious
 from gsmap.evaluation.report import flat_metrics
@@ -93,7 +94,9 @@ def test_chamfer_figures(metrics: dict[str, float], eval_dir: Path) -> None:
 
 def test_chamfer_with_predictions_at_their_own_points(frames, eval_dir: Path) -> None:
     config = ChamferConfig(CLASSES, resample_predictions=False)
-    report = chamfer_report([match_chamfer(p, g, config, t) for t, p, g in frames], config)
+    report = chamfer_report(
+        MatchTable([match_chamfer(p, g, config, t) for t, p, g in frames]), config
+    )
     want = read(eval_dir / "E2_A_noresample.json")
     check_chamfer(report.metrics, want["per_class"])
     assert report.metrics["chamfer/mAP"] == pytest.approx(want["mAP"], abs=AP_TOLERANCE)

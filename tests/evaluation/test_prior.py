@@ -3,6 +3,7 @@ import pytest
 
 from gsmap.evaluation import prior as prior_module
 from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
+from gsmap.evaluation.matches import MatchTable
 from gsmap.evaluation.prior import fit_prior
 from gsmap.structures.elements import MapElements
 
@@ -16,7 +17,7 @@ def line(x: float) -> np.ndarray:
 
 def score(prior, truth) -> dict[str, float]:
     return chamfer_report(
-        [match_chamfer(prior, t, CHAMFER, str(i)) for i, t in enumerate(truth)], CHAMFER
+        MatchTable([match_chamfer(prior, t, CHAMFER, str(i)) for i, t in enumerate(truth)]), CHAMFER
     ).metrics
 
 

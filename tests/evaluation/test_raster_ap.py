@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from golden_data import unpacked
 
+from gsmap.evaluation.matches import MatchTable
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report, rasterize
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
@@ -118,7 +119,7 @@ def test_hand_worked_ap_raster():
     assert matches.pred_index.tolist() == [1, 0]
     assert matches.matched_gt.tolist() == [[0, 0, 0, -1, -1, -1], [-1] * 6]
     assert matches.quality[0] == pytest.approx(0.6)
-    metrics = raster_report([matches], TINY).metrics
+    metrics = raster_report(MatchTable([matches]), TINY).metrics
     assert metrics["raster/ped_crossing/AP"] == pytest.approx(0.5)
     assert metrics["raster/ped_crossing/AP@0.6"] == pytest.approx(1.0)
     assert metrics["raster/ped_crossing/AP@0.65"] == 0.0
@@ -133,7 +134,7 @@ def test_half_recall_is_51_of_101():
     line = [[0, -20], [0, 20]]
     gt = MapElements.from_polylines([line, [[8, -20], [8, 20]]], [0, 0])
     metrics = raster_report(
-        [match_raster(MapElements.from_polylines([line], [0]), gt, CONFIG)], CONFIG
+        MatchTable([match_raster(MapElements.from_polylines([line], [0]), gt, CONFIG)]), CONFIG
     ).metrics
     assert metrics["raster/divider/AP"] == pytest.approx(51 / 101)
 

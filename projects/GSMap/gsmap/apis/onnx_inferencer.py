@@ -69,7 +69,7 @@ class OnnxInferencer:
             self._outputs = [value.name for value in self.session.get_outputs()]
             images, *calibration = self.session.get_inputs()
             shape = [len(self.metadata["cameras"]), 3, *self.metadata["image_size"]]
-            if images.shape != shape or not _OUTPUTS <= set(self._outputs):
+            if images.shape != shape or not set(self._outputs) >= _OUTPUTS:
                 raise ValueError("its graph is not the one that its metadata tell of")
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(

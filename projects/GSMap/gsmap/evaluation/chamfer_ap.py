@@ -7,14 +7,13 @@ heights, distances are in space, as in MapTRv2's; lines are resampled and strips
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from gsmap.evaluation import chamfer_kernels as kernels
 from gsmap.evaluation.average_precision import area_ap
-from gsmap.evaluation.matches import FrameMatches, assign, gather, ranked_predictions
+from gsmap.evaluation.matches import FrameMatches, MatchTable, assign, ranked_predictions
 from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
@@ -147,13 +146,13 @@ def match_chamfer(
     return FrameMatches(token, rows, labels, scores, matched, quality, num_gts)
 
 
-def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> MetricReport:
-    """Compute AP_chamfer from the matches of all samples, in any order; a token counts once.
+def chamfer_report(matches: MatchTable, config: ChamferConfig) -> MetricReport:
+    """Compute AP_chamfer from the matches of all samples.
 
     A class without ground truth counts as 0 in ``mAP``, as in MapTR, but in no mean per threshold.
     """
     classes, thresholds = config.classes, config.thresholds
-    records, detections = gather(matches, dict.fromkeys(classes, thresholds))
+    detections = matches.detections(dict.fromkeys(classes, thresholds))
     metrics: dict[str, float] = {}
     for name, found in detections.items():
         figures = class_figures(found, area_ap, absent=0.0)
@@ -166,5 +165,5 @@ def chamfer_report(matches: Iterable[FrameMatches], config: ChamferConfig) -> Me
         aps = [metrics[f"chamfer/{name}/AP@{threshold}"] for name in present]
         metrics[f"chamfer/AP@{threshold}"] = float(np.mean(aps)) if aps else 0.0
     metrics["chamfer/mAP"] = float(np.mean([metrics[f"chamfer/{name}/AP"] for name in classes]))
-    metrics["chamfer/num_samples"] = float(len(records))
+    metrics["chamfer/num_samples"] = float(len(matches))
     return MetricReport("chamfer", {"class": classes}, metrics, detections)

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
-from gsmap.evaluation.matches import FrameMatches
+from gsmap.evaluation.matches import FrameMatches, MatchTable
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
 from gsmap.evaluation.report import MetricReport
 from gsmap.structures.elements import MapElements
@@ -47,6 +47,11 @@ class MapEvaluator:
         assert config is not None
         return config.classes
 
+    @property
+    def counts_heights(self) -> bool:
+        """Whether a metric measures distances in space."""
+        return self.chamfer is not None and self.chamfer.dim == 3
+
     def match(
         self, token: str, predictions: MapElements, ground_truth: MapElements
     ) -> SampleMatches:
@@ -82,9 +87,14 @@ class MapEvaluator:
 
     def reports(self, samples: Iterable[SampleMatches]) -> list[MetricReport]:
         """Compute the metrics from the matches of all samples; repeated tokens count once."""
-        records, found = list(samples), []
+        chamfer, raster, found = MatchTable(), MatchTable(), []
+        for sample in samples:
+            if self.chamfer:
+                chamfer.add(sample["chamfer"])
+            if self.raster:
+                raster.add(sample["raster"])
         if self.chamfer:
-            found.append(chamfer_report((r["chamfer"] for r in records), self.chamfer))
+            found.append(chamfer_report(chamfer, self.chamfer))
         if self.raster:
-            found.append(raster_report((r["raster"] for r in records), self.raster))
+            found.append(raster_report(raster, self.raster))
         return found

@@ -1,60 +1,99 @@
 """Score a result file against a ground-truth file, in one or more processes."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import islice, zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.evaluator import MapEvaluator, SampleMatches
+from gsmap.evaluation.evaluator import MapEvaluator, Sample, SampleMatches
 from gsmap.evaluation.report import MetricReport
-from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, read_samples
+from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard
 
 CHUNK = 64  # samples per task: large enough to hide the hand-over, small enough to share evenly
-Samples = Mapping[str, MapElements]
 Evaluation = tuple[list[MetricReport], list[str]]
 """A report per metric, and notes: elements left out, z ignored, samples without results."""
 
 
-def read_ground_truth(
-    path: str | Path, classes: Sequence[str], shard: Shard = WHOLE
-) -> tuple[dict[str, MapElements], Counter[str]]:
-    """Read a shard of ground truth: an annotation file, or MapTR's JSON; as ``read_samples`` does.
+class AnnotatedTruth:
+    """The ground truth of an annotation file, in the form of ``SampleFile``.
+
+    Args:
+        path: The file.
+        classes: Names of the classes; elements of others get the label -1.
+        shard: Which part of the samples to read.
 
     Raises:
-        ValueError: If an annotation file lacks one of the classes, or a sample has no ground truth.
+        ValueError: If it lacks one of the classes, or, when read, a sample has no ground truth.
     """
-    if Path(path).suffix.lower() == ".json":
-        everything, ignored = read_samples(path, GROUND_TRUTH_KEY, classes)
-        return {token: everything[token] for token in shard.part(list(everything))}, ignored
-    file = AnnotationFile(path)
-    names = file.meta.classes
-    missing = [name for name in classes if name not in names]
-    if missing:
-        raise ValueError(f"{path} has the classes {names}, not {missing}.")
-    labels = np.array([classes.index(name) if name in classes else -1 for name in names])
-    samples: dict[str, MapElements] = {}
-    ignored = Counter({THREE_D: len(file) * (file.meta.dim == 3)})
-    for sample in map(file.__getitem__, shard.part(range(len(file)))):
-        if sample.instances is None:
-            raise ValueError(
-                f"{path}, sample {sample.token!r} has no ground truth: it cannot be scored."
+
+    def __init__(self, path: str | Path, classes: Sequence[str], shard: Shard = WHOLE) -> None:
+        self._file = AnnotationFile(path)
+        names = self._file.meta.classes
+        missing = [name for name in classes if name not in names]
+        if missing:
+            raise ValueError(f"{path} has the classes {names}, not {missing}.")
+        self._labels = np.array([classes.index(n) if n in classes else -1 for n in names])
+        self._rows = shard.part(range(len(self._file)))
+        self.ignored = Counter({THREE_D: len(self._file) * (self._file.meta.dim == 3)})
+
+    def __iter__(self) -> Iterator[tuple[str, MapElements, int]]:
+        """Yield token, elements and row of each sample."""
+        names = self._file.meta.classes
+        for row in self._rows:
+            sample = self._file[row]
+            if sample.instances is None:
+                raise ValueError(
+                    f"{self._file.path}, sample {sample.token!r} has no ground truth: it cannot "
+                    "be scored."
+                )
+            self.ignored.update(
+                names[i.label] for i in sample.instances if self._labels[i.label] < 0
             )
-        elements = elements_of_instances(sample.instances)
-        samples[sample.token] = replace(elements, labels=labels[elements.labels])
-        ignored.update(names[i.label] for i in sample.instances if labels[i.label] < 0)
-    return samples, ignored
+            yield sample.token, self._elements(sample), row
+
+    def tokens(self) -> list[str]:
+        """Return the tokens of all samples, whatever the shard."""
+        return self._file.column("token")
+
+    def load(self, row: int) -> MapElements:
+        """Read the elements of one sample again."""
+        return self._elements(self._file[row])
+
+    def _elements(self, sample: MapSample) -> MapElements:
+        elements = elements_of_instances(sample.instances or [])
+        return replace(elements, labels=self._labels[elements.labels])
 
 
-def mismatch_notes(results: Samples, truth: Samples, allowed: bool) -> list[str]:
-    """Say which samples have no results or no ground truth.
+def open_ground_truth(
+    path: str | Path, classes: Sequence[str], shard: Shard = WHOLE
+) -> AnnotatedTruth | SampleFile:
+    """Open an annotation file, of which a shard is read, or MapTR's JSON, which is read whole."""
+    if Path(path).suffix.lower() == ".json":
+        return SampleFile(path, GROUND_TRUTH_KEY, classes)
+    return AnnotatedTruth(path, classes, shard)
+
+
+def read_ground_truth(
+    path: str | Path, classes: Sequence[str]
+) -> tuple[dict[str, MapElements], Counter[str]]:
+    """Read all ground truth of an annotation file, or of MapTR's JSON, as ``read_samples`` does."""
+    truth = open_ground_truth(path, classes)
+    return {token: elements for token, elements, _ in truth}, truth.ignored
+
+
+def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bool) -> list[str]:
+    """Say which tokens of samples have no results or no ground truth.
 
     Raises:
         ValueError: If the tokens differ and that is not ``allowed``.
@@ -75,6 +114,96 @@ def mismatch_notes(results: Samples, truth: Samples, allowed: bool) -> list[str]
     return notes
 
 
+class SamplePairs:
+    """Predictions and ground truth of each sample of two files, for one walk through both.
+
+    Few samples are in memory at a time: where the files have other orders, a sample waits by its
+    place in the file, and is read again for its partner.
+
+    Args:
+        results_path: Results in MapTR's JSON form.
+        truth_path: Ground truth, as ``open_ground_truth`` takes it.
+        classes: Names of the classes.
+        allow_mismatch: A sample without results counts as without predictions, and results without
+            ground truth are left out; otherwise both are errors, after the last pair.
+        shard: Which part of the ground truth's samples to take.
+    """
+
+    def __init__(
+        self,
+        results_path: str | Path,
+        truth_path: str | Path,
+        classes: Sequence[str],
+        allow_mismatch: bool = False,
+        shard: Shard = WHOLE,
+    ) -> None:
+        self._results = SampleFile(results_path, RESULTS_KEY, classes)
+        self._truth = open_ground_truth(truth_path, classes, shard)
+        self._allow_mismatch = allow_mismatch
+        self._elsewhere: set[str] = set()  # what belongs to other shards is theirs
+        if shard.count:
+            tokens = self._truth.tokens()
+            self._elsewhere = set(tokens).difference(shard.part(tokens))
+        self._mismatches: list[str] = []
+        self._degenerate = 0
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Yield token, predictions and ground truth of each sample.
+
+        Raises:
+            FileNotFoundError: If a file does not exist.
+            ValueError: If a file is malformed or the samples differ.
+        """
+        sides = self._results, self._truth
+        waiting: tuple[dict[str, Any], dict[str, Any]] = {}, {}  # elements, or places of them
+        mine = ((item for item in side if item[0] not in self._elsewhere) for side in sides)
+        for items in zip_longest(*mine):
+            if None not in items and items[0][0] == items[1][0]:
+                yield self._counted(*(items[0][:2]), items[1][1])
+                continue
+            for own, item in enumerate(items):
+                if item is None:
+                    continue
+                token, elements, place = item
+                other = 1 - own
+                if token in waiting[other]:
+                    pair = [elements, self._load(sides[other], waiting[other].pop(token))]
+                    yield self._counted(token, pair[own], pair[other])
+                else:
+                    waiting[own][token] = elements if len(waiting[own]) < CHUNK else place
+        self._mismatches = mismatch_notes(*waiting, self._allow_mismatch)
+        nothing = MapElements.from_polylines()
+        for token, kept in waiting[1].items():
+            yield self._counted(token, nothing, self._load(self._truth, kept))
+
+    def _load(self, side: Any, kept: Any) -> MapElements:
+        """Return the elements of a sample that waited."""
+        return kept if isinstance(kept, MapElements) else side.load(kept)
+
+    def _counted(self, token: str, predictions: MapElements, truth: MapElements) -> Sample:
+        self._degenerate += int((truth.num_points < 2).sum())
+        return token, predictions, truth
+
+    def notes(self, counts_heights: bool) -> list[str]:
+        """Say, after the walk, what was left out: elements, heights, samples without results."""
+        notes = list(self._mismatches)
+        ignored = [Counter(side.ignored) for side in (self._results, self._truth)]
+        if sum(counts.pop(THREE_D, 0) for counts in ignored) and not counts_heights:
+            notes.append(
+                "some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)"
+            )
+        if self._degenerate:
+            notes.append(
+                f"{self._degenerate} ground truths have fewer than two points: they count, nothing "
+                "can match"
+            )
+        for what, counts in zip(("predictions", "ground truths"), ignored, strict=True):
+            notes += [
+                f"{n} {what} of class {c!r} are not scored" for c, n in sorted(counts.items())
+            ]
+        return notes
+
+
 def evaluate_files(
     results_path: str | Path,
     truth_path: str | Path,
@@ -82,69 +211,24 @@ def evaluate_files(
     num_workers: int = 1,
     allow_mismatch: bool = False,
 ) -> Evaluation:
-    """Score a result file; arguments as of ``match_files``."""
-    matches, notes = match_files(results_path, truth_path, evaluator, num_workers, allow_mismatch)
-    return evaluator.reports(matches), notes
-
-
-def match_files(
-    results_path: str | Path,
-    truth_path: str | Path,
-    evaluator: MapEvaluator,
-    num_workers: int = 1,
-    allow_mismatch: bool = False,
-    shard: Shard = WHOLE,
-) -> tuple[list[SampleMatches], list[str]]:
-    """Match the samples of a result file.
-
-    Args:
-        results_path: Results in MapTR's JSON form.
-        truth_path: Ground truth, as ``read_ground_truth`` reads it.
-        evaluator: Metrics and their rules.
-        num_workers: Number of processes.
-        allow_mismatch: A sample without results counts as without predictions, and results without
-            ground truth are left out; otherwise both are errors.
-        shard: Which part of the ground truth's samples to match.
-
-    Returns:
-        The matches, and notes: elements left out, z ignored, samples without results.
+    """Score a result file; ``num_workers`` is the number of processes, others as of ``SamplePairs``.
 
     Raises:
         FileNotFoundError: If a file does not exist.
         ValueError: If a file is malformed or the samples differ.
     """
-    results, other_results = read_samples(results_path, RESULTS_KEY, evaluator.classes)
-    truth, other_truth = read_ground_truth(truth_path, evaluator.classes, shard)
-    if shard.count:  # what belongs to other shards is theirs
-        if Path(truth_path).suffix.lower() == ".json":
-            everywhere = set(read_samples(truth_path, GROUND_TRUTH_KEY, ())[0])
-        else:
-            everywhere = set(AnnotationFile(truth_path).column("token"))
-        results = {t: found for t, found in results.items() if t in truth or t not in everywhere}
-    notes = mismatch_notes(results, truth, allow_mismatch)
-    with_height = other_results.pop(THREE_D, 0) + other_truth.pop(THREE_D, 0)
-    if with_height and not (evaluator.chamfer and evaluator.chamfer.dim == 3):
-        notes.append("some elements have 3D points: z is ignored (AP_chamfer can count it: dim 3)")
-    degenerate = sum(int((elements.num_points < 2).sum()) for elements in truth.values())
-    if degenerate:
-        notes.append(
-            f"{degenerate} ground truths have fewer than two points: they count, nothing can match"
-        )
-    for what, counts in (("predictions", other_results), ("ground truths", other_truth)):
-        notes += [f"{n} {what} of class {c!r} are not scored" for c, n in sorted(counts.items())]
-    return match_samples(results, truth, evaluator, num_workers), notes
+    pairs = SamplePairs(results_path, truth_path, evaluator.classes, allow_mismatch)
+    reports = evaluator.reports(match_samples(pairs, evaluator, num_workers))
+    return reports, pairs.notes(evaluator.counts_heights)
 
 
 def match_samples(
-    results: Samples, truth: Samples, evaluator: MapEvaluator, num_workers: int = 1
-) -> list[SampleMatches]:
-    """Match all samples of the ground truth, by token; other results are left out."""
-    nothing = MapElements.from_polylines()
-    pairs = [(token, results.get(token, nothing), of_token) for token, of_token in truth.items()]
-    tasks = [pairs[i : i + CHUNK] for i in range(0, len(pairs), CHUNK)]
-    matches: list[SampleMatches] = []
-    with Progress(total=len(pairs), unit="samples") as bar:
+    pairs: Iterable[Sample], evaluator: MapEvaluator, num_workers: int = 1
+) -> Iterator[SampleMatches]:
+    """Match the samples in their order."""
+    stream = iter(pairs)
+    tasks = iter(lambda: list(islice(stream, CHUNK)), [])
+    with Progress(unit="samples") as bar:
         for found in ordered_map(evaluator.match_all, tasks, num_workers):
-            matches += found
+            yield from found
             bar.update(len(found))
-    return matches

@@ -1,5 +1,6 @@
 """What the metrics keep of one sample: scores and matches, never masks or points."""
 
+from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,16 @@ from numba import njit
 
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+
+_COLUMNS = {  # of a table, with the codes of their numbers
+    "length": "q",
+    "labels": "q",
+    "scores": "d",
+    "quality": "d",
+    "hits": "b",
+    "num_gts": "q",
+    "class_iou": "d",
+}
 
 
 @dataclass(frozen=True)
@@ -78,37 +89,74 @@ def ranked_predictions(
     return rows[np.sort(np.concatenate(counted))]
 
 
-def gather(
-    matches: Iterable[FrameMatches], thresholds: Mapping[str, Sequence[float]]
-) -> tuple[list[FrameMatches], dict[str, ClassDetections]]:
-    """Rank the predictions of each class over all samples by score.
+class MatchTable:
+    """The matches of many samples: what the figures need of them, in few bytes.
 
     No figure depends on repeats, order or processes: a token counts once, and equal scores keep
     the order of the tokens, then the order within the sample. (The reference evaluators leave it to
-    an unstable sort, in AP_chamfer, or to the order of the file, in AP_raster.) ``thresholds`` are
-    those of each class, by its name, in the order of the labels. C x (T,)
-
-    Returns one record per token, sorted, and the ranked predictions of each class.
+    an unstable sort, in AP_chamfer, or to the order of the file, in AP_raster.)
     """
-    unique = {record.token: record for record in reversed(list(matches))}
-    records = [unique[token] for token in sorted(unique)]
-    none = np.zeros(0)
-    num_thresholds = len(next(iter(thresholds.values())))
-    labels = np.concatenate([none, *(m.labels for m in records)])
-    scores = np.concatenate([none, *(m.scores for m in records)])
-    quality = np.concatenate([none, *(m.quality for m in records)])
-    matched = np.concatenate([np.zeros((0, num_thresholds)), *(m.matched_gt for m in records)])
-    frame = np.repeat(np.arange(len(records)), [len(m.labels) for m in records])
-    detections = {}
-    for label, (name, of_class) in enumerate(thresholds.items()):
-        rows = np.flatnonzero(labels == label)
-        ranks = np.arange(len(rows)) - np.searchsorted(frame[rows], frame[rows])
-        order = np.argsort(-scores[rows], kind="stable")
-        rows, num_gts = rows[order], sum(int(m.num_gts[label]) for m in records)
-        detections[name] = ClassDetections(
-            of_class, scores[rows], matched[rows] >= 0, quality[rows], ranks[order], num_gts
-        )
-    return records, detections
+
+    def __init__(self, matches: Iterable[FrameMatches] = ()) -> None:
+        self._number: dict[str, int] = {}  # of each token
+        self._columns = {name: array(code) for name, code in _COLUMNS.items()}
+        for record in matches:
+            self.add(record)
+
+    def __len__(self) -> int:
+        return len(self._number)
+
+    def add(self, record: FrameMatches) -> None:
+        """Add the matches of a sample; those of a token that is known are left out."""
+        if record.token in self._number:
+            return
+        self._number[record.token] = len(self)
+        values = vars(record) | {"length": len(record.labels), "hits": record.matched_gt >= 0}
+        for name, column in self._columns.items():
+            if values[name] is not None:
+                column.frombytes(np.asarray(values[name], column.typecode).tobytes())
+
+    @property
+    def _order(self) -> IntArray:
+        """The samples in the order of their tokens. (S,)"""
+        return np.array([self._number[token] for token in sorted(self._number)], np.int64)
+
+    def class_iou(self, label: int) -> FloatArray:
+        """Return ``FrameMatches.class_iou`` of one class in all samples. (S,)"""
+        values = np.asarray(self._columns["class_iou"]).reshape(len(self), -1)
+        return values[self._order, label] if values.size else np.zeros(0)
+
+    def detections(self, thresholds: Mapping[str, Sequence[float]]) -> dict[str, ClassDetections]:
+        """Rank the predictions of each class over all samples by score.
+
+        ``thresholds`` are those of each class, by its name, in the order of the labels. C x (T,)
+        """
+        columns = {name: np.asarray(column) for name, column in self._columns.items()}
+        lengths = columns["length"]
+        order, starts = self._order, np.cumsum(lengths) - lengths
+        lengths = lengths[order]
+        shifts = starts[order] - (np.cumsum(lengths) - lengths)
+        by_token = np.repeat(shifts, lengths) + np.arange(lengths.sum())
+        frame = np.repeat(np.arange(len(self)), lengths)
+        labels, scores = columns["labels"][by_token], columns["scores"][by_token]
+        hits = columns["hits"].reshape(-1, len(next(iter(thresholds.values())))) > 0
+        num_gts = columns["num_gts"].reshape(-1, len(thresholds)).sum(axis=0)
+        found = {}
+        for label, (name, of_class) in enumerate(thresholds.items()):
+            rows = np.flatnonzero(labels == label)
+            ranks = np.arange(len(rows)) - np.searchsorted(frame[rows], frame[rows])
+            best = np.argsort(-scores[rows], kind="stable")
+            rows = rows[best]
+            places = by_token[rows]
+            found[name] = ClassDetections(
+                of_class,
+                scores[rows],
+                hits[places],
+                columns["quality"][places],
+                ranks[best],
+                int(num_gts[label]),
+            )
+        return found
 
 
 @njit(cache=True)

@@ -157,10 +157,12 @@ def evaluate_prior(
     truth, _ = read_ground_truth(truth_path, evaluator.classes)
     fitted = fit_prior(list(train.values()), chamfer, max_elements)
     alone = MapEvaluator(chamfer, None)
-    (on_train,) = alone.reports(match_samples(dict.fromkeys(train, fitted), train, alone))
+    (on_train,) = alone.reports(
+        match_samples([(token, fitted, found) for token, found in train.items()], alone)
+    )
     note = (
         f"the same {len(fitted)} elements in every sample, fitted on {len(train)} training "
         f"samples; mAP_chamfer there {on_train.metrics['chamfer/mAP']:.6f}"
     )
-    matches = match_samples(dict.fromkeys(truth, fitted), truth, evaluator)
-    return evaluator.reports(matches), [note]
+    pairs = [(token, fitted, found) for token, found in truth.items()]
+    return evaluator.reports(match_samples(pairs, evaluator)), [note]

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmap.evaluation import raster_kernels as kernels
 from gsmap.evaluation.average_precision import interpolated_ap
-from gsmap.evaluation.matches import FrameMatches, assign, gather, ranked_predictions
+from gsmap.evaluation.matches import FrameMatches, MatchTable, assign, ranked_predictions
 from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
@@ -140,19 +140,19 @@ def _mean(values: Iterable[float]) -> float:
     return float(np.mean(defined)) if defined else UNDEFINED
 
 
-def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> MetricReport:
-    """Compute AP_raster from the matches of all samples, in any order; a token counts once.
+def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
+    """Compute AP_raster from the matches of all samples.
 
     A class without ground truth is left out of the means.
     """
-    records, detections = gather(matches, config.thresholds)
+    detections = matches.detections(config.thresholds)
     figures: dict[str, dict[str, float]] = {}
     for c, (name, found) in enumerate(detections.items()):
         figures[name] = of_class = class_figures(found, interpolated_ap, absent=UNDEFINED)
         for limit in RECALL_LIMITS:
             hits = found.hits[found.ranks < limit].sum(axis=0)
             of_class[f"AR@{limit}"] = _mean(hits / found.num_gts if found.num_gts else ())
-        ious = np.array([m.class_iou[c] for m in records if m.class_iou is not None])
+        ious = matches.class_iou(c)
         of_class["mIoU"] = _mean(ious[~np.isnan(ious)])
     groups: dict[str, list[str]] = {}
     for name, polygon in zip(config.classes, config.is_polygon, strict=True):
@@ -164,6 +164,6 @@ def raster_report(matches: Iterable[FrameMatches], config: RasterConfig) -> Metr
                 metrics[f"{group}/{key}"] = _mean(figures[name][key] for name in names)
     metrics["mAP"] = _mean(found["AP"] for found in figures.values())
     metrics["mIoU"] = _mean(found["mIoU"] for found in figures.values())
-    metrics["num_samples"] = float(len(records))
+    metrics["num_samples"] = float(len(matches))
     flat = {f"raster/{key}": value for key, value in metrics.items()}
     return MetricReport("raster", groups, flat, detections)

@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from gsmap.evaluation.json_items import Place, items_of
 from gsmap.structures.elements import MapElements
 from gsmap.utils.files import atomic_write
 from gsmap.utils.shards import ShardFile
@@ -68,10 +69,8 @@ def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, 
     return vectors
 
 
-def read_samples(
-    path: str | Path, key: str, classes: Sequence[str], gaussians: bool = False
-) -> tuple[dict[str, MapElements], Counter[str]]:
-    """Read a result or ground-truth file; samples become arrays while it is parsed.
+class SampleFile:
+    """The samples of a result or ground-truth file, one after another; never all in memory.
 
     Args:
         path: The file.
@@ -79,46 +78,71 @@ def read_samples(
         classes: Names of the classes; elements of others get the label -1, which no metric counts.
         gaussians: Whether to read the Gaussians of results where all elements have them.
 
-    Returns:
-        The elements of each sample, by token; how many elements are of which other class, and how
-        many samples have points with heights (``THREE_D``).
-
-    Raises:
-        ValueError: If it has no list under the key, a sample is malformed or has no token, or a
-            token occurs twice; the message names the file and the sample.
+    Attributes:
+        ignored: Of the samples so far, how many elements are of which other class, and how many
+            samples have points with heights (``THREE_D``).
     """
-    ignored = Counter[str]()
 
-    def convert(item: dict[str, Any]) -> Any:
-        if "sample_token" not in item or "vectors" not in item:
-            return item
+    def __init__(
+        self, path: str | Path, key: str, classes: Sequence[str], gaussians: bool = False
+    ) -> None:
+        self.path, self._key, self._classes = Path(path), key, classes
+        self._gaussians = gaussians
+        self.ignored = Counter[str]()
+
+    def __iter__(self) -> Iterator[tuple[str, MapElements, Place]]:
+        """Yield token, elements and place of each sample.
+
+        Raises:
+            FileNotFoundError: If the file does not exist.
+            ValueError: If it has no list under the key, a sample is malformed or has no token, or a
+                token occurs twice; the message names the file and the sample.
+        """
+        seen = set()
+        for item, place in items_of(self.path, self._key):
+            token, elements = self._convert(item, self.ignored)
+            if token in seen:
+                raise ValueError(f"{self.path} holds sample {token!r} more than once.")
+            seen.add(token)
+            yield token, elements, place
+
+    def tokens(self) -> list[str]:
+        """Return the tokens of all samples."""
+        return [token for token, *_ in SampleFile(self.path, self._key, self._classes)]
+
+    def load(self, place: Place) -> MapElements:
+        """Read the elements of one sample again."""
+        start, length = place
+        with self.path.open("rb") as file:
+            file.seek(start)
+            return self._convert(json.loads(file.read(length)), Counter())[1]
+
+    def _convert(self, item: Any, ignored: Counter[str]) -> tuple[str, MapElements]:
+        """Return token and elements of a sample."""
+        if not isinstance(item, dict) or not {"sample_token", "vectors"} <= item.keys():
+            raise ValueError(f"{self.path}: {item!r:.80} has no sample_token or no vectors.")
+        token, scored = str(item["sample_token"]), self._key == RESULTS_KEY
         try:
-            elements = _elements(item["vectors"], classes, key == RESULTS_KEY, gaussians, ignored)
-        except (ValueError, KeyError, TypeError) as error:
+            return token, _elements(
+                item["vectors"], self._classes, scored, self._gaussians, ignored
+            )
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise ValueError(
-                f"{path}, sample {item['sample_token']!r}: {error!r}; each vector needs pts, "
+                f"{self.path}, sample {token!r}: {error!r}; each vector needs pts, "
                 "cls_name and, in results, confidence_level."
             ) from error
-        return str(item["sample_token"]), elements
 
-    try:
-        items = json.loads(Path(path).read_text(encoding="utf-8"), object_hook=convert)[key]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        items = error
-    if not isinstance(items, list):
-        raise ValueError(
-            f"{path} is empty or holds no complete list under {key!r}: expected "
-            f'{{"{key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}, got {items!r:.80}.'
-        )
-    samples: dict[str, MapElements] = {}
-    for item in items:
-        if not isinstance(item, tuple):
-            raise ValueError(f"{path}: {item!r:.80} has no sample_token or no vectors.")
-        token, elements = item
-        if token in samples:
-            raise ValueError(f"{path} holds sample {token!r} more than once.")
-        samples[token] = elements
-    return samples, ignored
+
+def read_samples(
+    path: str | Path, key: str, classes: Sequence[str], gaussians: bool = False
+) -> tuple[dict[str, MapElements], Counter[str]]:
+    """Read all samples of a file; arguments and errors as of ``SampleFile``.
+
+    Returns:
+        The elements of each sample, by token; and what is ignored.
+    """
+    file = SampleFile(path, key, classes, gaussians)
+    return {token: elements for token, elements, _ in file}, file.ignored
 
 
 def write_results(

@@ -1,0 +1,125 @@
+"""The items of a long list in a JSON file, one after another."""
+
+import json
+import re
+from codecs import getincrementaldecoder
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+Place = tuple[int, int]
+"""Where an item begins, and its length, in bytes."""
+_BLOCK = 1 << 20
+_SPACE = re.compile(r"[ \t\n\r]*")
+_DECODER = json.JSONDecoder()
+
+
+def items_of(path: Path, key: str) -> Iterator[tuple[Any, Place]]:
+    """Yield value and place of each item of the list under a key of the whole file's object.
+
+    What is in memory does not grow with the list.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If it is no JSON, or has no list there; maybe only after some items.
+    """
+    with path.open("rb") as file:
+        try:
+            yield from _Text(file).items(key)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(
+                f"{path} is empty or holds no complete list under {key!r}: expected "
+                f'{{"{key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}, got {error!r:.80}.'
+            ) from error
+
+
+class _Text:
+    """A part of a file's text, from which JSON is taken value by value."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file, self._decode = file, getincrementaldecoder("utf-8")().decode
+        self._text = ""
+        self._at = 0  # where the next value begins, in the text
+        self._byte = 0  # and in the file
+
+    def items(self, key: str) -> Iterator[tuple[Any, Place]]:
+        """Yield the items of the list under a key."""
+        found = False
+        self._take("{")
+        more = self._sign() != "}"
+        while more:
+            if self._sign() != '"':
+                raise self._error("no name")
+            name, _ = self._value()
+            self._take(":")
+            if name != key:
+                self._value()
+            elif found or self._sign() != "[":
+                raise self._error(f"a second {key!r}" if found else "no list")
+            else:
+                found = True
+                yield from self._list()
+            more = self._sign() == ","
+            if more:
+                self._take(",")
+        self._take("}")
+        if self._sign():
+            raise self._error("more text")
+        if not found:
+            raise self._error(f"no {key!r}")
+
+    def _list(self) -> Iterator[tuple[Any, Place]]:
+        """Yield the items of the list that begins here."""
+        self._take("[")
+        more = self._sign() != "]"
+        while more:
+            yield self._value()
+            more = self._sign() == ","
+            if more:
+                self._take(",")
+        self._take("]")
+
+    def _value(self) -> tuple[Any, Place]:
+        """Take a value, and return it with its place."""
+        self._sign()
+        while True:
+            try:
+                value, end = _DECODER.raw_decode(self._text, self._at)
+            except json.JSONDecodeError as error:
+                if not self._read():
+                    raise self._error(error.msg) from error
+                continue
+            if end < len(self._text) or not self._read():  # a number may go on
+                start = self._byte
+                self._move(end)
+                return value, (start, self._byte - start)
+
+    def _sign(self) -> str:
+        """Skip white space and return the character that follows, nothing at the end."""
+        while True:
+            self._move(_SPACE.match(self._text, self._at).end())  # type: ignore[union-attr]
+            if self._at < len(self._text):
+                return self._text[self._at]
+            if not self._read():
+                return ""
+
+    def _take(self, sign: str) -> None:
+        """Take a character that must follow."""
+        if self._sign() != sign:
+            raise self._error(f"no {sign!r}")
+        self._move(self._at + 1)
+
+    def _move(self, end: int) -> None:
+        """Go on to a place in the text."""
+        self._byte += len(self._text[self._at : end].encode())
+        self._at = end
+
+    def _read(self) -> bool:
+        """Read on, as much again as is left and at least a block; return whether there was any."""
+        block = self._file.read(max(_BLOCK, len(self._text) - self._at))
+        self._text = self._text[self._at :] + self._decode(block, not block)
+        self._at = 0
+        return bool(block)
+
+    def _error(self, what: str) -> ValueError:
+        return ValueError(f"{what} at byte {self._byte}")
