@@ -121,7 +121,7 @@ def test_the_wheel_says_what_it_is_and_needs(site):
         assert owner & (required | BROUGHT), f"{name} is imported, but {owner} is not required"
 
 
-def test_a_source_distribution_builds_the_same_wheel(source, tmp_path):
+def test_a_source_distribution_holds_what_a_wheel_needs(source, tmp_path):
     build = "from setuptools import build_meta; import sys; build_meta.build_sdist(sys.argv[1])"
     done = run_python("-c", build, tmp_path, cwd=source)
     assert not done.returncode, done.stderr
