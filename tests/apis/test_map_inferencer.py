@@ -9,6 +9,7 @@ import pytest
 import torch
 from mmengine.config import Config
 
+from gsmap.apis.checkpoint import load_model
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
@@ -286,3 +287,97 @@ def test_samples_of_another_frame_are_seen_from_the_model_s(inferencer, tmp_path
     (found,) = inferencer(Source(samples, "ego", tmp_path))
     (expected,) = inferencer([reframed(s, "ego", "lidar") for s in samples], tmp_path)
     torch.testing.assert_close(found.pred_instances_3d.pts, expected.pred_instances_3d.pts)
+
+
+def in_memory(sample, folder):
+    """Return a sample's images (RGB), intrinsics and cam_from_frame, by camera."""
+    images = {c.name: cv2.imread(str(folder / c.path))[..., ::-1] for c in sample.cameras}
+    intrinsics = {c.name: c.intrinsics for c in sample.cameras}
+    return images, intrinsics, {c.name: c.cam_from_frame for c in sample.cameras}
+
+
+def test_images_in_memory_give_what_their_files_give(inferencer, tmp_path):
+    (sample,) = make_samples(tmp_path, 1)
+    for camera in sample.cameras:  # a file that holds the very pixels
+        image = cv2.imread(str(tmp_path / camera.path))
+        camera.path = f"{camera.name}.png"
+        cv2.imwrite(str(tmp_path / camera.path), image)
+    (expected,) = inferencer([sample], tmp_path)
+    arrays = in_memory(sample, tmp_path)
+    found = inferencer.predict_images(*arrays)
+    torch.testing.assert_close(found.pred_instances_3d.pts, expected.pred_instances_3d.pts)
+    assert figure_to_rgb(inferencer.draw(found, score_thr=0.0)).shape[1] == 400
+    assert len(inferencer.visualizer.cameras(found.metainfo)) == 2
+    lines = inferencer.elements(found)
+    np.testing.assert_array_equal(lines.points.reshape(-1, 20, 2), found.pred_instances_3d.pts)
+    # as a list, turned round: each camera is the model's that looks as it does
+    listed = inferencer.predict_images(*(list(by_name.values())[::-1] for by_name in arrays))
+    torch.testing.assert_close(
+        listed.pred_instances_3d.pts, expected.pred_instances_3d.pts, atol=1e-3, rtol=0
+    )
+    vehicle = reframed(sample, "lidar", "ego")
+    (seen,) = inferencer([reframed(vehicle, "ego", "lidar")], tmp_path)
+    found = inferencer.predict_images(*in_memory(vehicle, tmp_path), frame="ego")
+    torch.testing.assert_close(found.pred_instances_3d.pts, seen.pred_instances_3d.pts)
+
+
+def test_a_drive_in_memory_leaves_no_files_and_its_images_as_they_are(inferencer, tmp_path):
+    (sample,) = make_samples(tmp_path, 1)
+    arrays = in_memory(sample, tmp_path)
+    before = {name: image.copy() for name, image in arrays[0].items()}
+    scratch = Path(inferencer._scratch.name)
+    files = sorted(scratch.rglob("*"))
+    inferencer.predict_images(*arrays)
+    assert sorted(scratch.rglob("*")) == files
+    for name, image in before.items():
+        np.testing.assert_array_equal(arrays[0][name], image)
+
+
+def test_an_absent_camera_in_memory_is_an_error_or_blank(inferencer, tmp_path):
+    (sample,) = make_samples(tmp_path, 1)
+    del sample.cameras[0]
+    arrays = in_memory(sample, tmp_path)
+    with pytest.raises(ValueError, match=r"lacks the cameras \['CAM_FRONT'\]"):
+        inferencer.predict_images(*arrays)
+    found = inferencer.predict_images(*arrays, allow_missing_cameras=True)
+    assert found.metainfo["cam_names"] == ["CAM_BACK"]
+
+
+@pytest.mark.parametrize(
+    ("which", "value", "error", "text"),
+    [
+        (0, np.zeros((4, 6, 3)), TypeError, "image of 'CAM_BACK' must be uint8, RGB, got float64"),
+        (0, np.zeros((4, 6), np.uint8), ValueError, r"'CAM_BACK' must have shape \(H, W, 3\)"),
+        (1, np.eye(4), ValueError, r"CAM_BACK: intrinsics must be numbers of shape \(3, 3\)"),
+        (1, np.zeros((3, 3)), ValueError, "intrinsics must be finite, with focal lengths > 0"),
+        (2, np.ones((4, 4)), ValueError, "cam_from_frame is no rigid transform"),
+        (2, None, ValueError, r"cam_from_frame must have the cameras of images, \['CAM_FRONT', "),
+    ],
+)
+def test_wrong_arrays_are_refused(inferencer, tmp_path, which, value, error, text):
+    arrays = in_memory(make_samples(tmp_path, 1)[0], tmp_path)
+    arrays[which]["CAM_BACK"] = value
+    if value is None:
+        del arrays[which]["CAM_BACK"]
+    with pytest.raises(error, match=text):
+        inferencer.predict_images(*arrays)
+
+
+def test_a_foreign_camera_or_frame_in_memory_is_refused(inferencer, tmp_path):
+    arrays = in_memory(make_samples(tmp_path, 1)[0], tmp_path)
+    with pytest.raises(ValueError, match=r"frame must be one of .*'lidar', 'ego'.* got 'world'"):
+        inferencer.predict_images(*arrays, frame="world")
+    for by_name in arrays:
+        by_name["roof"] = by_name.pop("CAM_BACK")
+    with pytest.raises(ValueError, match=r"has the cameras .* but not \['roof'\]: name all"):
+        inferencer.predict_images(*arrays)
+
+
+def test_load_model_gives_the_model_alone(tmp_path):
+    model = load_model(make_config(), cfg_options={"model.map_head.coder.max_num": 5})
+    assert not model.training
+    assert model.cfg.model.map_head.coder.max_num == 5
+    state = {k: torch.full_like(v, 0.01) for k, v in model.state_dict().items()}
+    torch.save({"state_dict": state}, tmp_path / "weights.pth")
+    loaded = load_model(make_config(), tmp_path / "weights.pth").state_dict()
+    assert all((v == 0.01).all() for v in loaded.values() if v.is_floating_point())

@@ -1,0 +1,91 @@
+"""What is imported from where, and what an import brings with it."""
+
+import importlib
+import re
+
+import pytest
+from processes import run_python
+
+import gsmap
+from gsmap.utils.lazy import lazy_names
+
+NAMES = [
+    *("gsmap.BEVGrid", "gsmap.MapElements", "gsmap.MapEvaluator", "gsmap.MapInferencer"),
+    *("gsmap.RasterLoss", "gsmap.list_models", "gsmap.load_model", "gsmap.render_gaussians"),
+    *("gsmap.write_geojson", "gsmap.apis.MapInferencer", "gsmap.apis.load_model"),
+    *("gsmap.datasets.VectorizedMapDataset", "gsmap.evaluation.ChamferConfig"),
+    *("gsmap.evaluation.MapEvaluator", "gsmap.evaluation.RasterConfig", "gsmap.maps.MapOrigin"),
+    *("gsmap.models.GSMapHead", "gsmap.models.MapDetector", "gsmap.models.RasterLoss"),
+    *("gsmap.ops.render_gaussians", "gsmap.structures.BEVGrid", "gsmap.structures.MapElements"),
+    *("gsmap.visualization.MapVisualizer", "gsmap.visualization.MapStyle"),
+]
+METRIC = """
+from gsmap.evaluation import ChamferConfig, MapEvaluator, RasterConfig
+from gsmap.structures import MapElements
+classes = ("divider",)
+evaluator = MapEvaluator(ChamferConfig(classes), RasterConfig(classes))
+line = [[[0.0, -20.0], [0.0, 20.0]]]
+found, truth = (MapElements.from_polylines(line, [0], scores) for scores in ([0.9], None))
+reports = evaluator.reports([evaluator.match("a", found, truth)])
+assert all(report.metrics[f"{report.name}/mAP"] > 0.999 for report in reports)
+"""
+
+
+def modules_after(code: str) -> set[str]:
+    """Return what is imported once a program has run."""
+    done = run_python("-c", f"{code}\nimport sys; print(*sys.modules)")
+    assert not done.returncode, done.stderr
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_is_where_users_look_for_it(name):
+    package, _, last = name.rpartition(".")
+    module = importlib.import_module(package)
+    found = getattr(module, last)
+    assert found.__name__ == last
+    assert last in module.__all__
+    assert last in dir(module)
+    assert getattr(module, last) is found
+
+
+def test_a_name_that_is_nowhere_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'gsmap' has no attribute 'MapInferrer'"):
+        gsmap.MapInferrer  # noqa: B018
+    load, _, names = lazy_names("gsmap.utils", {"Progress": "progress"})
+    assert names == ["Progress"]
+    assert load("Progress").__module__ == "gsmap.utils.progress"
+
+
+def test_every_name_of_every_table_exists():
+    for room in ("apis", "datasets", "evaluation", "maps", "models", "ops", "structures"):
+        module = importlib.import_module(f"gsmap.{room}")
+        assert all(getattr(module, name) for name in module.__all__)
+
+
+def test_the_packages_text_names_modules_that_exist():
+    named = re.findall(r"\bgsmap(?:\.\w+)+", gsmap.__doc__)
+    assert len(named) >= 5
+    for name in named:
+        importlib.import_module(name)
+
+
+def test_importing_the_library_imports_no_other_package():
+    assert not {"numpy", "torch", "mmengine", "mmdet3d"} & modules_after(
+        "import gsmap, gsmap.models"
+    )
+
+
+def test_the_metric_needs_no_torch():
+    assert not {"torch", "mmengine", "matplotlib"} & modules_after(METRIC)
+
+
+def test_rendering_needs_nothing_of_openmmlab():
+    found = modules_after("from gsmap import BEVGrid, RasterLoss, render_gaussians")
+    assert not {"mmengine", "mmcv", "mmdet", "mmdet3d", "numba", "matplotlib"} & found
+
+
+def test_the_inferencer_is_imported_without_what_only_a_model_needs():
+    slow = {"mmdet3d.structures", "mmdet3d.models", "mmcv.ops", "mmengine.runner", "matplotlib"}
+    slow |= {"numba", "av2", "scipy", "shapely", "pandas"}
+    assert not slow & modules_after("from gsmap import MapInferencer")
