@@ -109,6 +109,7 @@ def test_texts_of_files_cannot_leave_the_block_of_data(data):
     assert "innerHTML" not in page
     policy = re.search(r'content="(default-src[^"]*)"', page)[1]
     assert policy.startswith("default-src 'none'; img-src data:; style-src 'sha256-")
+    assert policy.endswith("; base-uri 'none'; form-action 'none'")
     for tag in ("style", "script"):
         content = re.search(rf"<{tag}>(.*?)</{tag}>", page, re.DOTALL)[1]
         digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()

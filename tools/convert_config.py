@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 from gsmap.converters.config.reader import read_assignments
-from gsmap.converters.config.upstream import convert_upstream, merge
+from gsmap.converters.config.upstream import convert_upstream, merge, python_text
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.shipped import shipped
@@ -29,9 +29,10 @@ def convert(source: Path, target: Path) -> str:
     settings = read_assignments(source)
     try:
         conversion = convert_upstream(settings)
-    except (ValueError, TypeError, LookupError) as error:
+        text = python_text(merge(conversion, shipped("configs")))
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
         raise ValueError(f"{source} cannot be converted: {error}") from error
-    write_text(target, merge(conversion, shipped("configs")).pretty_text)
+    write_text(target, text)
     lines = [f"{target} is written: configs/{conversion.base} with the settings of {source}"]
     if conversion.unplaced:
         lines.append("not placed, see docs/migration.md:")

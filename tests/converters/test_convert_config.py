@@ -11,7 +11,7 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config
 
 from gsmap.converters.config.reader import read_assignments
-from gsmap.converters.config.upstream import convert_upstream, merge
+from gsmap.converters.config.upstream import convert_upstream, merge, python_text
 from gsmap.engine.launch import check_config, read_config
 
 REPO = Path(__file__).resolve().parents[2]
@@ -171,6 +171,18 @@ def test_what_is_more_than_assignments_is_refused_and_never_run(line, message, t
     source.write_text(f"first = 1\n{line}\n")
     with pytest.raises(ValueError, match=message):
         read_assignments(source)
+
+
+def test_what_is_written_says_what_was_placed_and_is_quick(tmp_path):
+    cfg, _ = converted(upstream_configs.maptrv2(), tmp_path)
+    tree = "it's {a}"
+    for _ in range(12):
+        tree = {"a": tree, "b-c": tree}
+    cfg.model.img_backbone.more = tree
+    target = tmp_path / "ours.py"
+    target.write_text(python_text(cfg))
+    written = Config.fromfile(target, import_custom_modules=False).to_dict()
+    assert written == {k: v for k, v in cfg.to_dict().items() if not k.startswith("_")}
 
 
 def test_values_that_are_read(tmp_path):

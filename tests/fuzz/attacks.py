@@ -161,6 +161,52 @@ def settings_corpus(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
     return {**found, "no settings": [make], "text": f"{PLANTED}.print"}
 
 
+def config_corpus(folder: Path, text: str) -> dict[str, str]:
+    """Return configs of another repository, whose text is given, by what they try."""
+    marker = str(folder / MARKER)
+    call = f"open({marker!r}, 'w')"
+    parts = {
+        "key that ends itself": {f"x': {call}, 'y": 1},
+        "key that ends its argument": {f"depth=1), z={call}, y=dict(x": 1},
+        "key that mmengine heeds": {"_scope_": PLANTED},
+        "number as a key": {1: 2},
+        "replaced by mmengine": {"x": "\"{{$NOPE:b'}}", "y": f",{call},"},
+        "layer of a module": {"conv_cfg": {"type": "os.system"}},
+        "type of a module": {"type": "os.makedirs"},
+        "bytes": {"x": b"1"},
+        "infinite": {"x": "INFINITE"},
+    }
+    inner = "type='ResNet', depth=50,"
+    tried = {
+        name: text.replace(inner, f"**{{**dict({inner}), **{part!r}}},")
+        for name, part in parts.items()
+    }
+    tried["infinite"] = tried["infinite"].replace("'INFINITE'", "1e999")
+    lines = {
+        "doubling": "a = [0]\n" + "a = a + a\n" * 60,
+        "doubling text": "a = 'x'\n" + "a = a + a\n" * 60,
+        "lists of lists": "a = 1\n" + "a = [a, a]\n" * 60,
+        "squares": "a = 10\n" + "a = a * a\n" * 60,
+        "deeper and deeper": "a = 1\n" + "a = [a]\n" * 600,
+        "deep signs": "a = " + "-" * 900 + "1\n",
+        "endless signs": "a = " + "-" * 90_000 + "1\n",
+        "deep brackets": "a = " + "[" * 3000 + "\n",
+        "zero byte": "a = 1\0\n",
+    }
+    return tried | {name: line + text for name, line in lines.items()}
+
+
+def _convert_config(path: Path) -> None:
+    from mmengine.config import Config
+
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+    from tools.convert_config import convert
+
+    target = path.with_suffix(".py")
+    convert(path, target)
+    Config.fromfile(target, import_custom_modules=False)
+
+
 def _read_settings(path: Path) -> None:
     from gsmap.apis.map_inferencer import MapInferencer
 
@@ -215,6 +261,7 @@ READERS: dict[str, Callable[[Path], None]] = {
     "infos": _read_infos,
     "sample": _read_sample,
     "weights": _read_weights,
+    "config": _convert_config,
     "settings": _read_settings,
     "settings as mmengine builds them": _build_settings,
     "python": _read_as_python_does,

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
+import upstream_configs
 from processes import run_python
 
-from fuzz.attacks import CONFIG, corpus, settings_corpus
+from fuzz.attacks import CONFIG, config_corpus, corpus, settings_corpus
 from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
 from gsmap.engine.launch import read_config
 
@@ -89,3 +90,15 @@ def test_no_settings_of_a_checkpoint_run_anything(checkpoints: set[str], tmp_pat
     for name, outcome in outcomes.items():
         assert outcome.startswith("did not run, ValueError: "), f"{name}: {outcome}"
         assert f"{name}.pkl was not loaded: of the settings in it" in outcome, f"{name}: {outcome}"
+
+
+def test_no_config_of_another_repository_runs_anything_or_hangs(tmp_path: Path):
+    attacks = config_corpus(tmp_path, upstream_configs.maptr())
+    for name, content in attacks.items():
+        (tmp_path / f"{name}.pkl").write_text(content)
+    outcomes = read_all("config", tmp_path)
+    assert outcomes.keys() == attacks.keys()
+    for name, outcome in outcomes.items():
+        assert outcome.startswith("did not run, ValueError: "), f"{name}: {outcome}"
+        assert f"{name}.pkl" in outcome, f"{name}: {outcome}"
+        assert not (tmp_path / f"{name}.py").exists()

@@ -145,7 +145,8 @@ def page_html(data: Mapping[str, Any]) -> str:
         images.append([each["src"] for row in frame["cameras"] for each in row])
     style, script = (f"'sha256-{_digest(parts[name])}'" for name in ("css", "js"))
     return Template(parts["html"]).substitute(
-        policy=f"default-src 'none'; img-src data:; style-src {style}; script-src {script}",
+        policy=f"default-src 'none'; img-src data:; style-src {style}; script-src {script}; "
+        "base-uri 'none'; form-action 'none'",  # which default-src does not cover
         title=html.escape(str(data["title"])),
         style=parts["css"],
         script=parts["js"],

@@ -11,6 +11,9 @@ ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
     ast.Div: operator.truediv, ast.FloorDiv: operator.floordiv,
 }  # fmt: skip
+_COPIED = 50_000  # values and characters that all earlier names stand for together
+_LARGEST = 1e15  # numbers
+_DEEPEST = 20
 CALLS: dict[str, Callable[[Any], Any]] = {"len": len, "list": list, "tuple": tuple}
 
 
@@ -24,11 +27,14 @@ def read_assignments(path: str | Path) -> dict[str, Any]:
     Raises:
         ValueError: If the file holds anything else; the message names the line.
     """
-    names: dict[str, Any] = {}
+    names = _Names()
     try:
-        tree = ast.parse(Path(path).read_text())
+        source = Path(path).read_text()
+        tree = ast.parse(source)
     except SyntaxError as error:
         raise ValueError(f"{path}, line {error.lineno}: {error.msg}.") from None
+    except (RecursionError, MemoryError):
+        raise ValueError(f"{path} cannot be read: it is nested too deep.") from None
     for node in tree.body:
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             continue  # a docstring
@@ -36,21 +42,40 @@ def read_assignments(path: str | Path) -> dict[str, Any]:
             if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Name):
                 raise ValueError("only assignments of names are read")
             names[node.targets[0].id] = _value(node.value, names)
-        except (ValueError, TypeError, LookupError, ArithmeticError) as error:
-            line = ast.unparse(node).splitlines()[0]
-            raise ValueError(f"{path}, line {node.lineno}, {line!r}: {error}.") from None
-    return names
+        except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
+            line = source.split("\n")[node.lineno - 1].strip()
+            raise ValueError(f"{path}, line {node.lineno}, {line[:80]!r}: {error}.") from None
+    return dict(names)
 
 
-def _value(node: ast.expr, names: dict[str, Any]) -> Any:
+class _Names(dict[str, Any]):
+    """Values by name; what is taken is copied, and counts, as names of names of names grow fast."""
+
+    _left = _COPIED
+
+    def take(self, name: str) -> Any:
+        """Return a copy of a value; ValueError if there is none, or all copies are too much."""
+        if name not in self:
+            raise ValueError(f"{name} is not assigned before")
+        self._count(self[name], 0)
+        return copy.deepcopy(self[name])
+
+    def _count(self, value: Any, depth: int) -> None:
+        self._left -= len(value) if isinstance(value, str) else 1
+        if self._left < 0 or depth > _DEEPEST:
+            raise ValueError("earlier names stand for too much, or for lists nested too deep")
+        if isinstance(value, (list, tuple, dict)):
+            for inner in (*value, *value.values()) if isinstance(value, dict) else value:
+                self._count(inner, depth + 1)
+
+
+def _value(node: ast.expr, names: _Names) -> Any:
     """Return what an expression stands for."""
     match node:
         case ast.Constant(value):
             return value
         case ast.Name(name):
-            if name not in names:
-                raise ValueError(f"{name} is not assigned before")
-            return copy.deepcopy(names[name])
+            return names.take(name)
         case ast.List(elements):
             return [_value(element, names) for element in elements]
         case ast.Tuple(elements):
@@ -62,7 +87,7 @@ def _value(node: ast.expr, names: dict[str, Any]) -> Any:
     return _computed(node, names)
 
 
-def _computed(node: ast.expr, names: dict[str, Any]) -> Any:
+def _computed(node: ast.expr, names: _Names) -> Any:
     """Return the value of a call or of arithmetic."""
     match node:
         case ast.Call(ast.Name("dict"), [], keywords):
@@ -79,11 +104,14 @@ def _computed(node: ast.expr, names: dict[str, Any]) -> Any:
             # a text or list multiplied may fill the memory
             if isinstance(sign, ast.Mult) and not all(isinstance(v, (int, float)) for v in sides):
                 raise ValueError("only numbers are multiplied")
-            return ARITHMETIC[type(sign)](*sides)
+            result = ARITHMETIC[type(sign)](*sides)
+            if isinstance(result, (int, float)) and not abs(result) <= _LARGEST:
+                raise ValueError(f"no setting is beyond {_LARGEST:g}")
+            return result
     raise ValueError(f"{ast.unparse(node)!r} is more than a value")
 
 
-def _mapping(pairs: Iterable[Any], names: dict[str, Any]) -> dict[Any, Any]:
+def _mapping(pairs: Iterable[Any], names: _Names) -> dict[Any, Any]:
     """Return a dict of pairs of key and value nodes; a key of None stands for ``**``."""
     values: dict[Any, Any] = {}
     for key, node in pairs:

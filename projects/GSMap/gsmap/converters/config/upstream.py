@@ -1,7 +1,10 @@
 """A config of MapTR, MapTRv2, GeMap or MapVR in their authors' form, as settings of ours."""
 
+import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from pprint import pformat
 from typing import Any
 
 from mmengine.config import Config
@@ -9,6 +12,8 @@ from mmengine.config import Config
 from gsmap.converters.config.data import data_settings, schedule_settings
 from gsmap.converters.config.fields import Fields
 
+_KEY = re.compile(r"[a-zA-Z][\w.-]*", re.ASCII)
+_TYPE = re.compile(r"(mmdet\.)?\w+")
 METHODS = ("MapTR", "MapTRv2", "GeMap", "GeMapFull")
 # top-level names that mean something by themselves; others are variables of the file
 RUN = (
@@ -134,6 +139,37 @@ def merge(conversion: Conversion, configs: Path) -> Config:
         for step in cfg[f"{part}_dataloader"].dataset.pipeline:
             step.update(conversion.steps.get(step.type, {}))
     return cfg
+
+
+def python_text(cfg: Config) -> str:
+    """Write a config as Python: each value by its ``repr``.
+
+    Raises:
+        ValueError: If a value is more than a number or text, a key is no plain word, a type is the
+            path of a module, or a text is one that mmengine replaces (``{{...}}``).
+    """
+    # the base's own values have done their work
+    values = {name: v for name, v in cfg.to_dict().items() if not name.startswith("_")}
+    _check_plain(values, "")
+    lines = (f"{name} = {pformat(v, width=100, sort_dicts=False)}\n" for name, v in values.items())
+    return "".join(lines)
+
+
+def _check_plain(value: Any, name: str) -> None:
+    """Refuse what is not to stand in a config, which is code."""
+    if isinstance(value, (dict, list, tuple)):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            own = f"{name}.{key}".lstrip(".")
+            if isinstance(value, dict) and not (isinstance(key, str) and _KEY.fullmatch(key)):
+                raise ValueError(f"{own[:60]!r} is no name of a setting")
+            if key == "type" and not (isinstance(inner, str) and _TYPE.fullmatch(inner)):
+                raise ValueError(f"{own} must be the name of a registered class, got {inner!r:.60}")
+            _check_plain(inner, own)
+    elif isinstance(value, str):
+        if "{{" in value:
+            raise ValueError(f"{name} is {value!r:.60}, which mmengine would replace")
+    elif not (value is None or (isinstance(value, (int, float)) and math.isfinite(value))):
+        raise ValueError(f"{name} is {value!r:.60}, neither a finite number nor a text")
 
 
 def _base(encoder: str, av2: bool, with_depth: bool) -> str:
