@@ -8,6 +8,7 @@ from mmengine.structures import InstanceData
 from model_cases import straight_elements
 
 import gsmap.registered  # noqa: F401
+from gsmap.models.maptr.pairs import Predictions
 from gsmap.structures.grid import BEVGrid
 
 N, P, C = 4, 5, 16
@@ -77,10 +78,10 @@ def along_y(*xs: float) -> list:
     return [((x, -20), (x, 20)) for x in xs]
 
 
-def predictions_of(head: torch.nn.Module, outputs: dict, layer: int = 1) -> list[InstanceData]:
+def predictions_of(head: torch.nn.Module, outputs: list, layer: int = 1) -> Predictions:
     """Return what costs and losses read of the first query group's predictions."""
     _, own = next(head.split_groups(outputs))
-    return head.layer_predictions(own, layer)
+    return own[layer]
 
 
 def losses_of(head: torch.nn.Module, *gts: InstanceData) -> dict[str, torch.Tensor]:

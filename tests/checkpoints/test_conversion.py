@@ -15,6 +15,7 @@ from model_cases import (
     small_config,
     straight_elements,
 )
+from predictions import stacked
 from torch import nn
 
 from gsmap.apis.checkpoint import load_weights, read_weights
@@ -94,8 +95,8 @@ def test_gsmap_starts_where_an_upstream_maptr_checkpoint_ended(tmp_path):
     images, samples = make_images(1), make_samples(straight_elements())
     with torch.no_grad():
         expected, outputs = maptr._forward(images, samples), gsmap._forward(images, samples)
-    assert torch.equal(outputs["all_pts_preds"], expected["all_pts_preds"])
-    assert torch.equal(outputs["all_cls_scores"], expected["all_cls_scores"])
+    assert torch.equal(stacked(outputs).pts, stacked(expected).pts)
+    assert torch.equal(stacked(outputs).scores, stacked(expected).scores)
     with pytest.raises(ValueError, match=r"does not have: .*map_head\.reference\.gaussian_init"):
         upstream_from_ours(gsmap.state_dict())
 

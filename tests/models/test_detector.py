@@ -1,6 +1,7 @@
 import pytest
 import torch
 from model_cases import build_small, make_images, make_samples, straight_elements
+from predictions import stacked
 
 NONE = straight_elements()
 ONE = straight_elements(((-5.0, -20.0), (-5.0, 20.0)))
@@ -37,10 +38,10 @@ def test_predictions_are_in_metres_best_first():
         assert found.pts.shape[1:] == (20, 2)
         assert (found.scores_3d.diff() <= 0).all()
         # the best pair of query and class, its points scaled to +-15 and +-30 m
-        scores = raw["all_cls_scores"][-1, number].sigmoid()
+        scores = stacked(raw).scores[-1, number].sigmoid()
         query, label = divmod(int(scores.argmax()), 3)
         assert found.labels_3d[0] == label
-        expected = raw["all_pts_preds"][-1, number, query] * torch.tensor([30.0, 60.0])
+        expected = stacked(raw).pts[-1, number, query] * torch.tensor([30.0, 60.0])
         torch.testing.assert_close(found.pts[0], expected - torch.tensor([15.0, 30.0]))
 
 
@@ -51,8 +52,8 @@ def test_a_sample_does_not_depend_on_its_batch():
     samples = make_samples(NONE, NONE)
     samples[1].set_metainfo({"lidar2img": samples[1].lidar2img[::-1].copy()})
     with torch.no_grad():
-        both = model._forward(images, samples)["all_pts_preds"]
-        second = model._forward({"imgs": images["imgs"][1:]}, samples[1:])["all_pts_preds"]
+        both = stacked(model._forward(images, samples)).pts
+        second = stacked(model._forward({"imgs": images["imgs"][1:]}, samples[1:])).pts
     torch.testing.assert_close(both[:, 1:], second, atol=1e-5, rtol=1e-4)
 
 
@@ -84,7 +85,7 @@ def test_mixed_precision_trains_and_keeps_points_in_float32():
     with torch.autocast("cpu", torch.bfloat16):
         outputs = model._forward(images, samples)
         losses = model.loss(images, samples)
-    assert outputs["all_pts_preds"].dtype == torch.float32
+    assert stacked(outputs).pts.dtype == torch.float32
     assert all(value.dtype == torch.float32 for value in losses.values())
     torch.stack(list(losses.values())).sum().backward()
     grads = [p.grad for p in model.parameters() if p.grad is not None]
@@ -96,9 +97,9 @@ def test_mixed_precision_stays_close_to_float32():
     model = build_small().eval()
     images, samples = make_images(1), make_samples(NONE)
     with torch.no_grad():
-        exact = model._forward(images, samples)["all_pts_preds"]
+        exact = stacked(model._forward(images, samples)).pts
         with torch.autocast("cpu", torch.bfloat16):
-            mixed = model._forward(images, samples)["all_pts_preds"]
+            mixed = stacked(model._forward(images, samples)).pts
     # bfloat16 keeps 8 bits; the points pass two layers of width 16
     torch.testing.assert_close(mixed, exact, atol=0.02, rtol=0)
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import torch
+from predictions import pairs_of, stacked
 
 from gsmap.checkpoints.key_map import GEMAP
 from gsmap.models.gemap.attention import GeometryDecoupledAttention
@@ -58,7 +59,7 @@ def check_loss(golden: Golden, name: str) -> Iterator[Row]:
     counts = matched.unflatten(0, (-1, NUM_INSTANCES)).sum(1).tolist()
     leaf = data["pred"].requires_grad_()
     pred, target = leaf[matched], ((data["target_m"] - LOW_M) / SIZE_M)[matched]
-    loss = EuclideanLoss()(pred, target, counts)
+    loss = EuclideanLoss()(pairs_of(pred_pts=pred, gt_pts=target, counts=counts))
     loss.backward()
     assert leaf.grad is not None
     shape = euclidean_shape_loss(pred, target)
@@ -90,8 +91,9 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     off = largest_difference(bev.flatten(1).T, data["bev_embed_sub"])
     yield Row(name, "BEV features", off, 1e-4)
     outputs = model.map_head(bev_outputs)
-    for key, atol in (("all_cls_scores", 5e-4), ("all_pts_preds", 1e-4)):
-        yield Row(name, key, largest_difference(outputs[key], data[key]), atol)
+    scores, pts = stacked(outputs).scores, stacked(outputs).pts
+    for key, value, atol in (("all_cls_scores", scores, 5e-4), ("all_pts_preds", pts, 1e-4)):
+        yield Row(name, key, largest_difference(value, data[key]), atol)
     yield from decoded_rows(name, data, model.map_head.predict_by_feat(outputs, [meta])[0])
 
 

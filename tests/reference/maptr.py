@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import torch
 from mmengine.structures import InstanceData
+from predictions import predicted, stacked
 from scipy.optimize import linear_sum_assignment
 
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
 from gsmap.checkpoints.key_map import find_key_map
 from gsmap.models.encoders.gkt import border_pixels, kernel_offsets
 from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.pairs import Predictions
 from gsmap.ops.deformable_sampling import sum_rows
 from reference.golden import Golden
 from reference.registry import check
@@ -83,12 +85,12 @@ def check_kernel_attention(golden: Golden, name: str) -> Iterator[Row]:
 def head_rows(
     name: str,
     data: dict[str, np.ndarray],
-    outputs: dict[str, Any],
+    outputs: Sequence[Predictions],
     cls_atol: float,
     pts_atol: float,
 ) -> Iterator[Row]:
     """Compare class scores, points and their boxes of all layers."""
-    scores, pts = outputs["all_cls_scores"], outputs["all_pts_preds"]
+    scores, pts = stacked(outputs).scores, stacked(outputs).pts
     low, high = pts.amin(-2), pts.amax(-2)
     boxes = torch.cat([(low + high) / 2, high - low], -1)
     yield Row(name, "all_cls_scores", largest_difference(scores, data["all_cls_scores"]), cls_atol)
@@ -158,7 +160,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
         name, "init_reference", largest_difference(reference[None], data["init_reference"]), 1e-5
     )
     outputs = head(bev_outputs)
-    states = outputs["states"][:, 0, ::25, ::8]
+    states = stacked(outputs).point_states.flatten(2, 3)[:, 0, ::25, ::8]
     yield Row(name, "decoder states", largest_difference(states, data["hs_sub"]), 1e-3)
     yield from head_rows(name, data, outputs, 5e-4, 1e-4)
     yield from decoded_rows(name, data, head.predict_by_feat(outputs, [meta])[0])
@@ -195,7 +197,7 @@ def loss_rows(
         torch.from_numpy(np.concatenate([arrays[key] for arrays in saved], 1)).requires_grad_()
         for key in ("all_cls_scores", "all_pts_preds")
     )
-    outputs = {"all_cls_scores": scores, "all_pts_preds": pts, "all_references": pts}
+    outputs = predicted(head, scores, pts)
     batch_gt = [gt_instances(golden.gt_sets[gt_set]) for _, gt_set in samples]
     metas = [golden.meta(size) for size, _ in samples]
     yield from match_rows(name, data, head, outputs, batch_gt, metas)
@@ -228,7 +230,7 @@ def head_loss_rows(
     """
     data, saved = golden.read_arrays(name), golden.read_arrays(forward_file)
     scores, pts = (torch.from_numpy(saved[key]) for key in ("all_cls_scores", "all_pts_preds"))
-    outputs = {"all_cls_scores": scores, "all_pts_preds": pts, "all_references": pts}
+    outputs = predicted(head, scores, pts)
     batch_gt = [gt_instances(golden.gt_sets[name.split("_")[2]])]
     metas = [golden.meta("reduced")]
     matches = {f"{key}_b0": value for key, value in data.items() if key.startswith("match_")}
@@ -245,15 +247,14 @@ def match_rows(
     name: str,
     data: dict[str, np.ndarray],
     head: MapHead,
-    outputs: dict[str, torch.Tensor],
+    outputs: Sequence[Predictions],
     batch_gt: Sequence[InstanceData],
     metas: Sequence[dict[str, Any]],
 ) -> Iterator[Row]:
     """Compare the pairs of query, ground truth and order of every layer."""
     gts = [head.prepare_gt(gt) for gt in batch_gt]
     wrong = 0.0
-    for layer in range(len(outputs["all_cls_scores"])):
-        predictions = head.layer_predictions(outputs, layer)
+    for layer, predictions in enumerate(outputs):
         pairs = head.match(predictions, gts, metas)
         for image, match in enumerate(pairs.matches):
             ours = torch.stack([match.query_inds, match.gt_inds, match.order_inds], -1)

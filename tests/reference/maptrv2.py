@@ -9,6 +9,7 @@ import torch
 from mmdet3d.structures import Det3DDataSample
 from mmengine.model import BaseModel
 from mmengine.structures import InstanceData
+from predictions import stacked
 from torch import Tensor
 
 from gsmap.datasets.annotations.record import MapInstance
@@ -17,6 +18,7 @@ from gsmap.models.encoders.camera_encoder import stack_calibration
 from gsmap.models.encoders.depth_net import camera_vector
 from gsmap.models.encoders.lss import CAMERA_MATRICES
 from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.pairs import Predictions
 from gsmap.models.maptrv2.depth import depth_bins
 from gsmap.ops.bev_pool import cell_indices
 from reference.golden import NUM_CAMS, Golden
@@ -113,16 +115,16 @@ def lifting_rows(
 
 
 def group_rows(
-    name: str, data: dict[str, np.ndarray], first: dict[str, Tensor], further: dict[str, Tensor]
+    name: str, data: dict[str, np.ndarray], first: list[Predictions], further: list[Predictions]
 ) -> Iterator[Row]:
     """Compare the predictions of the training queries."""
     ours = {
-        "train_one2one_cls": first["all_cls_scores"],
-        "train_one2one_pts": first["all_pts_preds"],
-        "one2many_cls": further["all_cls_scores"],
-        "one2many_pts": further["all_pts_preds"],
-        "one2many_pts_layer_last": further["all_pts_preds"][-1],
-        "one2many_pts_every10th": further["all_pts_preds"][:, :, ::10],
+        "train_one2one_cls": stacked(first).scores,
+        "train_one2one_pts": stacked(first).pts,
+        "one2many_cls": stacked(further).scores,
+        "one2many_pts": stacked(further).pts,
+        "one2many_pts_layer_last": stacked(further).pts[-1],
+        "one2many_pts_every10th": stacked(further).pts[:, :, ::10],
     }
     for key, value in ours.items():
         if key in data:
@@ -196,7 +198,7 @@ def match_rows(
     data: dict[str, np.ndarray],
     group: str,
     head: MapHead,
-    outputs: dict[str, Tensor],
+    outputs: list[Predictions],
     gt: InstanceData,
     meta: dict[str, Any],
     repeats: int,
@@ -204,8 +206,7 @@ def match_rows(
     """Compare the matches of all layers; copies of one ground truth stand for each other."""
     prepared = head.prepare_gt(gt)
     different = total = 0
-    for layer in range(len(outputs["all_cls_scores"])):
-        predictions = head.layer_predictions(outputs, layer)
+    for layer, predictions in enumerate(outputs):
         match = head.match(predictions, [prepared], [meta], repeats).matches[0]
         ours = zip(match.query_inds, match.gt_inds, match.order_inds, strict=True)
         listed = data[f"match_{group}_l{layer}"]

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import torch
 from mmengine.structures import InstanceData
+from predictions import pairs_of
 
 from gsmap.models.mapvr.cost import RenderedDiceCost
 from gsmap.models.mapvr.losses import RenderedDiceLoss
@@ -51,7 +52,8 @@ def check_dice(golden: Golden, name: str) -> Iterator[Row]:
     for case in sorted(key.removesuffix("_labels") for key in data if key.endswith("_labels")):
         labels, gt = data[f"{case}_labels"], data[f"{case}_gt"]
         pred = data[f"{case}_pred"].clone().requires_grad_()
-        loss = RenderedDiceLoss()(pred, gt, labels)
+        pairs = pairs_of(pred_pts=pred, gt_first_pts=gt, gt_labels=labels, avg_factor=len(gt))
+        loss = RenderedDiceLoss()(pairs)
         loss.backward()
         assert pred.grad is not None
         off = largest_relative(loss.detach(), data[f"{case}_loss_w15"])

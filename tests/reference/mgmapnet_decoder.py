@@ -8,6 +8,7 @@ import torch
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from mmengine.registry import init_default_scope
+from predictions import stacked
 from torch import Tensor
 
 from gsmap.checkpoints.key_map import MGMAPNET
@@ -47,16 +48,16 @@ def small_head(golden: Golden) -> MapHead:
 def run(head: MapHead, bev_feats: Tensor) -> dict[str, Tensor]:
     """Return all predictions by the golden names."""
     outputs = head({"bev_feats": bev_feats})
-    states = outputs["all_instance_states"]
+    states = stacked(outputs).instance_states
     position, _ = head.queries()
     samples = zip(states[-1], bev_feats, strict=True)
     return {
         "init_reference": head.reference.start(position)[:, None].expand(B, -1, P, -1),
         "instance_states": states.transpose(1, 2),
-        "point_states": outputs["states"].unflatten(2, (-1, P)),
-        "references": outputs["all_references"],
-        "mean_loc": outputs["all_mean_locations"],
-        "all_cls_scores": outputs["all_cls_scores"],
+        "point_states": stacked(outputs).point_states,
+        "references": stacked(outputs).references,
+        "mean_loc": stacked(outputs).mean_locations,
+        "all_cls_scores": stacked(outputs).scores,
         "seg": head.aux_heads["seg"](bev_feats),
         "ins_seg": torch.stack([head.losses["ins_seg"].logits(*sample) for sample in samples]),
     }
@@ -147,17 +148,17 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     off = fraction_beyond(cells, data["bev_embed_sub"], 1e-4)
     yield Row(name, "share of BEV that is off by > 1e-4", off, 0.01)
     outputs = head(bev_outputs)
-    scores = outputs["all_cls_scores"]
+    scores = stacked(outputs).scores
     ours = {
         "all_cls_scores": (scores, 1e-3),
-        "all_pts_preds": (outputs["all_pts_preds"], 1e-4),
-        "mean_loc_last": (outputs["all_mean_locations"][-1], 1e-4),
+        "all_pts_preds": (stacked(outputs).pts, 1e-4),
+        "mean_loc_last": (stacked(outputs).mean_locations[-1], 1e-4),
     }
     for key, (value, tolerance) in ours.items():
         yield Row(name, key, largest_difference(value, data[key]), tolerance)
     yield from decoded_rows(name, data, head.predict_by_feat(outputs, [meta])[0])
     masks = head.aux_heads
-    instances = head.losses["ins_seg"].logits(outputs["all_instance_states"][-1, 0], bev[0])
+    instances = head.losses["ins_seg"].logits(stacked(outputs).instance_states[-1, 0], bev[0])
     for key, value in {
         "seg": masks["seg"](bev)[..., ::2, ::2],
         "ins_seg": instances[None, ::10, ::4, ::4],
@@ -167,12 +168,12 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
         yield Row(name, f"cells with {key} off by > 1e-3", off, 0.01)
     with all_queries(head):
         (_, first), (_, further) = head.split_groups(head(bev_outputs))
-    change = (first["all_cls_scores"] - scores).abs().amax((1, 2, 3))
+    change = (stacked(first).scores - scores).abs().amax((1, 2, 3))
     ours = {
-        "one2one_cls": (first["all_cls_scores"], 1e-3),
-        "one2one_pts_last": (first["all_pts_preds"][-1], 1e-4),
-        "one2many_cls_sub": (further["all_cls_scores"][:, :, ::20], 1e-3),
-        "one2many_pts_last_sub": (further["all_pts_preds"][-1, :, ::20], 1e-4),
+        "one2one_cls": (stacked(first).scores, 1e-3),
+        "one2one_pts_last": (stacked(first).pts[-1], 1e-4),
+        "one2many_cls_sub": (stacked(further).scores[:, :, ::20], 1e-3),
+        "one2many_pts_last_sub": (stacked(further).pts[-1, :, ::20], 1e-4),
         "minus_eval_cls_maxabs": (change, 1e-4),
     }
     for key, (value, tolerance) in ours.items():

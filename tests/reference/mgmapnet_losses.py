@@ -6,10 +6,12 @@ import numpy as np
 import torch
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
+from predictions import predicted
 from torch import Tensor, nn
 
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.masks import ElementMasks
+from gsmap.models.maptr.pairs import Predictions
 from gsmap.models.maptrv2.aux_heads import BEVMaskHead
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
@@ -22,9 +24,9 @@ GROUPS = {"o2o": 20, "o2m": 60}  # the file's names and their queries
 REPEATS, LAYERS = 3, 6
 LOSS, LOSS_GRAD = 1e-4, 1e-3
 OUTPUTS = {  # ours and the file's
-    "all_cls_scores": "all_cls_scores",
-    "all_pts_preds": "all_pts_preds",
-    "all_mean_locations": "all_MGA_Ref_preds",
+    "scores": "all_cls_scores",
+    "references": "all_pts_preds",
+    "mean_locations": "all_MGA_Ref_preds",
 }
 WEIGHTS = {"_bce": (3.0, 0.0), "_dice": (0.0, 3.0), "": (3.0, 3.0)}  # of both terms of masks
 LOSSES = {"cls": "cls", "pts": "pts", "dir": "dir", "mean_loc": "MGA_ref"}
@@ -64,19 +66,14 @@ def saved_outputs(data: Mapping[str, np.ndarray], parts: GoldenParts) -> dict[st
     for ours, theirs in OUTPUTS.items():
         groups = []
         for group, num in GROUPS.items():
-            if ours == "all_cls_scores":
+            if ours == "scores":
                 groups.append(parts.normal(f"mgm_loss_{group}_cls", (LAYERS, B, num, 3), shift=-1))
             else:
                 groups.append(torch.from_numpy(data[f"in_{group}_{theirs}"]))
         outputs[ours] = torch.cat(groups, 2).requires_grad_()
     states = torch.eye(sum(GROUPS.values()), GROUPS["o2o"]).expand(LAYERS, B, -1, -1)
     masks = torch.from_numpy(data["in_o2o_ins_seg"]).requires_grad_()
-    references = outputs["all_pts_preds"]
-    return outputs | {
-        "all_references": references,
-        "all_instance_states": states,
-        "bev_feats": masks,
-    }
+    return outputs | {"instance_states": states, "bev_feats": masks}
 
 
 def ground_truths(data: Mapping[str, np.ndarray], parts: GoldenParts) -> list[InstanceData]:
@@ -96,8 +93,9 @@ def ground_truths(data: Mapping[str, np.ndarray], parts: GoldenParts) -> list[In
 def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     """Compare matches, losses and gradients of fixed predictions."""
     data, parts = golden.read_arrays(name), GoldenParts(golden)
-    outputs, gts = saved_outputs(data, parts), ground_truths(data, parts)
+    saved, gts = saved_outputs(data, parts), ground_truths(data, parts)
     head = loss_head(golden, "released")
+    outputs = predicted(head, **saved)
     yield from match_rows(name, data, head, outputs, gts)
     losses = head.loss_by_feat(outputs, gts, [{}] * B)
     for group in GROUPS:
@@ -115,23 +113,22 @@ def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     off = largest_relative(total.item() + data["loss_seg"], data["total"])
     yield Row(name, "total (relative)", off, LOSS)
     total.backward()
-    yield from gradient_rows(name, data, outputs)
-    yield from matched_rows(name, data, outputs, loss_head(golden, "matched"), gts)
+    yield from gradient_rows(name, data, saved)
+    yield from matched_rows(name, data, saved, loss_head(golden, "matched"), gts)
 
 
 def match_rows(
     name: str,
     data: Mapping[str, np.ndarray],
     head: MapHead,
-    outputs: dict[str, Tensor],
+    outputs: list[Predictions],
     gts: list[InstanceData],
 ) -> Iterator[Row]:
     """Compare the matches of both groups; copies of one ground truth stand for each other."""
     prepared = [head.prepare_gt(gt) for gt in gts]
     for label, (group, own) in zip(GROUPS, head.split_groups(outputs), strict=True):
         wrong = 0
-        for layer in range(LAYERS):
-            predictions = head.layer_predictions(own, layer)
+        for layer, predictions in enumerate(own):
             pairs = head.match(predictions, prepared, [{}] * B, group.repeats)
             for sample, match in enumerate(pairs.matches):
                 triples = torch.stack([match.query_inds, match.gt_inds, match.order_inds], -1)
@@ -161,33 +158,34 @@ def class_mask_rows(name: str, data: Mapping[str, np.ndarray], parts: GoldenPart
 
 
 def gradient_rows(
-    name: str, data: Mapping[str, np.ndarray], outputs: dict[str, Tensor]
+    name: str, data: Mapping[str, np.ndarray], saved: dict[str, Tensor]
 ) -> Iterator[Row]:
     """Compare the gradients of all predictions."""
     for ours, theirs in OUTPUTS.items():
-        parts = outputs[ours].grad.split(list(GROUPS.values()), 2)
+        parts = saved[ours].grad.split(list(GROUPS.values()), 2)
         for group, part in zip(GROUPS, parts, strict=True):
             off = relative_norm(part, data[f"grad_{group}_{theirs}"])
             yield Row(name, f"{group}: gradient of {ours} (relative)", off, LOSS_GRAD)
-    off = relative_norm(outputs["bev_feats"].grad, data["grad_ins_seg"])
+    off = relative_norm(saved["bev_feats"].grad, data["grad_ins_seg"])
     yield Row(name, "gradient of instance masks, released (relative)", off, LOSS_GRAD)
 
 
 def matched_rows(
     name: str,
     data: Mapping[str, np.ndarray],
-    outputs: dict[str, Tensor],
+    saved: dict[str, Tensor],
     head: MapHead,
     gts: list[InstanceData],
 ) -> Iterator[Row]:
     """Compare the loss of instance masks whose pairs are those of the matching."""
-    outputs["bev_feats"].grad = None
+    saved["bev_feats"].grad = None
     part = head.losses["ins_seg"]
     for key, weights in WEIGHTS.items():
         part.loss_weight, part.dice_weight = weights
+        outputs = predicted(head, **saved)
         loss = head.loss_by_feat(outputs, gts, [{}] * B)["loss_ins_seg"]
         off = largest_relative(loss.item(), data[f"loss_ins_seg_matched{key}"])
         yield Row(name, f"instance masks, matched{key} (relative)", off, LOSS)
     loss.backward()
-    off = relative_norm(outputs["bev_feats"].grad, data["grad_ins_seg_matched"])
+    off = relative_norm(saved["bev_feats"].grad, data["grad_ins_seg_matched"])
     yield Row(name, "gradient of instance masks, matched (relative)", off, LOSS_GRAD)

@@ -3,7 +3,7 @@ import torch
 from head_cases import HEAD, LANES, along_y, bev, build_head, elements, with_layer
 
 from gsmap.models.gemap.attention import GeometryDecoupledAttention
-from gsmap.models.gemap.losses import EuclideanLoss
+from gsmap.models.gemap.losses import euclidean_relation_loss, euclidean_shape_loss
 from gsmap.models.maptrv2.attention import DecoupledSelfAttention
 
 GEMAP = {**HEAD, "type": "GeMapHead"}
@@ -32,12 +32,14 @@ def test_the_loss_compares_relations_within_each_sample_only():
     actual = head.loss_by_feat(outputs, truths, [{}, {}])["loss_euclidean"]
     gts = [head.prepare_gt(truth) for truth in truths]
     ((_, own),) = head.split_groups(outputs)
-    predictions = head.layer_predictions(own, 1)
-    pairs = head.match(predictions, gts, [{}, {}])
-    matched = [p.pts[m.query_inds] for p, m in zip(predictions, pairs.matches, strict=True)]
-    expected = EuclideanLoss()(torch.cat(matched), pairs["gt.pts"], [2, 3])
+    pairs = head.match(own[1], gts, [{}, {}])
+    samples = zip(own[1].pts, pairs.matches, strict=True)
+    points = torch.cat([pts[match.query_inds] for pts, match in samples]), pairs.gt_pts
+    shape = euclidean_shape_loss(*points)
+    expected = 0.005 * (shape + euclidean_relation_loss(*points, [2, 3]))
     torch.testing.assert_close(actual, expected)
-    assert not torch.isclose(expected, EuclideanLoss()(torch.cat(matched), pairs["gt.pts"], [5]))
+    whole = 0.005 * (shape + euclidean_relation_loss(*points, [5]))
+    assert not torch.isclose(expected, whole)
 
 
 def test_parts_of_gemap_can_be_left_out():

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from predictions import pairs_of
 
 from gsmap.models.gemap.losses import (
     EuclideanLoss,
@@ -12,6 +13,11 @@ from gsmap.models.gemap.losses import (
 )
 
 LOW, SIZE = torch.tensor([-15.0, -30.0]), torch.tensor([30.0, 60.0])  # the golden files' range
+
+
+def loss_of(loss, pred, target, counts):
+    """Return the loss of pairs of points, so many of each sample."""
+    return loss(pairs_of(pred_pts=pred, gt_pts=target, counts=counts))
 
 
 def read(path):
@@ -70,7 +76,7 @@ def test_loss_and_gradient_equal_the_golden_ones(golden_dir):
     pred, target = leaf[matched], ((golden["target_m"] - LOW) / SIZE)[matched]
     shape = euclidean_shape_loss(pred, target)
     relation = euclidean_relation_loss(pred, target, counts)
-    loss = EuclideanLoss()(pred, target, counts)
+    loss = loss_of(EuclideanLoss(), pred, target, counts)
     loss.backward()
     for value, name in (
         (shape, "intra_unweighted"),
@@ -90,7 +96,7 @@ def test_loss_on_a_models_predictions_equals_the_golden_one(golden_dir, case):
     shifts = (read(models / f"maptr_loss_{case}_A.npz")["gt_shift_pts"] - LOW) / SIZE
     for layer, pred in enumerate(preds):
         query, gt, shift = golden[f"match_l{layer}"].T
-        value = EuclideanLoss()(pred[query], shifts[gt, shift], [len(query)])
+        value = loss_of(EuclideanLoss(), pred[query], shifts[gt, shift], [len(query)])
         name = f"loss/d{layer}.loss_geo_2" if layer < 5 else "loss/loss_geo_2"
         torch.testing.assert_close(value.double(), golden[name], rtol=1e-4, atol=0)
 
@@ -100,19 +106,19 @@ def test_gradients():
     pred, target = torch.rand(2, 5, 4, 2, dtype=torch.float64, generator=generator)
     pred.requires_grad_()
     loss = EuclideanLoss(1.0, 0.7, 1.3)
-    assert torch.autograd.gradcheck(lambda p: loss(p, target, [2, 0, 3]), [pred])
+    assert torch.autograd.gradcheck(lambda p: loss_of(loss, p, target, [2, 0, 3]), [pred])
 
 
 def test_repeated_points_keep_the_gradient_finite():
     pred = torch.zeros(2, 4, 2, requires_grad=True)
-    EuclideanLoss()(pred, torch.rand(2, 4, 2), [2]).backward()
+    loss_of(EuclideanLoss(), pred, torch.rand(2, 4, 2), [2]).backward()
     assert torch.isfinite(pred.grad).all()
 
 
 @pytest.mark.parametrize("counts", [[], [0, 0]])
 def test_nothing_matched_gives_zero_with_a_gradient(counts):
     pred = torch.zeros(0, 20, 2, requires_grad=True)
-    value = EuclideanLoss()(pred, torch.zeros(0, 20, 2), counts)
+    value = loss_of(EuclideanLoss(), pred, torch.zeros(0, 20, 2), counts)
     value.backward()
     assert value.item() == 0
     assert pred.grad.shape == pred.shape
@@ -121,7 +127,7 @@ def test_nothing_matched_gives_zero_with_a_gradient(counts):
 def test_bad_arguments_are_named():
     pred = torch.rand(3, 4, 2)
     with pytest.raises(ValueError, match=r"counts must add up to 3 matches, got \[1, 1\]"):
-        EuclideanLoss()(pred, pred, [1, 1])
+        loss_of(EuclideanLoss(), pred, pred, [1, 1])
     for loss in (euclidean_shape_loss, lambda p, t: euclidean_relation_loss(p, t, [3])):
         with pytest.raises(ValueError, match=r"target must have shape \(3, 4, 2\) of pred"):
             loss(pred, pred[:2])

@@ -15,6 +15,7 @@ from head_cases import (
     predictions_of,
     with_layer,
 )
+from predictions import predicted, stacked
 
 from gsmap.models.gsmap.layer import GaussianDecoderLayer
 from gsmap.ops.gaussian_raster import render_gaussians
@@ -38,8 +39,8 @@ def test_with_the_weights_of_another_head_its_points_and_scores_are_exactly_the_
     parts = ("reference.gaussian_init.", "reference.gaussian_branches.", ".guidance.embedding.")
     assert all(any(part in key for part in parts) for key in left.missing_keys)
     expected, actual = other(bev()), gsmap_head(bev())
-    assert torch.equal(actual["all_pts_preds"], expected["all_pts_preds"])
-    assert torch.equal(actual["all_cls_scores"], expected["all_cls_scores"])
+    assert torch.equal(stacked(actual).pts, stacked(expected).pts)
+    assert torch.equal(stacked(actual).scores, stacked(expected).scores)
 
 
 def test_the_guided_attention_is_as_large_as_maptrs_and_drops_as_much():
@@ -100,17 +101,12 @@ def test_each_layer_has_its_raster_loss_or_only_the_last():
 def perfect_outputs(head, gt, scales=(0.0, 0.0), rotation=0.0):
     """Return outputs whose first instances are the ground truth itself, the others far away."""
     outputs = head(bev())
-    references = torch.full_like(outputs["all_references"], 1e-3)
+    references = torch.full_like(stacked(outputs).references, 1e-3)
     references[..., 2:] = torch.tensor([*scales, rotation])
     references[:, :, : len(gt.pts), :, :2] = head.grid.norm_from_metres(gt.pts)
-    scores = torch.full_like(outputs["all_cls_scores"], -9.0)
+    scores = torch.full_like(stacked(outputs).scores, -9.0)
     scores[:, :, range(len(gt.pts)), gt.labels_3d] = 9.0
-    return {
-        **outputs,
-        "all_references": references.requires_grad_(),
-        "all_pts_preds": references[..., :2],
-        "all_cls_scores": scores,
-    }
+    return predicted(head, scores, references.requires_grad_())
 
 
 def test_a_band_along_the_line_has_a_smaller_raster_loss_than_one_across_it():
@@ -127,8 +123,8 @@ def test_the_raster_loss_reaches_centres_scales_and_angles():
     lane = elements(((-3, -20), (-1, 20)))
     outputs = perfect_outputs(head, lane, scales=(0.2, 0.7), rotation=0.3)
     loss = head.loss_by_feat(outputs, [lane], [{}])["loss_raster"]
-    (gradient,) = torch.autograd.grad(loss, outputs["all_references"])
-    matched, others = gradient[-1, 0, 0], gradient[-1, 0, 1:]
+    (gradient,) = torch.autograd.grad(loss, outputs[-1].references)
+    matched, others = gradient[0, 0], gradient[0, 1:]
     assert (matched.abs().sum(0) > 0).all()  # each of mu_x, mu_y, sigma_x, sigma_y, theta
     assert not others.any()
 
@@ -138,19 +134,18 @@ def test_matching_reads_the_rendered_masks():
     head = build_head(GSMAP)
     lane = elements(((-3, -20), (-3, 20)))
     outputs = perfect_outputs(head, lane)
-    references = outputs["all_references"].detach().clone()
+    references = stacked(outputs).references.detach().clone()
     references[-1, 0, 0, :, 2:] = torch.tensor([0.0, 3.0, 0.0])
     references[-1, 0, 1] = references[-1, 0, 0]
     references[-1, 0, 1, :, 2:] = torch.tensor([3.0, 0.0, 0.0])
-    outputs["all_references"], outputs["all_pts_preds"] = references, references[..., :2]
-    outputs["all_cls_scores"][-1, 0, 1] = outputs["all_cls_scores"][-1, 0, 0]
-    predictions = predictions_of(head, outputs, 1)
+    scores = stacked(outputs).scores
+    scores[-1, 0, 1] = scores[-1, 0, 0]
+    predictions = predictions_of(head, predicted(head, scores, references), 1)
     pairs = head.match(predictions, [head.prepare_gt(lane)], [{}])
     assert pairs.matches[0].query_inds.tolist() == [1]
 
     blind = build_head(GSMAP, iou_cost=None)
-    predictions = predictions_of(blind, outputs, 1)
-    assert "rasters" not in predictions[0]
+    predictions = predictions_of(blind, predicted(blind, scores, references), 1)
     pairs = blind.match(predictions, [blind.prepare_gt(lane)], [{}])
     assert pairs.matches[0].query_inds.tolist() == [0]
 
@@ -158,9 +153,10 @@ def test_matching_reads_the_rendered_masks():
 def test_the_masks_of_matching_carry_no_gradient():
     head = build_head(GSMAP)
     predictions = predictions_of(head, head(bev()), 1)
-    assert predictions[0].rasters.shape == (6, 80, 40)
-    assert not predictions[0].rasters.requires_grad
-    assert predictions[0].references.requires_grad
+    (sample,) = predictions.samples()
+    assert sample.cost_masks.shape == (6, 80, 40)
+    assert not sample.cost_masks.requires_grad
+    assert sample.references.requires_grad
 
 
 def test_the_rendered_mask_is_that_of_the_predicted_gaussians():
@@ -169,8 +165,8 @@ def test_the_rendered_mask_is_that_of_the_predicted_gaussians():
     (result,) = head.predict_by_feat(outputs, [{}])
     grid = BEVGrid((-15, 15), (-30, 30), 40, 20)
     expected = render_gaussians(result.pts, result.scales, result.rotations, grid, "reference")
-    order = outputs["all_cls_scores"][-1, 0].sigmoid().flatten().topk(len(result)).indices // 3
-    gaussians = head.reference.space.decode(outputs["all_references"][-1, 0])
+    order = stacked(outputs).scores[-1, 0].sigmoid().flatten().topk(len(result)).indices // 3
+    gaussians = head.reference.space.decode(stacked(outputs).references[-1, 0])
     actual = render_gaussians(*gaussians, head.masks.grid)[order]
     torch.testing.assert_close(actual, expected, atol=1e-5, rtol=0)
 
@@ -204,7 +200,7 @@ def test_parts_of_the_guided_layer_switch_off_by_themselves(part):
     assert isinstance(head.decoder.layers[0], GaussianDecoderLayer)
     weights = {k: v for k, v in full.state_dict().items() if k in head.state_dict()}
     head.load_state_dict(weights)
-    assert not torch.equal(head(bev())["states"], full(bev())["states"])
+    assert not torch.equal(head(bev())[-1].scores, full(bev())[-1].scores)
 
 
 def test_a_plain_layer_may_stand_under_the_head():
@@ -234,10 +230,8 @@ def test_the_log_says_how_the_gaussians_of_each_class_live():
 
 def test_without_either_mask_nothing_is_drawn_or_rendered(monkeypatch):
     head = build_head(GSMAP, loss_raster=None, iou_cost=None)
-    for maker in ("masks.draw_polylines", "head.render_gaussians", "pairs.render_gaussians"):
-        monkeypatch.setattr(
-            f"gsmap.models.maptr.{maker}", lambda *_: pytest.fail("a mask was made")
-        )
+    for maker in ("maptr.masks.draw_polylines", "gsmap.reference.render_gaussians"):
+        monkeypatch.setattr(f"gsmap.models.{maker}", lambda *_: pytest.fail("a mask was made"))
     losses = losses_of(head, LANES)
     assert set(losses) == {f"{p}loss_{n}" for p in ("", "d0.") for n in ("cls", "pts", "dir")}
 

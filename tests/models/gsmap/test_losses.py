@@ -1,5 +1,6 @@
 import pytest
 import torch
+from predictions import pairs_of
 
 from gsmap.models.gsmap.losses import RasterLoss
 from gsmap.ops.gaussian_raster import render_gaussians
@@ -19,13 +20,13 @@ def test_module_weights_and_averages():
     pred, target = two_masks()
     losses = raster_loss(pred, target, 0.5, 2.0)
     module = RasterLoss(loss_weight=3.0, alpha=0.5, foreground_weight=2.0)
-    torch.testing.assert_close(module(pred, target), 3 * losses.mean())
-    torch.testing.assert_close(module(pred, target, avg_factor=8), 3 * losses.sum() / 8)
+    pairs = pairs_of(pred_masks=pred, gt_masks=target, avg_factor=8)
+    torch.testing.assert_close(module(pairs), 3 * losses.sum() / 8)
 
 
 def test_nothing_matched_gives_zero_with_a_gradient():
     pred = torch.zeros(0, 21, 33, requires_grad=True)
-    loss = RasterLoss()(pred, torch.zeros(0, 21, 33))
+    loss = RasterLoss()(pairs_of(pred_masks=pred, gt_masks=torch.zeros(0, 21, 33)))
     loss.backward()
     assert loss.item() == 0
     assert pred.grad.shape == pred.shape
@@ -34,9 +35,12 @@ def test_nothing_matched_gives_zero_with_a_gradient():
 def test_compiled_model_keeps_the_gradient():
     pred, target = two_masks()
     pred.requires_grad_()
-    module = RasterLoss()
-    (expected,) = torch.autograd.grad(module(pred * 0.9, target), pred)
-    compiled = torch.compile(lambda p, t: module(p * 0.9, t), backend="aot_eager", fullgraph=True)
+
+    def module(p, t):
+        return RasterLoss().per_instance(p * 0.9, t).sum()
+
+    (expected,) = torch.autograd.grad(module(pred, target), pred)
+    compiled = torch.compile(module, backend="aot_eager", fullgraph=True)
     (actual,) = torch.autograd.grad(compiled(pred, target), pred)
     torch.testing.assert_close(actual, expected)
 
@@ -70,6 +74,6 @@ def test_gaussians_learn_a_line_from_its_mask():
     for _ in range(100):
         mask = render_gaussians(means, log_scales.exp(), rotations, grid)
         optimizer.zero_grad()
-        RasterLoss()(mask, target).backward()
+        RasterLoss()(pairs_of(pred_masks=mask, gt_masks=target)).backward()
         optimizer.step()
     assert pairwise_soft_iou(mask.detach(), target).item() > 0.75

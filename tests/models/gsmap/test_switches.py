@@ -17,6 +17,7 @@ from head_cases import (
     train_a_step,
     with_layer,
 )
+from predictions import stacked
 
 SQUARE = elements(((-4, -4), (4, -4)), labels=[1])
 SQUARE.polylines = torch.tensor([[[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-4, -4]]])
@@ -101,7 +102,7 @@ def test_an_unknown_overlap_is_refused():
 
 def total_cost(head: torch.nn.Module) -> torch.Tensor:
     """Return the summed matching costs of a new model's first prediction. (N, K)"""
-    (prediction,) = predictions_of(head, head(bev()), 0)
+    (prediction,) = predictions_of(head, head(bev()), 0).samples()
     gt = head.prepare_gt(LANES)
     return sum(cost(prediction, gt, {}) for cost in head.assigner.match_costs)
 
@@ -139,7 +140,7 @@ def test_the_invariant_frame_does_not_tell_a_gaussian_from_itself_turned_by_pi(i
     scores = []
     for turn in (0.4, 0.4 + torch.pi):
         torch.nn.init.constant_(head.reference.gaussian_init.bias[2:], turn)
-        scores.append(head(bev())["all_cls_scores"])
+        scores.append(stacked(head(bev())).scores)
     assert torch.allclose(*scores, atol=1e-5) == invariant
 
 
@@ -153,8 +154,7 @@ def test_masks_come_from_full_resolution_or_from_the_matched_points(source):
     pairs = head.match(predictions, gts, [{}])
     drawn = {"full": SQUARE.polylines, "points": SQUARE.pts}[source]
     expected = head.masks.draw(drawn, SQUARE.labels_3d, head.masks.grid)
-    torch.testing.assert_close(pairs["gt.masks"], expected)
-    assert ("masks" in gts[0]) == (source == "full")
+    torch.testing.assert_close(pairs.gt_masks, expected)
 
 
 def test_filled_classes_have_filled_masks():

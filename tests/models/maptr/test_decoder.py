@@ -11,7 +11,8 @@ LAYER = {**SIZES, "cross_attn": {"num_points": 2}}
 
 def small_decoder(num_layers=2, **settings):
     torch.manual_seed(0)
-    return MapDecoder({"type": "MapDecoderLayer", **LAYER}, num_layers, **settings).eval()
+    layer = {"type": "MapDecoderLayer", **LAYER}
+    return MapDecoder(layer, num_layers, num_points=1, **settings).eval()
 
 
 def stepping(steps):
@@ -30,11 +31,10 @@ def test_each_layer_refines_what_the_one_before_returned():
         torch.randn(2, 8, 5, 4),
         stepping(steps),
     )
-    assert out["point_states"].shape == (2, 2, 6, 8)
-    references = out["references"]
+    assert [layer.point_states.shape for layer in out] == [(2, 6, 1, 8)] * 2
     first = refine_reference(reference, steps[0])
-    torch.testing.assert_close(references[0], first)
-    torch.testing.assert_close(references[1], refine_reference(first, steps[1]))
+    torch.testing.assert_close(out[0].references[:, :, 0], first)
+    torch.testing.assert_close(out[1].references[:, :, 0], refine_reference(first, steps[1]))
 
 
 @pytest.mark.parametrize("cut", [True, False])
@@ -48,7 +48,7 @@ def test_the_gradient_between_layers_is_cut_or_not(cut):
         torch.randn(1, 8, 5, 4),
         stepping(steps),
     )
-    out["references"][1].sum().backward()
+    out[1].references.sum().backward()
     assert (steps[0].grad is None or not steps[0].grad.any()) == cut
     assert steps[1].grad.abs().min() > 0
 
@@ -59,12 +59,12 @@ def test_a_masked_query_does_not_change_the_others():
     mask = torch.zeros(6, 6, dtype=torch.bool)
     mask[:5, 5] = True  # nobody looks at the last query
     arguments = (torch.rand(1, 6, 2), torch.randn(1, 8, 5, 4), stepping([torch.zeros(1, 6, 2)]))
-    before = decoder(query, position, *arguments, mask)["point_states"]
+    before = decoder(query, position, *arguments, mask)[0].point_states
     changed = query.clone()
     changed[:, 5] += 3.0
-    after = decoder(changed, position, *arguments, mask)["point_states"]
-    torch.testing.assert_close(before[:, :, :5], after[:, :, :5])
-    assert not torch.allclose(before[:, :, 5], after[:, :, 5])
+    after = decoder(changed, position, *arguments, mask)[0].point_states
+    torch.testing.assert_close(before[:, :5], after[:, :5])
+    assert not torch.allclose(before[:, 5], after[:, 5])
 
 
 def test_a_layer_is_three_residual_blocks_with_norms_after():

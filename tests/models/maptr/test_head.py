@@ -1,13 +1,14 @@
 import math
+from dataclasses import dataclass
 
 import pytest
 import torch
-from mmdet3d.registry import MODELS
 from mmengine.structures import InstanceData
 from model_cases import build_small, small_config, straight_elements
-from torch import nn
+from predictions import predicted, stacked
 
-from gsmap.models.maptr.decoder import MapDecoder
+from gsmap.models.maptr.decoder import Decoded
+from gsmap.models.maptr.losses import MapLoss
 
 LINE = ((-6.0, -12.0), (6.0, 12.0))
 NUM = 8  # queries
@@ -24,7 +25,7 @@ def outputs_with(pts_m, head, scores=None, layers=1):
     pts[:, 0, : len(pts_m)] = head.grid.norm_from_metres(pts_m)
     if scores is None:
         scores = torch.zeros(layers, 1, NUM, 3)
-    return {"all_cls_scores": scores, "all_pts_preds": pts, "all_references": pts}
+    return predicted(head, scores, pts)
 
 
 def focal(logit, target):
@@ -57,12 +58,12 @@ def test_the_direction_is_compared_in_metres(head):
 
 def test_the_divisor_is_the_number_of_matched_elements_in_the_batch(head):
     one, three = straight_elements(LINE), straight_elements(LINE, *[((3.0, 0), (3.0, 9))] * 2)
-    outputs = outputs_with(torch.cat([one.pts + 1.0]), head)
-    both = {key: value.expand(-1, 2, *value.shape[2:]) for key, value in outputs.items()}
+    outputs = stacked(outputs_with(torch.cat([one.pts + 1.0]), head))
+    both = predicted(head, outputs.scores.repeat(1, 2, 1, 1), outputs.pts.repeat(1, 2, 1, 1, 1))
     gts = [head.prepare_gt(gt) for gt in (one, three)]
-    pairs = head.match(head.layer_predictions(both, 0), gts, [{}, {}])
+    pairs = head.match(both[0], gts, [{}, {}])
     assert pairs.avg_factor.item() == 4.0
-    assert pairs["gt.pts"].shape == (4, 20, 2)
+    assert pairs.gt_pts.shape == (4, 20, 2)
     assert (pairs.query_labels()[:NUM] >= 0).sum() == 1
 
 
@@ -94,11 +95,11 @@ def test_class_scores_come_from_the_mean_point(head):
     torch.manual_seed(0)
     with torch.no_grad():
         outputs = head({"bev_feats": torch.randn(2, 16, 12, 6)})
-    mean = outputs["states"][1].unflatten(1, (-1, 20)).mean(2)
+    mean = stacked(outputs).point_states[1].mean(2)
     with torch.no_grad():
-        torch.testing.assert_close(outputs["all_cls_scores"][1], head.cls_branches[1](mean))
-    assert outputs["all_pts_preds"].shape == (2, 2, 8, 20, 2)
-    assert outputs["all_references"].shape == (2, 2, 8, 20, 2)
+        torch.testing.assert_close(stacked(outputs).scores[1], head.cls_branches[1](mean))
+    assert stacked(outputs).pts.shape == (2, 2, 8, 20, 2)
+    assert stacked(outputs).references.shape == (2, 2, 8, 20, 2)
 
 
 def test_every_class_starts_improbable():
@@ -106,34 +107,33 @@ def test_every_class_starts_improbable():
     torch.testing.assert_close(bias.sigmoid(), torch.full((3,), 0.01))
 
 
-@MODELS.register_module()
-class QueryNumberLoss(nn.Module):
-    """Adds what a decoder calls ``number`` of the matched queries, and their ground truths."""
+@dataclass(eq=False)
+class Numbered(Decoded):
+    """What a decoder returns that numbers its queries. (B, N)"""
+
+    number: torch.Tensor
+
+
+class QueryNumberLoss(MapLoss):
+    """Adds the numbers of the matched queries, and their ground truths."""
 
     name = "new"
-    reads = ("pred.number", "gt.labels", "gt.samples")
 
-    def forward(self, numbers, labels, samples, avg_factor):
-        return (numbers + 10 * labels + 100 * samples).sum() / avg_factor
-
-
-@MODELS.register_module()
-class NumberingDecoder(MapDecoder):
-    """A decoder with one field more."""
-
-    fields = ("number",)
+    def values(self, pairs):
+        numbers = pairs.of_queries(pairs.predictions.decoded.number)
+        return numbers + 10 * pairs.gt_labels + 100 * pairs.samples
 
 
 def test_a_loss_reads_what_a_decoder_adds_of_the_matched_pairs():
     head = small_config().map_head
-    head.decoder.type = "NumberingDecoder"
-    head.losses = [{"type": "QueryNumberLoss"}]
+    head.losses = [{"type": QueryNumberLoss}]
     head = build_small(map_head=head).map_head
     gt = straight_elements(LINE, labels=[2])
-    outputs = outputs_with(torch.cat([gt.pts + 5, gt.pts]), head)
-    outputs = {name: value.expand(-1, 2, *value.shape[2:]) for name, value in outputs.items()}
-    outputs["all_number"] = torch.arange(NUM).expand(1, 2, NUM)
-    losses = head.loss_by_feat(outputs, [gt, gt], [{}, {}])
+    (layer,) = outputs_with(torch.cat([gt.pts + 5, gt.pts]), head)
+    points = layer.pts.repeat(2, 1, 1, 1)
+    decoded = Numbered(points, points, points, torch.arange(NUM).repeat(2, 1))
+    layer = head.predictions(torch.zeros(2, NUM, 3), decoded, None)
+    losses = head.loss_by_feat([layer], [gt, gt], [{}, {}])
     assert losses["loss_new"].item() == (21 + 121) / 2  # query 1, class 2, in both samples
     assert "loss_pts" not in losses
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 from head_cases import GSMAP, HEAD, N, P, bev, build_head, elements, losses_of, train_a_step
 from mmengine.structures import InstanceData
+from predictions import predicted
 
 Z_RANGE = (-5.0, 3.0)
 GAUSSIANS = {**GSMAP, "masks": {"pixel_m": 0.75, "cost_pixel_m": 0.75}}
@@ -20,16 +21,16 @@ def raised(gt: InstanceData, *heights: float) -> InstanceData:
     return gt
 
 
-def predicting(head: torch.nn.Module, points_m: torch.Tensor) -> dict[str, torch.Tensor]:
+def predicting(head: torch.nn.Module, points_m: torch.Tensor) -> list:
     """Return outputs of one layer that say these points (N, P, 3), each a sure divider."""
     norm = head.reference.norm(points_m)[None, None]
     scores = torch.tensor([5.0, -5.0, -5.0]).expand(1, 1, len(points_m), 3)
-    return {"all_cls_scores": scores, "all_pts_preds": norm, "all_references": norm}
+    return predicted(head, scores, norm)
 
 
-def losses_against(head: torch.nn.Module, predicted: torch.Tensor, gt: InstanceData) -> dict:
+def losses_against(head: torch.nn.Module, points_m: torch.Tensor, gt: InstanceData) -> dict:
     """Return the losses of predicted points (N, P, 3) in metres."""
-    return head.loss_by_feat(predicting(head, predicted), [gt], [{"token": "a"}])
+    return head.loss_by_feat(predicting(head, points_m), [gt], [{"token": "a"}])
 
 
 def test_losses_of_height_by_hand():

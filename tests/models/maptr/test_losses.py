@@ -1,21 +1,30 @@
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from predictions import pairs_of
 
 from gsmap.models.maptr.losses import DirectionLoss, PointsLoss
 from gsmap.models.mapvr.losses import SelfDirectionLoss
-from gsmap.models.mgmapnet.losses import SamplingLocationLoss
 
-points_loss, direction_loss = PointsLoss(1.0), DirectionLoss(1.0)
-self_direction_loss = SelfDirectionLoss(1.0)
+
+def given(loss, pred, target, avg_factor):
+    """Return a loss of points that are normalised and in metres alike."""
+    points = {"pred_pts": pred, "pred_pts_m": pred, "gt_pts": target, "gt_pts_m": target}
+    return loss(pairs_of(**points, avg_factor=avg_factor))
+
+
+points_loss, direction_loss, self_direction_loss = (
+    partial(given, loss(1.0)) for loss in (PointsLoss, DirectionLoss, SelfDirectionLoss)
+)
 
 
 def test_points_loss_by_hand():
     pred = torch.tensor([[[0.0, 0.0], [1.0, 2.0]]])
     target = torch.tensor([[[0.5, 0.0], [1.0, 0.0]]])
-    assert PointsLoss(loss_weight=4.0)(pred, target, 2.0).item() == 4 * 1.25
+    assert given(PointsLoss(loss_weight=4.0), pred, target, 2.0).item() == 4 * 1.25
 
 
 def test_direction_loss_by_hand():
@@ -37,8 +46,8 @@ def test_self_direction_by_hand():
     pred = torch.tensor(
         [[[0.0, 0], [1, 0], [3, 0], [3, 5], [3, 0]], [[0, 0], [1, 0], [2, 0], [3, 0], [4, 0]]]
     )
-    torch.testing.assert_close(self_direction_loss(pred, 2.0), torch.tensor(1.5))
-    assert self_direction_loss(pred[:, :2], 2.0).item() == 0
+    torch.testing.assert_close(self_direction_loss(pred, None, 2.0), torch.tensor(1.5))
+    assert self_direction_loss(pred[:, :2], None, 2.0).item() == 0
 
 
 @pytest.mark.parametrize("case", ["closed", "many"])
@@ -49,16 +58,12 @@ def test_self_direction_equals_the_golden_one(golden_dir, case):
     for layer, pred in enumerate(torch.from_numpy(preds)):
         query = golden[f"match_l{layer}"][:, 0]
         points_m = pred[query] * torch.tensor([30.0, 60.0]) - torch.tensor([15.0, 30.0])
-        value = SelfDirectionLoss()(points_m, len(query))
+        value = given(SelfDirectionLoss(), points_m, None, len(query))
         name = f"loss/d{layer}.loss_dir" if layer < 5 else "loss/loss_dir"
         assert value.item() == pytest.approx(float(golden[name]), rel=1e-4)
 
 
-def self_loss(pred, _, avg_factor):
-    return self_direction_loss(pred, avg_factor)
-
-
-@pytest.mark.parametrize("loss", [points_loss, direction_loss, self_loss])
+@pytest.mark.parametrize("loss", [points_loss, direction_loss, self_direction_loss])
 def test_no_match_gives_a_zero_with_a_gradient(loss):
     pred = torch.zeros(0, 20, 2, requires_grad=True)
     value = loss(pred, torch.zeros(0, 20, 2), 1.0)
@@ -67,7 +72,7 @@ def test_no_match_gives_a_zero_with_a_gradient(loss):
     assert pred.grad.shape == (0, 20, 2)
 
 
-@pytest.mark.parametrize("loss", [points_loss, direction_loss, self_loss])
+@pytest.mark.parametrize("loss", [points_loss, direction_loss, self_direction_loss])
 def test_gradients(loss):
     torch.manual_seed(0)
     pred = torch.randn(2, 4, 2, dtype=torch.float64, requires_grad=True)
@@ -75,7 +80,7 @@ def test_gradients(loss):
     assert torch.autograd.gradcheck(lambda p: loss(p, target, 3.0), [pred])
 
 
-@pytest.mark.parametrize("loss", [direction_loss, self_loss])
+@pytest.mark.parametrize("loss", [direction_loss, self_direction_loss])
 def test_equal_neighbours_do_not_break_the_direction(loss):
     pred = torch.zeros(1, 3, 2, requires_grad=True)
     loss(pred, torch.rand(1, 3, 2), 1.0).backward()
@@ -86,10 +91,3 @@ def test_equal_neighbours_do_not_break_the_direction(loss):
 def test_other_shapes_are_refused(loss):
     with pytest.raises(ValueError, match=r"target must have shape \(2, 4, 2\) of pred"):
         loss(torch.rand(2, 4, 2), torch.rand(1, 4, 2), 1.0)
-
-
-def test_mean_sampling_locations_are_compared_in_the_plane():
-    locations = torch.tensor([[[0.5, 0.25], [1.5, 0.0]]])
-    points = torch.tensor([[[0.0, 0.25, 9.0], [1.0, 1.0, 9.0]]])
-    loss = SamplingLocationLoss(loss_weight=2.0)(locations, points, avg_factor=4.0)
-    assert loss.item() == pytest.approx(2 * (0.5 + 0.5 + 1.0) / 4)

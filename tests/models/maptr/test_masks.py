@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from head_cases import ALONG_Y, elements
+from predictions import pairs_of
 
 import gsmap.registered  # noqa: F401
 from gsmap.datasets.annotations.record import MapInstance
@@ -93,7 +94,9 @@ def fit(target_pts: torch.Tensor, mask: torch.Tensor, masks: ElementMasks) -> fl
     raster = RasterLoss(loss_weight=10.0)
     for _ in range(60):
         rendered = render_gaussians(*space.decode(torch.cat([centres, shapes], -1)), masks.grid)
-        loss = 5 * (centres - target).abs().sum() + raster(rendered, mask)
+        loss = 5 * (centres - target).abs().sum() + raster(
+            pairs_of(pred_masks=rendered, gt_masks=mask)
+        )
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

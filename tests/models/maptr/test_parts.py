@@ -2,25 +2,17 @@
 
 import pytest
 from head_cases import GSMAP, HEAD, MASKS, N, build_head, with_layer
-from mmdet3d.registry import MODELS, TASK_UTILS
+from mmdet3d.registry import MODELS
 from torch import nn
 
 RASTER = {"type": "RasterLoss"}
 
 
-@TASK_UTILS.register_module()
-class MaskCost:
-    """A matching cost of what only matched pairs have."""
-
-    reads = ("pred.masks", "gt.masks")
-
-
 @MODELS.register_module()
-class HeightLoss(nn.Module):
-    """A loss of a field that nobody offers."""
+class OldLoss(nn.Module):
+    """A loss that is no `MapLoss`."""
 
-    name = "height"
-    reads = ("pred.pts", "gt.height")
+    name = "old"
 
 
 @pytest.mark.parametrize(
@@ -28,13 +20,13 @@ class HeightLoss(nn.Module):
     [
         (
             {"losses": [*HEAD["losses"], RASTER]},
-            r"RasterLoss reads \['pred.masks'\], which PointReference, .* do not offer",
+            r"RasterLoss needs Gaussians, got PointReference: set .*type='GaussianReference'",
         ),
         (
             {"match_costs": [*HEAD["match_costs"], {"type": "IoUCost"}]},
-            r"IoUCost reads \['pred.rasters'\], which before the matching, PointReference",
+            r"IoUCost needs Gaussians, got PointReference",
         ),
-        ({"losses": [{"type": "HeightLoss"}]}, r"HeightLoss reads \['gt.height'\]"),
+        ({"losses": [{"type": "OldLoss"}]}, r"OldLoss is no MapLoss: derive it from .*MapLoss"),
         ({"losses": [HEAD["losses"][0]] * 2}, "two parts have one name, 'pts'"),
         (
             {"aux_heads": [{"type": "BEVMaskHead", "name": "pts"}]},
@@ -56,17 +48,13 @@ class HeightLoss(nn.Module):
     ],
 )
 def test_a_part_that_misses_something_is_refused_by_name(settings, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         build_head(HEAD, **settings)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (
-            {"match_costs": [*HEAD["match_costs"], {"type": "MaskCost"}]},
-            r"MaskCost reads \['gt.masks', 'pred.masks'\], which before the matching",
-        ),
         ({"losses": [RASTER]}, "two parts have one name, 'raster'"),  # and the default one
         ({"reference": {"type": "PointReference", "min_scale_m": 0.2}}, "min_scale_m"),
         ({"masks": {**MASKS, "source": "half"}}, "source must be one of .*, got 'half'"),

@@ -4,6 +4,7 @@ import pytest
 import torch
 from head_cases import GSMAP, HEAD, C, N, P, along_y, bev, build_head, elements, losses_of
 from mmengine.structures import InstanceData
+from predictions import predicted, stacked
 
 FURTHER = {"name": "one2many", "num": 6, "repeats": 3}
 GROUPS = [{"num": N}, FURTHER]
@@ -23,8 +24,8 @@ def lines(num: int) -> InstanceData:
 
 def test_further_queries_exist_in_training_only():
     head = build()
-    assert head(bev(2))["all_pts_preds"].shape == (2, 2, 10, P, 2)
-    assert head.eval()(bev(2))["all_pts_preds"].shape == (2, 2, N, P, 2)
+    assert stacked(head(bev(2))).pts.shape == (2, 2, 10, P, 2)
+    assert stacked(head.eval()(bev(2))).pts.shape == (2, 2, N, P, 2)
     assert head.attention_mask() is None
 
 
@@ -35,8 +36,9 @@ def test_one_to_one_queries_predict_the_same_in_training_and_test(config, attent
     head = build({**config, "decoder": {"num_layers": 2, "layer": layer}})
     (_, trained), _ = head.split_groups(head(bev()))
     tested = head.eval()(bev())
-    for key in ("all_cls_scores", "all_references"):
-        torch.testing.assert_close(trained[key], tested[key])
+    for name in ("scores", "references"):
+        values = [getattr(stacked(part), name) for part in (trained, tested)]
+        torch.testing.assert_close(*values)
 
 
 def test_mask_separates_the_groups():
@@ -50,10 +52,10 @@ def test_mask_separates_the_groups():
 
 def test_the_further_queries_do_not_see_those_that_predict():
     head = build()
-    before = head(bev())["all_cls_scores"]
+    before = stacked(head(bev())).scores
     with torch.no_grad():
         head.instance_embedding.weight[:N] += 3.0
-    after = head(bev())["all_cls_scores"]
+    after = stacked(head(bev())).scores
     torch.testing.assert_close(before[:, :, N:], after[:, :, N:])
     assert not torch.allclose(before[:, :, :N], after[:, :, :N])
 
@@ -66,8 +68,7 @@ def test_every_ground_truth_is_matched_once_and_then_several_times():
     prepared = [head.prepare_gt(gt)]
     matched = {}
     for group, own in head.split_groups(outputs):
-        predictions = head.layer_predictions(own, 1)
-        pairs = head.match(predictions, prepared, meta, group.repeats)
+        pairs = head.match(own[1], prepared, meta, group.repeats)
         matched[group.name] = torch.bincount(pairs.matches[0].gt_inds).tolist()
         expected = head.layer_losses(group, pairs, is_last=True)
         suffix = f"_{group.name}" if group.name else ""
@@ -124,20 +125,19 @@ def test_the_raster_loss_of_the_further_queries_compares_with_the_matched_masks(
     groups = [{"num": 2}, {"name": "one2many", "num": 4, "repeats": 2}]
     head = build_head(GSMAP, query_groups=groups).train()
     outputs = head(bev())
-    references = torch.zeros_like(outputs["all_references"])
+    references = torch.zeros_like(stacked(outputs).references)
     references[..., :2] = head.grid.norm_from_metres(gt.pts).repeat(3, 1, 1)  # three times both
-    scores = torch.zeros_like(outputs["all_cls_scores"])
-    outputs.update(
-        all_references=references, all_pts_preds=references[..., :2], all_cls_scores=scores
-    )
+    scores = torch.zeros_like(stacked(outputs).scores)
+    outputs = predicted(head, scores, references)
     losses = head.loss_by_feat(outputs, [gt], [{}])
     assert losses["loss_pts"] < 1e-5
     torch.testing.assert_close(losses["loss_raster_one2many"], losses["loss_raster"])
     crossed = head.prepare_gt(gt)
     crossed.masks = crossed.masks.flip(0)
     _, (group, further) = head.split_groups(outputs)
-    others = head.group_losses(group, further, [crossed], [{}])
-    assert others["loss_raster_one2many"] > 1.1 * losses["loss_raster_one2many"]
+    pairs = head.match(further[-1], [crossed], [{}], group.repeats)
+    others = head.layer_losses(group, pairs, is_last=True)
+    assert others["loss_raster"] > 1.1 * losses["loss_raster_one2many"]
 
 
 def test_the_further_queries_can_do_without_the_raster_loss():

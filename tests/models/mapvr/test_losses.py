@@ -4,9 +4,17 @@ import math
 import numpy as np
 import pytest
 import torch
+from predictions import pairs_of
 
 from gsmap.models.mapvr.losses import ElementRenderer, RenderedDiceLoss
 from gsmap.ops.soft_iou import dice_loss, pairwise_dice_loss
+
+
+def rendered(loss, pred, gt, labels):
+    """Return the mean loss of pairs of points."""
+    count = max(len(pred), 1)
+    pairs = pairs_of(pred_pts=pred, gt_first_pts=gt, gt_labels=labels, avg_factor=count)
+    return loss(pairs)
 
 
 @pytest.fixture(params=["closed", "many"])
@@ -26,7 +34,7 @@ def test_dice_worked_by_hand():
 
 def test_loss_and_true_gradient_equal_the_golden_ones(golden):
     pred = golden["pred"].requires_grad_()
-    loss = RenderedDiceLoss()(pred, golden["gt"], golden["labels"])
+    loss = rendered(RenderedDiceLoss(), pred, golden["gt"], golden["labels"])
     loss.backward()
     torch.testing.assert_close(loss.double(), golden["loss_w15"], rtol=1e-4, atol=0)
     difference = (pred.grad - golden["grad_analytic"]).norm()
@@ -56,7 +64,9 @@ def test_gradient_of_the_plain_distances_loss():
     pred, gt = torch.rand(2, 2, 4, 2, dtype=torch.float64, generator=generator)
     loss = RenderedDiceLoss(size=(9, 7), distance="plain")
     labels = torch.tensor([0, 1])
-    assert torch.autograd.gradcheck(lambda p: loss(p, gt, labels), [pred.requires_grad_()])
+    assert torch.autograd.gradcheck(
+        lambda p: rendered(loss, p, gt, labels), [pred.requires_grad_()]
+    )
 
 
 @pytest.mark.parametrize("case", ["closed", "many"])
@@ -70,14 +80,16 @@ def test_loss_on_a_models_predictions_equals_the_golden_one(golden_dir, case):
     labels = torch.tensor([element["label"] for element in annotated])
     for layer, pred in enumerate(torch.from_numpy(preds)):
         query, gt, _ = golden[f"match_l{layer}"].T
-        value = RenderedDiceLoss()(pred[query], gts[gt], labels[gt])
+        value = rendered(RenderedDiceLoss(), pred[query], gts[gt], labels[gt])
         name = f"loss/d{layer}.loss_rendered_mask" if layer < 5 else "loss/loss_rendered_mask"
         assert value.item() == pytest.approx(float(golden[name]), rel=1e-4)
 
 
 def test_nothing_matched_gives_zero_with_a_gradient():
     pred = torch.zeros(0, 20, 2, requires_grad=True)
-    loss = RenderedDiceLoss()(pred, torch.zeros(0, 20, 2), torch.zeros(0, dtype=torch.long))
+    loss = rendered(
+        RenderedDiceLoss(), pred, torch.zeros(0, 20, 2), torch.zeros(0, dtype=torch.long)
+    )
     loss.backward()
     assert loss.item() == 0
     assert pred.grad.shape == pred.shape

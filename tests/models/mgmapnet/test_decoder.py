@@ -52,15 +52,17 @@ def run(decoder, mask=None, num=N, dims=2, step=0.3):
     def refine(_, states, reference):
         return refine_reference(reference, step * states[..., :dims])
 
-    return decoder(content, position, reference, bev, refine, mask)
+    layers = decoder(content, position, reference, bev, refine, mask)
+    names = vars(layers[0])
+    return {name: torch.stack([vars(layer)[name] for layer in layers]) for name in names}
 
 
 @pytest.mark.parametrize("dims", [2, 3, 5])
 def test_shapes_and_references_of_several_entries(dims):
     out = run(build(reference_dims=min(dims, 3)), dims=dims)
     assert out["instance_states"].shape == (3, B, N, C)
-    assert out["point_states"].shape == (3, B, N * P, C)
-    assert out["references"].shape == (3, B, N * P, dims)
+    assert out["point_states"].shape == (3, B, N, P, C)
+    assert out["references"].shape == (3, B, N, P, dims)
     assert out["mean_locations"].shape == (3, B, N, P, 2)
 
 
@@ -71,9 +73,10 @@ def test_the_gradient_is_cut_between_layers():
     out = decoder(
         query, position, reference, bev, lambda n, _, r: refine_reference(r, moves[n].expand_as(r))
     )
-    (gradient,) = torch.autograd.grad(out["references"][2].sum(), moves, retain_graph=True)
+    (gradient,) = torch.autograd.grad(out[2].references.sum(), moves, retain_graph=True)
     assert gradient.ne(0).tolist() == [False, False, True]
-    (gradient,) = torch.autograd.grad(out["mean_locations"].sum(), moves, allow_unused=True)
+    locations = sum(layer.mean_locations.sum() for layer in out)
+    (gradient,) = torch.autograd.grad(locations, moves, allow_unused=True)
     assert gradient is None or not gradient.any()
 
 
@@ -89,11 +92,11 @@ def test_a_mask_parts_the_groups_in_the_self_attention_but_not_in_p2i():
     mask = group[:, None] != group
     without = build(cross_attn={"p2i": False})
     both, alone = run(without, mask), run(without, num=2)
-    torch.testing.assert_close(both["point_states"][:, :, : 2 * P], alone["point_states"])
+    torch.testing.assert_close(both["point_states"][:, :, :2], alone["point_states"])
     torch.testing.assert_close(both["instance_states"][:, :, :2], alone["instance_states"])
     full = build()
     both, alone = run(full, mask), run(full, num=2)
-    assert not torch.allclose(both["point_states"][:, :, : 2 * P], alone["point_states"])
+    assert not torch.allclose(both["point_states"][:, :, :2], alone["point_states"])
 
 
 ROWS = {  # the poster's tables
@@ -124,7 +127,10 @@ def test_every_row_of_the_tables_trains_with_all_of_its_parameters(row):
 def test_gaussians_guide_positions_and_samples_once_they_are_not_neutral():
     grid = BEVGrid((-15, 15), (-30, 30), 8, 6)
     settings = {"space": GaussianSpace(grid), "reference_dims": 2}
-    guided, plain = build(**settings, guidance={}), build(reference_dims=2)
+    guided, plain = (
+        build(**settings, guidance={"type": "GaussianGuidance"}),
+        build(reference_dims=2),
+    )
     plain.load_state_dict({k: guided.state_dict()[k] for k in plain.state_dict()})
     assert not torch.allclose(
         run(guided, dims=5)["mean_locations"][0], run(plain, dims=5)["mean_locations"][0]

@@ -4,6 +4,7 @@ import pytest
 import torch
 from head_cases import GSMAP, HEAD, MASKS, C, N, P, along_y, bev, build_head, elements, losses_of
 from mmdet3d.structures import Det3DDataSample
+from predictions import stacked
 
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
 
@@ -42,25 +43,25 @@ def test_outputs_by_instance_and_by_point():
     head = build_head(MGMAP)
     outputs = head.train()(BEV)
     num = N + FURTHER["num"]
-    assert outputs["all_cls_scores"].shape == (2, 1, num, 3)
-    assert outputs["all_pts_preds"].shape == (2, 1, num, P, 2)
-    assert outputs["all_mean_locations"].shape == (2, 1, num, P, 2)
-    assert outputs["all_instance_states"].shape == (2, 1, num, C)
-    assert head.eval()(BEV)["all_mean_locations"].shape == (2, 1, N, P, 2)
+    assert stacked(outputs).scores.shape == (2, 1, num, 3)
+    assert stacked(outputs).pts.shape == (2, 1, num, P, 2)
+    assert stacked(outputs).mean_locations.shape == (2, 1, num, P, 2)
+    assert stacked(outputs).instance_states.shape == (2, 1, num, C)
+    assert stacked(head.eval()(BEV)).mean_locations.shape == (2, 1, N, P, 2)
 
 
 def test_the_classes_come_from_the_instance_states():
     head = build_head(MGMAP).eval()
     outputs = head(BEV)
-    expected = head.cls_branches[1](outputs["all_instance_states"][1])
-    torch.testing.assert_close(outputs["all_cls_scores"][1], expected)
+    expected = head.cls_branches[1](stacked(outputs).instance_states[1])
+    torch.testing.assert_close(stacked(outputs).scores[1], expected)
 
 
 def test_other_decoders_offer_the_mean_of_their_points_as_instance_states():
     head = build_head(HEAD).eval()
     outputs = head(bev())
-    means = outputs["states"].unflatten(2, (-1, P)).mean(3)
-    assert torch.equal(outputs["all_instance_states"], means)
+    means = stacked(outputs).point_states.mean(3)
+    assert torch.equal(stacked(outputs).instance_states, means)
     part = {"type": "InstanceMaskLoss", "embed_dims": C}
     head = build_head(HEAD, losses=[*HEAD["losses"], part], masks={"pixel_m": 3.0})
     assert losses_of(head.train(), LANES)["loss_ins_seg"] > 0
@@ -121,7 +122,7 @@ def test_gaussians_on_mgmapnets_decoder():
     shared = {"decoder": decoder, "losses": parts, "query_groups": [{"num": N}, FURTHER]}
     head = build_head(GSMAP, masks=MASKS, **shared)
     assert all(part.guidance is not None for part in head.decoder.layers)
-    assert head(BEV)["all_references"].shape == (2, 1, N + FURTHER["num"], P, 5)
+    assert stacked(head(BEV)).references.shape == (2, 1, N + FURTHER["num"], P, 5)
     found = losses(head)
     assert found["loss_raster"] > 0
     assert found["loss_mean_loc"] > 0
@@ -137,10 +138,10 @@ def test_points_with_height_are_codes_and_predictions_of_three_numbers():
     head = build_head(MGMAP, decoder=decoder, reference={"coords": 3, "z_range": (-5, 3)})
     assert head.decoder.layers[1].reference_code[0].in_features == 3 * P
     outputs = head(BEV)
-    assert outputs["all_pts_preds"].shape[-1] == 3
-    assert outputs["all_mean_locations"].shape[-1] == 2
+    assert stacked(outputs).pts.shape[-1] == 3
+    assert stacked(outputs).mean_locations.shape[-1] == 2
 
 
 def test_a_loss_of_samples_needs_a_decoder_that_tells_them():
-    with pytest.raises(ValueError, match=r"SamplingLocationLoss reads \['pred.mean_locations'\]"):
+    with pytest.raises(ValueError, match=r"SamplingLocationLoss needs .* got MapDecoder"):
         build_head(HEAD, losses=[{"type": "SamplingLocationLoss"}])

@@ -36,7 +36,7 @@ class ExportedDetector(nn.Module):
             )
         self.model = model
         self.input_names = ("images", *model.bev_encoder.calibration)
-        shapes = ("scales", "rotations") if hasattr(model.map_head.reference, "space") else ()
+        shapes = ("scales", "rotations") if model.map_head.reference.space is not None else ()
         self.output_names = ("scores", "labels", "points", *shapes)
 
     def forward(self, images: Tensor, *calibration: Tensor) -> tuple[Tensor, ...]:
@@ -57,8 +57,8 @@ class ExportedDetector(nn.Module):
         named = dict(zip(self.input_names[1:], (x[None] for x in calibration), strict=True))
         head = self.model.map_head
         outputs = head(self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:])))
-        fields = head.reference.decode(outputs["all_references"][-1][0])
-        best = head.coder.best(outputs["all_cls_scores"][-1][0])
+        fields = head.reference.decode(outputs[-1].references[0])
+        best = head.coder.best(outputs[-1].scores[0])
         names = ("pts", *self.output_names[3:])
         return (best.scores, best.labels, *(fields[name][best.query_inds] for name in names))
 

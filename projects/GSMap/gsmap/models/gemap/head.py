@@ -1,14 +1,14 @@
 """GeMap's head: instances and points attend apart, shapes and relations are supervised."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mmdet3d.registry import MODELS
 
-from gsmap.models.maptr.head import PARTS, MapHead
-from gsmap.models.maptr.parts import switched
-
-ATTENTION = "GeometryDecoupledAttention"
+from gsmap.models.gemap.attention import GeometryDecoupledAttention
+from gsmap.models.gemap.losses import EuclideanLoss
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.parts import DEFAULTS, PARTS, brought, class_of
 
 
 @MODELS.register_module()
@@ -30,17 +30,18 @@ class GeMapHead(MapHead):
         decoder: PARTS,
         losses: Sequence[PARTS],
         query_groups: Sequence[PARTS] = ({"num": 50},),
-        loss_euclidean: PARTS | None = {"loss_weight": 0.005},  # noqa: B006
+        loss_euclidean: Mapping[str, Any] | None = DEFAULTS,
         decoupled: bool = True,
         one_to_many: bool = False,
         **kwargs: Any,
     ) -> None:
         layer = decoder.get("layer", {})
-        if decoupled and layer.get("self_attn", {}).get("type") != ATTENTION:
-            decoder = {**decoder, "layer": {**layer, "self_attn": {"type": ATTENTION}}}
+        attention = {"type": GeometryDecoupledAttention}
+        if decoupled and class_of(layer.get("self_attn", {})) is not GeometryDecoupledAttention:
+            decoder = {**decoder, "layer": {**layer, "self_attn": attention}}
         super().__init__(
             decoder=decoder,
-            losses=[*losses, *switched("EuclideanLoss", loss_euclidean)],
+            losses=[*losses, *brought(EuclideanLoss, loss_euclidean)],
             query_groups=query_groups if one_to_many else query_groups[:1],
             **kwargs,
         )

@@ -6,12 +6,13 @@ element has an edge from its last point to its first, open lines too.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
-from torch import Tensor, nn
+from torch import Tensor
 
+from gsmap.models.maptr.losses import MapLoss
+from gsmap.models.maptr.pairs import MatchedPairs
 from gsmap.structures.tensors import check_same_shape
 
 NORM_EPS = 1e-6  # added to the product of two lengths: an edge may be a single point
@@ -75,35 +76,33 @@ def euclidean_relation_loss(pred: Tensor, target: Tensor, counts: Sequence[int])
 
 
 @MODELS.register_module()
-class EuclideanLoss(nn.Module):
+class EuclideanLoss(MapLoss):
     """GeMap's Euclidean loss of matched elements, of their shapes and of their relations.
 
     Args:
         loss_weight: Weight of the whole (lambda of the supplement's Table A1).
         shape_weight: Weight of the shapes within it.
         relation_weight: Weight of the relations within it.
+        flags: As in `MapLoss`.
     """
 
     name = "euclidean"
-    reads = ("pred.pts", "gt.pts", "gt.counts")
 
     def __init__(
-        self, loss_weight: float = 0.005, shape_weight: float = 1.0, relation_weight: float = 1.0
+        self,
+        loss_weight: float = 0.005,
+        shape_weight: float = 1.0,
+        relation_weight: float = 1.0,
+        **flags: bool,
     ) -> None:
-        super().__init__()
-        self.loss_weight = loss_weight
+        super().__init__(loss_weight, **flags)
         self.shape_weight, self.relation_weight = shape_weight, relation_weight
 
-    def forward(
-        self, pred: Tensor, target: Tensor, counts: Sequence[int], avg_factor: Any = None
-    ) -> Tensor:
-        """Return the weighted loss of its parts, which are means: ``avg_factor`` does not count.
-
-        Arguments as of `euclidean_relation_loss`; heights are left out. 2 x (M, P, 2 or 3) -> ()
-        """
-        pred, target = pred[..., :2], target[..., :2]  # in the plane
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Return the weighted loss of parts that are means, in the plane: heights are left out."""
+        pred, target = pairs.pred_pts[..., :2], pairs.gt_pts[..., :2]
         shape = euclidean_shape_loss(pred, target)
-        relation = euclidean_relation_loss(pred, target, counts)
+        relation = euclidean_relation_loss(pred, target, pairs.counts)
         return self.loss_weight * (self.shape_weight * shape + self.relation_weight * relation)
 
 

@@ -1,25 +1,39 @@
 """How one layer's Gaussians guide where the next looks (GSMap section 3.4)."""
 
+from mmdet3d.registry import MODELS
 from mmengine.model import constant_init
-from torch import Tensor, nn
+from torch import Tensor
 
+from gsmap.models.maptr.decoder import Guidance
 from gsmap.models.maptr.layers import mlp
 from gsmap.structures.gaussians import GaussianSpace
 
 
-class GaussianGuidance(nn.Module):
+@MODELS.register_module()
+class GaussianGuidance(Guidance):
     """What a decoder layer takes from the Gaussians, for whichever attentions it has.
 
     Both parts start neutral: the sampling frame is the identity and the embedding zero, so a layer
     with the weights of a MapTR layer computes what that layer computes. The settings are those of
-    `GaussianDecoderLayer`; ``space`` says how the reference stands for a Gaussian.
+    `GaussianDecoderLayer`.
+
+    Args:
+        space: How the reference stands for a Gaussian.
+        embed_dims: Channels C.
+        sampling: As ``guide_sampling``.
+        embedding: As ``embed_gaussians``.
+        invariant: As ``invariant_frame``.
+        hidden_dims: As ``embed_hidden_dims``.
+
+    Raises:
+        ValueError: If the reference holds no Gaussians.
     """
 
     neutral_keys = ("embedding.",)
 
     def __init__(
         self,
-        space: GaussianSpace,
+        space: GaussianSpace | None,
         embed_dims: int,
         sampling: bool = True,
         embedding: bool = True,
@@ -27,6 +41,8 @@ class GaussianGuidance(nn.Module):
         hidden_dims: int = 16,
     ) -> None:
         super().__init__()
+        if space is None:
+            raise ValueError("a guided decoder layer needs a reference that holds Gaussians.")
         self.space, self.sampling, self.invariant = space, sampling, invariant
         self.embedding = mlp(6, hidden_dims, embed_dims) if embedding else None
         self.init_weights()

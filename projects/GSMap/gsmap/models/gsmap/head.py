@@ -1,16 +1,22 @@
 """GSMap's head: elements as ordered Gaussians, supervised as polylines and as rendered masks."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mmdet3d.registry import MODELS
+from mmdet3d.registry import MODELS, TASK_UTILS
 from torch import Tensor
 
+from gsmap.models.gsmap.cost import IoUCost
+from gsmap.models.gsmap.layer import guided
+from gsmap.models.gsmap.losses import MaskLoss, RasterLoss
+from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.statistics import gaussian_statistics
-from gsmap.models.maptr.head import PARTS, MapHead
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.losses import PointsLoss
 from gsmap.models.maptr.masks import ElementMasks
+from gsmap.models.maptr.matching import OrderedPointsCost
 from gsmap.models.maptr.pairs import MatchedPairs
-from gsmap.models.maptr.parts import switched, weighted
+from gsmap.models.maptr.parts import DEFAULTS, PARTS, brought, with_points_weight
 from gsmap.structures.grid import BEVGrid
 
 
@@ -23,11 +29,14 @@ class GSMapHead(MapHead):
     12). Nothing is rendered at inference. Besides `MapHead`'s arguments:
 
     Args:
-        loss_raster: Settings of the loss of the rendered masks, or None to train without it; what
-            they leave out is as by default.
-        iou_cost: The same of the matching cost of the rendered masks.
+        loss_raster: Settings of the loss of the rendered masks, `RasterLoss` if they name no other,
+            or None to train without it.
+        iou_cost: Settings of the matching cost of the rendered masks, `IoUCost` of weight 2 if they
+            say nothing else, or None to match without it.
         points_weight: Weight of the points in losses and in matching (the paper's lambda_v), or
-            None to leave those of ``losses`` and ``match_costs``.
+            None to leave those of ``losses`` and ``match_costs``; ValueError if a weight is given
+            and they have no points.
+        masks: Settings of `ElementMasks`.
         reference: Settings of `GaussianReference`; its smallest sigma is half a pixel of the masks
             by default.
     """
@@ -38,40 +47,46 @@ class GSMapHead(MapHead):
         decoder: PARTS,
         losses: Sequence[PARTS],
         match_costs: Sequence[PARTS],
-        loss_raster: PARTS | None = {"loss_weight": 10.0},  # noqa: B006
-        iou_cost: PARTS | None = {"weight": 2.0},  # noqa: B006
+        loss_raster: Mapping[str, Any] | None = DEFAULTS,
+        iou_cost: Mapping[str, Any] | None = DEFAULTS,
         points_weight: float | None = None,
         masks: PARTS | None = None,
         reference: PARTS | None = None,
         **kwargs: Any,
     ) -> None:
-        guided = MODELS.get(decoder.get("type", "MapDecoder")).guided_layer
+        drawing = ElementMasks(grid, **(masks or {}))
         # Half a pixel of the masks: smaller Gaussians get no gradient. On rasters so coarse that
         # the usual first Gaussian comes close to that, it grows with it.
-        half_pixel_m = ElementMasks(grid, **(masks or {})).half_pixel_m
-        smallest = (reference or {}).get("min_scale_m", half_pixel_m)
+        smallest = (reference or {}).get("min_scale_m", drawing.half_pixel_m)
         gaussian = {
-            "type": "GaussianReference",
+            "type": GaussianReference,
             "min_scale_m": smallest,
             "init_scales_m": (max(1.0, 3 * smallest), max(0.4, 1.5 * smallest)),
         }
-        losses = weighted(losses, "PointsLoss", "loss_weight", points_weight)
-        match_costs = weighted(match_costs, "OrderedPointsCost", "weight", points_weight)
+        losses = with_points_weight(losses, PointsLoss, points_weight, "loss_weight")
+        match_costs = with_points_weight(
+            match_costs, OrderedPointsCost, points_weight, "weight", TASK_UTILS
+        )
         super().__init__(
             grid=grid,
-            decoder={**decoder, "layer": {**guided, **decoder.get("layer", {})}},
-            losses=[*losses, *switched("RasterLoss", loss_raster, loss_weight=10.0)],
-            match_costs=[*match_costs, *switched("IoUCost", iou_cost, weight=2.0)],
-            masks=masks,
+            decoder=guided(decoder),
+            losses=[*losses, *brought(RasterLoss, loss_raster)],
+            match_costs=[*match_costs, *brought(IoUCost, iou_cost, weight=2.0)],
+            masks=drawing,
             reference={**gaussian, **(reference or {})},
             **kwargs,
         )
 
     def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:
         """Return what says whether the Gaussians live (see `gaussian_statistics`)."""
-        if "pred.masks" not in self._reads:
+        space = self.reference.space
+        if space is None or not any(isinstance(loss, MaskLoss) for loss in self.losses.values()):
             return {}
-        gaussians = self.reference.space.decode(pairs["pred.references"])
-        masks, labels = (pairs["pred.masks"], pairs["gt.masks"]), pairs["gt.labels"]
-        floor_m = self.reference.space.floor_m
-        return gaussian_statistics(gaussians, *masks, labels, self.classes, floor_m)
+        return gaussian_statistics(
+            space.decode(pairs.pred_references),
+            rendered=pairs.pred_masks,
+            masks=pairs.gt_masks,
+            labels=pairs.gt_labels,
+            class_names=self.classes,
+            floor_m=space.floor_m,
+        )

@@ -4,7 +4,9 @@ from typing import Any
 
 from mmdet3d.registry import MODELS
 
-from gsmap.models.maptr.decoder import MapDecoderLayer
+from gsmap.models.gsmap.guidance import GaussianGuidance
+from gsmap.models.maptr.decoder import MapDecoder, MapDecoderLayer
+from gsmap.models.maptr.parts import PARTS, class_of
 
 
 @MODELS.register_module()
@@ -27,6 +29,22 @@ class GaussianDecoderLayer(MapDecoderLayer):
         embed_hidden_dims: int = 16,
         **kwargs: Any,
     ) -> None:
-        guidance: dict[str, Any] = {"sampling": guide_sampling, "embedding": embed_gaussians}
-        guidance |= {"invariant": invariant_frame, "hidden_dims": embed_hidden_dims}
+        guidance = {
+            "type": GaussianGuidance,
+            "sampling": guide_sampling,
+            "embedding": embed_gaussians,
+            "invariant": invariant_frame,
+            "hidden_dims": embed_hidden_dims,
+        }
         super().__init__(guidance=guidance, **kwargs)
+
+
+def guided(decoder: PARTS) -> PARTS:
+    """Return a decoder's config with layers that Gaussians guide, where it says nothing else."""
+    kind, layer = class_of({"type": MapDecoder, **decoder}), decoder.get("layer", {})
+    if kind is None or not issubclass(kind, MapDecoder) or kind.layer_class is MapDecoderLayer:
+        return {**decoder, "layer": {"type": GaussianDecoderLayer, **layer}}
+    guidance = layer.get("guidance", {})
+    if guidance is not None:
+        guidance = {"type": GaussianGuidance, **guidance}
+    return {**decoder, "layer": {**layer, "guidance": guidance}}

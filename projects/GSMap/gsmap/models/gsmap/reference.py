@@ -9,7 +9,9 @@ from mmengine.model import constant_init
 from torch import Tensor, nn
 
 from gsmap.models.maptr import layers
+from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.references import PointReference
+from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
@@ -28,7 +30,7 @@ class GaussianReference(PointReference):
         space: Settings of `GaussianSpace`: ``min_scale_m`` and so on.
     """
 
-    fields = PointReference.fields | {"masks", "rasters"}
+    space: GaussianSpace
     neutral_keys = ("gaussian_init.", "gaussian_branches.")
 
     def __init__(
@@ -68,13 +70,27 @@ class GaussianReference(PointReference):
         shapes = at_least_float32(self.gaussian_init(query_pos))
         return torch.cat([super().start(query_pos), shapes], -1)
 
-    def offsets(self, layer: int, states: Tensor) -> Tensor:
+    def offsets(self, layer: int, point_states: Tensor) -> Tensor:
         """Return a layer's change of the Gaussians (Eq. 8). (..., C) -> (..., D)"""
-        shapes = at_least_float32(self.gaussian_branches[layer](states))
-        return torch.cat([super().offsets(layer, states), shapes], -1)
+        shapes = at_least_float32(self.gaussian_branches[layer](point_states))
+        return torch.cat([super().offsets(layer, point_states), shapes], -1)
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:
         """Add the Gaussians' ``scales`` (N, P, 2) in metres and ``rotations`` (N, P) in radians."""
         gaussians = self.space.decode(references)
         shapes = {"scales": gaussians.scales, "rotations": gaussians.rotations}
         return super().decode(references) | shapes
+
+    def render(self, references: Tensor, grid: BEVGrid) -> Tensor:
+        """Render the masks of elements (GSMap Eq. 6). (..., P, D) -> (..., H, W)"""
+        means, scales, rotations = self.space.decode(references)
+        return render_gaussians(means, scales, rotations, grid)
+
+
+def require_gaussians(part: Any, head: MapHead) -> None:
+    """Raise ValueError if a loss or a cost of rendered masks is given to a head of points."""
+    if not isinstance(head.reference, GaussianReference):
+        raise ValueError(
+            f"{type(part).__name__} needs Gaussians, got {type(head.reference).__name__}: set "
+            "reference=dict(type='GaussianReference'), or take GSMapHead."
+        )

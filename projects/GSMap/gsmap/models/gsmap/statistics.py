@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gsmap.ops.soft_iou import soft_iou
 from gsmap.structures.gaussians import AT_FLOOR, Gaussians, extents_along_line
 
 
@@ -19,16 +20,22 @@ def gaussian_statistics(
 ) -> dict[str, Tensor]:
     """Summarise matched elements by class; a class without one is left out.
 
-    Gaussians of the predictions (M, P), their masks, those of their ground truths (M, H, W), and
-    classes (M,); ``floor_m`` is the smallest sigma in metres. Scalars: per class
-    ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and ``sigma_across/<name>`` (medians in
-    metres); of all ``at_floor``, the share of Gaussians whose sigmas both lie within 10 % of it.
+    Args:
+        gaussians: Gaussians of the predictions. (M, P)
+        rendered: Their masks in [0, 1]. (M, H, W)
+        masks: Masks of their ground truths in [0, 1]. (M, H, W)
+        labels: Class indices. (M,)
+        class_names: Names of the classes.
+        floor_m: Smallest sigma in metres.
+
+    Returns:
+        Scalars: per class ``soft_iou/<name>`` (mean), ``sigma_along/<name>`` and
+        ``sigma_across/<name>`` (medians in metres); of all ``at_floor``, the share of Gaussians
+        whose sigmas both lie within 10 % of the smallest.
     """
     if not len(labels):
         return {}
-    overlap = torch.minimum(rendered, masks).sum((1, 2))
-    union = rendered.sum((1, 2)) + masks.sum((1, 2)) - overlap
-    iou = overlap / union.clamp(min=1e-6)
+    iou = soft_iou(rendered, masks)
     extents = extents_along_line(gaussians)  # (M, P, 2)
     figures = {}
     for label, name in enumerate(class_names):

@@ -1,16 +1,48 @@
 """MapTR's decoder: point queries interact, look at the BEV and refine their reference."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
 from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule, ModuleList
 from torch import Tensor, nn
 
-from gsmap.models.gsmap.guidance import GaussianGuidance
 from gsmap.models.maptr.layers import feed_forward
 from gsmap.structures.gaussians import GaussianSpace
+
+
+class Guidance(nn.Module):
+    """What a decoder layer takes from its references, for whichever attentions it has."""
+
+    def position(self, query_pos: Tensor, reference: Tensor) -> Tensor:
+        """Add what references (B, Q, D) say to the queries' position. (B, Q, C) -> (B, Q, C)"""
+        raise NotImplementedError
+
+    def frames(self, reference: Tensor, feats: Tensor) -> Tensor | None:
+        """Return what turns sampling offsets in cells of the features, if anything. (B, Q, 2, 2)"""
+        raise NotImplementedError
+
+
+@dataclass(eq=False)
+class Decoded:
+    """What a decoder layer returns, for all samples of a batch.
+
+    A decoder that returns more has a subclass, whose fields all start with (B, N).
+
+    Args:
+        point_states: They move the references. (B, N, P, C)
+        references: What the layer has refined, float32. (B, N, P, D)
+        instance_states: They say the class. (B, N, C)
+    """
+
+    point_states: Tensor
+    references: Tensor
+    instance_states: Tensor
+
+    def of_queries(self, queries: slice) -> "Decoded":
+        """Return what belongs to some of the instance queries."""
+        return type(self)(**{name: value[:, queries] for name, value in vars(self).items()})
 
 
 @MODELS.register_module()
@@ -25,8 +57,8 @@ class MapDecoderLayer(BaseModule):
         dropout: Dropout of every sublayer.
         self_attn: Config of the self-attention (`PointSelfAttention`).
         cross_attn: Config of the cross-attention (`BEVDeformableAttention`).
-        guidance: Settings of `GaussianGuidance`, or None for a layer that is not guided.
-        space: How the reference stands for a Gaussian; ValueError if guidance does not get it.
+        guidance: Config of a `Guidance`, or None for a layer that is not guided.
+        space: How the reference stands for a Gaussian; the guidance takes it.
     """
 
     def __init__(
@@ -49,11 +81,9 @@ class MapDecoderLayer(BaseModule):
         self.cross_attn = MODELS.build({**own, **(cross_attn or {})})
         self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
-        self.guidance: GaussianGuidance | None = None
+        self.guidance: Guidance | None = None
         if guidance is not None:
-            if space is None:
-                raise ValueError("a guided decoder layer needs a reference that holds Gaussians.")
-            self.guidance = GaussianGuidance(space, embed_dims, **guidance)
+            self.guidance = MODELS.build({"space": space, "embed_dims": embed_dims, **guidance})
 
     def forward(
         self,
@@ -80,39 +110,47 @@ class MapDecoder(BaseModule):
     Args:
         layer: Config of the layer.
         num_layers: Number of layers L.
+        num_points: Points per instance P.
         detach_reference: Cut the gradient through the reference between layers, as MapTR does.
-        shared: What the head hands on to every layer: ``embed_dims``, ``num_points``, ``space``.
+        shared: What the head hands on to every layer: ``embed_dims`` and ``space``.
 
     Attributes:
         point_queries: Whether it takes point queries (B, N * P, C), or instance queries (B, N, C).
-        guided_layer: What makes its layers guided ones, in their config.
-        fields: What else it returns, (L, B, N, ...) each; losses may read it of the predictions.
-            ``instance_states``, if among them, say the class in place of the mean over points.
+        layer_class: Class of its layers, where their config names none.
     """
 
     point_queries = True
-    guided_layer: ClassVar[dict[str, Any]] = {"type": "GaussianDecoderLayer"}
-    fields: ClassVar[tuple[str, ...]] = ()
+    layer_class: ClassVar[type[MapDecoderLayer]] = MapDecoderLayer
 
     def __init__(
         self,
         layer: dict[str, Any],
         num_layers: int = 6,
+        num_points: int = 20,
         detach_reference: bool = True,
         **shared: Any,
     ) -> None:
         super().__init__()
-        self.detach_reference = detach_reference
-        layer = {"type": "MapDecoderLayer", **shared, **layer}
+        self.num_points, self.detach_reference = num_points, detach_reference
+        layer = {"type": self.layer_class, "num_points": num_points, **shared, **layer}
         self.layers = ModuleList(MODELS.build(layer) for _ in range(num_layers))
 
     def start(self, query: Tensor, reference: Tensor, bev_feats: Tensor) -> tuple[Any, Tensor, Any]:
         """Return queries, reference and features as the layers take them."""
         return query, reference, bev_feats
 
-    def read(self, state: Any) -> dict[str, Tensor]:
-        """Return ``point_states`` (B, N * P, C) and the further ``fields`` of a layer's output."""
-        return {"point_states": state}
+    def point_states(self, state: Any) -> Tensor:
+        """Return the states of the points of a layer's output. (B, N * P, C)"""
+        return state
+
+    def read(self, state: Any, references: Tensor) -> Decoded:
+        """Return a layer's output, with the references that it has refined. (B, N * P, D)"""
+        points = self.by_instance(self.point_states(state))
+        return Decoded(points, self.by_instance(references), points.mean(2))
+
+    def by_instance(self, values: Tensor) -> Tensor:
+        """Sort values of points by their instance. (B, N * P, ...) -> (B, N, P, ...)"""
+        return values.unflatten(1, (-1, self.num_points))
 
     def forward(
         self,
@@ -122,7 +160,7 @@ class MapDecoder(BaseModule):
         bev_feats: Tensor,
         refine: Callable[[int, Tensor, Tensor], Tensor],
         attn_mask: Tensor | None = None,
-    ) -> dict[str, Tensor]:
+    ) -> list[Decoded]:
         """Run all layers, each on the reference that the one before refined.
 
         Args:
@@ -134,16 +172,15 @@ class MapDecoder(BaseModule):
                 D) to the refined one.
             attn_mask: True where an instance may not attend to another, or None. (N, N)
 
-        Of all layers, it returns ``point_states`` (L, B, N * P, C), the refined ``references`` (L,
-        B, N * P, D), float32, and the decoder's further ``fields``.
+        Returns:
+            The output of every layer.
         """
         state, reference, feats = self.start(query, reference, bev_feats)
-        outputs: list[dict[str, Tensor]] = []
+        outputs: list[Decoded] = []
         for number, layer in enumerate(self.layers):
             state = layer(state, query_pos, reference, feats, attn_mask)
-            outputs.append(self.read(state))
-            reference = refine(number, outputs[-1]["point_states"], reference)
-            outputs[-1]["references"] = reference
+            reference = refine(number, self.point_states(state), reference)
+            outputs.append(self.read(state, reference))
             if self.detach_reference:
                 reference = reference.detach()
-        return {name: torch.stack([output[name] for output in outputs]) for name in outputs[0]}
+        return outputs

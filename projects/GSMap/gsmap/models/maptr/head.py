@@ -15,18 +15,18 @@ from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
 from gsmap.models.maptr.coder import MapCoder
-from gsmap.models.maptr.decoder import MapDecoder
+from gsmap.models.maptr.decoder import Decoded, MapDecoder
 from gsmap.models.maptr.layers import classification_branch, init_matrices
+from gsmap.models.maptr.losses import MapLoss
 from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.matching import MapAssigner
-from gsmap.models.maptr.pairs import MatchedPairs
-from gsmap.models.maptr.parts import by_name, check_parts
-from gsmap.ops.gaussian_raster import render_gaussians
+from gsmap.models.maptr.matching import MapAssigner, MapCost
+from gsmap.models.maptr.pairs import GroundTruth, MatchedPairs, Predictions
+from gsmap.models.maptr.parts import PARTS, AuxHead, by_name, check_classes, refuse_twins
+from gsmap.models.maptr.references import PointReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 
 _PRIOR_PROBABILITY = 0.01
-PARTS = dict[str, Any]
 Tensors = dict[str, Tensor]
 Samples = Sequence[Det3DDataSample]
 Instances = Sequence[InstanceData]
@@ -70,27 +70,28 @@ class MapHead(BaseModule):
     """Predict N map elements of P ordered points from BEV features, as its parts say.
 
     A query is the sum of its instance's and its point's embedding (MapTR); half of its channels are
-    position, half content. Methods are combined by their parts. A loss or a cost names the fields
-    that it reads (``reads``); what nobody offers is an error when the head is built.
+    position, half content. The flow: queries, decoder, matched pairs, losses or prediction. Methods
+    are combined by their parts.
 
     Args:
         grid: The map's extent.
         classes: Names of the classes.
         decoder: Config of the decoder.
-        losses: Configs of the losses of matched pairs.
+        losses: Configs of the losses of matched pairs (`MapLoss`).
         match_costs: Configs of the matching costs.
         loss_cls: Config of the classification loss, on logits and one-hot targets.
         query_groups: Settings of each `QueryGroup`; the first one predicts.
         reference: Config of what the decoder refines (`PointReference`).
-        masks: Settings of `ElementMasks`, for losses and costs that read masks.
+        masks: `ElementMasks` or their settings, for losses and costs that read masks.
         aux_heads: Configs of heads that only help training.
         coder: Settings of `MapCoder`.
         num_points: Points per instance P.
         embed_dims: Channels C.
 
     Raises:
-        ValueError: If a loss or a cost reads a field that nothing here offers or names a class
-            that there is not, or two parts have one name.
+        TypeError: If a loss is no `MapLoss`.
+        ValueError: If a loss or a cost lacks a part that it reads, a class or a loss is named that
+            there is not, or two parts have one name.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class MapHead(BaseModule):
         loss_cls: PARTS,
         query_groups: Sequence[PARTS] = ({"num": 50},),
         reference: PARTS | None = None,
-        masks: PARTS | None = None,
+        masks: ElementMasks | PARTS | None = None,
         aux_heads: Sequence[PARTS] = (),
         coder: PARTS | None = None,
         num_points: int = 20,
@@ -113,13 +114,13 @@ class MapHead(BaseModule):
         super().__init__(init_cfg)
         self.grid, self.classes = grid, tuple(classes)
         self.num_points, self.embed_dims = num_points, embed_dims
-        self.masks = ElementMasks(grid, **(masks or {}))
+        self.masks = ElementMasks.of(grid, masks)
         self.query_groups = [QueryGroup(**group) for group in query_groups]
         num_instances = sum(group.num for group in self.query_groups)
         shared = {"embed_dims": embed_dims, "num_layers": decoder["num_layers"]}
         point = {"type": "PointReference", "grid": grid, **shared}
-        self.reference = MODELS.build({**point, **(reference or {})})
-        handed_on = {"num_points": num_points, "space": getattr(self.reference, "space", None)}
+        self.reference: PointReference = MODELS.build({**point, **(reference or {})})
+        handed_on = {"num_points": num_points, "space": self.reference.space}
         self.decoder: MapDecoder = MODELS.build(
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
         )
@@ -137,7 +138,29 @@ class MapHead(BaseModule):
         )
         self.assigner = MapAssigner(match_costs)
         self.coder = MapCoder(grid=grid, **(coder or {}))
-        self._reads = check_parts(self)
+        self.check_parts()
+
+    def check_parts(self) -> None:
+        """Refuse parts that do not fit together, see the class."""
+        for loss in self.losses.values():
+            if not isinstance(loss, MapLoss):
+                raise TypeError(
+                    f"{type(loss).__name__} is no MapLoss: derive it from "
+                    "gsmap.models.maptr.losses.MapLoss (docs/add_a_method.md)."
+                )
+        names = ["cls", *self.losses]
+        refuse_twins([*names, *self.aux_heads], "losses")
+        refuse_twins([group.name for group in self.query_groups], "query groups")
+        for group in self.query_groups:
+            unknown = sorted(set(group.losses or ()) - set(names))
+            if unknown:
+                raise ValueError(
+                    f"query group {group.name!r} names losses {unknown}; there are {names}."
+                )
+        check_classes("masks.filled_classes", self.masks.filled_classes, self.classes)
+        for part in (*self.losses.values(), *self.assigner.match_costs):
+            if isinstance(part, (MapLoss, MapCost)):
+                part.check(self)
 
     def init_weights(self) -> None:
         """Initialise the decoder's matrices (Xavier) and let every class start improbable."""
@@ -187,32 +210,27 @@ class MapHead(BaseModule):
             logging.WARNING,
         )
 
-    def forward(self, bev_outputs: Tensors) -> Tensors:
-        """Predict the elements after every decoder layer from ``bev_feats`` (B, C, H, W).
+    def forward(self, bev_outputs: Tensors) -> list[Predictions]:
+        """Predict the elements after every decoder layer.
 
-        ``all_cls_scores`` are logits (L, B, N, classes), ``all_pts_preds`` normalised (L, B, N, P,
-        2 or 3), with ``all_references`` (L, B, N, P, D), float32; ``all_instance_states`` (L, B, N,
-        C) and the decoder's further ``fields``; ``states`` (L, B, N * P, C); ``bev_feats``.
+        Args:
+            bev_outputs: What the BEV encoder returns: ``bev_feats`` (B, C, H, W) is read.
+
+        Returns:
+            The predictions of each layer, scores in float32 at least.
         """
-        bev_feats = bev_outputs["bev_feats"]
-        query_pos, query = (part.expand(len(bev_feats), -1, -1) for part in self.queries())
-        start, refine, mask = self.reference.start, self.reference.refine, self.attention_mask()
-        decoded = self.decoder(query, query_pos, start(query_pos), bev_feats, refine, mask)
-        by_point = (-1, self.num_points)
-        fields = {name: decoded[name] for name in self.decoder.fields}
-        if "instance_states" not in fields:
-            fields["instance_states"] = decoded["point_states"].unflatten(2, by_point).mean(3)
-        states = fields["instance_states"]  # (L, B, N, C)
-        scores = [branch(layer) for branch, layer in zip(self.cls_branches, states, strict=True)]
-        references = decoded["references"].unflatten(2, by_point)  # (L, B, N, P, D)
-        return {
-            "all_cls_scores": at_least_float32(torch.stack(scores)),
-            "all_pts_preds": references[..., : self.reference.coords],
-            "all_references": references,
-            **{f"all_{name}": value for name, value in fields.items()},
-            "states": decoded["point_states"],
-            "bev_feats": bev_feats,
-        }
+        feats = bev_outputs["bev_feats"]
+        query_pos, query = (part.expand(len(feats), -1, -1) for part in self.queries())
+        start, mask = self.reference.start(query_pos), self.attention_mask()
+        layers = self.decoder(query, query_pos, start, feats, self.reference.refine, mask)
+        return [
+            self.predictions(at_least_float32(branch(layer.instance_states)), layer, feats)
+            for branch, layer in zip(self.cls_branches, layers, strict=True)
+        ]
+
+    def predictions(self, scores: Tensor, decoded: Decoded, bev_feats: Tensor) -> Predictions:
+        """Return the predictions of a layer, with what decodes and renders them."""
+        return Predictions(scores, decoded, bev_feats, self.reference, self.masks)
 
     def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
         """Run the head and return its losses, those of the auxiliary heads included."""
@@ -220,117 +238,78 @@ class MapHead(BaseModule):
         metas = [sample.metainfo for sample in batch_data_samples]
         losses = self.loss_by_feat(self(bev_outputs), gts, metas)
         for name, head in self.aux_heads.items():
-            losses[f"loss_{name}"] = cast(Any, head).loss(bev_outputs, batch_data_samples)
+            losses[f"loss_{name}"] = cast(AuxHead, head).loss(bev_outputs, batch_data_samples)
         return losses
 
     def loss_by_feat(
-        self, outputs: Tensors, batch_gt_instances: Instances, batch_img_metas: Metas
+        self, outputs: Sequence[Predictions], batch_gt_instances: Instances, batch_img_metas: Metas
     ) -> Tensors:
         """Prepare the ground truth and return the losses of every decoder layer and query group.
 
-        Ground truth is, per sample, ``labels_3d`` (K,), ``pts`` (K, P, 2), ``pts_shifts`` (K, S, P,
-        2) in metres, and for masks ``polylines`` (K, M, 2). The last layer's losses have their
-        names, the others' the prefix ``d<layer>.``; those of a further query group end in its name.
+        The last layer's losses have their names, the others' the prefix ``d<layer>.``; those of a
+        further query group end in its name.
+
+        Args:
+            outputs: Predictions of each layer, of all query groups.
+            batch_gt_instances: Ground truth of each sample, as `GroundTruth` takes it.
+            batch_img_metas: Meta dict of each sample.
 
         Raises:
             FloatingPointError: If a matching cost is not finite.
         """
         losses: Tensors = {}
-        with torch.autocast(outputs["all_pts_preds"].device.type, enabled=False):
-            gts = [self.prepare_gt(gt) for gt in batch_gt_instances]
+        with torch.autocast(outputs[-1].scores.device.type, enabled=False):
+            truths = [self.prepare_gt(gt) for gt in batch_gt_instances]
             for group, own in self.split_groups(outputs):
-                losses.update(self.group_losses(group, own, gts, batch_img_metas))
+                for number, layer in enumerate(own):
+                    pairs = self.match(layer, truths, batch_img_metas, group.repeats)
+                    is_last = number == len(own) - 1
+                    prefix = "" if is_last else f"d{number}."
+                    suffix = f"_{group.name}" if group.name else ""
+                    for name, value in self.layer_losses(group, pairs, is_last).items():
+                        losses[f"{prefix}{name}{suffix}"] = value
         return losses
 
-    def split_groups(self, outputs: Tensors) -> Iterator[tuple[QueryGroup, Tensors]]:
-        """Yield each query group with its predictions, ``all_*`` (L, B, N of the group, ...)."""
-        shared = {k: v for k, v in outputs.items() if k == "bev_feats"}
+    def split_groups(
+        self, outputs: Sequence[Predictions]
+    ) -> Iterator[tuple[QueryGroup, list[Predictions]]]:
+        """Yield each query group with its predictions of each layer."""
         start = 0
         for group in self.query_groups:
-            end = start + group.num
-            own = {k: v[:, :, start:end] for k, v in outputs.items() if k.startswith("all_")}
-            yield group, own | shared
-            start = end
+            queries = slice(start, start + group.num)
+            yield group, [layer.of_queries(queries) for layer in outputs]
+            start += group.num
 
-    def group_losses(
-        self, group: QueryGroup, outputs: Tensors, gts: Instances, metas: Metas
-    ) -> Tensors:
-        """Return every layer's losses of one query group."""
-        losses: Tensors = {}
-        last = len(outputs["all_cls_scores"]) - 1
-        suffix = f"_{group.name}" if group.name else ""
-        for layer in range(last + 1):
-            predictions, feats = self.layer_predictions(outputs, layer), outputs.get("bev_feats")
-            pairs = self.match(predictions, gts, metas, group.repeats, feats)
-            prefix = "" if layer == last else f"d{layer}."
-            for name, value in self.layer_losses(group, pairs, layer == last).items():
-                weight = group.weight if name.startswith("loss_") else 1.0
-                losses[f"{prefix}{name}{suffix}"] = weight * value
-        return losses
-
-    def prepare_gt(self, gt_instances: InstanceData) -> InstanceData:
-        """Return one sample's ground truth as costs and losses read it.
-
-        It has ``labels`` (K,), normalised ``pts_shifts`` (K, S, P, 2) and, in the annotated order,
-        ``first_pts`` (K, P, 2); where they are read, ``rasters`` (K, h, w) for matching and
-        ``masks`` (K, H, W).
-        """
-        gt = InstanceData(
-            labels=gt_instances.labels_3d,
-            pts_shifts=self.reference.norm(gt_instances.pts_shifts.float()),
-            first_pts=self.reference.norm(gt_instances.pts.float()),
-        )
-        if "gt.rasters" in self._reads:
-            gt.rasters = self.masks.draw_sample(gt_instances, self.masks.cost_grid)
-        if "gt.masks" in self._reads and self.masks.source == "full":
-            gt.masks = self.masks.draw_sample(gt_instances, self.masks.grid)
-        return gt
-
-    def layer_predictions(self, outputs: Tensors, layer: int) -> list[InstanceData]:
-        """Return a layer's predictions, per sample, as costs and losses read them.
-
-        They have ``scores`` (N, classes), normalised ``pts`` (N, P, 2), ``references`` (N, P, D),
-        what else the decoder gives, and, where a cost reads them, ``rasters`` (N, h, w) without
-        gradient.
-        """
-        names = {"all_cls_scores": "scores", "all_pts_preds": "pts", "all_references": "references"}
-        fields = {
-            names.get(name, name.removeprefix("all_")): value[layer].float()
-            for name, value in outputs.items()
-            if name.startswith("all_")
-        }
-        if "pred.rasters" in self._reads:
-            means, scales, rotations = self.reference.space.decode(fields["references"].detach())
-            fields["rasters"] = render_gaussians(means, scales, rotations, self.masks.cost_grid)
-        batch = len(fields["scores"])
-        return [InstanceData(**{k: v[i] for k, v in fields.items()}) for i in range(batch)]
+    def prepare_gt(self, gt_instances: InstanceData) -> GroundTruth:
+        """Return one sample's ground truth as costs and losses read it."""
+        return GroundTruth(gt_instances, self.reference, self.masks)
 
     def match(
         self,
-        predictions: Instances,
-        gts: Instances,
+        predictions: Predictions,
+        truths: Sequence[GroundTruth],
         metas: Metas,
         repeats: int = 1,
-        bev_feats: Tensor | None = None,
     ) -> MatchedPairs:
-        """Match every sample's predictions with its ground truth."""
-        samples = zip(predictions, gts, metas, strict=True)
+        """Match every sample's predictions of one layer with its ground truth."""
+        samples = zip(predictions.samples(), truths, metas, strict=True)
         matches = [self.assigner.assign(*sample, repeats) for sample in samples]
-        return MatchedPairs(predictions, gts, matches, self.reference, self.masks, bev_feats)
+        return MatchedPairs(predictions, truths, matches)
 
     def layer_losses(self, group: QueryGroup, pairs: MatchedPairs, is_last: bool) -> Tensors:
-        """Return the losses of one layer's predictions."""
+        """Return the weighted losses of one layer's predictions, and figures to log."""
         losses: Tensors = {}
-        first, avg_factor = group is self.query_groups[0], pairs.avg_factor
+        first = group is self.query_groups[0]
         if group.has("cls"):
             # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
             one_hot = F.one_hot(pairs.query_labels() + 1, len(self.classes) + 1)[:, 1:]
-            losses["loss_cls"] = self.loss_cls(pairs.query_scores(), one_hot, avg_factor=avg_factor)
-        for name, loss in self.losses.items():
-            late = is_last or not getattr(loss, "last_layer_only", False)
-            if late and group.has(name) and (first or not getattr(loss, "first_group_only", False)):
-                values = [pairs[field] for field in cast(Any, loss).reads]
-                losses[f"loss_{name}"] = loss(*values, avg_factor=avg_factor)
+            scores, count = pairs.query_scores(), pairs.avg_factor
+            losses["loss_cls"] = group.weight * self.loss_cls(scores, one_hot, avg_factor=count)
+        for name, module in self.losses.items():
+            loss = cast(MapLoss, module)
+            applies = (is_last or not loss.last_layer_only) and (first or not loss.first_group_only)
+            if applies and group.has(name):
+                losses[f"loss_{name}"] = group.weight * loss(pairs)
         if is_last and first:
             losses.update(self.statistics(pairs))
         return losses
@@ -344,15 +323,16 @@ class MapHead(BaseModule):
         metas = [sample.metainfo for sample in batch_data_samples]
         return self.predict_by_feat(self(bev_outputs), metas)
 
-    def predict_by_feat(self, outputs: Tensors, batch_img_metas: Metas) -> list[InstanceData]:
+    def predict_by_feat(
+        self, outputs: Sequence[Predictions], batch_img_metas: Metas
+    ) -> list[InstanceData]:
         """Decode the last layer's predictions, best first.
 
         They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,), ``pts`` (M, P, 2) in metres
         and what else the reference decodes.
         """
         results = []
-        last = zip(outputs["all_cls_scores"][-1], outputs["all_references"][-1], strict=True)
-        for scores, references in last:
+        for scores, references in zip(outputs[-1].scores, outputs[-1].references, strict=True):
             fields = self.reference.decode(references)
             best = self.coder.decode(scores, fields["pts"])
             chosen = {name: value[best.query_inds] for name, value in fields.items()}

@@ -1,62 +1,111 @@
-"""Losses of matched points: where they are, and which way the edges between them run."""
+"""Losses of matched pairs: what they share, and MapTR's, of points and of edges between them."""
 
-import torch
+from typing import TYPE_CHECKING
+
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.models.maptr.pairs import MatchedPairs
 from gsmap.structures.tensors import check_same_shape
+
+if TYPE_CHECKING:
+    from gsmap.models.maptr.head import MapHead
 
 _EPS = 1e-12
 
 
-@MODELS.register_module()
-class PointsLoss(nn.Module):
-    """L1 distance of the points of matched pairs (MapTR Eq. 6, GSMap Eq. 11).
-
-    Args:
-        loss_weight: Weight of the loss (lambda_v).
-    """
-
-    name = "pts"
-    reads: tuple[str, ...] = ("pred.pts", "gt.pts")
-
-    def __init__(self, loss_weight: float = 5.0) -> None:
-        super().__init__()
-        self.loss_weight = loss_weight
-
-    def forward(self, pred: Tensor, target: Tensor, avg_factor: float | Tensor) -> Tensor:
-        """Return the weighted sum over ``avg_factor``, of normalised points in the same order.
-
-        ValueError if the shapes disagree. 2 x (M, P, 2 or 3) -> ()
-        """
-        check_same_shape(pred=pred, target=target)
-        return self.loss_weight * ((pred - target).abs().sum() / avg_factor)
-
-
-@MODELS.register_module()
-class DirectionLoss(PointsLoss):
-    """One minus the cosine between the edges of matched pairs (MapTR Eq. 7).
-
-    Closed shapes need no extra edge: their last point is their first.
+class MapLoss(nn.Module):
+    """A loss of matched pairs: the weighted sum of its `values` over the number of pairs.
 
     Args:
         loss_weight: Weight of the loss.
+        last_layer_only: Leave it out of all decoder layers but the last.
+        first_group_only: Leave it out of all query groups but the one that predicts.
+
+    Attributes:
+        name: It is logged as ``loss_<name>``; unique in a head.
+
+    Raises:
+        TypeError: If a class sets a flag as its attribute, where a misspelt one would be silent.
+    """
+
+    name: str
+
+    def __init__(
+        self,
+        loss_weight: float = 1.0,
+        last_layer_only: bool = False,
+        first_group_only: bool = False,
+    ) -> None:
+        super().__init__()
+        self.loss_weight = loss_weight
+        self.last_layer_only, self.first_group_only = last_layer_only, first_group_only
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        flags = [name for name, value in vars(cls).items() if isinstance(value, bool)]
+        if flags:
+            raise TypeError(
+                f"{cls.__name__} sets {flags} as attributes of the class: pass last_layer_only and "
+                "first_group_only to MapLoss.__init__."
+            )
+
+    def check(self, head: "MapHead") -> None:
+        """Raise ValueError if a head lacks what the loss reads; called when the head is built."""
+
+    def values(self, pairs: MatchedPairs) -> Tensor:
+        """Return the values that are summed, of any shape."""
+        raise NotImplementedError
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Return the weighted loss, 0 with a gradient of 0 if nothing is matched. ()"""
+        return self.loss_weight * (self.values(pairs).sum() / pairs.avg_factor)
+
+
+@MODELS.register_module()
+class PointsLoss(MapLoss):
+    """L1 distance of the points of matched pairs, [0, 1] over the map (MapTR Eq. 6, GSMap Eq. 11).
+
+    Args:
+        loss_weight: Weight of the loss (lambda_v).
+        flags: As in `MapLoss`.
+    """
+
+    name = "pts"
+
+    def __init__(self, loss_weight: float = 5.0, **flags: bool) -> None:
+        super().__init__(loss_weight, **flags)
+
+    def values(self, pairs: MatchedPairs) -> Tensor:
+        """Return the distance of each coordinate. (M, P, 2 or 3)"""
+        check_same_shape(pred=pairs.pred_pts, target=pairs.gt_pts)
+        return (pairs.pred_pts - pairs.gt_pts).abs()
+
+
+@MODELS.register_module()
+class DirectionLoss(MapLoss):
+    """One minus the cosine between the edges of matched pairs (MapTR Eq. 7).
+
+    Points are in metres, so that x and y weigh the same. Closed shapes need no extra edge: their
+    last point is their first.
+
+    Args:
+        loss_weight: Weight of the loss.
+        flags: As in `MapLoss`.
     """
 
     name = "dir"
-    reads = ("pred.pts_m", "gt.pts_m")
 
-    def __init__(self, loss_weight: float = 0.005) -> None:
-        super().__init__(loss_weight)
+    def __init__(self, loss_weight: float = 0.005, **flags: bool) -> None:
+        super().__init__(loss_weight, **flags)
 
-    def forward(self, pred: Tensor, target: Tensor, avg_factor: float | Tensor) -> Tensor:
-        """Return the weighted sum of points in metres: x and y weigh the same. As `PointsLoss`."""
-        check_same_shape(pred=pred, target=target)
-        turns = sum_of_turns(pred.diff(dim=1), target.diff(dim=1))
-        return self.loss_weight * (turns / avg_factor)
+    def values(self, pairs: MatchedPairs) -> Tensor:
+        """Return the value of each edge. (M, P - 1)"""
+        check_same_shape(pred=pairs.pred_pts_m, target=pairs.gt_pts_m)
+        return turns(pairs.pred_pts_m.diff(dim=1), pairs.gt_pts_m.diff(dim=1))
 
 
-def sum_of_turns(first: Tensor, second: Tensor) -> Tensor:
-    """Return the sum of one minus the cosine between edges. (M, E, 2) each -> ()"""
+def turns(first: Tensor, second: Tensor) -> Tensor:
+    """Return one minus the cosine between edges. 2 x (M, E, 2 or 3) -> (M, E)"""
     lengths = ((first.square().sum(-1) + _EPS) * (second.square().sum(-1) + _EPS)).sqrt()
-    return torch.sum(1 - (first * second).sum(-1) / lengths)
+    return 1 - (first * second).sum(-1) / lengths

@@ -1,6 +1,7 @@
 """Masks of map elements: their rasters, and how the ground truth is drawn."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from mmengine.structures import InstanceData
@@ -47,6 +48,11 @@ class ElementMasks:
         self.filled_classes = tuple(filled_classes)
         self.source = source
 
+    @classmethod
+    def of(cls, grid: BEVGrid, masks: "ElementMasks | dict[str, Any] | None") -> "ElementMasks":
+        """Return masks as they are, or build them from their settings."""
+        return masks if isinstance(masks, ElementMasks) else cls(grid, **(masks or {}))
+
     @property
     def half_pixel_m(self) -> float:
         """Half the longer side of a pixel of the losses' masks, in metres."""
@@ -61,10 +67,11 @@ class ElementMasks:
 
     def draw_sample(self, gt_instances: InstanceData, grid: BEVGrid) -> Tensor:
         """Draw a sample's ground truth, before its matching is known. (K, H, W)"""
-        name = "polylines" if self.source == "full" else "pts"
-        if name not in gt_instances:
+        if self.source == "points":
+            return self.draw(gt_instances.pts, gt_instances.labels_3d, grid)
+        if "polylines" not in gt_instances:
             raise ValueError(
-                f"masks of source {self.source!r} need gt_instances_3d.{name}: make the targets "
-                "with FormatMapTargets."
+                "masks of source 'full' need gt_instances_3d.polylines: make the targets with "
+                "FormatMapTargets."
             )
-        return self.draw(gt_instances[name], gt_instances.labels_3d, grid)
+        return self.draw(gt_instances.polylines, gt_instances.labels_3d, grid)

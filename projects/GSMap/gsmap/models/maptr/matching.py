@@ -1,14 +1,17 @@
 """Assignment of predictions to annotated map elements, and MapTR's cost of points."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from mmdet3d.registry import TASK_UTILS
-from mmengine.structures import InstanceData
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from gsmap.models.maptr.head import MapHead
+    from gsmap.models.maptr.pairs import GroundTruth, SamplePredictions
 
 
 class MapMatch(NamedTuple):
@@ -38,16 +41,18 @@ class MapAssigner:
     @torch.no_grad()
     def assign(
         self,
-        pred_instances: InstanceData,
-        gt_instances: InstanceData,
+        pred_instances: "SamplePredictions",
+        gt_instances: "GroundTruth",
         img_meta: dict[str, Any] | None = None,
         repeats: int = 1,
     ) -> MapMatch:
         """Match each ground truth to ``repeats`` predictions: min(N, K * repeats) pairs.
 
-        Predictions have ``scores``, logits (N, classes), ``pts`` normalised (N, P, 2), ground
-        truths ``labels`` (K,), ``pts_shifts`` normalised (K, S, P, 2), and both what further costs
-        read. The meta dict's ``token`` names the sample in errors.
+        Args:
+            pred_instances: The sample's predictions, N queries.
+            gt_instances: Its ground truth, K elements.
+            img_meta: Its ``token`` names the sample in errors.
+            repeats: How often each ground truth may be matched.
 
         Raises:
             FloatingPointError: If a cost (or, without ground truth, a score) is not finite.
@@ -78,6 +83,26 @@ class MapAssigner:
             )
 
 
+class MapCost:
+    """A matching cost that says what it needs when the head is built; others may be costs as well.
+
+    Args:
+        weight: Weight of the cost.
+    """
+
+    def __init__(self, weight: float = 1.0) -> None:
+        self.weight = weight
+
+    def check(self, head: "MapHead") -> None:
+        """Raise ValueError if a head lacks what the cost reads; called when the head is built."""
+
+    def __call__(
+        self, pred_instances: "SamplePredictions", gt_instances: "GroundTruth", img_meta: Any = None
+    ) -> Tensor:
+        """Return the weighted cost of each prediction with each ground truth. (N, K)"""
+        raise NotImplementedError
+
+
 def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
     """Return the summed L1 distance of every prediction to every order of every ground truth.
 
@@ -95,20 +120,18 @@ def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
 
 
 @TASK_UTILS.register_module()
-class OrderedPointsCost:
+class OrderedPointsCost(MapCost):
     """L1 distance to the closest equivalent point order (MapTR Eq. 5).
 
     Args:
         weight: Weight of the cost.
     """
 
-    reads = ("pred.pts", "gt.pts_shifts")
-
     def __init__(self, weight: float = 5.0) -> None:
-        self.weight = weight
+        super().__init__(weight)
 
     def __call__(
-        self, pred_instances: InstanceData, gt_instances: InstanceData, img_meta: Any = None
+        self, pred_instances: "SamplePredictions", gt_instances: "GroundTruth", img_meta: Any = None
     ) -> Tensor:
         """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
         return order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1) * self.weight

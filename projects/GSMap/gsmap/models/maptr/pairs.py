@@ -1,90 +1,242 @@
-"""Matched predictions and ground truths of a batch, as the losses read them."""
+"""What costs and losses read: predictions of a layer, ground truth, and the pairs of both."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from mmdet.utils import reduce_mean
 from mmengine.structures import InstanceData
 from torch import Tensor
 
+from gsmap.models.maptr.decoder import Decoded
 from gsmap.models.maptr.masks import ElementMasks
 from gsmap.models.maptr.matching import MapMatch
 from gsmap.models.maptr.references import PointReference
-from gsmap.ops.gaussian_raster import render_gaussians
 
-GT_FIELDS = {"gt.labels", "gt.pts_shifts", "gt.first_pts", "gt.rasters"}
-# what only matched pairs have: a loss may read it, a matching cost may not
-MATCHED_GT_FIELDS = {f"gt.{x}" for x in ("pts", "pts_m", "masks", "samples", "counts", "inds")}
-AFTER_MATCHING = {"pred.pts_m", "pred.masks", "bev_feats", *MATCHED_GT_FIELDS}
+
+@dataclass(eq=False)
+class Predictions:
+    """What the head predicts after one decoder layer, for all samples of a batch.
+
+    Args:
+        scores: Class logits. (B, N, classes)
+        decoded: What the decoder layer returned: states and references.
+        bev_feats: BEV features. (B, C, H, W)
+        reference: What ``decoded.references`` stand for.
+        masks: The rasters on which predictions and ground truth are compared.
+    """
+
+    scores: Tensor
+    decoded: Decoded
+    bev_feats: Tensor
+    reference: PointReference
+    masks: ElementMasks
+
+    @property
+    def references(self) -> Tensor:
+        """What the decoder refines: a point, or a Gaussian. (B, N, P, D)"""
+        return self.decoded.references
+
+    @property
+    def pts(self) -> Tensor:
+        """Points, [0, 1] over the map. (B, N, P, 2 or 3)"""
+        return self.decoded.references[..., : self.reference.coords]
+
+    @cached_property
+    def cost_masks(self) -> Tensor:
+        """Rendered masks for matching, without gradient. (B, N, h, w)"""
+        return self.reference.render(self.references.detach(), self.masks.cost_grid)
+
+    def of_queries(self, queries: slice) -> "Predictions":
+        """Return the predictions of some of the instance queries, scores in float32."""
+        return replace(
+            self,
+            scores=self.scores[:, queries].float(),
+            decoded=self.decoded.of_queries(queries),
+        )
+
+    def samples(self) -> list["SamplePredictions"]:
+        """Return the predictions of each sample."""
+        return [SamplePredictions(self, index) for index in range(len(self.scores))]
+
+
+class SamplePredictions:
+    """One sample's predictions, as matching costs read them.
+
+    Args:
+        batch: The predictions of the batch.
+        index: Number of the sample in the batch.
+
+    Attributes:
+        scores: Class logits. (N, classes)
+        pts: Points, [0, 1] over the map. (N, P, 2 or 3)
+        references: What the decoder refines. (N, P, D)
+    """
+
+    def __init__(self, batch: Predictions, index: int) -> None:
+        self._batch, self._index = batch, index
+        self.scores, self.pts = batch.scores[index], batch.pts[index]
+        self.references = batch.references[index]
+
+    @property
+    def cost_masks(self) -> Tensor:
+        """Rendered masks, without gradient. (N, h, w)"""
+        return self._batch.cost_masks[self._index]
+
+
+class GroundTruth:
+    """One sample's ground truth, as costs and losses read it; masks are drawn when first read.
+
+    Args:
+        instances: ``labels_3d`` (K,), ``pts`` (K, P, 2 or 3) and ``pts_shifts`` (K, S, P, 2 or 3)
+            in metres; for masks also ``polylines`` (K, M, 2 or 3) in metres.
+        reference: It brings points to [0, 1] over the map.
+        masks: How masks are drawn.
+
+    Attributes:
+        labels: Class indices. (K,)
+        pts_shifts: Equivalent point orders, [0, 1] over the map. (K, S, P, 2 or 3)
+        first_pts: Points in the annotated order, [0, 1] over the map. (K, P, 2 or 3)
+    """
+
+    def __init__(
+        self, instances: InstanceData, reference: PointReference, masks: ElementMasks
+    ) -> None:
+        self._instances, self._drawing = instances, masks
+        self.labels: Tensor = instances.labels_3d
+        self.pts_shifts = reference.norm(instances.pts_shifts.float())
+        self.first_pts = reference.norm(instances.pts.float())
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @cached_property
+    def masks(self) -> Tensor:
+        """Masks of the losses. (K, H, W)"""
+        return self._drawing.draw_sample(self._instances, self._drawing.grid)
+
+    @cached_property
+    def cost_masks(self) -> Tensor:
+        """Coarser masks, for matching. (K, h, w)"""
+        return self._drawing.draw_sample(self._instances, self._drawing.cost_grid)
 
 
 class MatchedPairs:
-    """Fields of the M matched pairs of a batch, made when they are first read.
+    """The M matched pairs of a batch, sample after sample; what is computed is so when first read.
 
-    ``pred.<name>`` is a field of the predictions of one layer, ``gt.<name>`` one of the ground
-    truths, samples concatenated. Besides the samples' own fields: ``pred.pts_m``, ``gt.pts_m`` in
-    metres (M, P, 2); ``gt.pts``, normalised, in the matched order (M, P, 2); ``pred.masks``,
-    rendered from the Gaussians, and ``gt.masks`` (M, H, W); ``gt.samples``, the sample's number in
-    the batch (M,); ``gt.inds``, the ground truth's number in its sample (M,); ``gt.counts``, each
-    sample's number of pairs, Python integers; ``bev_feats`` of the batch (B, C, H, W).
-    ``avg_factor`` is the number of pairs, averaged over ranks, at least 1. ()
+    Args:
+        predictions: Predictions of one layer and query group.
+        truths: Ground truth of each sample.
+        matches: Matches of each sample.
+
+    Attributes:
+        counts: Number of pairs of each sample.
+        avg_factor: Number of pairs, averaged over the ranks, at least 1. ()
     """
 
     def __init__(
         self,
-        predictions: Sequence[InstanceData],
-        gts: Sequence[InstanceData],
+        predictions: Predictions,
+        truths: Sequence[GroundTruth],
         matches: Sequence[MapMatch],
-        reference: PointReference,
-        masks: ElementMasks,
-        bev_feats: Tensor | None = None,
     ) -> None:
-        self.matches = list(matches)
-        self._sides = {"pred": list(predictions), "gt": list(gts)}
-        self._reference: Any = reference  # one of Gaussians where masks are read
-        self._masks = masks
-        counts = [len(match.gt_inds) for match in matches]
-        self._made: dict[str, Any] = {"gt.counts": counts, "bev_feats": bev_feats}
-        count = predictions[0].scores.new_tensor(float(sum(counts)))
+        self.predictions, self.truths, self.matches = predictions, truths, matches
+        self.counts = [len(match.gt_inds) for match in matches]
+        count = predictions.scores.new_tensor(float(sum(self.counts)))
         self.avg_factor: Tensor = reduce_mean(count).clamp(min=1.0)
 
-    def __getitem__(self, field: str) -> Any:
-        if field not in self._made:
-            self._made[field] = self._make(field)
-        return self._made[field]
+    def of_queries(self, values: Tensor) -> Tensor:
+        """Take what belongs to the matched queries. (B, N, ...) -> (M, ...)"""
+        return values[self.samples, self.query_inds]
+
+    def of_truths(self, values: Iterable[Tensor]) -> Tensor:
+        """Take what belongs to the matched ground truths. B x (K, ...) -> (M, ...)"""
+        pairs = zip(values, self.matches, strict=True)
+        return torch.cat([value[match.gt_inds] for value, match in pairs])
+
+    @cached_property
+    def samples(self) -> Tensor:
+        """Number of each pair's sample in the batch. (M,)"""
+        numbers = torch.arange(len(self.counts)).repeat_interleave(torch.tensor(self.counts))
+        return numbers.to(self.predictions.scores.device)
+
+    @cached_property
+    def query_inds(self) -> Tensor:
+        """Number of each pair's query in its sample. (M,)"""
+        return torch.cat([match.query_inds for match in self.matches])
+
+    @cached_property
+    def gt_inds(self) -> Tensor:
+        """Number of each pair's ground truth in its sample. (M,)"""
+        return torch.cat([match.gt_inds for match in self.matches])
+
+    @cached_property
+    def pred_references(self) -> Tensor:
+        """What the decoder refines: a point, or a Gaussian. (M, P, D)"""
+        return self.of_queries(self.predictions.references)
+
+    @cached_property
+    def pred_pts(self) -> Tensor:
+        """Predicted points, [0, 1] over the map. (M, P, 2 or 3)"""
+        return self.of_queries(self.predictions.pts)
+
+    @cached_property
+    def pred_pts_m(self) -> Tensor:
+        """Predicted points in metres. (M, P, 2 or 3)"""
+        return self.predictions.reference.metres(self.pred_pts)
+
+    @cached_property
+    def pred_masks(self) -> Tensor:
+        """Masks rendered from the predicted Gaussians. (M, H, W)"""
+        return self.predictions.reference.render(self.pred_references, self.predictions.masks.grid)
+
+    @cached_property
+    def pred_instance_states(self) -> Tensor:
+        """States of the matched instances, float32. (M, C)"""
+        return self.of_queries(self.predictions.decoded.instance_states).float()
+
+    @cached_property
+    def gt_labels(self) -> Tensor:
+        """Class indices. (M,)"""
+        return self.of_truths(gt.labels for gt in self.truths)
+
+    @cached_property
+    def gt_pts(self) -> Tensor:
+        """Annotated points in the matched order, [0, 1] over the map. (M, P, 2 or 3)"""
+        pairs = zip(self.truths, self.matches, strict=True)
+        return torch.cat([gt.pts_shifts[match.gt_inds, match.order_inds] for gt, match in pairs])
+
+    @cached_property
+    def gt_first_pts(self) -> Tensor:
+        """Annotated points in the annotated order, [0, 1] over the map. (M, P, 2 or 3)"""
+        return self.of_truths(gt.first_pts for gt in self.truths)
+
+    @cached_property
+    def gt_pts_m(self) -> Tensor:
+        """Annotated points in the matched order, in metres. (M, P, 2 or 3)"""
+        return self.predictions.reference.metres(self.gt_pts)
+
+    @cached_property
+    def gt_masks(self) -> Tensor:
+        """Masks drawn of the ground truth. (M, H, W)"""
+        masks = self.predictions.masks
+        if masks.source == "points":
+            return masks.draw(self.gt_pts_m, self.gt_labels, masks.grid)
+        return self.of_truths(gt.masks for gt in self.truths)
+
+    @property
+    def bev_feats(self) -> Tensor:
+        """BEV features of the batch. (B, C, H, W)"""
+        return self.predictions.bev_feats
 
     def query_scores(self) -> Tensor:
         """Return the class logits of every query, matched or not. (B * N, classes)"""
-        return torch.cat([prediction.scores for prediction in self._sides["pred"]])
+        return self.predictions.scores.flatten(0, 1)
 
     def query_labels(self) -> Tensor:
         """Return the class that every query should say, -1 for none. (B * N,)"""
-        labels = []
-        for prediction, gt, match in zip(*self._sides.values(), self.matches, strict=True):
-            sample_labels = gt.labels.new_full((len(prediction.scores),), -1)
-            sample_labels[match.query_inds] = gt.labels[match.gt_inds]
-            labels.append(sample_labels)
-        return torch.cat(labels)
-
-    def _make(self, field: str) -> Tensor:
-        """Return a field of the matched pairs. (M, ...)"""
-        if field in ("pred.pts_m", "gt.pts_m"):
-            return self._reference.metres(self[field.removesuffix("_m")])
-        if field == "pred.masks":
-            means, scales, rotations = self._reference.space.decode(self["pred.references"])
-            return render_gaussians(means, scales, rotations, self._masks.grid)
-        if field == "gt.masks" and self._masks.source == "points":
-            return self._masks.draw(self["gt.pts_m"], self["gt.labels"], self._masks.grid)
-        if field == "gt.inds":
-            return torch.cat([match.gt_inds for match in self.matches])
-        if field == "gt.samples":
-            return torch.cat(
-                [m.gt_inds.new_full(m.gt_inds.shape, i) for i, m in enumerate(self.matches)]
-            )
-        side, name = field.split(".")
-        pairs = list(zip(self._sides[side], self.matches, strict=True))
-        if field == "gt.pts":
-            return torch.cat([gt.pts_shifts[m.gt_inds, m.order_inds] for gt, m in pairs])
-        index = "query_inds" if side == "pred" else "gt_inds"
-        return torch.cat([sample[name][getattr(match, index)] for sample, match in pairs])
+        scores = self.predictions.scores
+        labels = torch.full(scores.shape[:2], -1, dtype=torch.long, device=scores.device)
+        labels[self.samples, self.query_inds] = self.gt_labels
+        return labels.flatten()

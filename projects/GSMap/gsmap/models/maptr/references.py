@@ -1,7 +1,6 @@
 """References: what decoder layers refine, from its first value to points in metres."""
 
 from collections.abc import Sequence
-from typing import ClassVar
 
 import torch
 from mmdet.models.layers import inverse_sigmoid
@@ -10,6 +9,7 @@ from mmengine.model import xavier_init
 from torch import Tensor, nn
 
 from gsmap.models.maptr.layers import mlp
+from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32, check_same_shape
 
@@ -33,7 +33,7 @@ class PointReference(nn.Module):
 
     Args:
         grid: The map's extent.
-        embed_dims: Channels C of the states.
+        embed_dims: Channels C of the point states.
         num_layers: Decoder layers.
         coords: 2, or 3 for points with height.
         z_range: Lowest and highest z in metres, for points with height.
@@ -41,10 +41,11 @@ class PointReference(nn.Module):
     Raises:
         ValueError: If ``coords`` is not 2 or 3, a height lacks its range, or that is empty.
 
-    ``fields`` are what a loss or a cost may read of a prediction.
+    Attributes:
+        space: How a reference stands for a Gaussian, None for points.
     """
 
-    fields: ClassVar[frozenset[str]] = frozenset({"pts", "pts_m", "references"})
+    space: GaussianSpace | None = None
 
     def __init__(
         self,
@@ -77,13 +78,13 @@ class PointReference(nn.Module):
         """Return the reference that the first layer starts from. (..., C) -> (..., D)"""
         return at_least_float32(self.initial(query_pos)).sigmoid()
 
-    def offsets(self, layer: int, states: Tensor) -> Tensor:
+    def offsets(self, layer: int, point_states: Tensor) -> Tensor:
         """Return a layer's change of the reference, at least float32. (..., C) -> (..., D)"""
-        return at_least_float32(self.branches[layer](states))
+        return at_least_float32(self.branches[layer](point_states))
 
-    def refine(self, layer: int, states: Tensor, reference: Tensor) -> Tensor:
+    def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
         """Return the reference after a layer. (..., C), (..., D) -> (..., D)"""
-        return refine_reference(reference, self.offsets(layer, states), self.coords)
+        return refine_reference(reference, self.offsets(layer, point_states), self.coords)
 
     def metres(self, points: Tensor) -> Tensor:
         """Bring normalised points to metres. (..., coords) -> (..., coords)"""
@@ -114,3 +115,11 @@ class PointReference(nn.Module):
     def decode(self, references: Tensor) -> dict[str, Tensor]:
         """Return what references (N, P, D) say in metres: ``pts`` (N, P, coords)."""
         return {"pts": self.metres(references[..., : self.coords])}
+
+    def render(self, references: Tensor, grid: BEVGrid) -> Tensor:
+        """Return rendered masks of what has an extent. (..., P, D) -> (..., H, W)
+
+        Raises:
+            TypeError: If it is points.
+        """
+        raise TypeError(f"{type(self).__name__} has no masks: set reference to GaussianReference.")

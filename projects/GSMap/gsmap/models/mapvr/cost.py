@@ -4,15 +4,17 @@ from typing import Any
 
 import torch
 from mmdet3d.registry import TASK_UTILS
-from mmengine.structures import InstanceData
 from torch import Tensor
 
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.matching import MapCost
+from gsmap.models.maptr.pairs import GroundTruth, SamplePredictions
 from gsmap.models.mapvr.losses import ElementRenderer
 from gsmap.ops.soft_iou import pairwise_dice_loss
 
 
 @TASK_UTILS.register_module()
-class RenderedDiceCost:
+class RenderedDiceCost(MapCost):
     """Dice loss of softly rendered points, each pair rendered as the ground truth's class (MapVR).
 
     Args:
@@ -21,16 +23,18 @@ class RenderedDiceCost:
         rendering: Further settings of `ElementRenderer`.
     """
 
-    reads = ("pred.pts", "gt.first_pts", "gt.labels")
-
     def __init__(
         self, weight: float = 10.0, size: tuple[int, int] = (128, 64), **rendering: Any
     ) -> None:
-        self.weight = weight
+        super().__init__(weight)
         self.renderer = ElementRenderer(size, **rendering)
 
+    def check(self, head: MapHead) -> None:
+        """Raise ValueError if a polygon's class does not exist."""
+        self.renderer.check(self, head)
+
     def __call__(
-        self, pred_instances: InstanceData, gt_instances: InstanceData, img_meta: Any = None
+        self, pred_instances: SamplePredictions, gt_instances: GroundTruth, img_meta: Any = None
     ) -> Tensor:
         """Compare ``pts`` (N, P, 2) with ``first_pts`` (K, P, 2) of ``labels`` (K,). (N, K)"""
         preds, is_polygon = pred_instances.pts, self.renderer.is_polygon(gt_instances.labels)

@@ -1,13 +1,17 @@
 """MapVR's head: points supervised through their soft rasters."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mmdet3d.registry import MODELS
+from mmdet3d.registry import MODELS, TASK_UTILS
 
-from gsmap.models.maptr.head import PARTS, MapHead
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.losses import DirectionLoss, PointsLoss
 from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.parts import switched, weighted
+from gsmap.models.maptr.matching import OrderedPointsCost
+from gsmap.models.maptr.parts import DEFAULTS, PARTS, brought, class_of, with_points_weight
+from gsmap.models.mapvr.cost import RenderedDiceCost
+from gsmap.models.mapvr.losses import RenderedDiceLoss, SelfDirectionLoss
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 
@@ -25,8 +29,9 @@ class MapVRHead(MapHead):
         match_costs: As in `MapHead`; `OrderedPointsCost` gets another weight.
         loss_dice: Settings of the dice loss, or None to train without it.
         dice_cost: Settings of its matching cost, or None to match without it.
-        loss_direction: Config of the direction loss, or None to train without one.
-        points_weight: Weight of the points in losses and in matching.
+        loss_direction: Settings of `SelfDirectionLoss`, or None to train without it.
+        points_weight: Weight of the points in losses and in matching, None to leave theirs;
+            ValueError if a weight is given and there are no points.
         polygons: Names of the classes that are rendered as filled polygons, ValueError for what is
             no class; None: those that are areas (`AREA_CLASSES`).
         rendering: Further settings of `ElementRenderer`, for loss and cost.
@@ -42,10 +47,10 @@ class MapVRHead(MapHead):
         decoder: PARTS,
         losses: Sequence[PARTS],
         match_costs: Sequence[PARTS],
-        loss_dice: PARTS | None = {"loss_weight": 15.0},  # noqa: B006
-        dice_cost: PARTS | None = {"weight": 10.0},  # noqa: B006
-        loss_direction: PARTS | None = {"type": "SelfDirectionLoss"},  # noqa: B006
-        points_weight: float = 1.0,
+        loss_dice: Mapping[str, Any] | None = DEFAULTS,
+        dice_cost: Mapping[str, Any] | None = DEFAULTS,
+        loss_direction: Mapping[str, Any] | None = DEFAULTS,
+        points_weight: float | None = 1.0,
         polygons: Sequence[str] | None = None,
         rendering: PARTS | None = None,
         masks: PARTS | None = None,
@@ -57,19 +62,21 @@ class MapVRHead(MapHead):
             raise ValueError(f"polygons must be classes of {list(classes)}, got {unknown}.")
         areas = AREA_CLASSES if polygons is None else polygons
         indices = tuple(index for index, name in enumerate(classes) if name in areas)
-        masks = {"pixel_m": 60 / 256, "cost_pixel_m": 60 / 128, **(masks or {})}
-        rasters = ElementMasks(grid, **masks)
+        sizes = {"pixel_m": 60 / 256, "cost_pixel_m": 60 / 128}
+        drawing = ElementMasks(grid, **{**sizes, **(masks or {})})
         shared = {"polygon_classes": indices, **(rendering or {})}
-        size, cost_size = ((g.height, g.width) for g in (rasters.grid, rasters.cost_grid))
-        kept = [loss for loss in losses if loss["type"] != "DirectionLoss"]
+        size, cost_size = ((g.height, g.width) for g in (drawing.grid, drawing.cost_grid))
+        kept = [loss for loss in losses if class_of(loss) is not DirectionLoss]
         losses = [
-            *weighted(kept, "PointsLoss", "loss_weight", points_weight),
-            *switched("SelfDirectionLoss", loss_direction),
-            *switched("RenderedDiceLoss", loss_dice, size=size, **shared),
+            *with_points_weight(kept, PointsLoss, points_weight, "loss_weight"),
+            *brought(SelfDirectionLoss, loss_direction),
+            *brought(RenderedDiceLoss, loss_dice, size=size, **shared),
         ]
         match_costs = [
-            *weighted(match_costs, "OrderedPointsCost", "weight", points_weight),
-            *switched("RenderedDiceCost", dice_cost, size=cost_size, **shared),
+            *with_points_weight(
+                match_costs, OrderedPointsCost, points_weight, "weight", TASK_UTILS
+            ),
+            *brought(RenderedDiceCost, dice_cost, size=cost_size, **shared),
         ]
         super().__init__(
             grid=grid,
@@ -77,6 +84,6 @@ class MapVRHead(MapHead):
             decoder={**decoder, "layer": {**decoder.get("layer", {}), "dropout": dropout}},
             losses=losses,
             match_costs=match_costs,
-            masks=masks,
+            masks=drawing,
             **kwargs,
         )

@@ -5,9 +5,12 @@ from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
-from torch import Tensor, nn
+from torch import Tensor
 
-from gsmap.models.maptr.losses import sum_of_turns
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.losses import MapLoss, turns
+from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.maptr.parts import check_classes
 from gsmap.ops.polyline_raster import DISTANCES, soft_rasters
 from gsmap.ops.soft_iou import dice_loss
 
@@ -44,6 +47,11 @@ class ElementRenderer:
         if min(softness) <= 0:
             raise ValueError(f"softness must be > 0, got {softness[0]} and {softness[1]}.")
 
+    def check(self, part: object, head: MapHead) -> None:
+        """Raise ValueError if a polygon's class, in the settings of a part, does not exist."""
+        name = f"{type(part).__name__}.polygon_classes"
+        check_classes(name, self.polygon_classes, head.classes)
+
     def is_polygon(self, labels: Tensor) -> Tensor:
         """Return which elements are rendered as polygons. (n,) -> (n,)"""
         return torch.isin(labels, labels.new_tensor(self.polygon_classes))
@@ -52,51 +60,57 @@ class ElementRenderer:
         """Return masks of elements whose vertices are normalised. (n, P, 2), (n,) -> (n, H, W)"""
         height, width = self.size
         pixels = torch.stack([points[..., 0] * width, points[..., 1] * height], -1)
-        softness = self.line_softness, self.polygon_softness
-        return soft_rasters(pixels, *self.size, is_polygon, *softness, self.distance)
+        return soft_rasters(
+            pixels,
+            height=height,
+            width=width,
+            is_polygon=is_polygon,
+            line_softness=self.line_softness,
+            polygon_softness=self.polygon_softness,
+            distance=self.distance,
+        )
 
 
 @MODELS.register_module()
-class RenderedDiceLoss(nn.Module):
+class RenderedDiceLoss(MapLoss):
     """Dice loss between softly rendered predictions and ground truths (MapVR, section 4.3).
+
+    A pair is rendered as its ground truth's class, from its points in the annotated order.
 
     Args:
         loss_weight: Weight of the loss.
         size: Rows H and columns W of the rasters.
+        last_layer_only: As in `MapLoss`.
+        first_group_only: As in `MapLoss`.
         rendering: Further settings of `ElementRenderer`.
     """
 
     name = "dice"
-    reads = ("pred.pts", "gt.first_pts", "gt.labels")
 
     def __init__(
-        self, loss_weight: float = 15.0, size: tuple[int, int] = (256, 128), **rendering: Any
+        self,
+        loss_weight: float = 15.0,
+        size: tuple[int, int] = (256, 128),
+        last_layer_only: bool = False,
+        first_group_only: bool = False,
+        **rendering: Any,
     ) -> None:
-        super().__init__()
-        self.loss_weight = loss_weight
+        super().__init__(loss_weight, last_layer_only, first_group_only)
         self.renderer = ElementRenderer(size, **rendering)
 
-    def forward(
-        self,
-        pred_points: Tensor,
-        gt_points: Tensor,
-        gt_labels: Tensor,
-        avg_factor: float | Tensor | None = None,
-    ) -> Tensor:
-        """Return the weighted sum over ``avg_factor``, or the mean over the n pairs without it.
+    def check(self, head: MapHead) -> None:
+        """Raise ValueError if a polygon's class does not exist."""
+        self.renderer.check(self, head)
 
-        Points are normalised (n, P, 2), the ground truth's in their first order; a pair is rendered
-        as its ground truth's class (n,). 0 with a gradient of 0 if nothing is matched.
-        """
-        is_polygon = self.renderer.is_polygon(gt_labels)
-        preds = self.renderer.render(pred_points, is_polygon)
-        targets = self.renderer.render(gt_points, is_polygon)
-        count = max(len(pred_points), 1) if avg_factor is None else avg_factor
-        return self.loss_weight * dice_loss(preds, targets).sum() / count
+    def values(self, pairs: MatchedPairs) -> Tensor:
+        """Compare the rasters of pairs. (M,)"""
+        is_polygon = self.renderer.is_polygon(pairs.gt_labels)
+        preds = self.renderer.render(pairs.pred_pts, is_polygon)
+        return dice_loss(preds, self.renderer.render(pairs.gt_first_pts, is_polygon))
 
 
 @MODELS.register_module()
-class SelfDirectionLoss(nn.Module):
+class SelfDirectionLoss(MapLoss):
     """One minus the cosine between consecutive edges of a prediction (MapVR Eq. 4).
 
     It keeps predictions from folding back where nothing but their rendering is supervised. Both
@@ -104,17 +118,16 @@ class SelfDirectionLoss(nn.Module):
 
     Args:
         loss_weight: Weight of the loss.
+        flags: As in `MapLoss`.
     """
 
     name = "dir"
-    reads = ("pred.pts_m",)
 
-    def __init__(self, loss_weight: float = 0.002) -> None:
-        super().__init__()
-        self.loss_weight = loss_weight
+    def __init__(self, loss_weight: float = 0.002, **flags: bool) -> None:
+        super().__init__(loss_weight, **flags)
 
-    def forward(self, pred: Tensor, avg_factor: float | Tensor) -> Tensor:
-        """Return the weighted sum over ``avg_factor`` of points in metres. (M, P, 2 or 3) -> ()"""
+    def values(self, pairs: MatchedPairs) -> Tensor:
+        """Return the value of each turn, of points in metres. (M, P - 2)"""
         # Differs from MapVR Eq. (4), which sums the cosines: their sign would reward folding.
-        edges = pred.diff(dim=1)
-        return self.loss_weight * (sum_of_turns(edges[:, :-1], edges[:, 1:]) / avg_factor)
+        edges = pairs.pred_pts_m.diff(dim=1)
+        return turns(edges[:, :-1], edges[:, 1:])

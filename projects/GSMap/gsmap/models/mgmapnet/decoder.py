@@ -1,12 +1,13 @@
 """MGMapNet's decoder: instance queries and point queries in one stack of layers."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any
 
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.maptr.decoder import MapDecoder, MapDecoderLayer
+from gsmap.models.maptr.decoder import Decoded, MapDecoder, MapDecoderLayer
 from gsmap.models.maptr.layers import feed_forward, mlp
 from gsmap.models.mgmapnet.attention import Granularities
 from gsmap.models.mgmapnet.bev_pyramid import BEVPyramid
@@ -93,13 +94,26 @@ class MGMapNetDecoderLayer(MapDecoderLayer):
         return by_point.unflatten(1, (-1, self.num_points)).mean(2)
 
 
+@dataclass(eq=False)
+class MGMapNetDecoded(Decoded):
+    """What a layer of `MGMapNetDecoder` returns, for all samples of a batch.
+
+    Args:
+        point_states: States of the point queries; they move the references. (B, N, P, C)
+        references: What the layer has refined, float32. (B, N, P, D)
+        instance_states: States of the instance queries; they say the class. (B, N, C)
+        mean_locations: Mean of each point's sampling locations (x, y), [0, 1] over the map, not
+            clipped. (B, N, P, 2)
+    """
+
+    mean_locations: Tensor
+
+
 @MODELS.register_module()
 class MGMapNetDecoder(MapDecoder):
     """A stack of layers with instance and point queries that refine one reference (MGMapNet).
 
-    It takes instance queries and one reference for each, which its points share at first. It also
-    returns ``instance_states`` (L, B, N, C), which say the class, and ``mean_locations`` (L, B, N,
-    P, 2), the mean of each point's sampling locations (x, y), [0, 1] over the map, not clipped.
+    It takes instance queries and one reference for each, which its points share at first.
 
     Args:
         layer: Config of the layer (`MGMapNetDecoderLayer`). Its ``reference_dims`` holds from the
@@ -109,20 +123,17 @@ class MGMapNetDecoder(MapDecoder):
     """
 
     point_queries = False
-    guided_layer: ClassVar[dict[str, Any]] = {"type": "MGMapNetDecoderLayer", "guidance": {}}
-    fields = ("instance_states", "mean_locations")
+    layer_class = MGMapNetDecoderLayer
 
     def __init__(
         self,
         layer: dict[str, Any] | None = None,
         embed_dims: int = 256,
-        num_points: int = 20,
         num_levels: int = 2,
         **kwargs: Any,
     ) -> None:
-        kwargs |= {"embed_dims": embed_dims, "num_points": num_points, "num_levels": num_levels}
-        super().__init__({"type": "MGMapNetDecoderLayer", **(layer or {})}, **kwargs)
-        self.num_points = num_points
+        kwargs |= {"embed_dims": embed_dims, "num_levels": num_levels}
+        super().__init__(layer or {}, **kwargs)
         # Differs from the poster: the released model's first layer adds the learned position.
         self.layers[0].reference_code = None
         self.bev_pyramid = BEVPyramid(embed_dims, num_levels)
@@ -134,9 +145,14 @@ class MGMapNetDecoder(MapDecoder):
         references = reference.repeat_interleave(self.num_points, 1)
         return Granularities(query), references, self.bev_pyramid(bev_feats)
 
-    def read(self, state: Granularities) -> dict[str, Tensor]:
-        """Return states and mean sampling locations of a layer."""
+    def point_states(self, state: Granularities) -> Tensor:
+        """Return the states of the points of a layer's output. (B, N * P, C)"""
+        assert state.points is not None
+        return state.points.flatten(1, 2)
+
+    def read(self, state: Granularities, references: Tensor) -> MGMapNetDecoded:
+        """Return a layer's output, with the references that it has refined. (B, N * P, D)"""
         assert state.points is not None
         assert state.mean_locations is not None
-        instances = {"instance_states": state.instances, "mean_locations": state.mean_locations}
-        return {"point_states": state.points.flatten(1, 2), **instances}
+        references = self.by_instance(references)
+        return MGMapNetDecoded(state.points, references, state.instances, state.mean_locations)

@@ -1,16 +1,21 @@
 """MGMapNet's head: instance and point queries, masks of the instances, supervised samples."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mmdet3d.registry import MODELS
+from mmengine.logging import print_log
 
-from gsmap.models.maptr.head import PARTS, MapHead
+from gsmap.models.maptr.attention import BEVDeformableAttention
+from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.parts import switched
+from gsmap.models.maptr.parts import DEFAULTS, PARTS, brought, class_of
+from gsmap.models.maptrv2.attention import DecoupledSelfAttention
+from gsmap.models.mgmapnet.decoder import MGMapNetDecoder, MGMapNetDecoderLayer
+from gsmap.models.mgmapnet.losses import InstanceMaskLoss, SamplingLocationLoss
 from gsmap.structures.grid import BEVGrid
 
-DECODER = "MGMapNetDecoder"
 LINE_PX = 3
 QUERY_GROUPS: tuple[PARTS, ...] = ({"num": 100}, {"name": "one2many", "num": 600, "repeats": 6})
 
@@ -20,8 +25,8 @@ class MGMapHead(MapHead):
     """The map head with MGMapNet's parts as defaults. Besides `MapHead`'s arguments:
 
     Args:
-        decoder: Config of the decoder; one of another type becomes `MGMapNetDecoder`, its layers
-            without the attentions that are not MGMapNet's.
+        decoder: Config of the decoder; one of another class becomes `MGMapNetDecoder` (see
+            `with_granularities`).
         loss_mean_loc: Settings of `SamplingLocationLoss`, or None to train without it.
         loss_ins_seg: Settings of `InstanceMaskLoss`, or None to train without it.
         masks: Settings of `ElementMasks`; its lines are 3 pixels wide by default.
@@ -33,25 +38,48 @@ class MGMapHead(MapHead):
         decoder: PARTS,
         losses: Sequence[PARTS],
         query_groups: Sequence[PARTS] = QUERY_GROUPS,
-        loss_mean_loc: PARTS | None = {"loss_weight": 5.0},  # noqa: B006
-        loss_ins_seg: PARTS | None = {"loss_weight": 3.0, "dice_weight": 3.0},  # noqa: B006
+        loss_mean_loc: Mapping[str, Any] | None = DEFAULTS,
+        loss_ins_seg: Mapping[str, Any] | None = DEFAULTS,
         masks: PARTS | None = None,
         embed_dims: int = 256,
         **kwargs: Any,
     ) -> None:
-        if decoder.get("type") != DECODER:  # another's attentions go
-            others = ("type", "self_attn", "cross_attn")
-            layer = {k: v for k, v in decoder.get("layer", {}).items() if k not in others}
-            decoder = {**decoder, "type": DECODER, "layer": layer}
-        mean_loc = switched("SamplingLocationLoss", loss_mean_loc)
-        ins_seg = switched("InstanceMaskLoss", loss_ins_seg, embed_dims=embed_dims)
-        pixel_m = max(ElementMasks(grid, **(masks or {})).grid.pixel_size_m)
+        drawing = ElementMasks(grid, **(masks or {}))
+        if "line_width_m" not in (masks or {}):
+            drawing.line_width_m = LINE_PX * 2 * drawing.half_pixel_m
+        mean_loc = brought(SamplingLocationLoss, loss_mean_loc)
+        ins_seg = brought(InstanceMaskLoss, loss_ins_seg, embed_dims=embed_dims)
         super().__init__(
             grid=grid,
-            decoder=decoder,
+            decoder=with_granularities(decoder),
             losses=[*losses, *mean_loc, *ins_seg],
             query_groups=query_groups,
-            masks={"line_width_m": LINE_PX * pixel_m, **(masks or {})},
+            masks=drawing,
             embed_dims=embed_dims,
             **kwargs,
         )
+
+
+def with_granularities(decoder: PARTS) -> PARTS:
+    """Return a decoder's config as one of `MGMapNetDecoder`, which takes queries of instances.
+
+    What MapTR's and MapTRv2's configs say of their own layers and attentions, which take queries of
+    points, is replaced, and a line in the log names it. Any other attention reaches the layer.
+    """
+    kind = class_of(decoder)
+    if kind is not None and issubclass(kind, MGMapNetDecoder):
+        return decoder
+    layer = dict(decoder.get("layer", {}))
+    replaced = {}
+    kind = class_of(layer)
+    if kind is None or not issubclass(kind, MGMapNetDecoderLayer):
+        replaced["type"] = layer.pop("type", None)
+    if class_of(layer.get("self_attn") or {}) is DecoupledSelfAttention:
+        replaced["self_attn"] = layer.pop("self_attn")
+    cross_attn = layer.get("cross_attn") or {}
+    if class_of(cross_attn) in (None, BEVDeformableAttention):
+        replaced["cross_attn"] = layer.pop("cross_attn", None)
+    named = {name: part for name, part in replaced.items() if part}
+    if named:
+        print_log(f"MGMapHead replaces {named} of its decoder's layers.", "current", logging.INFO)
+    return {**decoder, "type": MGMapNetDecoder, "layer": layer}

@@ -1,14 +1,17 @@
 """MGMapNet's losses: of sampling locations, and of masks of instances."""
 
-from collections.abc import Sequence
+from typing import cast
 
 import torch
 import torch.nn.functional as F
 from mmdet3d.registry import MODELS
-from torch import Tensor, nn
+from torch import Tensor
 
+from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.layers import mlp
-from gsmap.models.maptr.losses import PointsLoss
+from gsmap.models.maptr.losses import MapLoss
+from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.mgmapnet.decoder import MGMapNetDecoded, MGMapNetDecoder
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import check_same_shape
 
@@ -31,7 +34,7 @@ def instance_mask_losses(
 
 
 @MODELS.register_module()
-class InstanceMaskLoss(nn.Module):
+class InstanceMaskLoss(MapLoss):
     """Masks of matched instances, by the product of their states and the BEV features (MGMapNet).
 
     Args:
@@ -41,15 +44,14 @@ class InstanceMaskLoss(nn.Module):
         pairing: ``"matched"`` compares each query with the mask of its own ground truth;
             ``"released"``, as MGMapNet's released code, the i-th matched query with the i-th ground
             truth, which is right only if the matching happens to be sorted.
+        last_layer_only: As in `MapLoss`.
+        first_group_only: As in `MapLoss`.
 
     Raises:
         ValueError: If ``pairing`` is unknown.
     """
 
     name = "ins_seg"
-    reads = ("pred.instance_states", "gt.masks", "gt.inds", "gt.counts", "bev_feats")
-    last_layer_only = True
-    first_group_only = True
 
     def __init__(
         self,
@@ -57,52 +59,57 @@ class InstanceMaskLoss(nn.Module):
         loss_weight: float = 3.0,
         dice_weight: float = 3.0,
         pairing: str = "matched",
+        last_layer_only: bool = True,
+        first_group_only: bool = True,
     ) -> None:
-        super().__init__()
+        super().__init__(loss_weight, last_layer_only, first_group_only)
         if pairing not in PAIRINGS:
             raise ValueError(f"pairing must be one of {PAIRINGS}, got {pairing!r}.")
         self.embedding = mlp(embed_dims, embed_dims, embed_dims, embed_dims)
-        self.loss_weight, self.dice_weight, self.pairing = loss_weight, dice_weight, pairing
+        self.dice_weight, self.pairing = dice_weight, pairing
 
     def logits(self, states: Tensor, bev_feats: Tensor) -> Tensor:
         """Return the masks of a sample's instances. (n, C), (C, H, W) -> (n, H, W)"""
         return torch.einsum("nc,chw->nhw", self.embedding(states), bev_feats.to(states))
 
-    def forward(
-        self,
-        states: Tensor,
-        masks: Tensor,
-        gt_inds: Tensor,
-        counts: Sequence[int],
-        bev_feats: Tensor,
-        avg_factor: float | Tensor,
-    ) -> Tensor:
-        """Return the weighted loss, 0 if nothing is matched.
-
-        States (M, C) of matched queries, ascending in a sample of ``counts`` matches; masks (M, h,
-        w) of their ground truths, averaged over the cells of the features (B, C, H, W);
-        ``gt_inds`` (M,), each one's ground truth in its sample.
-        """
-        samples = zip(states.split(list(counts)), bev_feats, strict=True)
-        logits = torch.cat([self.logits(*sample) for sample in samples])
-        masks = masks.to(logits)
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Return the weighted loss; masks are averaged over the cells of the BEV features."""
+        samples = zip(pairs.pred_instance_states.split(pairs.counts), pairs.bev_feats, strict=True)
+        logits = torch.cat([self.logits(*sample) for sample in samples])  # (M, H, W)
+        masks = pairs.gt_masks.to(logits)
         if self.pairing == "released":
-            split = zip(masks.split(list(counts)), gt_inds.split(list(counts)), strict=True)
+            split = zip(masks.split(pairs.counts), pairs.gt_inds.split(pairs.counts), strict=True)
             masks = torch.cat([own[inds.argsort()] for own, inds in split])
         if masks.shape != logits.shape and len(masks):
             masks = F.interpolate(masks[:, None], size=logits.shape[-2:], mode="area")[:, 0]
         masks = masks.reshape(logits.shape)
-        cross_entropy, dice = instance_mask_losses(logits, masks, avg_factor)
+        cross_entropy, dice = instance_mask_losses(logits, masks, pairs.avg_factor)
         return self.loss_weight * cross_entropy + self.dice_weight * dice
 
 
 @MODELS.register_module()
-class SamplingLocationLoss(PointsLoss):
-    """The same of each point's mean sampling location, against the point itself (MGMapNet)."""
+class SamplingLocationLoss(MapLoss):
+    """L1 distance of each point's mean sampling location to the point itself (MGMapNet).
+
+    Args:
+        loss_weight: Weight of the loss.
+        flags: As in `MapLoss`.
+    """
 
     name = "mean_loc"
-    reads = ("pred.mean_locations", "gt.pts")
 
-    def forward(self, pred: Tensor, target: Tensor, avg_factor: float | Tensor) -> Tensor:
-        """Return the weighted loss in the plane. (M, P, 2), (M, P, 2 or 3) -> ()"""
-        return super().forward(pred, target[..., :2], avg_factor)
+    def __init__(self, loss_weight: float = 5.0, **flags: bool) -> None:
+        super().__init__(loss_weight, **flags)
+
+    def check(self, head: MapHead) -> None:
+        """Raise ValueError if the decoder does not say where it samples."""
+        if not isinstance(head.decoder, MGMapNetDecoder):
+            raise ValueError(
+                "SamplingLocationLoss needs the sampling locations of MGMapNetDecoder, got "
+                f"{type(head.decoder).__name__}: leave the loss out, or take MGMapHead."
+            )
+
+    def values(self, pairs: MatchedPairs) -> Tensor:
+        """Return the distance of each coordinate in the plane, [0, 1] over the map. (M, P, 2)"""
+        decoded = cast(MGMapNetDecoded, pairs.predictions.decoded)
+        return (pairs.of_queries(decoded.mean_locations) - pairs.gt_pts[..., :2]).abs()

@@ -6,6 +6,7 @@ from torch import Tensor
 from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.soft_iou.reference import pairwise_minima_reference
 
+_EPS = 1e-6  # added to the union: two empty masks have IoU 0
 _pairwise_minima = fused_operator(
     "soft_iou.pairwise_minima",
     "Tensor preds, Tensor targets",
@@ -13,18 +14,15 @@ _pairwise_minima = fused_operator(
 )
 
 
-def pairwise_soft_iou(
-    preds: Tensor, targets: Tensor, eps: float = 1e-6, backend: str = "auto"
-) -> Tensor:
+def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> Tensor:
     r"""Return the soft IoU in [0, 1] of every prediction with every ground truth. (N, K)
 
-    :math:`\sum_p \min(a, b) / \sum_p \max(a, b)`; since min + max = a + b, only the minimum is
-    summed per pair, without an (N, K, H, W) tensor.
+    :math:`\sum_p \min(a, b) / \sum_p \max(a, b)`. Only the minimum is summed per pair, without an
+    (N, K, H, W) tensor; the IoU of two empty masks is 0.
 
     Args:
         preds: Masks in [0, 1]. (N, H, W)
         targets: Masks in [0, 1]. (K, H, W)
-        eps: Added to the union, so that two empty masks have IoU 0.
         backend: As in `choose_backend`. The fused kernels give no gradient; ``"auto"`` takes them
             where none is asked for.
 
@@ -47,7 +45,18 @@ def pairwise_soft_iou(
     else:
         preds, targets = preds.detach(), targets.detach()
         minima = _pairwise_minima(preds, targets, backend)
-    return minima / (preds.sum(-1)[:, None] + targets.sum(-1) - minima + eps)
+    return _iou(minima, preds.sum(-1)[:, None], targets.sum(-1))
+
+
+def soft_iou(preds: Tensor, targets: Tensor) -> Tensor:
+    """Return the soft IoU in [0, 1] of pairs of masks in [0, 1]. 2 x (M, H, W) -> (M,)"""
+    minima = torch.minimum(preds, targets).sum((1, 2))
+    return _iou(minima, preds.sum((1, 2)), targets.sum((1, 2)))
+
+
+def _iou(minima: Tensor, preds: Tensor, targets: Tensor) -> Tensor:
+    """Return sums of minima over those of maxima, since min + max = a + b; 0 of empty masks."""
+    return minima / (preds + targets - minima + _EPS)
 
 
 def dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
