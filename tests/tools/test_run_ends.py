@@ -16,7 +16,7 @@ from processes import REPO
 
 import tools.train
 from gsmap.engine.run_log import MapRunner
-from gsmap.models.heads.map_head import MapHead
+from gsmap.models.maptr.head import MapHead
 from gsmap.utils.cli import run_command
 
 ENVIRONMENT = {"PYTHON": sys.executable, "PORT": "29614", "OMP_NUM_THREADS": "1"}
