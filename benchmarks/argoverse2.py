@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from gsmap.converters.argoverse2.log import Argoverse2Log, find_logs
-from gsmap.converters.argoverse2.map import MAP_CLASSES, Argoverse2Map
+from mapdata.argoverse2.log import Argoverse2Log, find_logs
+from mapdata.argoverse2.map import MAP_CLASSES, Argoverse2Map
 
 _SETS = {
     "divider": MAP_CLASSES[:1],

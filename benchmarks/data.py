@@ -13,7 +13,7 @@ import psutil
 import shapely
 from shapely import affinity
 
-from gsmap.converters.nuscenes.map import NuScenesLocalMap, open_layers
+from mapdata.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import MapInstance, MapSample
 from gsmap.structures.polylines import is_closed

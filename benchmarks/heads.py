@@ -22,7 +22,7 @@ from mmengine.dataset import pseudo_collate
 from mmengine.logging import MMLogger
 
 from benchmarks.measure import markdown_table
-from gsmap.apis.checkpoint import load_weights
+from gsmap.checkpoints.reading import load_weights
 from gsmap.engine.arguments import data_root_options, parse_options
 from gsmap.engine.launch import read_config
 from gsmap.utils.files import atomic_write

@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
 TRAINVAL_SAMPLES = 34_149
 _REFERENCES = {

@@ -48,7 +48,7 @@ def minicity_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def minicity_annotations(minicity_root: Path) -> dict[str, Path]:
     """The annotation files of ``minicity_root`` by split, in its root."""
-    from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
+    from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
     convert_nuscenes(NuScenesOptions(minicity_root, "v1.0-trainval", dataset="minicity"))
     return {split: minicity_root / f"gsmap_minicity_{split}.arrow" for split in ("train", "val")}

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from gsmap.datasets.annotations.record import MapSample
-from gsmap.maps.drive import Drive, DriveFrame
+from drivemaps.drive import Drive, DriveFrame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import clip_to_box
 

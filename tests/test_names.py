@@ -14,7 +14,7 @@ NAMES = [
     *("gsmap.RasterLoss", "gsmap.list_models", "gsmap.load_model", "gsmap.render_gaussians"),
     *("gsmap.write_geojson", "gsmap.apis.MapInferencer", "gsmap.apis.load_model"),
     *("gsmap.datasets.VectorizedMapDataset", "gsmap.evaluation.ChamferConfig"),
-    *("gsmap.evaluation.MapEvaluator", "gsmap.evaluation.RasterConfig", "gsmap.maps.MapOrigin"),
+    *("gsmap.evaluation.MapEvaluator", "gsmap.evaluation.RasterConfig", "drivemaps.MapOrigin"),
     *("gsmap.models.GSMapHead", "gsmap.models.MapDetector", "gsmap.models.RasterLoss"),
     *("gsmap.ops.render_gaussians", "gsmap.structures.BEVGrid", "gsmap.structures.MapElements"),
     *("gsmap.visualization.MapVisualizer", "gsmap.visualization.MapStyle"),

@@ -18,18 +18,18 @@ import numpy as np
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
-from gsmap.maps.config import MergeConfig
-from gsmap.maps.drive import Drive, read_drive
-from gsmap.maps.geodetic import MapOrigin, known_origin
-from gsmap.maps.geojson import write_geojson
-from gsmap.maps.lanelet2 import write_lanelet2
-from gsmap.maps.mcap import write_mcap
-from gsmap.maps.merging import confident, merge, suppress
-from gsmap.maps.replay import Replay
-from gsmap.maps.rerun import write_rerun
-from gsmap.maps.scoring import figures_table, map_figures
-from gsmap.maps.truth import true_map
-from gsmap.maps.video import write_video
+from drivemaps.config import MergeConfig
+from drivemaps.drive import Drive, read_drive
+from drivemaps.geodetic import MapOrigin, known_origin
+from drivemaps.geojson import write_geojson
+from drivemaps.lanelet2 import write_lanelet2
+from drivemaps.mcap import write_mcap
+from drivemaps.merging import confident, merge, suppress
+from drivemaps.replay import Replay
+from drivemaps.rerun import write_rerun
+from drivemaps.scoring import figures_table, map_figures
+from drivemaps.truth import true_map
+from drivemaps.video import write_video
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import file_name, write_text

@@ -15,7 +15,7 @@ def main() -> str:
         raise FileExistsError(f"{args.target} exists already: choose another name or remove it.")
     import torch
 
-    from gsmap.apis.checkpoint import read_weights
+    from gsmap.checkpoints.reading import read_weights
     from gsmap.checkpoints.convert import convert_state
 
     weights = read_weights(args.source)

@@ -8,8 +8,8 @@ The file is read, not run. Settings without a counterpart are printed. Example:
 import argparse
 from pathlib import Path
 
-from gsmap.converters.config.reader import read_assignments
-from gsmap.converters.config.upstream import convert_upstream, merge, python_text
+from mapdata.upstream_configs.reader import read_assignments
+from mapdata.upstream_configs.upstream import convert_upstream, merge, python_text
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.shipped import shipped

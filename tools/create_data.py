@@ -16,15 +16,15 @@ from gsmap.utils.shards import without_options
 
 COMMANDS = {
     "minicity": ("minicity.cli", "generate the MiniCity data set"),
-    "nuscenes": ("gsmap.converters.nuscenes.convert", "convert nuScenes or MiniCity"),
-    "av2": ("gsmap.converters.argoverse2.convert", "convert Argoverse 2 logs"),
+    "nuscenes": ("mapdata.nuscenes.convert", "convert nuScenes or MiniCity"),
+    "av2": ("mapdata.argoverse2.convert", "convert Argoverse 2 logs"),
     "av2-render": (
-        "gsmap.converters.argoverse2.render",
+        "mapdata.argoverse2.render",
         "render camera images for real Argoverse 2 logs",
     ),
-    "infos": ("gsmap.converters.infos", "convert an info file of MapTR or MapTRv2"),
-    "check": ("gsmap.converters.check", "check annotation files completely"),
-    "export": ("gsmap.converters.export", "write an annotation file's vectors as JSON"),
+    "infos": ("mapdata.infos.convert", "convert an info file of MapTR or MapTRv2"),
+    "check": ("mapdata.check", "check annotation files completely"),
+    "export": ("mapdata.export", "write an annotation file's vectors as JSON"),
 }
 
 

@@ -15,17 +15,17 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from gsmap.apis.result_log import ResultLog
-from gsmap.converters.command_line import parse_rate
+from mapdata.command_line import parse_rate
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.arguments import add_config_options
-from gsmap.engine.named_models import checkpoint_for
+from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
-from gsmap.inputs.calibration_check import (
+from mapdata.calibration_check import (
     calibration_figure,
     calibration_warnings,
     image_warnings,
 )
-from gsmap.inputs.source import InputOptions, Source, open_input
+from mapdata.source import InputOptions, Source, open_input
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_bytes
 from gsmap.utils.progress import Progress

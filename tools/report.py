@@ -9,7 +9,7 @@ Examples:
 import argparse
 from pathlib import Path
 
-from gsmap.report.page import ReportOptions, report_data, write_page
+from gsmap.visualization.report.page import ReportOptions, report_data, write_page
 from gsmap.utils.cli import CommandParser, output_file, run_command
 
 

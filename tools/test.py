@@ -11,7 +11,7 @@ from pathlib import Path
 from mmengine.config import Config
 
 from gsmap.engine.arguments import add_common_arguments
-from gsmap.engine.named_models import checkpoint_for
+from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.utils.cli import CommandParser, is_first_rank, output_file, run_command
 from gsmap.utils.files import write_text
 
@@ -73,7 +73,7 @@ def main() -> None:
     args = parse_args()
     if not args.eval and not args.out:
         raise ValueError("Nothing to do: name a metric after --eval, or a file after --out.")
-    from gsmap.apis.checkpoint import adopt_settings
+    from gsmap.checkpoints.reading import adopt_settings
     from gsmap.engine.launch import load_config
     from gsmap.engine.run_log import MapRunner
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from mmengine.config import Config
 
 from gsmap.engine.arguments import add_common_arguments
-from gsmap.engine.named_models import find_checkpoint
+from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.utils.cli import CommandParser, is_first_rank, run_command
 from gsmap.utils.files import lock_folder
 
@@ -34,7 +34,7 @@ def parse_args() -> argparse.Namespace:
 
 def choose_start(cfg: Config, resume: str | None) -> None:
     """Say what the run goes on from or starts from, and check that file."""
-    from gsmap.apis.checkpoint import read_weights
+    from gsmap.checkpoints.reading import read_weights
     from gsmap.engine.launch import newest_checkpoint
 
     if resume == "auto":

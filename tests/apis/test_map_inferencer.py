@@ -9,12 +9,12 @@ import pytest
 import torch
 from mmengine.config import Config
 
-from gsmap.apis.checkpoint import load_model
+from gsmap.checkpoints.reading import load_model
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
-from gsmap.inputs.frames import reframed
-from gsmap.inputs.source import Source
+from gsmap.apis.reframing import reframed
+from mapdata.source import Source
 from gsmap.visualization.figure import figure_to_rgb
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -18,7 +18,7 @@ from model_cases import (
 from predictions import stacked
 from torch import nn
 
-from gsmap.apis.checkpoint import load_weights, read_weights
+from gsmap.checkpoints.reading import load_weights, read_weights
 from gsmap.checkpoints.convert import (
     convert_state,
     ours_from_upstream,

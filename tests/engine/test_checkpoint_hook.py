@@ -19,7 +19,7 @@ from mmengine.runner.checkpoint import save_checkpoint
 from processes import run_python
 
 import gsmap.registered  # noqa: F401
-from gsmap.apis.checkpoint import read_checked
+from gsmap.checkpoints.reading import read_checked
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.engine.checkpoint_hook import AtomicCheckpointHook, AtomicLocalBackend
 

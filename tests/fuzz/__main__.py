@@ -64,7 +64,7 @@ def run_reader(
 
 def make_data(folder: Path) -> tuple[Path, Path]:
     """Make a tiny MiniCity and its annotation files."""
-    from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
+    from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
     from minicity.generate import generate
 
     root = folder / "root"

@@ -229,25 +229,25 @@ def _build_settings(path: Path) -> None:
 
 
 def _read_plain(path: Path) -> None:
-    from gsmap.datasets.plain_pickle import load_plain_pickle
+    from mapdata.infos.plain_pickle import load_plain_pickle
 
     load_plain_pickle(path)
 
 
 def _read_infos(path: Path) -> None:
-    from gsmap.converters.infos import convert_infos
+    from mapdata.infos.convert import convert_infos
 
     convert_infos(path, path.with_suffix(".arrow"), path.parent, "val")
 
 
 def _read_sample(path: Path) -> None:
-    from gsmap.inputs.info_file import read_info_file
+    from mapdata.infos.recordings import read_info_file
 
     read_info_file(path)
 
 
 def _read_weights(path: Path) -> None:
-    from gsmap.apis.checkpoint import read_weights
+    from gsmap.checkpoints.reading import read_weights
 
     read_weights(path)
 

@@ -14,7 +14,7 @@ import torch
 from argoverse2_road import write_log
 from mmdet3d.registry import MODELS
 
-from gsmap.converters.custom import from_records
+from mapdata.custom import from_records
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
 from gsmap.engine.launch import read_config

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from processes import run_python
 
-from gsmap.converters.nuscenes.convert import NuScenesOptions, convert_nuscenes
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from minicity.generate import generate
 
 # mAP_chamfer, mAP_raster of these 30 samples; those of 400 are in models/README.md

@@ -1,6 +1,6 @@
 import numpy as np
 
-from gsmap.datasets.plain_pickle import load_plain_pickle
+from mapdata.infos.plain_pickle import load_plain_pickle
 from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
 
 

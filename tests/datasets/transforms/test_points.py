@@ -15,9 +15,9 @@ from mmengine.registry import init_default_scope
 from pyarrow import feather
 
 import gsmap.registered  # noqa: F401
-from gsmap.converters.argoverse2.convert import convert_argoverse2
-from gsmap.converters.argoverse2.log import RING_CAMERAS
-from gsmap.converters.argoverse2.samples import Argoverse2Options
+from mapdata.argoverse2.convert import convert_argoverse2
+from mapdata.argoverse2.log import RING_CAMERAS
+from mapdata.argoverse2.samples import Argoverse2Options
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.transforms.points import LoadLidarPoints, LoadLidarSweeps, read_points
 

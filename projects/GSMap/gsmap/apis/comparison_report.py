@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from mmengine.config import Config
 
-from gsmap.apis.checkpoint import read_weights
+from gsmap.checkpoints.reading import read_weights
 from gsmap.apis.comparison import RECORD
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import newest_checkpoint

@@ -20,7 +20,7 @@ from mmengine.logging import print_log
 from mmengine.registry import init_default_scope
 from mmengine.utils import import_modules_from_strings
 
-from gsmap.engine.named_models import find_config
+from gsmap.checkpoints.named_models import find_config
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.utils.faults import nearest, registered
 from gsmap.utils.parallel import LAUNCHER, die_with_parent

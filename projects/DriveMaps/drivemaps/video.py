@@ -1,0 +1,66 @@
+"""A drive as a film: cameras with predictions, predictions and the growing map from above."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from drivemaps.replay import Moment, Replay
+from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
+from gsmap.utils.extras import import_extra
+from gsmap.utils.files import atomic_write
+from gsmap.visualization.bev_view import BEVPanel
+from gsmap.visualization.camera_view import camera_views
+from gsmap.visualization.figure import compose_figure, figure_to_rgb
+from gsmap.visualization.frame_view import FRAME_VIEWS
+from gsmap.visualization.style import MapStyle
+
+
+def write_video(path: str | Path, replay: Replay, width_px: int = 1280) -> None:
+    """Write a film (``.mp4``) in H.264, as fast as the drive was; an empty map has no panel.
+
+    Raises:
+        ValueError: If an image is missing or damaged.
+        RuntimeError: If ``av`` (PyAV) is missing.
+    """
+    av = import_extra("av", "viz")
+    times_ns = [frame.sample.timestamp_ns for frame in replay.drive.frames]
+    period_s = np.median(np.diff(times_ns)) / 1e9 if len(times_ns) > 1 else 0.5
+    rate = Fraction(1 / np.clip(period_s, 1 / 60, 10)).limit_denominator(100)
+    with atomic_write(path, "wb") as file, av.open(file, "w", format="mp4") as film:
+        stream = None
+        for moment in replay.moments():
+            picture = _picture(moment, replay, width_px)
+            if stream is None:
+                stream = film.add_stream("libx264", rate=rate, options={"crf": "20"})
+                stream.pix_fmt = "yuv420p"  # what every player takes, of even sizes
+                stream.height, stream.width = (size // 2 * 2 for size in picture.shape[:2])
+            shown = np.ascontiguousarray(picture[: stream.height, : stream.width])
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(shown, format="rgb24")))
+        if stream is not None:
+            film.mux(stream.encode())
+
+
+def _picture(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
+    """Draw one moment. (H, W, 3)"""
+    frame, sample, drive = moment.frame, moment.frame.sample, replay.drive
+    found = MapElements.from_polylines(moment.lines, frame.elements.labels, frame.elements.scores)
+    panels, cameras = [BEVPanel("Prediction", found)], []
+    if len(replay.elements):
+        lines = [frame.to_frame(points[:, :2]) for _, points in moment.seen]
+        seen = MapElements.from_polylines(lines, [label for label, _ in moment.seen])
+        panels.append(BEVPanel("Map so far", seen))
+    if replay.data_root is not None:
+        cameras = camera_views(sample.cameras, replay.data_root, sample.token)
+    figure = compose_figure(
+        cameras,
+        panels,
+        BEVGrid(drive.x_range, drive.y_range),
+        FRAME_VIEWS[replay.frame_kind].tilted(sample.ego_from_frame),
+        MapStyle(classes=drive.classes),
+        found,
+        drive.scene,
+        width_px,
+    )
+    return figure_to_rgb(figure)

@@ -1,0 +1,146 @@
+"""Frames for the page: chosen samples with their map in centimetres, cameras and thumbnails."""
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gsmap.datasets.annotations.record import CameraRecord, MapSample
+from gsmap.datasets.elements import elements_of_instances
+from gsmap.evaluation.raster_ap import MIN_SCORE
+from gsmap.visualization.report.scores import ScoredResult
+from gsmap.visualization.camera_view import arrange_cameras, camera_title
+from gsmap.visualization.frame_view import FrameView
+
+_JPEG_QUALITY = 70
+
+
+def choose_frames(
+    tokens: Sequence[str], max_frames: int, results: Sequence[ScoredResult], score_thr: float
+) -> list[int]:
+    """Choose samples: three quarters evenly, and those of the first result's lowest F1.
+
+    Args:
+        tokens: All samples, in order.
+        max_frames: How many to choose at most.
+        results: None, one or two; without any all samples are chosen evenly.
+        score_thr: Smallest score that F1 counts.
+
+    Returns:
+        Indices, ascending.
+    """
+    if len(tokens) <= max_frames:
+        return list(range(len(tokens)))
+    even = max_frames - max_frames // 4 if results else max_frames
+    chosen = set(np.linspace(0, len(tokens) - 1, even).round().astype(int).tolist())
+    if results:
+        f1 = np.array([results[0].f1(token, score_thr) for token in tokens])
+        worst = (i for i in np.argsort(f1, kind="stable").tolist() if i not in chosen)
+        chosen.update(i for i, _ in zip(worst, range(max_frames - even), strict=False))
+    return sorted(chosen)
+
+
+def _centimetres(points: np.ndarray, view: FrameView) -> list[int]:
+    """Return (right, ahead) of each point, one after another, in whole centimetres."""
+    return np.rint(100 * view.display_from_frame(points)).astype(int).ravel().tolist()
+
+
+def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
+    """Return a sample's ground truth: class ``c`` and points ``p`` in centimetres."""
+    elements = elements_of_instances(sample.instances or [])
+    pairs = zip(elements.labels.tolist(), elements.polylines, strict=True)
+    return [{"c": label, "p": _centimetres(line, view)} for label, line in pairs]
+
+
+def found_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str, Any]]:
+    """Return a sample's predictions that AP_raster does not drop, in descending order of score.
+
+    Returns:
+        Per prediction its class ``c``, score ``s``, points ``p``, the index of the ground truth
+        that it hits within 1 m or -1, and, if it has Gaussians, sigma along both axes in
+        centimetres and the angle in the display in degrees per point, ``g``.
+    """
+    matches, hits = result.matches[token], result.hits(token)
+    kept = matches.scores >= MIN_SCORE
+    if not kept.any():
+        return []
+    elements = result.predictions[token].select(matches.pred_index[kept])
+    found = [
+        {"c": label, "s": round(score, 6), "hit": hit, "p": _centimetres(line, view)}
+        for label, score, hit, line in zip(
+            elements.labels.tolist(),
+            elements.confidence.tolist(),
+            hits[kept].tolist(),
+            elements.polylines,
+            strict=True,
+        )
+    ]
+    if elements.scales is not None and elements.rotations is not None:
+        degrees = np.degrees(elements.rotations + view.display_turn_rad)[:, None]
+        values = np.rint(np.hstack([100 * elements.scales, degrees])).astype(int)  # (M, 3)
+        for entry, a, b in zip(found, elements.offsets, elements.offsets[1:], strict=False):
+            entry["g"] = values[a:b].ravel().tolist()
+    return found
+
+
+def _img_from_display(camera: CameraRecord, view: FrameView) -> np.ndarray:
+    """Return the homography from (right, ahead, 1) on the ground, in metres, to pixels. (3, 3)"""
+    a, b, c = view.ground
+    axes = np.eye(3) if view.forward == "y" else np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    lift = np.array([[1, 0, 0], [0, 1, 0], [a, b, c], [0, 0, 1]])  # (x, y, 1) -> (x, y, z, 1)
+    return camera.img_from_frame[:3] @ lift @ axes
+
+
+def thumbnail(path: Path, width_px: int) -> str:
+    """Return an image as a small JPEG in a data URI.
+
+    Args:
+        path: The image file.
+        width_px: Largest width.
+
+    Raises:
+        ValueError: If there is no image, or it is damaged.
+    """
+    image = cv2.imread(str(path)) if path.is_file() else None
+    if image is None:
+        raise ValueError(
+            f"no readable image at {path}: give the folder that image paths start from as "
+            "--data-root, or leave the images out with --no-images."
+        )
+    height, width = image.shape[:2]
+    if width > width_px:
+        size = (width_px, max(round(height * width_px / width), 1))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+    return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
+
+
+def cameras_of(
+    sample: MapSample, view: FrameView, data_root: Path, width_px: int
+) -> list[list[dict[str, Any]]]:
+    """Return a sample's cameras in rows, as they stand on the car.
+
+    Args:
+        sample: The sample.
+        view: Its ground and orientation.
+        data_root: Folder that image paths start from.
+        width_px: Width of the thumbnails; 0 leaves the images out.
+
+    Raises:
+        ValueError: If an image cannot be read.
+    """
+    rows = []
+    for row in arrange_cameras(sample.cameras, view):
+        entries = []
+        for camera in row:
+            matrix = _img_from_display(camera, view)
+            title, size = camera_title(camera.name), [camera.width, camera.height]
+            entry: dict[str, Any] = {"title": title, "size": size}
+            entry["matrix"] = [float(f"{value:.6g}") for value in matrix.ravel()]
+            entry["src"] = thumbnail(data_root / camera.path, width_px) if width_px else ""
+            entries.append(entry)
+        rows.append(entries)
+    return rows

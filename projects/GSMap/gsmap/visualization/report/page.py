@@ -1,0 +1,181 @@
+"""The report page: everything that it shows as one value, and the HTML file that shows it."""
+
+import base64
+import hashlib
+import html
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.evaluation.file_evaluation import read_ground_truth
+from gsmap.evaluation.raster_ap import MIN_SCORE
+from gsmap.visualization.report.frames import cameras_of, choose_frames, found_of, truth_of
+from gsmap.visualization.report.scores import MATCH_M, score_result
+from gsmap.visualization.report.tables import class_tables, curves, summary_table
+from gsmap.structures.grid import BEVGrid
+from gsmap.utils.files import write_text
+from gsmap.visualization.bev_view import display_extent
+from gsmap.visualization.frame_view import FRAME_VIEWS
+from gsmap.visualization.style import MATCH_COLOURS, MapStyle
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What goes onto the page.
+
+    Args:
+        data_root: Folder that image paths start from; the annotation file's by default.
+        max_frames: Largest number of frames.
+        score_thr: Where the slider of the score starts, in [0, 1].
+        image_width: Width of the cameras' thumbnails in pixels; 0 leaves them out.
+        allow_mismatch: Samples without results count as without predictions, results without
+            ground truth are left out; otherwise both are errors.
+
+    Raises:
+        ValueError: If a value is out of its range.
+    """
+
+    data_root: Path | None = None
+    max_frames: int = 200
+    score_thr: float = 0.4
+    image_width: int = 240
+    allow_mismatch: bool = False
+
+    def __post_init__(self) -> None:
+        if self.max_frames < 1 or self.image_width < 0 or not 0 <= self.score_thr <= 1:
+            raise ValueError(
+                "max_frames must be >= 1, image_width >= 0 and score_thr in [0, 1], got "
+                f"{self.max_frames}, {self.image_width}, {self.score_thr}."
+            )
+
+
+def report_data(
+    annotations: str | Path, results: Mapping[str, str | Path], options: ReportOptions
+) -> dict[str, Any]:
+    """Gather all that the page shows.
+
+    Args:
+        annotations: Annotation file.
+        results: None, one or two result files by the names that the page gives them; without any
+            the page shows ground truth and cameras alone.
+        options: What goes onto the page.
+
+    Returns:
+        Plain values, as ``page.js`` reads them.
+
+    Raises:
+        FileNotFoundError: If a file does not exist.
+        ValueError: If a file is malformed, or does not fit the others.
+    """
+    file = AnnotationFile(annotations)
+    meta, view, style = file.meta, FRAME_VIEWS[file.meta.frame], MapStyle(file.meta.classes)
+    truth = read_ground_truth(annotations, meta.classes)[0] if results else {}
+    scored = [
+        score_result(name, path, truth, meta, options.allow_mismatch)
+        for name, path in results.items()
+    ]
+    tokens, seconds = file.column("token"), file.seconds_into_scene
+    chosen = choose_frames(tokens, options.max_frames, scored, options.score_thr)
+    root = Path(annotations).parent if options.data_root is None else options.data_root
+    frames = []
+    for index in chosen:
+        sample = file[index]
+        tilted = view.tilted(sample.ego_from_frame)
+        frames.append(
+            {
+                "token": sample.token,
+                "title": f"{sample.scene}, {seconds[index]:.1f} s",
+                "place": sample.map_name,
+                "truth": truth_of(sample, view),
+                "found": [found_of(sample.token, result, view) for result in scored],
+                "cameras": cameras_of(sample, tilted, root, options.image_width),
+            }
+        )
+    notes = [f"{result.name}: {note}" for result in scored for note in result.notes]
+    if len(chosen) < len(tokens):
+        how = "evenly spread"
+        if scored:
+            worst = options.max_frames // 4
+            how = f"{len(chosen) - worst} evenly spread and the {worst} worst of {scored[0].name}"
+        notes.append(f"The page shows {len(chosen)} of {len(tokens)} frames: {how}.")
+    return {
+        "title": f"{meta.dataset} {meta.split}: {' and '.join(results) or 'ground truth'}",
+        "notes": notes,
+        "samples": len(tokens),
+        "classes": [
+            {"title": style.title(i), "colour": style.colour(i), "area": style.is_closed(i)}
+            for i in range(len(meta.classes))
+        ],
+        "match_colours": MATCH_COLOURS,
+        "extent": display_extent(BEVGrid(meta.x_range, meta.y_range), view),
+        "vehicle": view.vehicle_m,
+        "match_m": MATCH_M,
+        "min_score": MIN_SCORE,
+        "score": options.score_thr,
+        "results": [result.name for result in scored],
+        "tables": [summary_table(scored), *class_tables(scored, style)] if scored else [],
+        "curves": curves(scored, style) if scored else [],
+        "frames": frames,
+    }
+
+
+def page_html(data: Mapping[str, Any]) -> str:
+    """Return the page: one file that fetches nothing and runs no script but its own.
+
+    Args:
+        data: From ``report_data``. Its texts are strangers' input: they stand in a block of JSON
+            without a single ``<``, and the script shows them as text.
+    """
+    parts = {
+        name: files("gsmap.visualization.report").joinpath(f"page.{name}").read_text("utf-8")
+        for name in ("html", "css", "js")
+    }
+    frames, images = [], []
+    for frame in data["frames"]:  # its images stand apart and are read when it is opened
+        rows = [
+            [{k: v for k, v in each.items() if k != "src"} for each in row]
+            for row in frame["cameras"]
+        ]
+        frames.append({**frame, "cameras": rows})
+        images.append([each["src"] for row in frame["cameras"] for each in row])
+    style, script = (f"'sha256-{_digest(parts[name])}'" for name in ("css", "js"))
+    return Template(parts["html"]).substitute(
+        policy=f"default-src 'none'; img-src data:; style-src {style}; script-src {script}; "
+        "base-uri 'none'; form-action 'none'",  # which default-src does not cover
+        title=html.escape(str(data["title"])),
+        style=parts["css"],
+        script=parts["js"],
+        data=_block({**data, "frames": frames}),
+        images="".join(
+            f'<script type="application/json" class="images">{_block(i)}</script>' for i in images
+        ),
+    )
+
+
+def _block(value: Any) -> str:
+    """Return JSON that cannot end the element it stands in."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _digest(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def write_page(path: str | Path, data: Mapping[str, Any]) -> str:
+    """Write the page.
+
+    Args:
+        path: The HTML file; parent folders are made.
+        data: From ``report_data``.
+
+    Returns:
+        What was written, in words, with its size.
+    """
+    text = page_html(data)
+    write_text(path, text)
+    return f"{len(data['frames'])} frames, {len(text) / 1e6:.1f} MB: {path}"

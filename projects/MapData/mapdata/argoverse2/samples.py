@@ -1,0 +1,193 @@
+"""The samples of one Argoverse 2 log: when they are, what the sensors saw, what the map holds."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mapdata.argoverse2.log import (
+    MAX_CAMERA_OFFSET_NS,
+    MAX_LIDAR_OFFSET_NS,
+    RING_CAMERAS,
+    Argoverse2Log,
+    closest_ns,
+)
+from mapdata.argoverse2.map import Argoverse2Map, check_rules, find_map
+from mapdata.command_line import FileOptions
+from gsmap.datasets.annotations.record import (
+    RANGES,
+    CameraRecord,
+    LidarRecord,
+    MapInstance,
+    MapSample,
+    SweepRecord,
+)
+from gsmap.datasets.errors import naming
+
+
+@dataclass(frozen=True)
+class Argoverse2Options(FileOptions):
+    """What to convert and how: the options of ``tools/create_data.py av2``.
+
+    Of ``rate_hz`` samples per second, None takes all; ``poses:N`` of ``at`` needs no sensor data.
+    """
+
+    _: KW_ONLY
+    split: str = "val"
+    at: str = "auto"
+    rate_hz: float | None = 2.0
+    compat: str = "maptrv2"
+    dim: int = 2
+    logs: Sequence[str] = ()
+    keep_map_changes: bool = False
+    x_range: tuple[float, float] = RANGES["ego"][0]
+    y_range: tuple[float, float] = RANGES["ego"][1]
+
+    def __post_init__(self) -> None:
+        if self.at not in ("auto", "lidar", "cameras") and self.pose_stride is None:
+            raise ValueError(f"at must be auto, lidar, cameras or poses:N, got {self.at!r}.")
+        if self.rate_hz is not None and not self.rate_hz > 0:
+            raise ValueError(f"rate_hz must be > 0, got {self.rate_hz}.")
+        if self.dim not in (2, 3):
+            raise ValueError(f"dim must be 2 or 3, got {self.dim}.")
+        check_rules(self.classes, self.compat)
+
+    @property
+    def pose_stride(self) -> int | None:
+        """N of ``poses:N``; None for the other choices."""
+        match = re.fullmatch(r"poses:([1-9]\d*)", self.at)
+        return int(match[1]) if match else None
+
+
+@dataclass
+class LogSamples:
+    """A log's samples by time, how many are left out by reason, and invalid polygons by kind."""
+
+    samples: list[MapSample] = field(default_factory=list)
+    left_out: Counter[str] = field(default_factory=Counter)
+    invalid: Counter[str] = field(default_factory=Counter)
+
+
+def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -> LogSamples:
+    """Make the samples of one log, with ground truth unless ``with_map`` is false.
+
+    Raises:
+        FileNotFoundError: If the map or the poses are missing.
+        ValueError: If a file is damaged, or sensor data that ``options.at`` needs are missing.
+    """
+    log, result = Argoverse2Log(log_dir), LogSamples()
+    times = sample_times(log, options).tolist()
+    log_map = Argoverse2Map.from_log(log_dir) if with_map else None
+    if log_map is not None:
+        result.invalid = +Counter(log_map.invalid_counts)  # those that are not zero
+    for timestamp_ns in times:
+        try:
+            with naming(log_dir, "download the log again"):
+                result.samples.append(_sample(log, log_map, timestamp_ns, options))
+        except _LeftOut as reason:
+            result.left_out[str(reason)] += 1
+    return result
+
+
+def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
+    """Return when samples are, in nanoseconds, ascending; ValueError if sensor data lack. (n,)"""
+    if options.pose_stride is not None:
+        return np.array(list(log.poses))[:: options.pose_stride]
+    missing = [name for name in RING_CAMERAS if name not in log.calibration]
+    if missing:
+        which = ", ".join(missing) if log.calibration else "the ring cameras"
+        raise ValueError(f"no calibration of {which} (--at poses:10 needs none)")
+    times, kind = log.lidar_timestamps_ns, "LiDAR sweeps"
+    if options.at == "cameras" or (options.at == "auto" and len(times) == 0):
+        times, kind = log.image_timestamps_ns[RING_CAMERAS[0]], f"images of {RING_CAMERAS[0]}"
+    if len(times) == 0:
+        raise ValueError(f"no {kind} (--at poses:10 needs neither sweeps nor images)")
+    return thin_out(times, options.rate_hz)
+
+
+def thin_out(times_ns: np.ndarray, rate_hz: float | None) -> np.ndarray:
+    """Keep the first of ascending times, then each that follows the latest kept after a period.
+
+    Half the sensor's own period is tolerated, so that 10 Hz with jitter thins out to every fourth
+    at 2.5 Hz, and what is already slower stays whole. Without a rate all stay. (n,) -> (m,)
+    """
+    if len(times_ns) < 2 or rate_hz is None:
+        return times_ns
+    least_gap = 1e9 / rate_hz - np.median(np.diff(times_ns)) / 2
+    kept = [int(times_ns[0])]
+    for time in times_ns[1:].tolist():
+        if time - kept[-1] >= least_gap:
+            kept.append(time)
+    return np.array(kept, dtype=np.int64)
+
+
+class _LeftOut(Exception):
+    """A sample that cannot be made; the message is the reason, the same for all of its kind."""
+
+
+def _sample(
+    log: Argoverse2Log, log_map: Argoverse2Map | None, timestamp_ns: int, options: Argoverse2Options
+) -> MapSample:
+    """Make the sample at a time, or raise ``_LeftOut``."""
+    city_from_ego = log.poses.get(timestamp_ns)
+    if city_from_ego is None:
+        raise _LeftOut("no pose at the sample's time")
+    sample = MapSample(
+        token=f"{log.log_id}_{timestamp_ns}",
+        scene=log.log_id,
+        map_name=log.city,
+        timestamp_ns=timestamp_ns,
+        cameras=list(_cameras(log, timestamp_ns, city_from_ego, options)),
+        global_from_frame=city_from_ego,
+        lidar=_lidar(log, timestamp_ns, np.linalg.inv(city_from_ego), options),
+    )
+    if log_map is not None:
+        ranges = options.x_range, options.y_range
+        with naming(find_map(log.log_dir), "download it again"):
+            found = log_map.extract(city_from_ego, options.classes, options.compat, *ranges)
+        sample.instances = [
+            MapInstance(label, points[:, : options.dim])
+            for label, name in enumerate(options.classes)
+            for points in found[name]
+        ]
+    return sample
+
+
+def _cameras(
+    log: Argoverse2Log, timestamp_ns: int, city_from_ego: np.ndarray, options: Argoverse2Options
+) -> Iterator[CameraRecord]:
+    """Yield the image of each calibrated camera closest in time."""
+    folder = (log.log_dir / "sensors/cameras").relative_to(options.root).as_posix()
+    for name, camera in log.calibration.items():
+        image_ns = closest_ns(log.image_timestamps_ns[name], timestamp_ns, MAX_CAMERA_OFFSET_NS)
+        city_from_ego_then = None if image_ns is None else log.poses.get(image_ns)
+        if city_from_ego_then is None:
+            if options.pose_stride is None:
+                limit = MAX_CAMERA_OFFSET_NS / 1e6
+                raise _LeftOut(f"no image of {name} with a pose within {limit:.0f} ms")
+            continue
+        path, size_px = f"{folder}/{name}/{image_ns}.jpg", (camera.width_px, camera.height_px)
+        motion = np.linalg.inv(city_from_ego_then) @ city_from_ego
+        cam_from_frame = camera.ego_SE3_cam.inverse().transform_matrix @ motion
+        yield CameraRecord(name, path, *size_px, camera.intrinsics.K, cam_from_frame)
+
+
+def _lidar(
+    log: Argoverse2Log, timestamp_ns: int, ego_from_city: np.ndarray, options: Argoverse2Options
+) -> LidarRecord | None:
+    """Return the closest sweep and the ones before it; sweeps are stored in the ego frame."""
+    times = log.lidar_timestamps_ns
+    sweep_ns = closest_ns(times, timestamp_ns, MAX_LIDAR_OFFSET_NS)
+    if sweep_ns is None or sweep_ns not in log.poses:
+        return None
+    folder = log.log_dir.relative_to(options.root).as_posix()
+    last = int(np.searchsorted(times, sweep_ns))
+    sweep, *earlier = (
+        SweepRecord(f"{folder}/sensors/lidar/{time}.feather", time, ego_from_city @ log.poses[time])
+        for time in times[max(last - options.max_sweeps, 0) : last + 1][::-1].tolist()
+        if time in log.poses
+    )
+    return LidarRecord(sweep.path, sweep.frame_from_lidar, earlier)

@@ -1,0 +1,414 @@
+"""Samples of a bag: images, camera info, transforms and poses of ROS 1 or ROS 2 (also MCAP)."""
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mapdata.argoverse2.samples import thin_out
+from gsmap.datasets.errors import naming
+from gsmap.datasets.image_files import decode_image
+from mapdata.folders.rig import (
+    PoseAt,
+    PoseTrack,
+    Recording,
+    RigCamera,
+    RigFrame,
+    nearest_images,
+    rig_samples,
+    rotation_of,
+)
+from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.extras import import_extra
+from gsmap.utils.files import file_name, write_bytes
+
+_IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+_INFO, _ODOMETRY = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_VEHICLE_FRAMES = ("base_footprint", "base_link")
+_GENERIC = ("compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
+            "image_rect_color")  # fmt: skip
+_TOLERANCE_NS = 50_000_000
+_GAP_NS, _FOREVER_NS = 10**9, 10**20
+_TO_BGR: dict[str, int | None] = {
+    "bgr8": None, "8UC3": None, "rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGR,
+    "bgra8": cv2.COLOR_BGRA2BGR, "mono8": cv2.COLOR_GRAY2BGR, "8UC1": cv2.COLOR_GRAY2BGR,
+    # OpenCV names a pattern by its second row
+    "bayer_rggb8": cv2.COLOR_BayerBG2BGR, "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR, "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
+    "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUYV, "yuv422": cv2.COLOR_YUV2BGR_UYVY,
+}  # fmt: skip
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "yuv422_yuy2": 2, "yuv422": 2}
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag: ``.bag``, ``.mcap``, ``.db3``, or a folder of rosbag2."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return path.suffix in (".bag", ".mcap", ".db3")
+
+
+def read_bag(
+    path: Path,
+    frames_dir: Path,
+    rate_hz: float | None = 2.0,
+    vehicle_frame: str | None = None,
+    ground_z_m: float = 0.0,
+) -> Recording:
+    """Read the samples of a bag, in the frame ``ego``, and write their images as files.
+
+    A message that cannot be read is left out and noted. An image that cannot be decoded is noted
+    and not written, so that its frame is known to be broken.
+
+    Args:
+        path: The bag.
+        frames_dir: Folder for folders of images; that of a bag is named by its content, and images
+            that are there are kept.
+        rate_hz: Samples per second of the first camera; None takes all of its images.
+        vehicle_frame: Frame of the vehicle (x ahead, y left, z up) in the bag's transforms;
+            ``base_footprint`` or ``base_link`` by default.
+        ground_z_m: Height of the road in that frame.
+
+    Raises:
+        RuntimeError: If ``rosbags`` is not installed; the message names the extra.
+        ValueError: If the bag is damaged or lacks what is needed; the message lists what it holds.
+    """
+    highlevel = import_extra("rosbags.highlevel", "bags")
+    typesys = import_extra("rosbags.typesys", "bags")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    with naming(path, "see docs/inference.md"):
+        with _of_rosbags():
+            bag = highlevel.AnyReader([path], default_typestore=store)
+            bag.open()
+        try:
+            return _read(bag, path, frames_dir, rate_hz, vehicle_frame, ground_z_m)
+        finally:
+            bag.close()
+
+
+@contextmanager
+def _of_rosbags() -> Iterator[None]:
+    """Turn what rosbags and the parsers below it raise for a damaged bag into a ``ValueError``."""
+    try:
+        yield
+    except MemoryError as error:
+        raise ValueError("a length in it asks for more memory than there is") from error
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno:
+            raise
+        raise ValueError(str(error) or type(error).__name__) from error
+
+
+def _messages(bag: Any, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
+    """Yield the messages of some connections: connection, time in nanoseconds, content."""
+    found = iter(bag.messages(connections)) if connections else iter(())
+    while True:
+        with _of_rosbags():
+            message = next(found, None)
+        if message is None:
+            return
+        yield message
+
+
+@dataclass
+class _Content:
+    """What a first pass over a bag finds; topics are those of images."""
+
+    infos: dict[str, Any] = field(default_factory=dict)
+    frame_ids: dict[str, str] = field(default_factory=dict)
+    times_ns: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
+    transforms: dict[str, tuple[str, list[int], list[np.ndarray]]] = field(default_factory=dict)
+    static: set[str] = field(default_factory=set)
+    odometry: tuple[list[int], list[np.ndarray]] = field(default_factory=lambda: ([], []))
+    digest: Any = field(default_factory=hashlib.sha256)
+    unread: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+
+
+def _read(
+    bag: Any,
+    path: Path,
+    frames_dir: Path,
+    rate_hz: float | None,
+    vehicle_frame: str | None,
+    ground_z_m: float,
+) -> Recording:
+    topics = _camera_topics(bag)
+    content = _first_pass(bag, topics)
+    ground = rigid(np.eye(3), (0, 0, ground_z_m))
+    vehicle = _vehicle_frame(content, vehicle_frame)
+    rig = {
+        topic: _camera(name, topic, content, vehicle, ground) for name, (topic, _) in topics.items()
+    }
+    times = {name: np.unique(content.times_ns[topic]) for name, (topic, _) in topics.items()}
+    first = next((name for name in times if "front" in name.lower()), next(iter(times)))
+    wanted = thin_out(times[first], rate_hz)
+    nearest = nearest_images(times, wanted.tolist(), _TOLERANCE_NS)
+    frames = [
+        RigFrame(
+            f"{path.stem}_{time_ns}",
+            time_ns,
+            {name: (f"{file_name(name)}/{t}.jpg", t) for name, t in found.items()},
+        )
+        for time_ns, found in zip(wanted.tolist(), nearest, strict=True)
+    ]
+    pose_at = _pose_at(content, vehicle, ground)
+    samples = rig_samples(path.stem, list(rig.values()), frames, pose_at)
+    root = frames_dir / f"{file_name(path.stem)}-{content.digest.hexdigest()[:16]}"
+    notes = [
+        f"{len(reasons)} messages of {topic!r} cannot be read and are left out: {reasons[0]}"
+        for topic, reasons in content.unread.items()
+    ]
+    notes += _write_images(bag, rig, frames, root)
+    return Recording(samples, root, pose_at is not None, tuple(notes))
+
+
+def _listing(bag: Any) -> str:
+    """Say what a bag holds."""
+    return "; ".join(
+        f"{name} ({info.msgtype or 'several types'}, {info.msgcount})"
+        for name, info in sorted(bag.topics.items())
+    )
+
+
+def _camera_topics(bag: Any) -> dict[str, tuple[str, str]]:
+    """Find the cameras: topic of images and of camera info, by name."""
+    kinds = {c.topic: c.msgtype for c in bag.connections}
+    infos = {c.rsplit("/", 1)[0]: c for c, kind in kinds.items() if kind == _INFO}
+    found: dict[str, tuple[str, str]] = {}
+    for kind in _IMAGES:  # of both kinds of one camera's images, the compressed
+        for topic in sorted(t for t, k in kinds.items() if k == kind):
+            parts = topic.split("/")
+            if parts[-1] == "compressedDepth":
+                continue
+            while len(parts) > 2 and parts[-1] in _GENERIC:
+                parts.pop()
+            base = "/".join(parts)
+            spaces = [s for s in infos if base == s or base.startswith(f"{s}/")]
+            if spaces and base not in found:
+                found[base] = topic, infos[max(spaces, key=len)]
+    if not found:
+        raise ValueError(
+            "it has no camera with images (sensor_msgs Image or CompressedImage) and a CameraInfo "
+            f"in the same namespace; it holds: {_listing(bag) or 'no topic'}"
+        )
+    short = [base.rsplit("/", 1)[-1] for base in found]
+    unique = len(set(short)) == len(short)
+    return {
+        name if unique else base.strip("/").replace("/", "_"): pair
+        for name, (base, pair) in zip(short, found.items(), strict=True)
+    }
+
+
+def _stamp_ns(header: Any) -> int:
+    stamp = header.stamp
+    return int(stamp.sec) * 10**9 + int(getattr(stamp, "nanosec", 0) or 0)
+
+
+def _matrix(place: Any, turn: Any) -> np.ndarray:
+    """Return a pose of a message. (4, 4)"""
+    pose = rigid(rotation_of((turn.w, turn.x, turn.y, turn.z)), (place.x, place.y, place.z))
+    if not np.isfinite(pose).all():
+        raise ValueError(f"a position is not finite: {pose[:3, 3].tolist()}")
+    return pose
+
+
+def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:
+    """Gather calibration, transforms, poses and the times of all images."""
+    content = _Content()
+    topic_of: dict[str, list[str]] = defaultdict(list)
+    for topic, info in topics.values():
+        topic_of[info].append(topic)
+    images = {topic for topic, _ in topics.values()}
+    kinds = (*_TRANSFORMS, _ODOMETRY)
+    chosen = [c for c in bag.connections if c.topic in images | set(topic_of) or c.msgtype in kinds]
+    for connection, time_ns, raw in _messages(bag, chosen):
+        topic, kind = connection.topic, connection.msgtype
+        content.digest.update(f"{topic} {kind} {len(raw)}\n".encode())
+        content.digest.update(raw)
+        try:
+            with naming(f"the message at {time_ns} ns", "it is damaged"):
+                with _of_rosbags():
+                    message = bag.deserialize(raw, kind)
+                if topic in topic_of:
+                    content.infos |= {t: message for t in topic_of[topic] if t not in content.infos}
+                else:
+                    _keep(content, message, topic, kind)
+        except ValueError as error:
+            content.unread[topic].append(str(error))
+    for name, (topic, info) in topics.items():
+        if topic not in content.infos or topic not in content.frame_ids:
+            reason = next((content.unread[t][0] for t in (topic, info) if content.unread[t]), "")
+            raise ValueError(f"camera {name!r} has no message on {topic} or {info}. {reason}")
+    return content
+
+
+def _keep(content: _Content, message: Any, topic: str, kind: str) -> None:
+    """Keep an image's time, or the poses of a message."""
+    if kind in _TRANSFORMS:
+        _add_transforms(content, message.transforms, topic.endswith("tf_static"))
+    elif kind == _ODOMETRY:
+        pose, time_ns = message.pose.pose, _stamp_ns(message.header)
+        content.odometry[1].append(_matrix(pose.position, pose.orientation))
+        content.odometry[0].append(time_ns)
+    else:
+        content.times_ns[topic].append(_stamp_ns(message.header))
+        content.frame_ids.setdefault(topic, message.header.frame_id)
+
+
+def _add_transforms(content: _Content, transforms: Sequence[Any], is_static: bool) -> None:
+    """Keep transforms, of static ones the first."""
+    for item in transforms:
+        child, parent = item.child_frame_id.lstrip("/"), item.header.frame_id.lstrip("/")
+        time_ns = _stamp_ns(item.header)
+        pose = _matrix(item.transform.translation, item.transform.rotation)
+        if is_static:
+            content.static.add(child)
+        _, times, poses = content.transforms.setdefault(child, (parent, [], []))
+        if not is_static or not times:
+            times.append(time_ns)
+            poses.append(pose)
+
+
+def _vehicle_frame(content: _Content, wanted: str | None) -> str:
+    frames = set(content.transforms) | {parent for parent, _, _ in content.transforms.values()}
+    for name in _VEHICLE_FRAMES if wanted is None else (wanted,):
+        if name in frames:
+            return name
+    raise ValueError(
+        f"its transforms have no frame {wanted or ' or '.join(_VEHICLE_FRAMES)!s}: name the "
+        f"vehicle's with --vehicle-frame; there are {sorted(frames) or 'no transforms at all'}"
+    )
+
+
+def _chain(content: _Content, frame: str) -> list[str]:
+    """Return a frame and those above it, up to the root."""
+    chain = [frame]
+    while chain[-1] in content.transforms:
+        parent = content.transforms[chain[-1]][0]
+        if parent in chain:
+            raise ValueError(f"its transforms lead from {parent!r} back to it")
+        chain.append(parent)
+    return chain
+
+
+def _camera(
+    name: str, topic: str, content: _Content, vehicle: str, ground: np.ndarray
+) -> RigCamera:
+    """Read a camera's calibration and its place on the vehicle."""
+    info, frame = content.infos[topic], content.frame_ids[topic].lstrip("/")
+    above, of_vehicle = _chain(content, frame), _chain(content, vehicle)
+    if above[-1] != of_vehicle[-1]:
+        raise ValueError(
+            f"camera {name!r}: no transform leads from its frame {frame!r} to {vehicle!r}; there "
+            f"are those of {sorted(content.transforms)}"
+        )
+
+    def root_from(chain: Sequence[str]) -> np.ndarray:
+        pose = np.eye(4)
+        for step in chain[:-1]:
+            pose = content.transforms[step][2][0] @ pose
+        return pose
+
+    vehicle_from_cam = invert_rigid(root_from(of_vehicle)) @ root_from(above)
+
+    def value(key: str) -> np.ndarray:
+        found = getattr(info, key) if hasattr(info, key) else getattr(info, key.upper())
+        return np.asarray(found, np.float64)
+
+    rectified = "rect" in topic.rsplit("/", 2)[-1] or "rect" in topic.rsplit("/", 2)[-2]
+    return RigCamera(
+        name,
+        value("p").reshape(3, 4)[:, :3] if rectified else value("k").reshape(3, 3),
+        invert_rigid(vehicle_from_cam) @ ground,
+        (int(info.width), int(info.height)),
+        np.zeros(0) if rectified else value("d"),
+        str(info.distortion_model),
+    )
+
+
+def _pose_at(content: _Content, vehicle: str, ground: np.ndarray) -> PoseAt | None:
+    """Return the ground's poses by the transforms above the vehicle, or else by odometry."""
+    above = _chain(content, vehicle)[:-1]
+    if content.static.issuperset(above):
+        steps = [PoseTrack(*content.odometry)] if content.odometry[0] else []
+    else:
+        gaps = [_FOREVER_NS if frame in content.static else _GAP_NS for frame in above]
+        found = [content.transforms[frame] for frame in above]
+        steps = [PoseTrack(t, poses, gap) for (_, t, poses), gap in zip(found, gaps, strict=True)]
+
+    def pose_at(time_ns: int) -> np.ndarray | None:
+        pose = ground
+        for step in steps:
+            parent_from_child = step.at(time_ns)
+            if parent_from_child is None:
+                return None
+            pose = parent_from_child @ pose
+        return pose
+
+    return pose_at if steps else None
+
+
+def _write_images(
+    bag: Any, rig: Mapping[str, RigCamera], frames: Sequence[RigFrame], frames_dir: Path
+) -> list[str]:
+    """Write the images of frames that are not there yet; say which cannot be used, and why."""
+    missing = {
+        (name, time_ns): frames_dir / path
+        for frame in frames
+        for name, (path, time_ns) in frame.images.items()
+        if not (frames_dir / path).is_file()
+    }
+    chosen = [c for c in bag.connections if c.topic in rig]
+    unusable = []
+    for connection, _, raw in _messages(bag, chosen) if missing else ():
+        camera = rig[connection.topic]
+        try:
+            with _of_rosbags():
+                message = bag.deserialize(raw, connection.msgtype)
+                target = missing.pop((camera.name, _stamp_ns(message.header)), None)
+        except ValueError:
+            continue  # the first pass has named it
+        if target is not None:
+            where = f"camera {camera.name!r}, image at {target.stem} ns"
+            try:
+                with naming(where, "its frame is left out"):
+                    _write_image(message, camera, target, where)
+            except ValueError as error:
+                unusable.append(str(error))
+    return unusable
+
+
+def _write_image(message: Any, camera: RigCamera, target: Path, where: str) -> None:
+    """Write a message's image as JPEG."""
+    if hasattr(message, "encoding"):
+        camera.write_image(target, _raw_image(message, camera.size_px))
+        return
+    content = np.asarray(message.data, np.uint8).tobytes()
+    image = decode_image(content, "its message", where, camera.size_px)
+    if camera.is_distorted or not content.startswith(b"\xff\xd8"):
+        camera.write_image(target, image)
+    else:
+        write_bytes(target, content)
+
+
+def _raw_image(message: Any, size_px: tuple[int, int]) -> np.ndarray:
+    """Return an uncompressed image, BGR. (H, W, 3)"""
+    encoding, found = message.encoding, (message.width, message.height)
+    if encoding not in _TO_BGR:
+        raise ValueError(f"it has the encoding {encoding!r}; known are {sorted(_TO_BGR)}")
+    if found != size_px:
+        raise ValueError(f"it has {found} pixels, and its camera info says {size_px}")
+    channels = _CHANNELS.get(encoding, 1)
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+    image = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
+    code = _TO_BGR[encoding]
+    try:
+        return image if code is None else cv2.cvtColor(np.ascontiguousarray(image), code)
+    except cv2.error as error:
+        raise ValueError(f"OpenCV cannot convert it from {encoding}: {error.err}") from error

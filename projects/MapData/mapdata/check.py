@@ -1,0 +1,93 @@
+"""Check annotation files completely: their own content, and the files that they name."""
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+import pyarrow as pa
+
+from mapdata.command_line import add_workers_option
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.image_files import read_image
+from gsmap.utils.parallel import ordered_map
+from gsmap.utils.progress import Progress
+
+_SHOWN = 10
+
+
+def _open(path: Path) -> AnnotationFile:
+    """Open an annotation file, which checks it, and compare what its footer leads to."""
+    file = AnnotationFile(path)
+    try:
+        reader = pa.ipc.open_file(pa.memory_map(str(path)))
+        for number, batch in enumerate(file.batches):
+            if not reader.get_batch(number).equals(batch):
+                raise ValueError(f"part {number} is another one")
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise ValueError(
+            f"{path}: the footer, by which other programs read the file, is damaged ({error}); "
+            f"{file.remedy}"
+        ) from error
+    return file
+
+
+def _broken_files(sample: MapSample, root: Path) -> list[str]:
+    """Read every file that a sample names, and return what is wrong with them."""
+    from gsmap.datasets.transforms.points import read_points
+
+    where, problems = f"sample {sample.token!r}", []
+    reads = [
+        partial(read_image, str(root / c.path), f"{where}, camera {c.name}", (c.width, c.height))
+        for c in sample.cameras
+    ]
+    lidar = sample.lidar
+    paths = [lidar.path, *(sweep.path for sweep in lidar.sweeps)] if lidar else []
+    reads += [partial(read_points, str(root / path), 5) for path in paths]
+    for read in reads:
+        try:
+            read()
+        except BrokenSampleError as error:
+            problems.append(str(error))
+    return problems
+
+
+def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
+    """Check annotation files and, with a data root, the images and sweeps that they name.
+
+    Returns what was found to be right.
+
+    Raises:
+        FileNotFoundError: If an annotation file does not exist.
+        ValueError: If something is wrong; the message names the first few files.
+    """
+    lines = []
+    for path in paths:
+        file = _open(path)
+        mark = "checksum right" if file.sealed else "no checksum, as it is of an earlier version"
+        lines.append(f"{path}: {len(file)} samples, values right, {mark}")
+        if root is not None:
+            samples = Progress(file, desc=path.name, unit="samples")
+            found = ordered_map(partial(_broken_files, root=root), samples, workers)
+            if problems := list(chain.from_iterable(found)):
+                more = f", and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+                shown = "; ".join(problems[:_SHOWN])
+                raise ValueError(f"{path} is right, but: {shown}{more}")
+            lines[-1] += ", images and LiDAR files whole"
+    return "\n".join(lines)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``tools/create_data.py check``."""
+    parser.add_argument("annotations", type=Path, nargs="+", help="annotation files (.arrow)")
+    root = "read every image and LiDAR file below this folder too"
+    parser.add_argument("--data-root", type=Path, help=root)
+    add_workers_option(parser)
+
+
+def run(arguments: argparse.Namespace) -> str:
+    """Check as the command line asks and say what is right."""
+    return check_files(arguments.annotations, arguments.data_root, arguments.workers)

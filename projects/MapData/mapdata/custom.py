@@ -1,0 +1,163 @@
+"""Annotation files of your own data, from plain records: any cameras, ground truth or not."""
+
+import hashlib
+import logging
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import shapely
+
+from mapdata.local_map import POLYGON, vertices_of
+from gsmap.datasets.annotations.file import check_samples, write_annotations
+from gsmap.datasets.annotations.record import (
+    AnnotationMeta,
+    CameraRecord,
+    LidarRecord,
+    MapInstance,
+    MapSample,
+    SweepRecord,
+)
+from gsmap.datasets.errors import naming
+from gsmap.datasets.image_files import image_size
+from gsmap.structures.polylines import Points, clip_to_box, is_closed
+from gsmap.utils.shards import WHOLE, Shard
+
+_LOGGER = logging.getLogger(__name__)
+_UNMOUNTED = (
+    "record %r has no ego_from_frame: pictures will take the road to be level, 1.84 m below the "
+    "sensor (nuScenes' height), and models that lift images (MapTRv2) cannot use it."
+)
+_KEYS = sorted(field.name for field in fields(MapSample))
+Record = TypeVar("Record")
+
+
+def from_records(
+    path: str | Path,
+    records: Iterable[Mapping[str, Any]],
+    meta: AnnotationMeta,
+    data_root: str | Path,
+    shard: Shard = WHOLE,
+) -> int:
+    """Write an annotation file from plain records.
+
+    A record is a mapping. All but the first two keys may be left out:
+
+    - ``token``: unique name;
+    - ``cameras``: mappings with ``name``, ``path`` (relative to ``data_root``), ``intrinsics``
+      (3, 3) in pixels, ``cam_from_frame`` (4, 4), and, unless the image is to be asked, ``width``
+      and ``height``;
+    - ``instances`` (absent: no ground truth is known): mappings with ``label`` (name or index) and
+      ``points`` (n, 2 or 3) in metres, a ring's last equal to its first. What lies outside the
+      range of ``meta`` is cut off; rings stay rings;
+    - ``lidar``: mapping with ``path``, ``frame_from_lidar`` (4, 4) and ``sweeps``, mappings with
+      ``path``, ``timestamp_ns``, ``frame_from_lidar``;
+    - ``ego_from_frame`` (4, 4): where the frame ``lidar`` stands on the vehicle, whose z = 0 is the
+      road; absent: not known, and one warning says what that means;
+    - ``scene``, ``map_name``, ``timestamp_ns``, ``global_from_frame``, ``can_bus``.
+
+    Args:
+        path: Annotation file to write.
+        records: The records.
+        meta: Frame, classes and range of the data.
+        data_root: Folder that image and LiDAR paths are relative to.
+        shard: Which part of the records to take, such as ``Shard.parse("3/16")``.
+
+    Returns:
+        How many samples were written.
+
+    Raises:
+        FileNotFoundError: If an image is missing whose size is not given.
+        ValueError: If a record is malformed; the message names its token. No file is left then.
+    """
+    source = ""
+    if shard.count:
+        records = list(records)
+        tokens = "\n".join(str(r.get("token") if isinstance(r, Mapping) else r) for r in records)
+        source = hashlib.sha256(tokens.encode()).hexdigest()
+        records = shard.part(records)
+    samples = _samples(records, meta, Path(data_root))
+    return write_annotations(path, meta, samples, shard, source)
+
+
+def _samples(
+    records: Iterable[Mapping[str, Any]], meta: AnnotationMeta, root: Path
+) -> Iterator[MapSample]:
+    warned = False
+    for number, record in enumerate(records):
+        name = record.get("token", number) if isinstance(record, Mapping) else number
+        with naming(f"record {name!r}", "correct it"):
+            unknown = set(record) - set(_KEYS)
+            if unknown:
+                raise ValueError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")
+            sample = _sample(record, meta, root)
+            check_samples([sample], meta)
+            if sample.instances is not None:
+                sample.instances = [
+                    MapInstance(item.label, piece)
+                    for item in sample.instances
+                    for piece in _clipped(np.asarray(item.points, np.float64), meta)
+                ]
+        if sample.ego_from_frame is None and meta.frame == "lidar" and not warned:
+            warned = True
+            _LOGGER.warning(_UNMOUNTED, sample.token)
+        yield sample
+
+
+def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
+    """Return a record as a sample; what it holds is still to be checked."""
+    token = record["token"]
+    given = {name: value for name, value in record.items() if value is not None}
+    given["cameras"] = [_camera(camera, token, root) for camera in record["cameras"]]
+    if "lidar" in given:
+        lidar = given["lidar"]
+        sweeps = [_record(SweepRecord, sweep) for sweep in lidar.get("sweeps", [])]
+        matrix = lidar.get("frame_from_lidar")
+        matrix = np.eye(4) if matrix is None else matrix
+        given["lidar"] = LidarRecord(lidar["path"], matrix, sweeps)
+    if "instances" in given:
+        given["instances"] = [
+            MapInstance(_label(instance["label"], meta), instance["points"])
+            for instance in given["instances"]
+        ]
+    absent = {"scene": "", "map_name": "", "timestamp_ns": 0, "global_from_frame": np.eye(4)}
+    return MapSample(**{**absent, **given})
+
+
+def _record(kind: type[Record], values: Mapping[str, Any]) -> Record:
+    """Return a mapping as a record of its kind; other keys are left alone."""
+    return kind(**{field.name: values[field.name] for field in fields(kind)})  # type: ignore[arg-type]
+
+
+def _camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
+    if camera.get("width") is None or camera.get("height") is None:
+        where = f"sample {token!r}, camera {camera['name']!r}"
+        width, height = image_size(root / camera["path"], where)
+        camera = {**camera, "width": width, "height": height}
+    return _record(CameraRecord, camera)
+
+
+def _label(label: Any, meta: AnnotationMeta) -> int:
+    """Return a class's index, given by its name or itself."""
+    if not isinstance(label, str):
+        return int(label)
+    if label not in meta.classes:
+        raise ValueError(f"label {label!r} is not among {meta.classes}.")
+    return meta.classes.index(label)
+
+
+def _clipped(points: Points, meta: AnnotationMeta) -> list[Points]:
+    """Return what of an element lies in the range; rings stay rings. each (n, dim)."""
+    low, high = np.array([meta.x_range, meta.y_range]).T
+    if ((points[:, :2] >= low) & (points[:, :2] <= high)).all():
+        return [points]
+    if not is_closed(points):
+        return list(clip_to_box(points, meta.x_range, meta.y_range))
+    polygon = shapely.Polygon(points)
+    if not polygon.is_valid:
+        raise ValueError("a ring that leaves the range crosses itself and cannot be cut: mend it.")
+    parts = shapely.get_parts(shapely.intersection(polygon, shapely.box(*low, *high)))
+    areas = parts[(shapely.get_type_id(parts) == POLYGON) & ~shapely.is_empty(parts)]
+    return vertices_of(shapely.get_exterior_ring(areas), meta.dim)

@@ -1,0 +1,290 @@
+"""Samples of a folder of images with one calibration file (docs/inference.md)."""
+
+import csv
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.errors import BrokenSampleError, naming
+from gsmap.datasets.image_files import image_size, read_image
+from mapdata.folders.rig import (
+    PoseTrack,
+    Recording,
+    RigCamera,
+    RigFrame,
+    nearest_images,
+    rig_samples,
+    rotation_of,
+)
+from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
+from gsmap.utils.files import file_name
+
+NAMES = ("calibration.yaml", "calibration.yml", "calibration.json")
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
+_KEYS = {"cameras", "ground_z_m", "poses", "rate_hz", "max_time_difference_ms"}
+_CAMERA_KEYS = {
+    "images", "intrinsics", "distortion", "distortion_model", "vehicle_from_camera", "position_m",
+    "quaternion_wxyz", "yaw_pitch_roll_deg", "size_px",
+}  # fmt: skip
+# A camera's axes (right, down, ahead) in a vehicle's (ahead, left, up).
+_AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+_MOST_VALUES = 100_000  # in a calibration file
+_TIME = re.compile(r"(?:^|\D)(\d{10}(?:\d{3}|\d{6}|\d{9})?)(?:\.(\d{1,9}))?$")
+
+
+def read_image_folder(file: Path, frames_dir: Path) -> Recording:
+    """Read the samples that a calibration file describes, in the frame ``ego``.
+
+    Args:
+        file: The calibration file, YAML or JSON. Its paths start from its folder.
+        frames_dir: Folder for folders of images without their distortion, made where a camera has
+            one; a folder is named by its images' content and the calibration.
+
+    Raises:
+        FileNotFoundError: If a camera has no image, or there is no file of poses.
+        ValueError: If the file is malformed; the message names the camera.
+    """
+    with naming(file, "see docs/inference.md"):
+        content = _content(file)
+        _require_keys(content, _KEYS, "a calibration file")
+        if not isinstance(content.get("cameras"), dict) or not content["cameras"]:
+            raise ValueError("`cameras` must map names to cameras, at least one")
+        ground = rigid(np.eye(3), (0, 0, float(content.get("ground_z_m", 0.0))))
+        rig, images = [], {}
+        for name, camera in content["cameras"].items():
+            with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
+                _require_keys(camera, _CAMERA_KEYS, "a camera")
+                images[str(name)] = _images_of(file.parent, str(name), camera)
+                rig.append(_camera(str(name), camera, ground, images[str(name)]))
+        rate_hz = float(content.get("rate_hz", 10.0))
+        tolerance_ns = round(float(content.get("max_time_difference_ms", 50.0)) * 1e6)
+        if not 0 < rate_hz < np.inf or tolerance_ns < 0:
+            raise ValueError("rate_hz must be > 0, and max_time_difference_ms >= 0")
+        frames, time_of = _frames(images, rate_hz, tolerance_ns, file)
+        pose_at = None
+        if content.get("poses"):
+            pose_at = _read_poses(file.parent / content["poses"], time_of, ground).at
+        scene, root, notes = file.parent.resolve().name, file.parent, []
+        samples = rig_samples(scene, rig, frames, pose_at)
+        if any(camera.is_distorted for camera in rig):
+            root = frames_dir / f"{file_name(scene)}-{_digest(file, frames)}"
+            notes = [_rectify(sample, rig, file.parent, root) for sample in samples]
+        return Recording(samples, root, pose_at is not None, tuple(chain(*notes)))
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads YAML without merge keys (``<<``), which can stand for any number of entries."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Leave merge keys, to which an error is raised."""
+
+
+def _content(file: Path) -> Any:
+    """Read a calibration file's values."""
+    text = file.read_text(encoding="utf-8")
+    try:
+        content = json.loads(text) if file.suffix == ".json" else yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise ValueError(f"it is no YAML: {error}") from error
+    values = [content]
+    for value in values:  # aliases of YAML stand for any number of them
+        values += value.values() if isinstance(value, dict) else ()
+        values += value if isinstance(value, list) else ()
+        if len(values) > _MOST_VALUES:
+            raise ValueError(f"it holds more than {_MOST_VALUES} values")
+    return content
+
+
+def _digest(file: Path, frames: Sequence[RigFrame]) -> str:
+    """Return a digest of a calibration file and all images of frames."""
+    total = hashlib.sha256(file.read_bytes())
+    for frame in frames:
+        for path, _ in frame.images.values():
+            total.update(f"{path}\n".encode() + (file.parent / path).read_bytes())
+    return total.hexdigest()[:16]
+
+
+def _require_keys(value: Any, known: set[str], what: str) -> None:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{what} must be a mapping, got {value!r:.60}")
+    if set(value) - known:
+        unknown = sorted(map(str, set(value) - known))
+        raise ValueError(f"unknown keys {unknown}; {what} may have {sorted(known)}")
+
+
+def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> list[Path]:
+    """Return a camera's images in the order of their names."""
+    pattern = str(camera.get("images", name))
+    place = folder / pattern
+    if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
+        raise ValueError(f"images must lie below the calibration file's folder, got {pattern!r}")
+    found = place.iterdir() if place.is_dir() else folder.glob(pattern)
+    paths = sorted(p for p in found if p.suffix.lower() in _SUFFIXES and p.is_file())
+    if not paths:
+        raise FileNotFoundError(
+            f"camera {name!r} has no image at {place}: `images` names a file, a folder or a "
+            "pattern, from the calibration file's folder (by default the camera's name)."
+        )
+    return paths
+
+
+def _camera(
+    name: str, camera: Mapping[str, Any], ground: np.ndarray, images: Sequence[Path]
+) -> RigCamera:
+    """Read a camera's calibration."""
+    given = np.array(camera["intrinsics"], np.float64)
+    if given.shape == (4,):
+        fx, fy, cx, cy = given
+        given = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    if given.shape != (3, 3):
+        raise ValueError(f"intrinsics must be [fx, fy, cx, cy] or 3 x 3, got {given.shape}")
+    width, height = camera.get("size_px") or _size_of(images, f"camera {name!r}")
+    return RigCamera(
+        name,
+        given,
+        invert_rigid(_mounting(camera)) @ ground,
+        (int(width), int(height)),
+        np.array(camera.get("distortion", ()), np.float64),
+        str(camera.get("distortion_model", "")),
+    )
+
+
+def _size_of(images: Sequence[Path], where: str) -> tuple[int, int]:
+    """Return the size of the first image that is whole enough to tell it."""
+    for path in images[:-1]:
+        with suppress(ValueError):
+            return image_size(path, where)
+    return image_size(images[-1], where)
+
+
+def _mounting(camera: Mapping[str, Any]) -> np.ndarray:
+    """Return where a camera stands and looks in the vehicle. (4, 4)"""
+    ways = {"vehicle_from_camera", "quaternion_wxyz", "yaw_pitch_roll_deg"} & set(camera)
+    if len(ways) != 1:
+        raise ValueError(
+            "say its place by vehicle_from_camera (4 x 4), or by position_m with either "
+            f"quaternion_wxyz or yaw_pitch_roll_deg; got {sorted(ways) or 'none of them'}"
+        )
+    if "vehicle_from_camera" in camera:
+        pose = np.array(camera["vehicle_from_camera"], np.float64)
+        if pose.shape == (4, 4) and np.linalg.det(pose[:3, :3]) < 0:
+            raise ValueError(
+                "vehicle_from_camera mirrors (its rotation's determinant is below 0): two axes are "
+                "swapped, or one has the wrong sign"
+            )
+        if pose.shape != (4, 4) or not is_rigid(pose):
+            raise ValueError("vehicle_from_camera must be a rotation with a translation, 4 x 4")
+        return pose
+    if "quaternion_wxyz" in camera:
+        rotation = rotation_of(camera["quaternion_wxyz"])
+    else:
+        turn = Rotation.from_euler("ZYX", camera["yaw_pitch_roll_deg"], degrees=True)
+        rotation = turn.as_matrix() @ _AHEAD
+    return rigid(rotation, camera["position_m"])
+
+
+def _time_ns(stem: str) -> int | None:
+    """Read the Unix time at the end of a file's name: s, ms, us, ns, or s with a fraction."""
+    found = _TIME.search(stem)
+    if found is None:
+        return None
+    whole, fraction = found[1], found[2]
+    if fraction is not None and len(whole) > 10:
+        return None
+    return int(whole) * 10 ** (19 - len(whole)) + int((fraction or "0").ljust(9, "0"))
+
+
+def _frames(
+    images: Mapping[str, list[Path]], rate_hz: float, tolerance_ns: int, file: Path
+) -> tuple[list[RigFrame], dict[str, int]]:
+    """Put images of one time together: by the times in their names, or by equal names.
+
+    Returns:
+        The frames, and the time of each file name that has one.
+    """
+    root, scene = file.parent, file.parent.resolve().name
+    time_of = {path.stem: _time_ns(path.stem) for paths in images.values() for path in paths}
+    known = {stem: time_ns for stem, time_ns in time_of.items() if time_ns is not None}
+    if len(known) == len(time_of):
+        at = {name: {known[path.stem]: path for path in paths} for name, paths in images.items()}
+        times = {name: np.array(sorted(found), np.int64) for name, found in at.items()}
+        wanted = next(iter(times.values())).tolist()
+        groups = [
+            (str(time_ns), time_ns, {name: (at[name][t], t) for name, t in nearest.items()})
+            for time_ns, nearest in zip(
+                wanted, nearest_images(times, wanted, tolerance_ns), strict=True
+            )
+        ]
+    elif all(len(paths) == 1 for paths in images.values()):
+        known = {paths[0].stem: 0 for paths in images.values()}
+        groups = [("0", 0, {name: (paths[0], 0) for name, paths in images.items()})]
+    else:
+        stems = [path.stem for path in next(iter(images.values()))]
+        known = {stem: round(i * 1e9 / rate_hz) for i, stem in enumerate(stems)}
+        named = {name: {path.stem: path for path in paths} for name, paths in images.items()}
+        groups = [
+            (stem, known[stem], {n: (p[stem], known[stem]) for n, p in named.items() if stem in p})
+            for stem in stems
+        ]
+    frames = [
+        RigFrame(
+            f"{scene}_{label}",
+            time_ns,
+            {name: (path.relative_to(root).as_posix(), t) for name, (path, t) in found.items()},
+        )
+        for label, time_ns, found in groups
+    ]
+    return frames, known
+
+
+def _read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> PoseTrack:
+    """Read a CSV file with x, y, z, qw, qx, qy, qz, and timestamp_ns or frame (a file's name)."""
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no file of poses {path}.")
+    times, poses = [], []
+    with naming(path, "see docs/inference.md"), path.open(encoding="utf-8", newline="") as file:
+        for row in _rows(file):
+            if "frame" in row and row["frame"] not in time_of:
+                continue
+            times.append(time_of[row["frame"]] if "frame" in row else int(row["timestamp_ns"]))
+            turn = rotation_of([row[f"q{axis}"] for axis in "wxyz"])
+            poses.append(rigid(turn, [float(row[axis]) for axis in "xyz"]) @ ground)
+        return PoseTrack(times, poses)
+
+
+def _rows(file: TextIO) -> Iterator[dict[str, str]]:
+    """Yield the rows of a CSV file by their columns."""
+    try:
+        yield from csv.DictReader(file)
+    except csv.Error as error:
+        raise ValueError(f"it is no CSV: {error}") from error
+
+
+def _rectify(sample: MapSample, rig: Sequence[RigCamera], root: Path, target: Path) -> list[str]:
+    """Write a sample's images without distortion, and make it point to them.
+
+    Returns which cannot be used, and why; they are not written, so that the sample is known to be
+    broken.
+    """
+    unusable, by_name = [], {camera.name: camera for camera in rig}
+    for record in sample.cameras:
+        camera, source = by_name[record.name], root / record.path
+        record.path = f"{file_name(record.name)}/{file_name(source.name)}.jpg"
+        if (target / record.path).is_file():
+            continue
+        try:
+            image = read_image(str(source), f"camera {record.name!r}", camera.size_px)
+            camera.write_image(target / record.path, image)
+        except BrokenSampleError as error:
+            unusable.append(str(error))
+    return unusable

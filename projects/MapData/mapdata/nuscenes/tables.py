@@ -1,0 +1,267 @@
+"""The tables of nuScenes-format data, without what maps do not need, and the samples in them."""
+
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache, partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyquaternion import Quaternion
+
+from mapdata.nuscenes.can_bus import read_messages, signals_at
+from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
+from gsmap.structures.rigid import invert_rigid, rigid
+
+CAMERAS = (
+    "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
+)  # fmt: skip
+LIDAR = "LIDAR_TOP"
+_MARK = re.compile(r"\s*([\[\],]?)\s*")
+_CHUNK_CHARACTERS = 1 << 20  # a record is shorter
+# what is read of each table: fields with their type, or how many numbers they hold
+_POSE: dict[str, type | int] = {"translation": 3, "rotation": 4}
+_FIELDS: dict[str, dict[str, type | int]] = {
+    "sensor": {"channel": str},
+    "calibrated_sensor": {"sensor_token": str, "camera_intrinsic": list, **_POSE},
+    "ego_pose": _POSE,
+    "log": {"location": str},
+    "sample": {"timestamp": int, "next": str},
+    "scene": {"name": str, "log_token": str, "first_sample_token": str, "nbr_samples": int},
+    "sample_data": {
+        "sample_token": str, "ego_pose_token": str, "calibrated_sensor_token": str,
+        "timestamp": int, "filename": str, "is_key_frame": bool, "prev": str, "width": int,
+        "height": int,
+    },
+}  # fmt: skip
+_LINKS = {
+    "calibrated_sensor": {"sensor_token": "sensor"},
+    "scene": {"log_token": "log", "first_sample_token": "sample"},
+    "sample_data": {
+        "sample_token": "sample", "ego_pose_token": "ego_pose",
+        "calibrated_sensor_token": "calibrated_sensor",
+    },
+}  # fmt: skip
+
+
+def _refuse_constant(name: str) -> float:
+    """Refuse NaN and infinity, which JSON does not have."""
+    raise ValueError(f"{name} is no number")
+
+
+def iterate_records(path: Path) -> Iterator[dict[str, Any]]:
+    """Read the records of a table (a JSON list) one by one; it is never in memory as a whole.
+
+    Raises:
+        ValueError: If it is not one whole list of records, from the first sign to the last.
+    """
+    decode = json.JSONDecoder(parse_constant=_refuse_constant).raw_decode
+    with path.open(encoding="utf-8") as file:
+        text, position, expected = "", 0, "["
+        try:
+            while True:
+                if len(text) - position < _CHUNK_CHARACTERS:
+                    text, position = text[position:] + file.read(_CHUNK_CHARACTERS), 0
+                mark = _MARK.match(text, position)
+                sign, position = (mark[1], mark.end()) if mark else ("", position)
+                if sign == "[" == expected and text[position : position + 1] == "]":
+                    sign, expected, position = "]", ",", position + 1
+                if sign == "]" and expected == ",":
+                    break
+                if sign != expected:
+                    raise ValueError(f"{expected!r} is missing before {text[position:][:40]!r}")
+                record, position = decode(text, position)
+                expected = ","
+                yield record
+            if (text[position:] + file.read()).strip():
+                raise ValueError("something follows the end of the list")
+        except (ValueError, RecursionError) as error:
+            raise ValueError(
+                f"table {path} is damaged or incomplete ({error}): download it again."
+            ) from error
+
+
+def _is_right(value: Any, kind: type | int) -> bool:
+    """Whether a value is of a type, or a list of so many finite numbers."""
+    if kind is list:  # a matrix of intrinsics, or nothing for another sensor
+        return type(value) is list and (
+            not value or (len(value) == 3 and all(_is_right(row, 3) for row in value))
+        )
+    if kind is int:  # microseconds that nanoseconds of 64 bits hold
+        return type(value) is int and abs(value) <= 1 << 53
+    if isinstance(kind, type):
+        return type(value) is kind
+    if type(value) is not list or len(value) != kind:
+        return False
+    if not all(type(v) in (int, float) and math.isfinite(v) for v in value):
+        return False
+    return kind != 4 or abs(math.hypot(*value) - 1) < 1e-3  # a quaternion
+
+
+def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
+    """Return the transform of a record's ``translation`` and ``rotation``. (4, 4).
+
+    The rotation is a quaternion (w, x, y, z), or in info files a matrix.
+    """
+    turned = np.asarray(record[f"{prefix}rotation"], np.float64)
+    rotation = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
+    return rigid(rotation, np.asarray(record[f"{prefix}translation"], np.float64).reshape(3))
+
+
+class NuScenesTables:
+    """The tables with the key frames of cameras and LiDAR, and LiDAR sweeps if asked for.
+
+    Annotation tables and every other sensor's records are left out while reading: of trainval's 2.6
+    million ``sample_data`` records a tenth remains (a fifth with sweeps), and with them their
+    poses. Each sample's ``data`` holds the records of its key frames by channel.
+
+    Raises:
+        FileNotFoundError: If a table is missing.
+        ValueError: If a table is damaged or a record points to one that there is not.
+    """
+
+    def __init__(self, version: str, dataroot: Path, max_sweeps: int) -> None:
+        self._folder, self._max_sweeps = dataroot / version, max_sweeps
+        self._messages = lru_cache(maxsize=1)(partial(read_messages, dataroot))
+        self._records: dict[str, dict[str, dict[str, Any]]] = {}
+        for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
+            self._keep(table, self._read(table))
+        data = list(self._wanted_sample_data())
+        wanted = {record["ego_pose_token"] for record in data}
+        self._keep("ego_pose", (r for r in self._read("ego_pose") if r["token"] in wanted))
+        self._keep("sample_data", data)
+        for sample in self._records["sample"].values():
+            sample["data"] = {}
+        for record in data:
+            if record["is_key_frame"]:
+                keys = self._records["sample"][record["sample_token"]]["data"]
+                keys[self._channel_of(record)] = record
+        self.scene = list(self._records["scene"].values())
+
+    def _damaged(self, table: str, wrong: str) -> ValueError:
+        return ValueError(f"{self._folder}/{table}.json{wrong}; download the tables again.")
+
+    def _keep(self, table: str, records: Iterable[dict[str, Any]]) -> None:
+        """Keep a table's records by token; those that they link to are there already."""
+        kept = self._records[table] = {}
+        for record in records:
+            for link in _LINKS.get(table, ()):
+                self._check_link(table, record, link)
+            if kept.setdefault(record["token"], record) is not record:
+                raise self._damaged(table, f" has record {record['token']!r} twice")
+
+    def _check_link(self, table: str, record: dict[str, Any], name: str) -> None:
+        if record[name] not in self._records[_LINKS[table][name]]:
+            wrong = f", record {record['token']!r}: {name} {record[name]!r} leads nowhere"
+            raise self._damaged(table, wrong)
+
+    def _read(self, table: str) -> Iterator[dict[str, Any]]:
+        """Yield a table's records, what is read of each checked."""
+        path = self._folder / f"{table}.json"
+        if not path.is_file():
+            raise FileNotFoundError(f"no table at {path}: download the tables again.")
+        fields: dict[str, type | int] = {"token": str, **_FIELDS[table]}
+        for record in iterate_records(path):
+            values = record if isinstance(record, dict) else {}
+            for name, kind in fields.items():
+                if not _is_right(value := values.get(name), kind):
+                    numbers = f"{kind} finite numbers"
+                    wanted = f"a {kind.__name__}" if isinstance(kind, type) else numbers
+                    wrong = f", record {values.get('token')!r}: {name} must be {wanted}"
+                    raise self._damaged(table, f"{wrong}, got {value!r}")
+            yield record
+
+    def _channel_of(self, record: dict[str, Any]) -> str:
+        """Return the sensor channel of a ``sample_data`` record."""
+        sensor = self._records["calibrated_sensor"][record["calibrated_sensor_token"]]
+        return self._records["sensor"][sensor["sensor_token"]]["channel"]
+
+    def _wanted_sample_data(self) -> Iterator[dict[str, Any]]:
+        for record in self._read("sample_data"):
+            self._check_link("sample_data", record, "calibrated_sensor_token")
+            channel = self._channel_of(record)
+            is_sweep = channel == LIDAR and self._max_sweeps > 0
+            if is_sweep or (record["is_key_frame"] and channel in (LIDAR, *CAMERAS)):
+                yield {name: record[name] for name in ("token", *_FIELDS["sample_data"])}
+
+    def chain(
+        self, table: str, token: str, step: str, first: dict[str, Any]
+    ) -> Iterator[dict[str, Any]]:
+        """Yield a table's records from ``token`` on, to which ``first`` leads; ``step`` leads on.
+
+        Raises:
+            ValueError: If a link leads nowhere or back; an empty one ends the chain.
+        """
+        known, seen, record = self._records[table], set(), first
+        while token:
+            if token not in known:
+                origin = record["token"]
+                raise self._damaged(table, f" has no record {token!r}, to which {origin!r} leads")
+            if token in seen:
+                wrong = f", record {record['token']!r}: {step} leads back to {token!r}"
+                raise self._damaged(table, wrong)
+            seen.add(token)
+            record = known[token]
+            yield record
+            token = record[step]
+
+    def samples_of(self, scene: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        """Yield a scene's samples in order of time."""
+        return self.chain("sample", scene["first_sample_token"], "next", scene)
+
+    def location_of(self, scene: dict[str, Any]) -> str:
+        """Return the name of the map that a scene was driven on."""
+        return self._records["log"][scene["log_token"]]["location"]
+
+    def _global_from(self, data: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return global-from-sensor (4, 4) and the calibration of a sensor record."""
+        calibration = self._records["calibrated_sensor"][data["calibrated_sensor_token"]]
+        global_from_ego = pose_of(self._records["ego_pose"][data["ego_pose_token"]])
+        return global_from_ego @ pose_of(calibration), calibration
+
+    def read(self, sample: dict[str, Any], scene: dict[str, Any]) -> MapSample:
+        """Return a sample in the frame of its LiDAR, without instances and absent cameras."""
+        lidar = sample["data"][LIDAR]
+        global_from_frame, calibration = self._global_from(lidar)
+        ego_from_frame, timestamp_ns = pose_of(calibration), sample["timestamp"] * 1000
+        global_from_ego = global_from_frame @ invert_rigid(ego_from_frame)
+        names = [name for name in CAMERAS if name in sample["data"]]
+        return MapSample(
+            token=sample["token"],
+            scene=scene["name"],
+            map_name=self.location_of(scene),
+            timestamp_ns=timestamp_ns,
+            cameras=[self._camera(n, sample["data"][n], global_from_frame) for n in names],
+            global_from_frame=global_from_frame,
+            lidar=LidarRecord(lidar["filename"], np.eye(4), self._sweeps(lidar, global_from_frame)),
+            ego_from_frame=ego_from_frame,
+            can_bus=signals_at(timestamp_ns, global_from_ego, self._messages(scene["name"])),
+        )
+
+    def _camera(
+        self, name: str, data: dict[str, Any], global_from_frame: np.ndarray
+    ) -> CameraRecord:
+        global_from_cam, calibration = self._global_from(data)
+        return CameraRecord(
+            name,
+            data["filename"],
+            data["width"],
+            data["height"],
+            np.array(calibration["camera_intrinsic"]),
+            invert_rigid(global_from_cam) @ global_from_frame,
+        )
+
+    def _sweeps(self, lidar: dict[str, Any], global_from_frame: np.ndarray) -> list[SweepRecord]:
+        frame_from_global = invert_rigid(global_from_frame)
+        earlier = self.chain("sample_data", lidar["prev"], "prev", lidar)
+        return [
+            SweepRecord(
+                data["filename"],
+                data["timestamp"] * 1000,
+                frame_from_global @ self._global_from(data)[0],
+            )
+            for data in islice(earlier, self._max_sweeps)
+        ]

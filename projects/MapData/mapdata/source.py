@@ -1,0 +1,135 @@
+"""From whatever holds a recording to samples: the one entrance to the readers of this room."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
+from mapdata.argoverse2.recordings import logs_in, read_logs
+from mapdata.bags import is_bag, read_bag
+from mapdata.folders.images import NAMES, read_image_folder
+from mapdata.infos.recordings import read_info_file
+from mapdata.nuscenes.recordings import read_nuscenes, versions_in
+
+_FILES = ("*.arrow", "*.pkl")
+KINDS = (
+    "an annotation file (.arrow), an info file of mmdet3d (.pkl), a nuScenes-format root, "
+    "Argoverse 2 logs, a folder of images with calibration.yaml or calibration.json, a bag of ROS "
+    "(.bag, .mcap, .db3 or a folder of rosbag2)"
+)
+
+
+@dataclass(frozen=True)
+class InputOptions:
+    """How inputs are read; each kind reads what concerns it.
+
+    Args:
+        data_root: Folder that paths of an annotation or info file start from.
+        allow_missing_cameras: Whether an info file may name images that do not exist.
+        version: Version folder of a nuScenes-format root; the only one by default.
+        rate_hz: Samples per second of Argoverse 2 logs and bags; None takes all.
+        frames_dir: Folder for images that have to be made, a bag's and those of distorted cameras,
+            in a folder for each input.
+        vehicle_frame: The vehicle's frame in a bag; ``base_footprint`` or ``base_link`` by default.
+        vehicle_ground_z_m: Height of the road in that frame.
+    """
+
+    data_root: Path | None = None
+    allow_missing_cameras: bool = False
+    version: str | None = None
+    rate_hz: float | None = 2.0
+    frames_dir: Path = Path("frames")
+    vehicle_frame: str | None = None
+    vehicle_ground_z_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Source:
+    """The samples of an input.
+
+    Args:
+        samples: The samples.
+        frame: Their annotation frame, ``lidar`` or ``ego``.
+        data_root: Folder that image and LiDAR paths start from; None leaves it to the config.
+        has_poses: Whether the vehicle's pose is known.
+        notes: What the reader has to say.
+    """
+
+    samples: Sequence[MapSample]
+    frame: str
+    data_root: Path | None
+    has_poses: bool = True
+    notes: tuple[str, ...] = ()
+
+
+def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Source:
+    """Read the samples of an input.
+
+    Args:
+        path: An annotation file, an info file of mmdet3d, a nuScenes-format root, an Argoverse 2
+            log or a folder with some, a folder of images with a calibration file (or that file), a
+            bag, or a folder with just one annotation or info file.
+        options: How to read it.
+
+    Returns:
+        Its samples.
+
+    Raises:
+        FileNotFoundError: If there is nothing there, or what it names.
+        ValueError: If it is none of these, or damaged; the message says why.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"There is no input {path}.")
+    if is_bag(path):
+        drive = read_bag(
+            path,
+            options.frames_dir,
+            options.rate_hz,
+            options.vehicle_frame,
+            options.vehicle_ground_z_m,
+        )
+        return Source(drive.samples, "ego", drive.data_root, drive.has_poses, drive.notes)
+    if path.is_dir():
+        return _open_folder(path, options)
+    if path.suffix == ".arrow":
+        annotations = AnnotationFile(path)
+        root = options.data_root
+        if root is None and _lies_with_its_images(annotations):
+            root = path.parent
+        return Source(annotations, annotations.meta.frame, root)
+    if path.suffix == ".pkl":
+        root = options.data_root or path.parent
+        samples = read_info_file(path, root, options.allow_missing_cameras)
+        return Source(samples, "lidar", root)
+    if path.suffix in (".yaml", ".yml", ".json"):
+        drive = read_image_folder(path, options.frames_dir)
+        return Source(drive.samples, "ego", drive.data_root, drive.has_poses, drive.notes)
+    raise ValueError(f"{path} is no input: it must be {KINDS}.")
+
+
+def _open_folder(folder: Path, options: InputOptions) -> Source:
+    """Read a folder by what lies in it."""
+    if versions_in(folder):
+        return Source(read_nuscenes(folder, options.version), "lidar", folder)
+    logs = logs_in(folder)
+    if logs:
+        root = folder.parent if logs == [folder] else folder
+        samples, left_out = read_logs(logs, root, options.rate_hz)
+        notes = tuple(f"{count} samples left out: {reason}" for reason, count in left_out.items())
+        return Source(samples, "ego", root, notes=notes)
+    files = [folder / name for name in NAMES if (folder / name).is_file()]
+    files = files or sorted(path for pattern in _FILES for path in folder.glob(pattern))
+    if len(files) == 1:
+        return open_input(files[0], options)
+    if files:
+        names = ", ".join(path.name for path in files)
+        raise ValueError(f"{folder} holds several files ({names}): name one of them.")
+    raise FileNotFoundError(f"{folder} holds no input: it must be {KINDS}.")
+
+
+def _lies_with_its_images(annotations: AnnotationFile) -> bool:
+    """Whether the first image of an annotation file is found from the file's own folder."""
+    cameras = annotations[0].cameras if len(annotations) else []
+    return bool(cameras) and (annotations.path.parent / cameras[0].path).is_file()

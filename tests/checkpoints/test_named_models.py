@@ -1,0 +1,96 @@
+"""Models by name: the registry, its files and its errors."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+import torch
+from mmdet3d.registry import MODELS
+
+from gsmap.checkpoints.reading import load_weights
+from gsmap.apis.map_inferencer import MapInferencer
+from gsmap.engine import named_models as registry
+from gsmap.engine.launch import read_config
+from gsmap.checkpoints.named_models import (
+    checkpoint_for,
+    find_checkpoint,
+    find_config,
+    list_models,
+    named_models,
+)
+from gsmap.utils.shipped import shipped
+
+SHIPPED = [name for name, model in named_models().items() if model.address is None]
+
+
+def test_every_model_has_a_config_and_says_where_its_file_is():
+    for model in named_models().values():
+        assert shipped(model.config).is_file(), model.name
+        assert model.file.is_file() == (model.address is None), model.name
+        assert model.address is None or model.address.startswith("https://")
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_weights_fit_their_config_and_their_digest(name):
+    path = find_checkpoint(name)
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == named_models()[name].sha256
+    assert path.stat().st_size <= 6_000_000
+    model = MODELS.build(read_config(name).model)
+    load_weights(model, name)
+    state = torch.load(path, weights_only=True)["state_dict"]
+    key = "map_head.instance_embedding.weight"
+    torch.testing.assert_close(model.state_dict()[key], state[key].float())
+
+
+def test_the_inferencer_takes_a_name_alone():
+    inferencer = MapInferencer("maptr_r18_minicity", device="cpu")
+    state = torch.load(find_checkpoint("maptr_r18_minicity"), weights_only=True)["state_dict"]
+    key = "map_head.instance_embedding.weight"
+    torch.testing.assert_close(inferencer.model.state_dict()[key], state[key].float())
+
+
+def test_a_file_comes_before_a_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("gsmap_r18_minicity").write_text("mine")
+    assert find_checkpoint("gsmap_r18_minicity") == Path("gsmap_r18_minicity")
+
+
+def test_a_config_is_found_by_its_path_in_the_repository_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = "configs/maptr/maptr_r18_minicity.py"
+    assert find_config(config) == shipped(config)
+    Path(config).parent.mkdir(parents=True)
+    Path(config).touch()
+    assert find_config(config) == Path(config)  # one's own comes first
+
+
+def test_a_wrong_name_gets_the_nearest_right_one():
+    with pytest.raises(FileNotFoundError, match=r"minicty.*did you mean gsmap_r18_minicity\?"):
+        find_config("gsmap_r18_minicty")
+    with pytest.raises(FileNotFoundError, match=r"did you mean maptr_r18_minicity\?"):
+        find_checkpoint("models/maptr_r18_minicty.pth")
+    with pytest.raises(FileNotFoundError, match=r"x.pth.*gsmap_r18_minicity, maptr_r18_minicity"):
+        find_checkpoint("x.pth")
+
+
+def test_a_model_that_does_not_ship_says_where_it_is_fetched():
+    with pytest.raises(FileNotFoundError, match=r"fetch it from https://.* and save it there"):
+        find_checkpoint("maptr_tiny_r50_24e")
+
+
+def test_a_damaged_file_is_refused(tmp_path, monkeypatch):
+    named_models()
+    monkeypatch.setattr(registry, "shipped", tmp_path.joinpath)
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models/gsmap_r18_minicity.pth").write_bytes(b"half")
+    assert list_models() == ["gsmap_r18_minicity"]
+    with pytest.raises(ValueError, match=r"damaged or another file: its sha256"):
+        find_checkpoint("gsmap_r18_minicity")
+
+
+def test_a_config_file_needs_a_checkpoint_and_a_name_does_not():
+    config = find_config("gsmap_r18_minicity")
+    with pytest.raises(ValueError, match="give a checkpoint after"):
+        checkpoint_for(config, None)
+    assert checkpoint_for("gsmap_r18_minicity", None).name == "gsmap_r18_minicity.pth"
+    assert checkpoint_for(config, "maptr_r18_minicity").name == "maptr_r18_minicity.pth"

@@ -1,0 +1,151 @@
+import json
+
+import pytest
+import torch
+from fuzz.attacks import Calls
+from mmengine.config import Config
+from torch import nn
+
+from gsmap.checkpoints.reading import adopt_settings, load_weights, read_weights
+from gsmap.checkpoints.settings import MODEL_SETTINGS, differences, plain
+from gsmap.engine.launch import read_config
+
+
+def save(path, content):
+    torch.save(content, path)
+    return path
+
+
+def test_weights_are_loaded_from_a_training_checkpoint_and_a_bare_state(tmp_path):
+    source, target = nn.Linear(2, 3), nn.Linear(2, 3)
+    for content in ({"state_dict": source.state_dict(), "meta": {"epoch": 1}}, source.state_dict()):
+        load_weights(target, save(tmp_path / "a.pth", content))
+        torch.testing.assert_close(target.weight, source.weight)
+        nn.init.zeros_(target.weight)
+
+
+def test_other_architecture_lists_the_first_keys_and_the_remedy(tmp_path):
+    path = save(tmp_path / "other.pth", nn.Sequential(nn.Linear(2, 3)).state_dict())
+    message = r"other.pth does not belong .*lacks weight, bias and has 0.weight, 0.bias too many"
+    with pytest.raises(ValueError, match=message):
+        load_weights(nn.Linear(2, 3), path)
+    with pytest.raises(ValueError, match=r"and 5 more"):
+        load_weights(
+            nn.Sequential(*[nn.Linear(2, 2) for _ in range(4)]), save(path, {"x": torch.ones(1)})
+        )
+
+
+def test_other_size_is_named(tmp_path):
+    path = save(tmp_path / "wide.pth", nn.Linear(4, 3).state_dict())
+    with pytest.raises(ValueError, match=r"wide.pth does not belong [^!]*size mismatch for weight"):
+        load_weights(nn.Linear(2, 3), path)
+
+
+def test_checkpoint_that_would_run_code_is_refused_and_nothing_runs(tmp_path):
+    path = save(
+        tmp_path / "attack.pth",
+        {"state_dict": {"w": torch.ones(1)}, "x": Calls(open, str(tmp_path / "proof"), "w")},
+    )
+    with pytest.raises(ValueError, match=r"attack.pth was not loaded: .*save its state_dict alone"):
+        read_weights(path)
+    assert not (tmp_path / "proof").exists()
+
+
+def test_missing_truncated_and_empty_files_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint .*gone.pth"):
+        read_weights(tmp_path / "gone.pth")
+    path = save(tmp_path / "half.pth", {"w": torch.ones(1000)})
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(ValueError, match=r"half.pth"):
+        read_weights(path)
+    path.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"half.pth"):
+        read_weights(path)
+    with pytest.raises(ValueError, match=r"holds no state dict"):
+        read_weights(save(tmp_path / "meta.pth", {"meta": {}}))
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_weights_that_are_not_finite_are_refused(tmp_path, value):
+    state = {"good": torch.ones(2), "bad": torch.tensor([1.0, value]), "count": torch.tensor(3)}
+    with pytest.raises(ValueError, match=r"failed.pth holds NaN or infinite weights \(bad\)"):
+        read_weights(save(tmp_path / "failed.pth", {"state_dict": state}))
+
+
+@pytest.fixture
+def small() -> Config:
+    """The config of a small model."""
+    return read_config("configs/maptr/maptr_r18_minicity.py")
+
+
+def with_settings(path, settings):
+    meta = {MODEL_SETTINGS: json.dumps(settings)}
+    return save(path, {"state_dict": {"w": torch.ones(1)}, "meta": meta})
+
+
+def test_a_model_is_tested_with_the_settings_of_its_checkpoint(small, tmp_path):
+    settings = plain(small.model.to_dict())
+    path = with_settings(tmp_path / "a.pth", settings)
+    before = small.model
+    assert adopt_settings(small, path, {"data.size": 3}) == []
+    assert small.model is before
+    settings["map_head"]["losses"][0]["loss_weight"] = 3.0
+    settings["map_head"]["losses"].append({"type": "EuclideanLoss"})
+    settings["img_backbone"]["init_cfg"] = {"type": "Pretrained", "checkpoint": "x/y.pth"}
+    path = with_settings(tmp_path / "a.pth", settings)
+    of_losses = "model.map_head.losses"
+    trained = [
+        f"{of_losses}.0.loss_weight: 3.0, as {path} was trained; the config has 5.0",
+        f"{of_losses}.2: {{'type': 'EuclideanLoss'}}, as {path} was trained; the config has None",
+    ]
+    assert adopt_settings(small, path, None) == trained
+    del settings["img_backbone"]["init_cfg"]  # never loaded: the checkpoint has all weights
+    assert small.model.to_dict() == settings
+    options = {f"{of_losses}.0.loss_weight": 5.0, "model.img_backbone.init_cfg": None}
+    small.merge_from_dict(options)
+    assert adopt_settings(small, path, options) == [
+        f"{of_losses}.0.loss_weight: 5.0, as asked for; {path} was trained with 3.0"
+    ]
+    assert small.model.map_head.losses[0].loss_weight == 5.0
+    assert adopt_settings(small, save(path, {"w": torch.ones(1)}), None) == []
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        ("img_backbone", {"type": "mmdet.SwinTransformer"}, "img_backbone.type is 'mmdet.Swin"),
+        ("map_head", {"type": "MapHead", "num": 1}, "MapHead has no setting 'num'"),
+        ("map_head", None, "'NoneType' object is not a mapping"),
+        ("bev_encoder", {"type": "BEVQueryEncoder"}, "missing 1 required .* 'cross_attn'"),
+    ],
+)
+def test_settings_that_make_no_model_are_the_checkpoints_fault(
+    part, value, message, small, tmp_path
+):
+    settings = {**plain(small.model.to_dict()), part: value}
+    path = with_settings(tmp_path / "a.pth", settings)
+    with pytest.raises(ValueError, match=message) as raised:
+        adopt_settings(small, path, None)
+    text = str(raised.value)
+    assert text.startswith(f"{path} was not loaded: of the settings in it, ")
+    assert "maptr_r18_minicity.py" not in text
+
+
+def test_a_part_of_the_config_may_be_set_otherwise(small, tmp_path):
+    """A part that others register is built from a checkpoint where the config has it too."""
+    settings = plain(small.model.to_dict())
+    settings["img_backbone"] |= {"style": "caffe", "norm_cfg": {"type": "BN2d"}}
+    path = with_settings(tmp_path / "a.pth", settings)
+    lines = adopt_settings(small, path, None)
+    assert [line.split(":")[0] for line in lines] == [
+        "model.img_backbone.norm_cfg.type",
+        "model.img_backbone.norm_cfg.requires_grad",
+        "model.img_backbone.style",
+    ]
+    assert small.model.img_backbone.style == "caffe"
+
+
+def test_differences_of_other_kinds_are_named_whole():
+    assert differences({"a": [1]}, {"a": {"b": 1}}) == {"a": ([1], {"b": 1})}
+    assert differences({"a": None}, {"a": {"b": 1}}) == {"a": (None, {"b": 1})}
+    assert differences([1, 2], [1, 2, 3], "x") == {"x.2": (None, 3)}

@@ -1,0 +1,213 @@
+import json
+import sys
+from dataclasses import replace
+
+import av
+import numpy as np
+import pytest
+import shapely
+from drive_cases import CLASSES, drive_of
+from PIL import Image
+
+from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord
+from drivemaps.drive import DriveFrame
+from drivemaps.geodetic import MapOrigin, known_origin
+from drivemaps.geojson import write_geojson
+from drivemaps.lanelet2 import write_lanelet2
+from drivemaps.mcap import write_mcap
+from drivemaps.replay import Replay
+from drivemaps.rerun import write_rerun
+from drivemaps.truth import true_map
+from drivemaps.video import write_video
+from gsmap.structures.elements import MapElements
+
+ORIGIN = MapOrigin(48.26, 11.67)
+COLOURS = ("#FF9500", "#2D8CFF", "#1DB954")
+JPEG = b"\xff\xd8\xff\xd9"  # both viewers take the bytes as they are
+
+
+@pytest.fixture(scope="module")
+def true():
+    return true_map(drive_of())
+
+
+@pytest.fixture(scope="module")
+def camera_drive(tmp_path_factory):
+    """Three frames with a camera that looks ahead, and a Gaussian on each vertex."""
+    root = tmp_path_factory.mktemp("images")
+    cam_from_frame = np.eye(4)
+    cam_from_frame[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    intrinsics = np.array([[200.0, 0.0, 200.0], [0.0, 200.0, 112.0], [0.0, 0.0, 1.0]])
+    frames = []
+    for number, frame in enumerate(drive_of().frames[:3]):
+        name = f"{number}.jpg"
+        (root / name).write_bytes(JPEG)
+        camera = CameraRecord("CAM_FRONT", name, 400, 225, intrinsics, cam_from_frame)
+        count = len(frame.elements.points)
+        elements = replace(
+            frame.elements, scales=np.full((count, 2), [0.4, 0.1]), rotations=np.zeros(count)
+        )
+        frames.append(DriveFrame(replace(frame.sample, cameras=[camera]), elements))
+    return replace(drive_of(), frames=frames), root
+
+
+def test_geojson_in_metres_holds_lines_and_polygons(tmp_path, true):
+    write_geojson(tmp_path / "map.geojson", true, CLASSES, None)
+    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    assert [f["properties"]["class"] for f in features] == [CLASSES[k] for k in true.labels]
+    for feature, line in zip(features, true.polylines, strict=True):
+        shape = shapely.geometry.shape(feature["geometry"])
+        assert shape.geom_type == (
+            "Polygon" if feature["properties"]["class"] == "ped_crossing" else "LineString"
+        )
+        if shape.geom_type == "Polygon":
+            assert shape.exterior.is_ccw
+            shape = shape.exterior
+        assert shape.hausdorff_distance(shapely.LineString(line)) < 1e-4
+
+
+def test_geojson_in_degrees_comes_back_within_a_millimetre(tmp_path, true):
+    pyproj = pytest.importorskip("pyproj", reason="pip install -e .[maps]")
+    write_geojson(tmp_path / "map.geojson", true, CLASSES, ORIGIN)
+    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    lon, lat = np.array(features[0]["geometry"]["coordinates"]).T
+    azimuth, _, distance = pyproj.Geod(ellps="WGS84").inv(
+        np.full(len(lon), ORIGIN.longitude_deg), np.full(len(lon), ORIGIN.latitude_deg), lon, lat
+    )
+    x, y = true.polylines[0].T
+    # geodesics and a transverse Mercator grid differ by 1e-8 at a kilometre
+    np.testing.assert_allclose(distance, np.hypot(x, y), atol=1e-3)
+    np.testing.assert_allclose(np.radians(azimuth), np.arctan2(x, y), atol=1e-6)
+
+
+def test_lanelet2_loads_the_map_within_a_centimetre(tmp_path, true):
+    pytest.importorskip("pyproj", reason="pip install -e .[maps]")
+    pytest.importorskip("lanelet2", reason="pip install lanelet2")
+    import lanelet2.io
+    import lanelet2.projection
+
+    path = tmp_path / "map.osm"
+    write_lanelet2(path, true, CLASSES, ORIGIN)
+    origin = lanelet2.io.Origin(ORIGIN.latitude_deg, ORIGIN.longitude_deg)
+    projector = lanelet2.projection.LocalCartesianProjector(origin)
+    found, errors = lanelet2.io.loadRobust(str(path), projector)
+    assert not list(errors)
+    lines = [*found.lineStringLayer, *found.polygonLayer]
+    assert len(lines) == len(true)
+    by_class = {name: [] for name in CLASSES}
+    for line in lines:
+        by_class[line.attributes["class"]].append(np.array([[p.x, p.y] for p in line]))
+    for label, points in zip(true.labels, true.polylines, strict=True):
+        name = CLASSES[label]
+        if name == "ped_crossing":  # a polygon's last vertex is not its first
+            points = points[:-1]
+        alike = [line for line in by_class[name] if line.shape == points.shape]
+        assert min(np.abs(line - points).max() for line in alike) < 0.01
+
+
+def test_origins_are_those_of_the_devkits():
+    pyproj = pytest.importorskip("pyproj", reason="pip install -e .[maps]")
+    del pyproj
+    av2 = pytest.importorskip("av2.geometry.utm")
+    meta = AnnotationMeta("av2", "ego", "val")
+    points = np.array([[1200.0, -340.0], [0.0, 0.0]])
+    expected = av2.convert_city_coords_to_wgs84(points, av2.CityName.PIT)[:, ::-1]
+    found = known_origin(meta, "PIT").lon_lat(points)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert known_origin(AnnotationMeta("nuscenes", "lidar", "val"), "boston-seaport") is not None
+    assert known_origin(AnnotationMeta("minicity", "lidar", "val"), "boston-seaport") is None
+    with pytest.raises(ValueError, match="latitude within 90"):
+        MapOrigin(120.0, 0.0)
+
+
+def test_the_map_grows_on_the_ground(camera_drive, true):
+    drive, _ = camera_drive
+    lengths = []
+    for moment in Replay(drive, true, "lidar", ()).moments():
+        lengths.append(sum(shapely.LineString(line[:, :2]).length for _, line in moment.seen))
+        for local in moment.lines:
+            np.testing.assert_allclose(local[:, 2], -1.84)
+        for _, line in moment.seen:
+            np.testing.assert_allclose(line[:, 2], 0.0, atol=1e-9)
+        centres, half_axes, quaternions = moment.ellipses
+        assert len(centres) == len(half_axes) == len(quaternions)
+        np.testing.assert_allclose(half_axes[0], [0.8, 0.2])
+    assert lengths[0] < lengths[1] < lengths[2]
+
+
+def test_mcap_holds_images_lines_and_gaussians_of_every_frame(tmp_path, camera_drive, true):
+    pytest.importorskip("foxglove", reason="pip install -e .[viz]")
+    reader = pytest.importorskip("mcap.reader", reason="pip install mcap")
+    drive, root = camera_drive
+    write_mcap(tmp_path / "drive.mcap", Replay(drive, true, "lidar", COLOURS, root))
+    with (tmp_path / "drive.mcap").open("rb") as file:
+        summary = reader.make_reader(file).get_summary()
+    counts = summary.statistics.channel_message_counts
+    found = {channel.topic: counts[k] for k, channel in summary.channels.items()}
+    topics = {"/map", "/predictions", "/gaussians", "/tf/vehicle", "/tf/CAM_FRONT"}
+    assert found == dict.fromkeys(
+        topics | {"/CAM_FRONT/image", "/CAM_FRONT/calibration"}, len(drive.frames)
+    )
+    assert summary.statistics.message_start_time == drive.frames[0].sample.timestamp_ns
+
+
+def test_rerun_recording_holds_cameras_lines_and_gaussians(tmp_path, camera_drive, true):
+    pytest.importorskip("rerun", reason="pip install -e .[viz]")
+    drive, root = camera_drive
+    write_rerun(tmp_path / "drive.rrd", Replay(drive, true, "lidar", COLOURS, root))
+    content = (tmp_path / "drive.rrd").read_bytes()
+    assert content[:3] == b"RRF"
+    for entity in (b"/world/map", b"/world/vehicle/CAM_FRONT", b"predictions/gaussians"):
+        assert entity in content
+
+
+def test_a_film_shows_every_frame_at_the_pace_of_the_drive(tmp_path, camera_drive, true):
+    """H.264 of 4:2:0, which players take; a map has a panel of its own and grows."""
+    drive, _ = camera_drive
+    for number, value in enumerate((40, 120, 200)):
+        Image.new("RGB", (400, 225), (value, value, value)).save(tmp_path / f"{number}.jpg")
+    frames = [
+        DriveFrame(replace(f.sample, timestamp_ns=i * 250_000_000), f.elements)
+        for i, f in enumerate(drive.frames)
+    ]
+    drive = replace(drive, frames=frames)
+    pictures = {}
+    for name, elements in (("map", true), ("none", MapElements.from_polylines())):
+        replayed = Replay(drive, elements, "lidar", COLOURS, tmp_path)
+        write_video(tmp_path / f"{name}.mp4", replayed, width_px=480)
+        with av.open(tmp_path / f"{name}.mp4") as film:
+            stream = film.streams.video[0]
+            assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
+            assert stream.average_rate == 4
+            assert stream.width == 480
+            pictures[name] = [f.to_ndarray(format="rgb24") for f in film.decode(video=0)]
+        assert len(pictures[name]) == 3
+    greys = [np.median(picture[60:100, 100:380]) for picture in pictures["none"]]
+    np.testing.assert_allclose(greys, (40, 120, 200), atol=4)  # the image of each moment
+    assert pictures["map"][0].shape != pictures["none"][0].shape or (
+        np.abs(pictures["map"][0].astype(int) - pictures["none"][0]).max() > 50
+    )
+    with pytest.raises(ValueError, match=r"no image at .*0.jpg"):
+        write_video(tmp_path / "no.mp4", Replay(drive, true, "lidar", COLOURS, tmp_path / "a"))
+    assert not (tmp_path / "no.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "write"),
+    [
+        ("pyproj", "maps", lambda p, d, t: write_geojson(p, t, CLASSES, MapOrigin(1.0, 2.0))),
+        ("rerun", "viz", lambda p, d, t: write_rerun(p, Replay(d, t, "lidar", COLOURS))),
+        ("foxglove", "viz", lambda p, d, t: write_mcap(p, Replay(d, t, "lidar", COLOURS))),
+        ("av", "viz", lambda p, d, t: write_video(p, Replay(d, t, "lidar", COLOURS))),
+    ],
+)
+def test_a_missing_extra_is_named(module, extra, write, tmp_path, monkeypatch, true):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(RuntimeError, match=rf"pip install -e \.\[{extra}\]"):
+        write(tmp_path / "map", drive_of(), true)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_empty_map_is_written(tmp_path):
+    write_geojson(tmp_path / "map.geojson", MapElements.from_polylines(), CLASSES, None)
+    assert json.loads((tmp_path / "map.geojson").read_text())["features"] == []

@@ -1,0 +1,159 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from drive_cases import CLASSES, drive_of, street
+
+from drivemaps.config import MergeConfig
+from drivemaps.drive import DriveFrame
+from drivemaps.merging import confident, merge, suppress
+from drivemaps.scoring import map_figures, near_and_total_m
+from drivemaps.stitching import stitch
+from drivemaps.truth import true_map
+from gsmap.structures.elements import MapElements
+
+
+def seen_street(drive):
+    """The street within the drive's range, as lines by label."""
+    seen = shapely.union_all([drive.footprint(frame) for frame in drive.frames])
+    return [(label, shapely.intersection(shapely.LineString(p), seen)) for label, p in street()]
+
+
+def test_samples_cuts_of_one_map_are_put_together_exactly():
+    drive = drive_of()
+    found = true_map(drive)
+    expected = seen_street(drive)
+    assert sorted(found.labels.tolist()) == sorted(label for label, _ in expected)
+    for label, line in expected:
+        distances = [
+            shapely.hausdorff_distance(line, shapely.LineString(p))
+            for p in found.select(found.labels == label).polylines
+        ]
+        assert min(distances) < 0.05  # 2 cm of simplification and the rounding of the grid
+    rings = [p for p in found.polylines if np.array_equal(p[0], p[-1])]
+    assert len(rings) == 2  # the crossing and the island
+
+
+@pytest.mark.parametrize("make", [merge, true_map])
+def test_ground_truth_fed_as_predictions_gives_1(make):
+    drive = drive_of()
+    true = true_map(drive)
+    figures = map_figures([make(drive)], [true], [drive])
+    for name, of_class in figures.items():
+        assert set(of_class) == {*CLASSES, "mean"}
+        # a vertex a metre from an end or corner may be missing, 150 m of line are there
+        assert min(of_class.values()) > (0.99 if "@" in name else 1 - 1e-9), name
+
+
+def test_merging_beats_suppression_on_noisy_frames():
+    drive = drive_of(noise_m=0.3, scored=True)
+    true = true_map(drive_of())
+    merged, suppressed = (map_figures([make(drive)], [true], [drive]) for make in (merge, suppress))
+    assert merged["AP"]["mean"] == 1.0 > suppressed["AP"]["mean"]
+    # the mean of a dozen frames errs by 0.3 m / sqrt(12)
+    assert merged["accuracy@0.5"]["mean"] > 0.98 > suppressed["accuracy@0.5"]["mean"]
+    assert merged["completeness@0.5"]["mean"] > 0.95
+
+
+def test_merging_is_deterministic_and_leaves_no_duplicates():
+    drive = drive_of(noise_m=0.3, scored=True)
+    first, second = merge(drive), merge(drive)
+    np.testing.assert_array_equal(first.points, second.points)
+    assert len(first) == len(street())
+    assert first.points.dtype == np.float64
+    assert ((first.scores > 0.4) & (first.scores <= 0.9)).all()
+
+
+def test_certain_gaussians_outweigh_uncertain_ones():
+    """One line at x = 0 in a third of the frames, sigma 0.1; at x = 0.8 in the rest, sigma 2."""
+    drive = drive_of()
+    frames = []
+    for number, frame in enumerate(drive.frames):
+        certain = number % 3 == 0
+        line = np.array([[0.0 if certain else 0.8, y] for y in np.linspace(-20, 20, 20)])
+        elements = MapElements.from_polylines(
+            [line],
+            [0],
+            [0.9],
+            scales=[np.full((20, 2), 0.1 if certain else 2.0)],
+            rotations=[np.zeros(20)],
+        )
+        still = replace(frame.sample, global_from_frame=np.eye(4))
+        frames.append(DriveFrame(still, elements))
+    drive = replace(drive, frames=frames)
+    weighted, plain = (merge(drive, MergeConfig(gaussians=g)).points[:, 0] for g in (True, False))
+    assert abs(weighted).max() < 0.2
+    assert abs(plain - 0.8 * 2 / 3).max() < 0.05
+
+
+def test_variance_across_a_line_is_that_of_the_gaussians_other_axis():
+    elements = MapElements.from_polylines(
+        [np.array([[0.0, 0.0], [0.0, 1.0]])],
+        [0],
+        [1.0],
+        scales=[np.array([[0.3, 0.1], [0.3, 0.1]])],
+        rotations=[np.array([np.pi / 2, 0.0])],
+    )
+    sample = replace(drive_of().frames[0].sample, global_from_frame=np.eye(4))
+    found = MergeConfig().variances(DriveFrame(sample, elements))
+    np.testing.assert_allclose(found, [0.1**2, 0.3**2 + 0.02**2], atol=1e-12)
+
+
+def test_what_few_frames_see_is_left_out():
+    drive = drive_of(noise_m=0.1, scored=True)
+    ghost = drive.frames[10].to_global(np.array([[-4.0, -20.0], [-4.0, 20.0]]))
+    elements = drive.frames[10].elements
+    more = MapElements.from_polylines(
+        [*elements.polylines, ghost], [*elements.labels, 0], [*elements.scores, 0.95]
+    )
+    frames = list(drive.frames)
+    frames[10] = replace(frames[10], elements=more)
+    assert len(merge(replace(drive, frames=frames))) == len(street())
+    assert len(confident(drive, 0.99).frames[0].elements) == 0
+
+
+def test_no_predictions_make_an_empty_map_that_can_be_scored():
+    drive = confident(drive_of(noise_m=0.1, scored=True), 0.99)
+    assert len(merge(drive)) == len(suppress(drive)) == 0
+    figures = map_figures([merge(drive)], [true_map(drive_of())], [drive])
+    assert figures["AP"]["mean"] == figures["completeness@1.5"]["mean"] == 0.0
+    assert np.isnan(figures["accuracy@1.5"]["mean"])
+
+
+def test_suppression_keeps_the_best_of_what_overlaps():
+    drive = drive_of()
+    lines = [np.array([[x, -20.0], [x, 20.0]]) for x in (0.0, 0.6, 3.0)]
+    elements = MapElements.from_polylines(lines, [0, 0, 0], [0.5, 0.8, 0.6])
+    drive = replace(drive, frames=[replace(drive.frames[0], elements=elements)])
+    assert suppress(drive).scores.tolist() == [0.8, 0.6]
+
+
+def test_lengths_near_the_other_map():
+    """Ten metres of line beside eight of the other, 0.7 m away."""
+    one = MapElements.from_polylines([np.array([[0.0, 0.0], [10.0, 0.0]])], [0])
+    other = MapElements.from_polylines([np.array([[0.0, 0.7], [8.0, 0.7]])], [0])
+    assert near_and_total_m(one, other, 0, 0.5).tolist() == [0.0, 10.0]
+    near, total = near_and_total_m(one, other, 0, 1.0)
+    assert near == pytest.approx(8.0 + np.sqrt(1.0 - 0.49), abs=0.01)
+    assert total == 10.0
+
+
+def test_ends_that_meet_are_joined_the_straightest_first():
+    """Three lines from one point: ahead, to the left, and the one that comes to it."""
+    comes = np.array([[-20.0, 0.0], [0.0, 0.0]])
+    ahead = np.array([[20.0, 0.5], [0.5, 0.0]])
+    left = np.array([[0.5, 0.1], [10.0, 10.0]])
+    found = sorted(stitch([left, comes, ahead]), key=len)
+    np.testing.assert_array_equal(found[0], left)
+    np.testing.assert_array_equal(found[1][[0, -1]], [[-20.0, 0.0], [20.0, 0.5]])
+
+
+def test_a_line_that_meets_itself_becomes_a_ring_and_a_turn_back_is_not_joined():
+    angles = np.linspace(0.0, 6.1, 40)
+    ring = 10.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    pieces = [ring[:15], ring[:13:-1]]
+    (closed,) = stitch(pieces)
+    np.testing.assert_array_equal(closed[0], closed[-1])
+    side_by_side = [np.array([[0.0, y], [10.0, y]]) for y in (0.0, 1.0)]
+    assert len(stitch(side_by_side)) == 2

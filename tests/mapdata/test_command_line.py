@@ -1,0 +1,104 @@
+"""How the commands that make data end: with a report, an error in words, or interrupted."""
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from argoverse2_road import write_log
+
+from mapdata.argoverse2 import convert as argoverse2
+from mapdata.argoverse2 import render as argoverse2_render
+from mapdata.nuscenes import convert as nuscenes
+
+TOOL = Path(__file__).resolve().parents[2] / "tools/create_data.py"
+
+
+@pytest.mark.parametrize(
+    ("module", "required", "expected"),
+    [
+        (argoverse2, [], {"x_range": (-30.0, 30.0), "y_range": (-15.0, 15.0), "max_sweeps": 0}),
+        (nuscenes, [], {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0), "max_sweeps": 10}),
+        (argoverse2_render, ["--out", "b"], {"rate_hz": 2.0, "split": "val", "logs": ()}),
+    ],
+)
+def test_shared_options_keep_each_command_s_defaults(module, required, expected):
+    parser = argparse.ArgumentParser()
+    module.add_arguments(parser)
+    found = vars(parser.parse_args(["--root", "a", *required]))
+    assert found["workers"] >= 1
+    assert {name: found[name] for name in expected} == expected
+
+
+def interrupt(command: list[str], ready: Callable[[int], bool]) -> subprocess.CompletedProcess:
+    """Start a command, press Ctrl-C (which a terminal sends to all its processes) when ready.
+
+    Args:
+        command: What to make, and options.
+        ready: Says from the number of the process whether it is time.
+    """
+    process = subprocess.Popen(
+        [sys.executable, str(TOOL), *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # a job in the background ignores Ctrl-C, and hands that on to what it starts
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    deadline = time.monotonic() + 120
+    while not ready(process.pid):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def check_interrupted(done: subprocess.CompletedProcess) -> None:
+    assert done.returncode == 130, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.splitlines()[-1] == "interrupted: nothing half-written is left"
+
+
+def test_ctrl_c_while_workers_render_leaves_nothing_half_written(tmp_path):
+    """The rendered picture of either log is there when the signal comes, and gone afterwards."""
+    out = tmp_path / "out"
+    for name in ("log-a", "log-b"):
+        write_log(tmp_path / "val" / name, seconds=20.0)
+    command = ["av2-render", "--root", str(tmp_path), "--out", str(out), "--workers", "2"]
+    done = interrupt([*command, "--rate", "all"], lambda _: bool(list(out.rglob("*.jpg"))))
+    check_interrupted(done)
+    assert list((out / "val").iterdir()) == []
+
+
+def has_starting_worker(pid: int) -> bool:
+    """Whether a worker is in the midst of its imports, which take seconds."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    try:
+        commands = [Path(f"/proc/{child}/cmdline").read_text() for child in children]
+    except OSError:  # one of them has just ended
+        return False
+    if not any("spawn_main" in command for command in commands):
+        return False
+    time.sleep(0.5)
+    return True
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+def test_ctrl_c_while_workers_start_brings_no_traceback_of_theirs(tmp_path):
+    write_log(tmp_path / "val" / "log-a", seconds=20.0)
+    write_log(tmp_path / "val" / "log-b", seconds=20.0)
+    before = sorted(tmp_path.iterdir())
+    command = ["av2", "--root", str(tmp_path), "--rate", "all", "--workers", "2"]
+    check_interrupted(interrupt(command, has_starting_worker))
+    root = tmp_path / "root"
+    command = ["minicity", "--root", str(root), "--scenes", "4", "--workers", "2"]
+    check_interrupted(interrupt(command, has_starting_worker))
+    assert sorted(tmp_path.iterdir()) == before

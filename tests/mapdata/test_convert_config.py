@@ -1,0 +1,226 @@
+"""Configs in the form of the original repositories become ours, and what has no place is named."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import upstream_configs
+from mmdet3d.registry import MODELS
+from mmengine.config import Config
+
+from mapdata.upstream_configs.reader import read_assignments
+from mapdata.upstream_configs.upstream import convert_upstream, merge, python_text
+from gsmap.engine.launch import check_config, read_config
+
+REPO = Path(__file__).resolve().parents[2]
+# every config there has one; it is not followed
+BASE = "_base_ = ['../_base_/default_runtime.py']"
+
+
+def converted(text: str, tmp_path: Path) -> tuple[Config, list[str]]:
+    source = tmp_path / "theirs.py"
+    source.write_text(text)
+    conversion = convert_upstream(read_assignments(source))
+    return merge(conversion, REPO / "configs"), conversion.unplaced
+
+
+def plain(value):
+    """Let lists equal tuples."""
+    if isinstance(value, dict):
+        return {key: plain(inner) for key, inner in value.items()}
+    return [plain(inner) for inner in value] if isinstance(value, (list, tuple)) else value
+
+
+def differences(ours, theirs, path=""):
+    """Yield the dotted names at which two configs differ."""
+    if isinstance(ours, dict) and isinstance(theirs, dict):
+        for key in ours.keys() | theirs.keys():
+            yield from differences(ours.get(key), theirs.get(key), f"{path}.{key}".lstrip("."))
+    elif plain(ours) != plain(theirs):
+        yield path
+
+
+@pytest.mark.parametrize(
+    ("name", "ours", "expected"),
+    [
+        ("maptr", "maptr/maptr_r50_24e", set()),
+        ("maptr_av2", "maptr/maptr_r50_av2_6e", set()),
+        ("maptrv2", "maptrv2/maptrv2_r50_24e", set()),
+        ("gemap", "gemap/gemap_simple_r50_24e", {"model.map_head.loss_euclidean"}),
+    ],
+)
+def test_the_papers_configs_become_the_ones_that_are_here(name, ours, expected, tmp_path):
+    cfg, unplaced = converted(getattr(upstream_configs, name)(), tmp_path)
+    wanted = read_config(REPO / f"configs/{ours}.py")
+    found = set(differences(wanted.to_dict(), cfg.to_dict()))
+    spelt_out = {  # ours has the same as a default
+        "model.bev_encoder.cross_attn.num_heads",
+        "model.img_neck.start_level",
+        "model.map_head.coder.margin_m",
+        "model.map_head.decoder.layer.self_attn",
+        "_gemap",  # the part that it comes from
+    }
+    assert found - spelt_out == expected
+    assert unplaced == [BASE]
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [
+        ("mapvr", "mapvr/mapvr_r50_24e"),
+        ("gemap", "gemap/gemap_simple_r50_24e"),
+        ("gemap_full", "gemap/gemap_full_r50_110e"),
+    ],
+)
+def test_a_method_becomes_the_same_head(name, ours, tmp_path):
+    cfg, unplaced = converted(getattr(upstream_configs, name)(), tmp_path)
+    wanted = read_config(REPO / f"configs/{ours}.py")
+    check_config(cfg)
+    with torch.device("meta"):
+        heads = [MODELS.build(each.model).map_head for each in (cfg, wanted)]
+    for part in ("losses", "aux_heads"):
+        values = [
+            {k: {**vars(m), "_modules": None} for k, m in getattr(head, part).items()}
+            for head in heads
+        ]
+        assert str(values[0]) == str(values[1])
+    costs = [[(type(c), vars(c)) for c in head.assigner.match_costs] for head in heads]
+    assert str(costs[0]) == str(costs[1])
+    shapes = [{k: v.shape for k, v in head.state_dict().items()} for head in heads]
+    assert shapes[0] == shapes[1]
+    assert heads[0].query_groups == heads[1].query_groups
+    assert cfg.optim_wrapper.optimizer == wanted.optim_wrapper.optimizer
+    assert cfg.train_cfg.max_epochs == wanted.train_cfg.max_epochs
+    assert cfg.param_scheduler == wanted.param_scheduler
+    assert cfg.model.img_backbone.frozen_stages == wanted.model.img_backbone.frozen_stages
+    assert unplaced == [BASE]
+
+
+def test_mapvrs_deformable_attention_keeps_the_dropout_that_it_has_there(tmp_path):
+    cfg, _ = converted(upstream_configs.mapvr(), tmp_path)
+    assert cfg.model.map_head.decoder.layer.dropout == 0
+    assert cfg.model.map_head.decoder.layer.cross_attn == {"dropout": 0.1}
+    assert cfg.model.bev_encoder.layer_cfg.dropout == 0
+    assert cfg.train_dataloader.batch_size == 8
+
+
+def test_settings_of_ones_own_arrive(tmp_path):
+    text = upstream_configs.maptr(
+        queries="num_vec=70,", scale=0.4, epochs=30, more="fp16 = dict(loss_scale=512.)"
+    ).replace("points = 20", "points = 30")
+    cfg, _ = converted(text, tmp_path)
+    assert cfg.model.map_head.query_groups == [{"num": 70}]
+    assert cfg.model.map_head.num_points == 30
+    for part in ("train", "val", "test"):
+        steps = {step.type: step for step in cfg[f"{part}_dataloader"].dataset.pipeline}
+        assert steps["ScaleImages"].scale == 0.4
+        if part == "train":
+            assert steps["FormatMapTargets"].num_points == 30
+    assert cfg.train_cfg.max_epochs == 30
+    assert "T_max" not in cfg.param_scheduler[1]  # as long as the training
+    assert cfg.optim_wrapper.type == "AmpOptimWrapper"
+    assert cfg.optim_wrapper.loss_scale == 512
+
+
+def test_what_has_no_place_is_named_with_its_value(tmp_path):
+    collect = "dict(type='CustomCollect3D"
+    text = (
+        upstream_configs.maptr()
+        .replace("dir_interval=1", "dir_interval=2")
+        .replace("weight=0.0, box_format", "weight=0.25, box_format")
+        .replace("policy='CosineAnnealing'", "policy='step'")
+        .replace(collect, f"dict(type='MixUp', alpha=0.3), {collect}")
+        .replace("type='MapTR',", "type='MapTR', modality='fusion', lidar_encoder=dict(a=1),")
+    )
+    _, unplaced = converted(text, tmp_path)
+    assert set(unplaced) == {
+        BASE,
+        "model.modality = 'fusion'",
+        "model.lidar_encoder.a = 1",
+        "model.pts_bbox_head.dir_interval = 2",
+        "model.train_cfg.pts.assigner.reg_cost.type = 'BBoxL1Cost'",
+        "model.train_cfg.pts.assigner.reg_cost.weight = 0.25",
+        "model.train_cfg.pts.assigner.reg_cost.box_format = 'xywh'",
+        "data.train.pipeline.6.type = 'MixUp'",
+        "data.train.pipeline.6.alpha = 0.3",
+        "lr_config.policy = 'step'",
+    }
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("import os", "line 2, 'import os': only assignments of names are read"),
+        ("a = open('x')", r"line 2, .*open\(\) is not called"),
+        ("a = __import__('os').system('true')", "is not called"),
+        ("a = [x for x in (1, 2)]", "is more than a value"),
+        ("a = b", "b is not assigned before"),
+        ("a = 'x' * 1000000000", "only numbers are multiplied"),
+        ("a = (1).real", "is more than a value"),
+        ("a, b = 1, 2", "only assignments of names are read"),
+        ("a = f'{1}'", "is more than a value"),
+        ("a = 1 / 0", "division by zero"),
+        ("a = [1][3]", "list index out of range"),
+        ("a =", "line 2: invalid syntax"),
+    ],
+)
+def test_what_is_more_than_assignments_is_refused_and_never_run(line, message, tmp_path):
+    source = tmp_path / "theirs.py"
+    source.write_text(f"first = 1\n{line}\n")
+    with pytest.raises(ValueError, match=message):
+        read_assignments(source)
+
+
+def test_what_is_written_says_what_was_placed_and_is_quick(tmp_path):
+    cfg, _ = converted(upstream_configs.maptrv2(), tmp_path)
+    tree = "it's {a}"
+    for _ in range(12):
+        tree = {"a": tree, "b-c": tree}
+    cfg.model.img_backbone.more = tree
+    target = tmp_path / "ours.py"
+    target.write_text(python_text(cfg))
+    written = Config.fromfile(target, import_custom_modules=False).to_dict()
+    assert written == {k: v for k, v in cfg.to_dict().items() if not k.startswith("_")}
+
+
+def test_values_that_are_read(tmp_path):
+    source = tmp_path / "theirs.py"
+    source.write_text(
+        '"""Text."""\na = [1, 2.5]\nb = dict(x=a, **dict(y=(len(a), -a[0])))\n'
+        "c = {'k': b['y'], 'r': 7 // 2 / 2.0}\nd = 'data/' + 'x.pkl'\na = a + [3]\n"
+    )
+    values = read_assignments(source)
+    assert values == {
+        "a": [1, 2.5, 3],
+        "b": {"x": [1, 2.5], "y": (2, -1)},
+        "c": {"k": (2, -1), "r": 1.5},
+        "d": "data/x.pkl",
+    }
+
+
+def test_a_config_of_another_model_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"model\.type must be one of .* got 'PETR'"):
+        converted(upstream_configs.maptr(model="PETR"), tmp_path)
+    with pytest.raises(ValueError, match=r"data\.train\.type must be one of .* got 'Mine'"):
+        converted(upstream_configs.maptr(dataset="Mine"), tmp_path)
+    bare = "model = dict(type='MapTR')\n"
+    with pytest.raises(ValueError, match=r"data\.train\.type"):
+        converted(bare, tmp_path)
+
+
+def test_the_command_writes_a_config_that_the_tools_read(tmp_path):
+    source, target = tmp_path / "theirs.py", tmp_path / "new/ours.py"
+    source.write_text(upstream_configs.gemap().replace("dir_interval=1", "dir_interval=2"))
+    command = [sys.executable, "tools/convert_config.py", str(source), str(target)]
+    run = subprocess.run(command, cwd=REPO, text=True, capture_output=True, check=True)
+    assert "configs/maptr/maptr_r50_24e.py" in run.stdout
+    assert "  model.pts_bbox_head.dir_interval = 2" in run.stdout
+    cfg = read_config(target)
+    check_config(cfg)
+    assert cfg.model.map_head.type == "GeMapHead"
+    source.write_text("import os\n")
+    run = subprocess.run(command, cwd=REPO, text=True, capture_output=True, check=False)
+    assert run.returncode == 2
+    assert "error:" in run.stderr

@@ -1,0 +1,201 @@
+"""Info pickles of MapTR and MapTRv2, synthesised in their formats from known samples."""
+
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fuzz.attacks import Calls
+from pyquaternion import Quaternion
+
+from mapdata.infos.convert import convert_infos
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import MapSample
+
+
+def split_pose(matrix: np.ndarray) -> tuple[list[float], list[float]]:
+    rotation = Quaternion(matrix=matrix[:3, :3], atol=1e-6, rtol=1e-6)
+    return matrix[:3, 3].tolist(), rotation.elements.tolist()
+
+
+def sensor_info(path: str, frame_from_sensor: np.ndarray, timestamp_us: int) -> dict:
+    return {
+        "data_path": f"./data/nuscenes/{path}",
+        "sensor2lidar_rotation": frame_from_sensor[:3, :3],
+        "sensor2lidar_translation": frame_from_sensor[:3, 3],
+        "timestamp": timestamp_us,
+    }
+
+
+def nuscenes_info(sample: MapSample) -> dict:
+    """One entry of ``nuscenes_infos_temporal_*.pkl``."""
+    lidar_pose = split_pose(sample.ego_from_frame)
+    ego_pose = split_pose(sample.global_from_frame @ np.linalg.inv(sample.ego_from_frame))
+    return {
+        "lidar_path": f"./data/nuscenes/{sample.lidar.path}",
+        "token": sample.token,
+        "prev": "",
+        "can_bus": np.array([*sample.can_bus[:16], 0, 0]),
+        "sweeps": [
+            sensor_info(s.path, s.frame_from_lidar, s.timestamp_ns // 1000)
+            for s in sample.lidar.sweeps
+        ],
+        "cams": {
+            c.name: {
+                **sensor_info(c.path, np.linalg.inv(c.cam_from_frame), 0),
+                "cam_intrinsic": c.intrinsics,
+            }
+            for c in sample.cameras
+        },
+        "map_location": sample.map_name,
+        "scene_token": "s",
+        "lidar2ego_translation": lidar_pose[0],
+        "lidar2ego_rotation": lidar_pose[1],
+        "ego2global_translation": ego_pose[0],
+        "ego2global_rotation": ego_pose[1],
+        "timestamp": sample.timestamp_ns // 1000,
+        "gt_names": np.array(["car", "truck"]),
+    }
+
+
+def annotation(sample: MapSample, classes: tuple[str, ...]) -> dict[str, list[np.ndarray]]:
+    lines = {name: [] for name in (*classes, "centerline")}
+    for instance in sample.instances:
+        lines[classes[instance.label]].append(instance.points.astype(np.float64))
+    lines["divider"].append(np.zeros((1, 2)))  # upstream's files hold such
+    return lines
+
+
+@pytest.fixture
+def known(minicity_annotations: dict[str, Path]) -> AnnotationFile:
+    return AnnotationFile(minicity_annotations["train"])
+
+
+def convert(tmp_path: Path, name: str, content: object, root: Path) -> AnnotationFile:
+    (tmp_path / name).write_bytes(pickle.dumps(content, protocol=4))
+    target = tmp_path / "out.arrow"
+    convert_infos(tmp_path / name, target, root, "train", command="make it")
+    return AnnotationFile(target)
+
+
+def assert_same_elements(found: MapSample, wanted: MapSample) -> None:
+    assert [i.label for i in found.instances] == [i.label for i in wanted.instances]
+    for one, other in zip(found.instances, wanted.instances, strict=True):
+        np.testing.assert_allclose(one.points, other.points, atol=1e-5)
+
+
+def test_maptr_infos_get_their_truth_from_the_maps(known, minicity_root, tmp_path):
+    infos = {"infos": [nuscenes_info(s) for s in known], "metadata": {"version": "v1.0-trainval"}}
+    file = convert(tmp_path, "nuscenes_infos_temporal_train.pkl", infos, minicity_root)
+    assert file.meta == replace(
+        file.meta, dataset="nuscenes", frame="lidar", split="train", command="make it"
+    )
+    for found, wanted in zip(file, known, strict=True):
+        assert found.token == wanted.token
+        assert found.lidar.path == wanted.lidar.path
+        for one, other in zip(found.cameras, wanted.cameras, strict=True):
+            assert (one.name, one.path) == (other.name, other.path)
+            np.testing.assert_allclose(one.cam_from_frame, other.cam_from_frame, atol=1e-6)
+        for one, other in zip(found.lidar.sweeps, wanted.lidar.sweeps, strict=True):
+            np.testing.assert_allclose(one.frame_from_lidar, other.frame_from_lidar, atol=1e-6)
+            assert one.timestamp_ns == other.timestamp_ns
+        np.testing.assert_allclose(found.global_from_frame, wanted.global_from_frame, atol=1e-6)
+        np.testing.assert_allclose(found.can_bus[3:], wanted.can_bus[3:], atol=1e-5)
+        assert_same_elements(found, wanted)
+
+
+def test_maptr_infos_without_maps_have_no_truth(known, tmp_path):
+    infos = {"infos": [nuscenes_info(known[0])]}
+    file = convert(tmp_path, "nuscenes_infos_temporal_train.pkl", infos, tmp_path)
+    assert file[0].instances is None
+    assert file[0].cameras[0].path.startswith("samples/CAM_FRONT/")
+
+
+def test_maptrv2_infos_bring_their_truth(known, tmp_path):
+    infos = []
+    for sample in known:
+        info = nuscenes_info(sample)
+        infos.append({**info, "annotation": annotation(sample, known.meta.classes)})
+    name = "nuscenes_map_infos_temporal_train.pkl"
+    for found, wanted in zip(
+        convert(tmp_path, name, {"infos": infos}, tmp_path), known, strict=True
+    ):
+        assert_same_elements(found, wanted)
+
+
+def test_argoverse_infos_keep_three_coordinates(tmp_path):
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    lines = [np.array([[0.0, 0, 1], [5, 0, 2]])]
+    camera = {
+        "img_fpath": "data/argoverse2/sensor/val/log/sensors/cameras/ring_front_center/7.jpg",
+        "intrinsics": np.diag([100.0, 100, 1]),
+        "extrinsics": np.eye(4),
+        "e2g_translation": np.array([1.0, 0, 0]),
+        "e2g_rotation": turn,
+    }
+    info = {
+        "e2g_translation": np.zeros(3),
+        "e2g_rotation": turn,
+        "cams": {"ring_front_center": camera},
+        "lidar_path": "data/argoverse2/sensor/val/log/sensors/lidar/7.feather",
+        "timestamp": "7",
+        "log_id": "log",
+        "token": "log_7",
+        "annotation": {"divider": lines, "ped_crossing": [], "boundary": [], "centerline": lines},
+    }
+    file = convert(tmp_path, "av2_map_infos_val.pkl", {"samples": [info]}, tmp_path)
+    sample = file[0]
+    assert (file.meta.dataset, file.meta.frame, file.meta.dim) == ("av2", "ego", 3)
+    assert (file.meta.x_range, file.meta.y_range) == ((-30, 30), (-15, 15))
+    assert len(sample.instances) == 1
+    np.testing.assert_allclose(sample.instances[0].points, lines[0])
+    assert sample.cameras[0].path == "val/log/sensors/cameras/ring_front_center/7.jpg"
+    assert (sample.cameras[0].width, sample.cameras[0].height) == (1550, 2048)
+    # the vehicle has moved 1 m along the city's x, which is -y of the vehicle, when the image is
+    # taken
+    np.testing.assert_allclose(sample.cameras[0].cam_from_frame[:3, 3], [0, 1, 0], atol=1e-12)
+
+
+def test_truth_beyond_the_range_is_refused_until_the_range_is_given(known, tmp_path):
+    info = nuscenes_info(known[0])
+    far = {"divider": [np.array([[0.0, -45], [0, 45]])], "ped_crossing": [], "boundary": []}
+    content = {"infos": [{**info, "annotation": far}]}
+    name = "nuscenes_map_infos_temporal_train.pkl"
+    with pytest.raises(ValueError, match=r"vertex at \(0.0, -45.0\), outside .* --y-range"):
+        convert(tmp_path, name, content, tmp_path)
+    ranges = {"x_range": (-25.0, 25.0), "y_range": (-50.0, 50.0)}
+    convert_infos(tmp_path / name, tmp_path / "far.arrow", tmp_path, "train", **ranges)
+    file = AnnotationFile(tmp_path / "far.arrow")
+    assert (file.meta.x_range, file.meta.y_range) == ((-25, 25), (-50, 50))
+    np.testing.assert_allclose(file[0].instances[0].points, far["divider"][0])
+
+
+@pytest.mark.parametrize(
+    "content", [{"infos": [Calls(os.system, "touch /tmp/gsmap_was_here")]}, {"infos": [Path("/")]}]
+)
+def test_a_pickle_that_runs_code_is_refused_unrun(content, tmp_path):
+    marker = Path("/tmp/gsmap_was_here")
+    marker.unlink(missing_ok=True)
+    with pytest.raises(ValueError, match="not plain data"):
+        convert(tmp_path, "nuscenes_infos_temporal_train.pkl", content, tmp_path)
+    assert not marker.exists()
+    assert not (tmp_path / "out.arrow").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "neither a list `infos`"),
+        ({"infos": []}, "no sample"),
+        (
+            {"infos": [{"token": "a"}]},
+            "sample 0 cannot be used: it has no 'lidar2ego",
+        ),
+    ],
+)
+def test_other_pickles_are_refused(content, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        convert(tmp_path, "nuscenes_infos_temporal_train.pkl", content, tmp_path)
+    assert not (tmp_path / "out.arrow").exists()

@@ -1,0 +1,128 @@
+"""Own data: the documented example runs, and mistakes are named."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapdata.custom import from_records
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import AnnotationMeta
+from gsmap.visualization.frame_view import FRAME_VIEWS
+
+REPO = Path(__file__).resolve().parents[2]
+DOC = REPO / "docs/custom_data.md"
+META = AnnotationMeta("mine", "ego", "train", x_range=(-30, 30), y_range=(-15, 15))
+
+
+def record(**changes) -> dict:
+    camera = {
+        "name": "front",
+        "path": "a.jpg",
+        "intrinsics": np.eye(3),
+        "cam_from_frame": np.eye(4),
+        "width": 8,
+        "height": 6,
+    }
+    return {"token": "t", "cameras": [camera], **changes}
+
+
+def elements(tmp_path: Path, *instances: dict, meta: AnnotationMeta = META) -> list:
+    from_records(tmp_path / "a.arrow", [record(instances=list(instances))], meta, tmp_path)
+    return AnnotationFile(tmp_path / "a.arrow")[0].instances
+
+
+def test_the_documented_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", DOC.read_text(), re.DOTALL)
+    assert len(blocks) == 2
+    scope: dict = {}
+    for block in blocks:
+        exec(block, scope)
+    labels = [i.label for i in AnnotationFile("my_data/train.arrow")[0].instances]
+    assert labels == [0, 1, 2]
+    divider = AnnotationFile("my_data/train.arrow")[0].instances[0].points
+    np.testing.assert_allclose(divider[[0, -1], 0], [-30, 30])
+    assert AnnotationFile("my_data/all.arrow")[1].instances is None
+    assert scope["data"]["inputs"]["img"].shape == (2, 3, 180, 320)
+    meta = scope["data"]["data_samples"].metainfo
+    # the crossing's near right corner, 8 m ahead and 4 m to the right, seen by the front camera
+    u, v, depth, _ = meta["lidar2img"][0] @ np.array([8, -4, 0, 1])
+    assert depth == pytest.approx(8)
+    assert (u / depth, v / depth) == pytest.approx((160 + 200 * 4 / 8, 90 + 200 * 1.5 / 8))
+
+
+def test_a_ring_that_leaves_the_range_stays_a_ring(tmp_path: Path):
+    square = [[25, 0], [35, 0], [35, 5], [25, 5], [25, 0]]
+    (ring,) = elements(tmp_path, {"label": 1, "points": square})
+    np.testing.assert_array_equal(ring.points[0], ring.points[-1])
+    assert ring.points[:, 0].max() == 30
+    assert elements(tmp_path, {"label": 0, "points": [[40, 0], [50, 0]]}) == []
+    assert elements(tmp_path, {"label": 1, "points": [[40, 0], [50, 0], [50, 5], [40, 0]]}) == []
+
+
+def test_height_is_interpolated_where_a_line_is_cut(tmp_path: Path):
+    meta = AnnotationMeta("mine", "ego", "train", x_range=(-30, 30), y_range=(-15, 15), dim=3)
+    (line,) = elements(tmp_path, {"label": 0, "points": [[20, 0, 0], [40, 0, 2]]}, meta=meta)
+    np.testing.assert_allclose(line.points, [[20, 0, 0], [30, 0, 1]])
+
+
+@pytest.mark.parametrize("frame", ["ego", "lidar"])
+def test_an_unknown_mounting_is_not_the_identity(frame: str, tmp_path: Path, caplog):
+    """Lines must lie on the road: 1.84 m below a LiDAR by default, not at its own height."""
+    meta = AnnotationMeta("mine", frame, "train")
+    mounted = np.eye(4)
+    mounted[2, 3] = 1.5
+    records = [
+        record(),
+        {**record(ego_from_frame=mounted), "token": "u"},
+        {**record(), "token": "v"},
+    ]
+    from_records(tmp_path / "a.arrow", records, meta, tmp_path)
+    file = AnnotationFile(tmp_path / "a.arrow")
+    heights = [FRAME_VIEWS[frame].tilted(sample.ego_from_frame).ground for sample in file]
+    usual = FRAME_VIEWS[frame].ground
+    assert heights == [usual, (0, 0, FRAME_VIEWS[frame].ego_ground_z_m - 1.5), usual]
+    unknown = [sample.ego_from_frame is None for sample in file]
+    assert unknown == ([True, False, True] if frame == "lidar" else [False] * 3)
+    assert caplog.text.count("has no ego_from_frame") == (frame == "lidar")
+
+
+def test_lidar_and_signals_are_kept(tmp_path: Path):
+    sweep = {"path": "s.bin", "timestamp_ns": 3, "frame_from_lidar": np.diag([-1.0, -1, 1, 1])}
+    lidar = {"path": "l.bin", "frame_from_lidar": np.eye(4), "sweeps": [sweep]}
+    from_records(tmp_path / "a.arrow", [record(lidar=lidar, can_bus=range(18))], META, tmp_path)
+    sample = AnnotationFile(tmp_path / "a.arrow")[0]
+    assert (sample.lidar.path, sample.lidar.sweeps[0].path) == ("l.bin", "s.bin")
+    assert sample.can_bus[17] == 17
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (record(gt=[]), r"unknown keys \['gt'\]"),
+        ({"token": "t"}, "record 't' cannot be used: it has no 'cameras'"),
+        (record(instances=[{"label": "tree", "points": [[0, 0], [1, 1]]}]), "'tree' is not among"),
+        (record(instances=[{"label": 0, "points": [[0, 0, 0], [1, 1, 1]]}]), r"\(n >= 2, 2\)"),
+        (record(instances=[{"label": 0, "points": [[0, np.nan], [1, 1]]}]), "NaN"),
+        (
+            record(instances=[{"label": 1, "points": [[0, 0], [40, 9], [40, 0], [0, 9], [0, 0]]}]),
+            "crosses itself",
+        ),
+    ],
+)
+def test_mistakes_are_named_and_leave_nothing(tmp_path: Path, bad: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        from_records(tmp_path / "a.arrow", [bad], META, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_or_broken_image_is_named(tmp_path: Path):
+    bare = record()
+    del bare["cameras"][0]["width"]
+    with pytest.raises(FileNotFoundError, match=r"'t', camera 'front': no image"):
+        from_records(tmp_path / "a.arrow", [bare], META, tmp_path)
+    (tmp_path / "a.jpg").write_text("no picture")
+    with pytest.raises(ValueError, match="not an image"):
+        from_records(tmp_path / "a.arrow", [bare], META, tmp_path)

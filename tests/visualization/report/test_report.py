@@ -1,0 +1,188 @@
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from processes import run_python
+from report_case import CLASSES, FRAMES, STRANGE, write_case
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
+from gsmap.visualization.report.frames import cameras_of, choose_frames
+from gsmap.visualization.report.page import ReportOptions, page_html, report_data
+from gsmap.visualization.frame_view import FRAME_VIEWS
+
+REPO = Path(__file__).resolve().parents[1]
+NO_IMAGES = ReportOptions(image_width=0)
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    return write_case(tmp_path_factory.mktemp("case"))
+
+
+@pytest.fixture(scope="module")
+def data(case):
+    return report_data(*case, ReportOptions())
+
+
+def test_predictions_hit_within_a_metre_and_the_tables_agree(data):
+    """The first divider stands 0, 0.4, 0.8, 1.2 ... m from the annotated one."""
+    found = [frame["found"][0] for frame in data["frames"]]
+    assert [[item["s"] for item in items] for items in found] == [[0.9, 0.5, 0.3]] * FRAMES
+    assert [items[0]["hit"] for items in found] == [0, 0, 0, -1, -1, -1]
+    assert [items[1]["hit"] for items in found] == [2] * FRAMES
+    assert [items[2]["hit"] for items in found] == [-1] * FRAMES
+    assert found[1][0]["p"][:4] == [40, -2000, 40, -1600]
+    assert found[1][0]["g"][:3] == [200, 50, 90]
+    assert "g" not in data["frames"][0]["found"][1][0]
+    # dividers at 1 m: ranks 1, 2, 3 hit, then recall stays at 1/2: AP = 1/2; boundaries are perfect
+    rows = data["tables"][1]["rows"]
+    column = data["tables"][1]["head"].index("at 1.0 m")
+    assert [row[column] for row in rows] == ["50.0", "0.0", "0.0", "0.0", "100.0", "100.0"]
+    # mAP: dividers (2/6 + 3/6 + 4/6) / 3, crossings 0, boundaries 1
+    assert data["tables"][0]["rows"][0][1:] == ["50.0", "33.3", "-16.7"]
+
+
+def test_curves_end_at_the_recall_that_is_reached(data):
+    divider = next(p for p in data["curves"] if p["metric"] == "AP_chamfer" and p["class"] == 0)
+    line = next(line for line in divider["lines"] if line["label"] == "1.0 m")
+    assert line["ap"] == ["50.0", "0.0"]
+    good, poor = line["points"]
+    assert good[2] == [0.5, 1.0]
+    assert good[-1] == [0.5, 0.25]
+    assert poor == []
+
+
+def test_frames_are_spread_evenly_and_the_worst_are_added(case):
+    class Result:
+        def f1(self, token, score_thr):
+            return {"7": 0.1, "8": 0.0, "0": 0.05}.get(token, 1.0)
+
+    tokens = [str(i) for i in range(10)]
+    assert choose_frames(tokens, 10, [Result()], 0.4) == list(range(10))
+    assert choose_frames(tokens, 4, [], 0.4) == [0, 3, 6, 9]
+    # three evenly (0, 4, 9), then the worst that is not among them
+    assert choose_frames(tokens, 4, [Result()], 0.4) == [0, 4, 8, 9]
+    some = report_data(*case, replace(NO_IMAGES, max_frames=4))
+    assert some["notes"] == [
+        "The page shows 4 of 6 frames: 3 evenly spread and the 1 worst of good."
+    ]
+
+
+def test_cameras_stand_as_on_the_car_and_see_the_ground(case):
+    sample = AnnotationFile(case[0])[0]
+    view = replace(FRAME_VIEWS["lidar"], ground=(0.01, -0.02, -1.8))
+    point = [3.0, 17.0, 0.01 * 3 - 0.02 * 17 - 1.8, 1.0]
+    (front,), (back,) = cameras_of(sample, view, Path(), 0)
+    assert (front["title"], back["title"], back["src"]) == ("front", "back", "")
+    for entry, camera in ((back, sample.cameras[0]), (front, sample.cameras[1])):
+        pixel = np.reshape(entry["matrix"], (3, 3)) @ [3, 17, 1]
+        expected = camera.intrinsics @ (camera.cam_from_frame @ point)[:3]
+        np.testing.assert_allclose(pixel, expected, rtol=1e-4)
+
+
+def test_a_frame_that_looks_along_x_is_turned_to_look_up(tmp_path):
+    path, results = write_case(tmp_path, frame="ego")
+    data = report_data(path, results, NO_IMAGES)
+    assert data["extent"] == (-30.0, 30.0, -15.0, 15.0)
+    frame = data["frames"][0]
+    assert frame["truth"][2]["p"] == [2000, 500, -2000, 500]  # x = 5 m ahead, y = 20 m to the left
+    assert frame["found"][0][0]["g"][:3] == [200, 50, 180]
+
+
+def test_texts_of_files_cannot_leave_the_block_of_data(data):
+    page = page_html(data)
+    block = re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1]
+    assert "<" not in block
+    assert json.loads(block)["results"] == ["good", STRANGE]
+    assert "data:image" not in block  # each frame's images are read when it is opened
+    images = re.findall(r'class="images">(.*?)</script>', page)
+    assert [len(json.loads(each)) for each in images] == [2] * FRAMES
+    assert page.count("data:image/jpeg") == 2 * FRAMES
+    assert json.loads(block)["frames"][0]["title"].startswith(STRANGE)
+    assert page.count("<img") == 0
+    assert "innerHTML" not in page
+    policy = re.search(r'content="(default-src[^"]*)"', page)[1]
+    assert policy.startswith("default-src 'none'; img-src data:; style-src 'sha256-")
+    assert policy.endswith("; base-uri 'none'; form-action 'none'")
+    for tag in ("style", "script"):
+        content = re.search(rf"<{tag}>(.*?)</{tag}>", page, re.DOTALL)[1]
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        assert f"{tag}-src 'sha256-{digest}'" in policy
+
+
+def test_thumbnails_are_small_jpegs_and_a_missing_image_is_an_error(case, tmp_path):
+    small = report_data(*case, ReportOptions(image_width=32, max_frames=1))
+    source = small["frames"][0]["cameras"][0][0]["src"]
+    assert source.startswith("data:image/jpeg;base64,/9j/")
+    assert len(source) < 1500
+    with pytest.raises(ValueError, match=r"no readable image at .*--data-root"):
+        report_data(*case, ReportOptions(data_root=tmp_path))
+
+
+def test_without_results_the_page_shows_ground_truth(case):
+    data = report_data(case[0], {}, replace(NO_IMAGES, max_frames=2))
+    assert data["title"] == "case val: ground truth"
+    assert data["tables"] == data["curves"] == data["frames"][0]["found"] == []
+    assert data["notes"] == ["The page shows 2 of 6 frames: evenly spread."]
+
+
+def test_results_of_other_samples_are_an_error_unless_allowed(case, tmp_path):
+    other = tmp_path / "other.json"
+    strange = {"cls_name": "kerb", "pts": [[0, 0], [1, 0]], "confidence_level": 0.5}
+    other.write_text(json.dumps({"results": [{"sample_token": "t0", "vectors": [strange]}]}))
+    with pytest.raises(ValueError, match=r"other\.json: 5 samples have no results"):
+        report_data(case[0], {"other": other}, NO_IMAGES)
+    allowed = report_data(case[0], {"other": other}, replace(NO_IMAGES, allow_mismatch=True))
+    assert allowed["frames"][3]["found"] == [[]]
+    assert "5 samples have no results" in allowed["notes"][0]
+    assert allowed["notes"][1] == "other: 1 predictions of class 'kerb' are not scored"
+
+
+@pytest.mark.parametrize("wrong", [{"max_frames": 0}, {"score_thr": 1.2}, {"image_width": -1}])
+def test_options_out_of_range_are_refused(wrong):
+    with pytest.raises(ValueError, match="must be"):
+        ReportOptions(**wrong)
+
+
+def test_gaussians_are_read_where_all_vectors_have_them(case, tmp_path):
+    path = case[1]["good"]
+    assert read_samples(path, RESULTS_KEY, CLASSES)[0]["t0"].scales is None
+    elements = read_samples(path, RESULTS_KEY, CLASSES, gaussians=True)[0]["t0"]
+    assert elements.scales.shape == (len(elements.points), 2)
+    assert elements.rotations[0] == pytest.approx(np.pi / 2)
+    content = json.loads(path.read_text())
+    del content["results"][0]["vectors"][1]["gaussian_scales"]
+    (tmp_path / "some.json").write_text(json.dumps(content))
+    some = read_samples(tmp_path / "some.json", RESULTS_KEY, CLASSES, gaussians=True)[0]
+    assert not some["t0"].has_gaussians
+    assert some["t1"].has_gaussians
+
+
+def run_report(*arguments):
+    return run_python("tools/report.py", *arguments)
+
+
+def test_the_command_writes_the_page_and_says_its_size(case, tmp_path):
+    path, results = case
+    out = tmp_path / "report.html"
+    both = [results["good"], "--compare", results[STRANGE], "--ann", path, "--out", out]
+    done = run_report(*both, "--names", "GSMap", "MapTR")
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(rf"6 frames, 0\.\d MB: {out}\n", done.stdout)
+    assert "<title>case val: GSMap and MapTR</title>" in out.read_text()
+    failed = run_report(*both, "--names", "GSMap")
+    assert failed.returncode == 2
+    assert "--names must give 2 different names" in failed.stderr
+
+
+def test_the_package_carries_the_page():
+    config = (REPO / "pyproject.toml").read_text()
+    pattern = re.search(r'"gsmap\.report" = \["(.*)"\]', config)[1]
+    carried = {path.name for path in (REPO / "projects/GSMap/gsmap/report").glob(pattern)}
+    assert {"page.html", "page.css", "page.js"} <= carried
