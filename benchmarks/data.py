@@ -13,10 +13,10 @@ import psutil
 import shapely
 from shapely import affinity
 
-from mapdata.nuscenes.map import NuScenesLocalMap, open_layers
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import MapInstance, MapSample
 from gsmap.structures.polylines import is_closed
+from mapdata.nuscenes.map import NuScenesLocalMap, open_layers
 
 _MEGABYTE = 2**20
 _CLASSES = ("divider", "ped_crossing", "boundary")

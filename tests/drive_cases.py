@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import shapely
 
-from gsmap.datasets.annotations.record import MapSample
 from drivemaps.drive import Drive, DriveFrame
+from gsmap.datasets.annotations.record import MapSample
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import clip_to_box
 

@@ -17,10 +17,10 @@ from mmengine.structures import InstanceData
 
 import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.strict import neutral_keys
-from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.engine.launch import check_config, read_config
 from gsmap.structures.grid import BEVGrid
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
 REPO = Path(__file__).resolve().parents[1]
 BASELINES = REPO / "configs"

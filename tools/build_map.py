@@ -15,9 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
 from drivemaps.config import MergeConfig
 from drivemaps.drive import Drive, read_drive
 from drivemaps.geodetic import MapOrigin, known_origin
@@ -30,6 +27,9 @@ from drivemaps.rerun import write_rerun
 from drivemaps.scoring import figures_table, map_figures
 from drivemaps.truth import true_map
 from drivemaps.video import write_video
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.elements import elements_of_instances
+from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import file_name, write_text

@@ -15,23 +15,24 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from gsmap.apis.result_log import ResultLog
-from mapdata.command_line import parse_rate
+from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.arguments import add_config_options
 from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
-from mapdata.calibration_check import (
-    calibration_figure,
-    calibration_warnings,
-    image_warnings,
-)
-from mapdata.source import InputOptions, Source, open_input
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_bytes
 from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
+from mapdata.calibration_check import (
+    calibration_figure,
+    calibration_warnings,
+    image_warnings,
+)
+from mapdata.command_line import parse_rate
+from mapdata.inputs import InputOptions, open_input
 
 if TYPE_CHECKING:  # slow to import
     from mmdet3d.structures import Det3DDataSample

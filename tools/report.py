@@ -9,8 +9,8 @@ Examples:
 import argparse
 from pathlib import Path
 
-from gsmap.visualization.report.page import ReportOptions, report_data, write_page
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.visualization.report.page import ReportOptions, report_data, write_page
 
 
 def parse_args() -> argparse.Namespace:

@@ -13,8 +13,7 @@ from gsmap.checkpoints.reading import load_model
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
-from gsmap.apis.reframing import reframed
-from mapdata.source import Source
+from gsmap.datasets.source import Source, reframed
 from gsmap.visualization.figure import figure_to_rgb
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -218,7 +217,7 @@ def test_file_of_another_range_is_refused(inferencer, tmp_path):
         tmp_path / "a.arrow", AnnotationMeta("x", "lidar", "val"), make_samples(tmp_path, 1)
     )
     with pytest.raises(ValueError, match=r"a.arrow was made with x_range"):
-        other.dataset(tmp_path, tmp_path)
+        other.dataset(tmp_path / "a.arrow", tmp_path)
 
 
 def test_missing_config_is_named(tmp_path):

@@ -7,10 +7,10 @@ import shapely
 
 from benchmarks.data import measure_loading, open_maps, per_item_orders, tile_annotations
 from benchmarks.memory import tile_tables
-from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.structures.polylines import PADDING, equivalent_orders
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
 
 def total_length(instances: list[MapInstance], label: int) -> float:

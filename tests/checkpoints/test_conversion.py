@@ -18,13 +18,13 @@ from model_cases import (
 from predictions import stacked
 from torch import nn
 
-from gsmap.checkpoints.reading import load_weights, read_weights
 from gsmap.checkpoints.convert import (
     convert_state,
     ours_from_upstream,
     upstream_from_ours,
 )
 from gsmap.checkpoints.key_map import KEY_MAPS, MAPTR, MAPTR_BEVFORMER, find_key_map
+from gsmap.checkpoints.reading import load_weights, read_weights
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
 
 REPO = Path(__file__).resolve().parents[2]

@@ -7,9 +7,15 @@ import pytest
 import torch
 from mmdet3d.registry import MODELS
 
-from gsmap.checkpoints.reading import load_weights
 from gsmap.apis.map_inferencer import MapInferencer
-from gsmap.engine import named_models as registry
+from gsmap.checkpoints import named_models as registry
+from gsmap.checkpoints.named_models import (
+    checkpoint_for,
+    find_checkpoint,
+    find_config,
+    named_models,
+)
+from gsmap.checkpoints.reading import load_weights
 from gsmap.engine.launch import read_config
 from gsmap.checkpoints.named_models import (
     checkpoint_for,

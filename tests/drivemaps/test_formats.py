@@ -9,7 +9,6 @@ import shapely
 from drive_cases import CLASSES, drive_of
 from PIL import Image
 
-from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord
 from drivemaps.drive import DriveFrame
 from drivemaps.geodetic import MapOrigin, known_origin
 from drivemaps.geojson import write_geojson
@@ -19,6 +18,7 @@ from drivemaps.replay import Replay
 from drivemaps.rerun import write_rerun
 from drivemaps.truth import true_map
 from drivemaps.video import write_video
+from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord
 from gsmap.structures.elements import MapElements
 
 ORIGIN = MapOrigin(48.26, 11.67)

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from processes import REPO, run_python
 
-from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.checkpoint_hook import AtomicLocalBackend
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, write_results

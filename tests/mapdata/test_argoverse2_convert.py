@@ -21,6 +21,7 @@ from argoverse2_road import (
 from processes import run_python
 
 from benchmarks.argoverse2 import measure_extraction
+from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
 from mapdata.argoverse2.convert import convert_argoverse2
 from mapdata.argoverse2.log import (
     BROKEN_LOGS,
@@ -32,7 +33,6 @@ from mapdata.argoverse2.log import (
 from mapdata.argoverse2.samples import Argoverse2Options, sample_times, thin_out
 from mapdata.command_line import parse_rate
 from mapdata.export import export_json
-from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
 
 REPO = Path(__file__).resolve().parents[2]
 

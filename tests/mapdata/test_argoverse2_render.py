@@ -18,6 +18,7 @@ from argoverse2_road import (
 from av2.datasets.sensor.av2_sensor_dataloader import AV2SensorDataLoader
 from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 
+from gsmap.datasets.annotations.file import AnnotationFile
 from mapdata.argoverse2.convert import convert_argoverse2
 from mapdata.argoverse2.log import RING_CAMERAS, Argoverse2Log
 from mapdata.argoverse2.map import find_map
@@ -28,8 +29,7 @@ from mapdata.argoverse2.render import (
     scaled_camera,
 )
 from mapdata.argoverse2.samples import Argoverse2Options
-from minicity.argoverse2_scene import height_grid, lane_paint, make_scene
-from gsmap.datasets.annotations.file import AnnotationFile
+from minicity.argoverse2 import height_grid, lane_paint, make_scene
 from minicity.terrain import sample_height
 
 X, Y = ORIGIN[:2]

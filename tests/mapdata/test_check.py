@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from mapdata.check import check_files
 from gsmap.datasets.annotations.file import AnnotationFile
+from mapdata.check import check_files
 
 
 def test_a_whole_data_set_is_right_and_damage_is_named(

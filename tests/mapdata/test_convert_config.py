@@ -10,6 +10,7 @@ import upstream_configs
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
 
+from gsmap.engine.launch import check_config, read_config
 from mapdata.upstream_configs.reader import read_assignments
 from mapdata.upstream_configs.upstream import convert_upstream, merge, python_text
 from gsmap.engine.launch import check_config, read_config

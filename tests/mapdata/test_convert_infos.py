@@ -10,9 +10,9 @@ import pytest
 from fuzz.attacks import Calls
 from pyquaternion import Quaternion
 
-from mapdata.infos.convert import convert_infos
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
+from mapdata.infos.convert import convert_infos
 
 
 def split_pose(matrix: np.ndarray) -> tuple[list[float], list[float]]:

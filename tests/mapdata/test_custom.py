@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapdata.custom import from_records
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import AnnotationMeta
-from gsmap.visualization.frame_view import FRAME_VIEWS
+from gsmap.structures.frames import FRAME_VIEWS
+from mapdata.custom import from_records
 
 REPO = Path(__file__).resolve().parents[2]
 DOC = REPO / "docs/custom_data.md"

@@ -11,12 +11,12 @@ import pytest
 import shapely
 from processes import run_python
 
+from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
 from mapdata.export import export_json
 from mapdata.lane_graph import link_lanes
 from mapdata.nuscenes import convert as nuscenes
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from mapdata.nuscenes.map import MapLayers, NuScenesLocalMap
-from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
 
 REPO = Path(__file__).resolve().parents[2]
 

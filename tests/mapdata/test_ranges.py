@@ -9,12 +9,12 @@ from mmdet3d.registry import DATASETS
 from mmengine.registry import init_default_scope
 
 import gsmap.registered  # noqa: F401
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import AnnotationMeta
 from mapdata.argoverse2.convert import convert_argoverse2
 from mapdata.argoverse2.samples import Argoverse2Options
 from mapdata.custom import from_records
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
-from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.annotations.record import AnnotationMeta
 
 RANGES = [(30.0, 15.0), (50.0, 25.0), (100.0, 50.0)]  # 60 x 30, 100 x 50 and 200 x 100 m
 

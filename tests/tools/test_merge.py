@@ -14,13 +14,13 @@ import torch
 from argoverse2_road import write_log
 from mmdet3d.registry import MODELS
 
-from mapdata.custom import from_records
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
 from gsmap.engine.launch import read_config
 from gsmap.evaluation.results_json import read_samples, vectors_of, write_results
 from gsmap.structures.elements import MapElements
 from gsmap.utils.shards import WHOLE, Shard
+from mapdata.custom import from_records
 from tools import create_data, infer
 from tools.evaluate import main as evaluate
 from tools.merge import main as merge

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.colors import to_rgba
 from scipy.spatial.transform import Rotation
 
-from gsmap.datasets.annotations.record import CameraRecord
 from drivemaps.replay import Moment, Replay
+from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.structures.elements import FloatArray
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from drivemaps.drive import Drive, DriveFrame
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
-from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
+from gsmap.structures.frames import FRAME_VIEWS, FrameView
 
 SHOWN_SIGMAS = 2.0  # ellipses reach so many standard deviations
 

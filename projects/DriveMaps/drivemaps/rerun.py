@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_rgba_array
 
-from gsmap.datasets.annotations.record import CameraRecord
 from drivemaps.replay import Moment, Replay
+from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write

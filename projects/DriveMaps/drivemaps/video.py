@@ -7,13 +7,13 @@ import numpy as np
 
 from drivemaps.replay import Moment, Replay
 from gsmap.structures.elements import MapElements
+from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import camera_views
 from gsmap.visualization.figure import compose_figure, figure_to_rgb
-from gsmap.visualization.frame_view import FRAME_VIEWS
 from gsmap.visualization.style import MapStyle
 
 

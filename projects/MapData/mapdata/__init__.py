@@ -1,1 +1,1 @@
-"""Converters from data sets to annotation files."""
+"""From raw recordings to annotation files or samples: a reader for each data set and format."""

@@ -8,14 +8,14 @@ from matplotlib.figure import Figure
 
 from gsmap.datasets.annotations.record import RANGES, CameraRecord, MapSample
 from gsmap.datasets.image_files import image_size
-from gsmap.apis.reframing import ground_from_frame
+from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.elements import MapElements
+from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import camera_views
 from gsmap.visualization.figure import compose_figure
-from gsmap.visualization.frame_view import FRAME_VIEWS
 from gsmap.visualization.style import MapStyle
 
 _FARTHEST_M, _HIGHEST_M, _LOWEST_M = 20.0, 5.0, 0.15

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from mapdata.command_line import add_workers_option
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
+from mapdata.command_line import add_workers_option
 
 _SHOWN = 10
 

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import numpy as np
 import shapely
 
-from mapdata.local_map import POLYGON, vertices_of
 from gsmap.datasets.annotations.file import check_samples, write_annotations
 from gsmap.datasets.annotations.record import (
     AnnotationMeta,
@@ -24,6 +23,7 @@ from gsmap.datasets.errors import naming
 from gsmap.datasets.image_files import image_size
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.shards import WHOLE, Shard
+from mapdata.local_map import POLYGON, vertices_of
 
 _LOGGER = logging.getLogger(__name__)
 _UNMOUNTED = (

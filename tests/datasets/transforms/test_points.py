@@ -15,11 +15,11 @@ from mmengine.registry import init_default_scope
 from pyarrow import feather
 
 import gsmap.registered  # noqa: F401
+from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.transforms.points import LoadLidarPoints, LoadLidarSweeps, read_points
 from mapdata.argoverse2.convert import convert_argoverse2
 from mapdata.argoverse2.log import RING_CAMERAS
 from mapdata.argoverse2.samples import Argoverse2Options
-from gsmap.datasets.errors import BrokenSampleError
-from gsmap.datasets.transforms.points import LoadLidarPoints, LoadLidarSweeps, read_points
 
 CONFIG = Path(__file__).resolve().parents[3] / "configs/maptrv2/maptrv2_r50_av2_depth_6e.py"
 GROUND_Z_M = -0.25  # exact in float16

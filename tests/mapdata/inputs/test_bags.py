@@ -11,9 +11,9 @@ import pytest
 from bag_cases import AXLE_M, Recorder, record
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.apis.reframing import ground_from_frame, reframed
-from mapdata.source import InputOptions, open_input
+from gsmap.datasets.source import ground_from_frame, reframed
 from gsmap.structures.rigid import invert_rigid
+from mapdata.inputs import InputOptions, open_input
 
 
 @pytest.fixture(scope="module")

@@ -9,14 +9,14 @@ import yaml
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from mapdata.argoverse2.log import Argoverse2Log
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CameraRecord
-from mapdata.calibration_check import calibration_figure, calibration_warnings, image_warnings
-from gsmap.apis.reframing import ground_from_frame, sample_in_vehicle
-from mapdata.infos.recordings import read_info_file
+from gsmap.datasets.source import ground_from_frame, sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
 from gsmap.visualization.figure import figure_to_rgb
+from mapdata.argoverse2.log import Argoverse2Log
+from mapdata.calibration_check import calibration_figure, calibration_warnings, image_warnings
+from mapdata.infos.recordings import read_info_file
 from tools import infer
 
 LOG = "av2/sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede"

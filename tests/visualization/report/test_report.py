@@ -12,11 +12,11 @@ from report_case import CLASSES, FRAMES, STRANGE, write_case
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
+from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.visualization.report.frames import cameras_of, choose_frames
 from gsmap.visualization.report.page import ReportOptions, page_html, report_data
-from gsmap.visualization.frame_view import FRAME_VIEWS
 
-REPO = Path(__file__).resolve().parents[1]
+REPO = Path(__file__).resolve().parents[3]
 NO_IMAGES = ReportOptions(image_width=0)
 
 
@@ -183,6 +183,8 @@ def test_the_command_writes_the_page_and_says_its_size(case, tmp_path):
 
 def test_the_package_carries_the_page():
     config = (REPO / "pyproject.toml").read_text()
-    pattern = re.search(r'"gsmap\.report" = \["(.*)"\]', config)[1]
-    carried = {path.name for path in (REPO / "projects/GSMap/gsmap/report").glob(pattern)}
+    pattern = re.search(r'"gsmap\.visualization\.report" = \["(.*)"\]', config)[1]
+    carried = {
+        path.name for path in (REPO / "projects/GSMap/gsmap/visualization/report").glob(pattern)
+    }
     assert {"page.html", "page.css", "page.js"} <= carried

@@ -8,8 +8,8 @@ import torch
 from report_case import CLASSES, FRAMES, STRANGE, write_case
 
 from gsmap.ops.gaussian_raster import render_gaussians
-from gsmap.visualization.report.page import ReportOptions, report_data, write_page
 from gsmap.structures.grid import BEVGrid
+from gsmap.visualization.report.page import ReportOptions, report_data, write_page
 from gsmap.visualization.style import MATCH_COLOURS
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")

@@ -20,6 +20,7 @@ import torch
 from mmdet3d.registry import DATASETS, MODELS
 from mmengine.config import Config
 
+from gsmap.checkpoints.named_models import REPO, find_checkpoint
 from gsmap.checkpoints.reading import read_weights
 from gsmap.checkpoints.settings import differences, plain
 from gsmap.engine.arguments import parse_options

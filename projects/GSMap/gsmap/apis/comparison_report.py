@@ -12,8 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from mmengine.config import Config
 
-from gsmap.checkpoints.reading import read_weights
 from gsmap.apis.comparison import RECORD
+from gsmap.checkpoints.reading import read_weights
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import newest_checkpoint
 from gsmap.evaluation.chamfer_ap import ChamferConfig

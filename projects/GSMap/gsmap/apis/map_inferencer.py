@@ -128,10 +128,10 @@ class MapInferencer:
         one of the config's, all of theirs take part, however many.
 
         Args:
-            source: Whatever ``open_input`` reads or returns, or samples in the frame of the config.
+            source: An annotation file, what ``mapdata.inputs.open_input`` makes of any other
+                recording, or samples in the frame of the config.
             data_root: Folder that image paths start from; by default that of the file, or the
                 config's where an annotation file lies apart from its images.
-            **options: Further fields of ``InputOptions``, such as ``allow_missing_cameras``.
 
         Raises:
             FileNotFoundError: If a file does not exist.
@@ -140,13 +140,12 @@ class MapInferencer:
         from mapdata.source import InputOptions, Source, open_input
 
         self._files += 1
+        root = None if data_root is None else Path(data_root)
         if isinstance(source, str | Path):
-            options.setdefault("frames_dir", Path(self._scratch.name) / f"frames{self._files}")
-            root = None if data_root is None else Path(data_root)
-            source = open_input(source, InputOptions(root, **options))
+            source = annotated(source, root)
         elif not isinstance(source, Source):
             frame = self.cfg.test_dataloader.dataset.get("frame") or "lidar"
-            source = Source(source, frame, None if data_root is None else Path(data_root))
+            source = Source(source, frame, root)
         settings: dict[str, Any] = dict(self.cfg.test_dataloader.dataset)
         samples, frame = source.samples, settings.get("frame") or source.frame
         if isinstance(samples, AnnotationFile) and source.frame == frame:

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmap.datasets.annotations.record import MapSample
+from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.visualization.camera_view import viewing_azimuth
-from gsmap.visualization.frame_view import FRAME_VIEWS
 
 # Where the cameras of nuScenes and Argoverse 2 look: degrees to the left of straight ahead.
 AZIMUTHS_DEG = {

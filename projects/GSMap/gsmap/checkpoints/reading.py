@@ -14,6 +14,7 @@ from mmengine.config import Config, ConfigDict
 from torch import Tensor, nn
 
 from gsmap.checkpoints.convert import listed
+from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import MODEL_SETTINGS, STARTS, checked, differences, plain
 from gsmap.engine.launch import read_config

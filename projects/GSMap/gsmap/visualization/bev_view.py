@@ -14,8 +14,8 @@ from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 
 from gsmap.structures.elements import MapElements
+from gsmap.structures.frames import FrameView
 from gsmap.structures.grid import BEVGrid
-from gsmap.visualization.frame_view import FrameView
 from gsmap.visualization.style import FALSE_DASHES, MATCH_COLOURS, TRUTH_OPACITY, MapStyle
 
 _SCORE_PT = 6.5

@@ -17,8 +17,8 @@ from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.structures.elements import MapElements
+from gsmap.structures.frames import FrameView
 from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
-from gsmap.visualization.frame_view import FrameView
 from gsmap.visualization.style import MapStyle
 
 _STEP_M = 2.0  # a line's width follows its depth in steps of this length

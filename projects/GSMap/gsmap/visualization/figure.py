@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from gsmap.structures.elements import MapElements
+from gsmap.structures.frames import FrameView
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import atomic_write, file_name
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
-from gsmap.visualization.frame_view import FrameView
 from gsmap.visualization.style import FALSE_DASHES, MATCH_COLOURS, TRUTH_OPACITY, MapStyle
 
 DPI = 220  # so that text of 6.5 points stays legible where a picture is shown 800 px wide

@@ -16,11 +16,11 @@ from gsmap.datasets.image_files import read_image
 from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.elements import MapElements
+from gsmap.structures.frames import FRAME_VIEWS, FrameView
 from gsmap.structures.grid import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
 from gsmap.visualization.figure import compose_figure, figure_to_rgb, sample_title
-from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
 from gsmap.visualization.style import MapStyle
 
 PANELS = ("ground_truth", "prediction", "matches", "gaussians", "rasters")
@@ -131,7 +131,7 @@ class MapVisualizer(Visualizer):
         if frame not in FRAME_VIEWS:
             raise ValueError(
                 f"No view is known for frame {frame!r}, only for {sorted(FRAME_VIEWS)}; "
-                "add one to gsmap.visualization.frame_view.FRAME_VIEWS."
+                "add one to gsmap.structures.frames.FRAME_VIEWS."
             )
         view = FRAME_VIEWS[frame]
         if self.ground_z_m is not None:

@@ -8,6 +8,10 @@ from pathlib import Path
 
 import shapely
 
+from gsmap.datasets.annotations.file import AnnotationWriter
+from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
+from gsmap.utils.parallel import ordered_map
+from gsmap.utils.progress import Progress
 from mapdata.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_logs
 from mapdata.argoverse2.map import COMPAT_MODES
 from mapdata.argoverse2.samples import Argoverse2Options, LogSamples, read_log
@@ -18,10 +22,6 @@ from mapdata.command_line import (
     options_from,
 )
 from mapdata.summary import ConversionSummary
-from gsmap.datasets.annotations.file import AnnotationWriter
-from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
-from gsmap.utils.parallel import ordered_map
-from gsmap.utils.progress import Progress
 
 
 def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:

@@ -12,6 +12,8 @@ import shapely
 from av2.map.lane_segment import LaneMarkType
 from av2.map.map_api import ArgoverseStaticMap
 
+from gsmap.datasets.annotations.record import RANGES
+from gsmap.datasets.errors import naming
 from mapdata.argoverse2.rules import (
     EDGE_MARGIN_M,
     clip_lines,
@@ -23,8 +25,6 @@ from mapdata.argoverse2.rules import (
 )
 from mapdata.lane_graph import ROUND_DECIMALS, LanePaths, link_lanes
 from mapdata.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
-from gsmap.datasets.annotations.record import RANGES
-from gsmap.datasets.errors import naming
 
 COMPAT_MODES = ("maptrv2", "maptr")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", "centerline")

@@ -3,9 +3,9 @@
 from collections import Counter
 from pathlib import Path
 
+from gsmap.datasets.annotations.record import MapSample
 from mapdata.argoverse2.log import POSES
 from mapdata.argoverse2.samples import Argoverse2Options, read_log
-from gsmap.datasets.annotations.record import MapSample
 
 
 def logs_in(folder: Path) -> list[Path]:

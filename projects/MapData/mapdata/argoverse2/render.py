@@ -17,15 +17,15 @@ from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 from av2.utils.io import read_feather
 
-from mapdata.argoverse2.log import POSES, RING_CAMERAS, Argoverse2Log, find_logs
-from mapdata.argoverse2.map import find_map
-from mapdata.argoverse2.samples import thin_out
-from minicity.argoverse2_scene import make_scene
-from mapdata.command_line import add_log_options, add_workers_option, options_from
 from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import add_shard_options
+from mapdata.argoverse2.log import POSES, RING_CAMERAS, Argoverse2Log, find_logs
+from mapdata.argoverse2.map import find_map
+from mapdata.argoverse2.samples import thin_out
+from mapdata.command_line import add_log_options, add_workers_option, options_from
+from minicity.argoverse2 import make_scene
 from minicity.camera import Camera
 from minicity.lighting import random_lighting
 from minicity.renderer import SceneRenderer

@@ -8,15 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mapdata.argoverse2.log import (
-    MAX_CAMERA_OFFSET_NS,
-    MAX_LIDAR_OFFSET_NS,
-    RING_CAMERAS,
-    Argoverse2Log,
-    closest_ns,
-)
-from mapdata.argoverse2.map import Argoverse2Map, check_rules, find_map
-from mapdata.command_line import FileOptions
 from gsmap.datasets.annotations.record import (
     RANGES,
     CameraRecord,
@@ -26,6 +17,15 @@ from gsmap.datasets.annotations.record import (
     SweepRecord,
 )
 from gsmap.datasets.errors import naming
+from mapdata.argoverse2.log import (
+    MAX_CAMERA_OFFSET_NS,
+    MAX_LIDAR_OFFSET_NS,
+    RING_CAMERAS,
+    Argoverse2Log,
+    closest_ns,
+)
+from mapdata.argoverse2.map import Argoverse2Map, check_rules, find_map
+from mapdata.command_line import FileOptions
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapS
 from gsmap.apis.reframing import sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.files import write_bytes
+from mapdata.argoverse2.log import closest_ns
 
 PoseAt = Callable[[int], np.ndarray | None]
 FISHEYE_MODELS = ("equidistant", "fisheye")

@@ -13,11 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from mapdata.command_line import add_range_options
-from mapdata.nuscenes.can_bus import pose_signals
-from mapdata.nuscenes.map import NuScenesLocalMap, expansion, open_layers
-from mapdata.nuscenes.tables import pose_of
-from mapdata.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter, check_samples
 from gsmap.datasets.annotations.record import (
     CLASSES,
@@ -31,10 +26,15 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.errors import naming
 from gsmap.datasets.image_files import image_size
-from mapdata.infos.plain_pickle import load_plain_pickle
 from gsmap.utils.cli import output_file
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard, add_shard_options, digest
+from mapdata.command_line import add_range_options
+from mapdata.infos.plain_pickle import load_plain_pickle
+from mapdata.nuscenes.can_bus import pose_signals
+from mapdata.nuscenes.map import NuScenesLocalMap, expansion, open_layers
+from mapdata.nuscenes.tables import pose_of
+from mapdata.summary import ConversionSummary
 
 NUSCENES_SIZE = (1600, 900)
 _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres

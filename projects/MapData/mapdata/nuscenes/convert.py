@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 import shapely
 
-from mapdata.command_line import FileOptions, add_file_options, fingerprint, options_from
-from mapdata.nuscenes.map import MAP_CLASSES, NuScenesLocalMap, check_classes, open_layers
-from mapdata.nuscenes.tables import CAMERAS, LIDAR, NuScenesTables
-from mapdata.splits import Positions, overlap_notes, read_split_file, resolve_scenes
-from mapdata.summary import ConversionSummary
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
 from gsmap.datasets.errors import naming
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
+from mapdata.command_line import FileOptions, add_file_options, fingerprint, options_from
+from mapdata.nuscenes.map import MAP_CLASSES, NuScenesLocalMap, check_classes, open_layers
+from mapdata.nuscenes.tables import CAMERAS, LIDAR, NuScenesTables
+from mapdata.splits import Positions, overlap_notes, read_split_file, resolve_scenes
+from mapdata.summary import ConversionSummary
 
 _OFFICIAL_SPLITS = {
     "v1.0-trainval": ("train", "val"), "v1.0-mini": ("mini_train", "mini_val"),

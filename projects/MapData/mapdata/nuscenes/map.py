@@ -13,6 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
+from gsmap.datasets.annotations.record import RANGES, MapInstance
+from gsmap.datasets.errors import naming
+from gsmap.structures.classes import AREA_CLASSES
+from gsmap.structures.polylines import Points
 from mapdata.lane_graph import LaneLinks, LanePaths, link_lanes
 from mapdata.local_map import (
     POLYGON,
@@ -22,10 +26,6 @@ from mapdata.local_map import (
     rings_of,
     vertices_of,
 )
-from gsmap.datasets.annotations.record import RANGES, MapInstance
-from gsmap.datasets.errors import naming
-from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.polylines import Points
 
 if TYPE_CHECKING:
     from nuscenes.map_expansion.map_api import NuScenesMap

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from mapdata.nuscenes.tables import LIDAR, NuScenesTables
 from gsmap.datasets.annotations.record import MapSample
+from mapdata.nuscenes.tables import LIDAR, NuScenesTables
 
 
 def versions_in(root: Path) -> list[str]:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from pyquaternion import Quaternion
 
-from mapdata.nuscenes.can_bus import read_messages, signals_at
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
 from gsmap.structures.rigid import invert_rigid, rigid
+from mapdata.nuscenes.can_bus import read_messages, signals_at
 
 CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",

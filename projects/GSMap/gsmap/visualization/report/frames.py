@@ -11,9 +11,9 @@ import numpy as np
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.raster_ap import MIN_SCORE
-from gsmap.visualization.report.scores import ScoredResult
+from gsmap.structures.frames import FrameView
 from gsmap.visualization.camera_view import arrange_cameras, camera_title
-from gsmap.visualization.frame_view import FrameView
+from gsmap.visualization.report.scores import ScoredResult
 
 _JPEG_QUALITY = 70
 

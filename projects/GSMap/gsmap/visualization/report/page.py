@@ -14,13 +14,13 @@ from typing import Any
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.file_evaluation import read_ground_truth
 from gsmap.evaluation.raster_ap import MIN_SCORE
-from gsmap.visualization.report.frames import cameras_of, choose_frames, found_of, truth_of
-from gsmap.visualization.report.scores import MATCH_M, score_result
-from gsmap.visualization.report.tables import class_tables, curves, summary_table
+from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import write_text
 from gsmap.visualization.bev_view import display_extent
-from gsmap.visualization.frame_view import FRAME_VIEWS
+from gsmap.visualization.report.frames import cameras_of, choose_frames, found_of, truth_of
+from gsmap.visualization.report.scores import MATCH_M, score_result
+from gsmap.visualization.report.tables import class_tables, curves, summary_table
 from gsmap.visualization.style import MATCH_COLOURS, MapStyle
 
 

@@ -1,11 +1,9 @@
 """From whatever holds a recording to samples: the one entrance to the readers of this room."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.datasets.annotations.record import MapSample
+from gsmap.datasets.source import Source, annotated
 from mapdata.argoverse2.recordings import logs_in, read_logs
 from mapdata.bags import is_bag, read_bag
 from mapdata.folders.images import NAMES, read_image_folder
@@ -44,25 +42,6 @@ class InputOptions:
     vehicle_ground_z_m: float = 0.0
 
 
-@dataclass(frozen=True)
-class Source:
-    """The samples of an input.
-
-    Args:
-        samples: The samples.
-        frame: Their annotation frame, ``lidar`` or ``ego``.
-        data_root: Folder that image and LiDAR paths start from; None leaves it to the config.
-        has_poses: Whether the vehicle's pose is known.
-        notes: What the reader has to say.
-    """
-
-    samples: Sequence[MapSample]
-    frame: str
-    data_root: Path | None
-    has_poses: bool = True
-    notes: tuple[str, ...] = ()
-
-
 def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Source:
     """Read the samples of an input.
 
@@ -94,11 +73,7 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
     if path.is_dir():
         return _open_folder(path, options)
     if path.suffix == ".arrow":
-        annotations = AnnotationFile(path)
-        root = options.data_root
-        if root is None and _lies_with_its_images(annotations):
-            root = path.parent
-        return Source(annotations, annotations.meta.frame, root)
+        return annotated(path, options.data_root)
     if path.suffix == ".pkl":
         root = options.data_root or path.parent
         samples = read_info_file(path, root, options.allow_missing_cameras)
@@ -127,9 +102,3 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
         names = ", ".join(path.name for path in files)
         raise ValueError(f"{folder} holds several files ({names}): name one of them.")
     raise FileNotFoundError(f"{folder} holds no input: it must be {KINDS}.")
-
-
-def _lies_with_its_images(annotations: AnnotationFile) -> bool:
-    """Whether the first image of an annotation file is found from the file's own folder."""
-    cameras = annotations[0].cameras if len(annotations) else []
-    return bool(cameras) and (annotations.path.parent / cameras[0].path).is_file()

@@ -1,7 +1,7 @@
 import numpy as np
 
+from gsmap.structures.frames import FRAME_VIEWS, FrameView
 from mapdata.infos.plain_pickle import load_plain_pickle
-from gsmap.visualization.frame_view import FRAME_VIEWS, FrameView
 
 
 def test_ahead_is_up_in_both_frames():

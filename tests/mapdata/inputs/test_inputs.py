@@ -11,12 +11,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from mapdata.argoverse2.log import Argoverse2Log
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.apis.reframing import ground_from_frame, reframed
-from mapdata.source import InputOptions, open_input
+from gsmap.datasets.source import ground_from_frame, reframed
+from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.rigid import invert_rigid
-from gsmap.visualization.frame_view import FRAME_VIEWS
+from mapdata.argoverse2.log import Argoverse2Log
+from mapdata.inputs import InputOptions, open_input
 
 LOG = Path("av2/sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede")
 

@@ -1,12 +1,58 @@
-"""Samples seen from another annotation frame, so that a model runs on another vehicle's data."""
+"""Samples of any origin, also seen from another annotation frame: another vehicle's data."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
+from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.rigid import invert_rigid, rigid
-from gsmap.visualization.frame_view import FRAME_VIEWS
+
+
+@dataclass(frozen=True)
+class Source:
+    """Samples of one origin.
+
+    Args:
+        samples: The samples.
+        frame: Their annotation frame, ``lidar`` or ``ego``.
+        data_root: Folder that image and LiDAR paths start from; None leaves it to the config.
+        has_poses: Whether the vehicle's pose is known.
+        notes: What the reader has to say.
+    """
+
+    samples: Sequence[MapSample]
+    frame: str
+    data_root: Path | None
+    has_poses: bool = True
+    notes: tuple[str, ...] = ()
+
+
+def annotated(path: str | Path, data_root: Path | None = None) -> Source:
+    """Open an annotation file as a source.
+
+    Args:
+        path: The file.
+        data_root: Folder that its paths start from; by default its own where its first image is
+            found from there.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no annotation file, or damaged.
+    """
+    if Path(path).suffix != ".arrow":
+        raise ValueError(
+            f"{path} is no annotation file (.arrow): open other recordings with "
+            "mapdata.inputs.open_input and give what it returns."
+        )
+    annotations = AnnotationFile(path)
+    cameras = annotations[0].cameras if len(annotations) else []
+    if data_root is None and cameras and (annotations.path.parent / cameras[0].path).is_file():
+        data_root = annotations.path.parent
+    return Source(annotations, annotations.meta.frame, data_root)
 
 
 def _raised(height_m: float) -> np.ndarray:

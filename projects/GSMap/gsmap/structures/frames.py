@@ -4,6 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmap.structures.elements import FloatArray
+
 
 @dataclass(frozen=True)
 class FrameView:
@@ -23,7 +25,7 @@ class FrameView:
     vehicle_m: tuple[float, float, float]
     ego_ground_z_m: float = 0.0
 
-    def tilted(self, ego_from_frame: np.ndarray | None) -> "FrameView":
+    def tilted(self, ego_from_frame: FloatArray | None) -> "FrameView":
         """Return the view with the ground plane that the sensor's mounting implies.
 
         A roof LiDAR is mounted with a tilt of a degree or two, which at 20 m moves the ground by
@@ -34,7 +36,7 @@ class FrameView:
         a, b, c, height = (float(v) for v in np.asarray(ego_from_frame)[2])
         return replace(self, ground=(-a / c, -b / c, (self.ego_ground_z_m - height) / c))
 
-    def display_from_frame(self, points: np.ndarray) -> np.ndarray:
+    def display_from_frame(self, points: FloatArray) -> FloatArray:
         """Turn (x, y) of the frame into (right, ahead), both in metres. (..., >= 2) -> (..., 2)"""
         if self.forward == "y":
             return points[..., :2]
@@ -45,7 +47,7 @@ class FrameView:
         """Angle by which the display is turned against the frame, anticlockwise, in radians."""
         return 0.0 if self.forward == "y" else np.pi / 2
 
-    def lifted(self, points: np.ndarray) -> np.ndarray:
+    def lifted(self, points: FloatArray) -> FloatArray:
         """Return points with a height: their own z, or the ground plane's. (n, 2 or 3) -> (n, 3)"""
         if points.shape[-1] >= 3:
             return points[..., :3]
