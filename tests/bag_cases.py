@@ -8,7 +8,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from gsmap.apis.reframing import ground_from_frame
+from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.rigid import invert_rigid
 
 AXLE_M = 0.3  # height of base_link above the road

@@ -12,7 +12,7 @@ from gsmap.utils.lazy import lazy_names
 NAMES = [
     *("gsmap.BEVGrid", "gsmap.MapElements", "gsmap.MapEvaluator", "gsmap.MapInferencer"),
     *("gsmap.RasterLoss", "gsmap.list_models", "gsmap.load_model", "gsmap.render_gaussians"),
-    *("gsmap.write_geojson", "gsmap.apis.MapInferencer", "gsmap.apis.load_model"),
+    *("drivemaps.write_geojson", "gsmap.apis.MapInferencer", "gsmap.apis.load_model"),
     *("gsmap.datasets.VectorizedMapDataset", "gsmap.evaluation.ChamferConfig"),
     *("gsmap.evaluation.MapEvaluator", "gsmap.evaluation.RasterConfig", "drivemaps.MapOrigin"),
     *("gsmap.models.GSMapHead", "gsmap.models.MapDetector", "gsmap.models.RasterLoss"),

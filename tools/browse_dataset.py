@@ -9,10 +9,10 @@ import argparse
 from pathlib import Path
 
 from gsmap.engine.arguments import add_config_options
-from gsmap.visualization.report.page import ReportOptions, report_data, write_page
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.progress import Progress
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
+from gsmap.visualization.report.page import ReportOptions, report_data, write_page
 
 
 def parse_args() -> argparse.Namespace:

@@ -15,8 +15,8 @@ def main() -> str:
         raise FileExistsError(f"{args.target} exists already: choose another name or remove it.")
     import torch
 
-    from gsmap.checkpoints.reading import read_weights
     from gsmap.checkpoints.convert import convert_state
+    from gsmap.checkpoints.reading import read_weights
 
     weights = read_weights(args.source)
     try:

@@ -8,11 +8,11 @@ The file is read, not run. Settings without a counterpart are printed. Example:
 import argparse
 from pathlib import Path
 
-from mapdata.upstream_configs.reader import read_assignments
-from mapdata.upstream_configs.upstream import convert_upstream, merge, python_text
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.shipped import shipped
+from mapdata.upstream_configs.reader import read_assignments
+from mapdata.upstream_configs.upstream import convert_upstream, merge, python_text
 
 
 def parse_args() -> argparse.Namespace:

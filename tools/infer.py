@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 from gsmap.apis.result_log import ResultLog
 from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.source import Source
 from gsmap.engine.arguments import add_config_options
-from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_bytes

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from mmengine.config import Config
 
-from gsmap.engine.arguments import add_common_arguments
 from gsmap.checkpoints.named_models import checkpoint_for
+from gsmap.engine.arguments import add_common_arguments
 from gsmap.utils.cli import CommandParser, is_first_rank, output_file, run_command
 from gsmap.utils.files import write_text
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from mmengine.config import Config
 
-from gsmap.engine.arguments import add_common_arguments
 from gsmap.checkpoints.named_models import find_checkpoint
+from gsmap.engine.arguments import add_common_arguments
 from gsmap.utils.cli import CommandParser, is_first_rank, run_command
 from gsmap.utils.files import lock_folder
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from mmengine.config import Config
 
-from gsmap.checkpoints.reading import load_model
+from gsmap.apis.loading import load_model
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample

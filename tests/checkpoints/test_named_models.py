@@ -13,17 +13,11 @@ from gsmap.checkpoints.named_models import (
     checkpoint_for,
     find_checkpoint,
     find_config,
+    list_models,
     named_models,
 )
 from gsmap.checkpoints.reading import load_weights
 from gsmap.engine.launch import read_config
-from gsmap.checkpoints.named_models import (
-    checkpoint_for,
-    find_checkpoint,
-    find_config,
-    list_models,
-    named_models,
-)
 from gsmap.utils.shipped import shipped
 
 SHIPPED = [name for name, model in named_models().items() if model.address is None]

@@ -30,16 +30,8 @@ from mmengine.config import Config
 from pyarrow.feather import write_feather
 
 from fuzz import contents, mutations
-from gsmap.checkpoints.reading import read_weights
 from gsmap.apis.onnx_inferencer import OnnxInferencer
-from mapdata.argoverse2.samples import Argoverse2Options, read_log
-from mapdata.custom import from_records
-from mapdata.infos.convert import convert_infos
-from mapdata.nuscenes.can_bus import read_messages, signals_at
-from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
-from mapdata.nuscenes.map import NuScenesLocalMap, open_layers
-from mapdata.nuscenes.tables import LIDAR, NuScenesTables
-from mapdata.splits import read_split_file
+from gsmap.checkpoints.reading import read_weights
 from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
@@ -55,13 +47,21 @@ from gsmap.evaluation.match_files import write_matches
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, vectors_of, write_results
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
-from mapdata.bags import read_bag
-from mapdata.folders.images import read_image_folder
-from mapdata.infos.recordings import read_info_file
-from mapdata.folders.rig import Recording
 from gsmap.structures.elements import MapElements
 from gsmap.utils.faults import in_words
 from gsmap.utils.shards import Shard, digest
+from mapdata.argoverse2.samples import Argoverse2Options, read_log
+from mapdata.bags import read_bag
+from mapdata.custom import from_records
+from mapdata.folders.images import read_image_folder
+from mapdata.folders.rig import Recording
+from mapdata.infos.convert import convert_infos
+from mapdata.infos.recordings import read_info_file
+from mapdata.nuscenes.can_bus import read_messages, signals_at
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
+from mapdata.nuscenes.map import NuScenesLocalMap, open_layers
+from mapdata.nuscenes.tables import LIDAR, NuScenesTables
+from mapdata.splits import read_split_file
 from tools.build_map import main as build_map
 from tools.convert_config import convert
 from tools.merge import main as merge

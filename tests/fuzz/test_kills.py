@@ -14,6 +14,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.checkpoint_hook import AtomicLocalBackend
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, write_results
 from gsmap.utils.files import SUFFIX
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
 SPLITS = [f"gsmap_minicity_{split}.arrow" for split in ("train", "val")]
 

@@ -14,10 +14,10 @@ import yaml
 from bag_cases import Recorder, record
 
 from fuzz.mutations import damaged_column, write
-from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.evaluation.results_json import write_results
-from mapdata.source import InputOptions, open_input
+from mapdata.inputs import InputOptions, open_input
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from tools.build_map import main as build_map
 
 

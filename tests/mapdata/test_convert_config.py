@@ -13,7 +13,6 @@ from mmengine.config import Config
 from gsmap.engine.launch import check_config, read_config
 from mapdata.upstream_configs.reader import read_assignments
 from mapdata.upstream_configs.upstream import convert_upstream, merge, python_text
-from gsmap.engine.launch import check_config, read_config
 
 REPO = Path(__file__).resolve().parents[2]
 # every config there has one; it is not followed

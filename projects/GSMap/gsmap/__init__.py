@@ -23,9 +23,8 @@ __getattr__, __dir__, __all__ = lazy_names(
         "MapEvaluator": "evaluation",
         "MapInferencer": "apis",
         "RasterLoss": "models",
-        "list_models": "engine.named_models",
+        "list_models": "checkpoints.named_models",
         "load_model": "apis",
         "render_gaussians": "ops",
-        "write_geojson": "maps",
     },
 )

@@ -11,9 +11,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mapdata.argoverse2.samples import thin_out
 from gsmap.datasets.errors import naming
 from gsmap.datasets.image_files import decode_image
+from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.extras import import_extra
+from gsmap.utils.files import file_name, write_bytes
+from mapdata.argoverse2.samples import thin_out
 from mapdata.folders.rig import (
     PoseAt,
     PoseTrack,
@@ -24,9 +27,6 @@ from mapdata.folders.rig import (
     rig_samples,
     rotation_of,
 )
-from gsmap.structures.rigid import invert_rigid, rigid
-from gsmap.utils.extras import import_extra
-from gsmap.utils.files import file_name, write_bytes
 
 _IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 _INFO, _ODOMETRY = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"

@@ -6,6 +6,6 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "MapInferencer": "map_inferencer",
-        "load_model": "checkpoint",
+        "load_model": "loading",
     },
 )

@@ -20,13 +20,12 @@ import torch
 from mmdet3d.registry import DATASETS, MODELS
 from mmengine.config import Config
 
-from gsmap.checkpoints.named_models import REPO, find_checkpoint
+from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.checkpoints.reading import read_weights
 from gsmap.checkpoints.settings import differences, plain
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
 from gsmap.engine.launch import check_config, read_config
-from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.utils.shards import digest
 from gsmap.utils.shipped import shipped
 

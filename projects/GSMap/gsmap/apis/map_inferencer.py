@@ -16,14 +16,14 @@ from mmdet3d.registry import DATASETS
 from mmengine.config import Config
 from torch.utils.data import DataLoader, Subset
 
-from gsmap.checkpoints.reading import load_model
 from gsmap.apis.frame_loader import BrokenFrame, FrameDataset, collate
+from gsmap.apis.loading import load_model
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_predictions
-from gsmap.evaluation.results_json import vectors_of
-from gsmap.apis.reframing import reframed
 from gsmap.datasets.memory import Cameras, frame_in_memory
+from gsmap.datasets.source import Source, annotated, reframed
+from gsmap.evaluation.results_json import vectors_of
 from gsmap.structures.elements import MapElements
 
 if TYPE_CHECKING:  # slow to import, and of no use before there is a model
@@ -31,7 +31,6 @@ if TYPE_CHECKING:  # slow to import, and of no use before there is a model
     from mmdet3d.structures import Det3DDataSample
 
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
-    from mapdata.source import Source
     from gsmap.visualization.map_visualizer import MapVisualizer
 
 _LOOK_AT = 100  # samples whose cameras are an input's
@@ -118,9 +117,8 @@ class MapInferencer:
 
     def dataset(
         self,
-        source: "str | Path | Source | Sequence[MapSample]",
+        source: str | Path | Source | Sequence[MapSample],
         data_root: str | Path | None = None,
-        **options: Any,
     ) -> "VectorizedMapDataset":
         """Open samples as the config's test data set, with its pipeline.
 
@@ -137,8 +135,6 @@ class MapInferencer:
             FileNotFoundError: If a file does not exist.
             ValueError: If a file cannot be used with this config; the message says why.
         """
-        from mapdata.source import InputOptions, Source, open_input
-
         self._files += 1
         root = None if data_root is None else Path(data_root)
         if isinstance(source, str | Path):
@@ -325,8 +321,6 @@ class MapInferencer:
             ValueError: If an array has another shape, a matrix is none of its kind, the cameras of
                 the arguments differ, or they are not those of the model.
         """
-        from mapdata.source import Source
-
         config = self.cfg.test_dataloader.dataset
         frame = frame or config.get("frame") or "lidar"
         sample, pixels = frame_in_memory(images, intrinsics, cam_from_frame, frame)
@@ -356,7 +350,7 @@ class MapInferencer:
 
     def __call__(
         self,
-        source: "str | Path | Source | Sequence[MapSample]",
+        source: str | Path | Source | Sequence[MapSample],
         data_root: str | Path | None = None,
     ) -> "list[Det3DDataSample]":
         """Predict all samples of a source; arguments as in ``dataset``."""

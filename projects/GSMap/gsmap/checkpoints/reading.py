@@ -1,7 +1,6 @@
 """Weights from a checkpoint into a model, or an error that says what to do."""
 
 import json
-import logging
 import pickle
 import zipfile
 from collections.abc import Mapping
@@ -17,11 +16,8 @@ from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import MODEL_SETTINGS, STARTS, checked, differences, plain
-from gsmap.engine.launch import read_config
-from gsmap.checkpoints.named_models import find_checkpoint, named_models
 from gsmap.utils.faults import in_words
 
-_LOGGER = logging.getLogger(__name__)
 # what torch's reader raises on bytes that make no sense
 _DAMAGE = (
     RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, ValueError,
@@ -162,37 +158,3 @@ def load_weights(model: nn.Module, path: str | Path) -> None:
             f"{listed(result.unexpected_keys)} too many. Give the config that it was trained with "
             "(a copy lies beside it in the work folder)."
         )
-
-
-def load_model(
-    config: str | Path | Config,
-    checkpoint: str | Path | None = None,
-    device: str | torch.device = "cpu",
-    cfg_options: dict | None = None,
-) -> Any:
-    """Build a model and load its weights, ready to predict.
-
-    Args:
-        config: Config file, a ``Config``, or the name of a model (``list_models``).
-        checkpoint: File or name. None means the named model's; without a name, initial weights.
-        device: Where the model is.
-        cfg_options: Overrides of the config, by dotted name.
-
-    Returns:
-        The torch module, in evaluation mode; ``model.cfg`` is its config, as it was trained.
-
-    Raises:
-        FileNotFoundError: If the config or the checkpoint does not exist.
-        ValueError: If the checkpoint belongs to another architecture, or cannot be read.
-    """
-    cfg = read_config(config, cfg_options)
-    if checkpoint is None and str(config) in named_models():
-        checkpoint = str(config)
-    if checkpoint is not None:
-        for line in adopt_settings(cfg, checkpoint, cfg_options):
-            _LOGGER.warning(line)
-    model = MODELS.build(cfg.model)
-    if checkpoint is not None:
-        load_weights(model, checkpoint)
-    model.cfg = cfg
-    return model.to(device).eval()

@@ -5,9 +5,9 @@ from gsmap.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "GSMapHead": "heads.gsmap_head",
-        "MapDetector": "detectors.map_detector",
-        "MapHead": "heads.map_head",
-        "RasterLoss": "losses.raster",
+        "GSMapHead": "gsmap.head",
+        "MapDetector": "detector",
+        "MapHead": "maptr.head",
+        "RasterLoss": "gsmap.losses",
     },
 )

@@ -8,10 +8,8 @@ from gsmap.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "FRAME_VIEWS": "frame_view",
         "BEVPanel": "bev_view",
         "CameraView": "camera_view",
-        "FrameView": "frame_view",
         "MapStyle": "style",
         "MapVisualizer": "map_visualizer",
         "compose_figure": "figure",

@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError, naming
 from gsmap.datasets.image_files import image_size, read_image
+from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
+from gsmap.utils.files import file_name
 from mapdata.folders.rig import (
     PoseTrack,
     Recording,
@@ -26,8 +28,6 @@ from mapdata.folders.rig import (
     rig_samples,
     rotation_of,
 )
-from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
-from gsmap.utils.files import file_name
 
 NAMES = ("calibration.yaml", "calibration.yml", "calibration.json")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")

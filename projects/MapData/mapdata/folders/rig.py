@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from mapdata.argoverse2.log import closest_ns
 from gsmap.datasets.annotations.file import check_samples
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapSample
-from gsmap.apis.reframing import sample_in_vehicle
+from gsmap.datasets.source import sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.files import write_bytes
 from mapdata.argoverse2.log import closest_ns
