@@ -1,9 +1,11 @@
 """``tools/infer.py`` in this process: a nuScenes-format root, broken frames, a killed run."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
+from bag_cases import AXLE_M, Recorder, record
 from mmdet3d.registry import MODELS
 
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -119,3 +121,22 @@ def test_nothing_to_do_and_no_usable_frame_are_named(drive, model, tmp_path):
     (tmp_path / "drive/samples").unlink()
     with pytest.raises(ValueError, match=r"no frame can be used: sample .* no image at"):
         infer.main([str(drive), "--model", *model, "--out", str(tmp_path / "m.json")])
+
+
+def test_a_bag_with_one_bad_image_loses_one_frame(
+    model, minicity_root, minicity_annotations, tmp_path, capsys
+):
+    first, *others = AnnotationFile(minicity_annotations["val"])
+    (tmp_path / "bad.jpg").write_bytes(b"")
+    bad = replace(first.cameras[0], path=str(tmp_path / "bad.jpg"))
+    recorder = Recorder(tmp_path / "drive", "sqlite")
+    record(recorder, [replace(first, cameras=[bad, *first.cameras[1:]]), *others], minicity_root)
+    words = [str(recorder.path), "--out", str(tmp_path / "map.json"), "--rate", "all"]
+    with pytest.raises(SystemExit) as end:
+        infer.main([*words, "--vehicle-ground-z", str(-AXLE_M), "--model", *model])
+    assert end.value.code == infer.SKIPPED
+    printed = capsys.readouterr().out
+    time_ns = first.timestamp_ns
+    assert f"camera '{bad.name}', image at {time_ns} ns: its message is not an image" in printed
+    assert f"1 broken frames skipped: drive_{time_ns}\n" in printed
+    assert len(results(tmp_path / "map.json")) == len(others)
