@@ -1,6 +1,7 @@
 import errno
 import fcntl
 import os
+import resource
 import signal
 import stat
 import subprocess
@@ -191,3 +192,23 @@ def test_what_stops_a_writer_is_said_of_the_file_that_was_asked_for(tmp_path, mo
     with pytest.raises(OSError, match=r"No space left on device: '.*/a'$"):
         write_text(tmp_path / "a", "")
     assert os.listdir(tmp_path) == ["folder"]
+
+
+def test_a_full_disk_is_told_whatever_a_library_says_of_it(tmp_path):
+    """Writers of films and of MCAP have errors of their own for it."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def write() -> None:
+        with atomic_write(tmp_path / "a", "wb") as file:
+            try:
+                file.write(bytes(100_000))
+            except OSError:
+                raise RuntimeError("error in callback") from None
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"File too large: '.*/a'$"):
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert os.listdir(tmp_path) == []
