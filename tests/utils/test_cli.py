@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -159,6 +160,21 @@ def test_a_full_disk_is_one_line(capsys):
         "error: [Errno 28] No space left on device: '/dev/full'; free some space there, or write "
         "elsewhere.\n"
     )
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_full_disk_in_a_thread_is_one_line_too(capsys, monkeypatch):
+    def log() -> None:
+        thread = threading.Thread(target=full_disk)
+        thread.start()
+        thread.join()
+
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)  # put back afterwards
+    run_command(log)
+    error = capsys.readouterr().err
+    assert error.startswith("error: [Errno 28] No space left on device: '/dev/full'; free some")
+    assert error.count("\n") == 1
 
 
 def bad_check(text: str) -> None:

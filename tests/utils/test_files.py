@@ -1,6 +1,7 @@
 import errno
 import fcntl
 import os
+import resource
 import signal
 import stat
 import subprocess
@@ -209,3 +210,23 @@ def test_a_foreign_name_becomes_one_part_of_a_path(name, tmp_path):
 def test_a_good_name_stays_and_two_names_never_make_one_file():
     assert file_name("scene-0001_Straße.+=") == "scene-0001_Straße.+="
     assert len({file_name(name) for name in ("a_b", "a/b", "a\\b", "a b", "/a_b")}) == 5
+
+
+def test_a_full_disk_is_told_whatever_a_library_says_of_it(tmp_path):
+    """Writers of films and of MCAP have errors of their own for it."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def write() -> None:
+        with atomic_write(tmp_path / "a", "wb") as file:
+            try:
+                file.write(bytes(100_000))
+            except OSError:
+                raise RuntimeError("error in callback") from None
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"File too large: '.*/a'$"):
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert os.listdir(tmp_path) == []

@@ -148,7 +148,7 @@ def newest_checkpoint(
         if (match := re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name))
     }
     for path in sorted(numbers, key=numbers.__getitem__, reverse=True):
-        reason = f"{path} is damaged"
+        reason = f"{path} is damaged and is passed over."
         try:
             with zipfile.ZipFile(path) as archive:
                 if archive.testzip() is None:
@@ -158,8 +158,8 @@ def newest_checkpoint(
         except zipfile.BadZipFile:
             pass
         except ValueError as error:
-            reason = str(error)
-        print_log(f"{reason} It is passed over.", level=logging.WARNING)
+            reason = f"{error} It is passed over."
+        print_log(reason, level=logging.WARNING)
     return None
 
 

@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -120,6 +121,7 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
             better die at once.
     """
     logging.raiseExceptions = False  # a log file on a full disk is no reason for tracebacks
+    threading.excepthook = _end_of_thread
     end = _End()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
     os.register_at_fork(after_in_child=die_with_parent)
@@ -141,11 +143,23 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
             os._exit(128 + signal.SIGINT)  # the interpreter's own end would wait for other ranks
         sys.exit(128 + signal.SIGINT)
     except Exception as error:
-        text = None if os.environ.get("GSMAP_TRACEBACK") else in_words(error)
-        if text is None:
+        if not _say(error):
             raise
-        sys.stderr.write(f"error: {' '.join(text.split())}\n")
         sys.exit(BAD_INPUT)
+
+
+def _say(error: BaseException | None) -> bool:
+    """Say in a line what a user can cause; whether the error is such."""
+    words = error is not None and not os.environ.get("GSMAP_TRACEBACK") and in_words(error)
+    if words:
+        sys.stderr.write(f"error: {' '.join(words.split())}\n")
+    return bool(words)
+
+
+def _end_of_thread(args: Any) -> None:
+    """Say why a library's thread ended, such as that of a log on a full disk."""
+    if not _say(args.exc_value):
+        threading.__excepthook__(args)
 
 
 class _End:

@@ -2,6 +2,7 @@
 
 import fcntl
 import hashlib
+import io
 import logging
 import os
 import platform
@@ -52,16 +53,39 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
             yield file
         return
     path.parent.mkdir(parents=True, exist_ok=True)
+    failures: list[OSError] = []
     try:
-        with partial_path(path) as made, made.open(mode, encoding=encoding) as file:
+        with (
+            partial_path(path) as made,
+            io.BufferedWriter(_Raw(made, failures)) as buffer,
+            buffer if encoding is None else io.TextIOWrapper(buffer, encoding) as file,
+        ):
             yield file
             file.flush()
             os.fsync(file.fileno())
             os.replace(made, path)
-    except OSError as error:
-        if error.errno and (not error.filename or _OURS.fullmatch(str(error.filename))):
-            raise type(error)(error.errno, error.strerror, str(path)) from error
-        raise
+    except Exception as raised:
+        error = failures[0] if failures else raised
+        if not isinstance(error, OSError) or not error.errno:
+            raise
+        if error.filename and not _OURS.fullmatch(str(error.filename)):
+            raise
+        raise type(error)(error.errno, error.strerror, str(path)) from raised
+
+
+class _Raw(io.FileIO):
+    """A file that notes why it cannot be written: some libraries tell it in words of their own."""
+
+    def __init__(self, path: Path, failures: list[OSError]) -> None:
+        super().__init__(path, "w")
+        self._failures = failures
+
+    def write(self, data: Any) -> int | None:  # type: ignore[override]
+        try:
+            return super().write(data)
+        except OSError as error:
+            self._failures.append(error)
+            raise
 
 
 def write_text(path: str | Path, text: str) -> None:
