@@ -4,6 +4,7 @@ An editable installation reads the repository itself (`gsmap.utils.shipped`).
 """
 
 import json
+import shutil
 from pathlib import Path
 
 from setuptools import setup
@@ -26,10 +27,13 @@ class BuildPackage(build_py):
     """Copies the modules, and what comes with them."""
 
     def run(self) -> None:
-        """Build; an editable installation needs no copies."""
+        """Build without what an earlier build left; an editable installation needs no copies."""
+        package = Path(self.build_lib, "gsmap")
+        if package.is_dir() and not self.editable_mode:
+            shutil.rmtree(package)
         super().run()
         for file in [] if self.editable_mode else shipped_files():
-            target = Path(self.build_lib, "gsmap/.mim", file)
+            target = package / ".mim" / file
             self.mkpath(str(target.parent))
             self.copy_file(file, str(target))
 

@@ -140,9 +140,9 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     elif program == "make":
         assert re.search(rf"^{rest[0]}:", (REPO / "Makefile").read_text(), re.MULTILINE), words
     elif program == "pip":
-        extra = re.fullmatch(r"\.\[(\w+)\]", rest[-1])
-        assert extra, words
-        assert f"\n{extra[1]} = [" in (REPO / "pyproject.toml").read_text()
+        place = re.fullmatch(r"\.(?:\[(\w+)\])?|pyproj", rest[-1])
+        assert place, words
+        assert f"\n{place[1]} = [" in (REPO / "pyproject.toml").read_text() or not place[1]
     else:
         known = ("cp", "source", "trtexec") if program != "python" else (program,)
         assert program in known, words

@@ -42,6 +42,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copy(part, copy)
     shutil.copytree(REPO / "models", copy / "models")
     (copy / "models/maptr_tiny_r50_24e.pth").write_bytes(b"fetched by its user")
+    (copy / "build/lib/gsmap").mkdir(parents=True)
+    (copy / "build/lib/gsmap/gone.py").write_text("built from an earlier version")
     return copy
 
 
@@ -90,6 +92,7 @@ def test_the_wheel_holds_the_models_that_ship_and_scripts_that_run(site):
     shipped = {path.name for path in (site / "gsmap/.mim/models").iterdir()}
     weights = {"gsmap_r18_minicity.pth", "maptr_r18_minicity.pth"}
     assert shipped == {"registry.json", "README.md", *weights}
+    assert not (site / "gsmap/gone.py").exists()
     assert os.access(site / "gsmap/.mim/tools/dist_train.sh", os.X_OK)
 
 
