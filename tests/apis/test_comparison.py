@@ -190,7 +190,7 @@ def test_the_config_in_a_runs_folder_says_seed_and_data_and_is_not_run(
     attacks = {
         f"import pathlib; pathlib.Path({str(marker)!r}).touch()": "only assignments",
         f"randomness = dict(seed=open({str(marker)!r}, 'w'))": r"open\(\) is not called",
-        "_base_ = 'evil.py'\nrandomness = dict(seed='x')": "the seed in its config must be a number, got 'x'",
+        "_base_ = 'evil.py'\nrandomness = dict(seed='x')": "must be a number, got 'x'",
         None: r"holds no 2\*/vis_data/config.py, which tools/train.py writes",
     }
     for number, (attack, message) in enumerate(attacks.items()):

@@ -1,5 +1,6 @@
 """Every reader of files with something whole to read, and what of its results can be checked."""
 
+import copy
 import json
 import pickle
 import shutil
@@ -21,7 +22,9 @@ from mmengine.config import Config
 from pyarrow.feather import write_feather
 
 from fuzz import contents, mutations
-from gsmap.apis.checkpoint import read_weights
+from fuzz.attacks import CONFIG
+from gsmap.apis.checkpoint import adopt_settings, read_weights
+from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
 from gsmap.converters.argoverse2.samples import Argoverse2Options, read_log
 from gsmap.converters.custom import from_records
 from gsmap.converters.infos import convert_infos
@@ -181,6 +184,7 @@ class Files:
             "LiDAR sweep": self.points,
             "LiDAR sweep, Argoverse 2": self.feather,
             "checkpoint": self.weights,
+            "settings in a checkpoint": self.settings,
         }
         for name in tables:
             path = self.work / VERSION / f"{name}.json"
@@ -258,9 +262,10 @@ class Files:
 
         def read() -> str:
             convert(path, target)
+            Config.fromfile(target, import_custom_modules=False)
             return target.read_text()
 
-        return Reader(path, read, (mutations.damaged_bytes,))
+        return Reader(path, read, (mutations.damaged_bytes, mutations.damaged_source))
 
     def image(self, suffix: str) -> Reader:
         content = cv2.imencode(
@@ -321,3 +326,17 @@ class Files:
         path = self.work / "weights.pth"
         torch.save({"state_dict": {"a.weight": torch.ones(4, 3)}, "meta": {"epoch": 1}}, path)
         return Reader(path, lambda: read_weights(path), (mutations.damaged_bytes,))
+
+    def settings(self) -> Reader:
+        path = self.work / "trained.pth"
+        cfg = read_config(CONFIG)
+        content = {"state_dict": {"a.weight": torch.ones(4, 3)}}
+        meta = {MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict()))}
+        torch.save({**content, "meta": meta}, path)
+
+        def read() -> Any:
+            changed = copy.copy(cfg)
+            adopt_settings(changed, path, None)
+            return plain(changed.model.to_dict())
+
+        return Reader(path, read, (mutations.damaged_settings,))
