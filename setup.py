@@ -12,7 +12,7 @@ from setuptools.command.build_py import build_py
 
 PATTERNS = (
     *("configs/**/*.py", "configs/*.json", "projects/GSMap/configs/*.py"),
-    *("tools/*.py", "tools/*.sh", "models/registry.json", "models/README.md"),
+    *("tools/**/*.py", "tools/*.sh", "models/registry.json", "models/README.md"),
 )
 
 

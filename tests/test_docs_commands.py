@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from comparison.plan import parse_entry
 
-from gsmap.apis.comparison import parse_entry
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.launch import check_config, read_config
 

@@ -13,6 +13,7 @@ ROOTS = {
     "minicity": REPO / "projects/MiniCity/minicity",
     "benchmarks": REPO / "benchmarks",
     "tools": REPO / "tools",
+    "comparison": REPO / "tools/comparison",
 }
 OPENMMLAB = {"mmengine", "mmcv", "mmdet", "mmdet3d"}
 
@@ -33,6 +34,10 @@ ALLOWED = {
     "mapdata": {"datasets", "minicity", "structures", "utils", "visualization"},
     "drivemaps": {"datasets", "evaluation", "structures", "utils", "visualization"},
     "minicity": {"utils"},
+    "comparison": {
+        "checkpoints", "datasets", "engine", "evaluation", "mapdata", "structures", "utils",
+        "visualization",
+    },
 }  # fmt: skip
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 

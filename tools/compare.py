@@ -22,11 +22,9 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from mmengine.config import DictAction
-
-from gsmap.apis.comparison import Protocol, Run, parse_entry, plan
-from gsmap.apis.comparison_jobs import execute
-from gsmap.apis.comparison_report import (
+from comparison.jobs import execute
+from comparison.plan import Protocol, Run, parse_entry, plan
+from comparison.report import (
     apply_rescoring,
     as_json,
     check_one_test_set,
@@ -34,6 +32,8 @@ from gsmap.apis.comparison_report import (
     plot_iterations,
     read_result,
 )
+from mmengine.config import DictAction
+
 from gsmap.engine.arguments import data_root_options
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text

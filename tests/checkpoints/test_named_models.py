@@ -1,6 +1,7 @@
 """Models by name: the registry, its files and its errors."""
 
 import hashlib
+import re
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ SHIPPED = [name for name, model in named_models().items() if model.address is No
 
 def test_every_model_has_a_config_and_says_where_its_file_is():
     for model in named_models().values():
+        assert re.fullmatch(r"\w+", model.name)  # of a file in models/
         assert shipped(model.config).is_file(), model.name
         assert model.file.is_file() == (model.address is None), model.name
         assert model.address is None or model.address.startswith("https://")
@@ -86,6 +88,21 @@ def test_a_damaged_file_is_refused(tmp_path, monkeypatch):
     assert list_models() == ["gsmap_r18_minicity"]
     with pytest.raises(ValueError, match=r"damaged or another file: its sha256"):
         find_checkpoint("gsmap_r18_minicity")
+
+
+def test_a_file_without_a_known_digest_is_called_unverified_once(tmp_path, monkeypatch):
+    named_models()
+    monkeypatch.setattr(registry, "REGISTRY", tmp_path / "registry.json")
+    said = []
+    monkeypatch.setattr(registry, "print_log", lambda text, **_: said.append(text))
+    for name in ("maptr_tiny_r50_24e", "gsmap_r18_minicity"):
+        (tmp_path / f"{name}.pth").write_bytes(b"whole")
+    assert find_checkpoint("maptr_tiny_r50_24e") == find_checkpoint("maptr_tiny_r50_24e")
+    digest = hashlib.sha256(b"whole").hexdigest()
+    assert said == [
+        f"{tmp_path}/maptr_tiny_r50_24e.pth is not verified: github.com/hustvl/MapTR gives no "
+        f"sha256 for maptr_tiny_r50_24e; that of this file is {digest}."
+    ]
 
 
 def test_a_config_file_needs_a_checkpoint_and_a_name_does_not():

@@ -125,10 +125,16 @@ def corpus(folder: Path) -> dict[str, bytes]:
     return found | {name: _whole(body) for name, body in raw.items()}
 
 
-def settings_corpus(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    """Return model settings that a checkpoint may hold, by what they try; writes the module."""
+def plant(folder: Path) -> str:
+    """Write the module, and return the name of its marker."""
     marker = str(folder / MARKER)
     (folder / f"{PLANTED}.py").write_text(f"open({marker!r}, 'w').close()\nprint(end='')\n")
+    return marker
+
+
+def settings_corpus(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """Return model settings that a checkpoint may hold, by what they try; writes the module."""
+    marker = plant(folder)
     make = {"type": "os.makedirs", "name": marker}
     head = settings["map_head"]
     tried: dict[str, dict[str, Any]] = {  # img_augment is not used when a model is tested

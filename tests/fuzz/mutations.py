@@ -1,18 +1,21 @@
 """Ways to damage a file: its bytes, or the values that it holds."""
 
 import copy
+import io
 import json
 import math
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import pyarrow as pa
+import torch
 import yaml
 
+from gsmap.checkpoints.settings import MODEL_SETTINGS
 from gsmap.datasets.annotations.schema import FIELDS
 
 ODD = (
@@ -27,6 +30,19 @@ _BOMB = "a: &a [0]\n" + "".join(
     f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n"
     for before, name in pairwise("abcdefghijklmn")
 )
+
+# each ends the process, should it run
+HOSTILE = (
+    {"type": "os.abort"}, [{"type": "os.abort"}], {"type": "mmdet.os.abort"}, {"type": "abort"},
+    {"type": "GridMask", "_scope_": "antigravity"}, {"type": ["os.abort"]}, "os.abort",
+    {"type": "mmdet.CameraMotionCompensation", "warp_mode": "__import__('os').abort()"},
+    {"x': __import__('os').abort(), 'y": 1}, {"x=__import__('os').abort(), y": 1},
+    {"x": "\"{{$NOPE:b'}}", "y": ",__import__('os').abort(),"},
+)  # fmt: skip
+GROWING = (
+    "x = [0]\n" + "x = x + x\n" * 60, "x = 9\n" + "x = x * x\n" * 60, "x = 1\n" + "x = [x]\n" * 600,
+    "x = " + "-" * 9000 + "1\n", "x = " + "(" * 900 + "1" + ")" * 900 + "\n",
+)  # fmt: skip
 
 
 def damaged_bytes(content: bytes, rng: Random) -> bytes:
@@ -56,7 +72,7 @@ def damaged_bytes(content: bytes, rng: Random) -> bytes:
     return bytes(data)
 
 
-def damaged_value(value: Any, rng: Random) -> Any:
+def damaged_value(value: Any, rng: Random, odd: Sequence[Any] = ODD) -> Any:
     """Return a copy with one part, somewhere inside, replaced, dropped, repeated or scaled."""
     value = copy.deepcopy(value)
     holder, place = [value], 0
@@ -76,7 +92,7 @@ def damaged_value(value: Any, rng: Random) -> Any:
         other = rng.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
         holder[place], holder[other] = holder[other], holder[place]
     else:
-        holder[place] = rng.choice(ODD)
+        holder[place] = rng.choice(odd)
     return top[0]
 
 
@@ -169,6 +185,30 @@ def damaged_rows(content: bytes, rng: Random) -> bytes:
             return _file_of(damaged, schema)
         except (pa.ArrowException, OverflowError, TypeError, KeyError):
             continue  # Arrow itself does not write this
+
+
+def damaged_settings(content: bytes, rng: Random) -> bytes:
+    """Damage a value, or the text, of the model settings in a checkpoint, or make it hostile."""
+    checkpoint = torch.load(io.BytesIO(content), weights_only=True)
+    text = checkpoint["meta"][MODEL_SETTINGS]
+    if rng.random() < 0.5:
+        text = damaged_json(text.encode(), rng).decode()
+    else:
+        text = json.dumps(damaged_value(json.loads(text), rng, HOSTILE))
+    checkpoint["meta"][MODEL_SETTINGS] = text
+    torch.save(checkpoint, file := io.BytesIO())
+    return file.getvalue()
+
+
+def damaged_source(content: bytes, rng: Random) -> bytes:
+    """Put hostile settings, or values that grow, into a config of assignments."""
+    if rng.random() < 0.3:
+        return rng.choice(GROWING).encode() + content
+    calls = [at for at in range(len(content)) if content.startswith(b"dict(", at)]
+    place = rng.choice(calls) + len(b"dict(")
+    hostile = rng.choice([part for part in HOSTILE if isinstance(part, dict)])
+    word = rng.choice((f"**{hostile!r},", f"more={hostile!r},", f"**{{'more': {hostile!r}}},"))
+    return content[:place] + word.encode() + content[place:]
 
 
 def write(path: Path, content: bytes) -> None:

@@ -1,6 +1,7 @@
 """Every reader of files with something whole to read, and what of its results can be checked."""
 
 import contextlib
+import copy
 import errno
 import io
 import json
@@ -30,8 +31,10 @@ from mmengine.config import Config
 from pyarrow.feather import write_feather
 
 from fuzz import contents, mutations
+from fuzz.attacks import CONFIG
 from gsmap.apis.onnx_inferencer import OnnxInferencer
-from gsmap.checkpoints.reading import read_weights
+from gsmap.checkpoints.reading import adopt_settings, read_weights
+from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
 from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
@@ -265,6 +268,7 @@ class Files:
             "LiDAR sweep": self.points,
             "LiDAR sweep, Argoverse 2": self.feather,
             "checkpoint": self.weights,
+            "settings in a checkpoint": self.settings,
         }
         if find_spec("onnx") and find_spec("onnxruntime"):
             made["exported model"] = self.exported
@@ -461,9 +465,10 @@ class Files:
 
         def read() -> str:
             convert(path, target)
+            Config.fromfile(target, import_custom_modules=False)
             return target.read_text()
 
-        return Reader(path, read, (mutations.damaged_bytes,))
+        return Reader(path, read, (mutations.damaged_bytes, mutations.damaged_source))
 
     def image(self, suffix: str) -> Reader:
         content = cv2.imencode(
@@ -524,3 +529,17 @@ class Files:
         path = self.work / "weights.pth"
         torch.save({"state_dict": {"a.weight": torch.ones(4, 3)}, "meta": {"epoch": 1}}, path)
         return Reader(path, lambda: read_weights(path), (mutations.damaged_bytes,))
+
+    def settings(self) -> Reader:
+        path = self.work / "trained.pth"
+        cfg = read_config(CONFIG)
+        content = {"state_dict": {"a.weight": torch.ones(4, 3)}}
+        meta = {MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict()))}
+        torch.save({**content, "meta": meta}, path)
+
+        def read() -> Any:
+            changed = copy.copy(cfg)
+            adopt_settings(changed, path, None)
+            return plain(changed.model.to_dict())
+
+        return Reader(path, read, (mutations.damaged_settings,))

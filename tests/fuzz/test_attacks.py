@@ -7,11 +7,18 @@ from pathlib import Path
 import pytest
 import torch
 import upstream_configs
+from comparison.report import evaluator_for, markdown, read_result
 from processes import run_python
 
-from fuzz.attacks import CONFIG, config_corpus, corpus, settings_corpus
+from fuzz.attacks import CONFIG, PLANTED, config_corpus, corpus, plant, settings_corpus
+from gsmap.apis.onnx_inferencer import METADATA_KEY, OnnxInferencer
 from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
+from gsmap.datasets.annotations.record import AnnotationMeta
+from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.launch import read_config
+from gsmap.evaluation.file_evaluation import evaluate_files
+from gsmap.evaluation.report import flat_metrics
 
 SCRIPT = Path(__file__).with_name("attacks.py")
 HARMLESS = {"open", "system", "exec", "eval", "makedirs", "nested", "key", "tofile"}
@@ -102,3 +109,56 @@ def test_no_config_of_another_repository_runs_anything_or_hangs(tmp_path: Path):
         assert outcome.startswith("did not run, ValueError: "), f"{name}: {outcome}"
         assert f"{name}.pkl" in outcome, f"{name}: {outcome}"
         assert not (tmp_path / f"{name}.py").exists()
+
+
+@pytest.fixture
+def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names that would leave a marker if they were looked up; that none was is checked."""
+    marker = Path(plant(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    yield [PLANTED, f"{PLANTED}.print", f"mmdet.{PLANTED}", f"open({str(marker)!r}, 'w')"]
+    assert not marker.exists()
+
+
+def test_the_words_of_annotations_and_results_are_never_looked_up(
+    words: list[str], minicity_annotations: dict[str, Path], tmp_path: Path
+):
+    first = words[0]
+    notes = {"type": words[1], "custom_imports": words, "command": words[3]}
+    meta = AnnotationMeta(
+        dataset=first, frame="lidar", split=words[2], classes=tuple(words), command=words[3],
+        source_fingerprint=first, versions={w: w for w in words}, options=notes,
+    )  # fmt: skip
+    path = tmp_path / "annotations.arrow"
+    write_annotations(path, meta, AnnotationFile(minicity_annotations["val"]))
+    dataset = VectorizedMapDataset(ann_file=str(path), pipeline=[], test_mode=True)
+    assert dataset.metainfo["classes"] == tuple(words)
+    vector = {"pts": [[0, 0], [9, 9]], "cls_name": words[1], "confidence_level": 0.5, "type": first}
+    tokens = [sample.token for sample in AnnotationFile(path)]
+    found = [{"sample_token": t, "vectors": [vector], "type": words[3]} for t in tokens]
+    results = tmp_path / "results.json"
+    results.write_text(json.dumps({"meta": notes, "type": words[1], "results": found}))
+    (chamfer, *_), *_ = evaluate_files(results, path, evaluator_for(path, {}), 1)
+    assert {f"chamfer/{word}/AP" for word in words} <= flat_metrics([chamfer]).keys()
+
+
+def test_the_words_of_a_run_and_of_an_exported_model_are_never_looked_up(
+    words: list[str], tmp_path: Path
+):
+    record = {"state": words[1], "machine": words[3], "type": words[0], "train": words}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    table = markdown([read_result(words[0], tmp_path, 0)], words[2], words[1])
+    assert words[3] in table
+    onnx = pytest.importorskip("onnx")
+    value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
+    node = onnx.helper.make_node("Identity", ["x"], ["y"])
+    result = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1])
+    graph = onnx.helper.make_graph([node], "g", [value], [result])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)])
+    model.ir_version = 9
+    notes = {"format": 1, "classes": words, "cameras": words, "image_size": [1, 1]}
+    onnx.helper.set_model_props(
+        model, {METADATA_KEY: json.dumps({**notes, "type": words[1], "frame": words[0]})}
+    )
+    onnx.save(model, tmp_path / "model.onnx")
+    assert OnnxInferencer(tmp_path / "model.onnx").classes == tuple(words)

@@ -39,6 +39,7 @@ def main() -> None:
         CommandParser.program = f"gsmap {name}"
         del sys.argv[0]
         sys.argv[0] = str(tools[name])
+        sys.path.insert(0, str(tools[name].parent))  # as Python does for a script
         runpy.run_path(sys.argv[0], run_name="__main__")
 
 

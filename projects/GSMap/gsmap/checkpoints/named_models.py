@@ -6,9 +6,12 @@ not ship: saved there under their name, they load like the others.
 
 import difflib
 import json
+import logging
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+
+from mmengine.logging import print_log
 
 from gsmap.utils.shards import digest
 from gsmap.utils.shipped import shipped
@@ -68,7 +71,9 @@ def find_config(config: str | Path) -> Path:
 
 
 def find_checkpoint(checkpoint: str | Path) -> Path:
-    """Return a checkpoint's file, checked against its digest if it was asked for by name.
+    """Return a checkpoint's file; asked for by name, it is checked against its digest.
+
+    A warning says so where the registry has no digest.
 
     Raises:
         FileNotFoundError: If it is neither, or the named model's file is not there.
@@ -82,12 +87,25 @@ def find_checkpoint(checkpoint: str | Path) -> Path:
         raise FileNotFoundError(
             f"There is no {model.file}, the weights of {model.name}: {remedy} and save it there."
         )
-    if model.sha256 and digest(model.file) != model.sha256:
+    if not model.sha256:
+        _say_unverified(model.name)
+    elif digest(model.file) != model.sha256:
         raise ValueError(
             f"{model.file} is damaged or another file: its sha256 is not that of {model.name} in "
             "registry.json; fetch it again, or give another file by its path."
         )
     return model.file
+
+
+@cache
+def _say_unverified(name: str) -> None:
+    """Say once that nobody knows whether a file is the one that its name promises."""
+    model = named_models()[name]
+    print_log(
+        f"{model.file} is not verified: {model.source} gives no sha256 for {model.name}; that of "
+        f"this file is {digest(model.file)}.",
+        level=logging.WARNING,
+    )
 
 
 def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:

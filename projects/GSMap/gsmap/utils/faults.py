@@ -121,7 +121,9 @@ def _of_a_file(error: BaseException, text: str, frames: list[FrameType]) -> str 
         name = error.filename or next((name for name in files if isinstance(name, str)), "")
         named = "" if not name or str(name) in text else f": {name!r}"
         return f"{text}{named}; {remedy}."
-    if not isinstance(error, ValueError) or type(error) is ValueError:
+    if frames and frames[-1].f_globals.get("__name__") == "json.decoder":
+        text = "it is nested too deep" if isinstance(error, RecursionError) else text
+    elif not isinstance(error, ValueError) or type(error) is ValueError:
         return None
     names = ("self", "path", "source")
     found = (frame.f_locals.get(name) for frame in reversed(frames) for name in names)

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from gsmap.apis.comparison import RECORD, SETTINGS, Run
+from comparison.plan import RECORD, SETTINGS, Run
 from gsmap.checkpoints.settings import plain
 from gsmap.utils.files import lock_folder, write_text
 from gsmap.utils.parallel import die_with_parent

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from mmengine.config import Config
 
-from gsmap.apis.comparison import RECORD
+from comparison.plan import RECORD
 from gsmap.checkpoints.reading import read_weights
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import newest_checkpoint
@@ -26,6 +25,8 @@ from gsmap.utils.parallel import default_workers
 from gsmap.visualization.plots import finish_panel, panel_grid
 from gsmap.visualization.run_curves import RunLog, read_run
 from gsmap.visualization.style import RUN_COLOURS
+from mapdata.upstream_configs.fields import Fields
+from mapdata.upstream_configs.reader import read_assignments
 
 _COSTS = {
     "iterations": ".0f",
@@ -71,8 +72,8 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
         folder: The folder; its metrics are ``metrics.json`` (``tools/test.py --metrics-out``).
         seed: Its seed; the folder's config says it if it is not given.
     """
-    record = _json(folder / RECORD) or {}
-    figures = _json(folder / "metrics.json") or {}
+    record = _json(folder / RECORD)
+    figures = _json(folder / "metrics.json")
     log = read_run(folder, name) if any(folder.glob("2*/vis_data/scalars.json")) else None
     steps = [r["step"] for r in log.train] if log else []
     state = "done" if figures else record.get("state", "cut off" if steps else "not started")
@@ -95,18 +96,35 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
         timing = json.loads(tests[-1].read_text().splitlines()[-1])
         costs["seconds a sample"] = timing["time"] - timing["data_time"]
     if seed is None and log:
-        seed = _config(folder).get("randomness", {}).get("seed")
+        seed = _config(folder).section("randomness").get("seed")
+        if not isinstance(seed, int | None):
+            raise ValueError(
+                f"{folder}: the seed in its config must be a number, got {seed!r:.60}."
+            )
     return Result(name, seed, folder, state, figures, costs, record, log)
 
 
-def _json(path: Path) -> Any:
-    """Read a JSON file; None if there is none."""
-    return json.loads(path.read_text()) if path.is_file() else None
+def _json(path: Path) -> dict[str, Any]:
+    """Read a JSON object; empty if there is no such file."""
+    content = json.loads(path.read_text()) if path.is_file() else {}
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must hold a JSON object, got {content!r:.60}.")
+    return content
 
 
-def _config(folder: Path) -> Config:
-    """Return the config that a run noted in its folder."""
-    return Config.fromfile(sorted(folder.glob("2*/vis_data/config.py"))[-1])
+def _config(folder: Path) -> Fields:
+    """Return the config that a run noted in its folder, read as data: others may have written it.
+
+    Raises:
+        ValueError: If there is none, or it is more than assignments of plain values.
+    """
+    noted = sorted(folder.glob("2*/vis_data/config.py"))
+    if not noted:
+        raise ValueError(
+            f"{folder} does not say what it is a run of: it holds no 2*/vis_data/config.py, which "
+            "tools/train.py writes. Copy the whole work folder."
+        )
+    return Fields(read_assignments(noted[-1]))
 
 
 def check_one_test_set(results: Sequence[Result]) -> None:
@@ -144,8 +162,10 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
 
 def rescore(result: Result, changes: Mapping[str, Any]) -> list[MetricReport]:
     """Score a run's ``results.json`` again, under changed rules if any are given."""
-    dataset = _config(result.folder).test_dataloader.dataset
-    annotations = Path(dataset.get("data_root", ""), dataset.ann_file)
+    dataset = _config(result.folder).section("test_dataloader.dataset")
+    if "ann_file" not in dataset:
+        raise ValueError(f"{result.folder}: its config does not name the data of its test.")
+    annotations = Path(str(dataset.get("data_root", "")), str(dataset["ann_file"]))
     evaluator = evaluator_for(annotations, changes)
     predictions = result.folder / "results.json"
     return evaluate_files(predictions, annotations, evaluator, default_workers())[0]

@@ -7,16 +7,18 @@ from pathlib import Path
 
 import pytest
 import torch
-
-from gsmap.apis.comparison import Protocol, Run, parse_entry, plan
-from gsmap.apis.comparison_jobs import Job
-from gsmap.apis.comparison_report import (
+from comparison.jobs import Job
+from comparison.plan import Protocol, Run, parse_entry, plan
+from comparison.report import (
     check_one_test_set,
     differences_to_first,
     evaluator_for,
     markdown,
     read_result,
+    rescore,
 )
+
+from gsmap.utils.faults import in_words
 
 CLASSES = ("divider", "boundary")
 
@@ -160,6 +162,52 @@ def test_means_spread_and_paired_differences_by_hand(tmp_path):
     assert any("train ended with exit code -9: train.log" in line for line in lines)
     assert differences_to_first(results)["B"]["raster/mAP"] == pytest.approx([0.1, 0.2])
     assert "`python tools/compare.py`" in lines
+
+
+def with_config(folder: Path, text: str | None) -> Path:
+    """Write a run with a log, and a config that it noted."""
+    noted = finished(folder, 0.5, 0.5) / "20260101_000000/vis_data"
+    noted.mkdir(parents=True)
+    (noted / "scalars.json").write_text('{"loss": 1.0, "time": 0.1, "step": 5}\n')
+    if text is not None:
+        (noted / "config.py").write_text(text)
+    return folder
+
+
+def test_the_config_in_a_runs_folder_says_seed_and_data_and_is_not_run(
+    minicity_annotations, tmp_path
+):
+    path = minicity_annotations["val"]
+    dataset = f"dict(data_root='{path.parent}/', ann_file='{path.name}')"
+    text = f"randomness = dict(seed=7)\ntest_dataloader = dict(dataset={dataset})\n"
+    result = read_result("a", with_config(tmp_path / "good", text))
+    assert result.seed == 7
+    with pytest.raises(
+        FileNotFoundError, match=r"results\.json"
+    ):  # the data is found, no predictions
+        rescore(result, {})
+    marker = tmp_path / "marker"
+    attacks = {
+        f"import pathlib; pathlib.Path({str(marker)!r}).touch()": "only assignments",
+        f"randomness = dict(seed=open({str(marker)!r}, 'w'))": r"open\(\) is not called",
+        "_base_ = 'evil.py'\nrandomness = dict(seed='x')": "must be a number, got 'x'",
+        None: r"holds no 2\*/vis_data/config.py, which tools/train.py writes",
+    }
+    for number, (attack, message) in enumerate(attacks.items()):
+        folder = with_config(tmp_path / f"bad{number}", attack)
+        (folder / "20260101_000000/vis_data/evil.py").write_text(f"open({str(marker)!r}, 'w')")
+        with pytest.raises(ValueError, match=message):
+            read_result("a", folder)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("content", ["[]", '"x"', '{"processes": "x"}', "[" * 5000])
+def test_a_runs_notes_of_another_kind_are_named(content, tiny_config, protocol, tmp_path):
+    (folder := protocol.out / "a/seed_0").mkdir(parents=True)
+    (folder / "settings.json").write_text(content)
+    with pytest.raises((ValueError, RecursionError)) as raised:
+        plan(entries(tiny_config, "a=CONFIG"), protocol)
+    assert "seed_0/settings.json" in in_words(raised.value)
 
 
 def test_results_of_different_ground_truth_are_refused(tmp_path):

@@ -210,9 +210,9 @@ def _processes(protocol: Protocol) -> int:
     if torch.cuda.device_count():
         return 1
     paths = protocol.out.glob(f"*/seed_*/{SETTINGS}")
-    there = (json.loads(path.read_text())["processes"] for path in paths)
+    there = (_noted(path)["processes"] for path in paths)
     possible = chain(there, range(len(os.sched_getaffinity(0)), 0, -1))
-    return next(n for n in possible if protocol.batch % n == 0)
+    return next(n for n in possible if n > 0 and protocol.batch % n == 0)
 
 
 def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Run:
@@ -271,12 +271,20 @@ def _refuse(found: Mapping[str, tuple[Any, Any]], what: str, remedy: str) -> Non
         raise ValueError(f"{what}: {shown}. {remedy[0].upper()}{remedy[1:]}.")
 
 
+def _noted(path: Path) -> dict[str, Any]:
+    """Return what a run was started with."""
+    found = json.loads(path.read_text())
+    if not isinstance(found, dict) or not isinstance(found.get("processes"), int):
+        raise ValueError(f"{path} is not what a run noted: give another --out, or remove the run.")
+    return found
+
+
 def _check_folder(run: Run) -> None:
     """Refuse a work folder that another run made."""
     path = run.folder / SETTINGS
     if path.is_file():
         _refuse(
-            differences(json.loads(path.read_text()), plain(run.settings)),
+            differences(_noted(path), plain(run.settings)),
             f"{run.folder} holds a run of other settings",
             "give another --out, or remove it",
         )
