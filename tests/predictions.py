@@ -8,7 +8,6 @@ from torch import Tensor
 from gsmap.models.maptr.decoder import Decoded
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.pairs import Predictions
-from gsmap.models.mgmapnet.decoder import MGMapNetDecoded
 
 
 def stacked(outputs: list[Predictions]) -> SimpleNamespace:
@@ -24,18 +23,14 @@ def predicted(
     scores: Tensor,
     references: Tensor,
     instance_states: Tensor | None = None,
-    mean_locations: Tensor | None = None,
     bev_feats: Tensor | None = None,
+    kind: type[Decoded] = Decoded,
+    **further: Tensor,
 ) -> list[Predictions]:
     """Return predictions of a head from values of all layers, each (L, B, N, ...)."""
-    if instance_states is None:
-        instance_states = scores
-    values = [references, references, instance_states]
-    kind = Decoded
-    if mean_locations is not None:
-        values.append(mean_locations)
-        kind = MGMapNetDecoded
-    layers = (kind(*layer) for layer in zip(*values, strict=True))
+    states = scores if instance_states is None else instance_states
+    values = zip(references, references, states, *further.values(), strict=True)
+    layers = (kind(*layer) for layer in values)
     return [head.predictions(*layer, bev_feats) for layer in zip(scores, layers, strict=True)]
 
 

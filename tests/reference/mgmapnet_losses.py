@@ -13,6 +13,7 @@ from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.masks import ElementMasks
 from gsmap.models.maptr.pairs import Predictions
 from gsmap.models.maptrv2.aux_heads import BEVMaskHead
+from gsmap.models.mgmapnet.decoder import MGMapNetDecoded
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
 from reference.mgmapnet import BEV, B, GoldenParts
@@ -95,7 +96,7 @@ def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     data, parts = golden.read_arrays(name), GoldenParts(golden)
     saved, gts = saved_outputs(data, parts), ground_truths(data, parts)
     head = loss_head(golden, "released")
-    outputs = predicted(head, **saved)
+    outputs = predicted(head, kind=MGMapNetDecoded, **saved)
     yield from match_rows(name, data, head, outputs, gts)
     losses = head.loss_by_feat(outputs, gts, [{}] * B)
     for group in GROUPS:
@@ -182,7 +183,7 @@ def matched_rows(
     part = head.losses["ins_seg"]
     for key, weights in WEIGHTS.items():
         part.loss_weight, part.dice_weight = weights
-        outputs = predicted(head, **saved)
+        outputs = predicted(head, kind=MGMapNetDecoded, **saved)
         loss = head.loss_by_feat(outputs, gts, [{}] * B)["loss_ins_seg"]
         off = largest_relative(loss.item(), data[f"loss_ins_seg_matched{key}"])
         yield Row(name, f"instance masks, matched{key} (relative)", off, LOSS)

@@ -100,6 +100,20 @@ def test_extents_along_the_line_by_hand():
     torch.testing.assert_close(extents_along_line(gaussians), expected)
 
 
+def test_extents_on_an_oblique_line_by_hand():
+    """A line at 30 degrees: Gaussians along it, across it, and at 60 degrees, 30 from the line."""
+    degrees = torch.tensor([30.0, 120.0, 60.0])
+    direction = torch.tensor([math.cos(math.pi / 6), math.sin(math.pi / 6)])
+    gaussians = Gaussians(
+        means=torch.arange(3.0)[:, None] * direction,
+        scales=torch.tensor([[2.0, 0.5]]).expand(3, 2),
+        rotations=degrees.deg2rad(),
+    )
+    tilted = [math.sqrt(4 * 0.75 + 0.25 * 0.25), math.sqrt(4 * 0.25 + 0.25 * 0.75)]
+    expected = torch.tensor([[2.0, 0.5], [0.5, 2.0], tilted])
+    torch.testing.assert_close(extents_along_line(gaussians), expected)
+
+
 def test_a_frame_stretches_along_the_gaussians_axes_and_then_turns():
     """A Gaussian twice as long along the direction of travel, turned by 90 degrees anticlockwise.
 

@@ -165,3 +165,13 @@ def test_orders_equal_the_reference_targets(golden_dir: Path):
             np.testing.assert_allclose(bounding_boxes(points), targets[f"f{i}_bbox"][j], atol=3e-6)
             seen += 1
     assert seen == 185
+
+
+def test_the_orders_of_a_long_ring_are_spread_evenly_over_it():
+    """A circle of 40 vertices and 5 points: four orders, which start at each quarter of it."""
+    angles = np.arange(41) * 2 * np.pi / 40
+    ring = np.stack([np.cos(angles), np.sin(angles)], -1)
+    ring[-1] = ring[0]
+    starts = equivalent_orders(ring, 5)[:, 0]
+    quarters = [[1, 0], [0, -1], [-1, 0], [0, 1]]  # order k starts at vertex -k
+    np.testing.assert_allclose(starts, quarters, atol=1e-12)

@@ -40,9 +40,13 @@ class MergeConfig:
         far = (SIGMA_PER_M * distances) ** 2
         if not (self.gaussians and elements.has_gaussians):
             return NEAR_SIGMA_M**2 + far
-        directions = np.concatenate(
-            [np.zeros((0, 2)), *(np.gradient(line, axis=0) for line in elements.polylines)]
+        import torch  # only Gaussians need it
+
+        from gsmap.structures.gaussians import Gaussians, extents_along_line
+
+        vertices = map(torch.from_numpy, (elements.points, elements.scales, elements.rotations))
+        lines = zip(
+            *(values.split(elements.num_points.tolist()) for values in vertices), strict=True
         )
-        angles = np.arctan2(directions[:, 1], directions[:, 0]) - elements.rotations
-        axes = np.stack([np.sin(angles), np.cos(angles)], axis=1)  # of the line's normal
-        return ((elements.scales * axes) ** 2).sum(axis=1) + far
+        across = [extents_along_line(Gaussians(*line))[:, 1] for line in lines]
+        return np.concatenate([np.zeros(0), *across]) ** 2 + far

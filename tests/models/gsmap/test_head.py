@@ -18,6 +18,7 @@ from head_cases import (
 from predictions import predicted, stacked
 
 from gsmap.models.gsmap.layer import GaussianDecoderLayer
+from gsmap.models.maptr.losses import PointsLoss
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.grid import BEVGrid
 
@@ -59,6 +60,22 @@ def test_the_points_get_another_weight_in_loss_and_matching():
     costs = [[cost.weight for cost in h.assigner.match_costs] for h in (head, lighter)]
     assert costs[0][1:] == [5.0, 2.0]
     assert costs[1] == [costs[0][0], 1.0, 2.0]
+
+
+@pytest.mark.parametrize("kind", ["PointsLoss", "mmdet3d.PointsLoss", PointsLoss])
+@pytest.mark.parametrize("head", ["GSMapHead", "MapVRHead"])
+def test_the_points_are_found_however_their_class_is_named(kind, head):
+    losses = [{"type": kind, "loss_weight": 5.0}, HEAD["losses"][1]]
+    costs = [HEAD["match_costs"][0], {"type": "mmdet3d.OrderedPointsCost", "weight": 5.0}]
+    settings = {"losses": losses, "match_costs": costs, "points_weight": 1.5}
+    built = build_head(HEAD, type=head, **settings)
+    assert built.losses["pts"].loss_weight == 1.5
+    assert built.assigner.match_costs[1].weight == 1.5
+
+
+def test_a_weight_of_points_that_there_are_not_is_refused():
+    with pytest.raises(ValueError, match=r"points_weight is 1.0, and there is no PointsLoss"):
+        build_head(GSMAP, losses=HEAD["losses"][1:], points_weight=1.0)
 
 
 def test_the_older_form_of_a_gsmap_config_builds_the_same_head():

@@ -6,7 +6,7 @@ import pytest
 import torch
 from predictions import pairs_of
 
-from gsmap.models.maptr.losses import DirectionLoss, PointsLoss
+from gsmap.models.maptr.losses import DirectionLoss, MapLoss, PointsLoss
 from gsmap.models.mapvr.losses import SelfDirectionLoss
 
 
@@ -91,3 +91,22 @@ def test_equal_neighbours_do_not_break_the_direction(loss):
 def test_other_shapes_are_refused(loss):
     with pytest.raises(ValueError, match=r"target must have shape \(2, 4, 2\) of pred"):
         loss(torch.rand(2, 4, 2), torch.rand(1, 4, 2), 1.0)
+
+
+def test_a_misspelt_flag_is_refused_as_an_argument_and_as_an_attribute():
+    with pytest.raises(TypeError, match="last_layer_onyl"):
+        PointsLoss(last_layer_onyl=True)
+    with pytest.raises(TypeError, match=r"Late sets \['last_layer_onyl'\] as attributes .*MapLoss"):
+
+        class Late(MapLoss):
+            name = "late"
+            last_layer_onyl = True
+
+
+def test_every_loss_of_pairs_takes_the_flags():
+    for kind in (PointsLoss, DirectionLoss, SelfDirectionLoss):
+        loss = kind(last_layer_only=True, first_group_only=True)
+        assert loss.last_layer_only
+        assert loss.first_group_only
+        assert not kind().last_layer_only
+        assert not kind().first_group_only

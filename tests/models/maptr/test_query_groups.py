@@ -91,6 +91,14 @@ def test_the_further_queries_do_not_change_the_losses_of_the_first():
     }
 
 
+def test_flags_leave_a_loss_out_of_earlier_layers_and_of_further_queries():
+    points, direction = HEAD["losses"]
+    losses = [{**points, "last_layer_only": True}, {**direction, "first_group_only": True}]
+    found = losses_of(build({**CONFIG, "losses": losses}), lines(2))
+    names = {name for name in found if "pts" in name or "dir" in name}
+    assert names == {"loss_pts", "loss_pts_one2many", "loss_dir", "d0.loss_dir"}
+
+
 def test_more_repeats_than_queries_match_every_query():
     losses = losses_of(build(), lines(4))
     assert losses["loss_pts_one2many"].isfinite()  # 12 copies for 6 queries

@@ -2,11 +2,27 @@
 
 import pytest
 import torch
-from head_cases import GSMAP, HEAD, MASKS, C, N, P, along_y, bev, build_head, elements, losses_of
+from head_cases import (
+    GSMAP,
+    HEAD,
+    MASKS,
+    C,
+    N,
+    P,
+    along_y,
+    bev,
+    build_head,
+    elements,
+    losses_of,
+    with_layer,
+)
+from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from predictions import stacked
 
+from gsmap.models.maptr.attention import PointSelfAttention
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
+from gsmap.models.mgmapnet.head import with_granularities
 
 FURTHER = {"name": "one2many", "num": 6, "repeats": 3}
 BEV = {"bev_feats": torch.randn(1, C, 8, 4, generator=torch.Generator().manual_seed(2))}
@@ -37,6 +53,38 @@ def test_one_word_makes_mgmapnet_of_any_head():
     own = {"type": "MGMapNetDecoder", "num_layers": 1, "layer": {"cross_attn": attention}}
     own["layer"]["num_heads"] = 4
     assert build_head(MGMAP, decoder=own).decoder.layers[0].cross_attn.p2i is None
+
+
+@MODELS.register_module()
+class LouderSelfAttention(PointSelfAttention):
+    """A self-attention of somebody else."""
+
+
+@pytest.mark.parametrize(
+    ("attention", "kind"),
+    [
+        ({"type": "LouderSelfAttention"}, LouderSelfAttention),
+        ({"type": LouderSelfAttention}, LouderSelfAttention),
+        ({"dropout": 0.25}, PointSelfAttention),
+        ({"type": "DecoupledSelfAttention"}, PointSelfAttention),  # MapTRv2's, for points
+    ],
+)
+def test_a_self_attention_reaches_the_layers_unless_it_is_the_base_methods(attention, kind):
+    head = build_head(MGMAP, decoder=with_layer(HEAD, self_attn=attention))
+    for layer in head.decoder.layers:
+        assert type(layer.self_attn) is kind
+        assert layer.self_attn.num_points == 1
+        assert layer.self_attn.dropout == attention.get("dropout", 0.0)
+
+
+def test_the_log_says_what_of_the_decoder_is_replaced(monkeypatch):
+    lines = []
+    monkeypatch.setattr("gsmap.models.mgmapnet.head.print_log", lambda text, *_: lines.append(text))
+    layer = {"self_attn": {"type": "DecoupledSelfAttention"}, "cross_attn": {"num_points": 3}}
+    with_granularities({"layer": {**layer, "ffn_dims": 32}})
+    assert lines == [f"MGMapHead replaces {layer} of its decoder's layers."]
+    with_granularities({"layer": {"ffn_dims": 32}})
+    assert len(lines) == 1
 
 
 def test_outputs_by_instance_and_by_point():

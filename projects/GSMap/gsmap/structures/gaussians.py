@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import at_least_float32
 
 ACTIVATIONS = ("sigmoid", "softplus", "exp")
 AT_FLOOR = 1.1  # a Gaussian is at its floor if both sigmas are below this multiple of it
@@ -88,7 +89,7 @@ class GaussianSpace:
             raise ValueError(
                 f"reference must have shape (..., 5) or more, got {tuple(reference.shape)}."
             )
-        reference = reference.to(torch.promote_types(reference.dtype, torch.float32))
+        reference = at_least_float32(reference)
         means = self.grid.metres_from_norm(reference[..., :2])
         scales = self.scales(reference[..., -3:-1])
         if self.literal_covariance:

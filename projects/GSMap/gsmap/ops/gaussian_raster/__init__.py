@@ -8,6 +8,7 @@ from torch import Tensor
 from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.gaussian_raster.reference import render_gaussians_reference
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import at_least_float32
 
 _render = fused_operator(
     "gaussian_raster.render_gaussians",
@@ -39,7 +40,7 @@ def render_gaussians(
     """
     _check(means, scales, rotations)
     gaussians = torch.cat([means, scales, rotations[..., None]], -1)  # (..., P, 5), the widest type
-    gaussians = gaussians.to(torch.promote_types(gaussians.dtype, torch.float32))
+    gaussians = at_least_float32(gaussians)
     with torch.autocast(means.device.type, enabled=False):
         backend = choose_backend(backend, gaussians)
         if backend == "reference":

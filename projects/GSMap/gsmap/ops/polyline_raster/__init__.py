@@ -6,6 +6,7 @@ from torch import Tensor
 from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.polyline_raster.reference import draw_reference, soft_rasters_reference
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import at_least_float32
 
 LANE_GAP_PX = 0.01  # how far MapVR moves a line's way back: both form a polygon
 DISTANCES = ("squared", "plain")
@@ -53,7 +54,7 @@ def draw_polylines(
     if not width_m > 0:
         raise ValueError(f"width_m must be > 0, got {width_m}.")
     flags = _flags(filled, "filled", polylines)
-    polylines = polylines.detach().to(torch.promote_types(polylines.dtype, torch.float32))
+    polylines = at_least_float32(polylines.detach())
     dx, dy = grid.pixel_size_m
     half_width_m, pixel_m = width_m / 2, (dx * dy) ** 0.5
     with torch.autocast(polylines.device.type, enabled=False):
@@ -106,7 +107,7 @@ def soft_rasters(
         raise ValueError(f"distance must be one of {DISTANCES}, got {distance!r}.")
     flags, plain = _flags(is_polygon, "is_polygon", vertices), distance == "plain"
     with torch.autocast(vertices.device.type, enabled=False):
-        vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
+        vertices = at_least_float32(vertices)
         # Differs from MapVR Eqs. (2-3) by default: D is squared, as in its released rasterizer.
         back = vertices.flip(1) + LANE_GAP_PX
         stay = vertices[:, -1:].expand_as(vertices)  # a polygon's ring is padded by its last corner

@@ -1,0 +1,228 @@
+"""The settings of each method's config against the numbers that its paper or release prints.
+
+A setting that no number is known of is not here.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mmdet3d.registry import MODELS
+from mmengine.config import Config
+from mmengine.registry import init_default_scope
+from torch import nn
+
+import gsmap.registered  # noqa: F401
+from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.raster_ap import MIN_SCORE, RasterConfig
+from gsmap.structures.grid import BEVGrid
+
+REPO = Path(__file__).resolve().parents[1]
+GSMAP = "../projects/GSMap/configs/"
+
+SCHEDULE = {  # MapTR's, which all others took over
+    "optim_wrapper.optimizer": {"type": "AdamW", "lr": 6e-4, "weight_decay": 0.01},
+    "optim_wrapper.paramwise_cfg.custom_keys.img_backbone.lr_mult": 0.1,
+    "optim_wrapper.clip_grad.max_norm": 35,
+    "param_scheduler.0.start_factor": 1 / 3,
+    "param_scheduler.0.end": 500,
+    "param_scheduler.1.type": "CosineAnnealingLR",
+    "param_scheduler.1.eta_min_ratio": 1e-3,
+    "train_cfg.max_epochs": 24,
+    "train_dataloader.batch_size": 4,
+}
+NUSCENES = {"grid.x_range": (-15.0, 15.0), "grid.y_range": (-30.0, 30.0)}
+CAMERAS = {  # GKT
+    "model.bev_encoder.cross_attn": {
+        "type": "GeometryKernelAttention",
+        "num_heads": 4,
+        "kernel_size": (3, 5),
+    },
+    "model.bev_encoder.z_range": (-2.0, 2.0),
+    "model.bev_encoder.bev_pixel_m": 0.3,  # 200 x 100 cells
+    "model.bev_encoder.num_layers": 1,
+}
+DEPTH = {  # LSS of MapTRv2
+    "model.bev_encoder.type": "LSSEncoder",
+    "model.bev_encoder.z_range": (-10.0, 10.0),
+    "model.bev_encoder.depth_range": (1.0, 35.0, 0.5),
+}
+GEMAP = {**SCHEDULE, "optim_wrapper.optimizer.weight_decay": 0.03}
+MGMAPNET = {**SCHEDULE, "train_dataloader.batch_size": 2}
+CONFIGS: dict[str, dict[str, Any]] = {
+    "maptr/maptr_r50_24e.py": {**SCHEDULE, **NUSCENES, **CAMERAS},
+    "maptr/maptr_r50_110e.py": {**SCHEDULE, "train_cfg.max_epochs": 110},
+    "maptr/maptr_r50_av2_6e.py": {
+        "grid.x_range": (-30.0, 30.0),
+        "grid.y_range": (-15.0, 15.0),
+        "train_cfg.max_epochs": 6,
+    },
+    "maptr/maptr_r18_nano_110e.py": {
+        "optim_wrapper.optimizer.lr": 4e-3,
+        "optim_wrapper.clip_grad.max_norm": 50,
+        "train_dataloader.batch_size": 24,
+        "model.map_head.query_groups": [{"num": 100}],
+        "model.map_head.decoder.num_layers": 2,
+    },
+    "maptrv2/maptrv2_r50_24e.py": {**SCHEDULE, **NUSCENES, **DEPTH},
+    "mapvr/mapvr_r50_24e.py": {**SCHEDULE, **CAMERAS, "model.bev_encoder.layer_cfg.dropout": 0.0},
+    "gemap/gemap_simple_r50_110e.py": {**GEMAP, **CAMERAS, "train_cfg.max_epochs": 110},
+    "gemap/gemap_full_r50_110e.py": {**GEMAP, **DEPTH, "train_cfg.max_epochs": 110},
+    "gemap/gemap_full_v299_110e.py": {"train_dataloader.batch_size": 3},
+    "gemap/gemap_full_swint_110e.py": {
+        "optim_wrapper.optimizer.lr": 4e-4,
+        "train_dataloader.batch_size": 3,
+    },
+    "mgmapnet/mgmapnet_r50_110e.py": {
+        **MGMAPNET,
+        **DEPTH,
+        "optim_wrapper.optimizer.lr": 4e-4,
+        "train_cfg.max_epochs": 110,
+    },
+    f"{GSMAP}gsmap_maptr_r50_24e.py": {**SCHEDULE, **NUSCENES, **CAMERAS},
+    f"{GSMAP}gsmap_maptr_r50_110e.py": {**SCHEDULE, "train_cfg.max_epochs": 110},
+    f"{GSMAP}gsmap_maptr_r50_av2_6e.py": {
+        **SCHEDULE,
+        "train_cfg.max_epochs": 6,
+        "train_dataloader.batch_size": 6,
+    },
+}
+
+# the built head: queries of each group, weights of losses by name, weights of costs in order
+MAPTR = {"queries": [50], "losses": {"pts": 5.0, "dir": 0.005}, "costs": [2.0, 5.0]}
+MASKS = {"seg": 1.0, "pv_seg": 2.0, "depth": 3.0}
+HEADS: dict[str, dict[str, Any]] = {
+    "maptr/maptr_r50_24e.py": MAPTR,
+    "maptrv2/maptrv2_r50_24e.py": {**MAPTR, "queries": [50, 300], "aux": MASKS},
+    "mapvr/mapvr_r50_24e.py": {
+        "queries": [50],
+        "losses": {"pts": 1.0, "dir": 0.002, "dice": 15.0},
+        "costs": [2.0, 1.0, 10.0],
+    },
+    "gemap/gemap_simple_r50_110e.py": {
+        **MAPTR,
+        "losses": {"pts": 5.0, "dir": 0.005, "euclidean": 0.005},
+    },
+    "gemap/gemap_full_r50_110e.py": {
+        **MAPTR,
+        "losses": {"pts": 5.0, "dir": 0.005, "euclidean": 0.005},
+        "aux": MASKS,
+    },
+    "mgmapnet/mgmapnet_r50_110e.py": {
+        "queries": [100, 600],
+        "losses": {"pts": 5.0, "dir": 0.005, "mean_loc": 5.0, "ins_seg": 3.0},
+        "costs": [2.0, 5.0],
+        "aux": {"seg": 3.0, "pv_seg": 2.0, "depth": 3.0},
+    },
+    f"{GSMAP}gsmap_maptr_r50_24e.py": {
+        "queries": [50],
+        "losses": {"pts": 5.0, "dir": 0.005, "raster": 10.0},
+        "costs": [2.0, 5.0, 2.0],  # the paper names no weight of the IoU cost: ours
+    },
+}
+
+
+def load(name: str) -> Config:
+    return Config.fromfile(REPO / "configs" / name, import_custom_modules=False)
+
+
+def head_of(name: str) -> nn.Module:
+    init_default_scope("mmdet3d")
+    cfg = load(name)
+    shared = {"grid": BEVGrid(**cfg.grid), "classes": cfg.classes}
+    return MODELS.build({**shared, **cfg.model.map_head})
+
+
+def setting(cfg: Any, path: str) -> Any:
+    for key in path.split("."):
+        cfg = cfg[int(key)] if key.isdecimal() else cfg[key]
+    return cfg
+
+
+def cases() -> Iterator[tuple[str, str, Any]]:
+    for name, settings in CONFIGS.items():
+        for path, value in settings.items():
+            if path != "optim_wrapper.optimizer":
+                yield name, path, value
+                continue
+            for key, part in value.items():
+                if f"{path}.{key}" not in settings:
+                    yield name, f"{path}.{key}", part
+
+
+@pytest.mark.parametrize(("name", "path", "value"), cases())
+def test_a_config_says_what_was_published(name: str, path: str, value: Any):
+    found = setting(load(name), path)
+    assert (tuple(found) if isinstance(value, tuple) else found) == value
+
+
+@pytest.mark.parametrize("name", HEADS)
+def test_a_head_has_the_published_queries_and_weights(name: str):
+    head, published = head_of(name), HEADS[name]
+    assert [group.num for group in head.query_groups] == published["queries"]
+    assert {name: loss.loss_weight for name, loss in head.losses.items()} == published["losses"]
+    assert [cost.weight for cost in head.assigner.match_costs] == published["costs"]
+    weights = {name: aux.loss_weight for name, aux in head.aux_heads.items()}
+    assert weights == published.get("aux", {})
+    focal = head.loss_cls
+    assert (focal.loss_weight, focal.alpha, focal.gamma) == (2.0, 0.25, 2.0)
+    assert (head.num_points, head.embed_dims, len(head.decoder.layers)) == (20, 256, 6)
+
+
+@pytest.mark.parametrize("name", ["maptrv2/maptrv2_r50_24e.py", "mgmapnet/mgmapnet_r50_110e.py"])
+def test_each_element_is_matched_six_times_by_the_further_queries(name: str):
+    first, further = head_of(name).query_groups
+    assert (first.repeats, further.repeats, further.weight) == (1, 6, 1.0)
+
+
+def test_masks_of_maptrv2_and_mgmapnet_weigh_as_published():
+    maptrv2 = head_of("maptrv2/maptrv2_r50_24e.py").aux_heads
+    assert (maptrv2["seg"].pos_weight, maptrv2["seg"].dice_weight) == (4.0, 0.0)
+    assert maptrv2["pv_seg"].pos_weight == 1.0
+    head = head_of("mgmapnet/mgmapnet_r50_110e.py")
+    assert (head.aux_heads["seg"].pos_weight, head.aux_heads["seg"].dice_weight) == (1.0, 3.0)
+    assert head.losses["ins_seg"].dice_weight == 3.0
+    assert head.losses["ins_seg"].last_layer_only
+    assert head.losses["ins_seg"].first_group_only
+
+
+def test_gsmap_renders_and_weighs_as_in_its_paper():
+    """Section 4.1: rasters of 200 x 100; Eq. 12 with 3DGS's weights and SSIM's usual window."""
+    head = head_of(f"{GSMAP}gsmap_maptr_r50_24e.py")
+    assert (head.masks.grid.height, head.masks.grid.width) == (200, 100)
+    assert head.losses["raster"].settings == {
+        "alpha": 0.8,
+        "foreground_weight": 1.0,
+        "normalize": "both",
+        "window_size": 11,
+        "window_sigma": 1.5,
+    }
+    assert not head.losses["raster"].last_layer_only
+    space = head.reference.space
+    assert (space.min_scale_m, space.init_scales_m) == (0.15, (1.0, 0.4))  # half a pixel, and ours
+
+
+def test_mapvr_renders_as_released():
+    head = head_of("mapvr/mapvr_r50_24e.py")
+    loss, cost = head.losses["dice"].renderer, head.assigner.match_costs[-1].renderer
+    assert (loss.size, cost.size) == ((256, 128), (128, 64))
+    for renderer in (loss, cost):
+        assert (renderer.line_softness, renderer.polygon_softness) == (2.0, 4.0)
+        assert (renderer.polygon_classes, renderer.distance) == ((1,), "squared")
+    assert all(part.p == 0 for part in head.modules() if isinstance(part, nn.Dropout))
+
+
+def test_detections_are_chosen_as_by_maptr():
+    coder = head_of("maptr/maptr_r50_24e.py").coder
+    assert (coder.max_num, coder.margin_m, coder.score_threshold) == (50, 5.0, None)
+
+
+def test_the_metrics_have_their_published_rules():
+    classes = ("divider", "ped_crossing", "boundary")
+    chamfer, raster = ChamferConfig(classes), RasterConfig(classes)
+    assert (chamfer.thresholds, chamfer.num_points) == ((0.5, 1.0, 1.5), 100)
+    assert (raster.size_px, raster.dilation_px, MIN_SCORE) == ((240, 480), 5, 0.05)
+    lines, polygons = raster.thresholds["divider"], raster.thresholds["ped_crossing"]
+    assert lines == pytest.approx((0.25, 0.3, 0.35, 0.4, 0.45, 0.5))
+    assert polygons == pytest.approx((0.5, 0.55, 0.6, 0.65, 0.7, 0.75))
