@@ -60,6 +60,8 @@ def content(folder: Path) -> dict[str, Any]:
         name = str(path.relative_to(folder))
         if not path.is_file() or name.startswith(("20", ".", "last_checkpoint")):
             continue
+        if path.suffix == ".py":  # a run's config says what it went on from
+            continue
         if path.suffix == ".pth":
             with torch.serialization.safe_globals(mmengine_globals()):
                 state = torch.load(path, weights_only=True)

@@ -77,7 +77,7 @@ class _Raw(io.FileIO):
     """A file that notes why it cannot be written: some libraries tell it in words of their own."""
 
     def __init__(self, path: Path, failures: list[OSError]) -> None:
-        super().__init__(path, "w")
+        super().__init__(str(path), "w")
         self._failures = failures
 
     def write(self, data: Any) -> int | None:  # type: ignore[override]
