@@ -8,6 +8,7 @@ import torch
 from bag_cases import AXLE_M, Recorder, record
 from mmdet3d.registry import MODELS
 
+from gsmap import MapInferencer
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import read_config
 from tools import infer
@@ -65,7 +66,7 @@ def test_a_killed_run_goes_on_and_broken_frames_are_named(
     broken.unlink()
     out = tmp_path / "map.json"
     words = [str(drive), "--model", *model, "--out", str(out)]
-    original, calls = infer.MapInferencer.vectors, []
+    original, calls = MapInferencer.vectors, []
 
     def killed_at_the_third(self, sample):
         calls.append(sample.metainfo["token"])
@@ -73,14 +74,14 @@ def test_a_killed_run_goes_on_and_broken_frames_are_named(
             raise KeyboardInterrupt
         return original(self, sample)
 
-    monkeypatch.setattr(infer.MapInferencer, "vectors", killed_at_the_third)
+    monkeypatch.setattr(MapInferencer, "vectors", killed_at_the_third)
     with pytest.raises(KeyboardInterrupt):
         infer.main(words)
     assert not out.exists()
     unfinished = tmp_path / "map.json.unfinished"
     unfinished.write_bytes(unfinished.read_bytes()[:-7])  # the kill cuts the last line
     monkeypatch.setattr(
-        infer.MapInferencer, "vectors", lambda s, x: calls.append("again") or original(s, x)
+        MapInferencer, "vectors", lambda s, x: calls.append("again") or original(s, x)
     )
     with pytest.raises(SystemExit) as end:
         infer.main(words)
