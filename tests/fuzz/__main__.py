@@ -30,9 +30,9 @@ def run_cases(
     make: Callable[[], Reader], name: str, numbers: range, seed: int, pipe: Connection
 ) -> None:
     """Run cases of one reader and send how each ends."""
-    reader = make()
-    sys.addaudithook(reader.watch)
     with open(os.devnull, "w") as nothing, redirect_stdout(nothing), redirect_stderr(nothing):
+        reader = make()
+        sys.addaudithook(reader.watch)
         for number in numbers:
             pipe.send(reader.outcome(Random(f"{seed} {name} {number}")))
 
