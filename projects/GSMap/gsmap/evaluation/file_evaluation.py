@@ -211,7 +211,7 @@ def evaluate_files(
     num_workers: int = 1,
     allow_mismatch: bool = False,
 ) -> Evaluation:
-    """Score a result file; ``num_workers`` is the number of processes, the rest as ``SamplePairs``.
+    """Score a result file in one or more processes; other arguments as of ``SamplePairs``.
 
     Raises:
         FileNotFoundError: If a file does not exist.

@@ -1,0 +1,126 @@
+"""Files that are read sample by sample: any order and layout, the same figures, little memory."""
+
+import json
+import random
+import tracemalloc
+from pathlib import Path
+
+import pytest
+
+from benchmarks.evaluation import CLASSES, generated_frames, write_race
+from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.evaluator import MapEvaluator
+from gsmap.evaluation.file_evaluation import CHUNK, SamplePairs, evaluate_files
+from gsmap.evaluation.json_items import items_of
+from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.report import flat_metrics
+from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile
+
+EVALUATOR = MapEvaluator(ChamferConfig(CLASSES), RasterConfig(CLASSES))
+COUNT = 3 * CHUNK
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> tuple[Path, Path]:
+    return write_race(tmp_path_factory.mktemp("race"), generated_frames(COUNT), COUNT)
+
+
+def rewritten(path: Path, key: str, target: Path, change, **layout) -> Path:
+    samples = json.loads(path.read_text())[key]
+    change(samples)
+    target.write_text(json.dumps({key: samples, "meta": {"GTs": [1]}}, **layout))
+    return target
+
+
+def test_order_and_layout_change_no_digit(files, tmp_path):
+    results, truth = files
+    wanted, notes = evaluate_files(results, truth, EVALUATOR)
+    assert notes == []
+    shuffled = rewritten(truth, "GTs", tmp_path / "a.json", random.Random(0).shuffle, indent=2)
+    last_first = rewritten(results, "results", tmp_path / "b.json", list.reverse, ensure_ascii=True)
+    for pair in ((results, shuffled), (last_first, truth), (last_first, shuffled)):
+        found, notes = evaluate_files(*pair, EVALUATOR)
+        assert flat_metrics(found) == flat_metrics(wanted)
+        assert notes == []
+
+
+def test_samples_that_lack_a_partner_are_counted_wherever_they_lie(files, tmp_path):
+    results, truth = files
+
+    def change(samples):
+        del samples[1], samples[CHUNK:-1]
+        samples.insert(0, {"sample_token": "other", "vectors": []})
+
+    some = rewritten(results, "results", tmp_path / "a.json", change)
+    left = CHUNK + 1
+    with pytest.raises(ValueError, match=f"^{COUNT - left} samples have no results.*1 results"):
+        evaluate_files(some, truth, EVALUATOR)
+    pairs = SamplePairs(some, truth, CLASSES, allow_mismatch=True)
+    found = {token: (len(predictions), len(true)) for token, predictions, true in pairs}
+    assert len(found) == COUNT
+    everything = SamplePairs(results, truth, CLASSES)
+    for number, (token, predictions, true) in enumerate(everything):
+        known = number != 1 and (number <= CHUNK or number == COUNT - 1)
+        assert found[token] == (len(predictions) * known, len(true))
+    assert len(pairs.notes(False)) == 2
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path):
+    frames, peaks = generated_frames(20), []
+    for count in (800, 3200):
+        results, _ = write_race(tmp_path, frames, count)
+        assert results.stat().st_size > 4000 * count
+        tracemalloc.start()
+        assert sum(1 for _ in SampleFile(results, RESULTS_KEY, CLASSES)) == count
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 1_000_000  # the tokens; the file is 10 MB longer
+
+
+def test_places_lead_to_the_same_elements_also_behind_letters_of_many_bytes(tmp_path):
+    vectors = [{"pts": [[0, 1.5], [2, 3]], "cls_name": "divider", "confidence_level": 0.5}]
+    samples = [{"vectors": vectors, "sample_token": f"Straße 東 {i}"} for i in range(3)]
+    path = tmp_path / "a.json"
+    content = {"ü": "東", RESULTS_KEY: samples, "n": 12}
+    path.write_text(json.dumps(content, ensure_ascii=False), encoding="utf-8")
+    file = SampleFile(path, RESULTS_KEY, CLASSES)
+    for token, elements, place in file:
+        start, length = place
+        assert json.loads(path.read_bytes()[start : start + length])["sample_token"] == token
+        assert file.load(place).points.tolist() == elements.points.tolist() == [[0, 1.5], [2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no '{' at byte 0"),
+        ("[]", "no '{' at byte 0"),
+        ("{}", "no 'a' at byte 2"),
+        ('{"a": 3}', "no list at byte 6"),
+        ('{"a": [1], "a": []}', "a second 'a'"),
+        ('{"a": [1 2]}', "no ']' at byte 9"),
+        ('{"a": [1,]}', "Expecting value at byte 9"),
+        ('{"a": [1]', "no '}' at byte 9"),
+        ('{"a": [1]} x', "more text at byte 11"),
+        ('{"a": [1], 3: 4}', "no name at byte 11"),
+        ('{"b": [1', "Expecting ',' delimiter at byte 6"),
+        ('{"a": ["' + "x" * (3 << 20), "Unterminated string starting at at byte 7"),
+        ('{"a": ' + "[" * 200_000, "RecursionError"),
+    ],
+)
+def test_what_is_no_list_is_named(text, message, tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"a.json is empty or holds no complete list .*{message}"):
+        list(items_of(path, "a"))
+
+
+@pytest.mark.parametrize(
+    "text", ['{"a":[1,[2],{"b":3}]}', ' {\n"b" : 1, "a" : [ 1 , [2],{"b":3}]}\n']
+)
+def test_items_come_as_they_are(text, tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    assert [item for item, _ in items_of(path, "a")] == [1, [2], {"b": 3}]
+    path.write_text('{"a": []}')
+    assert list(items_of(path, "a")) == []
