@@ -159,7 +159,7 @@ class SamplePairs:
         mine = ((item for item in side if item[0] not in self._elsewhere) for side in sides)
         for items in zip_longest(*mine):
             if None not in items and items[0][0] == items[1][0]:
-                yield self._counted(*(items[0][:2]), items[1][1])
+                yield self._counted(items[0][0], items[0][1], items[1][1])
                 continue
             for own, item in enumerate(items):
                 if item is None:
