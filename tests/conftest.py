@@ -90,7 +90,7 @@ def poisoned_empty(monkeypatch: pytest.MonkeyPatch) -> None:
         def poisoned(*args, original=original, **kwargs):
             result = original(*args, **kwargs)
             if result.is_floating_point():
-            result.detach().fill_(torch.nan)  # also a leaf that wants a gradient
-        return result
+                result.detach().fill_(torch.nan)  # also a leaf that wants a gradient
+            return result
 
         monkeypatch.setattr(torch, name, poisoned)
