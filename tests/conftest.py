@@ -89,6 +89,8 @@ def poisoned_empty(monkeypatch: pytest.MonkeyPatch) -> None:
 
         def poisoned(*args, original=original, **kwargs):
             result = original(*args, **kwargs)
-            return result.fill_(torch.nan) if result.is_floating_point() else result
+            if result.is_floating_point():
+                result.detach().fill_(torch.nan)  # also a leaf that wants a gradient
+            return result
 
         monkeypatch.setattr(torch, name, poisoned)

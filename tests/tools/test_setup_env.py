@@ -69,7 +69,7 @@ def machine(tmp_path: Path) -> Machine:
 
 
 def test_neither_operators_nor_tools_of_tests_by_default(machine):
-    _pip, torch, rest, own = machine.set_up()
+    _, torch, rest, own = machine.set_up()
     assert torch == "install --no-compile torch==2.13.0"
     assert "mmcv-lite==2.1.0" in rest.split()
     assert "requirements-dev.txt" not in rest

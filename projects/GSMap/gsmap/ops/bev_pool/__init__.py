@@ -76,7 +76,8 @@ def bev_pool_conv3x3(
             f"weight must have shape (O, {context.shape[2]}, 3, 3) to match context, "
             f"got {tuple(weight.shape)}."
         )
-    if torch.compiler.is_exporting():  # ONNX can scatter sums, and has no bags of many sizes
+    exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # torch < 2.7
+    if exporting():  # ONNX can scatter sums, and has no bags of many sizes
         return F.conv2d(bev_pool(probs, context, cells, grid), weight, padding=1)
     pixels, probs, counts = _sort_by_cell(probs, cells, grid)
     taps = weight.permute(1, 2, 3, 0).flatten(1)  # (C, 9*O)
