@@ -252,7 +252,7 @@ def match_rows(
     metas: Sequence[dict[str, Any]],
 ) -> Iterator[Row]:
     """Compare the pairs of query, ground truth and order of every layer."""
-    gts = [head.prepare_gt(gt) for gt in batch_gt]
+    gts = head.prepare_gts(batch_gt)
     wrong = 0.0
     for layer, predictions in enumerate(outputs):
         pairs = head.match(predictions, gts, metas)
@@ -277,7 +277,7 @@ def check_loss(golden: Golden, name: str) -> Iterator[Row]:
             scores=torch.from_numpy(saved["all_cls_scores"][-1, 0]),
             pts=torch.from_numpy(saved["all_pts_preds"][-1, 0]),
         )
-        gt = head.prepare_gt(gt_instances(golden.gt_sets[case]))
+        (gt,) = head.prepare_gts([gt_instances(golden.gt_sets[case])]).samples
         keys = ("cost_cls_lastlayer", "cost_pts_lastlayer")
         for key, cost in zip(keys, head.assigner.match_costs, strict=True):
             ours = cost(prediction, gt, {})

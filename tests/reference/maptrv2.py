@@ -204,10 +204,10 @@ def match_rows(
     repeats: int,
 ) -> Iterator[Row]:
     """Compare the matches of all layers; copies of one ground truth stand for each other."""
-    prepared = head.prepare_gt(gt)
+    prepared = head.prepare_gts([gt])
     different = total = 0
     for layer, predictions in enumerate(outputs):
-        match = head.match(predictions, [prepared], [meta], repeats).matches[0]
+        match = head.match(predictions, prepared, [meta], repeats).matches[0]
         ours = zip(match.query_inds, match.gt_inds, match.order_inds, strict=True)
         listed = data[f"match_{group}_l{layer}"]
         reference = {(q, g % len(gt), order) for q, g, order in listed.tolist()}

@@ -126,7 +126,7 @@ def match_rows(
     gts: list[InstanceData],
 ) -> Iterator[Row]:
     """Compare the matches of both groups; copies of one ground truth stand for each other."""
-    prepared = [head.prepare_gt(gt) for gt in gts]
+    prepared = head.prepare_gts(gts)
     for label, (group, own) in zip(GROUPS, head.split_groups(outputs), strict=True):
         wrong = 0
         for layer, predictions in enumerate(own):

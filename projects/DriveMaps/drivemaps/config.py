@@ -44,9 +44,8 @@ class MergeConfig:
 
         from gsmap.structures.gaussians import Gaussians, extents_along_line
 
-        vertices = map(torch.from_numpy, (elements.points, elements.scales, elements.rotations))
-        lines = zip(
-            *(values.split(elements.num_points.tolist()) for values in vertices), strict=True
-        )
+        values = map(torch.from_numpy, (elements.points, elements.scales, elements.rotations))
+        counts = elements.num_points.tolist()
+        lines = zip(*(value.split(counts) for value in values), strict=True)
         across = [extents_along_line(Gaussians(*line))[:, 1] for line in lines]
         return np.concatenate([np.zeros(0), *across]) ** 2 + far

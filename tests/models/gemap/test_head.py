@@ -30,7 +30,7 @@ def test_the_loss_compares_relations_within_each_sample_only():
     head = build_head(GEMAP)
     outputs, truths = head(bev(2)), [LANES, elements(*along_y(-5, 0, 5))]
     actual = head.loss_by_feat(outputs, truths, [{}, {}])["loss_euclidean"]
-    gts = [head.prepare_gt(truth) for truth in truths]
+    gts = head.prepare_gts(truths)
     ((_, own),) = head.split_groups(outputs)
     pairs = head.match(own[1], gts, [{}, {}])
     samples = zip(own[1].pts, pairs.matches, strict=True)

@@ -19,6 +19,8 @@ from head_cases import (
 )
 from predictions import stacked
 
+from gsmap.models.maptr.pairs import SamplePredictions
+
 SQUARE = elements(((-4, -4), (4, -4)), labels=[1])
 SQUARE.polylines = torch.tensor([[[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-4, -4]]])
 
@@ -102,8 +104,8 @@ def test_an_unknown_overlap_is_refused():
 
 def total_cost(head: torch.nn.Module) -> torch.Tensor:
     """Return the summed matching costs of a new model's first prediction. (N, K)"""
-    (prediction,) = predictions_of(head, head(bev()), 0).samples()
-    gt = head.prepare_gt(LANES)
+    prediction = SamplePredictions(predictions_of(head, head(bev()), 0), 0)
+    (gt,) = head.prepare_gts([LANES]).samples
     return sum(cost(prediction, gt, {}) for cost in head.assigner.match_costs)
 
 
@@ -150,7 +152,7 @@ def test_masks_come_from_full_resolution_or_from_the_matched_points(source):
     head = build_head(GSMAP, masks={**MASKS, "source": source})
     train_a_step(head, SQUARE)
     predictions = predictions_of(head, head(bev()), 1)
-    gts = [head.prepare_gt(SQUARE)]
+    gts = head.prepare_gts([SQUARE])
     pairs = head.match(predictions, gts, [{}])
     drawn = {"full": SQUARE.polylines, "points": SQUARE.pts}[source]
     expected = head.masks.draw(drawn, SQUARE.labels_3d, head.masks.grid)
@@ -160,10 +162,10 @@ def test_masks_come_from_full_resolution_or_from_the_matched_points(source):
 def test_filled_classes_have_filled_masks():
     hollow = build_head(GSMAP, masks={**MASKS, "pixel_m": 0.3})
     filled = build_head(GSMAP, masks={**MASKS, "pixel_m": 0.3, "filled_classes": (1,)})
-    assert hollow.prepare_gt(SQUARE).masks[0, 100, 50] == 0
-    assert filled.prepare_gt(SQUARE).masks[0, 100, 50] == 1
+    assert hollow.prepare_gts([SQUARE]).masks[0, 100, 50] == 0
+    assert filled.prepare_gts([SQUARE]).masks[0, 100, 50] == 1
     lane = elements(*along_y(-3.0))
-    assert torch.equal(hollow.prepare_gt(lane).masks, filled.prepare_gt(lane).masks)
+    assert torch.equal(hollow.prepare_gts([lane]).masks, filled.prepare_gts([lane]).masks)
     assert train_a_step(filled, SQUARE)["loss_raster"] > 0
 
 

@@ -65,7 +65,7 @@ def test_every_ground_truth_is_matched_once_and_then_several_times():
     outputs = head(bev())
     gt, meta = lines(2), [{"token": "a"}]
     losses = head.loss_by_feat(outputs, [gt], meta)
-    prepared = [head.prepare_gt(gt)]
+    prepared = head.prepare_gts([gt])
     matched = {}
     for group, own in head.split_groups(outputs):
         pairs = head.match(own[1], prepared, meta, group.repeats)
@@ -140,10 +140,10 @@ def test_the_raster_loss_of_the_further_queries_compares_with_the_matched_masks(
     losses = head.loss_by_feat(outputs, [gt], [{}])
     assert losses["loss_pts"] < 1e-5
     torch.testing.assert_close(losses["loss_raster_one2many"], losses["loss_raster"])
-    crossed = head.prepare_gt(gt)
+    crossed = head.prepare_gts([gt])
     crossed.masks = crossed.masks.flip(0)
     _, (group, further) = head.split_groups(outputs)
-    pairs = head.match(further[-1], [crossed], [{}], group.repeats)
+    pairs = head.match(further[-1], crossed, [{}], group.repeats)
     others = head.layer_losses(group, pairs, is_last=True)
     assert others["loss_raster"] > 1.1 * losses["loss_raster_one2many"]
 

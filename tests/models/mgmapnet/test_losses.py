@@ -74,7 +74,7 @@ def given(states, masks, gt_inds, counts, bev_feats, avg_factor):
         gt_masks=masks,
         gt_inds=gt_inds,
         counts=counts,
-        bev_feats=bev_feats,
+        predictions=SimpleNamespace(bev_feats=bev_feats),
         avg_factor=avg_factor,
     )
 

@@ -20,7 +20,13 @@ from gsmap.models.maptr.layers import classification_branch, init_matrices
 from gsmap.models.maptr.losses import MapLoss
 from gsmap.models.maptr.masks import ElementMasks
 from gsmap.models.maptr.matching import MapAssigner, MapCost
-from gsmap.models.maptr.pairs import GroundTruth, MatchedPairs, Predictions
+from gsmap.models.maptr.pairs import (
+    GroundTruth,
+    MatchedPairs,
+    Predictions,
+    SamplePredictions,
+    SampleTruth,
+)
 from gsmap.models.maptr.parts import PARTS, AuxHead, by_name, check_classes, refuse_twins
 from gsmap.models.maptr.references import PointReference
 from gsmap.structures.grid import BEVGrid
@@ -59,10 +65,6 @@ class QueryGroup:
             raise ValueError(
                 f"a query group needs num >= 1 and repeats >= 1, got {self.num} and {self.repeats}."
             )
-
-    def has(self, loss: str) -> bool:
-        """Return whether the group has a loss."""
-        return self.losses is None or loss in self.losses
 
 
 @MODELS.register_module()
@@ -259,7 +261,7 @@ class MapHead(BaseModule):
         """
         losses: Tensors = {}
         with torch.autocast(outputs[-1].scores.device.type, enabled=False):
-            truths = [self.prepare_gt(gt) for gt in batch_gt_instances]
+            truths = self.prepare_gts(batch_gt_instances)
             for group, own in self.split_groups(outputs):
                 for number, layer in enumerate(own):
                     pairs = self.match(layer, truths, batch_img_metas, group.repeats)
@@ -280,35 +282,39 @@ class MapHead(BaseModule):
             yield group, [layer.of_queries(queries) for layer in outputs]
             start += group.num
 
-    def prepare_gt(self, gt_instances: InstanceData) -> GroundTruth:
-        """Return one sample's ground truth as costs and losses read it."""
-        return GroundTruth(gt_instances, self.reference, self.masks)
+    def prepare_gts(self, batch_gt_instances: Instances) -> GroundTruth:
+        """Return the ground truth of a batch as costs and losses read it."""
+        samples = [SampleTruth(gt, self.reference, self.masks) for gt in batch_gt_instances]
+        return GroundTruth(samples)
 
     def match(
         self,
         predictions: Predictions,
-        truths: Sequence[GroundTruth],
+        truths: GroundTruth,
         metas: Metas,
         repeats: int = 1,
     ) -> MatchedPairs:
         """Match every sample's predictions of one layer with its ground truth."""
-        samples = zip(predictions.samples(), truths, metas, strict=True)
-        matches = [self.assigner.assign(*sample, repeats) for sample in samples]
+        matches = []
+        for index, (truth, meta) in enumerate(zip(truths.samples, metas, strict=True)):
+            sample = SamplePredictions(predictions, index)
+            matches.append(self.assigner.assign(sample, truth, meta, repeats))
         return MatchedPairs(predictions, truths, matches)
 
     def layer_losses(self, group: QueryGroup, pairs: MatchedPairs, is_last: bool) -> Tensors:
         """Return the weighted losses of one layer's predictions, and figures to log."""
         losses: Tensors = {}
         first = group is self.query_groups[0]
-        if group.has("cls"):
+        chosen = ("cls", *self.losses) if group.losses is None else group.losses
+        if "cls" in chosen:
             # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
-            one_hot = F.one_hot(pairs.query_labels() + 1, len(self.classes) + 1)[:, 1:]
-            scores, count = pairs.query_scores(), pairs.avg_factor
-            losses["loss_cls"] = group.weight * self.loss_cls(scores, one_hot, avg_factor=count)
-        for name, module in self.losses.items():
-            loss = cast(MapLoss, module)
+            one_hot = F.one_hot(pairs.query_labels() + 1, len(self.classes) + 1)[..., 1:]
+            scores = pairs.predictions.scores.flatten(0, 1)  # (B * N, classes)
+            loss = self.loss_cls(scores, one_hot.flatten(0, 1), avg_factor=pairs.avg_factor)
+            losses["loss_cls"] = group.weight * loss
+        for name, loss in cast(Any, self.losses.items()):
             applies = (is_last or not loss.last_layer_only) and (first or not loss.first_group_only)
-            if applies and group.has(name):
+            if applies and name in chosen:
                 losses[f"loss_{name}"] = group.weight * loss(pairs)
         if is_last and first:
             losses.update(self.statistics(pairs))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from gsmap.models.maptr.head import MapHead
-    from gsmap.models.maptr.pairs import GroundTruth, SamplePredictions
+    from gsmap.models.maptr.pairs import SamplePredictions, SampleTruth
 
 
 class MapMatch(NamedTuple):
@@ -37,12 +37,13 @@ class MapAssigner:
         if not match_costs:
             raise ValueError("match_costs must hold at least one cost.")
         self.match_costs = [TASK_UTILS.build(cost) for cost in match_costs]
+        self.names = [type(cost).__name__ for cost in self.match_costs]
 
     @torch.no_grad()
     def assign(
         self,
         pred_instances: "SamplePredictions",
-        gt_instances: "GroundTruth",
+        gt_instances: "SampleTruth",
         img_meta: dict[str, Any] | None = None,
         repeats: int = 1,
     ) -> MapMatch:
@@ -57,25 +58,28 @@ class MapAssigner:
         Raises:
             FloatingPointError: If a cost (or, without ground truth, a score) is not finite.
         """
-        device = pred_instances.scores.device
-        if len(gt_instances) == 0:
-            self._check_finite(pred_instances.scores, "class scores", img_meta)
-            return MapMatch(*(torch.empty(0, dtype=torch.long, device=device) for _ in range(3)))
-        costs = [cost(pred_instances, gt_instances, img_meta) for cost in self.match_costs]
-        total = torch.stack([cost.float() for cost in costs]).cpu()  # (costs, N, K)
-        for cost, values in zip(self.match_costs, total, strict=True):
-            self._check_finite(values, type(cost).__name__, img_meta)
+        device, num_gts = pred_instances.scores.device, len(gt_instances.labels)
+        if num_gts == 0:
+            self._check_finite(pred_instances.scores[None], ["class scores"], img_meta)
+            return MapMatch(*torch.empty(3, 0, dtype=torch.long, device=device))
+        sample = pred_instances, gt_instances, img_meta
+        total = torch.stack([cost(*sample).float() for cost in self.match_costs]).cpu()
+        self._check_finite(total, self.names, img_meta)
         rows, cols = linear_sum_assignment(np.tile(total.sum(0).numpy(), repeats))
         queries = torch.from_numpy(rows).to(device)
-        gts = torch.from_numpy(cols % len(gt_instances)).to(device)
+        gts = torch.from_numpy(cols % num_gts).to(device)
         offsets = pred_instances.pts[queries, None] - gt_instances.pts_shifts[gts]  # (M, S, P, 2)
         return MapMatch(queries, gts, offsets.abs().sum((-1, -2)).argmin(-1))
 
     @staticmethod
-    def _check_finite(values: Tensor, what: str, img_meta: dict[str, Any] | None) -> None:
-        """Refuse values that the assignment cannot order."""
-        if not torch.isfinite(values).all():
+    def _check_finite(
+        values: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None
+    ) -> None:
+        """Refuse values that the assignment cannot order; one name for each of the first axis."""
+        finite = values.isfinite().flatten(1).all(1)
+        if not finite.all():
             token = (img_meta or {}).get("token", "unknown")
+            what = names[int(finite.int().argmin())]
             raise FloatingPointError(
                 f"{what} of sample {token!r} is not finite before the assignment: look at the "
                 "sample's images and ground truth, then at the learning rate and at the loss scale "
@@ -97,7 +101,7 @@ class MapCost:
         """Raise ValueError if a head lacks what the cost reads; called when the head is built."""
 
     def __call__(
-        self, pred_instances: "SamplePredictions", gt_instances: "GroundTruth", img_meta: Any = None
+        self, pred_instances: "SamplePredictions", gt_instances: "SampleTruth", img_meta: Any = None
     ) -> Tensor:
         """Return the weighted cost of each prediction with each ground truth. (N, K)"""
         raise NotImplementedError
@@ -131,7 +135,7 @@ class OrderedPointsCost(MapCost):
         super().__init__(weight)
 
     def __call__(
-        self, pred_instances: "SamplePredictions", gt_instances: "GroundTruth", img_meta: Any = None
+        self, pred_instances: "SamplePredictions", gt_instances: "SampleTruth", img_meta: Any = None
     ) -> Tensor:
         """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
         return order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1) * self.weight

@@ -1,7 +1,6 @@
 """What costs and losses read: predictions of a layer, ground truth, and the pairs of both."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from functools import cached_property
 
 import torch
@@ -15,7 +14,6 @@ from gsmap.models.maptr.matching import MapMatch
 from gsmap.models.maptr.references import PointReference
 
 
-@dataclass(eq=False)
 class Predictions:
     """What the head predicts after one decoder layer, for all samples of a batch.
 
@@ -25,40 +23,29 @@ class Predictions:
         bev_feats: BEV features. (B, C, H, W)
         reference: What ``decoded.references`` stand for.
         masks: The rasters on which predictions and ground truth are compared.
+
+    Attributes:
+        references: What the decoder refines: a point, or a Gaussian. (B, N, P, D)
+        pts: Points, [0, 1] over the map. (B, N, P, 2 or 3)
     """
 
-    scores: Tensor
-    decoded: Decoded
-    bev_feats: Tensor
-    reference: PointReference
-    masks: ElementMasks
-
-    @property
-    def references(self) -> Tensor:
-        """What the decoder refines: a point, or a Gaussian. (B, N, P, D)"""
-        return self.decoded.references
-
-    @property
-    def pts(self) -> Tensor:
-        """Points, [0, 1] over the map. (B, N, P, 2 or 3)"""
-        return self.decoded.references[..., : self.reference.coords]
-
-    @cached_property
-    def cost_masks(self) -> Tensor:
-        """Rendered masks for matching, without gradient. (B, N, h, w)"""
-        return self.reference.render(self.references.detach(), self.masks.cost_grid)
+    def __init__(
+        self,
+        scores: Tensor,
+        decoded: Decoded,
+        bev_feats: Tensor,
+        reference: PointReference,
+        masks: ElementMasks,
+    ) -> None:
+        self.scores, self.decoded, self.bev_feats = scores, decoded, bev_feats
+        self.reference, self.masks = reference, masks
+        self.references = decoded.references
+        self.pts = decoded.references[..., : reference.coords]
 
     def of_queries(self, queries: slice) -> "Predictions":
         """Return the predictions of some of the instance queries, scores in float32."""
-        return replace(
-            self,
-            scores=self.scores[:, queries].float(),
-            decoded=self.decoded.of_queries(queries),
-        )
-
-    def samples(self) -> list["SamplePredictions"]:
-        """Return the predictions of each sample."""
-        return [SamplePredictions(self, index) for index in range(len(self.scores))]
+        scores, decoded = self.scores[:, queries].float(), self.decoded.of_queries(queries)
+        return Predictions(scores, decoded, self.bev_feats, self.reference, self.masks)
 
 
 class SamplePredictions:
@@ -75,18 +62,19 @@ class SamplePredictions:
     """
 
     def __init__(self, batch: Predictions, index: int) -> None:
-        self._batch, self._index = batch, index
         self.scores, self.pts = batch.scores[index], batch.pts[index]
         self.references = batch.references[index]
+        self._batch = batch
 
-    @property
+    @cached_property
     def cost_masks(self) -> Tensor:
         """Rendered masks, without gradient. (N, h, w)"""
-        return self._batch.cost_masks[self._index]
+        grid = self._batch.masks.cost_grid
+        return self._batch.reference.render(self.references.detach(), grid)
 
 
-class GroundTruth:
-    """One sample's ground truth, as costs and losses read it; masks are drawn when first read.
+class SampleTruth:
+    """One sample's ground truth, as matching costs read it; masks are drawn when first read.
 
     Args:
         instances: ``labels_3d`` (K,), ``pts`` (K, P, 2 or 3) and ``pts_shifts`` (K, S, P, 2 or 3)
@@ -122,27 +110,62 @@ class GroundTruth:
         return self._drawing.draw_sample(self._instances, self._drawing.cost_grid)
 
 
+class GroundTruth:
+    """The ground truth of a batch: of each sample, and all of it in one, T elements.
+
+    Args:
+        samples: Ground truth of each sample.
+
+    Attributes:
+        labels: Class indices. (T,)
+        pts_shifts: Equivalent point orders, [0, 1] over the map. (T, S, P, 2 or 3)
+        first_pts: Points in the annotated order, [0, 1] over the map. (T, P, 2 or 3)
+        first: Number of each sample's first element. (B,)
+    """
+
+    def __init__(self, samples: Sequence[SampleTruth]) -> None:
+        self.samples = samples
+        self.labels = torch.cat([sample.labels for sample in samples])
+        self.pts_shifts = torch.cat([sample.pts_shifts for sample in samples])
+        self.first_pts = torch.cat([sample.first_pts for sample in samples])
+        counts = torch.tensor([len(sample) for sample in samples])
+        self.first = (counts.cumsum(0) - counts).to(self.labels.device)
+
+    @cached_property
+    def masks(self) -> Tensor:
+        """Masks of the losses. (T, H, W)"""
+        return torch.cat([sample.masks for sample in self.samples])
+
+
 class MatchedPairs:
     """The M matched pairs of a batch, sample after sample; what is computed is so when first read.
 
     Args:
         predictions: Predictions of one layer and query group.
-        truths: Ground truth of each sample.
+        truths: Ground truth of the batch.
         matches: Matches of each sample.
 
     Attributes:
         counts: Number of pairs of each sample.
+        samples: Number of each pair's sample in the batch. (M,)
+        query_inds: Number of each pair's query in its sample. (M,)
+        gt_inds: Number of each pair's ground truth in its sample. (M,)
+        gt_labels: Class indices. (M,)
         avg_factor: Number of pairs, averaged over the ranks, at least 1. ()
     """
 
     def __init__(
-        self,
-        predictions: Predictions,
-        truths: Sequence[GroundTruth],
-        matches: Sequence[MapMatch],
+        self, predictions: Predictions, truths: GroundTruth, matches: Sequence[MapMatch]
     ) -> None:
         self.predictions, self.truths, self.matches = predictions, truths, matches
-        self.counts = [len(match.gt_inds) for match in matches]
+        queries, gts, orders = zip(*matches, strict=True)
+        self.counts = list(map(len, queries))
+        self.query_inds, self.gt_inds = torch.cat(queries), torch.cat(gts)
+        numbers = torch.arange(len(matches)).repeat_interleave(torch.tensor(self.counts))
+        self.samples = numbers.to(self.gt_inds.device)
+        self._order_inds = torch.cat(orders)
+        self._rows = self.gt_inds + truths.first[self.samples]  # in the batch's ground truth
+        self.gt_labels = truths.labels[self._rows]
         count = predictions.scores.new_tensor(float(sum(self.counts)))
         self.avg_factor: Tensor = reduce_mean(count).clamp(min=1.0)
 
@@ -150,36 +173,19 @@ class MatchedPairs:
         """Take what belongs to the matched queries. (B, N, ...) -> (M, ...)"""
         return values[self.samples, self.query_inds]
 
-    def of_truths(self, values: Iterable[Tensor]) -> Tensor:
-        """Take what belongs to the matched ground truths. B x (K, ...) -> (M, ...)"""
-        pairs = zip(values, self.matches, strict=True)
-        return torch.cat([value[match.gt_inds] for value, match in pairs])
-
-    @cached_property
-    def samples(self) -> Tensor:
-        """Number of each pair's sample in the batch. (M,)"""
-        numbers = torch.arange(len(self.counts)).repeat_interleave(torch.tensor(self.counts))
-        return numbers.to(self.predictions.scores.device)
-
-    @cached_property
-    def query_inds(self) -> Tensor:
-        """Number of each pair's query in its sample. (M,)"""
-        return torch.cat([match.query_inds for match in self.matches])
-
-    @cached_property
-    def gt_inds(self) -> Tensor:
-        """Number of each pair's ground truth in its sample. (M,)"""
-        return torch.cat([match.gt_inds for match in self.matches])
+    def of_truths(self, values: Tensor) -> Tensor:
+        """Take what belongs to the matched ground truths. (T, ...) -> (M, ...)"""
+        return values[self._rows]
 
     @cached_property
     def pred_references(self) -> Tensor:
         """What the decoder refines: a point, or a Gaussian. (M, P, D)"""
-        return self.of_queries(self.predictions.references)
+        return self.predictions.references[self.samples, self.query_inds]
 
     @cached_property
     def pred_pts(self) -> Tensor:
         """Predicted points, [0, 1] over the map. (M, P, 2 or 3)"""
-        return self.of_queries(self.predictions.pts)
+        return self.predictions.pts[self.samples, self.query_inds]
 
     @cached_property
     def pred_pts_m(self) -> Tensor:
@@ -197,20 +203,14 @@ class MatchedPairs:
         return self.of_queries(self.predictions.decoded.instance_states).float()
 
     @cached_property
-    def gt_labels(self) -> Tensor:
-        """Class indices. (M,)"""
-        return self.of_truths(gt.labels for gt in self.truths)
-
-    @cached_property
     def gt_pts(self) -> Tensor:
         """Annotated points in the matched order, [0, 1] over the map. (M, P, 2 or 3)"""
-        pairs = zip(self.truths, self.matches, strict=True)
-        return torch.cat([gt.pts_shifts[match.gt_inds, match.order_inds] for gt, match in pairs])
+        return self.truths.pts_shifts[self._rows, self._order_inds]
 
     @cached_property
     def gt_first_pts(self) -> Tensor:
         """Annotated points in the annotated order, [0, 1] over the map. (M, P, 2 or 3)"""
-        return self.of_truths(gt.first_pts for gt in self.truths)
+        return self.truths.first_pts[self._rows]
 
     @cached_property
     def gt_pts_m(self) -> Tensor:
@@ -223,20 +223,11 @@ class MatchedPairs:
         masks = self.predictions.masks
         if masks.source == "points":
             return masks.draw(self.gt_pts_m, self.gt_labels, masks.grid)
-        return self.of_truths(gt.masks for gt in self.truths)
-
-    @property
-    def bev_feats(self) -> Tensor:
-        """BEV features of the batch. (B, C, H, W)"""
-        return self.predictions.bev_feats
-
-    def query_scores(self) -> Tensor:
-        """Return the class logits of every query, matched or not. (B * N, classes)"""
-        return self.predictions.scores.flatten(0, 1)
+        return self.truths.masks[self._rows]
 
     def query_labels(self) -> Tensor:
-        """Return the class that every query should say, -1 for none. (B * N,)"""
+        """Return the class that every query should say, -1 for none. (B, N)"""
         scores = self.predictions.scores
         labels = torch.full(scores.shape[:2], -1, dtype=torch.long, device=scores.device)
         labels[self.samples, self.query_inds] = self.gt_labels
-        return labels.flatten()
+        return labels

@@ -74,7 +74,8 @@ class InstanceMaskLoss(MapLoss):
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Return the weighted loss; masks are averaged over the cells of the BEV features."""
-        samples = zip(pairs.pred_instance_states.split(pairs.counts), pairs.bev_feats, strict=True)
+        states, feats = pairs.pred_instance_states, pairs.predictions.bev_feats
+        samples = zip(states.split(pairs.counts), feats, strict=True)
         logits = torch.cat([self.logits(*sample) for sample in samples])  # (M, H, W)
         masks = pairs.gt_masks.to(logits)
         if self.pairing == "released":
