@@ -125,7 +125,8 @@ def _named(name: str | Path, what: str, remedy: str = "") -> NamedModel:
     models = named_models()
     if str(name) not in models:
         close = difflib.get_close_matches(Path(name).stem, models, n=1, cutoff=0.7)
-        hint = f"did you mean {close[0]}?" if close else f"{', '.join(list_models())} are here"
+        ours = ", ".join(model.name for model in models.values() if not model.address)
+        hint = f"did you mean {close[0]}?" if close else f"{ours} ship"
         raise FileNotFoundError(
             f"There is no {what} {name}, and no model of that name ({hint}){remedy}."
         )
