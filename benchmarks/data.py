@@ -1,4 +1,4 @@
-"""Measurements behind ``docs/benchmarks/data.md``, run by ``python -m benchmarks data``."""
+"""Measurements behind ``docs/benchmarks/speed.md``, run by ``python -m benchmarks data``."""
 
 import multiprocessing
 import time
