@@ -21,6 +21,7 @@ OUTSIDE = {
     "index.md": "README.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
+    "security.md": "SECURITY.md",
     "models.md": "models/README.md",
     "gsmap.md": "projects/GSMap/README.md",
     "minicity_package.md": "projects/MiniCity/README.md",
