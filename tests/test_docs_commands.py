@@ -86,7 +86,10 @@ def tool(name: str) -> Any:
     if name.endswith(".py"):
         scope = runpy.run_path(str(REPO / name), run_name="tool")
         return scope.get("make") or scope["main"]
-    return importlib.import_module(f"{name}.__main__").main
+    module = importlib.import_module(name)
+    if hasattr(module, "__path__"):
+        module = importlib.import_module(f"{name}.__main__")
+    return module.main
 
 
 def parse(name: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
