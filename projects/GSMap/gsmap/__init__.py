@@ -1,7 +1,7 @@
 """Online vectorized HD-map construction with 2D Gaussians.
 
-Light on purpose: the mathematics in ``geometry``, ``ops``, ``losses`` and ``evaluation`` needs
-torch and numpy alone. A config registers every model, data set and metric with
+Light on purpose: the mathematics in ``structures``, ``ops`` and ``evaluation`` needs nothing of
+OpenMMLab. A config registers every model, data set and metric with
 ``custom_imports = dict(imports=['gsmap.registered'])``.
 """
 
