@@ -72,6 +72,25 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, value):
         read_weights(save(tmp_path / "failed.pth", {"state_dict": state}))
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        {1: torch.ones(2)},
+        {"state_dict": [torch.ones(2)]},
+        {"a": torch.eye(3).to_sparse()},
+        {"a": torch.ones(3, device="meta")},
+        {"a": torch.quantize_per_tensor(torch.ones(3), 1.0, 0, torch.qint8)},
+        {"a": torch.ones(3).to(torch.float8_e4m3fn)},
+        {"a": torch.ones(1).expand(2**48)},
+        {"state_dict": {"a": torch.ones(2)}, "meta": ["epoch"]},
+    ],
+    ids=["number", "list", "sparse", "meta", "quantised", "float8", "huge", "meta is a list"],
+)
+def test_what_is_no_plain_state_dict_is_refused_in_words(content, tmp_path):
+    with pytest.raises(ValueError, match=r"odd.pth (holds no state dict|is not a whole checkpoint)"):
+        read_weights(save(tmp_path / "odd.pth", content))
+
+
 @pytest.fixture
 def small() -> Config:
     """The config of a small model."""

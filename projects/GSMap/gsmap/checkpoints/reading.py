@@ -45,7 +45,12 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
             checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
         state = checkpoint.get("state_dict", checkpoint) if isinstance(checkpoint, Mapping) else {}
         meta = (checkpoint.get("meta") if state is not checkpoint else None) or {}
+        if not isinstance(meta, Mapping):
+            raise TypeError(f"meta must be a dictionary, got {meta!r:.60}")
         settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
+        if not isinstance(state, Mapping) or not all(map(_is_weight, state, state.values())):
+            state = {}
+        broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
     except pickle.UnpicklingError as error:
         reason = str(error).split(". ")[0]
         raise ValueError(
@@ -57,15 +62,20 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
             f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); "
             "fetch it again, or use an earlier epoch's."
         ) from error
-    if not state or not all(isinstance(value, Tensor) for value in state.values()):
-        raise ValueError(f"{path} holds no state dict of tensors.")
-    broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
+    if not state:
+        raise ValueError(f"{path} holds no state dict of plain tensors: give a training's.")
     if broken:
         raise ValueError(
             f"{path} holds NaN or infinite weights ({listed(broken)}): the training that wrote it "
             "had failed; use an earlier epoch's."
         )
     return {key.removeprefix("module."): value for key, value in state.items()}, settings
+
+
+def _is_weight(key: Any, value: Any) -> bool:
+    """Whether an entry of a state dict is a weight: a plain tensor under a name."""
+    plain_tensor = isinstance(value, Tensor) and value.layout is torch.strided
+    return isinstance(key, str) and plain_tensor and not (value.is_quantized or value.is_meta)
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:
