@@ -13,82 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.cli import output_file, run_command
 from gsmap.utils.files import atomic_write
-
-
-def tool() -> CommandParser:
-    """A parser with every kind of option."""
-    parser = CommandParser()
-    parser.add_argument("config")
-    parser.add_argument("checkpoint")
-    parser.add_argument("--eval", nargs="*", choices=["chamfer", "raster"], default=["all"])
-    parser.add_argument("--thresholds", nargs="+", type=float)
-    parser.add_argument("--range", nargs=2, type=float)
-    parser.add_argument("--classes", nargs="+")
-    parser.add_argument("--cfg-options", nargs="+", metavar="KEY=VALUE")
-    parser.add_argument("--resume", nargs="?", const="auto")
-    parser.add_argument("--amp", action="store_true")
-    parser.add_argument("--out")
-    return parser
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("C K --eval chamfer raster", {"eval": ["chamfer", "raster"]}),
-        ("--eval chamfer raster C K", {"eval": ["chamfer", "raster"]}),
-        ("C --eval chamfer K", {"eval": ["chamfer"]}),
-        ("--eval C K", {"eval": []}),
-        ("--ev raster C K --out o", {"eval": ["raster"], "out": "o"}),
-        ("--thresholds 0.5 1 C K", {"thresholds": [0.5, 1.0]}),
-        ("--range -30 .5 C --amp K", {"range": [-30.0, 0.5], "amp": True}),
-        ("--classes a b C K", {"classes": ["a", "b"]}),
-        ("C --classes a b K", {"classes": ["a", "b"]}),
-        ("--cfg-options a=1 b.c=2 C K", {"cfg_options": ["a=1", "b.c=2"]}),
-        ("--resume C K", {"resume": "auto"}),
-        ("--resume last C K", {"resume": "last"}),
-        ("C K --resume", {"resume": "auto"}),
-        ("--out=o --amp C K", {"out": "o", "amp": True}),
-        ("--eval chamfer -- C K", {"eval": ["chamfer"]}),
-    ],
-)
-def test_lists_leave_the_positional_arguments_alone(words, expected):
-    found = vars(tool().parse_args(words.split()))
-    assert (found["config"], found["checkpoint"]) == ("C", "K")
-    assert {name: found[name] for name in expected} == expected
-    defaults = vars(tool().parse_args(["C", "K"]))
-    rest = set(found) - set(expected)
-    assert {name: found[name] for name in rest} == {name: defaults[name] for name in rest} | {
-        "config": "C",
-        "checkpoint": "K",
-    }
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--eval raste C K", "invalid choice: 'raste'"),
-        ("C K --thresholds x", "invalid float value: 'x'"),
-        ("C", "required: checkpoint"),
-        ("C K L", "unrecognized arguments: L"),
-        ("C K --nothing", "unrecognized arguments: --nothing"),
-    ],
-)
-def test_wrong_words_are_named(words, message, capsys):
-    with pytest.raises(SystemExit) as left:
-        tool().parse_args(words.split())
-    assert left.value.code == 2
-    assert message in capsys.readouterr().err
-
-
-def test_subcommands_and_lists_of_positional_arguments_too():
-    parser = CommandParser()
-    command = parser.add_subparsers().add_parser("fps")
-    command.add_argument("configs", nargs="+")
-    command.add_argument("--sizes", nargs="+", type=int)
-    found = parser.parse_args(["fps", "--sizes", "1", "2", "A", "B"])
-    assert (found.configs, found.sizes) == (["A", "B"], [1, 2])
 
 
 class DamagedError(ValueError):
@@ -292,7 +218,7 @@ run_command(command)
 def test_kill_runs_the_clean_up_where_that_is_wanted(heed_kill, code, left, tmp_path):
     program = f"""
 import time
-from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.cli import output_file, run_command
 from gsmap.utils.files import atomic_write
 def command():
     with atomic_write({str(tmp_path / "a")!r}):

@@ -10,9 +10,9 @@ from matplotlib.transforms import Bbox
 from processes import run_python
 
 from gsmap.structures.elements import MapElements
+from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.grid import BEVGrid
 from gsmap.visualization import (
-    FRAME_VIEWS,
     BEVPanel,
     CameraView,
     MapStyle,

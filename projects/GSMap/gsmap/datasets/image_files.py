@@ -1,8 +1,9 @@
-"""Image files: their size, and their pixels with every doubt about them an error."""
+"""Image files: their size, their pixels with every doubt about them an error, and JPEG."""
 
 from io import BytesIO
 from pathlib import Path
 
+import cv2
 import numpy as np
 import simplejpeg
 from PIL import Image, UnidentifiedImageError
@@ -78,6 +79,11 @@ def decode_image(
             "images."
         )
     return image
+
+
+def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
+    """Return an image, BGR (H, W, 3), as the content of a JPEG file of a quality in 0 to 100."""
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def _size(content: bytes) -> tuple[int, int]:

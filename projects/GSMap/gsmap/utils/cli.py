@@ -1,18 +1,15 @@
-"""What every command shares: how its words are read, and how it ends."""
+"""What every command shares: its name in help, where it may write, and how it ends."""
 
 import argparse
 import errno
 import logging
 import math
 import os
-import re
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from functools import partial
-from itertools import chain, takewhile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,82 +19,15 @@ from gsmap.utils.parallel import die_with_parent
 BAD_INPUT = 2  # exit code, as argparse's for bad arguments
 ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 CLEAN_UP_S = 5.0  # how long further Ctrl-C are not answered
-_LISTS = ("?", "*", "+")
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose lists leave the positional arguments alone.
-
-    argparse lets ``--eval chamfer raster CONFIG`` swallow ``CONFIG``. Here a list ends before a
-    word that it cannot take (by its choices, its type, or a ``=`` in its metavar), and gives back
-    its last words if positional arguments would be missing.
-    """
+    """A parser that calls its command as the user does: ``gsmap NAME``, or by its script's name."""
 
     program: str | None = None
-    """What help calls the command; None for the script's name."""
 
     def __init__(self, prog: str | None = None, **options: Any):
         super().__init__(prog or self.program, **options)
-
-    def parse_known_args(  # type: ignore[override]
-        self, args: Sequence[str] | None = None, namespace: Any = None
-    ) -> Any:
-        """Parse as argparse does, after a rearrangement with the positional arguments first."""
-        words = list(sys.argv[1:] if args is None else args)
-        return super().parse_known_args(self._positionals_first(words), namespace)
-
-    def _positionals_first(self, words: list[str]) -> list[str]:
-        """Rearrange the words, or leave them as they are if that would not help."""
-        if self._subparsers is not None or "--" in words:
-            return words
-        groups: list[list[str]] = [[]]  # each but the first: an option and what follows it
-        for word in words:
-            if re.match(r"-(?!\.?\d|$)", word):
-                groups.append([])
-            groups[-1].append(word)
-        actions = [self._option(group[0]) for group in groups[1:]]
-        taken = [_taken(*pair) for pair in zip(actions, groups[1:], strict=True)]
-        fixed = [action.nargs for action in self._get_positional_actions()]
-        needed = sum(n if isinstance(n, int) else n in (None, "+") for n in fixed)
-        free = len(words) - sum(taken)
-        for i in reversed(range(len(taken))):
-            if actions[i] is not None and actions[i].nargs in _LISTS and free < needed:
-                given = min(needed - free, taken[i] - 1 - (actions[i].nargs == "+"))
-                taken[i], free = taken[i] - given, free + given
-        if free > needed and not set(_LISTS) & set(fixed):
-            return words  # too many: argparse says it best
-        rest = [group[n:] for group, n in zip(groups, [0, *taken], strict=True)]
-        kept = [group[:n] for group, n in zip(groups[1:], taken, strict=True)]
-        return list(chain(*rest, *kept))
-
-    def _option(self, word: str) -> Any:
-        """Find an option by its name or by how that begins; None for what it is not."""
-        options = self._option_string_actions
-        if word in options:
-            return options[word]
-        found = {id(action): action for name, action in options.items() if name.startswith(word)}
-        return next(iter(found.values())) if len(found) == 1 else None
-
-
-def _taken(action: Any, group: list[str]) -> int:
-    """Count the words of a group that belong to its option, with the option itself."""
-    if action is None:
-        return 1 if "=" in group[0] else len(group)
-    if action.nargs not in _LISTS:
-        return min(len(group), 2 if action.nargs is None else 1 + action.nargs)
-    values = group[1:2] if action.nargs == "?" else group[1:]
-    return 1 + sum(1 for _ in takewhile(partial(_fits, action), values))
-
-
-def _fits(action: argparse.Action, word: str) -> bool:
-    """Whether a list may take a word."""
-    if "=" in str(action.metavar) and "=" not in word:
-        return False
-    try:
-        value = action.type(word) if callable(action.type) else word
-    except (argparse.ArgumentTypeError, ValueError, TypeError):
-        return False
-    return action.choices is None or value in action.choices
 
 
 def is_first_rank() -> bool:

@@ -8,17 +8,17 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from gsmap.datasets.image_files import decode_image, encode_jpeg
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FrameView
 from gsmap.structures.grid import BEVGrid
-from gsmap.utils.files import atomic_write, file_name
+from gsmap.utils.files import file_name, write_bytes
 from gsmap.visualization.bev_view import BEVPanel, display_extent, draw_bev
 from gsmap.visualization.camera_view import CameraView, arrange_cameras, draw_camera
 from gsmap.visualization.style import FALSE_DASHES, MATCH_COLOURS, TRUTH_OPACITY, MapStyle
@@ -219,8 +219,7 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
         )
     content = BytesIO()
     figure.savefig(content, format=kind, **_SAVE_OPTIONS[kind])
-    with atomic_write(path, "wb") as file:
-        file.write(_compact(content.getvalue()) if kind == "svg" else content.getvalue())
+    write_bytes(path, _compact(content.getvalue()) if kind == "svg" else content.getvalue())
     return path
 
 
@@ -232,6 +231,5 @@ def _compact(svg: bytes) -> bytes:
 
 def _as_jpeg(image: re.Match[bytes]) -> bytes:
     """Turn an image in an SVG from PNG to JPEG."""
-    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image[1]), np.uint8), cv2.IMREAD_COLOR)
-    jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 65])[1]
-    return b"data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes())
+    pixels = decode_image(base64.b64decode(image[1]), "an image", "figure")
+    return b"data:image/jpeg;base64," + base64.b64encode(encode_jpeg(pixels, 65))

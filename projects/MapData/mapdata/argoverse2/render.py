@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pyarrow.feather as feather
 import shapely
@@ -17,6 +16,7 @@ from av2.geometry.camera.pinhole_camera import PinholeCamera
 from av2.map.map_api import ArgoverseStaticMap, GroundHeightLayer
 from av2.utils.io import read_feather
 
+from gsmap.datasets.image_files import encode_jpeg
 from gsmap.utils.files import partial_path
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
@@ -99,7 +99,7 @@ def _prepare(
         city_from_cam = log.poses[timestamp_ns] @ cameras[name].ego_SE3_cam.transform_matrix
         camera = Camera(*pinholes[name], np.linalg.inv(city_from_cam))
         image = renderer.render_camera(camera, [], rng)
-        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+        return encode_jpeg(image, JPEG_QUALITY)
 
     return take
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from gsmap.datasets.annotations.file import check_samples
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapSample
+from gsmap.datasets.image_files import encode_jpeg
 from gsmap.datasets.source import sample_in_vehicle
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.files import write_bytes
@@ -103,7 +104,7 @@ class RigCamera:
     def write_image(self, path: Path, image: np.ndarray) -> None:
         """Write an image, BGR, as JPEG, without its distortion. (H, W, 3)"""
         image = self.rectified(image) if self.is_distorted else image
-        write_bytes(path, cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
+        write_bytes(path, encode_jpeg(image, 95))
 
 
 @dataclass(frozen=True)

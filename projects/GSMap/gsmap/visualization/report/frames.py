@@ -10,6 +10,8 @@ import numpy as np
 
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
 from gsmap.datasets.elements import elements_of_instances
+from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.image_files import encode_jpeg, read_image
 from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.structures.frames import FrameView
 from gsmap.visualization.camera_view import arrange_cameras, camera_title
@@ -104,18 +106,19 @@ def thumbnail(path: Path, width_px: int) -> str:
     Raises:
         ValueError: If there is no image, or it is damaged.
     """
-    image = cv2.imread(str(path)) if path.is_file() else None
-    if image is None:
+    try:
+        image = read_image(str(path), "report")
+    except BrokenSampleError as error:
         raise ValueError(
             f"no readable image at {path}: give the folder that image paths start from as "
             "--data-root, or leave the images out with --no-images."
-        )
+        ) from error
     height, width = image.shape[:2]
     if width > width_px:
         size = (width_px, max(round(height * width_px / width), 1))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-    return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
+    content = base64.b64encode(encode_jpeg(image, _JPEG_QUALITY))
+    return f"data:image/jpeg;base64,{content.decode()}"
 
 
 def cameras_of(
