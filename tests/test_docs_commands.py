@@ -23,7 +23,9 @@ from gsmap.engine.arguments import parse_options
 from gsmap.engine.launch import check_config, read_config
 
 REPO = Path(__file__).resolve().parents[1]
-PAGES = [REPO / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "models/README.md")]
+PAGES = [
+    REPO / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "models/README.md")
+]
 PAGES += sorted([*(REPO / "docs").rglob("*.md"), *(REPO / "projects").glob("*/README.md")])
 PAGES += sorted((REPO / "tools").glob("*.py"))
 STAND_INS = {"CONFIG": "configs/maptr/maptr_r18_minicity.py", "ITERATIONS": "100"}
