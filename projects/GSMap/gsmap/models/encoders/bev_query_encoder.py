@@ -169,5 +169,10 @@ class BEVQueryEncoder(CameraEncoder):
         """Project every cell's pillar into every camera."""
         # Differs from upstream for batches: it takes the set of seen cells from the first sample
         # for all.
-        pillars = self.grid, self.z_range, self.num_heights, img_from_frame.device
-        return project_pillars(pillar_points(*pillars), img_from_frame, img_shape)
+        pillars = pillar_points(
+            grid=self.grid,
+            z_range=self.z_range,
+            num_heights=self.num_heights,
+            device=img_from_frame.device,
+        )
+        return project_pillars(pillars, img_from_frame, img_shape)

@@ -49,8 +49,12 @@ class SpatialCrossAttention(SamplingAttention):
             cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
             centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
             locations = centres[:, None] + offsets[sample, cell]  # (T, heads, S, 2)
-            inputs = value[sample, view][None], (height, width), locations[None]
-            seen = sample_map(*inputs, weights[sample, cell][None])
+            seen = sample_map(
+                value[sample, view][None],
+                shape=(height, width),
+                locations=locations[None],
+                weights=weights[sample, cell][None],
+            )
             summed[sample] = summed[sample].index_add(0, cell, seen[0])
         count = projection.visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])

@@ -1,6 +1,7 @@
 """MGMapNet's attention: one sampling of the BEV serves an instance query and its point queries."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -172,10 +173,16 @@ class MultiGranularityAttention(PerPointSampling):
     ) -> None:
         super().__init__(embed_dims=embed_dims, **kwargs)
         _, points, samples = self.layout
-        settings = (embed_dims, self.num_heads, ffn_dims, self.dropout.p)
+        interaction = partial(
+            Interaction,
+            embed_dims=embed_dims,
+            num_heads=self.num_heads,
+            ffn_dims=ffn_dims,
+            dropout=self.dropout.p,
+        )
         self.add_instance = add_instance
-        self.p2p = Interaction(*settings) if p2p else None
-        self.p2i = Interaction(*settings) if p2i else None
+        self.p2p = interaction() if p2p else None
+        self.p2i = interaction() if p2i else None
         dims = (embed_dims, embed_dims)
         coded = position_codes and (p2p or p2i)
         self.point_code = mlp(2 * samples, *dims) if coded else None
