@@ -1,12 +1,14 @@
 """What the tools share: reading a config, changing it, checking it, the work folder."""
 
 import argparse
+import errno
 import inspect
 import logging
 import os
 import re
 import traceback
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -150,17 +152,27 @@ def newest_checkpoint(
     for path in sorted(numbers, key=numbers.__getitem__, reverse=True):
         reason = f"{path} is damaged and is passed over."
         try:
-            with zipfile.ZipFile(path) as archive:
-                if archive.testzip() is None:
-                    if read is not None:
-                        read(path)
-                    return path
-        except zipfile.BadZipFile:
-            pass
+            if _is_whole(path):
+                if read is not None:
+                    read(path)
+                return path
         except ValueError as error:
             reason = f"{error} It is passed over."
         print_log(reason, level=logging.WARNING)
     return None
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file is a zip archive without damage."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is None
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError):
+        return False
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a place before the file's beginning
+            raise
+        return False
 
 
 def check_config(cfg: Config) -> None:
