@@ -8,7 +8,6 @@ import os
 import re
 import traceback
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -25,6 +24,7 @@ from mmengine.utils import import_modules_from_strings
 from gsmap.checkpoints.named_models import find_config
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.utils.faults import nearest, registered
+from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
@@ -167,7 +167,7 @@ def _is_whole(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return archive.testzip() is None
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError):
+    except DAMAGED_ZIP:
         return False
     except OSError as error:
         if error.errno != errno.EINVAL:  # a place before the file's beginning

@@ -10,6 +10,8 @@ import re
 import secrets
 import shutil
 import time
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +24,7 @@ _OURS = re.compile(rf".+\.([0-9a-f]{{8}})-[0-9a-f]{{8}}{re.escape(SUFFIX)}", re.
 _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
 _CHANGED = re.compile(r"-[0-9a-f]{16}\Z")  # as `file_name` ends a changed name
+DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)  # what it raises
 _LONGEST_NAME = 100  # bytes; a file system takes 255, with all that is appended
 
 
