@@ -6,7 +6,7 @@ PY := $(VENV)/bin/python
 help:
 	@echo "make setup   build the environment in $(VENV) (again: a second)"
 	@echo "make test    set up if needed, then run every test"
-	@echo "make demo    set up if needed, then a trained GSMap drawn on MiniCity, and one trained from scratch beside it"
+	@echo "make demo    set up if needed, then a trained GSMap drawn on MiniCity, and one of your own that starts from MapTR"
 	@echo "make lint    ruff, ruff format, codespell, mypy"
 	@echo "make format  let ruff fix what it can"
 	@echo "make docs    the documentation as a site, in site/"

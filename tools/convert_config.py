@@ -30,7 +30,9 @@ def convert(source: Path, target: Path) -> str:
     try:
         conversion = convert_upstream(settings)
         text = python_text(merge(conversion, shipped("configs")))
-    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
+    except (
+        ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
+    ) as error:  # fmt: skip
         raise ValueError(f"{source} cannot be converted: {error}") from error
     write_text(target, text)
     lines = [f"{target} is written: configs/{conversion.base} with the settings of {source}"]

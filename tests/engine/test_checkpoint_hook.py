@@ -44,7 +44,8 @@ def test_an_import_changes_nothing_of_mmengine_and_torch():
     assert done.returncode == 0, done.stderr
 
 
-def test_the_hook_writes_through_the_atomic_backend_and_lets_torch_read(tmp_path):
+def test_the_hook_writes_through_the_atomic_backend_and_lets_torch_read(monkeypatch):
+    monkeypatch.setenv("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "0")  # and as it was after the test
     before = torch.serialization.get_safe_globals()
     hook = AtomicCheckpointHook(interval=1)
     assert isinstance(get_file_backend("a.pth", backend_args=hook.backend_args), AtomicLocalBackend)
@@ -57,6 +58,30 @@ def test_the_hook_writes_through_the_atomic_backend_and_lets_torch_read(tmp_path
     finally:
         torch.serialization.clear_safe_globals()
         torch.serialization.add_safe_globals(before)
+
+
+def test_a_fetched_checkpoint_runs_no_code(monkeypatch, tmp_path):
+    """What ``load_from`` and ``init_cfg`` name by an address is read by torch's own hub."""
+    code = (
+        "import sys, threading, torch\n"
+        "from http.server import HTTPServer, SimpleHTTPRequestHandler\n"
+        "from mmengine.runner import load_checkpoint\n"
+        "from gsmap.engine.checkpoint_hook import AtomicCheckpointHook\n"
+        "server = HTTPServer(('127.0.0.1', 0), SimpleHTTPRequestHandler)\n"
+        "threading.Thread(target=server.serve_forever, daemon=True).start()\n"
+        "if sys.argv[1] == 'hook': AtomicCheckpointHook().before_run(None)\n"
+        "address = f'http://127.0.0.1:{server.server_port}/a.pth'\n"
+        "load_checkpoint(torch.nn.Linear(1, 1), address)\n"
+    )
+    torch.save({"x": Calls(open, str(tmp_path / "proof"), "w")}, tmp_path / "a.pth")
+    for name in ("http_proxy", "HTTP_PROXY", "TORCH_FORCE_WEIGHTS_ONLY_LOAD"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "cache"))
+    refused = run_python("-c", code, "hook", cwd=tmp_path)
+    assert "Weights only load failed" in refused.stderr
+    assert not (tmp_path / "proof").exists()
+    run_python("-c", code, "no hook", cwd=tmp_path)
+    assert (tmp_path / "proof").exists()  # the attack works
 
 
 @pytest.mark.usefixtures("safe_globals")

@@ -85,3 +85,18 @@ def test_the_newest_whole_checkpoint_is_found_whatever_is_noted(tmp_path, capsys
     (tmp_path / "epoch_10.pth").write_bytes(content[:100])
     assert newest_checkpoint(tmp_path).name == "epoch_9.pth"
     assert "epoch_10.pth is damaged and is passed over" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [(6, 200), (8, 1), (10, 9), (42, 0xFFFF_FFF0)],
+    ids=["version", "encryption", "compression", "place"],
+)
+def test_a_checkpoint_with_a_damaged_list_of_contents_is_passed_over(tmp_path, place, value):
+    for number in (1, 2):
+        torch.save({"state_dict": {"w": torch.ones(1000)}}, tmp_path / f"epoch_{number}.pth")
+    content = bytearray((tmp_path / "epoch_2.pth").read_bytes())
+    entry = content.rindex(b"PK\x01\x02") + place
+    content[entry : entry + 2 + 2 * (value > 999)] = value.to_bytes(2 + 2 * (value > 999), "little")
+    (tmp_path / "epoch_2.pth").write_bytes(content)
+    assert newest_checkpoint(tmp_path).name == "epoch_1.pth"

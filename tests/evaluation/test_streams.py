@@ -87,7 +87,20 @@ def test_places_lead_to_the_same_elements_also_behind_letters_of_many_bytes(tmp_
     for token, elements, place in file:
         start, length = place
         assert json.loads(path.read_bytes()[start : start + length])["sample_token"] == token
-        assert file.load(place).points.tolist() == elements.points.tolist() == [[0, 1.5], [2, 3]]
+        again = file.load(token, place)
+        assert again.points.tolist() == elements.points.tolist() == [[0, 1.5], [2, 3]]
+
+
+@pytest.mark.parametrize("change", [list.reverse, list.clear])
+def test_a_file_that_changes_while_samples_wait_is_named(files, tmp_path, change):
+    """The files have opposite orders, so that samples wait by their places."""
+    results, truth = files
+    last_first = rewritten(truth, "GTs", tmp_path / "a.json", list.reverse)
+    stream = iter(SamplePairs(results, last_first, CLASSES))
+    next(stream)
+    rewritten(last_first, "GTs", last_first, change)
+    with pytest.raises(ValueError, match=r"a\.json was changed while it was read"):
+        list(stream)
 
 
 @pytest.mark.parametrize(

@@ -181,6 +181,7 @@ def config_corpus(folder: Path, text: str) -> dict[str, str]:
         "type of a module": {"type": "os.makedirs"},
         "bytes": {"x": b"1"},
         "infinite": {"x": "INFINITE"},
+        "deep name": {".".join("x" * 3000): 1},
     }
     inner = "type='ResNet', depth=50,"
     tried = {

@@ -160,6 +160,7 @@ def test_what_has_no_place_is_named_with_its_value(tmp_path):
         ("a = 'x' * 1000000000", "only numbers are multiplied"),
         ("a = (1).real", "is more than a value"),
         ("a, b = 1, 2", "only assignments of names are read"),
+        ("a = b[0] = 1", "only assignments of names are read"),
         ("a = f'{1}'", "is more than a value"),
         ("a = 1 / 0", "division by zero"),
         ("a = [1][3]", "list index out of range"),
@@ -189,7 +190,7 @@ def test_values_that_are_read(tmp_path):
     source = tmp_path / "theirs.py"
     source.write_text(
         '"""Text."""\na = [1, 2.5]\nb = dict(x=a, **dict(y=(len(a), -a[0])))\n'
-        "c = {'k': b['y'], 'r': 7 // 2 / 2.0}\nd = 'data/' + 'x.pkl'\na = a + [3]\n"
+        "c = {'k': b['y'], 'r': 7 // 2 / 2.0}\nd = 'data/' + 'x.pkl'\na = a + [3]\ne = f = a\n"
     )
     values = read_assignments(source)
     assert values == {
@@ -197,7 +198,10 @@ def test_values_that_are_read(tmp_path):
         "b": {"x": [1, 2.5], "y": (2, -1)},
         "c": {"k": (2, -1), "r": 1.5},
         "d": "data/x.pkl",
+        "e": [1, 2.5, 3],
+        "f": [1, 2.5, 3],
     }
+    assert values["e"] is not values["f"]
 
 
 def test_a_config_of_another_model_is_refused(tmp_path):

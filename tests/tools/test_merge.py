@@ -19,7 +19,7 @@ from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
 from gsmap.engine.launch import read_config
 from gsmap.evaluation.results_json import read_samples, vectors_of, write_results
 from gsmap.structures.elements import MapElements
-from gsmap.utils.shards import WHOLE, Shard
+from gsmap.utils.shards import WHOLE, Shard, digest
 from mapdata.custom import from_records
 from tools import create_data, infer
 from tools.evaluate import main as evaluate
@@ -215,6 +215,20 @@ def test_forged_rules_of_figures_are_refused(rules, message, scored, tmp_path):
     with pytest.raises(ValueError, match=message):
         merge([str(target)])
     assert not target.exists()
+
+
+def test_forged_matches_are_refused(scored, tmp_path):
+    target = tmp_path / "metrics.json"
+    evaluate([*map(str, scored), "--eval", "chamfer", "--out", str(target), "--shard", "0/1"])
+    path = tmp_path / "metrics.00000-of-00001.json"
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\x01\x02") + 10] = 99  # a compression that nobody knows
+    path.write_bytes(content)
+    manifest = json.loads(path.with_name(f"{path.name}.manifest").read_text())
+    manifest["sha256"] = digest(path)
+    path.with_name(f"{path.name}.manifest").write_text(json.dumps(manifest))
+    with pytest.raises(ValueError, match="holds no matches by the rules"):
+        merge([str(target)])
 
 
 def test_figures_of_results_that_lie_in_shards(predictions, minicity_annotations, tmp_path):

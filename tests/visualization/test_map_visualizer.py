@@ -131,9 +131,9 @@ def test_hits_are_those_of_the_evaluation_and_the_legend_has_what_is_drawn(tmp_p
 def test_scene_and_time_name_a_picture(tmp_path):
     meta = {"scene": "scene/7", "seconds": 12.5, "token": "0123456789abcdef"}
     assert sample_name(meta | {"scene": "a"}, ".png") == "a_0012.50s_89abcdef.png"
-    assert sample_name(meta, ".png") == "scene_7_0012.50s_89abcdef-8f86fd43.png"
+    assert sample_name(meta, ".png") == "scene_7_0012.50s_89abcdef-8f86fd439eaf1e35.png"
     assert sample_title(meta) == "scene/7  ·  12.50 s  ·  0123456789abcdef"
-    assert sample_name({"scene": "a", "token": "b/1"}, ".png") == "b_1-c2c4324f.png"
+    assert sample_name({"scene": "a", "token": "b/1"}, ".png") == "b_1-c2c4324fdbeececd.png"
     sample = make_sample(tmp_path, cameras=0)
     sample.set_metainfo({"seconds": 3.0})
     figure = make_visualizer("named", width_px=300).draw_sample(sample)

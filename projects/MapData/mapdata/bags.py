@@ -197,12 +197,12 @@ def _camera_topics(bag: Any) -> dict[str, tuple[str, str]]:
             "it has no camera with images (sensor_msgs Image or CompressedImage) and a CameraInfo "
             f"in the same namespace; it holds: {_listing(bag) or 'no topic'}"
         )
-    short = [base.rsplit("/", 1)[-1] for base in found]
-    unique = len(set(short)) == len(short)
-    return {
-        name if unique else base.strip("/").replace("/", "_"): pair
-        for name, (base, pair) in zip(short, found.items(), strict=True)
-    }
+    names = [base.rsplit("/", 1)[-1] for base in found]
+    if len(set(names)) < len(names):
+        names = [base.strip("/").replace("/", "_") for base in found]
+    if len(set(names)) < len(names):
+        raise ValueError(f"the cameras {sorted(found)} get one name: record them under other names")
+    return dict(zip(names, found.values(), strict=True))
 
 
 def _stamp_ns(header: Any) -> int:

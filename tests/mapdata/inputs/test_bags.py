@@ -104,6 +104,19 @@ def test_a_damaged_bag_and_a_missing_extra_are_named(tmp_path, monkeypatch):
         open_input(path)
 
 
+def test_cameras_of_one_name_are_told_apart_or_refused(drive, minicity_root, tmp_path):
+    def bag(name, *spaces):
+        recorder = Recorder(tmp_path / name, "sqlite")
+        cameras = [replace(drive[0].cameras[i], name=space) for i, space in enumerate(spaces)]
+        record(recorder, [replace(drive[0], cameras=cameras)], minicity_root)
+        return recorder.path
+
+    source = open_input(bag("apart", "left/cam", "right/cam"), options(tmp_path))
+    assert {camera.name for camera in source.samples[0].cameras} == {"left_cam", "right_cam"}
+    with pytest.raises(ValueError, match=r"cameras \['/a/b/cam', '/a_b/cam'\] get one name"):
+        open_input(bag("mixed", "a/b/cam", "a_b/cam"), options(tmp_path))
+
+
 def starting_at_0(drive, turn=0, **more):
     """Return the first sample at time 0; cameras may have one another's images."""
     sample, paths = drive[0], [camera.path for camera in drive[0].cameras]

@@ -82,7 +82,7 @@ class MapInferencer:
 
     Args:
         config: Config file of the model, a ``Config``, or the name of a model
-            (``engine/named_models.py``), such as ``gsmap_r18_minicity``.
+            (``checkpoints/named_models.py``), such as ``gsmap_r18_minicity``.
         checkpoint: Its checkpoint, or such a name. None means the named model's, and without a name
             the initial weights (for trying out a pipeline).
         device: Where to run, or several devices that share the batches; a GPU if there is one.

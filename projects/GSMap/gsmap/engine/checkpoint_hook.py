@@ -1,6 +1,7 @@
 """Checkpoints that are whole or absent when written, and run no code when read."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +38,19 @@ class AtomicCheckpointHook(CheckpointHook):
 
     A run that is killed while it saves leaves the previous checkpoint as it was, so ``--resume``
     always finds a whole one, and a validation that it missed is made up for on resuming. A
-    checkpoint holds the model's settings. What is loaded and resumed from is read with torch's
-    ``weights_only``, to which the hook names mmengine's own data when a run begins.
+    checkpoint holds the model's settings. What is loaded, fetched and resumed from is read with
+    torch's ``weights_only``, to which the hook names mmengine's own data when a run begins.
     """
 
     def __init__(self, *args: Any, backend_args: dict | None = None, **kwargs: Any) -> None:
         super().__init__(*args, backend_args=backend_args or {"backend": "atomic"}, **kwargs)
 
     def before_run(self, runner: Runner) -> None:
-        """Let torch read mmengine's checkpoints; mmengine reads one right after this."""
+        """Let torch read mmengine's checkpoints; mmengine reads one right after this.
+
+        torch's own choice, and mmengine's for files that it fetches, would run code in them.
+        """
+        os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
         torch.serialization.add_safe_globals(mmengine_globals())
 
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:

@@ -1,6 +1,7 @@
 """What the tools share: reading a config, changing it, checking it, the work folder."""
 
 import argparse
+import errno
 import inspect
 import logging
 import os
@@ -23,6 +24,7 @@ from mmengine.utils import import_modules_from_strings
 from gsmap.checkpoints.named_models import find_config
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.utils.faults import nearest, registered
+from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
@@ -150,17 +152,27 @@ def newest_checkpoint(
     for path in sorted(numbers, key=numbers.__getitem__, reverse=True):
         reason = f"{path} is damaged and is passed over."
         try:
-            with zipfile.ZipFile(path) as archive:
-                if archive.testzip() is None:
-                    if read is not None:
-                        read(path)
-                    return path
-        except zipfile.BadZipFile:
-            pass
+            if _is_whole(path):
+                if read is not None:
+                    read(path)
+                return path
         except ValueError as error:
             reason = f"{error} It is passed over."
         print_log(reason, level=logging.WARNING)
     return None
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file is a zip archive without damage."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is None
+    except DAMAGED_ZIP:
+        return False
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a place before the file's beginning
+            raise
+        return False
 
 
 def check_config(cfg: Config) -> None:

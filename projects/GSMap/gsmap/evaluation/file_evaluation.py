@@ -66,7 +66,7 @@ class AnnotatedTruth:
         """Return the tokens of all samples, whatever the shard."""
         return self._file.column("token")
 
-    def load(self, row: int) -> MapElements:
+    def load(self, _token: str, row: int) -> MapElements:
         """Read the elements of one sample again."""
         return self._elements(self._file[row])
 
@@ -167,18 +167,18 @@ class SamplePairs:
                 token, elements, place = item
                 other = 1 - own
                 if token in waiting[other]:
-                    pair = [elements, self._load(sides[other], waiting[other].pop(token))]
+                    pair = [elements, self._load(sides[other], token, waiting[other].pop(token))]
                     yield self._counted(token, pair[own], pair[other])
                 else:
                     waiting[own][token] = elements if len(waiting[own]) < CHUNK else place
         self._mismatches = mismatch_notes(*waiting, self._allow_mismatch)
         nothing = MapElements.from_polylines()
         for token, kept in waiting[1].items():
-            yield self._counted(token, nothing, self._load(self._truth, kept))
+            yield self._counted(token, nothing, self._load(self._truth, token, kept))
 
-    def _load(self, side: Any, kept: Any) -> MapElements:
+    def _load(self, side: Any, token: str, kept: Any) -> MapElements:
         """Return the elements of a sample that waited."""
-        return kept if isinstance(kept, MapElements) else side.load(kept)
+        return kept if isinstance(kept, MapElements) else side.load(token, kept)
 
     def _counted(self, token: str, predictions: MapElements, truth: MapElements) -> Sample:
         self._degenerate += int((truth.num_points < 2).sum())

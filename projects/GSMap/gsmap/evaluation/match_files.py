@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from gsmap.evaluation.matches import FrameMatches
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import MetricReport
 from gsmap.structures.grid import BEVGrid
-from gsmap.utils.files import atomic_write
+from gsmap.utils.files import DAMAGED_ZIP, atomic_write
 from gsmap.utils.shards import Shard, ShardFile
 
 SHARD_KIND = "matches"
@@ -89,7 +88,7 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
             records = [dict(zip(metrics, of_sample, strict=True)) for of_sample in by_metric]
             for of_sample in records[:1]:
                 evaluator.require_fitting(of_sample)
-        except (*_FAULTS, BadZipFile) as error:
+        except (*_FAULTS, *DAMAGED_ZIP) as error:
             raise ValueError(
                 f"{shard.path} holds no matches by the rules of its manifest ({error!r}): make "
                 "that shard again."

@@ -8,7 +8,7 @@ import heapq
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -110,12 +110,17 @@ class SampleFile:
         """Return the tokens of all samples."""
         return [token for token, *_ in SampleFile(self.path, self._key, self._classes)]
 
-    def load(self, place: Place) -> MapElements:
-        """Read the elements of one sample again."""
+    def load(self, token: str, place: Place) -> MapElements:
+        """Read the elements of one sample again; ValueError if it is no longer in that place."""
         start, length = place
-        with self.path.open("rb") as file:
+        with self.path.open("rb") as file, suppress(ValueError):
             file.seek(start)
-            return self._convert(json.loads(file.read(length)), Counter())[1]
+            found, elements = self._convert(json.loads(file.read(length)), Counter())
+            if found == token:
+                return elements
+        raise ValueError(
+            f"{self.path} was changed while it was read: end what writes there, and start again."
+        )
 
     def _convert(self, item: Any, ignored: Counter[str]) -> tuple[str, MapElements]:
         """Return token and elements of a sample."""

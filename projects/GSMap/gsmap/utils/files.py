@@ -10,6 +10,8 @@ import re
 import secrets
 import shutil
 import time
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,6 +23,8 @@ _MACHINE = _BOOT.read_text()[:8] if _BOOT.exists() else secrets.token_hex(4)
 _OURS = re.compile(rf".+\.([0-9a-f]{{8}})-[0-9a-f]{{8}}{re.escape(SUFFIX)}", re.DOTALL)
 _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
+_CHANGED = re.compile(r"-[0-9a-f]{16}\Z")  # as `file_name` ends a changed name
+DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)  # what it raises
 _LONGEST_NAME = 100  # bytes; a file system takes 255, with all that is appended
 
 
@@ -28,14 +32,14 @@ def file_name(foreign: str) -> str:
     """Make the name of a file or folder from a name that a file brings.
 
     It is one part of a path and leads nowhere else. Letters, digits and ``_.+=-`` stay. A name that
-    has others, is empty or long, or begins with a dot or hyphen is changed and gets a digest, so
-    that two names never make one file.
+    has others, is empty or long, begins with a dot or hyphen, or ends as such a name does is
+    changed and gets a digest, so that two names never make one file.
     """
     plain = re.sub(r"[^\w.+=-]", "_", foreign).lstrip(".-").encode()[:_LONGEST_NAME]
     name = plain.decode(errors="ignore") or "unnamed"
-    if name == foreign:
+    if name == foreign and not _CHANGED.search(name):
         return name
-    return f"{name}-{hashlib.sha256(foreign.encode(errors='surrogatepass')).hexdigest()[:8]}"
+    return f"{name}-{hashlib.sha256(foreign.encode(errors='surrogatepass')).hexdigest()[:16]}"
 
 
 @contextmanager
@@ -163,7 +167,7 @@ def lock_folder(folder: Path, name: str, advice: str) -> IO[str]:
         RuntimeError: If another process has it; its number, its machine and since when.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    file = open(folder / name, "a+", encoding="utf-8")  # noqa: SIM115 - held by the caller
+    file = open(folder / name, "a+", encoding="utf-8", errors="replace")  # noqa: SIM115 - kept
     os.register_at_fork(after_in_child=file.close)  # workers must not hold it for a killed parent
     file.seek(0)
     lock(file, f"{folder} is in use by {file.read(200) or 'another process'}: {advice}.")

@@ -39,9 +39,12 @@ def read_assignments(path: str | Path) -> dict[str, Any]:
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             continue  # a docstring
         try:
-            if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Name):
+            if not isinstance(node, ast.Assign):
                 raise ValueError("only assignments of names are read")
-            names[node.targets[0].id] = _value(node.value, names)
+            for target in node.targets:
+                if not isinstance(target, ast.Name):
+                    raise ValueError("only assignments of names are read")
+                names[target.id] = _value(node.value, names)
         except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
             line = source.split("\n")[node.lineno - 1].strip()
             raise ValueError(f"{path}, line {node.lineno}, {line[:80]!r}: {error}.") from None
