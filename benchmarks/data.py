@@ -1,6 +1,5 @@
 """Measurements behind ``docs/benchmarks/speed.md``, run by ``python -m benchmarks data``."""
 
-import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
@@ -13,13 +12,13 @@ import psutil
 import shapely
 from shapely import affinity
 
+from benchmarks.measure import in_own_process
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
-from gsmap.datasets.annotations.record import MapInstance, MapSample
+from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
 from gsmap.structures.polylines import is_closed
 from mapdata.nuscenes.map import NuScenesLocalMap, open_layers
 
 _MEGABYTE = 2**20
-_CLASSES = ("divider", "ped_crossing", "boundary")
 
 
 def tile_annotations(source: Path, target: Path, count: int) -> None:
@@ -40,12 +39,12 @@ def _unique_bytes() -> int:
     return psutil.Process().memory_full_info().uss
 
 
-def _read_in_worker(file: AnnotationFile, reads: int, queue: Any) -> None:
+def _read_in_worker(file: AnnotationFile, reads: int) -> tuple[int, int, int, int]:
     """Read random samples in a fresh process and report the memory that it took."""
     before = _unique_bytes()
     order = np.random.default_rng(0).integers(len(file), size=reads)
     points = sum(len(i.points) for row in order for i in file[int(row)].instances or [])
-    queue.put((before, _unique_bytes(), psutil.Process().memory_info().rss, points))
+    return before, _unique_bytes(), psutil.Process().memory_info().rss, points
 
 
 def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
@@ -68,12 +67,7 @@ def measure_loading(path: Path, reads: int = 5000) -> dict[str, float]:
     for row in np.random.default_rng(1).integers(len(file), size=1000):
         file[int(row)]
     read = time.process_time() - start
-    context = multiprocessing.get_context("spawn")
-    queue = context.Queue()
-    worker = context.Process(target=_read_in_worker, args=(file, reads, queue))
-    worker.start()
-    before, after, rss, _ = queue.get(timeout=120)
-    worker.join()
+    before, after, rss, _ = in_own_process(_read_in_worker, file, reads)
     return {
         "samples": len(file),
         "file_mb": path.stat().st_size / _MEGABYTE,
@@ -186,8 +180,8 @@ def open_maps(root: Path, x_range: tuple[float, float], y_range: tuple[float, fl
     prepared, per_item = {}, {}
     for name in locations:
         if (root / f"maps/expansion/{name}.json").is_file():
-            layers = open_layers(root, name, _CLASSES)
-            prepared[name] = NuScenesLocalMap(layers, _CLASSES, x_range, y_range)
+            layers = open_layers(root, name, CLASSES)
+            prepared[name] = NuScenesLocalMap(layers, CLASSES, x_range, y_range)
             per_item[name] = PerItemGroundTruth(NuScenesMap(str(root), name), x_range, y_range)
     return prepared, per_item
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import markdown_table, publish
+from gsmap.datasets.annotations.record import CLASSES
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
@@ -23,7 +24,6 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.shipped import shipped
 
-CLASSES = ("divider", "ped_crossing", "boundary")
 Record = dict[str, Any]
 
 

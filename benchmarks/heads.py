@@ -8,10 +8,9 @@ and is tested on the same features. Its predictions, ``NAME-SEED/results.json``,
 
 import argparse
 import json
-import multiprocessing
 import shlex
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,11 @@ from mmengine.logging import MMLogger
 
 from benchmarks.measure import markdown_table
 from gsmap.checkpoints.reading import load_weights
+from gsmap.datasets.annotations.record import CLASSES
 from gsmap.engine.arguments import data_root_options, parse_options
 from gsmap.engine.launch import read_config
-from gsmap.utils.files import atomic_write
+from gsmap.utils.files import atomic_write, write_text
+from gsmap.utils.parallel import ordered_map
 
 METRIC_NAMES = ("chamfer", "raster")
 _DECIDING = ("config", "checkpoint", "data_root", "iterations", "batch", "lr", "from_scratch")
@@ -81,20 +82,16 @@ def run(args: argparse.Namespace) -> None:
             results = args.out / f"{name}-{seed}/results.json"
             tasks[name, seed] = Task(Path(config), changed, seed, results)
     figures: dict[tuple[str, int], dict[str, float]] = {}
-    waiting = {}
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.workers, mp_context=context) as pool:
-        for (name, seed), task in tasks.items():
-            path = args.out / f"{name}-{seed}.json"
-            if path.exists():
-                figures[name, seed] = json.loads(path.read_text())
-            else:
-                waiting[name, seed] = path, pool.submit(train_and_test, task, args, features)
-        for key, (path, future) in waiting.items():
-            figures[key] = future.result()
-            with atomic_write(path) as file:
-                json.dump(figures[key], file, indent=1)
-            print(f"{key[0]}, seed {key[1]}: {', '.join(cells(figures[key]))}", flush=True)
+    paths = {(name, seed): args.out / f"{name}-{seed}.json" for name, seed in tasks}
+    done = [key for key, path in paths.items() if path.exists()]
+    figures |= {key: json.loads(paths[key].read_text()) for key in done}
+    waiting = [key for key in tasks if key not in figures]
+    train = partial(train_and_test, args=args, features=features)
+    work = ordered_map(train, map(tasks.__getitem__, waiting), args.workers, timeout_s=None)
+    for key, found in zip(waiting, work, strict=True):
+        figures[key] = found
+        write_text(paths[key], json.dumps(found, indent=1))
+        print(f"{key[0]}, seed {key[1]}: {', '.join(cells(found))}", flush=True)
     table = [[name, str(seed), *cells(found)] for (name, seed), found in figures.items()]
     header = ["head", "seed", "divider", "ped_crossing", "boundary", "mean"]
     print(f"\n{args.iterations} iterations of {args.batch}, AP_chamfer / AP_raster\n")
@@ -105,13 +102,12 @@ def refuse_others(path: Path, settings: dict[str, str]) -> None:
     """Note what a variant's figures come from, or raise an error if those there are of others."""
     if path.exists() and json.loads(path.read_text()) != settings:
         raise ValueError(f"{path.parent} holds figures of other settings: give another --out.")
-    with atomic_write(path) as file:
-        json.dump(settings, file, indent=1)
+    write_text(path, json.dumps(settings, indent=1))
 
 
 def cells(figures: dict[str, float]) -> list[str]:
     """Return both APs of every class and their mean, in percent."""
-    keys = [f"{name}/AP" for name in ("divider", "ped_crossing", "boundary")] + ["mAP"]
+    keys = [f"{name}/AP" for name in CLASSES] + ["mAP"]
     return [" / ".join(f"{100 * figures[f'{m}/{key}']:.1f}" for m in METRIC_NAMES) for key in keys]
 
 

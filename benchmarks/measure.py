@@ -6,9 +6,15 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import torch
+
+from gsmap.utils.parallel import ordered_map
+
+Result = TypeVar("Result")
 
 MIB = 2**20
 M_MMAP_THRESHOLD = -3  # of glibc's mallopt
@@ -60,6 +66,17 @@ def measure(function: Callable[[], object], device: torch.device, repeats: int =
         wall = min(wall, time.perf_counter() - wall_start)
         cpu = min(cpu, time.process_time() - cpu_start)
     return Cost(wall, cpu, peak)
+
+
+def in_own_process(function: Callable[..., Result], *arguments: object) -> Result:
+    """Call a function in a fresh process: what others left in memory does not count there."""
+    # one worker would be this process; of two, a single task starts but one
+    (result,) = ordered_map(partial(_call, function), [arguments], workers=2, timeout_s=None)
+    return result
+
+
+def _call(function: Callable[..., Result], arguments: tuple[object, ...]) -> Result:
+    return function(*arguments)
 
 
 def _wait_for(device: torch.device) -> None:

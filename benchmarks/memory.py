@@ -1,13 +1,12 @@
 """How much memory the nuScenes conversion takes as the data set grows."""
 
 import json
-import multiprocessing
 import resource
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measure import in_own_process
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
 TRAINVAL_SAMPLES = 34_149
@@ -103,9 +102,8 @@ def measure_memory(root: Path, version: str, copies: tuple[int, int]) -> dict[st
         with tempfile.TemporaryDirectory() as folder:
             target = Path(folder, "root")
             samples.append(tile_tables(root, version, target, number))
-            with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-                work = pool.submit(peak_of_conversion, target, version, Path(folder, "out"))
-            peaks.append(work.result())
+            out = Path(folder, "out")
+            peaks.append(in_own_process(peak_of_conversion, target, version, out))
     growth = (peaks[1] - peaks[0]) / (samples[1] - samples[0])
     return {
         "samples_small": samples[0],

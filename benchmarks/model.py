@@ -2,9 +2,7 @@
 
 import argparse
 import math
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
-from benchmarks.measure import Cost, markdown_table
+from benchmarks.measure import Cost, in_own_process, markdown_table
 from gsmap.datasets.transforms.masks import MakePVMask
 from gsmap.engine.launch import read_config
 
@@ -44,12 +42,7 @@ def in_fresh_processes(
     Returns:
         The first argument of every call, and its result.
     """
-    context = multiprocessing.get_context("spawn")
-    results = []
-    for each in arguments:
-        with ProcessPoolExecutor(1, mp_context=context) as pool:
-            results.append((each[0], pool.submit(task, *each).result()))
-    return results
+    return [(each[0], in_own_process(task, *each)) for each in arguments]
 
 
 def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:

@@ -18,6 +18,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsmap.datasets.annotations.record import CLASSES
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
@@ -29,7 +30,6 @@ To go on in this environment:
     source {activate}
     gsmap --help
     gsmap test gsmap_r18_minicity --data-root {root}"""
-CLASSES = ("divider", "ped_crossing", "boundary")
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import time
 from pathlib import Path
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import CLASSES, RANGES
 from gsmap.evaluation.chamfer_ap import (
     CHAMFER_THRESHOLDS,
     HARD_CHAMFER_THRESHOLDS,
@@ -41,9 +42,6 @@ from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.faults import nearest
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest, digest_of_common, read_shard
-
-DEFAULT_CLASSES = ("divider", "ped_crossing", "boundary")
-DEFAULT_RANGE = (-15.0, -30.0, 15.0, 30.0)
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -122,16 +120,15 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
 
 def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
     """Join the arguments with what the annotation file says."""
-    classes, extent = args.classes, args.range
+    classes, (x_range, y_range) = CLASSES, RANGES["lidar"]
     if args.ground_truth.suffix.lower() != ".json":
         meta = AnnotationFile(args.ground_truth).meta
-        (x0, x1), (y0, y1) = meta.x_range, meta.y_range
-        classes = classes or meta.classes
-        extent = extent or (x0, y0, x1, y1)
-    classes = tuple(classes or DEFAULT_CLASSES)
+        classes, x_range, y_range = meta.classes, meta.x_range, meta.y_range
+    classes = tuple(args.classes or classes)
     for name in set(args.polygon_classes) - {*classes, *AREA_CLASSES}:
         raise ValueError(f"--polygon-classes: there is no class {name!r}{nearest(name, classes)}")
-    x0, y0, x1, y1 = extent or DEFAULT_RANGE
+    if args.range:
+        x_range, y_range = tuple(args.range[::2]), tuple(args.range[1::2])
     chamfer = raster = None
     if "chamfer" in args.eval:
         thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
@@ -143,7 +140,7 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
             dim=args.dim,
         )
     if "raster" in args.eval:
-        raster = RasterConfig(classes, BEVGrid((x0, x1), (y0, y1)), tuple(args.polygon_classes))
+        raster = RasterConfig(classes, BEVGrid(x_range, y_range), tuple(args.polygon_classes))
     return MapEvaluator(chamfer, raster, args.gt_points)
 
 

@@ -77,7 +77,7 @@ def ordered_map(
     function: Callable[[Task], Result],
     tasks: Iterable[Task],
     workers: int,
-    timeout_s: float = 600.0,
+    timeout_s: float | None = 600.0,
 ) -> Iterator[Result]:
     """Apply a function to tasks in worker processes and yield each one's result, in order.
 
@@ -89,7 +89,7 @@ def ordered_map(
         function: A picklable function; it reaches each process once, not with every task.
         tasks: Its arguments, picklable; drawn as they are needed.
         workers: Number of processes, >= 1.
-        timeout_s: Longest time that one result may take, in seconds.
+        timeout_s: Longest time that one result may take, in seconds; None for any.
 
     Raises:
         ValueError: If ``workers`` is below 1.
@@ -129,7 +129,7 @@ def ordered_map(
 
 
 def _in_order(
-    pool: ProcessPoolExecutor, tasks: Iterable[Any], limit: int, timeout_s: float
+    pool: ProcessPoolExecutor, tasks: Iterable[Any], limit: int, timeout_s: float | None
 ) -> Iterator[Any]:
     """Keep at most ``limit`` tasks in the pool and yield the oldest one's result."""
     pending: deque[Future[Any]] = deque()
