@@ -14,6 +14,7 @@ COMMANDS = {
     "heads": "heads",
     "masks": "masks",
     "minicity": "minicity",
+    "mutations": "mutations",
     "parameters": "parameters",
     "profile": "profile",
     "raster": "raster",

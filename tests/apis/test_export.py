@@ -212,6 +212,18 @@ def test_wrong_images_and_matrices_are_named(shipped):
         exported(images, {})
 
 
+def test_elements_beyond_the_margin_are_left_out(tmp_path):
+    """The map ends at x = -15 and 15, y = -30 and 30 m; the margin is 5 m."""
+    path = tmp_path / "model.onnx"
+    path.write_bytes(exported_model())
+    ends = [[0, 0], [-20, 0], [20, 0], [0, -35], [0, 35]]
+    ends += [[-20.1, 0], [20.1, 0], [0, -35.1], [0, 35.1]]
+    points = np.stack([np.zeros((9, 2)), ends], 1)
+    outputs = {"points": points, "labels": np.zeros(9, int), "scores": np.linspace(0.9, 0.1, 9)}
+    found = OnnxInferencer(path).elements(outputs)
+    np.testing.assert_array_equal([line[1] for line in found.polylines], ends[:5])
+
+
 def test_other_files_and_an_absent_package_are_named(small, tmp_path, monkeypatch):
     import onnx
     from onnx import TensorProto, helper, numpy_helper

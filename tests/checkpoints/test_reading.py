@@ -24,6 +24,11 @@ def test_weights_are_loaded_from_a_training_checkpoint_and_a_bare_state(tmp_path
         nn.init.zeros_(target.weight)
 
 
+def test_weights_that_several_processes_trained_lose_their_prefix(tmp_path):
+    state = {"module.weight": torch.ones(1), "head.module.bias": torch.zeros(1)}
+    assert list(read_weights(save(tmp_path / "a.pth", state))) == ["weight", "head.module.bias"]
+
+
 def test_other_architecture_lists_the_first_keys_and_the_remedy(tmp_path):
     path = save(tmp_path / "other.pth", nn.Sequential(nn.Linear(2, 3)).state_dict())
     message = r"other.pth does not belong .*lacks weight, bias and has 0.weight, 0.bias too many"

@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -78,7 +79,18 @@ def test_a_training_sample_is_packed_as_the_contract_says(
         meta["lidar2img"][2],
         meta["img_aug_matrix"][2] @ meta["cam2img"][2] @ meta["lidar2cam"][2],
     )
-    assert meta["can_bus"].shape == (18,)
+
+
+def test_the_motion_since_the_last_frame_is_zero_as_of_single_frames(
+    build, minicity_root, minicity_annotations, tmp_path
+):
+    """Of 1 to 18: position (entries 0 to 2) and change of yaw (the last) are left out."""
+    source = AnnotationFile(minicity_annotations["train"])
+    path = tmp_path / "gsmap_minicity_train.arrow"
+    write_annotations(path, source.meta, [replace(source[0], can_bus=np.arange(1.0, 19.0))])
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root, ann_file=str(path))
+    can_bus = build(**config).get_data_info(0)["can_bus"]
+    assert can_bus.tolist() == [0, 0, 0, *range(4, 18), 0]
 
 
 @pytest.fixture(scope="module")

@@ -204,6 +204,22 @@ def test_constant_heights_change_nothing(resampled):
     np.testing.assert_allclose(found[1].quality, found[0].quality, rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("predictions", "truth", "distance"),
+    [(False, False, 0.0), (True, True, 0.0), (False, True, 1 / 3), (True, False, 1 / 3)],
+)
+def test_each_side_is_resampled_by_its_own_switch(predictions, truth, distance):
+    """The same line of 4 m with points at 0 and 4, or resampled at 0, 2 and 4.
+
+    From two to three points: 0; back: 0, 2, 0, on average 2 / 3; mean of both 1 / 3.
+    """
+    rules = ChamferConfig(
+        ("divider",), num_points=3, resample_predictions=predictions, resample_ground_truth=truth
+    )
+    line = MapElements.from_polylines([upright(0.0, 0.0, 4.0)], [0], [1.0])
+    assert nearest_by_chamfer(line, line, rules)[1].tolist() == pytest.approx([distance])
+
+
 def test_strips_touch_in_the_plane():
     """End to end, 0.9 m apart: no strip touches the other, whatever the heights; so no match."""
     for dim in (2, 3):

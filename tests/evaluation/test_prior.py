@@ -44,6 +44,21 @@ def test_scores_order_elements_by_how_often_they_are_right():
     assert score(prior, truth)["chamfer/divider/AP@0.5"] == pytest.approx(want)
 
 
+def test_an_element_is_chosen_by_precision_and_recall():
+    """Four samples: a divider that is always there but one of four, a crossing in three of them.
+
+    Gain of the divider: precision 1, recall 4 of 16, so 0.25; of the crossing: 3 of 4 times 3 of 3.
+    """
+    truth = []
+    for i in range(4):
+        others = [line(10.0 * (3 * i + k)) for k in range(1, 4)]
+        rings = [RING] * (i < 3)
+        labels = [0] * 4 + [1] * len(rings)
+        truth.append(MapElements.from_polylines([line(0.0), *others, *rings], labels))
+    assert fit_prior(truth, CHAMFER, max_elements=1).labels.tolist() == [1]
+    assert fit_prior(truth, CHAMFER, max_elements=2).labels.tolist() == [1, 0]
+
+
 def test_refinement_moves_an_element_to_the_middle_of_what_it_matches(monkeypatch):
     """Lines within +-0.9 m, every second one turned: only the middle is within 1.0 m of all."""
     truth = [

@@ -134,6 +134,14 @@ def test_parallel_crossings_that_touch_are_one_element():
     )
 
 
+def test_antiparallel_crossings_are_one_element():
+    """The straight long sides of two overlapping strips: run through up, then down."""
+    strip = np.array([[0, 0], [2, 1], [3, 5], [2, 9], [0, 10]], float)
+    turned = np.array([5, 10]) - strip
+    merged = merge_parallel(shapely.polygons([strip, turned]), np.arange(2))
+    assert shapely.bounds(merged).tolist() == [[0, 0, 5, 10]]
+
+
 def test_pieces_of_a_ring_are_joined_across_its_start():
     ring = np.array([shapely.LinearRing([(0, 0), (20, 0), (20, 8), (0, 8)])])
     lines, owner = cut_rings(ring, shapely.box(-10, -10, 10, 10))

@@ -144,7 +144,10 @@ def test_pickle_hands_on_the_path_and_checksums_alone(tmp_path: Path):
             {"cameras": [CameraRecord("A", "x", 0, 1, INTRINSICS, np.eye(4))]},
             "size is not positive",
         ),
-        ({"cameras": [CameraRecord("A", "x", 1, 1, -INTRINSICS, np.eye(4))]}, "focal lengths > 0"),
+        *(
+            ({"cameras": [CameraRecord("A", "x", 1, 1, np.diag(f), np.eye(4))]}, "lengths > 0")
+            for f in ([0.0, 9.0, 1.0], [9.0, 0.0, 1.0], [-9.0, 9.0, 1.0], [9.0, -9.0, 1.0])
+        ),
         ({"global_from_frame": np.eye(3)}, r"global_from_frame .*\(4, 4\)"),
         ({"can_bus": np.zeros(16)}, r"can_bus .*\(18,\)"),
         (

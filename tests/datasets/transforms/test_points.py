@@ -10,13 +10,19 @@ import pytest
 import torch
 from argoverse2_road import SPEED_M_S, START_NS, SWEEP_EVERY_NS, write_log
 from mmdet3d.registry import DATASETS
+from mmdet3d.structures import LiDARPoints
 from mmengine.config import Config
 from mmengine.registry import init_default_scope
 from pyarrow import feather
 
 import gsmap.registered  # noqa: F401
 from gsmap.datasets.errors import BrokenSampleError
-from gsmap.datasets.transforms.points import LoadLidarPoints, LoadLidarSweeps, read_points
+from gsmap.datasets.transforms.points import (
+    LoadLidarPoints,
+    LoadLidarSweeps,
+    MakeDepthMap,
+    read_points,
+)
 from mapdata.argoverse2.convert import convert_argoverse2
 from mapdata.argoverse2.log import RING_CAMERAS
 from mapdata.argoverse2.samples import Argoverse2Options
@@ -115,6 +121,24 @@ def test_a_bad_feather_file_is_named_with_its_sample(tmp_path, damage, message):
     with pytest.raises(BrokenSampleError, match=f"sample 'sample-9'.*{message}") as raised:
         LoadLidarPoints(**LOAD).transform(results)
     assert str(path) in str(raised.value)
+
+
+def test_of_returns_at_one_pixel_the_nearest_counts():
+    """Column 3, row 2 at 10 m, then 5 m; column 1, row 4 at 6 m, then 8 m."""
+    rays = [(3, 2, 10), (3, 2, 5), (1, 4, 6), (1, 4, 8)]
+    points = torch.tensor([[x * depth, y * depth, depth] for x, y, depth in rays])
+    results = {
+        "points": LiDARPoints(points.float(), points_dim=3),
+        "img_shape": (32, 32),
+        "raw_shapes": [np.array([32, 32])],
+        "lidar2img": [np.eye(4)],
+        "img_aug_matrix": [np.eye(4)],
+    }
+    depths = MakeDepthMap().transform(results)["gt_depth"]
+    assert depths.shape == (1, 32, 32)
+    assert depths[0, 2, 3] == 5
+    assert depths[0, 4, 1] == 6
+    assert depths.sum() == 11
 
 
 def test_a_sample_without_lidar_is_named():

@@ -113,7 +113,7 @@ def test_a_bev_mask_has_row_0_at_the_smallest_y():
 
 
 def test_a_camera_mask_draws_what_lies_in_front():
-    """The camera looks along +y from 1.6 m above ground; the line crosses its axis 10 m ahead.
+    """The camera looks along +y from 1.6 m above ground, the default; the line crosses its axis 10 m ahead.
 
     At depth 10 the ground lies 16 px below the centre (focal length 100): row 5 + 1.6 at stride 10.
     """
@@ -121,7 +121,7 @@ def test_a_camera_mask_draws_what_lies_in_front():
     ahead = MapInstance(0, np.array([[-1.9, 10], [1.9, 10]]))
     behind = MapInstance(0, np.array([[-2.0, -10], [2, -10]]))
     results = {"map_instances": [ahead, behind], "lidar2img": [lidar2img], "img_shape": (100, 100)}
-    transform = MakePVMask(stride=10, pad_size_divisor=20, ground_z_m=-1.6)
+    transform = MakePVMask(stride=10, pad_size_divisor=20)
     mask = transform.transform(results)["gt_pv_seg"]
     assert mask.shape == (1, 1, 10, 10)
     assert mask[0, 0].nonzero().tolist() == [[6, col] for col in (3, 4, 5, 6)]

@@ -138,7 +138,7 @@ class PoseTrack:
     Args:
         times_ns: In any order; of equal times one counts. (n,)
         poses: Global from vehicle. (n, 4, 4)
-        gap_ns: Longest gap that is bridged, and how far the ends reach.
+        gap_ns: Longest gap that is bridged; the ends reach a tenth of it.
 
     Raises:
         ValueError: If there is no pose, or one is not finite.

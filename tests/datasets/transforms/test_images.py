@@ -1,0 +1,24 @@
+"""Images on their way into the model: sizes and matrices worked by hand."""
+
+import numpy as np
+import pytest
+
+from gsmap.datasets.transforms.images import ScaleImages
+
+
+def test_matrices_take_the_exact_ratio_of_each_axis():
+    """Half of 101 x 51 pixels is 50 x 25: a little less than half, by another ratio each way."""
+    image = np.zeros((51, 101, 3), np.uint8)
+    matrices = {"lidar2img": [np.eye(4)], "img_aug_matrix": [np.diag([2.0, 2.0, 1.0, 1.0])]}
+    results = ScaleImages(0.5).transform({"img": [image], **matrices})
+    assert results["img"][0].shape == (25, 50, 3)
+    assert results["img_shape"] == results["pad_shape"] == (25, 50)
+    np.testing.assert_allclose(results["lidar2img"][0], np.diag([50 / 101, 25 / 51, 1, 1]))
+    np.testing.assert_allclose(results["img_aug_matrix"][0], np.diag([100 / 101, 50 / 51, 1, 1]))
+
+
+def test_a_scale_that_leaves_no_image_is_refused():
+    with pytest.raises(ValueError, match="scale must be > 0, got 0"):
+        ScaleImages(0)
+    with pytest.raises(ValueError, match="scale 0.1 leaves nothing of a 9 x 20 image"):
+        ScaleImages(0.1).transform({"img": [np.zeros((20, 9, 3), np.uint8)]})
