@@ -185,7 +185,9 @@ class _Finder:
     def __init__(self, module: str, source: str) -> None:
         self.module, self.source = module, source
 
-    def find_spec(self, name: str, path: Sequence[str] | None, _: object = None) -> ModuleSpec | None:
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, _: object = None
+    ) -> ModuleSpec | None:
         spec = PathFinder.find_spec(name, path) if name == self.module else None
         if spec is not None and spec.origin is not None:
             spec.loader = _Loader(name, spec.origin)
