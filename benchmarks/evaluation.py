@@ -1,7 +1,6 @@
 """The race of the metrics: tools/evaluate.py beside the reference's way, memory, many sizes."""
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.results_json import write_results
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.files import read_json
 from gsmap.utils.shipped import shipped
 
 Record = dict[str, Any]
@@ -222,7 +222,7 @@ def _say(text: str) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Measure, print and write the tables."""
-    given = json.loads(args.frames.read_text())["frames"] if args.frames else None
+    given = read_json(args.frames)["frames"] if args.frames else None
     x, y = (size / 2 for size in args.size)
     grid = BEVGrid((-x, x), (-y, y))
     frames = given or generated_frames(320, size_m=args.size)

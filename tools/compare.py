@@ -14,7 +14,6 @@ Examples:
 """
 
 import argparse
-import json
 import shlex
 import sys
 from collections.abc import Iterator
@@ -36,7 +35,7 @@ from mmengine.config import DictAction
 
 from gsmap.engine.arguments import data_root_options
 from gsmap.utils.cli import CommandParser, run_command
-from gsmap.utils.files import write_text
+from gsmap.utils.files import read_json, write_text
 from gsmap.utils.progress import Progress
 from gsmap.utils.shipped import shipped
 from gsmap.visualization.figure import save_figure
@@ -89,7 +88,7 @@ def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     Raises:
         ValueError: If there is none.
     """
-    tables = json.loads(shipped("configs/tables.json").read_text())
+    tables = read_json(shipped("configs/tables.json"))
     chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
     if not chosen:
         names = ", ".join(table["table"] for table in tables)

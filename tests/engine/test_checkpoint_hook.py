@@ -44,8 +44,7 @@ def test_an_import_changes_nothing_of_mmengine_and_torch():
     assert done.returncode == 0, done.stderr
 
 
-def test_the_hook_writes_through_the_atomic_backend_and_lets_torch_read(monkeypatch):
-    monkeypatch.setenv("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "0")  # and as it was after the test
+def test_the_hook_writes_through_the_atomic_backend_and_lets_torch_read():
     before = torch.serialization.get_safe_globals()
     hook = AtomicCheckpointHook(interval=1)
     assert isinstance(get_file_backend("a.pth", backend_args=hook.backend_args), AtomicLocalBackend)

@@ -14,7 +14,7 @@ def test_split_files_are_checked(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match="no split file"):
         read_split_file(path)
     for text, message in [
-        ("[", "not JSON"),
+        ("[", "cannot be read"),
         ('["a"]', "must look like"),
         ('{"train": "a"}', "must look like"),
     ]:

@@ -1,20 +1,18 @@
 """How a command ends: with a report, an error in words, interrupted, or a traceback."""
 
-import json
 import os
 import re
 import signal
 import subprocess
 import sys
 import threading
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
 
 from gsmap.utils.cli import output_file, run_command
-from gsmap.utils.files import atomic_write
+from gsmap.utils.files import atomic_write, read_json, read_text, write_text
+from gsmap.utils.parallel import ordered_map
 
 
 class DamagedError(ValueError):
@@ -60,22 +58,21 @@ def test_files_of_the_user_end_in_words(tmp_path, capsys):
     (tmp_path / "a.json").write_text("{")
     (tmp_path / "b.txt").write_bytes(b"\xff")
     for read in (
-        lambda: json.loads((tmp_path / "a.json").read_text()),
-        lambda: (tmp_path / "b.txt").read_text(encoding="utf-8"),
+        lambda: read_json(tmp_path / "a.json"),
+        lambda: read_text(tmp_path / "b.txt"),
         lambda: (tmp_path / "c.txt").read_text(),
     ):
         with pytest.raises(SystemExit):
             run_command(read)
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(":")[0] for line in lines] == ["error"] * 3
-    assert "Expecting property name" in lines[0]
+    assert "a.json cannot be read: Expecting property name" in lines[0]
     assert "b.txt cannot be read: 'utf-8' codec can't decode byte" in lines[1]
     assert "c.txt'; check the path." in lines[2]
 
 
 def full_disk() -> None:
-    with open("/dev/full", "w") as file:
-        file.write("x")
+    write_text("/dev/full", "x")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
@@ -144,8 +141,7 @@ def look_up(key: str) -> None:
 
 
 def in_worker(function, argument) -> None:
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        pool.submit(function, argument).result()
+    list(ordered_map(function, [argument], workers=2))
 
 
 def test_every_traceback_can_be_had(monkeypatch):

@@ -4,7 +4,6 @@ Each run is a work folder of ``tools/train.py`` with its test in it; nothing is 
 does not stand there, so a comparison that was killed goes on when its command is given again.
 """
 
-import json
 import math
 import os
 import re
@@ -26,6 +25,7 @@ from gsmap.checkpoints.settings import differences, plain
 from gsmap.engine.arguments import parse_options
 from gsmap.engine.checkpoint_hook import VALIDATED
 from gsmap.engine.launch import check_config, read_config
+from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
 from gsmap.utils.shipped import shipped
 
@@ -273,7 +273,7 @@ def _refuse(found: Mapping[str, tuple[Any, Any]], what: str, remedy: str) -> Non
 
 def _noted(path: Path) -> dict[str, Any]:
     """Return what a run was started with."""
-    found = json.loads(path.read_text())
+    found = read_json(path)
     if not isinstance(found, dict) or not isinstance(found.get("processes"), int):
         raise ValueError(f"{path} is not what a run noted: give another --out, or remove the run.")
     return found

@@ -21,6 +21,7 @@ from gsmap.evaluation.file_evaluation import evaluate_files
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import MetricReport, flat_metrics
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.files import read_json
 from gsmap.utils.parallel import default_workers
 from gsmap.visualization.plots import finish_panel, panel_grid
 from gsmap.visualization.run_curves import RunLog, read_run
@@ -106,7 +107,7 @@ def read_result(name: str, folder: Path, seed: int | None = None) -> Result:
 
 def _json(path: Path) -> dict[str, Any]:
     """Read a JSON object; empty if there is no such file."""
-    content = json.loads(path.read_text()) if path.is_file() else {}
+    content = read_json(path) if path.is_file() else {}
     if not isinstance(content, dict):
         raise ValueError(f"{path} must hold a JSON object, got {content!r:.60}.")
     return content

@@ -1,11 +1,12 @@
 """Which scenes belong to which split, and whether splits overlap on the ground."""
 
-import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
+
+from gsmap.utils.files import read_json
 
 OVERLAP_DISTANCE_M = 5.0
 # (x, y) in metres of the samples of each split, by map name
@@ -19,10 +20,7 @@ def read_split_file(path: Path) -> dict[str, list[str]]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"no split file at {path}.")
-    try:
-        splits = json.loads(path.read_text())
-    except ValueError as error:  # of JSON, or of the encoding
-        raise ValueError(f"split file {path} is not JSON: {error}.") from error
+    splits = read_json(path)
     if not isinstance(splits, dict) or not all(
         isinstance(scenes, list) and all(isinstance(s, str) for s in scenes)
         for scenes in splits.values()

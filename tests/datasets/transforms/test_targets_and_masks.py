@@ -115,7 +115,8 @@ def test_a_bev_mask_has_row_0_at_the_smallest_y():
 def test_a_camera_mask_draws_what_lies_in_front():
     """The camera looks along +y from 1.6 m above ground; the line crosses its axis 10 m ahead.
 
-    At depth 10 the ground lies 16 px below the centre (focal length 100): row 5 + 1.6 at stride 10.
+    At depth 10 the ground, 1.6 m below by default, lies 16 px below the centre (focal length 100):
+    row 5 + 1.6 at stride 10.
     """
     lidar2img = np.array([[100, 50, 0, 0], [0, 50, -100, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
     ahead = MapInstance(0, np.array([[-1.9, 10], [1.9, 10]]))

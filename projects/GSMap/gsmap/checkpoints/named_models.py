@@ -5,7 +5,6 @@ not ship: saved there under their name, they load like the others.
 """
 
 import difflib
-import json
 import logging
 from dataclasses import dataclass
 from functools import cache
@@ -13,6 +12,7 @@ from pathlib import Path
 
 from mmengine.logging import print_log
 
+from gsmap.utils.files import read_json
 from gsmap.utils.shards import digest
 from gsmap.utils.shipped import shipped
 
@@ -48,7 +48,7 @@ class NamedModel:
 @cache
 def named_models() -> dict[str, NamedModel]:
     """Return the registry by name."""
-    rows = json.loads(shipped("models/registry.json").read_text(encoding="utf-8"))
+    rows = read_json(shipped("models/registry.json"))
     return {row["name"]: NamedModel(**row) for row in rows}
 
 

@@ -63,7 +63,7 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
             "fetch it again, or use an earlier epoch's."
         ) from error
     if not state:
-        raise ValueError(f"{path} holds no state dict of plain tensors: give a training's.")
+        raise ValueError(f"{path} holds no state dict of tensors: give a training checkpoint.")
     if broken:
         raise ValueError(
             f"{path} holds NaN or infinite weights ({listed(broken)}): the training that wrote it "

@@ -1,7 +1,7 @@
 """Checkpoints that are whole or absent when written, and run no code when read."""
 
 import json
-import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,8 @@ from mmdet3d.registry import HOOKS
 from mmengine.fileio import LocalBackend, register_backend
 from mmengine.hooks import CheckpointHook
 from mmengine.runner import EpochBasedTrainLoop, Runner
+from mmengine.runner import checkpoint as mmengine_checkpoint
+from torch.hub import load_state_dict_from_url
 
 from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.safe_globals import mmengine_globals
@@ -46,11 +48,9 @@ class AtomicCheckpointHook(CheckpointHook):
         super().__init__(*args, backend_args=backend_args or {"backend": "atomic"}, **kwargs)
 
     def before_run(self, runner: Runner) -> None:
-        """Let torch read mmengine's checkpoints; mmengine reads one right after this.
-
-        torch's own choice, and mmengine's for files that it fetches, would run code in them.
-        """
-        os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
+        """Let torch read mmengine's checkpoints; mmengine reads one right after this."""
+        # what mmengine fetches, torch would run code of
+        mmengine_checkpoint.load_url = partial(load_state_dict_from_url, weights_only=True)
         torch.serialization.add_safe_globals(mmengine_globals())
 
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:

@@ -1,12 +1,10 @@
 """What an exception says to a user, where it is the user's affair and not a slip in the code."""
 
+import dis
 import errno
 import re
-import traceback
 from collections.abc import Iterable
 from difflib import get_close_matches
-from io import IOBase
-from pathlib import PurePath
 from types import FrameType
 from typing import Any
 
@@ -50,20 +48,20 @@ def in_words(error: BaseException) -> str | None:
     Returns:
         The text; None for a slip in the code, whose traceback is worth more.
     """
+    if hasattr(error, "words"):  # a worker of `ordered_map` had the traceback
+        return error.words
     # a KeyError's own text is its message in quotes
     text = str(error.args[0] if type(error) is KeyError and error.args else error)
-    if _IN_WORKER in text:
-        raised, text = _is_raised(text), text.rstrip().splitlines()[-1].partition(": ")[2]
-    elif type(error.__cause__).__name__ == "_RemoteTraceback":
-        raised = _is_raised(str(error.__cause__))
-    else:
-        raised = _is_raised("".join(traceback.format_tb(error.__traceback__)))
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    frames, last = _steps(error)
+    meant = last == "RAISE_VARARGS" or _of_a_parser(error)  # Python itself finds the others
+    if _IN_WORKER in text:  # all that torch hands on
+        meant, text = isinstance(error, ValueError), text.rstrip().splitlines()[-1]
+        text = text.partition(": ")[2]
     return (
         _of_the_machine(error, text)
-        or _of_a_file(error, text, frames)
-        or _of_a_config(error, text, frames, raised)
-        or (text if raised and isinstance(error, _CHECKS) else None)
+        or _of_the_system(error, text)
+        or _of_a_config(error, text, frames, last)
+        or (text if meant and isinstance(error, _CHECKS) else None)
     )
 
 
@@ -83,10 +81,19 @@ def registered(registry: Any) -> list[str]:
     return [name for member in family for name in member.module_dict]
 
 
-def _is_raised(tracebacks: str) -> bool:
-    """Whether a ``raise`` statement stands at the end, and not what Python itself found."""
-    statements = re.findall(r'^  File ".*\n    (.*)', tracebacks, re.MULTILINE)
-    return bool(statements) and statements[-1].startswith("raise ")
+def _steps(error: BaseException) -> tuple[list[FrameType], str]:
+    """Return the functions that an error came through, and the last one's instruction."""
+    frames, instruction, step = [], "", error.__traceback__
+    while step is not None:
+        frames.append(step.tb_frame)
+        instruction = dis.opname[step.tb_frame.f_code.co_code[step.tb_lasti]]
+        step = step.tb_next
+    return frames, instruction
+
+
+def _of_a_parser(error: BaseException) -> bool:
+    """Whether a library could not understand a text or a file, such as JSON or Arrow."""
+    return isinstance(error, ValueError) and type(error) is not ValueError
 
 
 def _of_the_machine(error: BaseException, text: str) -> str | None:
@@ -110,38 +117,25 @@ def _of_the_machine(error: BaseException, text: str) -> str | None:
     return None
 
 
-def _of_a_file(error: BaseException, text: str, frames: list[FrameType]) -> str | None:
-    """Speak of what the system or a parser says, with the file's name."""
-    if isinstance(error, OSError):
-        remedy = _REMEDIES.get(error.errno or 0)
-        if not remedy or not text.startswith("[Errno"):
-            return text
-        parts = (value for frame in reversed(frames) for value in frame.f_locals.values())
-        files = (getattr(part, "name", None) for part in parts if isinstance(part, IOBase))
-        name = error.filename or next((name for name in files if isinstance(name, str)), "")
-        named = "" if not name or str(name) in text else f": {name!r}"
-        return f"{text}{named}; {remedy}."
-    if frames and frames[-1].f_globals.get("__name__") == "json.decoder":
-        text = "it is nested too deep" if isinstance(error, RecursionError) else text
-    elif not isinstance(error, ValueError) or type(error) is ValueError:
+def _of_the_system(error: BaseException, text: str) -> str | None:
+    """Speak of what the system refuses."""
+    if not isinstance(error, OSError):
         return None
-    names = ("self", "path", "source")
-    found = (frame.f_locals.get(name) for frame in reversed(frames) for name in names)
-    path = next((str(value) for value in found if isinstance(value, PurePath)), "")
-    return text if path in text else f"{path} cannot be read: {text}."
+    remedy = _REMEDIES.get(error.errno or 0)
+    return f"{text}; {remedy}." if remedy and text.startswith("[Errno") else text
 
 
 def _of_a_config(
-    error: BaseException, text: str, frames: list[FrameType], raised: bool
+    error: BaseException, text: str, frames: list[FrameType], instruction: str
 ) -> str | None:
     """Speak of settings that nothing can be made of."""
     built = [frame.f_locals for frame in frames if frame.f_code.co_name == _BUILDER]
-    last = traceback.extract_tb(error.__traceback__)[-1:]
-    source, line = (last[0].filename, last[0].line or "") if last else ("", "")
+    module = frames[-1].f_globals.get("__name__", "") if frames else ""
+    handed_over = instruction == "CALL_FUNCTION_EX" or module.startswith("mmengine.")
     where = _config_file(frames)
-    if "/mmengine/config/" in source and isinstance(error, (KeyError, AttributeError)):
+    if module.startswith("mmengine.config.") and isinstance(error, (KeyError, AttributeError)):
         return f"{where}a setting is missing: {text}."
-    if (unknown := _UNEXPECTED.search(text)) and (built or "/mmengine/" in source or "**" in line):
+    if (unknown := _UNEXPECTED.search(text)) and (built or handed_over):
         return where + _unknown_setting(unknown[1], unknown[2], built, frames)
     if not built or not isinstance(error, _SLIPS):
         return None
@@ -149,7 +143,7 @@ def _of_a_config(
         registry = built[-1]["registry"]
         close = nearest(absent[1], registered(registry))
         return f"{where}there is no {registry.name} of type {absent[1]!r}{close or '.'}"
-    if raised and isinstance(error, _CHECKS):
+    if instruction == "RAISE_VARARGS" and isinstance(error, _CHECKS):
         return text if "/" in text else where + text
     kinds = [_name(frame["obj_cls"]) for frame in reversed(built) if frame.get("obj_cls")]
     return (

@@ -3,6 +3,7 @@
 import fcntl
 import hashlib
 import io
+import json
 import logging
 import os
 import platform
@@ -13,7 +14,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -52,22 +53,20 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
     """
     path = Path(path)
     encoding = None if "b" in mode else "utf-8"
-    if _is_special(path):
-        with path.open(mode, encoding=encoding) as file:
-            yield file
-        return
+    special = _is_special(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     failures: list[OSError] = []
     try:
         with (
-            partial_path(path) as made,
+            nullcontext(path) if special else partial_path(path) as made,
             io.BufferedWriter(_Raw(made, failures)) as buffer,
             buffer if encoding is None else io.TextIOWrapper(buffer, encoding) as file,
         ):
             yield file
             file.flush()
-            os.fsync(file.fileno())
-            os.replace(made, path)
+            if not special:
+                os.fsync(file.fileno())
+                os.replace(made, path)
     except Exception as raised:
         error = failures[0] if failures else raised
         if not isinstance(error, OSError) or not error.errno:
@@ -96,6 +95,24 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a text file in one step, in UTF-8."""
     with atomic_write(path) as file:
         file.write(text)
+
+
+def read_text(path: str | Path) -> str:
+    """Return the content of a text file in UTF-8; ValueError with its name if it is not such."""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} cannot be read: {error}.") from error
+
+
+def read_json(path: str | Path) -> Any:
+    """Return the value in a JSON file; ValueError with its name if it is none."""
+    try:
+        return json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} cannot be read: {error}.") from error
+    except RecursionError:
+        raise ValueError(f"{path} cannot be read: it is nested too deep.") from None
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:

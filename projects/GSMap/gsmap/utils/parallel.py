@@ -14,6 +14,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
+from gsmap.utils.faults import in_words
+
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 LAUNCHER = "GSMAP_LAUNCHER"  # variable with the number of torchrun's process, for its ranks
@@ -69,6 +71,9 @@ def _work(task: Any) -> Any:
         if _Worker.stopping:
             raise SystemExit(128 + signal.SIGTERM)
         return _Worker.function(task)
+    except Exception as error:
+        error.words = in_words(error)  # type: ignore[attr-defined] # the traceback stays here
+        raise
     finally:
         _Worker.busy = False
 

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from gsmap.utils.files import read_text
 from gsmap.visualization.plots import finish_panel, panel_grid
 from gsmap.visualization.style import RUN_COLOURS
 
@@ -48,7 +49,7 @@ class RunLog:
 
 def _records(path: Path) -> list[dict[str, float]]:
     """Read one JSON record per line; a last line that a killed run left unfinished is dropped."""
-    lines = path.read_text().splitlines()
+    lines = read_text(path).splitlines()
     records = []
     for number, line in enumerate(lines, start=1):
         try:
