@@ -84,6 +84,8 @@ def test_a_rank_that_hangs_is_named_within_the_timeout(tiny_config, tmp_path):
         stopped = time.monotonic()
         said = next(line for line in launcher.stdout if line.startswith("error: "))
         assert time.monotonic() - stopped < limit_s
+        while Path(f"/proc/{ranks[0]}").exists():  # until torchrun has seen its end
+            time.sleep(0.05)
         os.kill(ranks[1], signal.SIGKILL)  # torchrun itself waits 30 s before it does
         rest = launcher.stdout.read()
     assert re.match(rf"error: rank 1 \(process {ranks[1]} on \S+, at .*\) does not answer; ", said)
