@@ -101,8 +101,8 @@ def test_a_file_without_a_known_digest_is_called_unverified_once(tmp_path, monke
     assert find_checkpoint("maptr_tiny_r50_24e") == find_checkpoint("maptr_tiny_r50_24e")
     digest = hashlib.sha256(b"whole").hexdigest()
     assert said == [
-        f"{tmp_path}/models/maptr_tiny_r50_24e.pth is not verified: github.com/hustvl/MapTR gives no "
-        f"sha256 for maptr_tiny_r50_24e; that of this file is {digest}."
+        f"{tmp_path}/models/maptr_tiny_r50_24e.pth is not verified: github.com/hustvl/MapTR gives "
+        f"no sha256 for maptr_tiny_r50_24e; that of this file is {digest}."
     ]
 
 
