@@ -92,16 +92,17 @@ def test_a_damaged_file_is_refused(tmp_path, monkeypatch):
 
 def test_a_file_without_a_known_digest_is_called_unverified_once(tmp_path, monkeypatch):
     named_models()
-    monkeypatch.setattr(registry, "REGISTRY", tmp_path / "registry.json")
+    registry._say_unverified.cache_clear()
+    monkeypatch.setattr(registry, "shipped", tmp_path.joinpath)
+    (tmp_path / "models").mkdir()
     said = []
     monkeypatch.setattr(registry, "print_log", lambda text, **_: said.append(text))
-    for name in ("maptr_tiny_r50_24e", "gsmap_r18_minicity"):
-        (tmp_path / f"{name}.pth").write_bytes(b"whole")
+    (tmp_path / "models/maptr_tiny_r50_24e.pth").write_bytes(b"whole")
     assert find_checkpoint("maptr_tiny_r50_24e") == find_checkpoint("maptr_tiny_r50_24e")
     digest = hashlib.sha256(b"whole").hexdigest()
     assert said == [
-        f"{tmp_path}/maptr_tiny_r50_24e.pth is not verified: github.com/hustvl/MapTR gives no "
-        f"sha256 for maptr_tiny_r50_24e; that of this file is {digest}."
+        f"{tmp_path}/models/maptr_tiny_r50_24e.pth is not verified: github.com/hustvl/MapTR gives "
+        f"no sha256 for maptr_tiny_r50_24e; that of this file is {digest}."
     ]
 
 

@@ -203,6 +203,12 @@ def test_heights_count_in_chamfer_if_asked_and_never_in_raster(tmp_path):
             '"cls_name": "divider", "confidence_level": 1}]}]}',
             "t0.*coordinates",
         ),
+        (  # names of two kinds could not be sorted in the notes
+            '{"results": [{"sample_token": "t0", "vectors": [{"pts": [[0, 0], [1, 1]],'
+            '"cls_name": null, "confidence_level": 1}, {"pts": [[0, 0], [1, 1]],'
+            '"cls_name": "other", "confidence_level": 1}]}]}',
+            "t0.*cls_name is no text",
+        ),
     ],
 )
 def test_malformed_results_name_the_file_and_the_sample(tmp_path, text, message):

@@ -224,6 +224,17 @@ def test_a_wrong_calibration_file_names_the_camera(tmp_path, camera, message):
         open_input(tmp_path)
 
 
+def test_two_images_of_a_camera_with_one_name_are_refused(tmp_path):
+    """Frames are told apart by names; one of the two was shown twice."""
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "0.png"), np.zeros((90, 160, 3), np.uint8))
+    content = {"cameras": {"front": LEVEL | {"images": "*/0.png"}}}
+    (tmp_path / "calibration.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(ValueError, match=r"'front' .*two of its images .* have one name"):
+        open_input(tmp_path)
+
+
 def test_a_mirrored_mounting_is_named(tmp_path):
     (tmp_path / "front").mkdir()
     cv2.imwrite(str(tmp_path / "front/a.png"), np.zeros((90, 160, 3), np.uint8))
@@ -294,6 +305,7 @@ def test_two_folders_of_one_name_and_a_corrected_calibration_have_their_own_pict
         ({"size_px": [0, 0]}, {}, r"images of \(0, 0\) pixels"),
         ({}, {"rate_hz": 0}, "rate_hz must be > 0"),
         ({}, {"max_time_difference_ms": -1}, "max_time_difference_ms >= 0"),
+        ({}, {"poses": "../poses.csv"}, "poses must lie below"),
     ],
 )
 def test_values_that_cannot_be_are_named_and_no_picture_is_made(tmp_path, camera, more, message):

@@ -32,6 +32,8 @@ def _elements(
 ) -> MapElements:
     """Convert the vectors of one sample and count what is ignored; other classes get label -1."""
     label_of = {name: label for label, name in enumerate(classes)}
+    if not all(isinstance(v["cls_name"], str) for v in vectors):
+        raise TypeError("cls_name is no text")
     ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in label_of)
     if any(len(point) == 3 for v in vectors for point in v["pts"][:1]):
         ignored[THREE_D] += 1

@@ -73,7 +73,8 @@ def read_image_folder(file: Path, frames_dir: Path) -> Recording:
         frames, time_of = _frames(images, rate_hz, tolerance_ns, file)
         pose_at = None
         if content.get("poses"):
-            pose_at = _read_poses(file.parent / content["poses"], time_of, ground).at
+            place = _below(file.parent, str(content["poses"]), "poses")
+            pose_at = _read_poses(place, time_of, ground).at
         scene, root, notes = file.parent.resolve().name, file.parent, []
         samples = rig_samples(scene, rig, frames, pose_at)
         if any(camera.is_distorted for camera in rig):
@@ -125,9 +126,7 @@ def _require_keys(value: Any, known: set[str], what: str) -> None:
 def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> list[Path]:
     """Return a camera's images in the order of their names."""
     pattern = str(camera.get("images", name))
-    place = folder / pattern
-    if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
-        raise ValueError(f"images must lie below the calibration file's folder, got {pattern!r}")
+    place = _below(folder, pattern, "images")
     found = place.iterdir() if place.is_dir() else folder.glob(pattern)
     paths = sorted(p for p in found if p.suffix.lower() in _SUFFIXES and p.is_file())
     if not paths:
@@ -135,7 +134,16 @@ def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> list[Path]
             f"camera {name!r} has no image at {place}: `images` names a file, a folder or a "
             "pattern, from the calibration file's folder (by default the camera's name)."
         )
+    if len({path.stem for path in paths}) < len(paths):
+        raise ValueError(f"two of its images at {place} have one name: rename one")
     return paths
+
+
+def _below(folder: Path, name: str, what: str) -> Path:
+    """Return a file or folder that a calibration file names."""
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise ValueError(f"{what} must lie below the calibration file's folder, got {name!r}")
+    return folder / name
 
 
 def _camera(
