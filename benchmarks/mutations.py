@@ -25,7 +25,7 @@ from benchmarks.measure import markdown_table
 REPO = Path(__file__).resolve().parents[1]
 FOLDERS = ("GSMap/gsmap", "MapData/mapdata", "DriveMaps/drivemaps")
 ROOMS = ("models", "ops", "structures", "evaluation", "datasets", "mapdata", "drivemaps")
-SURVIVED = "not caught"
+VERDICTS = CAUGHT, SURVIVED, LATE = "caught", "not caught", "timed out"
 PRELOADED = ["gsmap", "pytest", "scipy.ndimage", "shapely", "mmdet3d.models", "mmdet3d.datasets"]
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
@@ -61,10 +61,8 @@ def run(args: argparse.Namespace) -> None:
             line, change, source = mutant(modules[name].read_text(), index)
             found.append(verdict(name, source, tests[name], args.seconds))
             print(f"{found[-1]}: {modules[name].relative_to(REPO)}:{line} {change}", flush=True)
-        caught = len(found) - found.count(SURVIVED)
-        percent = f"{100 * caught / len(found):.0f}" if found else "-"
-        rows.append([room, str(len(found)), str(caught), str(found.count("timed out")), percent])
-    print(markdown_table(["room", "mutants", "caught", "of these by time", "caught, %"], rows))
+        rows.append([room, str(len(found)), *(str(found.count(v)) for v in VERDICTS)])
+    print(markdown_table(["room", "mutants", *VERDICTS], rows))
 
 
 def modules_of(room: str) -> dict[str, Path]:
@@ -160,8 +158,8 @@ def verdict(module: str, source: str, tests: Sequence[str], seconds: float | Non
             os.killpg(child.pid or 0, signal.SIGKILL)
         child.kill()
         child.join()
-        return "timed out"
-    return "caught" if child.exitcode else SURVIVED
+        return LATE
+    return CAUGHT if child.exitcode else SURVIVED
 
 
 def _run_tests(module: str, source: str, tests: Sequence[str]) -> None:

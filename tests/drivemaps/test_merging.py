@@ -157,3 +157,21 @@ def test_a_line_that_meets_itself_becomes_a_ring_and_a_turn_back_is_not_joined()
     np.testing.assert_array_equal(closed[0], closed[-1])
     side_by_side = [np.array([[0.0, y], [10.0, y]]) for y in (0.0, 1.0)]
     assert len(stitch(side_by_side)) == 2
+
+
+@pytest.mark.parametrize(("side", "closes"), [(2.0, True), (1.6, False)])
+def test_a_line_of_10_m_whose_ends_meet_becomes_a_ring(side: float, closes: bool):
+    """A hexagon but for a tenth of one side: 11.8 m, 9.8 m before the last vertex; and 9.4 m."""
+    angles = np.arange(6) * np.pi / 3
+    corners = side * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    start = corners[0] + 0.9 * (corners[5] - corners[0])
+    (line,) = stitch([np.concatenate([start[None], corners])])
+    assert np.array_equal(line[0], line[-1]) == closes
+
+
+def test_lines_a_metre_apart_or_less_are_suppressed():
+    drive = drive_of()
+    lines = [np.array([[x, 0.0], [x, 20.0]]) for x in (0.0, 0.9, 1.5)]
+    elements = MapElements.from_polylines(lines, [0] * 3, [0.9, 0.8, 0.7])
+    drive = replace(drive, frames=[DriveFrame(drive.frames[0].sample, elements)])
+    assert suppress(drive).scores.tolist() == [0.9, 0.7]

@@ -35,6 +35,16 @@ def test_another_raster_covers_the_same_extent():
     assert grid.resized(64, 128).pixel_size_m == pytest.approx((60 / 128, 30 / 64))
 
 
+def test_pixels_of_a_size_in_metres_divide_the_extent():
+    """60 m along x and 30 m along y."""
+    grid = BEVGrid((-30, 30), (-15, 15), 100, 200)
+    assert grid.rasterized(0.3) == BEVGrid((-30, 30), (-15, 15), 100, 200)
+    assert grid.rasterized([0.5, 0.25]) == BEVGrid((-30, 30), (-15, 15), 120, 120)
+    for sizes, named in ((0.7, "0.7 x 0.7"), ([0.5, 0.7], "0.5 x 0.7"), ([0.7, 0.5], "0.7 x 0.5")):
+        with pytest.raises(ValueError, match=f"pixels of {named} m do not divide .* 60 x 30 m"):
+            grid.rasterized(sizes)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

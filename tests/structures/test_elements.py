@@ -36,7 +36,9 @@ def test_z_is_kept_if_all_have_it():
     elements = MapElements.from_polylines([line_3d], [0])
     assert elements.points.tolist() == line_3d
     assert elements.with_coordinates(2).points.tolist() == LINE
-    assert MapElements.from_polylines([line_3d, RING], [0, 1]).points.tolist() == LINE + RING
+    for kind in (list, np.array):
+        mixed = MapElements.from_polylines([kind(line_3d), kind(RING)], [0, 1])
+        assert mixed.points.tolist() == LINE + RING
     assert elements.with_coordinates(2).with_coordinates(2).points.flags.c_contiguous
     assert elements.with_coordinates(3).points.tolist() == line_3d
     assert MapElements.from_polylines().with_coordinates(3).points.shape == (0, 3)

@@ -1,10 +1,10 @@
-"""Poses of a vehicle over time."""
+"""Poses of a vehicle over time, and the distortion of its cameras."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mapdata.folders.rig import PoseTrack
+from mapdata.folders.rig import PoseTrack, RigCamera
 
 SECOND_NS = 1_000_000_000
 
@@ -36,3 +36,26 @@ def test_the_ends_reach_a_tenth_of_the_gap(end_ns: int, step_ns: int, x: float):
 def test_a_longer_gap_is_not_bridged():
     assert PoseTrack([0, 10], [np.eye(4)] * 2, gap_ns=10).at(5) is not None
     assert PoseTrack([0, 11], [np.eye(4)] * 2, gap_ns=10).at(5) is None
+
+
+@pytest.mark.parametrize(
+    ("model", "numbers", "known"),
+    [
+        *(("plumb_bob", [0.01] + [0.0] * (n - 1), n in (4, 5, 8, 12, 14)) for n in range(3, 16)),
+        ("equidistant", [0.01, 0, 0, 0], True),
+        ("equidistant", [0.01, 0, 0, 0, 0], True),  # some drivers add zeros
+        ("equidistant", [0.01, 0, 0, 0, 0.01], False),
+        ("equidistant", [0.01, 0, 0], False),
+    ],
+)
+def test_coefficients_are_as_many_as_opencv_has(model: str, numbers: list[float], known: bool):
+    intrinsics = np.array([[100.0, 0, 80], [0, 100, 60], [0, 0, 1]])
+
+    def camera() -> RigCamera:
+        return RigCamera("a", intrinsics, np.eye(4), (160, 120), np.array(numbers), model)
+
+    if known:
+        assert camera().is_distorted
+    else:
+        with pytest.raises(ValueError, match=f"the model {model} takes 4 [or0-9 ]*numbers"):
+            camera()
