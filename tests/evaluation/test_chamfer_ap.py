@@ -9,6 +9,7 @@ from gsmap.evaluation.chamfer_ap import (
 )
 from gsmap.evaluation.chamfer_kernels import chamfer_distance
 from gsmap.evaluation.matches import MatchTable
+from gsmap.evaluation.report import format_table
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import resample_all
 
@@ -47,7 +48,8 @@ def test_hand_worked_ap():
     matches = match_chamfer(pred, gt, CONFIG, "a")
     assert matches.pred_index.tolist() == [1, 2, 0]
     assert matches.matched_gt.tolist() == [[0, 0, 0], [-1, 1, 1], [-1, -1, -1]]
-    metrics = chamfer_report(MatchTable([matches]), CONFIG).metrics
+    report = chamfer_report(MatchTable([matches]), CONFIG)
+    metrics = report.metrics
     assert metrics["chamfer/divider/AP@0.5"] == 0.5
     assert metrics["chamfer/divider/AP@1.0"] == 1.0
     assert metrics["chamfer/divider/recall@0.5"] == 0.5
@@ -56,6 +58,12 @@ def test_hand_worked_ap():
     assert metrics["chamfer/mAP"] == pytest.approx(2.5 / 6)
     assert metrics["chamfer/divider/error_m@1.5"] == pytest.approx(0.5)  # of 0.3 and 0.7
     assert metrics["chamfer/boundary/error_m@1.5"] == -1.0
+    name, titles, _, divider, *_ = format_table(report).splitlines()
+    assert name == "AP_chamfer"
+    assert titles.split()[:4] == ["class", "AP", "@0.5", "m"]
+    # the scores 0.9, 0.8 and 0.7 against 1, 1 and 0 at 1.5 m: (0.1 + 0.2 + 0.7) / 3
+    cells = "divider 0.8333 0.5000 1.0000 1.0000 1.0000 0.5000 0.3333 2 3"
+    assert divider.split() == cells.split()
 
 
 def test_precision_envelope_lifts_an_early_miss():

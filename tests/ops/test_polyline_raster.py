@@ -214,3 +214,6 @@ def test_soft_rasters_name_bad_arguments():
         soft_rasters(torch.zeros(1, 3, 2), 4, 4, distance="cubed")
     with pytest.raises(ValueError, match=r"vertices must have shape \(n, V, 2\)"):
         soft_rasters(torch.zeros(3, 2), 4, 4)
+    for shape in ((2, 3, 3), (2, 0, 2)):
+        with pytest.raises(ValueError, match="vertices must have shape"):
+            soft_rasters(torch.zeros(shape), 4, 4)

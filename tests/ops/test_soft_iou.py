@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from gsmap.ops.soft_iou import pairwise_soft_iou
+from gsmap.ops.soft_iou import dice_loss, pairwise_dice_loss, pairwise_soft_iou
 
 BACKENDS = ["reference", "cpu"]
 
@@ -33,6 +33,16 @@ def test_fused_kernel_equals_every_pair_in_float64():
 def test_no_prediction_and_no_ground_truth(backend, n, k):
     iou = pairwise_soft_iou(sparse_masks(n, 0), sparse_masks(k, 1), backend=backend)
     assert iou.shape == (n, k)
+
+
+def test_dice_loss_by_hand():
+    """p = (1, 0.5, 0), t = (0.5, 0.5, 1): 1 - (2 * 0.75 + 1) / (1.5 + 2 + 1); of nothing: 0."""
+    preds = torch.tensor([[[1, 0.5, 0]], [[0, 0, 0]]])
+    targets = torch.tensor([[[0.5, 0.5, 1]], [[0, 0, 0]]])
+    torch.testing.assert_close(dice_loss(preds, targets), torch.tensor([4 / 9, 0.0]))
+    # the other pairs: 1 - 1 / (1.5 + 1) and 1 - 1 / (2 + 1)
+    expected = torch.tensor([[4 / 9, 0.6], [2 / 3, 0.0]])
+    torch.testing.assert_close(pairwise_dice_loss(preds, targets), expected)
 
 
 def test_two_empty_masks_have_no_overlap():

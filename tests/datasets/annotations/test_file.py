@@ -379,11 +379,18 @@ def test_a_worker_of_a_run_refuses_another_file_of_the_same_name(tmp_path: Path)
         pickle.loads(handed_on)[0]
 
 
+def test_the_usual_range_is_60_m_along_the_road_and_30_m_across():
+    lidar, ego = (AnnotationMeta("x", frame, "val") for frame in ("lidar", "ego"))
+    assert (lidar.x_range, lidar.y_range) == ((-15.0, 15.0), (-30.0, 30.0))
+    assert (ego.x_range, ego.y_range) == ((-30.0, 30.0), (-15.0, 15.0))
+
+
 def test_meta_refuses_bad_values():
     with pytest.raises(ValueError, match="frame"):
         AnnotationMeta("x", "camera", "val")
-    with pytest.raises(ValueError, match="x_range"):
-        AnnotationMeta("x", "ego", "val", x_range=(1, 1))
+    for x_range in ((1, 1), (1, np.inf), (-np.inf, 1)):
+        with pytest.raises(ValueError, match="x_range"):
+            AnnotationMeta("x", "ego", "val", x_range=x_range)
     with pytest.raises(ValueError, match="classes"):
         AnnotationMeta("x", "ego", "val", classes=("a", "a"))
     with pytest.raises(ValueError, match="classes must be names"):

@@ -17,6 +17,14 @@ def test_matrices_take_the_exact_ratio_of_each_axis():
     np.testing.assert_allclose(results["img_aug_matrix"][0], np.diag([100 / 101, 50 / 51, 1, 1]))
 
 
+def test_sizes_are_not_one_pixel_short():
+    """0.58 * 100 is 57.99999999999999 in floating-point numbers."""
+    matrices = {"lidar2img": [np.eye(4)], "img_aug_matrix": [np.eye(4)]}
+    for size in ((100, 200, 3), (200, 100, 3)):
+        results = ScaleImages(0.58).transform({"img": [np.zeros(size, np.uint8)], **matrices})
+        assert sorted(results["img_shape"]) == [58, 116]
+
+
 def test_a_scale_that_leaves_no_image_is_refused():
     with pytest.raises(ValueError, match="scale must be > 0, got 0"):
         ScaleImages(0)

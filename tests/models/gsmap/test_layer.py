@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from gsmap.models.gsmap.guidance import GaussianGuidance
-from gsmap.models.gsmap.layer import GaussianDecoderLayer
+from gsmap.models.gsmap.layer import GaussianDecoderLayer, guided
 from gsmap.models.maptr.attention import place_samples
-from gsmap.models.maptr.decoder import MapDecoderLayer
+from gsmap.models.maptr.decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.maptr.references import refine_reference
+from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
 
@@ -103,3 +104,17 @@ def test_a_new_guided_layer_computes_what_the_plain_one_does():
 def test_guidance_without_gaussians_is_refused():
     with pytest.raises(ValueError, match="needs a reference that holds Gaussians"):
         GaussianDecoderLayer()
+
+
+def test_a_decoder_with_layers_of_its_own_keeps_them():
+    """MapTR's take the layer that is guided; those of MGMapNet are guided by a part."""
+    for decoder in ({}, {"type": MapDecoder}):
+        layer = {"type": GaussianDecoderLayer, "ffn_dims": 4}
+        assert guided({**decoder, "layer": {"ffn_dims": 4}}) == {**decoder, "layer": layer}
+    layer = {"ffn_dims": 4, "guidance": {"type": GaussianGuidance, "embed_hidden_dims": 2}}
+    own = {"ffn_dims": 4, "guidance": {"embed_hidden_dims": 2}}
+    found = guided({"type": MGMapNetDecoder, "layer": own})
+    assert found == {"type": MGMapNetDecoder, "layer": layer}
+    assert guided({"type": MGMapNetDecoder, "layer": {"guidance": None}})["layer"] == {
+        "guidance": None
+    }
