@@ -57,18 +57,21 @@ def test_what_a_check_says_is_one_line_and_2(error, line, capsys):
 def test_files_of_the_user_end_in_words(tmp_path, capsys):
     (tmp_path / "a.json").write_text("{")
     (tmp_path / "b.txt").write_bytes(b"\xff")
+    (tmp_path / "d.json").write_text("[" * 100_000)
     for read in (
         lambda: read_json(tmp_path / "a.json"),
         lambda: read_text(tmp_path / "b.txt"),
         lambda: (tmp_path / "c.txt").read_text(),
+        lambda: read_json(tmp_path / "d.json"),
     ):
         with pytest.raises(SystemExit):
             run_command(read)
     lines = capsys.readouterr().err.splitlines()
-    assert [line.split(":")[0] for line in lines] == ["error"] * 3
+    assert [line.split(":")[0] for line in lines] == ["error"] * 4
     assert "a.json cannot be read: Expecting property name" in lines[0]
     assert "b.txt cannot be read: 'utf-8' codec can't decode byte" in lines[1]
     assert "c.txt'; check the path." in lines[2]
+    assert "d.json cannot be read: it is nested too deep." in lines[3]
 
 
 def full_disk() -> None:
@@ -118,6 +121,14 @@ def test_the_raise_statement_may_span_lines_or_stand_in_a_block(tmp_path, capsys
             run_command(command)
     assert capsys.readouterr().err == "error: text must be a number, got x.\nerror: not whole\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_raise_statement_is_known_without_its_source(capsys):
+    scope: dict = {}
+    exec("def check(): raise ValueError('not whole')", scope)
+    with pytest.raises(SystemExit):
+        run_command(scope["check"])
+    assert capsys.readouterr().err == "error: not whole\n"
 
 
 @pytest.mark.parametrize(

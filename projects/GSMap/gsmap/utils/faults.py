@@ -53,7 +53,8 @@ def in_words(error: BaseException) -> str | None:
     # a KeyError's own text is its message in quotes
     text = str(error.args[0] if type(error) is KeyError and error.args else error)
     frames, last = _steps(error)
-    meant = last == "RAISE_VARARGS" or _of_a_parser(error)  # Python itself finds the others
+    of_parser = isinstance(error, ValueError) and type(error) is not ValueError  # such as Arrow's
+    meant = last == "RAISE_VARARGS" or of_parser  # Python itself finds the others
     if _IN_WORKER in text:  # all that torch hands on
         meant, text = isinstance(error, ValueError), text.rstrip().splitlines()[-1]
         text = text.partition(": ")[2]
@@ -89,11 +90,6 @@ def _steps(error: BaseException) -> tuple[list[FrameType], str]:
         instruction = dis.opname[step.tb_frame.f_code.co_code[step.tb_lasti]]
         step = step.tb_next
     return frames, instruction
-
-
-def _of_a_parser(error: BaseException) -> bool:
-    """Whether a library could not understand a text or a file, such as JSON or Arrow."""
-    return isinstance(error, ValueError) and type(error) is not ValueError
 
 
 def _of_the_machine(error: BaseException, text: str) -> str | None:
