@@ -130,6 +130,16 @@ def test_hand_worked_ap_raster():
     assert metrics["raster/ped_crossing/mIoU"] == pytest.approx(6 / (10 + 6))  # B: 6 pixels
 
 
+def test_average_recall_takes_the_best_predictions_of_a_sample():
+    """Two areas, both found exactly: the best prediction finds one, the best ten find both."""
+    areas = [[[x, 0], [x + 3, 0], [x + 3, 1], [x, 1]] for x in (0, 6)]
+    gt = MapElements.from_polylines(areas, [1, 1])
+    pred = MapElements.from_polylines(areas, [1, 1], [0.8, 0.9])
+    metrics = raster_report(MatchTable([match_raster(pred, gt, TINY, "a")]), TINY).metrics
+    assert metrics["raster/ped_crossing/AR@1"] == 0.5
+    assert metrics["raster/ped_crossing/AR@10"] == 1.0
+
+
 def test_half_recall_is_51_of_101():
     line = [[0, -20], [0, 20]]
     gt = MapElements.from_polylines([line, [[8, -20], [8, 20]]], [0, 0])
