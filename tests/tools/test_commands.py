@@ -57,7 +57,8 @@ SLOWER = {"mmdet3d.structures", "mmdet3d.models", "mmcv.ops"}
 
 @pytest.mark.parametrize("tool", sorted(path.name for path in (REPO / "tools").glob("*.py")))
 def test_help_comes_without_what_is_slow_to_import(tool):
-    code = "import runpy, sys; sys.argv = sys.argv[1:]\ntry: runpy.run_path(sys.argv[0], None, "
+    code = "import runpy, sys; sys.argv = sys.argv[1:]; sys.path.insert(0, 'tools')"
+    code += "\ntry: runpy.run_path(sys.argv[0], None, "
     code += "'__main__')\nexcept SystemExit: pass\nprint('modules:', *sys.modules)"
     done = run_python("-c", code, f"tools/{tool}", "--help")
     text, modules = done.stdout.split("modules: ")
