@@ -32,7 +32,7 @@ _BOMB = "a: &a [0]\n" + "".join(
 )
 
 # each ends the process, should it run
-HOSTILE = (
+HOSTILE_SETTINGS = (
     {"type": "os.abort"}, [{"type": "os.abort"}], {"type": "mmdet.os.abort"}, {"type": "abort"},
     {"type": "GridMask", "_scope_": "antigravity"}, {"type": ["os.abort"]}, "os.abort",
     {"type": "mmdet.CameraMotionCompensation", "warp_mode": "__import__('os').abort()"},
@@ -194,7 +194,7 @@ def damaged_settings(content: bytes, rng: Random) -> bytes:
     if rng.random() < 0.5:
         text = damaged_json(text.encode(), rng).decode()
     else:
-        text = json.dumps(damaged_value(json.loads(text), rng, HOSTILE))
+        text = json.dumps(damaged_value(json.loads(text), rng, HOSTILE_SETTINGS))
     checkpoint["meta"][MODEL_SETTINGS] = text
     torch.save(checkpoint, file := io.BytesIO())
     return file.getvalue()
@@ -206,7 +206,7 @@ def damaged_source(content: bytes, rng: Random) -> bytes:
         return rng.choice(GROWING).encode() + content
     calls = [at for at in range(len(content)) if content.startswith(b"dict(", at)]
     place = rng.choice(calls) + len(b"dict(")
-    hostile = rng.choice([part for part in HOSTILE if isinstance(part, dict)])
+    hostile = rng.choice([part for part in HOSTILE_SETTINGS if isinstance(part, dict)])
     word = rng.choice((f"**{hostile!r},", f"more={hostile!r},", f"**{{'more': {hostile!r}}},"))
     return content[:place] + word.encode() + content[place:]
 

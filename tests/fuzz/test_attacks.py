@@ -150,13 +150,18 @@ def test_the_words_of_a_run_and_of_an_exported_model_are_never_looked_up(
     table = markdown([read_result(words[0], tmp_path, 0)], words[2], words[1])
     assert words[3] in table
     onnx = pytest.importorskip("onnx")
-    value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
-    node = onnx.helper.make_node("Identity", ["x"], ["y"])
-    result = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1])
-    graph = onnx.helper.make_graph([node], "g", [value], [result])
+    shape = [len(words), 3, 1, 1]
+    names = ("scores", "labels", "points")
+    value, *results = (
+        onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
+        for name in ("images", *names)
+    )
+    nodes = [onnx.helper.make_node("Identity", ["images"], [name]) for name in names]
+    graph = onnx.helper.make_graph(nodes, "g", [value], results)
     model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)])
     model.ir_version = 9
     notes = {"format": 1, "classes": words, "cameras": words, "image_size": [1, 1]}
+    notes |= {"x_range": [-1, 1], "y_range": [-1, 1], "margin_m": None, "score_threshold": None}
     onnx.helper.set_model_props(
         model, {METADATA_KEY: json.dumps({**notes, "type": words[1], "frame": words[0]})}
     )
