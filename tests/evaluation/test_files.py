@@ -269,7 +269,7 @@ def test_annotation_file_without_ground_truth_or_class_is_refused(tmp_path):
         read_ground_truth(arrow, ("divider", "stop_line"))
 
 
-def test_elements_of_other_classes_are_left_out_and_counted(tmp_path):
+def test_elements_of_other_classes_have_no_label_and_are_counted(tmp_path):
     """A divider, two crossings and a boundary; crossings are not asked for."""
     line = np.array([[0.0, 0.0], [1.0, 0.0]])
     instances = [MapInstance(label, line) for label in (0, 1, 1, 2)]
@@ -277,5 +277,5 @@ def test_elements_of_other_classes_are_left_out_and_counted(tmp_path):
     path = tmp_path / "truth.arrow"
     write_annotations(path, AnnotationMeta("x", "lidar", "val"), [sample])
     found, ignored = read_ground_truth(path, ("boundary", "divider"))
-    assert found["a"].labels.tolist() == [1, 0]
-    assert ignored == {"ped_crossing": 2}
+    assert found["a"].labels.tolist() == [1, -1, -1, 0]
+    assert +ignored == {"ped_crossing": 2}  # without the zeros

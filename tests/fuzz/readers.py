@@ -290,7 +290,7 @@ class Files:
         return Reader(self.arrow, read, damages, exact)
 
     def in_use(self, *damages: Any) -> Reader:
-        used, whole = self.work / "used.arrow", self.arrow.read_bytes()
+        used, whole = self.out / "used.arrow", self.arrow.read_bytes()
         path = self.put("other.arrow", whole)
 
         def read() -> list[MapSample]:
@@ -415,7 +415,7 @@ class Files:
         evaluator = MapEvaluator(
             ChamferConfig(LIDAR_META.classes), RasterConfig(LIDAR_META.classes)
         )
-        target = self.work / f"whole of {kind}"
+        target = self.out / f"whole of {kind}"
         for shard in (Shard(index, count) for index in range(count)):
             sample = replace(self.sample, token=str(shard.index))
             if kind == ANNOTATIONS:
