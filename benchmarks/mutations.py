@@ -21,8 +21,10 @@ from types import CodeType
 import numpy as np
 
 from benchmarks.measure import markdown_table
+from gsmap.utils.shipped import shipped
 
-REPO = Path(__file__).resolve().parents[1]
+REPO = shipped()
+TESTS = {"mapdata": "map_data", "drivemaps": "drive_maps"}  # folders of tests by room
 FOLDERS = ("GSMap/gsmap", "MapData/mapdata", "DriveMaps/drivemaps")
 ROOMS = ("models", "ops", "structures", "evaluation", "datasets", "mapdata", "drivemaps")
 VERDICTS = CAUGHT, SURVIVED, LATE = "caught", "not caught", "timed out"
@@ -82,7 +84,7 @@ def tests_of(module: str, room: str) -> list[str]:
     """Return the test files of a room that import a module."""
     return [
         str(path)
-        for path in sorted((REPO / "tests" / room).rglob("test_*.py"))
+        for path in sorted((REPO / "tests" / TESTS.get(room, room)).rglob("test_*.py"))
         if module in _imported(path.read_text())
     ]
 

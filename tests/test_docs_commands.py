@@ -156,7 +156,7 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPO)))
 def test_every_command_is_understood(page: Path, monkeypatch: pytest.MonkeyPatch):
-    for word in ("tests", "tests/mapdata"):  # as PYTHONPATH of the pages says
+    for word in ("tests", "tests/map_data"):  # as PYTHONPATH of the pages says
         monkeypatch.syspath_prepend(str(REPO / word))
     monkeypatch.chdir(REPO)
     for words in commands(page):

@@ -14,7 +14,7 @@ def test_damaged_files_end_in_words(minicity_root: Path, minicity_annotations: d
     paths = [
         str(TESTS.parent),
         str(TESTS),
-        str(TESTS / "mapdata"),
+        str(TESTS / "map_data"),
         os.environ.get("PYTHONPATH", ""),
     ]
     environment = {"PYTHONPATH": os.pathsep.join(paths)}

@@ -59,7 +59,7 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
     assert not ranks(folder)  # training died with it
 
     bad = f"bad={tiny_config},optim_wrapper.optimizer.lr=-1.0"
-    done = run_python(*words, bad, env=threads)
+    done = run_python(*words[:2], bad, *words[2:], env=threads)
     assert done.returncode == 2
     assert "error: bad/seed_0 did not end" in done.stderr
     assert "runs done" in done.stderr

@@ -104,7 +104,7 @@ def test_one_and_two_processes_score_and_write_the_same(tiny_config, trained, tm
     for folder in (one, two):
         folder.mkdir()
     run(
-        sys.executable, "tools/test.py", *metrics, tiny_config, trained / "epoch_3.pth", *options,
+        sys.executable, "tools/test.py", tiny_config, trained / "epoch_3.pth", *metrics, *options,
         "--metrics-out", one / "metrics.json", "--out", one / "results.json",
         "--show-dir", one / "pictures",
     )  # fmt: skip
