@@ -85,8 +85,8 @@ def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_confi
         "chamfer/divider/AP@0.5",
     }
 
-    slurm = run_python(*words, bad, "--slurm=gpu", env=threads, check=True)
+    slurm = run_python(*words[:2], bad, *words[2:], "--slurm=gpu", env=threads, check=True)
     (line,) = slurm.stdout.splitlines()  # the other run is done
     srun = ["srun", "--partition=gpu", "--gres=gpu:1", "--ntasks=1", "--cpus-per-task=5"]
-    own = [sys.executable, *words, bad, "--only", "bad/seed_0"]
+    own = [sys.executable, *words[:2], bad, *words[2:], "--only", "bad/seed_0"]
     assert shlex.split(line) == [*srun, "--job-name=bad/seed_0", *own]
