@@ -1,4 +1,4 @@
-"""How long Argoverse 2 ground truth takes: what docs/benchmarks/argoverse2.md states."""
+"""How long Argoverse 2 ground truth takes: what docs/benchmarks/speed.md states."""
 
 import resource
 import time

@@ -24,7 +24,7 @@ OUTSIDE = {
     "security.md": "SECURITY.md",
     "models.md": "models/README.md",
     "gsmap.md": "projects/GSMap/README.md",
-    "minicity_package.md": "projects/MiniCity/README.md",
+    "minicity.md": "projects/MiniCity/README.md",
 }
 PAGES = {source: page for page, source in OUTSIDE.items()}
 LANGUAGES = {".py": "python", ".sh": "bash", ".json": "json"}

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # Every check that wants a GPU, in under 40 minutes on one: tools/gpu_checks.sh [WORK_FOLDER]. What it measures is appended to
-# docs/benchmarks/gpu.md with date and device. A part that fails is named, and the others still run.
+# WORK_FOLDER/results.md with date and device. A part that fails is named, and the others still run.
 #   PYTHON=.venv/bin/python   the interpreter        RESULTS=FILE   where to append instead
 #   REDUCED=1                 each part at its smallest, on the CPU: whether the script works, not how fast anything is
 set -uo pipefail
 cd "$(dirname "$0")/.."
 work=$(realpath -m "${1:-work_dirs/gpu_checks}")
 python=${PYTHON:-.venv/bin/python}
-results=$(realpath -m "${RESULTS:-docs/benchmarks/gpu.md}")
+results=$(realpath -m "${RESULTS:-$work/results.md}")
 mkdir -p "$work"
 gsmap=projects/GSMap/configs
 r50=(configs/maptr/maptr_r50_24e.py configs/mapvr/mapvr_r50_24e.py "$gsmap/gsmap_maptr_r50_24e.py" configs/gemap/gemap_simple_r50_24e.py

@@ -2,7 +2,7 @@
 """Join the parts that ``--shard I/N`` of other commands made: ``python tools/merge.py FILE ...``.
 
 FILE is what the command makes without ``--shard``: an annotation file, results or metrics. All of
-its N parts must be in the same folder. The result is identical, byte for byte (docs/fleet.md).
+its N parts must be in the same folder. The result is identical, byte for byte (docs/scale.md).
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-# A small MapTR on real Argoverse 2 roads with rendered pictures (docs/argoverse2.md), a quarter of the real size and a
+# A small MapTR on real Argoverse 2 roads with rendered pictures (projects/MiniCity), a quarter of the real size and a
 # quarter of that again, trained from scratch on two CPU cores; the BEV mask as on MiniCity.
 # `python tools/create_data.py av2-render --root data/av2 --out data/av2_rendered` makes the pictures,
 # `python tools/create_data.py av2 --root data/av2_rendered` the annotation files, each once per split.

@@ -42,7 +42,7 @@ val_dataloader = dict(
 test_dataloader = val_dataloader
 
 # Pipelines for leaves to choose. MapTRv2 learns from BEV and camera masks besides map elements, and from the depth of
-# the LiDAR sweep that each sample names (docs/argoverse2.md).
+# the LiDAR sweep that each sample names (docs/data.md).
 _masks = [
     dict(type='MakeBEVMask', size=(100, 200), num_classes=3),
     dict(type='MakePVMask', stride=32, ground_z_m=-0.3, num_classes=3),  # the origin is the rear axle

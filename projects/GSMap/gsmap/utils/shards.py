@@ -109,7 +109,7 @@ class ShardFile(NamedTuple):
 
 def add_shard_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--shard I/N``, and the options that make all shards on a cluster."""
-    group = parser.add_argument_group("several machines (docs/fleet.md)")
+    group = parser.add_argument_group("several machines (docs/scale.md)")
     group.add_argument(
         "--shard",
         type=Shard.parse,

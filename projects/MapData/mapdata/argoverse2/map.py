@@ -1,7 +1,7 @@
 """Local vector maps from the map of one Argoverse 2 log, by the rules of MapTRv2 or of MapTR.
 
 Whatever does not depend on the vehicle's pose is done once per log; a frame then takes a few
-vectorised geometry calls. ``docs/argoverse2.md`` states both sets of rules.
+vectorised geometry calls. ``docs/data.md`` states both sets of rules.
 """
 
 from collections.abc import Collection
