@@ -193,3 +193,38 @@ def test_every_unused_key_is_documented():
 def _suffixes(text):
     """Return the abbreviated keys of the table's rows, as ``.norm.bias``."""
     return re.findall(r"`(\.[\w.]+)`", text)
+
+
+ARCHITECTURES = {  # others are one word: the name of the map
+    "all": {key_map.name for key_map in KEY_MAPS},
+    "BEV queries": {"maptr", "maptr-bevformer", "gemap"},
+    "LSS": {"maptrv2", "gemap-full", "mgmapnet"},
+    "MapTR (BEVFormer)": {"maptr-bevformer"},
+    "MapTR, GeMap (simple)": {"maptr", "gemap"},
+    "GeMap": {"gemap", "gemap-full"},
+    "not MapTRv2": {key_map.name for key_map in KEY_MAPS} - {"maptrv2"},
+}
+
+
+def test_the_table_of_keys_in_the_docs_is_the_table_of_the_code():
+    text = (REPO / "docs/migration.md").read_text()
+    rows = re.findall(
+        r"^\| ([^`|]+) \| `([\w.*]+)` \| (?:`([\w.*]+)`|the same) \|$", text, re.MULTILINE
+    )
+    assert len(rows) > 40
+    for architectures, upstream, ours in rows:
+        upstream, ours = (
+            re.sub(r"\bN\b", "3", key).replace("*", "9.weight")
+            for key in (upstream, ours or upstream)
+        )
+        known = [
+            m
+            for m in KEY_MAPS
+            if m.name in ARCHITECTURES.get(architectures, {architectures.lower()})
+        ]
+        found = {key_map.to_ours(upstream) for key_map in known}
+        loose = architectures.startswith(("all", "not"))  # other methods may lack the part
+        assert found - ({None} if loose else set()) == {ours}, upstream
+    shown = {(upstream.rstrip("*"), (ours or upstream).rstrip("*")) for _, upstream, ours in rows}
+    rules = {rule for key_map in KEY_MAPS for rule in key_map.rules}
+    assert {tuple(part.replace("{i}", "N") for part in rule) for rule in rules} == shown

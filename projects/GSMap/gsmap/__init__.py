@@ -1,8 +1,7 @@
 """Online vectorized HD-map construction with 2D Gaussians.
 
-The names below are imported when they are first used (docs/library.md). ``gsmap.structures``,
-``gsmap.ops`` and, but for its two ``*_metric.py``, ``gsmap.evaluation`` need nothing of OpenMMLab.
-A config registers every model, data set and metric with
+The names below are imported when they are first used (docs/library.md). docs/architecture.md says
+which packages need torch and OpenMMLab. A config registers every model, data set and metric with
 ``custom_imports = dict(imports=['gsmap.registered'])``.
 """
 
