@@ -129,9 +129,7 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
     return find_checkpoint(config if checkpoint is None else checkpoint)
 
 
-def _named(
-    name: str | Path, what: str, remedy: str = "", others: Iterable[str] = ()
-) -> NamedModel:
+def _named(name: str | Path, what: str, remedy: str = "", others: Iterable[str] = ()) -> NamedModel:
     """Return a model by its name, or raise an error with the nearest, or with all that ship."""
     models = named_models()
     if str(name) not in models:
