@@ -12,6 +12,7 @@ COMMANDS = {
     "export": "export",
     "fps": "fps",
     "heads": "heads",
+    "live": "live",
     "masks": "masks",
     "minicity": "minicity",
     "mutations": "mutations",

@@ -8,6 +8,8 @@ that shows it.
 import html
 import posixpath
 import re
+from importlib import import_module
+from itertools import accumulate
 from pathlib import Path
 
 from latex2mathml.converter import convert
@@ -33,6 +35,7 @@ LINK = re.compile(
     r"```.*?```|`[^`\n]*`|\]\((?P<target>[^)\s:]+?)(?P<anchor>#[^)\s]*)?\)", re.DOTALL
 )
 MATH = re.compile(r":math:<code>(.*?)</code>", re.DOTALL)
+NAME = re.compile(r'<h3 id="([\w.]+)\.(\w+)" class="doc doc-heading">.*?</h3>', re.DOTALL)
 ROLE = re.compile(r":(?:class|func|meth):(?=<code>)")
 
 
@@ -90,6 +93,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Show the equations of docstrings as MathML, and names in them without their roles."""
+    """Show equations as MathML, names without their roles, and where a name is imported from."""
     content = MATH.sub(lambda match: convert(html.unescape(match[1])), content)
-    return ROLE.sub("", content)
+    return NAME.sub(with_import, ROLE.sub("", content))
+
+
+def with_import(heading: re.Match[str]) -> str:
+    """Return the heading of a class or function, with the line that imports it below."""
+    module, name = heading.groups()
+    packages = accumulate(module.split("."), "{}.{}".format)
+    offers = (path for path in packages if name in getattr(import_module(path), "__all__", ()))
+    return f"{heading[0]}<p><code>from {next(offers, module)} import {name}</code></p>"

@@ -52,6 +52,20 @@ def test_the_reference_has_every_registered_name(site: Path):
     assert "<math" in shown
 
 
+def test_the_reference_says_what_to_import_and_what_a_module_takes(site: Path):
+    shown = "".join(page.read_text(encoding="utf-8") for page in (site / "api").glob("*.html"))
+    lines = set(re.findall(r"<code>(from [\w.]+ import \w+)</code>", shown))
+    assert {
+        "from gsmap import MapInferencer",
+        "from gsmap.evaluation import ChamferConfig",
+        "from gsmap.models.gsmap.cost import IoUCost",
+    } <= lines
+    for line in lines:
+        exec(line, {})
+    for name in ("gsmap.losses.RasterLoss", "gsmap.head.GSMapHead"):  # both inherit it
+        assert f'id="gsmap.models.{name}.forward"' in shown
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPO)))
 def test_lines_are_short(page: Path):
     """Table rows cannot be broken; everything else is shorter than 120 characters."""

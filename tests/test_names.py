@@ -26,8 +26,9 @@ classes = ("divider",)
 evaluator = MapEvaluator(ChamferConfig(classes), RasterConfig(classes))
 line = [[[0.0, -20.0], [0.0, 20.0]]]
 found, truth = (MapElements.from_polylines(line, [0], scores) for scores in ([0.9], None))
-reports = evaluator.reports([evaluator.match("a", found, truth)])
-assert all(report.metrics[f"{report.name}/mAP"] > 0.999 for report in reports)
+evaluator.update(found, truth)
+figures = evaluator.compute()
+assert min(figures["chamfer/mAP"], figures["raster/mAP"]) > 0.999
 """
 
 

@@ -17,7 +17,7 @@ from gsmap.visualization.report.page import ReportOptions, report_data, write_pa
 
 def parse_args() -> argparse.Namespace:
     parser = CommandParser(description=__doc__)
-    parser.add_argument("config", help="config file")
+    parser.add_argument("config", help="config: its file or its name")
     parser.add_argument("--split", default="train", choices=["train", "val", "test"])
     parser.add_argument("--num", type=int, default=20, help="how many samples, evenly spread")
     parser.add_argument(

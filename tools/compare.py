@@ -46,7 +46,7 @@ def parse_args() -> argparse.Namespace:
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("configs", nargs="*", metavar="CONFIG", help="configs to compare")
+    parser.add_argument("configs", nargs="*", metavar="CONFIG", help="configs, by file or name")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="seeds 0 to N - 1")
     parser.add_argument("--budget", type=int, metavar="ITERATIONS", help="length of every run")
     parser.add_argument("--batch", type=int, default=4, help="samples per iteration")

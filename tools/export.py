@@ -39,7 +39,7 @@ def parse_args() -> argparse.Namespace:
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("config", help="config file of the model, or the name of one that ships")
+    parser.add_argument("config", help="config, by file or name, or the name of a trained model")
     parser.add_argument("checkpoint", nargs="?", help="its checkpoint; not needed with a name")
     parser.add_argument("--out", type=output_file, required=True, help="ONNX file to write")
     parser.add_argument(

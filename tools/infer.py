@@ -52,7 +52,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--model",
         nargs="+",
         metavar=("NAME_OR_CONFIG", "CHECKPOINT"),
-        help="name of a model that ships, or config file and checkpoint",
+        help="name of a trained model, or config and checkpoint",
     )
     parser.add_argument("--out", type=output_file, help="JSON file for the predictions")
     parser.add_argument("--show-dir", type=Path, help="folder for pictures")

@@ -18,7 +18,7 @@ from gsmap.utils.files import write_text
 
 def parse_args() -> argparse.Namespace:
     parser = CommandParser(description=__doc__)
-    parser.add_argument("config", help="config file, or the name of a model that ships")
+    parser.add_argument("config", help="config, by file or name, or the name of a trained model")
     parser.add_argument(
         "checkpoint", nargs="?", help="checkpoint, ours or MapTR's; not needed with a name"
     )

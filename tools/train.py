@@ -15,7 +15,7 @@ from gsmap.utils.files import lock_folder
 
 def parse_args() -> argparse.Namespace:
     parser = CommandParser(description=__doc__)
-    parser.add_argument("config", help="config file")
+    parser.add_argument("config", help="config: its file or its name")
     parser.add_argument(
         "--resume",
         nargs="?",

@@ -332,6 +332,24 @@ def test_a_drive_in_memory_leaves_no_files_and_its_images_as_they_are(inferencer
         np.testing.assert_array_equal(arrays[0][name], image)
 
 
+def test_a_live_rig_sees_each_frame_as_if_it_were_alone(inferencer, tmp_path, monkeypatch):
+    opened = []
+    dataset = inferencer.dataset
+    monkeypatch.setattr(inferencer, "dataset", lambda s: opened.append(s) or dataset(s))
+    frames = [in_memory(sample, tmp_path) for sample in make_samples(tmp_path, 3)]
+    live = inferencer.live(*frames[0][1:])
+    found = [live(images) for images, *_ in frames]
+    assert len(opened) == 1  # the calibration is fitted once
+    for elements, frame in zip(found, frames, strict=True):
+        alone = inferencer.elements(inferencer.predict_images(*frame))
+        np.testing.assert_array_equal(elements.points, alone.points)
+        np.testing.assert_array_equal(elements.scores, alone.scores)
+    assert abs(found[0].points - found[1].points).max() > 1e-3  # the images matter
+    small = {name: image[::2, ::2] for name, image in frames[0][0].items()}
+    alone = inferencer.elements(inferencer.predict_images(small, *frames[0][1:]))
+    np.testing.assert_array_equal(live(small).points, alone.points)  # of another size
+
+
 def test_an_absent_camera_in_memory_is_an_error_or_blank(inferencer, tmp_path):
     (sample,) = make_samples(tmp_path, 1)
     del sample.cameras[0]

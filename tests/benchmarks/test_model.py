@@ -5,7 +5,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from benchmarks import fps, profile, step
+from benchmarks import fps, live, profile, step
 from benchmarks.model import image_shape, mask_stride
 
 REPO = Path(__file__).resolve().parents[2]
@@ -54,6 +54,15 @@ def test_frames_per_second_are_those_of_the_time(capsys):
     assert float(seconds) > 0
     assert float(peak) > 0
     assert ratio == "1.000"
+
+
+def test_a_frame_of_a_known_rig_is_measured_beside_one_of_a_new_rig(capsys):
+    run(live, "maptr_r18_minicity")
+    printed = capsys.readouterr().out
+    assert printed.startswith("maptr_r18_minicity, 6 images of 64 x 96, cpu, ")
+    known, new = cells(printed)
+    assert (known[0], new[0]) == ("live(images)", "predict_images(images, ...)")
+    assert min(float(known[1]), float(new[1])) > 0
 
 
 def test_a_step_is_measured_for_every_raster_of_gsmap(capsys):

@@ -15,6 +15,7 @@ from gsmap.checkpoints.named_models import (
     find_checkpoint,
     find_config,
     list_models,
+    named_configs,
     named_models,
 )
 from gsmap.checkpoints.reading import load_weights
@@ -64,6 +65,27 @@ def test_a_config_is_found_by_its_path_in_the_repository_from_any_folder(tmp_pat
     Path(config).parent.mkdir(parents=True)
     Path(config).touch()
     assert find_config(config) == Path(config)  # one's own comes first
+
+
+def test_a_config_is_found_by_its_name_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name = "gsmap_maptr_r18_minicity"
+    assert find_config(name) == shipped(f"projects/GSMap/configs/{name}.py")
+    assert find_config("maptr_r50_24e") == shipped("configs/maptr/maptr_r50_24e.py")
+    with pytest.raises(ValueError, match=f"give a checkpoint after {name}: only a model's name"):
+        checkpoint_for(name, None)
+    with pytest.raises(FileNotFoundError, match=r"config file gsmap.*mean gsmap_maptr_r50_24e\?"):
+        find_config("gsmap_maptr_r50_24")
+    Path(name).write_text("mine = 1")
+    assert find_config(name) == Path(name)
+
+
+def test_a_name_means_one_config():
+    files = [*shipped("configs").glob("[!_]*/*.py")]
+    files += shipped("projects/GSMap/configs").glob("*.py")
+    assert sorted(named_configs().values()) == sorted(files)  # so no name stands for two
+    for name in named_configs().keys() & named_models():
+        assert named_configs()[name] == shipped(named_models()[name].config)
 
 
 def test_a_wrong_name_gets_the_nearest_right_one():

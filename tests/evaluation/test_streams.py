@@ -3,16 +3,18 @@
 import json
 import random
 import tracemalloc
+from operator import itemgetter
 from pathlib import Path
 
 import pytest
 
 from benchmarks.evaluation import CLASSES, generated_frames, write_race
-from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
 from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.file_evaluation import CHUNK, SamplePairs, evaluate_files
 from gsmap.evaluation.json_items import items_of
-from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.matches import MatchTable
+from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
 from gsmap.evaluation.report import flat_metrics
 from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile
 
@@ -89,6 +91,28 @@ def test_places_lead_to_the_same_elements_also_behind_letters_of_many_bytes(tmp_
         assert json.loads(path.read_bytes()[start : start + length])["sample_token"] == token
         again = file.load(token, place)
         assert again.points.tolist() == elements.points.tolist() == [[0, 1.5], [2, 3]]
+
+
+def test_update_and_compute_give_the_figures_of_the_functions(files):
+    samples = list(SamplePairs(*files, CLASSES))
+    wanted = {}
+    for config, match, report in (
+        (ChamferConfig(CLASSES), match_chamfer, chamfer_report),
+        (RasterConfig(CLASSES), match_raster, raster_report),
+    ):
+        found = [match(predictions, truth, config, token) for token, predictions, truth in samples]
+        wanted |= report(MatchTable(found), config).metrics
+    evaluator = MapEvaluator(ChamferConfig(CLASSES), RasterConfig(CLASSES))
+    for _, predictions, truth in sorted(samples, key=itemgetter(0)):  # equal scores: by token
+        evaluator.update(predictions, truth)
+    assert evaluator.compute() == wanted
+    assert evaluator.compute()["chamfer/num_samples"] == COUNT
+    evaluator.reset()
+    with pytest.raises(ValueError, match="no sample to score"):
+        evaluator.compute()
+    for token, predictions, truth in [*samples, samples[0]]:
+        evaluator.update(predictions, truth, token)
+    assert evaluator.compute() == wanted
 
 
 @pytest.mark.parametrize("change", [list.reverse, list.clear])

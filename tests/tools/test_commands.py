@@ -32,7 +32,9 @@ def test_gsmap_runs_the_tools_from_any_folder(tmp_path, monkeypatch, capsys):
     assert gsmap(monkeypatch, "create_data", "--help") == 0
     assert "usage: gsmap create_data [-h]" in capsys.readouterr().out
     assert gsmap(monkeypatch, "train", "--help") == 0
-    assert "usage: gsmap train [-h]" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "usage: gsmap train [-h]" in said
+    assert "Train a model: ``gsmap train CONFIG``." in said
     assert gsmap(monkeypatch, "learn") == 2
     assert "there is no command learn; there are analyze_run, " in capsys.readouterr().err
 

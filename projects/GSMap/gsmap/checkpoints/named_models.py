@@ -6,6 +6,7 @@ not ship: saved there under their name, they load like the others.
 
 import difflib
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -57,17 +58,24 @@ def list_models() -> list[str]:
     return [name for name, model in named_models().items() if model.file.is_file()]
 
 
+@cache
+def named_configs() -> dict[str, Path]:
+    """Return the configs that ship, by the names of their files, without those to inherit from."""
+    patterns = ("configs/[!_]*/*.py", "projects/GSMap/configs/*.py")
+    return {path.stem: path for pattern in patterns for path in sorted(shipped().glob(pattern))}
+
+
 def find_config(config: str | Path) -> Path:
-    """Return a config's file, given that, its path in the repository, or the name of a model.
+    """Return a config's file, given that, its path in the repository, its name, or a model's name.
 
     Raises:
-        FileNotFoundError: If it is neither; the message has the nearest name.
+        FileNotFoundError: If it is none of these; the message has the nearest name.
     """
-    for path in (Path(config), shipped(str(config))):
-        if path.is_file():
+    for path in (Path(config), shipped(str(config)), named_configs().get(str(config))):
+        if path is not None and path.is_file():
             return path
     remedy = f"; configs are in configs/ and projects/GSMap/configs/ of {shipped()}"
-    return shipped(_named(config, "config file", remedy).config)
+    return shipped(_named(config, "config file", remedy, named_configs()).config)
 
 
 def find_checkpoint(checkpoint: str | Path) -> Path:
@@ -113,18 +121,19 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
 
     Raises:
         FileNotFoundError: If it does not exist.
-        ValueError: If none is given with a config file.
+        ValueError: If none is given with a config.
     """
-    if checkpoint is None and Path(config).is_file():
+    is_config = Path(config).is_file() or str(config) in named_configs().keys() - named_models()
+    if checkpoint is None and is_config:
         raise ValueError(f"give a checkpoint after {config}: only a model's name stands for both.")
     return find_checkpoint(config if checkpoint is None else checkpoint)
 
 
-def _named(name: str | Path, what: str, remedy: str = "") -> NamedModel:
+def _named(name: str | Path, what: str, remedy: str = "", others: Iterable[str] = ()) -> NamedModel:
     """Return a model by its name, or raise an error with the nearest, or with all that ship."""
     models = named_models()
     if str(name) not in models:
-        close = difflib.get_close_matches(Path(name).stem, models, n=1, cutoff=0.7)
+        close = difflib.get_close_matches(Path(name).stem, [*models, *others], n=1, cutoff=0.7)
         ours = ", ".join(model.name for model in models.values() if not model.address)
         hint = f"did you mean {close[0]}?" if close else f"{ours} ship"
         raise FileNotFoundError(

@@ -49,8 +49,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     What it registers is imported, and its scope is made the default one.
 
     Args:
-        config: A config file, the name of a model (`named_models`), or a ``Config``, which is left
-            as it is.
+        config: A config, by file or name (`find_config`), or a ``Config``, which is left as it is.
         cfg_options: Overrides, by dotted name.
 
     Raises:

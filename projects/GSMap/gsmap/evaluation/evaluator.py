@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
 from gsmap.evaluation.matches import FrameMatches, MatchTable
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
-from gsmap.evaluation.report import MetricReport
+from gsmap.evaluation.report import MetricReport, flat_metrics
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import resample_all
 
@@ -17,7 +18,10 @@ SampleMatches = dict[str, FrameMatches]  # by the name of the metric
 
 @dataclass(frozen=True)
 class MapEvaluator:
-    """Which metrics to compute, and how: ``match`` each sample, then make ``reports`` of all.
+    """Which metrics to compute, and how.
+
+    ``update`` with each sample, then ``compute``. Or keep what ``match`` returns for each sample,
+    such as of several processes, and make ``reports`` of all.
 
     Args:
         chamfer: Rules of AP_chamfer, or None to leave it out.
@@ -39,6 +43,30 @@ class MapEvaluator:
             raise ValueError(f"name at least one of {METRIC_NAMES}, with the same classes.")
         if self.ground_truth_points is not None and self.ground_truth_points < 2:
             raise ValueError(f"ground_truth_points must be >= 2, got {self.ground_truth_points}.")
+
+    @cached_property
+    def _matches(self) -> list[SampleMatches]:
+        """Matches of the samples so far."""
+        return []
+
+    def update(
+        self, predictions: MapElements, ground_truth: MapElements, token: str | None = None
+    ) -> None:
+        """Add a sample; one whose token was there before counts once. Its place is the default."""
+        token = f"{len(self._matches):09d}" if token is None else token
+        self._matches.append(self.match(token, predictions, ground_truth))
+
+    def compute(self) -> dict[str, float]:
+        """Return the figures of all samples so far, as docs/evaluation.md lists them.
+
+        Raises:
+            ValueError: If there is no sample.
+        """
+        return flat_metrics(self.reports(self._matches))
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self._matches.clear()
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -86,13 +114,19 @@ class MapEvaluator:
         return [self.match(*sample) for sample in samples]
 
     def reports(self, samples: Iterable[SampleMatches]) -> list[MetricReport]:
-        """Compute the metrics from the matches of all samples; repeated tokens count once."""
+        """Compute the metrics from the matches of all samples; repeated tokens count once.
+
+        Raises:
+            ValueError: If there is no sample.
+        """
         chamfer, raster, found = MatchTable(), MatchTable(), []
         for sample in samples:
             if self.chamfer:
                 chamfer.add(sample["chamfer"])
             if self.raster:
                 raster.add(sample["raster"])
+        if not (len(chamfer) or len(raster)):
+            raise ValueError("there is no sample to score.")
         if self.chamfer:
             found.append(chamfer_report(chamfer, self.chamfer))
         if self.raster:

@@ -5,6 +5,7 @@ import errno
 import logging
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -26,8 +27,10 @@ class CommandParser(argparse.ArgumentParser):
 
     program: str | None = None
 
-    def __init__(self, prog: str | None = None, **options: Any):
-        super().__init__(prog or self.program, **options)
+    def __init__(self, prog: str | None = None, description: str | None = None, **options: Any):
+        if self.program and description:
+            description = re.sub(r"(python )?tools/(\w+)\.py", r"gsmap \2", description)
+        super().__init__(prog or self.program, description=description, **options)
 
 
 def is_first_rank() -> bool:
