@@ -129,7 +129,7 @@ convert_checkpoint: K plain.txt | plain.txt exists already
 convert_config: nowhere.py out.py | No such file or directory: 'nowhere.py'
 convert_config: open.py out.py | open.py, line 1: '(' was never closed.
 convert_config: bytes.py out.py | bytes.py cannot be read
-convert_config: empty.py out.py | empty.py cannot be converted: model.type must be one of
+convert_config: empty.py out.py | empty.py cannot be converted: None is not supported: model.type must be one of
 create_data: nuscenes --root nowhere | no data set at nowhere
 create_data: nuscenes --root . | no version 'v1.0-trainval' in .
 create_data: av2 --root . | no folder val
