@@ -51,7 +51,10 @@ def test_one_folder_serves_every_split_unless_an_override_says_otherwise(swapped
         ("_scale=0.5", "give train.dataset.pipeline.1.scale, val.dataset.pipeline.1.scale, "),
         ("grid.x_range=[-9,9]", "give train.dataset.grid.x_range, val.dataset.grid.x_range, "),
         ("grid.x_range.0=-9", "edit CONFIG"),
-        ("classes=[a]", "give train.dataset.classes, val.dataset.classes, test.dataset.classes, mod"),
+        (
+            "classes=[a]",
+            "give train.dataset.classes, val.dataset.classes, test.dataset.classes, mod",
+        ),
         ("_load=[]", "edit CONFIG"),
         ("_nothing=3", "edit CONFIG"),
         ("vis_backends=[]", "give visualizer.vis_backends, or edit CONFIG"),

@@ -205,7 +205,9 @@ def test_values_that_are_read(tmp_path):
 
 
 def test_a_config_of_another_model_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"^StreamMapNet is not supported: model\.type must be one"):
+    with pytest.raises(
+        ValueError, match=r"^StreamMapNet is not supported: model\.type must be one"
+    ):
         converted(upstream_configs.maptr(model="StreamMapNet"), tmp_path)
     with pytest.raises(ValueError, match=r"data\.train\.type must be one of .* got 'Mine'"):
         converted(upstream_configs.maptr(dataset="Mine"), tmp_path)
@@ -228,7 +230,9 @@ def test_a_config_of_another_model_is_refused(tmp_path):
 def test_a_part_that_ours_does_not_have_is_refused(ours, theirs, tmp_path):
     text = upstream_configs.maptr()
     assert ours in text
-    with pytest.raises(ValueError, match=rf"^{theirs} is not supported: \S+ must be one of .*{ours}"):
+    with pytest.raises(
+        ValueError, match=rf"^{theirs} is not supported: \S+ must be one of .*{ours}"
+    ):
         converted(text.replace(ours, theirs), tmp_path)
 
 

@@ -193,7 +193,9 @@ def _base(encoder: str, av2: bool, with_depth: bool) -> str:
     """Return our config that has the same encoder and data set."""
     of_nuscenes = {"SpatialCrossAttention": "bevformer", "PlainLSSTransform": "bevpool"}
     if encoder in of_nuscenes and av2:
-        raise ValueError(f"{encoder.removeprefix('Plain')} of MapTR is not supported on Argoverse 2.")
+        raise ValueError(
+            f"{encoder.removeprefix('Plain')} of MapTR is not supported on Argoverse 2."
+        )
     if encoder in of_nuscenes:
         return f"maptr/maptr_r50_{of_nuscenes[encoder]}_24e.py"
     if encoder == "LSSTransform":
