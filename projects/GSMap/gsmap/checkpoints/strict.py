@@ -32,8 +32,8 @@ def adapt_state(
     """Rename upstream's keys in place, then compare the state with what the model expects.
 
     Batch counters of BatchNorm may be missing, as in old checkpoints. Neutral keys (`neutral_keys`)
-    may be missing all together, unless ``allow_untrained`` is False. Both states have ``prefix``; ``fit`` changes the renamed state in
-    place before it is compared.
+    may be missing all together, unless ``allow_untrained`` is False. Both states have ``prefix``;
+    ``fit`` changes the renamed state in place before it is compared.
 
     Raises:
         ValueError: If a key is missing, left over or of another shape.
