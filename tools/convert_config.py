@@ -1,7 +1,8 @@
 #!/usr/bin/env python
 """Convert a config of the original MapTR, MapTRv2, GeMap or MapVR to ours.
 
-The file is read, not run. Settings without a counterpart are printed. Example:
+The file is read, not run. Settings without a counterpart are printed; those of the model are an
+error unless --allow-changes is given. Example:
     python tools/convert_config.py maptr_tiny_r50_24e.py configs/mine/maptr_tiny.py
 """
 
@@ -21,10 +22,15 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("source", type=Path, help="config of an original repository")
     parser.add_argument("target", type=output_file, help="config to write")
+    parser.add_argument(
+        "--allow-changes",
+        action="store_true",
+        help="write a model that is another one without the settings that have no counterpart",
+    )
     return parser.parse_args()
 
 
-def convert(source: Path, target: Path) -> str:
+def convert(source: Path, target: Path, allow_changes: bool = False) -> str:
     """Write the converted config and return what to say of it."""
     settings = read_assignments(source)
     try:
@@ -34,17 +40,24 @@ def convert(source: Path, target: Path) -> str:
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
     ) as error:  # fmt: skip
         raise ValueError(f"{source} cannot be converted: {error}") from error
+    of_model = [setting for setting in conversion.unplaced if setting.startswith("model.")]
+    if of_model and not allow_changes:
+        raise ValueError(
+            f"{source} would become another model: {len(of_model)} of its settings have no "
+            f"counterpart, {', '.join(of_model[:3])[:300]}... --allow-changes leaves them out."
+        )
     write_text(target, text)
     lines = [f"{target} is written: configs/{conversion.base} with the settings of {source}"]
-    if conversion.unplaced:
-        lines.append("not placed, see docs/migration.md:")
-        lines += [f"  {setting}" for setting in conversion.unplaced]
+    others = [setting for setting in conversion.unplaced if setting not in of_model]
+    for what, left_out in (("another model, without", of_model), ("not placed", others)):
+        if left_out:
+            lines += [f"{what}, see docs/migration.md:", *(f"  {s}" for s in left_out)]
     return "\n".join(lines)
 
 
 def main() -> str:
     args = parse_args()
-    return convert(args.source, args.target)
+    return convert(args.source, args.target, args.allow_changes)
 
 
 if __name__ == "__main__":

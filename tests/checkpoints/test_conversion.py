@@ -141,6 +141,9 @@ def test_neutral_keys_may_be_missing_together_only():
     adapt_state(state, expected, "", neutral)
     assert state.keys() == expected.keys()
     assert torch.equal(state["head.extra.weight"], model["head"].extra.weight)
+    with pytest.raises(ValueError, match=r"never trained [^!]*: head\.extra\.bias, head\.extra\.w"):
+        adapt_state(dict(without), expected, "", neutral, allow_untrained=False)
+    adapt_state(dict(without), without, "", set(), allow_untrained=False)
     with pytest.raises(ValueError, match=r"missing: head\.extra\.bias\."):
         adapt_state({**without, "head.extra.weight": torch.ones(2, 2)}, expected, "", neutral)
 

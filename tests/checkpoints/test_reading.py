@@ -3,6 +3,7 @@ import json
 import pytest
 import torch
 from fuzz.attacks import Calls
+from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from torch import nn
 
@@ -102,6 +103,21 @@ def small() -> Config:
     return read_config("configs/maptr/maptr_r18_minicity.py")
 
 
+def test_parts_that_were_never_trained_are_used_only_where_that_is_asked_for(small, tmp_path):
+    small.model.map_head.type = "GSMapHead"
+    settings = plain(small.model.to_dict()) | {"allow_untrained": True}
+    settings["map_head"]["losses"] = []
+    path = with_settings(tmp_path / "a.pth", settings)
+    adopt_settings(small, path, None)
+    assert small.model.allow_untrained is False  # not for the file to say
+    with pytest.raises(ValueError, match="was never trained with parts"):
+        load_weights(MODELS.build(small.model), "maptr_r18_minicity")
+    small.model.allow_untrained = True
+    small.model.map_head.losses = [{"type": "PointsLoss"}]
+    adopt_settings(small, path, None)
+    load_weights(MODELS.build(small.model), "maptr_r18_minicity")
+
+
 def with_settings(path, settings):
     meta = {MODEL_SETTINGS: json.dumps(settings)}
     return save(path, {"state_dict": {"w": torch.ones(1)}, "meta": meta})
@@ -124,7 +140,7 @@ def test_a_model_is_tested_with_the_settings_of_its_checkpoint(small, tmp_path):
     ]
     assert adopt_settings(small, path, None) == trained
     del settings["img_backbone"]["init_cfg"]  # never loaded: the checkpoint has all weights
-    assert small.model.to_dict() == settings
+    assert small.model.to_dict() == {**settings, "allow_untrained": False}
     options = {f"{of_losses}.0.loss_weight": 5.0, "model.img_backbone.init_cfg": None}
     small.merge_from_dict(options)
     assert adopt_settings(small, path, options) == [

@@ -1,4 +1,5 @@
 import argparse
+import re
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,30 @@ def test_one_folder_serves_every_split_unless_an_override_says_otherwise(swapped
     roots = [cfg[f"{split}_dataloader"].dataset.data_root for split in ("train", "val", "test")]
     assert roots == ["there", "here", "there"]
     assert args.data_root == Path("there")
+
+
+@pytest.mark.parametrize(
+    ("option", "instead"),
+    [
+        ("data_root=other/", "give --data-root DIR, or edit CONFIG"),
+        ("_cameras=[a]", "give train.dataset.cameras, val.dataset.cameras, test.dataset.cameras,"),
+        ("_scale=0.5", "give train.dataset.pipeline.1.scale, val.dataset.pipeline.1.scale, "),
+        ("grid.x_range=[-9,9]", "give train.dataset.grid.x_range, val.dataset.grid.x_range, "),
+        ("grid.x_range.0=-9", "edit CONFIG"),
+        (
+            "classes=[a]",
+            "give train.dataset.classes, val.dataset.classes, test.dataset.classes, mod",
+        ),
+        ("_load=[]", "edit CONFIG"),
+        ("_nothing=3", "edit CONFIG"),
+        ("vis_backends=[]", "give visualizer.vis_backends, or edit CONFIG"),
+    ],
+)
+def test_an_override_of_a_value_that_was_copied_is_refused_with_its_copies(option, instead):
+    with pytest.raises(ValueError, match="changes nothing: the other settings have cop") as refused:
+        load_config(parse("configs/my_data.py", "--cfg-options", option))
+    said = str(refused.value).replace("_dataloader", "")
+    assert f"Instead {instead}" in re.sub(r"\S*my_data\.py", "CONFIG", said)
 
 
 def test_a_missing_config_is_named():

@@ -22,13 +22,14 @@ def read(path: Path) -> Any:
 
 def frame_of(record: dict[str, Any]) -> Frame:
     pred, gt = record["pred"], record["gt"]
-    predictions = MapElements.from_polylines(
-        [p["pts"] for p in pred], [p["label"] for p in pred], [p["score"] for p in pred]
-    )
+    labels = [
+        [-1 if e["label"] >= len(CLASSES) else e["label"] for e in part] for part in (pred, gt)
+    ]
+    scores = [p["score"] for p in pred]
     return (
         record["token"],
-        predictions,
-        MapElements.from_polylines([g["pts"] for g in gt], [g["label"] for g in gt]),
+        MapElements.from_polylines([p["pts"] for p in pred], labels[0], scores),
+        MapElements.from_polylines([g["pts"] for g in gt], labels[1]),
     )
 
 

@@ -104,10 +104,10 @@ def test_error_of_a_match_that_exists_at_the_tight_threshold_only():
 
 
 def test_unknown_classes_and_short_lines():
-    """Label 7 is nobody's; a prediction of one point is dropped, such a ground truth counts."""
-    gt = MapElements.from_polylines([upright(0.0), [[1, 1]], upright(3.0)], [0, 0, 7])
+    """Label -1 is nobody's; a prediction of one point is dropped, such a ground truth counts."""
+    gt = MapElements.from_polylines([upright(0.0), [[1, 1]], upright(3.0)], [0, 0, -1])
     pred = MapElements.from_polylines(
-        [[[0, 0]], upright(0.0), upright(3.0)], [0, 0, 7], [0.9, 0.8, 0.7]
+        [[[0, 0]], upright(0.0), upright(3.0)], [0, 0, -1], [0.9, 0.8, 0.7]
     )
     matches = match_chamfer(pred, gt, CONFIG)
     assert matches.pred_index.tolist() == [1]
@@ -142,8 +142,10 @@ def test_branch_and_bound_finds_what_brute_force_finds():
 
 
 def test_bad_configuration_is_refused():
-    with pytest.raises(ValueError, match="must not be empty"):
-        ChamferConfig(())
+    for classes in ((), "divider", (1, 2)):
+        with pytest.raises(ValueError, match="classes must be names"):
+            ChamferConfig(classes)
+    assert ChamferConfig(["divider"]).classes == ("divider",)
     with pytest.raises(ValueError, match="> 0 m"):
         ChamferConfig(("divider",), (0.0, 1.0))
     with pytest.raises(ValueError, match="num_points"):
@@ -244,6 +246,7 @@ def test_without_heights_a_metric_in_space_is_refused():
         match_chamfer(flat, high, IN_SPACE, "a")
     nothing = MapElements.from_polylines()
     assert match_chamfer(nothing, high, IN_SPACE).num_gts.tolist() == [1, 0]
+    high = MapElements.from_polylines(high.polylines, [0], [0.9])
     assert match_chamfer(high, nothing, IN_SPACE).matched_gt.tolist() == [[-1, -1, -1]]
     with pytest.raises(ValueError, match="dim must be 2 or 3, got 4"):
         ChamferConfig(CONFIG.classes, dim=4)

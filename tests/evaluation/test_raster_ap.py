@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from golden_data import unpacked
 
+from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.evaluation.matches import MatchTable
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report, rasterize
 from gsmap.structures.elements import MapElements
@@ -144,7 +145,8 @@ def test_half_recall_is_51_of_101():
     line = [[0, -20], [0, 20]]
     gt = MapElements.from_polylines([line, [[8, -20], [8, 20]]], [0, 0])
     metrics = raster_report(
-        MatchTable([match_raster(MapElements.from_polylines([line], [0]), gt, CONFIG)]), CONFIG
+        MatchTable([match_raster(MapElements.from_polylines([line], [0], [1.0]), gt, CONFIG)]),
+        CONFIG,
     ).metrics
     assert metrics["raster/divider/AP"] == pytest.approx(51 / 101)
 
@@ -192,6 +194,25 @@ def test_extended_classes_are_polygons():
     assert mask[256, 136]  # the middle of the square: (2 + 15) * 8, (2 + 30) * 8
 
 
+@pytest.mark.parametrize("match", [match_raster, match_chamfer])
+@pytest.mark.parametrize(
+    ("labels", "scores", "true", "message"),
+    [
+        ([2], [0.5], [0], "'a': prediction 0 has the label 2, beyond the 2 classes divider,"),
+        ([0, -2], [0.5, 0.5], [0], "prediction 1 has the label -2"),
+        ([0], [0.5], [0, 9], "ground truth 1 has the label 9"),
+        ([0], None, [0], "predictions need scores"),
+    ],
+)
+def test_what_cannot_be_scored_is_refused(match, labels, scores, true, message):
+    line = [[0, -20], [0, 20]]
+    config = CONFIG if match is match_raster else ChamferConfig(CLASSES)
+    pred = MapElements.from_polylines([line] * len(labels), labels, scores)
+    with pytest.raises(ValueError, match=message):
+        match(pred, MapElements.from_polylines([line] * len(true), true), config, "a")
+    match(MapElements.from_polylines(), MapElements.from_polylines(), config)
+
+
 def test_far_points_do_not_overflow():
     lines = [[[0.0, 0.0], [1e30, 1e30]], [[1e12, 0], [1e12, 5]]]
     masks = unpacked(rasterize(MapElements.from_polylines(lines, [0, 1]), CONFIG), 240)
@@ -200,8 +221,9 @@ def test_far_points_do_not_overflow():
 
 
 def test_bad_configuration_is_refused():
-    with pytest.raises(ValueError, match="must not be empty"):
-        RasterConfig(())
+    for classes in ((), "divider"):
+        with pytest.raises(ValueError, match="classes must be names"):
+            RasterConfig(classes)
     with pytest.raises(ValueError, match="odd"):
         RasterConfig(CLASSES, dilation_px=4)
     with pytest.raises(ValueError, match="at least one pixel"):

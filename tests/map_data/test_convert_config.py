@@ -205,22 +205,68 @@ def test_values_that_are_read(tmp_path):
 
 
 def test_a_config_of_another_model_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"model\.type must be one of .* got 'PETR'"):
-        converted(upstream_configs.maptr(model="PETR"), tmp_path)
+    with pytest.raises(
+        ValueError, match=r"^StreamMapNet is not supported: model\.type must be one"
+    ):
+        converted(upstream_configs.maptr(model="StreamMapNet"), tmp_path)
     with pytest.raises(ValueError, match=r"data\.train\.type must be one of .* got 'Mine'"):
         converted(upstream_configs.maptr(dataset="Mine"), tmp_path)
     bare = "model = dict(type='MapTR')\n"
-    with pytest.raises(ValueError, match=r"data\.train\.type"):
+    with pytest.raises(ValueError, match=r"None is not supported: model\.pts_bbox_head\.type"):
         converted(bare, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        ("MapTRHead", "MapQRHead"),
+        ("BEVFormerEncoder", "UNetEncoder"),
+        ("GeometrySptialCrossAttention", "HeightKernelAttention"),
+        ("DetrTransformerDecoderLayer", "MapQRDecoderLayer"),
+        ("MultiheadAttention", "OtherAttention"),
+        ("CustomMSDeformableAttention", "InstancePointAttention"),
+    ],
+)
+def test_a_part_that_ours_does_not_have_is_refused(ours, theirs, tmp_path):
+    text = upstream_configs.maptr()
+    assert ours in text
+    with pytest.raises(
+        ValueError, match=rf"^{theirs} is not supported: \S+ must be one of .*{ours}"
+    ):
+        converted(text.replace(ours, theirs), tmp_path)
+
+
+def test_maptr_on_depth_pooled_features_stays_maptr(tmp_path):
+    lift = upstream_configs.LIFT.split(", downsample")[0] + ", downsample=2)"
+    settings = {**upstream_configs.LIFTED, "encoder": lift, "keys": "['img']"}
+    cfg, unplaced = converted(upstream_configs.maptr(**settings), tmp_path)
+    wanted = read_config(REPO / "configs/maptr/maptr_r50_bevpool_24e.py")
+    with torch.device("meta"):
+        models = [MODELS.build(each.model) for each in (cfg, wanted)]
+    shapes = [{k: v.shape for k, v in model.state_dict().items()} for model in models]
+    assert shapes[0] == shapes[1]
+    assert models[0].bev_encoder.camera_aware is False
+    assert unplaced == [BASE]
+    settings |= {"range_m": "[-30.0, -15.0, -5.0, 30.0, 15.0, 3.0]", "rows": 100, "cols": 200}
+    with pytest.raises(ValueError, match="LSSTransform of MapTR is not supported on Argoverse 2"):
+        converted(upstream_configs.maptr(**settings), tmp_path)
 
 
 def test_the_command_writes_a_config_that_the_tools_read(tmp_path):
     source, target = tmp_path / "theirs.py", tmp_path / "new/ours.py"
     source.write_text(upstream_configs.gemap().replace("dir_interval=1", "dir_interval=2"))
     command = [sys.executable, "tools/convert_config.py", str(source), str(target)]
+    run = subprocess.run(command, cwd=REPO, text=True, capture_output=True, check=False)
+    assert run.returncode == 2
+    assert "another model: 1 of its settings have no counterpart, model.pts_bbox_h" in run.stderr
+    assert not target.exists()
+    command.append("--allow-changes")
     run = subprocess.run(command, cwd=REPO, text=True, capture_output=True, check=True)
     assert "configs/maptr/maptr_r50_24e.py" in run.stdout
-    assert "  model.pts_bbox_head.dir_interval = 2" in run.stdout
+    of_model, others = run.stdout.split("not placed")
+    assert "another model, without" in of_model
+    assert "  model.pts_bbox_head.dir_interval = 2" in of_model
+    assert "  _base_ = " in others
     cfg = read_config(target)
     check_config(cfg)
     assert cfg.model.map_head.type == "GeMapHead"

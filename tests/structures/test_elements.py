@@ -64,7 +64,9 @@ def test_ground_truth_has_full_confidence_and_a_sample_may_be_empty():
         (([[[0.0, 1.0], [2.0]]], [0]), "coordinates"),
         (([[0.0, 1.0]], [0]), r"lists of \(x, y\)"),
         (([LINE, [[0.0, np.nan]]], [0, 0]), "element 1 has a point that is not finite"),
-        (([LINE], [0], [np.inf]), "element 0 has a score that is not finite"),
+        (([LINE], [0], [np.nan]), r"element 0 has the score nan, not in \[0, 1\]"),
+        (([LINE] * 3, [0] * 3, [1, 0, 1.01]), r"element 2 has the score 1.01, not in \[0, 1\]"),
+        (([LINE] * 3, [0] * 3, [1, -0.5, 2]), r"element 1 has the score -0.5, not in \[0, 1\]"),
     ],
 )
 def test_bad_elements_are_refused(values, message):

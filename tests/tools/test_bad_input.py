@@ -9,6 +9,7 @@ import pytest
 import torch
 from mmdet3d.registry import MODELS
 
+from gsmap.checkpoints.strict import neutral_keys
 from gsmap.engine.launch import read_config
 from gsmap.utils.cli import run_command
 from gsmap.utils.files import SUFFIX
@@ -47,6 +48,7 @@ infer: VAL --model C --out out.json | give a checkpoint after
 infer: VAL --model C nowhere.pth --out out.json | There is no checkpoint nowhere.pth
 infer: VAL --model C damaged.pth --out out.json | damaged.pth was not loaded: it is broken
 infer: VAL --model C foreign.pth --out out.json | foreign.pth does not belong to this config
+infer: VAL --model C maptr.pth --out out.json | maptr.pth does not belong to this config: the checkpoint was never trained with parts of the config's model: map_head.reference.gaussian_branches
 infer: nowhere --model C K --out out.json | There is no input nowhere
 infer: damaged.arrow --model C K --out out.json | damaged.arrow is not a whole annotation file
 infer: list.pkl --model C K --out out.json | list.pkl
@@ -84,6 +86,8 @@ train: C --work-dir w --cfg-options train_dataloader.dataset.cameras=[A] train_d
 test: nowhere.py K | There is no config file nowhere.py
 test: C nowhere.pth | There is no checkpoint nowhere.pth
 test: C foreign.pth --work-dir w | the checkpoint does not fit the model
+test: C maptr.pth --work-dir w | or use them as they start: --cfg-options model.allow_untrained=True
+export: C maptr.pth --out out.onnx | was never trained with parts
 test: C K --eval | Nothing to do
 test: C K --out . | Is a directory
 test: C K --work-dir w --cfg-options test_dataloader.dataset.data_root=nowhere | no annotation file at nowhere
@@ -125,7 +129,7 @@ convert_checkpoint: K plain.txt | plain.txt exists already
 convert_config: nowhere.py out.py | No such file or directory: 'nowhere.py'
 convert_config: open.py out.py | open.py, line 1: '(' was never closed.
 convert_config: bytes.py out.py | bytes.py cannot be read
-convert_config: empty.py out.py | empty.py cannot be converted: model.type must be one of
+convert_config: empty.py out.py | empty.py cannot be converted: None is not supported: model.type must be one of
 create_data: nuscenes --root nowhere | no data set at nowhere
 create_data: nuscenes --root . | no version 'v1.0-trainval' in .
 create_data: av2 --root . | no folder val
@@ -164,7 +168,9 @@ def folder(tiny_config, minicity_annotations, tmp_path_factory) -> Path:
     (made / "tiny.py").write_text(tiny_config.read_text())
     torch.save({f"layer{i}.weight": torch.ones(3) for i in range(500)}, made / "foreign.pth")
     model = MODELS.build(read_config(tiny_config).model)
-    torch.save(model.state_dict(), made / "tiny.pth")
+    state = model.state_dict()
+    torch.save(state, made / "tiny.pth")
+    torch.save({k: state[k] for k in state.keys() - neutral_keys(model)}, made / "maptr.pth")
     return made
 
 

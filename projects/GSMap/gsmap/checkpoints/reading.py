@@ -86,7 +86,8 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
 def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> list[str]:
     """Give a config the model settings that a checkpoint was trained with, and say which changed.
 
-    How training started (`STARTS`) is left out.
+    How training started (`STARTS`) is left out. Parts that were never trained are refused when the
+    weights are loaded, unless the config sets ``model.allow_untrained``.
 
     Args:
         cfg: The config; its ``model`` changes.
@@ -102,6 +103,7 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
     """
     settings = read_checked(path)[1]
     config = plain(cfg.model.to_dict())
+    allowed = cfg.model.setdefault("allow_untrained", False)
     if settings is None or not differences(settings, config):
         return []
     options = {
@@ -122,6 +124,7 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
     ]
     if lines:
         cfg.model = model
+        cfg.model.allow_untrained = allowed
     return lines
 
 

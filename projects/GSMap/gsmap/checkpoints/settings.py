@@ -8,7 +8,8 @@ from typing import Any
 from mmdet3d.registry import MODELS, TASK_UTILS
 
 MODEL_SETTINGS = "model_settings"  # key of a checkpoint's meta: JSON, as a config's text is code
-STARTS = {"init_cfg", "pretrained"}  # settings of the start of a training, which may load files
+# settings of the start of a training, which may load files
+STARTS = {"init_cfg", "pretrained", "allow_untrained"}
 _KEY = re.compile(r"[a-zA-Z]\w*")
 _TEXT = re.compile(r"[\w -]*")  # no name of a file, an address or a module, and no expression
 _LARGEST = 1_000_000  # layers, channels, voxels

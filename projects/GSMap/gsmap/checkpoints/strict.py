@@ -27,12 +27,13 @@ def adapt_state(
     prefix: str,
     neutral: set[str],
     fit: Callable[[dict[str, Tensor]], None] | None = None,
+    allow_untrained: bool = True,
 ) -> None:
     """Rename upstream's keys in place, then compare the state with what the model expects.
 
     Batch counters of BatchNorm may be missing, as in old checkpoints. Neutral keys (`neutral_keys`)
-    may be missing all together. Both states have ``prefix``; ``fit`` changes the renamed state in
-    place before it is compared.
+    may be missing all together, unless ``allow_untrained`` is False. Both states have ``prefix``;
+    ``fit`` changes the renamed state in place before it is compared.
 
     Raises:
         ValueError: If a key is missing, left over or of another shape.
@@ -46,7 +47,8 @@ def adapt_state(
     missing = {
         key for key in expected if key not in state and not key.endswith("num_batches_tracked")
     }
-    if neutral <= missing:
+    untrained = sorted(neutral) if neutral <= missing else []
+    if untrained:
         missing -= neutral
         state.update({key: expected[key] for key in neutral})  # they stay as they are
     problems = {
@@ -63,4 +65,10 @@ def adapt_state(
         raise ValueError(
             f"the checkpoint does not fit the model; {text}. Load it with the config it was "
             "trained with; docs/migration.md lists the architectures that load."
+        )
+    if untrained and not allow_untrained:
+        raise ValueError(
+            "the checkpoint was never trained with parts of the config's model: "
+            f"{listed(untrained)}. Give the config that it was trained with, or use them as they "
+            "start: --cfg-options model.allow_untrained=True."
         )

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from datetime import timedelta
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from mmdet3d.registry import OPTIMIZERS, RUNNERS
@@ -28,9 +29,10 @@ from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
+_COPIED = ("backend_args", "classes", "data_root", "grid", "vis_backends")  # read by no runner
 _OWN_KEYS = (
-    "backend_args", "classes", "custom_imports", "data_root", "find_unused_parameters", "grid",
-    "model_wrapper_cfg", "runner_type", "strategy", "vis_backends",
+    *_COPIED, "custom_imports", "find_unused_parameters", "model_wrapper_cfg", "runner_type",
+    "strategy",
 )  # fmt: skip
 _SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
 
@@ -54,7 +56,8 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
 
     Raises:
         FileNotFoundError: If there is no such file or model.
-        ValueError: If it cannot be read, has an unknown top-level key, or an override does not fit.
+        ValueError: If it cannot be read, has an unknown top-level key, or an override does not fit
+            or would change nothing.
     """
     if isinstance(config, Config):
         cfg = Config(config.to_dict())
@@ -62,6 +65,8 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
         path = find_config(config)
         with _naming(path):
             cfg = Config.fromfile(path, import_custom_modules=False)
+    for name in cfg_options or {}:
+        _check_effect(cfg, name)
     with _naming(f"--cfg-options of {cfg.filename or 'a config'}"):
         cfg.merge_from_dict(cfg_options or {})
     _check_keys(cfg)
@@ -197,6 +202,35 @@ def check_config(cfg: Config) -> None:
         if isinstance(kind, str) and registry.get(kind) is None:
             close = nearest(kind, registered(registry)) or "."
             raise ValueError(f"{cfg.filename}: there is no {what} of type {kind!r}{close}")
+
+
+def _check_effect(cfg: Config, name: str) -> None:
+    """Refuse an override of a config's own value, of which the other settings have copies."""
+    top, *keys = name.split(".")
+    if not (top.startswith("_") or top in _COPIED):
+        return
+    value: Any = cfg.get(top)
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    last = [top.removeprefix("_"), *keys][-1]
+    settings = {k: v for k, v in cfg.items() if k not in _COPIED and not k.startswith("_")}
+    copies = ["--data-root DIR"] if name == "data_root" else [*_places(settings, last, value, "")]
+    remedy = f"give {', '.join(copies)}, or edit" if copies else "edit"
+    raise ValueError(
+        f"--cfg-options {name} changes nothing: the other settings have copies of it, made when "
+        f"the config was read. Instead {remedy} {cfg.filename or 'the config'}."
+    )
+
+
+def _places(settings: Any, name: str, value: Any, path: str) -> Iterator[str]:
+    """Yield where nested settings have a value under a name, by dotted name."""
+    if isinstance(settings, list | tuple):
+        settings = dict(enumerate(settings))
+    for key, inner in settings.items() if isinstance(settings, dict) else ():
+        if key == name and inner == value:
+            yield f"{path}{key}"
+        else:
+            yield from _places(inner, name, value, f"{path}{key}.")
 
 
 def _check_keys(cfg: Config) -> None:

@@ -13,7 +13,14 @@ import numpy as np
 
 from gsmap.evaluation import chamfer_kernels as kernels
 from gsmap.evaluation.average_precision import area_ap
-from gsmap.evaluation.matches import FrameMatches, MatchTable, assign, ranked_predictions
+from gsmap.evaluation.matches import (
+    FrameMatches,
+    MatchTable,
+    assign,
+    check_pair,
+    checked_classes,
+    ranked_predictions,
+)
 from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
@@ -49,11 +56,9 @@ class ChamferConfig:
     def __post_init__(self) -> None:
         thresholds = tuple(sorted(round(float(t), 6) for t in self.thresholds))
         object.__setattr__(self, "thresholds", thresholds)
-        if not (self.classes and thresholds and 0 < thresholds[0] <= thresholds[-1] < math.inf):
-            raise ValueError(
-                "classes and thresholds must not be empty and thresholds must be > 0 m, got "
-                f"{self.classes} and {thresholds}."
-            )
+        object.__setattr__(self, "classes", checked_classes(self.classes))
+        if not (thresholds and 0 < thresholds[0] <= thresholds[-1] < math.inf):
+            raise ValueError(f"thresholds must not be empty, and must be > 0 m, got {thresholds}.")
         if self.num_points < 2:
             raise ValueError(f"num_points must be >= 2, got {self.num_points}.")
         if self.dim not in (2, 3):
@@ -127,8 +132,9 @@ def match_chamfer(
     than two points, counts as a ground truth that nobody can match. ``token`` names the sample.
 
     Raises:
-        ValueError: If heights count, and a side has none.
+        ValueError: If heights count, and a side has none; or as of `check_pair`.
     """
+    check_pair(predictions, ground_truth, config.classes, token)
     num_classes = len(config.classes)
     try:
         best, distance = nearest_by_chamfer(

@@ -71,6 +71,32 @@ class ClassDetections:
     num_gts: int
 
 
+def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:
+    """Return names of classes; ValueError if they are none, or one text in place of several."""
+    names = tuple(classes)
+    if isinstance(classes, str) or not all(isinstance(name, str) for name in names) or not names:
+        raise ValueError(
+            f"classes must be names, such as ('divider', 'boundary'), got {classes!r}."
+        )
+    return names
+
+
+def check_pair(
+    predictions: MapElements, ground_truth: MapElements, classes: Sequence[str], token: str
+) -> None:
+    """Raise ValueError unless predictions have scores and all labels are -1 (no class) or known."""
+    for what, elements in (("prediction", predictions), ("ground truth", ground_truth)):
+        beyond = (elements.labels < -1) | (elements.labels >= len(classes))
+        if beyond.any():
+            index = beyond.argmax()
+            raise ValueError(
+                f"sample {token!r}: {what} {index} has the label {elements.labels[index]}, beyond "
+                f"the {len(classes)} classes {', '.join(classes)}."
+            )
+    if len(predictions) and predictions.scores is None:
+        raise ValueError(f"sample {token!r}: predictions need scores, in [0, 1].")
+
+
 def ranked_predictions(
     predictions: MapElements,
     num_classes: int,

@@ -12,7 +12,14 @@ import numpy as np
 
 from gsmap.evaluation import raster_kernels as kernels
 from gsmap.evaluation.average_precision import interpolated_ap
-from gsmap.evaluation.matches import FrameMatches, MatchTable, assign, ranked_predictions
+from gsmap.evaluation.matches import (
+    FrameMatches,
+    MatchTable,
+    assign,
+    check_pair,
+    checked_classes,
+    ranked_predictions,
+)
 from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
@@ -49,8 +56,7 @@ class RasterConfig:
     dilation_px: int = 5
 
     def __post_init__(self) -> None:
-        if not self.classes:
-            raise ValueError("classes must not be empty.")
+        object.__setattr__(self, "classes", checked_classes(self.classes))
         if self.px_per_m <= 0 or min(self.size_px) < 1:
             raise ValueError(f"px_per_m must give at least one pixel, got {self.px_per_m}.")
         if self.dilation_px < 1 or self.dilation_px % 2 == 0:
@@ -114,11 +120,12 @@ def match_raster(
 ) -> FrameMatches:
     """Match the predictions of one sample with its ground truth by the IoU of their masks.
 
-    Ground truth is at full resolution; ``token`` names the sample.
+    Ground truth is at full resolution; ``token`` names the sample. Errors are those of `check_pair`.
     """
+    check_pair(predictions, ground_truth, config.classes, token)
     num_classes, gt_labels = len(config.classes), ground_truth.labels
     rows = ranked_predictions(predictions, num_classes, MIN_SCORE, MAX_PREDICTIONS)
-    gt_index = np.flatnonzero((gt_labels >= 0) & (gt_labels < num_classes))
+    gt_index = np.flatnonzero(gt_labels >= 0)
     pred = rasterize(predictions.select(rows), config)
     gt = rasterize(ground_truth.select(gt_index), config)
     labels = predictions.labels[rows], gt_labels[gt_index]

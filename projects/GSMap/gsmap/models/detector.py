@@ -41,6 +41,8 @@ class MapDetector(Base3DDetector):
             norms are folded into its convolutions (faster, for a second copy of its weights).
         strict_loading: Whether a checkpoint must hold every weight, by our names or upstream's, and
             nothing else; otherwise it is loaded as torch does, by our names.
+        allow_untrained: Whether it may lack the parts that start without effect, as MapTR's lack
+            GSMap's Gaussians: so a training may start, and nothing else does unless it is asked.
 
     Raises:
         ValueError: If there is neither camera nor LiDAR, or both but no fusion.
@@ -59,6 +61,7 @@ class MapDetector(Base3DDetector):
         bev_fuser: dict | None = None,
         fold_batch_norms: bool = True,
         strict_loading: bool = True,
+        allow_untrained: bool = True,
         data_preprocessor: dict | None = None,
         init_cfg: dict | None = None,
     ) -> None:
@@ -66,6 +69,7 @@ class MapDetector(Base3DDetector):
         self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
         self.folded_backbone = FoldedBackbone() if fold_batch_norms else None
         self.strict_loading = strict_loading
+        self.allow_untrained = allow_untrained
         self.img_neck = MODELS.build(img_neck) if img_neck else None
         self.img_augment = MODELS.build(img_augment) if img_augment else None
         if not (bev_encoder or lidar_encoder):
@@ -148,5 +152,5 @@ class MapDetector(Base3DDetector):
         if self.strict_loading:
             own, neutral = self.state_dict(prefix=prefix), neutral_keys(self, prefix)
             fit = partial(self.map_head.fit_state, prefix=f"{prefix}map_head.")
-            adapt_state(state_dict, own, prefix, neutral, fit)
+            adapt_state(state_dict, own, prefix, neutral, fit, self.allow_untrained)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

@@ -52,8 +52,8 @@ class MapElements:
         others are as in the class, labels and scores (N,), scales N x (P, 2), rotations N x (P,).
 
         Raises:
-            ValueError: If the lengths disagree, the points are not (x, y[, z]), or a point or a
-                score is not finite.
+            ValueError: If the lengths disagree, the points are not (x, y[, z]), a point is not
+                finite, or a score is outside [0, 1].
         """
         labels = np.asarray(labels, np.int64).reshape(-1)
         scores = None if scores is None else np.asarray(scores, np.float64).reshape(-1)
@@ -73,9 +73,10 @@ class MapElements:
         if not finite.all():
             index = np.searchsorted(offsets, finite.argmin(), side="right") - 1
             raise ValueError(f"element {index} has a point that is not finite.")
-        if scores is not None and not np.isfinite(scores).all():
-            index = np.isfinite(scores).argmin()
-            raise ValueError(f"element {index} has a score that is not finite.")
+        fair = True if scores is None else (scores >= 0) & (scores <= 1)  # NaN is not
+        if not np.all(fair):
+            index = np.argmin(fair)
+            raise ValueError(f"element {index} has the score {scores[index]}, not in [0, 1].")
         scales = _per_vertex(scales, "scales", (len(points), 2))
         rotations = _per_vertex(rotations, "rotations", (len(points),))
         return cls(points, offsets, labels, scores, scales, rotations)

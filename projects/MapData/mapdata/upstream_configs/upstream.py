@@ -50,6 +50,16 @@ MOVED_OF_PILLARS = {
     f"{_PILLARS}.feedforward_channels": _BEV + "layer_cfg.ffn_dims",
     f"{_PILLARS}.ffn_dropout": _BEV + "layer_cfg.dropout",
 }
+# the kinds of parts that ours has, too
+KINDS: dict[str, tuple[str, ...]] = {
+    "model": METHODS,
+    _THEIRS: tuple(f"{method}Head" for method in METHODS),
+    _ENCODER: ("BEVFormerEncoder", "LSSTransform"),
+    _LAYER: ("DetrTransformerDecoderLayer", "DecoupledDetrTransformerDecoderLayer"),
+}
+_SELF_ATTENTIONS = ("MultiheadAttention", "GeometryDecoupledAttention")
+_CROSS_ATTENTIONS = ("CustomMSDeformableAttention",)
+_SPATIAL_ATTENTIONS = ("GeometrySptialCrossAttention", "SpatialCrossAttention")
 # what only ever has one value, and is that of ours
 FIXED: dict[str, dict[str, Any]] = {
     _THEIRS: {
@@ -102,12 +112,11 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
     """Turn the assignments of an original config, which are used up, into settings of ours.
 
     Raises:
-        ValueError: If the config is of no model that is known.
+        ValueError: If the config is of a model, or of a data set with it, that ours is not.
     """
     fields = Fields({name: names[name] for name in RUN if name in names})
-    kind = fields.section("model").get("type")
-    if kind not in METHODS:
-        raise ValueError(f"model.type must be one of {METHODS}, got {kind!r}.")
+    for section, kinds in KINDS.items():
+        _check_kind(fields, section, kinds)
     settings = data_settings(fields) | schedule_settings(fields) | _image_settings(fields)
     sides = *settings["grid"]["x_range"], *settings["grid"]["y_range"]
     encoder = _encoder_settings(fields, settings, sides)
@@ -122,6 +131,14 @@ def convert_upstream(names: dict[str, Any]) -> Conversion:
         fields.drop(section, DROPPED.get(section, ""), **FIXED.get(section, {}))
     base = _base(encoder, sides[0] == -30.0, settings.pop("with_depth"))
     return Conversion(base, settings, settings.pop("steps"), fields.left_over())
+
+
+def _check_kind(fields: Fields, section: str, kinds: tuple[str, ...]) -> None:
+    """Refuse a part that ours does not have."""
+    kind = fields.section(section).get("type")
+    if kind not in kinds:
+        known = ", ".join(kinds)
+        raise ValueError(f"{kind!s:.60} is not supported: {section}.type must be one of {known}.")
 
 
 def merge(conversion: Conversion, configs: Path) -> Config:
@@ -174,8 +191,13 @@ def _check_plain(value: Any, name: str) -> None:
 
 def _base(encoder: str, av2: bool, with_depth: bool) -> str:
     """Return our config that has the same encoder and data set."""
-    if encoder == "SpatialCrossAttention":
-        return "maptr/maptr_r50_bevformer_24e.py"
+    of_nuscenes = {"SpatialCrossAttention": "bevformer", "PlainLSSTransform": "bevpool"}
+    if encoder in of_nuscenes and av2:
+        raise ValueError(
+            f"{encoder.removeprefix('Plain')} of MapTR is not supported on Argoverse 2."
+        )
+    if encoder in of_nuscenes:
+        return f"maptr/maptr_r50_{of_nuscenes[encoder]}_24e.py"
     if encoder == "LSSTransform":
         on_av2 = "av2_depth_6e" if with_depth else "av2_6e"
         return f"maptrv2/maptrv2_r50_{on_av2 if av2 else '24e'}.py"
@@ -206,6 +228,9 @@ def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[flo
     settings[_BEV + "bev_pixel_m"] = sizes[0] if abs(sizes[0] - sizes[1]) < 1e-6 else list(sizes)
     if kind == "LSSTransform":
         fields.drop(_ENCODER, "out_channels feat_down_sample", downsample=2)
+        aware = {"depthnet_cfg", "loss_depth_weight"} & fields.section(_ENCODER).keys()
+        if fields.section("model").get("type") == "MapTR" and not aware:
+            kind = "PlainLSSTransform"  # its depth net does not read the cameras' parameters
         aspp = fields.take(f"{_ENCODER}.depthnet_cfg.aspp_mid_channels", 96)
         settings[_BEV + "depth_range"] = tuple(fields.take(f"{_ENCODER}.dbound"))
         settings[_BEV + "aspp_channels"] = aspp
@@ -213,12 +238,13 @@ def _encoder_settings(fields: Fields, settings: dict[str, Any], sides: tuple[flo
     fields.drop(_ENCODER, num_points_in_pillar=4)
     settings[_BEV + "num_cams"] = fields.take(f"{_TRANSFORMER}.num_cams", 6)
     settings |= fields.move(MOVED_OF_PILLARS)
+    _check_kind(fields, _SPATIAL, _SPATIAL_ATTENTIONS)
     kind = fields.take(f"{_SPATIAL}.type")
     ours, theirs = _BEV + "cross_attn.", _SPATIAL + "."
     if kind == "GeometrySptialCrossAttention":
         settings[ours + "num_heads"] = fields.take(theirs + "attention.num_heads")
         settings[ours + "kernel_size"] = tuple(fields.take(theirs + "attention.kernel_size"))
-    elif kind == "SpatialCrossAttention":
+    else:
         settings[ours + "num_points"] = fields.take(theirs + "deformable_attention.num_points", 8)
     return kind
 
@@ -228,6 +254,8 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
     layer = _DECODER + "layer."
     decoupled = fields.take(f"{_LAYER}.type") == "DecoupledDetrTransformerDecoderLayer"
     first, *others, cross = fields.items(f"{_LAYER}.attn_cfgs")
+    _check_kind(fields, first, _SELF_ATTENTIONS)
+    _check_kind(fields, cross, _CROSS_ATTENTIONS)
     kind, heads = fields.take(first + ".type"), fields.take(first + ".num_heads")
     settings[layer + "num_heads"] = heads
     ours = "PointSelfAttention" if kind == "MultiheadAttention" else kind
