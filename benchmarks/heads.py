@@ -21,6 +21,7 @@ from mmengine.dataset import pseudo_collate
 from mmengine.logging import MMLogger
 
 from benchmarks.measure import markdown_table
+from gsmap.checkpoints.building import building
 from gsmap.checkpoints.reading import load_weights
 from gsmap.datasets.annotations.record import CLASSES
 from gsmap.engine.arguments import data_root_options, parse_options
@@ -114,7 +115,8 @@ def cells(figures: dict[str, float]) -> list[str]:
 @torch.no_grad()
 def store_features(cfg: Config, checkpoint: str, part: str, path: Path) -> None:
     """Save the BEV features (N, C, H, W), float16, and the samples of a split."""
-    model = MODELS.build(cfg.model).eval()
+    with building(cfg):
+        model = MODELS.build(cfg.model).eval()
     load_weights(model, checkpoint)
     dataset = DATASETS.build(cfg[f"{part}_dataloader"].dataset)
     feats, samples = [], []
@@ -137,7 +139,8 @@ def train_and_test(
     torch.set_num_threads(1)
     torch.manual_seed(task.seed)
     cfg = read_config(task.config, task.options)
-    model = MODELS.build(cfg.model)
+    with building(cfg):
+        model = MODELS.build(cfg.model)
     model.init_weights()
     if not args.from_scratch:
         load_weights(model, args.checkpoint)

@@ -12,6 +12,7 @@ from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
 from benchmarks.measure import Cost, in_own_process, markdown_table
+from gsmap.checkpoints.building import building
 from gsmap.datasets.transforms.masks import MakePVMask
 from gsmap.engine.launch import read_config
 
@@ -56,7 +57,8 @@ def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
     if cfg.model.get("img_backbone"):
         cfg.model.img_backbone.init_cfg = None
     torch.manual_seed(0)
-    return MODELS.build(cfg.model).to(args.device)
+    with building(cfg):
+        return MODELS.build(cfg.model).to(args.device)
 
 
 def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:

@@ -5,6 +5,7 @@ import argparse
 from mmdet3d.registry import MODELS
 from torch import nn
 
+from gsmap.checkpoints.building import building
 from gsmap.engine.launch import read_config
 
 
@@ -16,7 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Count and print."""
-    counts = count_parameters(MODELS.build(read_config(args.config).model), args.depth)
+    cfg = read_config(args.config)
+    with building(cfg):
+        counts = count_parameters(MODELS.build(cfg.model), args.depth)
     width = max(map(len, counts))
     print(f"{'module'.ljust(width)}  {'all':>12}  {'trainable':>12}")
     for name, (total, trainable) in counts.items():

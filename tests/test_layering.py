@@ -31,9 +31,9 @@ ALLOWED = {
     "apis": {
         "checkpoints", "datasets", "engine", "evaluation", "structures", "utils", "visualization",
     },
-    "mapdata": {"datasets", "minicity", "structures", "utils", "visualization"},
+    "mapdata": {"datasets", "structures", "utils", "visualization"},
     "drivemaps": {"datasets", "evaluation", "structures", "utils", "visualization"},
-    "minicity": {"utils"},
+    "minicity": {"datasets", "mapdata", "utils"},  # the last two for argoverse2_render
     "comparison": {
         "checkpoints", "datasets", "engine", "evaluation", "mapdata", "structures", "utils",
         "visualization",

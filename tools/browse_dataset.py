@@ -40,11 +40,13 @@ def main() -> str:
     from mmdet3d.registry import DATASETS
 
     from gsmap.apis.map_inferencer import spread_evenly
+    from gsmap.checkpoints.building import building
     from gsmap.engine.launch import read_config
     from gsmap.visualization.map_visualizer import MapVisualizer, images_from_inputs
 
     cfg = read_config(args.config, args.cfg_options)
-    dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
+    with building(cfg):
+        dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
     if args.web:
         options = ReportOptions(Path(dataset.data_root), args.num)
         return write_page(args.web, report_data(dataset.ann_file, {}, options))

@@ -19,7 +19,7 @@ COMMANDS = {
     "nuscenes": ("mapdata.nuscenes.convert", "convert nuScenes or MiniCity"),
     "av2": ("mapdata.argoverse2.convert", "convert Argoverse 2 logs"),
     "av2-render": (
-        "mapdata.argoverse2.render",
+        "minicity.argoverse2_render",
         "render camera images for real Argoverse 2 logs",
     ),
     "infos": ("mapdata.infos.convert", "convert an info file of MapTR or MapTRv2"),

@@ -73,6 +73,7 @@ def main() -> None:
     args = parse_args()
     if not args.eval and not args.out:
         raise ValueError("Nothing to do: name a metric after --eval, or a file after --out.")
+    from gsmap.checkpoints.building import building
     from gsmap.checkpoints.reading import adopt_settings
     from gsmap.engine.launch import load_config
     from gsmap.engine.run_log import MapRunner
@@ -84,8 +85,9 @@ def main() -> None:
     apply_options(cfg, args)
     if notes and is_first_rank():
         print("\n".join(notes))
-    runner = MapRunner.from_cfg(cfg)
-    metrics = runner.test()
+    with building(cfg):
+        runner = MapRunner.from_cfg(cfg)
+        metrics = runner.test()
     if args.metrics_out and runner.rank == 0:
         write_text(args.metrics_out, json.dumps(metrics, indent=2))
 

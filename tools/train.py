@@ -61,6 +61,7 @@ def main() -> None:
     args = parse_args()
     from mmdet3d.registry import RUNNERS
 
+    from gsmap.checkpoints.building import building
     from gsmap.engine.launch import load_config
     from gsmap.engine.run_log import MapRunner
 
@@ -75,7 +76,8 @@ def main() -> None:
     with writes_alone(cfg.work_dir):
         choose_start(cfg, args.resume)
         runner = RUNNERS.get(cfg.runner_type) if "runner_type" in cfg else MapRunner
-        runner.from_cfg(cfg).train()
+        with building(cfg):
+            runner.from_cfg(cfg).train()
 
 
 if __name__ == "__main__":

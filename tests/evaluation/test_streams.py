@@ -12,7 +12,6 @@ from benchmarks.evaluation import CLASSES, generated_frames, write_race
 from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
 from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.file_evaluation import CHUNK, SamplePairs, evaluate_files
-from gsmap.evaluation.json_items import items_of
 from gsmap.evaluation.matches import MatchTable
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
 from gsmap.evaluation.report import flat_metrics
@@ -125,39 +124,3 @@ def test_a_file_that_changes_while_samples_wait_is_named(files, tmp_path, change
     rewritten(last_first, "GTs", last_first, change)
     with pytest.raises(ValueError, match=r"a\.json was changed while it was read"):
         list(stream)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "no '{' at byte 0"),
-        ("[]", "no '{' at byte 0"),
-        ("{}", "no 'a' at byte 2"),
-        ('{"a": 3}', "no list at byte 6"),
-        ('{"a": [1], "a": []}', "a second 'a'"),
-        ('{"a": [1 2]}', "no ']' at byte 9"),
-        ('{"a": [1,]}', "Expecting value at byte 9"),
-        ('{"a": [1]', "no '}' at byte 9"),
-        ('{"a": [1]} x', "more text at byte 11"),
-        ('{"a": [1], 3: 4}', "no name at byte 11"),
-        ('{"b": [1', "Expecting ',' delimiter at byte 6"),
-        ('{"a": ["' + "x" * (3 << 20), "Unterminated string starting at at byte 7"),
-        ('{"a": ' + "[" * 200_000, "RecursionError"),
-    ],
-)
-def test_what_is_no_list_is_named(text, message, tmp_path):
-    path = tmp_path / "a.json"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=f"a.json is empty or holds no complete list .*{message}"):
-        list(items_of(path, "a"))
-
-
-@pytest.mark.parametrize(
-    "text", ['{"a":[1,[2],{"b":3}]}', ' {\n"b" : 1, "a" : [ 1 , [2],{"b":3}]}\n']
-)
-def test_items_come_as_they_are(text, tmp_path):
-    path = tmp_path / "a.json"
-    path.write_text(text)
-    assert [item for item, _ in items_of(path, "a")] == [1, [2], {"b": 3}]
-    path.write_text('{"a": []}')
-    assert list(items_of(path, "a")) == []

@@ -1,12 +1,23 @@
 """One sample as the files of other programs and of users hold it, for the readers of such files."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsmap.datasets.annotations.record import CLASSES, MapSample
+from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
+from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
+from gsmap.datasets.elements import elements_of_instances
+from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.evaluator import MapEvaluator
+from gsmap.evaluation.match_files import write_matches
+from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
+from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.utils.shards import Shard
 
 
 def info_v2(sample: MapSample) -> dict[str, Any]:
@@ -140,3 +151,22 @@ def own_record(sample: MapSample) -> dict[str, Any]:
     ]  # fmt: skip
     lines = [{"label": i.label, "points": i.points.tolist()} for i in sample.instances]
     return {"token": "t", "cameras": cameras, "instances": lines, "timestamp_ns": 5}
+
+
+def write_shards(
+    target: Path, kind: str, count: int, sample: MapSample, meta: AnnotationMeta
+) -> None:
+    """Write a file's shards, with their manifests: annotations, results or matches of a sample."""
+    elements = elements_of_instances(sample.instances)
+    results = [(token, vectors_of(elements, meta.classes)) for token in "ab"]
+    evaluator = MapEvaluator(ChamferConfig(meta.classes), RasterConfig(meta.classes))
+    for shard in (Shard(index, count) for index in range(count)):
+        own = replace(sample, token=str(shard.index))
+        if kind == ANNOTATIONS:
+            write_annotations(target, meta, [own], shard)
+        elif kind == RESULTS:
+            write_results(shard.path_of(target), results[shard.index :: count])
+            shard.seal(target, kind, "", {"model": "m"}, 1)
+        else:
+            matches = [evaluator.match(own.token, elements, elements)]
+            write_matches(target, shard, matches, [], evaluator, "")

@@ -13,8 +13,8 @@ import pytest
 from argoverse2_road import write_log
 
 from mapdata.argoverse2 import convert as argoverse2
-from mapdata.argoverse2 import render as argoverse2_render
 from mapdata.nuscenes import convert as nuscenes
+from minicity import argoverse2_render
 
 TOOL = Path(__file__).resolve().parents[2] / "tools/create_data.py"
 

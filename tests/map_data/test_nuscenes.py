@@ -241,7 +241,7 @@ def test_a_sample_without_lidar_is_left_out_and_one_without_a_camera_kept(
 def test_a_truncated_table_is_named_and_nothing_stays_behind(options, damaged_root: Path):
     table = damaged_root / "v1.0-trainval/ego_pose.json"
     table.write_text(table.read_text()[:-40])
-    with pytest.raises(ValueError, match=r"ego_pose.json is damaged or incomplete"):
+    with pytest.raises(ValueError, match=r"ego_pose.json is empty or holds no complete list"):
         convert_nuscenes(replace(options, root=damaged_root))
     assert not options.out_dir.exists()
 

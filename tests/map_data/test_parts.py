@@ -42,20 +42,6 @@ def test_overlap_counts_validation_positions_near_training_on_the_same_map():
     assert overlap_share(train, {}) == 0
 
 
-def test_tables_are_read_across_chunk_borders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from mapdata.nuscenes import tables as nuscenes_tables
-
-    records = [{"token": str(i), "values": [i, {"deep": "ü" * i}]} for i in range(40)]
-    path = tmp_path / "table.json"
-    path.write_text(json.dumps(records, indent=1, ensure_ascii=False))
-    for chunk in (256, 1000, 1 << 20):  # each longer than a record
-        monkeypatch.setattr(nuscenes_tables, "_CHUNK_CHARACTERS", chunk)
-        assert list(nuscenes_tables.iterate_records(path)) == records
-    path.write_text(path.read_text()[:-30])
-    with pytest.raises(ValueError, match="damaged or incomplete"):
-        list(nuscenes_tables.iterate_records(path))
-
-
 def test_can_bus_takes_the_latest_message(tmp_path: Path):
     from mapdata.nuscenes.can_bus import read_messages, signals_at
 

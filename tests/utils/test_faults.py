@@ -6,8 +6,10 @@ import signal
 import pytest
 import torch
 from mmengine import Registry
+from mmengine.config import Config
 from torch.utils.data import DataLoader
 
+from gsmap.checkpoints.building import building
 from gsmap.utils.faults import in_words
 
 PARTS = Registry("part")
@@ -55,7 +57,11 @@ def said(command) -> str | None:
     ],
 )
 def test_settings_that_nothing_can_be_made_of(settings, text):
-    assert said(lambda: PARTS.build(settings)).endswith(text)
+    def build() -> None:
+        with building(Config()):
+            PARTS.build(settings)
+
+    assert said(build).endswith(text)
 
 
 @pytest.mark.parametrize("kind", [MemoryError, RuntimeError, torch.OutOfMemoryError])

@@ -19,6 +19,7 @@ import torch
 from mmdet3d.registry import DATASETS, MODELS
 from mmengine.config import Config
 
+from gsmap.checkpoints.building import building
 from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.checkpoints.reading import read_weights
 from gsmap.checkpoints.settings import differences, plain
@@ -223,7 +224,8 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     words += [] if init is None else [f"load_from={init}"]
     own = (*entry.options, *protocol.options)
     cfg = read_config(entry.config, parse_options([*words, *own]))
-    share = math.ceil(len(DATASETS.build(cfg.train_dataloader.dataset)) / processes)
+    with building(cfg):
+        share = math.ceil(len(DATASETS.build(cfg.train_dataloader.dataset)) / processes)
     epoch = math.ceil(share / cfg.train_dataloader.batch_size)
     epochs = round(protocol.budget / epoch) or 1
     if epochs * epoch != protocol.budget:
@@ -239,7 +241,8 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     check_config(cfg)
     if cfg.train_cfg.max_epochs != epochs:
         raise ValueError(f"{entry.name}: the budget decides train_cfg.max_epochs; leave it out.")
-    MODELS.build(cfg.model)
+    with building(cfg):
+        MODELS.build(cfg.model)
     settings = {key: plain(cfg.get(key)) for key in _DECIDING}
     settings |= {"processes": processes, "batch": protocol.batch, "data": _data_of(cfg)}
     settings["sampler"] = plain(cfg.train_dataloader.get("sampler"))

@@ -1,35 +1,21 @@
 """Every switch of GSMap builds, trains a step, and changes what it is there to change."""
 
+import head_cases as heads
 import pytest
 import torch
-from head_cases import (
-    GSMAP,
-    HEAD,
-    LANES,
-    MASKS,
-    N,
-    along_y,
-    bev,
-    build_head,
-    elements,
-    losses_of,
-    predictions_of,
-    train_a_step,
-    with_layer,
-)
 from predictions import stacked
 
 from gsmap.models.maptr.pairs import SamplePredictions
 
-SQUARE = elements(((-4, -4), (4, -4)), labels=[1])
+SQUARE = heads.elements(((-4, -4), (4, -4)), labels=[1])
 SQUARE.polylines = torch.tensor([[[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-4, -4]]])
 
 
 def switched(**settings) -> tuple[torch.nn.Module, dict, dict]:
     """Return a switched head that has trained a step, its losses before, and the default's."""
-    head = build_head(GSMAP, **settings)
-    expected = losses_of(build_head(GSMAP), LANES)
-    return head, train_a_step(head, LANES), expected
+    head = heads.build_head(heads.GSMAP, **settings)
+    expected = heads.losses_of(heads.build_head(heads.GSMAP), heads.LANES)
+    return head, heads.train_a_step(head, heads.LANES), expected
 
 
 def changed(losses: dict, expected: dict) -> set[str]:
@@ -46,11 +32,11 @@ def changed(losses: dict, expected: dict) -> set[str]:
 
 @pytest.mark.parametrize("cut", [True, False])
 def test_points_reach_the_earlier_layers_branch_through_the_reference(cut):
-    decoder = {**HEAD["decoder"], **({} if cut else {"detach_reference": False})}
-    head = build_head(GSMAP, decoder=decoder)
-    train_a_step(head, LANES)
+    decoder = {**heads.HEAD["decoder"], **({} if cut else {"detach_reference": False})}
+    head = heads.build_head(heads.GSMAP, decoder=decoder)
+    heads.train_a_step(head, heads.LANES)
     head.zero_grad()
-    losses_of(head, LANES)["loss_pts"].backward()  # of the second layer
+    heads.losses_of(head, heads.LANES)["loss_pts"].backward()  # of the second layer
     gradients = [p.grad for p in head.reference.branches[0].parameters()]
     assert any(g is not None and g.any() for g in gradients) == (not cut)
     # the first layer's sigma and theta are refined by the second one
@@ -70,7 +56,7 @@ def test_sigma_and_theta_from_an_mlp_start_alike_and_learn():
     assert not changed(losses, expected) - {"loss_cls", "loss_pts", "loss_dir", "loss_raster"}
     branch = head.reference.gaussian_branches[0]
     assert len(branch) == 5  # two hidden layers, two ReLUs, the last matrix
-    losses_of(head, LANES)["d0.loss_raster"].backward()
+    heads.losses_of(head, heads.LANES)["d0.loss_raster"].backward()
     assert branch[0].weight.grad.abs().sum() > 0  # from the second step on
 
 
@@ -82,7 +68,7 @@ def test_another_activation_has_the_same_first_gaussian_and_another_slope(activa
     raw = torch.tensor([[0.5, 0.5, 1.0, 0.5, 0.0]])
     assert not torch.allclose(
         head.reference.space.decode(raw).scales,
-        build_head(GSMAP).reference.space.decode(raw).scales,
+        heads.build_head(heads.GSMAP).reference.space.decode(raw).scales,
     )
 
 
@@ -99,13 +85,13 @@ def test_overlap_takes_the_place_of_the_raster_loss(kind, last_layer_only):
 
 def test_an_unknown_overlap_is_refused():
     with pytest.raises(ValueError, match="kind must be 'dice' or 'iou', got 'area'"):
-        build_head(GSMAP, loss_raster={"type": "MaskOverlapLoss", "kind": "area"})
+        heads.build_head(heads.GSMAP, loss_raster={"type": "MaskOverlapLoss", "kind": "area"})
 
 
 def total_cost(head: torch.nn.Module) -> torch.Tensor:
     """Return the summed matching costs of a new model's first prediction. (N, K)"""
-    prediction = SamplePredictions(predictions_of(head, head(bev()), 0), 0)
-    (gt,) = head.prepare_gts([LANES]).samples
+    prediction = SamplePredictions(heads.predictions_of(head, head(heads.bev()), 0), 0)
+    (gt,) = head.prepare_gts([heads.LANES]).samples
     return sum(cost(prediction, gt, {}) for cost in head.assigner.match_costs)
 
 
@@ -113,19 +99,21 @@ def total_cost(head: torch.nn.Module) -> torch.Tensor:
 def test_the_mask_cost_weighs_as_it_is_told(kind):
     costs = {}
     for weight in (0.0, 2.0, 10.0):
-        head = build_head(GSMAP, iou_cost={"type": "IoUCost", "kind": kind, "weight": weight})
+        head = heads.build_head(
+            heads.GSMAP, iou_cost={"type": "IoUCost", "kind": kind, "weight": weight}
+        )
         costs[weight] = total_cost(head)
-        train_a_step(head, LANES)
-    without = build_head(GSMAP, iou_cost=None)
+        heads.train_a_step(head, heads.LANES)
+    without = heads.build_head(heads.GSMAP, iou_cost=None)
     torch.testing.assert_close(costs[0.0], total_cost(without))
     part = costs[2.0] - costs[0.0]
     assert part.min() > 0
     torch.testing.assert_close(costs[10.0] - costs[0.0], 5 * part, atol=1e-5, rtol=1e-5)
-    train_a_step(without, LANES)
+    heads.train_a_step(without, heads.LANES)
 
 
 def test_the_direction_loss_can_be_left_out():
-    _, losses, expected = switched(losses=HEAD["losses"][:1])
+    _, losses, expected = switched(losses=heads.HEAD["losses"][:1])
     assert changed(losses, expected) == {"loss_dir"}
 
 
@@ -136,22 +124,24 @@ def test_lambda_v_weighs_the_points():
 
 @pytest.mark.parametrize("invariant", [True, False])
 def test_the_invariant_frame_does_not_tell_a_gaussian_from_itself_turned_by_pi(invariant):
-    head = build_head(GSMAP, decoder=with_layer(HEAD, invariant_frame=invariant))
-    train_a_step(head, LANES)
+    head = heads.build_head(
+        heads.GSMAP, decoder=heads.with_layer(heads.HEAD, invariant_frame=invariant)
+    )
+    heads.train_a_step(head, heads.LANES)
     head.eval()
     scores = []
     for turn in (0.4, 0.4 + torch.pi):
         torch.nn.init.constant_(head.reference.gaussian_init.bias[2:], turn)
-        scores.append(stacked(head(bev())).scores)
+        scores.append(stacked(head(heads.bev())).scores)
     assert torch.allclose(*scores, atol=1e-5) == invariant
 
 
 @pytest.mark.parametrize("source", ["full", "points"])
 def test_masks_come_from_full_resolution_or_from_the_matched_points(source):
     """The ground truth's polyline is a ring; its points are one side of it."""
-    head = build_head(GSMAP, masks={**MASKS, "source": source})
-    train_a_step(head, SQUARE)
-    predictions = predictions_of(head, head(bev()), 1)
+    head = heads.build_head(heads.GSMAP, masks={**heads.MASKS, "source": source})
+    heads.train_a_step(head, SQUARE)
+    predictions = heads.predictions_of(head, head(heads.bev()), 1)
     gts = head.prepare_gts([SQUARE])
     pairs = head.match(predictions, gts, [{}])
     drawn = {"full": SQUARE.polylines, "points": SQUARE.pts}[source]
@@ -160,21 +150,25 @@ def test_masks_come_from_full_resolution_or_from_the_matched_points(source):
 
 
 def test_filled_classes_have_filled_masks():
-    hollow = build_head(GSMAP, masks={**MASKS, "pixel_m": 0.3})
-    filled = build_head(GSMAP, masks={**MASKS, "pixel_m": 0.3, "filled_classes": (1,)})
+    hollow = heads.build_head(heads.GSMAP, masks={**heads.MASKS, "pixel_m": 0.3})
+    filled = heads.build_head(
+        heads.GSMAP, masks={**heads.MASKS, "pixel_m": 0.3, "filled_classes": (1,)}
+    )
     assert hollow.prepare_gts([SQUARE]).masks[0, 100, 50] == 0
     assert filled.prepare_gts([SQUARE]).masks[0, 100, 50] == 1
-    lane = elements(*along_y(-3.0))
+    lane = heads.elements(*heads.along_y(-3.0))
     assert torch.equal(hollow.prepare_gts([lane]).masks, filled.prepare_gts([lane]).masks)
-    assert train_a_step(filled, SQUARE)["loss_raster"] > 0
+    assert heads.train_a_step(filled, SQUARE)["loss_raster"] > 0
 
 
 @pytest.mark.parametrize("source", ["full", "points"])
 def test_one_to_many_queries_train_with_or_without_the_raster_loss(source):
     """With masks from points, each group draws the order that it was matched in."""
     further = {"name": "one2many", "num": 6, "repeats": 3}
-    masks = {**MASKS, "source": source}
+    masks = {**heads.MASKS, "source": source}
     for losses in (None, ("cls", "pts", "dir")):
-        groups = [{"num": N}, {**further, "losses": losses}]
-        found = train_a_step(build_head(GSMAP, query_groups=groups, masks=masks), LANES)
+        groups = [{"num": heads.N}, {**further, "losses": losses}]
+        found = heads.train_a_step(
+            heads.build_head(heads.GSMAP, query_groups=groups, masks=masks), heads.LANES
+        )
         assert ("loss_raster_one2many" in found) == (losses is None)

@@ -8,6 +8,7 @@ import torch
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
 
+from gsmap.checkpoints.building import building
 from gsmap.checkpoints.named_models import named_models
 from gsmap.checkpoints.reading import adopt_settings, load_weights
 from gsmap.engine.launch import read_config
@@ -39,10 +40,11 @@ def load_model(
     cfg = read_config(config, cfg_options)
     if checkpoint is None and str(config) in named_models():
         checkpoint = str(config)
-    if checkpoint is not None:
-        for line in adopt_settings(cfg, checkpoint, cfg_options):
-            _LOGGER.warning(line)
-    model = MODELS.build(cfg.model)
+    with building(cfg):
+        if checkpoint is not None:
+            for line in adopt_settings(cfg, checkpoint, cfg_options):
+                _LOGGER.warning(line)
+        model = MODELS.build(cfg.model)
     if checkpoint is not None:
         load_weights(model, checkpoint)
     model.cfg = cfg

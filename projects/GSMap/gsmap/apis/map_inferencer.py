@@ -19,6 +19,7 @@ from torch.utils.data import DataLoader, Subset
 from gsmap.apis.frame_loader import BrokenFrame, FrameDataset, collate
 from gsmap.apis.live_map import LiveMap
 from gsmap.apis.loading import load_model
+from gsmap.checkpoints.building import building
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_predictions
@@ -75,7 +76,8 @@ def _build_visualizer(cfg: Config) -> "MapVisualizer":
     if str(options.pop("type", "MapVisualizer")).split(".")[-1] != "MapVisualizer":
         options = {}
     own = {k: v for k, v in options.items() if k not in ("name", "vis_backends", "save_dir")}
-    return MapVisualizer(name=f"inferencer-{id(cfg)}", **own)
+    with building(cfg, MapVisualizer):
+        return MapVisualizer(name=f"inferencer-{id(cfg)}", **own)
 
 
 class MapInferencer:
@@ -155,7 +157,8 @@ class MapInferencer:
         settings["serialize_data"] = len(samples) > 1  # costs a collection of all garbage
         if source.data_root is not None:
             settings["data_root"] = str(source.data_root.resolve())
-        dataset = DATASETS.build(settings)
+        with building(self.cfg):
+            dataset = DATASETS.build(settings)
         self.visualizer.dataset_meta = dataset.metainfo
         return dataset
 

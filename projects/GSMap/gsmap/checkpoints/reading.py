@@ -12,6 +12,7 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config, ConfigDict
 from torch import Tensor, nn
 
+from gsmap.checkpoints.building import building
 from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.checkpoints.safe_globals import mmengine_globals
@@ -141,7 +142,8 @@ def _model_of(
         settings = checked(settings, config)
         own = Config({"model": settings})
         own.merge_from_dict(options)
-        MODELS.build(own.model)
+        with building(own):
+            MODELS.build(own.model)
     except Exception as error:  # a stranger's settings may end in whatever they like
         reason = (in_words(error) or f"{type(error).__name__}: {error}").rstrip(".")
         raise ValueError(

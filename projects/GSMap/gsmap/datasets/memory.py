@@ -42,8 +42,9 @@ def sample_of_rig(
     rig = {"intrinsics": _by_name(intrinsics), "cam_from_frame": _by_name(cam_from_frame)}
     for what, values in rig.items():
         if set(values) != set(images) or not images:
-            names = list(images)
-            raise ValueError(f"{what} must have the cameras of images, {names}, got {list(values)}.")
+            raise ValueError(
+                f"{what} must have the cameras of images, {list(images)}, got {list(values)}."
+            )
     cameras = [
         CameraRecord(
             name,

@@ -12,9 +12,9 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from gsmap.evaluation.json_items import Place, items_of
 from gsmap.structures.elements import MapElements
 from gsmap.utils.files import atomic_write
+from gsmap.utils.json_items import Place, items_of
 from gsmap.utils.shards import ShardFile
 
 RESULTS_KEY, GROUND_TRUTH_KEY = "results", "GTs"
@@ -100,8 +100,8 @@ class SampleFile:
             ValueError: If it has no list under the key, a sample is malformed or has no token, or a
                 token occurs twice; the message names the file and the sample.
         """
-        seen = set()
-        for item, place in items_of(self.path, self._key):
+        seen, form = set(), f'{{"{self._key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}'
+        for item, place in items_of(self.path, self._key, f"it must be {form}"):
             token, elements = self._convert(item, self.ignored)
             if token in seen:
                 raise ValueError(f"{self.path} holds sample {token!r} more than once.")

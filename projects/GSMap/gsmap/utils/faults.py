@@ -5,7 +5,6 @@ import errno
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
-from types import FrameType
 from typing import Any
 
 _FULL = "free some space there, or write elsewhere"
@@ -31,7 +30,6 @@ _NO_DEVICE = re.compile(
 _NO_PEER = re.compile(r"gloo.*(closed|reset) by peer|NCCL.*remote process", re.DOTALL)
 _UNEXPECTED = re.compile(r"([\w.]+)\(\) got an unexpected keyword argument '(\w+)'")
 _IN_WORKER = "Original Traceback (most recent call last)"  # in texts of torch's DataLoader
-_BUILDER = "build_from_cfg"  # mmengine's function that makes an object from a config's settings
 _CHECKS = ValueError, TypeError, KeyError, RuntimeError, FloatingPointError
 _SLIPS = (
     *_CHECKS, IndexError, AttributeError, AssertionError, ArithmeticError, NotImplementedError,
@@ -52,7 +50,7 @@ def in_words(error: BaseException) -> str | None:
         return error.words
     # a KeyError's own text is its message in quotes
     text = str(error.args[0] if type(error) is KeyError and error.args else error)
-    frames, last = _steps(error)
+    scope, last = _raised_in(error)
     of_parser = isinstance(error, ValueError) and type(error) is not ValueError  # such as Arrow's
     meant = last == "RAISE_VARARGS" or of_parser  # Python itself finds the others
     if _IN_WORKER in text:  # all that torch hands on
@@ -61,7 +59,7 @@ def in_words(error: BaseException) -> str | None:
     return (
         _of_the_machine(error, text)
         or _of_the_system(error, text)
-        or _of_a_config(error, text, frames, last)
+        or _of_a_config(error, text, scope, last)
         or (text if meant and isinstance(error, _CHECKS) else None)
     )
 
@@ -82,14 +80,14 @@ def registered(registry: Any) -> list[str]:
     return [name for member in family for name in member.module_dict]
 
 
-def _steps(error: BaseException) -> tuple[list[FrameType], str]:
-    """Return the functions that an error came through, and the last one's instruction."""
-    frames, instruction, step = [], "", error.__traceback__
-    while step is not None:
-        frames.append(step.tb_frame)
-        instruction = dis.opname[step.tb_frame.f_code.co_code[step.tb_lasti]]
+def _raised_in(error: BaseException) -> tuple[dict[str, Any], str]:
+    """Return the names of the module that an error came up in, and the instruction."""
+    step = error.__traceback__
+    if step is None:
+        return {}, ""
+    while step.tb_next is not None:
         step = step.tb_next
-    return frames, instruction
+    return step.tb_frame.f_globals, dis.opname[step.tb_frame.f_code.co_code[step.tb_lasti]]
 
 
 def _of_the_machine(error: BaseException, text: str) -> str | None:
@@ -122,52 +120,37 @@ def _of_the_system(error: BaseException, text: str) -> str | None:
 
 
 def _of_a_config(
-    error: BaseException, text: str, frames: list[FrameType], instruction: str
+    error: BaseException, text: str, scope: dict[str, Any], instruction: str
 ) -> str | None:
-    """Speak of settings that nothing can be made of."""
-    built = [frame.f_locals for frame in frames if frame.f_code.co_name == _BUILDER]
-    module = frames[-1].f_globals.get("__name__", "") if frames else ""
-    handed_over = instruction == "CALL_FUNCTION_EX" or module.startswith("mmengine.")
-    where = _config_file(frames)
+    """Speak of settings that nothing can be made of; `checkpoints.building` notes which."""
+    config, built = getattr(error, "config", None), getattr(error, "built", [])
+    where = f"{config}: " if config else ""
+    module = scope.get("__name__", "")
     if module.startswith("mmengine.config.") and isinstance(error, (KeyError, AttributeError)):
         return f"{where}a setting is missing: {text}."
-    if (unknown := _UNEXPECTED.search(text)) and (built or handed_over):
-        return where + _unknown_setting(unknown[1], unknown[2], built, frames)
+    handed_over = built or instruction == "CALL_FUNCTION_EX" or module.startswith("mmengine.")
+    kinds = [kind for _, kind in built if kind]
+    if (unknown := _UNEXPECTED.search(text)) and handed_over:
+        return where + _unknown_setting(unknown[1], unknown[2], kinds, scope)
     if not built or not isinstance(error, _SLIPS):
         return None
     if absent := re.match(r"(\S+) is not in the \S+ registry", text):
-        registry = built[-1]["registry"]
+        registry = built[0][0]
         close = nearest(absent[1], registered(registry))
         return f"{where}there is no {registry.name} of type {absent[1]!r}{close or '.'}"
     if instruction == "RAISE_VARARGS" and isinstance(error, _CHECKS):
         return text if "/" in text else where + text
-    kinds = [_name(frame["obj_cls"]) for frame in reversed(built) if frame.get("obj_cls")]
     return (
-        f"{where}{' of '.join(kinds)} cannot be made from these settings: {type(error).__name__}: "
-        f"{text} (GSMAP_TRACEBACK=1 shows where)."
+        f"{where}{' of '.join(map(_name, kinds))} cannot be made from these settings: "
+        f"{type(error).__name__}: {text} (GSMAP_TRACEBACK=1 shows where)."
     )
 
 
-def _config_file(frames: list[FrameType]) -> str:
-    """Return the name of the config that a command works with, and a colon."""
-    for frame in reversed(frames):
-        own = getattr(frame.f_locals.get("self"), "__dict__", {})
-        for holder in (frame.f_locals.get("cfg"), own.get("cfg")):
-            name = getattr(holder, "filename", None)
-            if isinstance(name, str):
-                return f"{name}: "
-    return ""
-
-
-def _unknown_setting(
-    owner: str, name: str, built: list[dict[str, Any]], frames: list[FrameType]
-) -> str:
+def _unknown_setting(owner: str, name: str, kinds: list[Any], scope: dict[str, Any]) -> str:
     """Name a setting that a class or function does not know, and the nearest one that it does."""
     place, _, method = owner.rpartition(".")
-    last = frames[-1]
-    near = type(last.f_locals.get("self")), last.f_globals.get(place or owner)
     known: list[str] = []
-    for kind in (*(frame.get("obj_cls") for frame in reversed(built)), *near):
+    for kind in (*kinds, scope.get(place or owner)):
         family = getattr(kind, "__mro__", (kind,))
         if (place or owner) in map(_name, family):
             parts = [vars(part).get(method) for part in family] if place else [kind]

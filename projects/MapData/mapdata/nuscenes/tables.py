@@ -1,8 +1,6 @@
 """The tables of nuScenes-format data, without what maps do not need, and the samples in them."""
 
-import json
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache, partial
 from itertools import islice
@@ -14,14 +12,13 @@ from pyquaternion import Quaternion
 
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
 from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.json_items import items_of
 from mapdata.nuscenes.can_bus import read_messages, signals_at
 
 CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 )  # fmt: skip
 LIDAR = "LIDAR_TOP"
-_MARK = re.compile(r"\s*([\[\],]?)\s*")
-_CHUNK_CHARACTERS = 1 << 20  # a record is shorter
 # what is read of each table: fields with their type, or how many numbers they hold
 _POSE: dict[str, type | int] = {"translation": 3, "rotation": 4}
 _FIELDS: dict[str, dict[str, type | int]] = {
@@ -45,43 +42,6 @@ _LINKS = {
         "calibrated_sensor_token": "calibrated_sensor",
     },
 }  # fmt: skip
-
-
-def _refuse_constant(name: str) -> float:
-    """Refuse NaN and infinity, which JSON does not have."""
-    raise ValueError(f"{name} is no number")
-
-
-def iterate_records(path: Path) -> Iterator[dict[str, Any]]:
-    """Read the records of a table (a JSON list) one by one; it is never in memory as a whole.
-
-    Raises:
-        ValueError: If it is not one whole list of records, from the first sign to the last.
-    """
-    decode = json.JSONDecoder(parse_constant=_refuse_constant).raw_decode
-    with path.open(encoding="utf-8") as file:
-        text, position, expected = "", 0, "["
-        try:
-            while True:
-                if len(text) - position < _CHUNK_CHARACTERS:
-                    text, position = text[position:] + file.read(_CHUNK_CHARACTERS), 0
-                mark = _MARK.match(text, position)
-                sign, position = (mark[1], mark.end()) if mark else ("", position)
-                if sign == "[" == expected and text[position : position + 1] == "]":
-                    sign, expected, position = "]", ",", position + 1
-                if sign == "]" and expected == ",":
-                    break
-                if sign != expected:
-                    raise ValueError(f"{expected!r} is missing before {text[position:][:40]!r}")
-                record, position = decode(text, position)
-                expected = ","
-                yield record
-            if (text[position:] + file.read()).strip():
-                raise ValueError("something follows the end of the list")
-        except (ValueError, RecursionError) as error:
-            raise ValueError(
-                f"table {path} is damaged or incomplete ({error}): download it again."
-            ) from error
 
 
 def _is_right(value: Any, kind: type | int) -> bool:
@@ -164,7 +124,7 @@ class NuScenesTables:
         if not path.is_file():
             raise FileNotFoundError(f"no table at {path}: download the tables again.")
         fields: dict[str, type | int] = {"token": str, **_FIELDS[table]}
-        for record in iterate_records(path):
+        for record, _ in items_of(path, None, "download it again"):
             values = record if isinstance(record, dict) else {}
             for name, kind in fields.items():
                 if not _is_right(value := values.get(name), kind):

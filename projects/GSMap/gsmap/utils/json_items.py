@@ -14,10 +14,15 @@ _SPACE = re.compile(r"[ \t\n\r]*")
 _DECODER = json.JSONDecoder()
 
 
-def items_of(path: Path, key: str) -> Iterator[tuple[Any, Place]]:
-    """Yield value and place of each item of the list under a key of the whole file's object.
+def items_of(path: Path, key: str | None, advice: str) -> Iterator[tuple[Any, Place]]:
+    """Yield value and place of each item of a list.
 
     What is in memory does not grow with the list.
+
+    Args:
+        path: The file.
+        key: Of the file's object, where the list is; None: the file is the list.
+        advice: What to do if it is not, for the message.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -27,9 +32,9 @@ def items_of(path: Path, key: str) -> Iterator[tuple[Any, Place]]:
         try:
             yield from _Text(file).items(key)
         except (ValueError, RecursionError) as error:
+            under = "" if key is None else f" under {key!r}"
             raise ValueError(
-                f"{path} is empty or holds no complete list under {key!r}: expected "
-                f'{{"{key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}, got {error!r:.80}.'
+                f"{path} is empty or holds no complete list{under} ({error!r:.80}): {advice}."
             ) from error
 
 
@@ -42,42 +47,38 @@ class _Text:
         self._at = 0  # where the next value begins, in the text
         self._byte = 0  # and in the file
 
-    def items(self, key: str) -> Iterator[tuple[Any, Place]]:
+    def items(self, key: str | None) -> Iterator[tuple[Any, Place]]:
         """Yield the items of the list under a key."""
         found = False
-        self._take("{")
-        more = self._sign() != "}"
-        while more:
+        for _ in () if key is None else self._parts("{", "}"):
             if self._sign() != '"':
                 raise self._error("no name")
             name, _ = self._value()
             self._take(":")
             if name != key:
                 self._value()
-            elif found or self._sign() != "[":
+                continue
+            if found or self._sign() != "[":
                 raise self._error(f"a second {key!r}" if found else "no list")
-            else:
-                found = True
-                yield from self._list()
-            more = self._sign() == ","
-            if more:
-                self._take(",")
-        self._take("}")
+            found = True
+            yield from (self._value() for _ in self._parts("[", "]"))
+        if key is None:
+            yield from (self._value() for _ in self._parts("[", "]"))
+        elif not found:
+            raise self._error(f"no {key!r}")
         if self._sign():
             raise self._error("more text")
-        if not found:
-            raise self._error(f"no {key!r}")
 
-    def _list(self) -> Iterator[tuple[Any, Place]]:
-        """Yield the items of the list that begins here."""
-        self._take("[")
-        more = self._sign() != "]"
+    def _parts(self, opening: str, closing: str) -> Iterator[None]:
+        """Stop before each part of an object or a list, for that to be taken."""
+        self._take(opening)
+        more = self._sign() != closing
         while more:
-            yield self._value()
+            yield
             more = self._sign() == ","
             if more:
                 self._take(",")
-        self._take("]")
+        self._take(closing)
 
     def _value(self) -> tuple[Any, Place]:
         """Take a value, and return it with its place."""

@@ -22,14 +22,14 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from mapdata.argoverse2.convert import convert_argoverse2
 from mapdata.argoverse2.log import RING_CAMERAS, Argoverse2Log
 from mapdata.argoverse2.map import find_map
-from mapdata.argoverse2.render import (
+from mapdata.argoverse2.samples import Argoverse2Options
+from minicity.argoverse2 import height_grid, lane_paint, make_scene
+from minicity.argoverse2_render import (
     RenderOptions,
     render_log,
     render_logs,
     scaled_camera,
 )
-from mapdata.argoverse2.samples import Argoverse2Options
-from minicity.argoverse2 import height_grid, lane_paint, make_scene
 from minicity.terrain import sample_height
 
 X, Y = ORIGIN[:2]
