@@ -120,7 +120,7 @@ def match_raster(
 ) -> FrameMatches:
     """Match the predictions of one sample with its ground truth by the IoU of their masks.
 
-    Ground truth is at full resolution; ``token`` names the sample. Errors are those of `check_pair`.
+    Ground truth is at full resolution; ``token`` names the sample. Errors are of `check_pair`.
     """
     check_pair(predictions, ground_truth, config.classes, token)
     num_classes, gt_labels = len(config.classes), ground_truth.labels
