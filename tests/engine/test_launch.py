@@ -14,7 +14,6 @@ from gsmap.engine.launch import (
     read_config,
 )
 
-
 SPLITS = ("train", "val", "test")
 
 

@@ -40,7 +40,7 @@ def differences(ours: Any, others: Any, name: str = "") -> dict[str, tuple[Any, 
 
 
 def scale_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
-    """Return the steps that scale images in a config's pipelines of ``train``, ``val``, ``test``."""
+    """Return the steps that scale images in pipelines of a config: train's, val's, test's."""
     loaders = [cfg.get(f"{part}_dataloader") or {} for part in parts]
     pipelines = [loader.get("dataset", {}).get("pipeline") or [] for loader in loaders]
     steps = [step for pipeline in pipelines for step in pipeline if isinstance(step, ConfigDict)]
