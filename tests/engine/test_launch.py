@@ -73,7 +73,7 @@ def test_one_scale_serves_the_images_of_every_split():
     cfg = load_config(parse("configs/my_data.py", "--image-scale", "0.125"))
     scales = [cfg[f"{split}_dataloader"].dataset.pipeline[1].scale for split in SPLITS]
     assert scales == [0.125] * 3
-    with pytest.raises(ValueError, match="--image-scale: no pipeline of .* has ScaleImages"):
+    with pytest.raises(ValueError, match=r"--image-scale: no pipeline of .* has ScaleImages"):
         read_config(Config({"test_dataloader": {"dataset": {}}}), {"image_scale": 0.5})
 
 
