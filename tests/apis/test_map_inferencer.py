@@ -149,6 +149,18 @@ def test_checkpoint_is_loaded(inferencer, tmp_path):
         MapInferencer(other, path, device="cpu")
 
 
+def test_images_are_scaled_to_the_size_of_the_training_unless_a_scale_is_given(
+    inferencer, tmp_path
+):
+    path, meta = tmp_path / "weights.pth", {"image_size": (80, 45)}
+    torch.save({"state_dict": inferencer.model.state_dict(), "meta": meta}, path)
+    samples = make_samples(tmp_path, 1)  # of 320 x 180 pixels; the config has the scale 0.5
+    for options, shape in ((None, (45, 80)), ({"image_scale": 0.5}, (90, 160))):
+        own = MapInferencer(make_config(), path, device="cpu", cfg_options=options)
+        (found,) = own(samples, tmp_path)
+        assert found.metainfo["img_shape"][:2] == shape
+
+
 def test_lidar_points_are_in_the_annotation_frame(inferencer, tmp_path):
     dataset = inferencer.dataset(make_samples(tmp_path, 1), tmp_path)
     np.testing.assert_allclose(

@@ -103,6 +103,33 @@ def small() -> Config:
     return read_config("configs/maptr/maptr_r18_minicity.py")
 
 
+def test_test_images_get_the_size_that_the_checkpoint_was_trained_at(small, tmp_path):
+    def steps():
+        return [small[f"{part}_dataloader"].dataset.pipeline[1] for part in ("test", "train")]
+
+    path = save(tmp_path / "a.pth", {"state_dict": {"w": torch.ones(1)}})
+    adopt_settings(small, path, None)
+    assert "trained_size" not in steps()[0]
+    for options in ({"image_scale": 0.5}, {"test_dataloader.dataset.pipeline.1.scale": 0.5}):
+        adopt_settings(small, "maptr_r18_minicity", options)
+        assert "trained_size" not in steps()[0]  # asked for by hand
+    adopt_settings(small, "maptr_r18_minicity", {"model.grid": None})
+    assert steps() == [
+        {"type": "ScaleImages", "scale": 0.4, "trained_size": (160, 90)},
+        {"type": "ScaleImages", "scale": 0.4},
+    ]
+    save(path, {"state_dict": {"w": torch.ones(1)}, "meta": {"image_size": [320, 180]}})
+    adopt_settings(small, path, None)
+    assert steps()[0].trained_size == (320, 180)
+
+
+@pytest.mark.parametrize("size", [3, [3], ["a", "b"], [0, 5], [1, 10**9], [1.5, 2], [1, 2, 3]])
+def test_an_image_size_that_is_none_is_refused(size, tmp_path):
+    content = {"state_dict": {"w": torch.ones(1)}, "meta": {"image_size": size}}
+    with pytest.raises(ValueError, match=r"a\.pth is not a whole checkpoint \(TypeError"):
+        read_weights(save(tmp_path / "a.pth", content))
+
+
 def test_parts_that_were_never_trained_are_used_only_where_that_is_asked_for(small, tmp_path):
     small.model.map_head.type = "GSMapHead"
     settings = plain(small.model.to_dict()) | {"allow_untrained": True}

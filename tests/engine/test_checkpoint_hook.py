@@ -219,7 +219,7 @@ def test_the_best_of_the_validations_is_kept(tmp_path):
 
 def test_a_checkpoint_holds_the_models_settings_and_no_text_that_runs(tmp_path):
     learn(tmp_path, 1)
-    _, settings = read_checked(tmp_path / "epoch_1.pth")
+    settings = read_checked(tmp_path / "epoch_1.pth").settings
     assert settings == {"type": "Learner", "size": [1, 2]}
     poisoned = torch.load(tmp_path / "epoch_1.pth", weights_only=False)
     poisoned["meta"]["config"] = f"open({str(tmp_path / 'proof')!r}, 'w')"

@@ -14,6 +14,8 @@ from gsmap.engine.launch import (
     read_config,
 )
 
+SPLITS = ("train", "val", "test")
+
 
 def parse(*arguments):
     parser = argparse.ArgumentParser()
@@ -38,7 +40,7 @@ def test_one_folder_serves_every_split_unless_an_override_says_otherwise(swapped
     words = f"{there} {here}" if swapped else f"{here} {there}"
     args = parse("maptr_r18_minicity", *words.split())
     cfg = load_config(args)
-    roots = [cfg[f"{split}_dataloader"].dataset.data_root for split in ("train", "val", "test")]
+    roots = [cfg[f"{split}_dataloader"].dataset.data_root for split in SPLITS]
     assert roots == ["there", "here", "there"]
     assert args.data_root == Path("there")
 
@@ -65,6 +67,14 @@ def test_an_override_of_a_value_that_was_copied_is_refused_with_its_copies(optio
         load_config(parse("configs/my_data.py", "--cfg-options", option))
     said = str(refused.value).replace("_dataloader", "")
     assert f"Instead {instead}" in re.sub(r"\S*my_data\.py", "CONFIG", said)
+
+
+def test_one_scale_serves_the_images_of_every_split():
+    cfg = load_config(parse("configs/my_data.py", "--image-scale", "0.125"))
+    scales = [cfg[f"{split}_dataloader"].dataset.pipeline[1].scale for split in SPLITS]
+    assert scales == [0.125] * 3
+    with pytest.raises(ValueError, match=r"--image-scale: no pipeline of .* has ScaleImages"):
+        read_config(Config({"test_dataloader": {"dataset": {}}}), {"image_scale": 0.5})
 
 
 def test_a_missing_config_is_named():

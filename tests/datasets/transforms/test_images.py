@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gsmap.datasets.transforms import images
 from gsmap.datasets.transforms.images import ScaleImages
 
 
@@ -23,6 +24,32 @@ def test_sizes_are_not_one_pixel_short():
     for size in ((100, 200, 3), (200, 100, 3)):
         results = ScaleImages(0.58).transform({"img": [np.zeros(size, np.uint8)], **matrices})
         assert sorted(results["img_shape"]) == [58, 116]
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ((400, 225), (160, 90)),  # as in training: 0.4 of them
+        ((1600, 900), (160, 90)),
+        ((640, 480), (160, 120)),  # of another shape: as long as in training
+        ((480, 640), (120, 160)),
+        ((80, 45), (160, 90)),
+    ],
+)
+def test_images_of_another_size_become_as_long_as_those_of_the_training(
+    size, expected, monkeypatch
+):
+    said = []
+    monkeypatch.setattr(images, "print_log", lambda text, _: said.append(text))
+    images._say_scaled.cache_clear()
+    matrices = {"lidar2img": [np.eye(4)], "img_aug_matrix": [np.eye(4)]}
+    image = np.zeros((*size[::-1], 3), np.uint8)
+    results = ScaleImages(0.4, (160, 90)).transform({"img": [image], **matrices})
+    assert results["img"][0].shape[1::-1] == expected
+    ratio = np.divide(expected, size)
+    np.testing.assert_allclose(results["lidar2img"][0], np.diag([*ratio, 1, 1]))
+    start = "images of {} x {} are scaled to {} x {}, without".format(*size, *expected)
+    assert [text.startswith(start) for text in said] == [True] * (size != (400, 225))
 
 
 def test_a_scale_that_leaves_no_image_is_refused():

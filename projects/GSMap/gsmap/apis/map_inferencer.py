@@ -309,7 +309,7 @@ class MapInferencer:
         for the model's that looks most like it, as one of another name is.
 
         Args:
-            images: RGB, uint8, at about the size that the model was trained on. each (H, W, 3)
+            images: RGB, uint8; scaled to the size that the model was trained at. each (H, W, 3)
             intrinsics: Pinhole matrices, in pixels. each (3, 3)
             cam_from_frame: From the annotation frame to the camera (x right, y down, z ahead), in
                 metres. each (4, 4)

@@ -30,6 +30,7 @@ class NamedModel:
         licence: Licence of the weights.
         address: Where its file is fetched; None for those that ship.
         figures: Published results on its validation split in percent, by our metrics' names.
+        image_size: Width and height that images were scaled to in training, in pixels.
     """
 
     name: str
@@ -39,6 +40,7 @@ class NamedModel:
     licence: str
     address: str | None
     figures: dict[str, float]
+    image_size: list[int]
 
     @property
     def file(self) -> Path:

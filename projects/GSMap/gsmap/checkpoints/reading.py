@@ -4,6 +4,7 @@ import json
 import pickle
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,17 @@ from torch import Tensor, nn
 
 from gsmap.checkpoints.building import building
 from gsmap.checkpoints.convert import listed
-from gsmap.checkpoints.named_models import find_checkpoint
+from gsmap.checkpoints.named_models import find_checkpoint, named_models
 from gsmap.checkpoints.safe_globals import mmengine_globals
-from gsmap.checkpoints.settings import MODEL_SETTINGS, STARTS, checked, differences, plain
+from gsmap.checkpoints.settings import (
+    IMAGE_SIZE,
+    MODEL_SETTINGS,
+    STARTS,
+    checked,
+    differences,
+    plain,
+    scale_steps,
+)
 from gsmap.utils.faults import in_words
 
 # what torch's reader raises on bytes that make no sense
@@ -24,17 +33,31 @@ _DAMAGE = (
     RuntimeError, EOFError, LookupError, TypeError, AttributeError, AssertionError, ValueError,
     ArithmeticError, OSError, zipfile.BadZipFile,
 )  # fmt: skip
+_SCALED = ("image_scale", "test_dataloader.dataset.pipeline")  # overrides of the images' scale
+_WIDEST_PX = 100_000
 _REMEDY = "if you trust its origin, save its state_dict alone and give that file."
 
 
-def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | None]:
+@dataclass(frozen=True)
+class Checkpoint:
+    """What is read of a checkpoint.
+
+    Attributes:
+        state: Its weights.
+        settings: The model's settings in training, not checked yet; None if they are not there.
+        image_size: Width and height that images were scaled to in training, or None.
+    """
+
+    state: dict[str, Tensor]
+    settings: Any
+    image_size: tuple[int, int] | None
+
+
+def read_checked(path: str | Path) -> Checkpoint:
     """Read a checkpoint without running code from it, and check its weights.
 
     Args:
         path: File that training wrote, a bare state dict, or the name of a model.
-
-    Returns:
-        The state dict, and the model's settings in training where the checkpoint has them.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -49,6 +72,8 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
         if not isinstance(meta, Mapping):
             raise TypeError(f"meta must be a dictionary, got {meta!r:.60}")
         settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
+        named = (m.image_size for m in named_models().values() if m.file == path)
+        size = _checked_size(meta.get(IMAGE_SIZE, next(named, None)))
         if not isinstance(state, Mapping) or not all(map(_is_weight, state, state.values())):
             state = {}
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
@@ -70,7 +95,17 @@ def read_checked(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any] | 
             f"{path} holds NaN or infinite weights ({listed(broken)}): the training that wrote it "
             "had failed; use an earlier epoch's."
         )
-    return {key.removeprefix("module."): value for key, value in state.items()}, settings
+    state = {key.removeprefix("module."): value for key, value in state.items()}
+    return Checkpoint(state, settings, size)
+
+
+def _checked_size(size: Any) -> tuple[int, int] | None:
+    """Return an image size that a file brings; TypeError if it is none."""
+    if size is None:
+        return None
+    if len(size) != 2 or not all(isinstance(n, int) and 0 < n <= _WIDEST_PX for n in size):
+        raise TypeError(f"{IMAGE_SIZE} must be width and height, got {size!r:.60}")
+    return tuple(size)
 
 
 def _is_weight(key: Any, value: Any) -> bool:
@@ -81,17 +116,18 @@ def _is_weight(key: Any, value: Any) -> bool:
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:
     """Return the state dict of a checkpoint; arguments and errors as in `read_checked`."""
-    return read_checked(path)[0]
+    return read_checked(path).state
 
 
 def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> list[str]:
     """Give a config the model settings that a checkpoint was trained with, and say which changed.
 
+    Test images are scaled to the size that it was trained at, unless ``cfg_options`` set the scale.
     How training started (`STARTS`) is left out. Parts that were never trained are refused when the
     weights are loaded, unless the config sets ``model.allow_untrained``.
 
     Args:
-        cfg: The config; its ``model`` changes.
+        cfg: The config; its ``model`` and ``test_dataloader`` change.
         path: The checkpoint, checked as in `read_checked`.
         cfg_options: Overrides that were given by hand, by dotted name; they stay.
 
@@ -102,7 +138,11 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
     Raises:
         ValueError: If the settings are no model's, or ask for more than a model (`checked`).
     """
-    settings = read_checked(path)[1]
+    checkpoint = read_checked(path)
+    settings = checkpoint.settings
+    if checkpoint.image_size and not any(n.startswith(_SCALED) for n in cfg_options or {}):
+        for step in scale_steps(cfg, "test"):
+            step.trained_size = checkpoint.image_size
     config = plain(cfg.model.to_dict())
     allowed = cfg.model.setdefault("allow_untrained", False)
     if settings is None or not differences(settings, config):

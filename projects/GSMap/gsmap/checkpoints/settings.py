@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from mmdet3d.registry import MODELS, TASK_UTILS
+from mmengine.config import Config, ConfigDict
 
 MODEL_SETTINGS = "model_settings"  # key of a checkpoint's meta: JSON, as a config's text is code
 # settings of the start of a training, which may load files
 STARTS = {"init_cfg", "pretrained", "allow_untrained"}
+IMAGE_SIZE = "image_size"  # key of a checkpoint's meta: width and height that images are scaled to
 _KEY = re.compile(r"[a-zA-Z]\w*")
 _TEXT = re.compile(r"[\w -]*")  # no name of a file, an address or a module, and no expression
 _LARGEST = 1_000_000  # layers, channels, voxels
@@ -35,6 +37,14 @@ def differences(ours: Any, others: Any, name: str = "") -> dict[str, tuple[Any, 
         inner = f"{name}.{key}" if name else str(key)
         found |= differences(ours.get(key), others.get(key), inner)
     return found
+
+
+def scale_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
+    """Return the steps that scale images in pipelines of a config: train's, val's, test's."""
+    loaders = [cfg.get(f"{part}_dataloader") or {} for part in parts]
+    pipelines = [loader.get("dataset", {}).get("pipeline") or [] for loader in loaders]
+    steps = [step for pipeline in pipelines for step in pipeline if isinstance(step, ConfigDict)]
+    return [step for step in steps if step.get("type") == "ScaleImages"]
 
 
 def checked(settings: Any, config: dict[str, Any]) -> dict[str, Any]:

@@ -14,25 +14,33 @@ def data_root_options(data_root: str | Path) -> dict[str, str]:
     return {f"{split}_dataloader.dataset.data_root": str(data_root) for split in splits}
 
 
-class _DataRootAction(argparse.Action):
-    """Turns ``--data-root DIR`` into overrides, which those of ``--cfg-options`` outdo."""
+class _OptionAction(argparse.Action):
+    """Turns an argument into overrides, which those of ``--cfg-options`` outdo."""
 
     def __call__(
         self, parser: object, namespace: argparse.Namespace, values: Any, option: object = None
     ) -> None:
-        namespace.data_root = values
+        setattr(namespace, self.dest, values)
         given = getattr(namespace, "cfg_options", None) or {}
-        namespace.cfg_options = {**data_root_options(values), **given}
+        own = data_root_options(values) if self.dest == "data_root" else {self.dest: values}
+        namespace.cfg_options = {**own, **given}
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--data-root`` and ``--cfg-options``; both go to `read_config` as ``cfg_options``."""
+    """Add the options that go to `read_config` as ``cfg_options``."""
     parser.add_argument(
         "--data-root",
         type=Path,
         metavar="DIR",
-        action=_DataRootAction,
+        action=_OptionAction,
         help="folder of the data set: annotation files, and root of the paths in them",
+    )
+    parser.add_argument(
+        "--image-scale",
+        type=float,
+        metavar="FACTOR",
+        action=_OptionAction,
+        help="scale of the images; by default to the size that a checkpoint was trained at",
     )
     parser.add_argument(
         "--cfg-options",

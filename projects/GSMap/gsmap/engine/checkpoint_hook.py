@@ -15,7 +15,9 @@ from torch.hub import load_state_dict_from_url
 
 from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.safe_globals import mmengine_globals
-from gsmap.checkpoints.settings import MODEL_SETTINGS, plain
+from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, plain
+from gsmap.datasets.transforms.images import ScaleImages, scaled_size
+from gsmap.engine.run_log import innermost
 from gsmap.utils.files import write_bytes, write_text
 
 VALIDATED = "last_validation"  # file of a work folder: the iteration validated last
@@ -58,7 +60,7 @@ class AtomicCheckpointHook(CheckpointHook):
         checkpoint.get("meta", {}).pop("config", None)
 
     def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
-        """Note the model's settings.
+        """Note the model's settings, and the size that images are scaled to.
 
         Raises:
             FloatingPointError: If a weight is not finite; such a checkpoint is of no use.
@@ -71,6 +73,9 @@ class AtomicCheckpointHook(CheckpointHook):
             )
         settings = plain(runner.cfg.model.to_dict())
         checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
+        size = _image_size(runner)
+        if size is not None:
+            checkpoint["meta"][IMAGE_SIZE] = list(size)
 
     def before_train(self, runner: Runner) -> None:
         """Make up for the validation that was due when a run was cut off, then begin as ever."""
@@ -99,3 +104,16 @@ class AtomicCheckpointHook(CheckpointHook):
         super().after_val_epoch(runner, metrics)
         if runner.rank == 0:
             write_text(Path(runner.work_dir, VALIDATED), str(runner.iter))
+
+
+def _image_size(runner: Runner) -> tuple[int, int] | None:
+    """Return width and height that training images are scaled to, if the data set tells."""
+    dataset = innermost(runner.train_dataloader.dataset)
+    if not hasattr(dataset, "sample"):
+        return None
+    cameras = dataset.sample(0).cameras
+    cameras = [c for c in cameras if c.name in (dataset.cameras or [c.name])]
+    size = max(c.width for c in cameras), max(c.height for c in cameras)
+    for step in dataset.pipeline.transforms:
+        size = scaled_size(size, step.scale) if isinstance(step, ScaleImages) else size
+    return size

@@ -23,6 +23,7 @@ from mmengine.registry import init_default_scope
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.checkpoints.named_models import find_config
+from gsmap.checkpoints.settings import scale_steps
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.utils.faults import nearest, registered
 from gsmap.utils.files import DAMAGED_ZIP
@@ -52,7 +53,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
 
     Args:
         config: A config, by file or name (`find_config`), or a ``Config``, which is left as it is.
-        cfg_options: Overrides, by dotted name.
+        cfg_options: Overrides, by dotted name; ``image_scale`` is the factor of all images.
 
     Raises:
         FileNotFoundError: If there is no such file or model.
@@ -65,10 +66,18 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
         path = find_config(config)
         with _naming(path):
             cfg = Config.fromfile(path, import_custom_modules=False)
-    for name in cfg_options or {}:
+    options = dict(cfg_options or {})
+    factor = options.pop("image_scale", None)
+    for name in options:
         _check_effect(cfg, name)
     with _naming(f"--cfg-options of {cfg.filename or 'a config'}"):
-        cfg.merge_from_dict(cfg_options or {})
+        cfg.merge_from_dict(options)
+    if factor is not None:
+        steps = scale_steps(cfg, "train", "val", "test")
+        if not steps:
+            raise ValueError(f"--image-scale: no pipeline of {cfg.filename} has ScaleImages.")
+        for step in steps:
+            step.scale = factor
     _check_keys(cfg)
     with _naming(f"custom_imports of {cfg.filename or 'a config'}"):
         import_modules_from_strings(**cfg.get("custom_imports", {"imports": ["gsmap.registered"]}))

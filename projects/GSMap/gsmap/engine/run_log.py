@@ -119,6 +119,13 @@ class RunSummaryHook(Hook):
         runner.logger.info(f"This run{text}")
 
 
+def innermost(dataset: Any) -> Any:
+    """Return the data set inside of wrappers, such as RepeatDataset."""
+    while hasattr(dataset, "dataset"):
+        dataset = dataset.dataset
+    return dataset
+
+
 def _data(runner: Runner) -> dict[str, str]:
     """Describe the data: how many samples, cameras, range and classes."""
     loaders = {"training": runner.train_dataloader}
@@ -126,9 +133,7 @@ def _data(runner: Runner) -> dict[str, str]:
         loaders["validation"] = runner.val_dataloader
     lines = {}
     for name, loader in loaders.items():
-        dataset = loader.dataset
-        while hasattr(dataset, "dataset"):  # a wrapper, such as RepeatDataset
-            dataset = dataset.dataset
+        dataset = innermost(loader.dataset)
         file = getattr(dataset, "ann_file", type(dataset).__name__)
         lines[name] = f"{len(loader.dataset)} samples of {file}"
     if not hasattr(dataset, "sample"):

@@ -73,9 +73,8 @@ class MapElements:
         if not finite.all():
             index = np.searchsorted(offsets, finite.argmin(), side="right") - 1
             raise ValueError(f"element {index} has a point that is not finite.")
-        fair = True if scores is None else (scores >= 0) & (scores <= 1)  # NaN is not
-        if not np.all(fair):
-            index = np.argmin(fair)
+        if scores is not None and not ((scores >= 0) & (scores <= 1)).all():  # NaN is not
+            index = ((scores >= 0) & (scores <= 1)).argmin()
             raise ValueError(f"element {index} has the score {scores[index]}, not in [0, 1].")
         scales = _per_vertex(scales, "scales", (len(points), 2))
         rotations = _per_vertex(rotations, "rotations", (len(points),))

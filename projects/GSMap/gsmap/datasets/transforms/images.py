@@ -1,12 +1,15 @@
 """Camera images: loading with checks, and scaling with the matrices kept right."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import mmcv
 import numpy as np
 from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
+from mmengine.logging import print_log
+from torch.utils.data import get_worker_info
 
 from gsmap.datasets.image_files import read_image
 
@@ -58,9 +61,13 @@ class ScaleImages(BaseTransform):
     Args:
         scale: Factor, > 0; sizes are rounded down, and the matrices take the exact ratio of each
             axis. ValueError if it is not positive.
+        trained_size: Width and height, in pixels, that a model was trained at: images that
+            ``scale`` would make larger or smaller get the longer side of it in place of that. They
+            are neither cropped nor padded.
     """
 
     scale: float
+    trained_size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if not self.scale > 0:
@@ -69,15 +76,38 @@ class ScaleImages(BaseTransform):
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Scale ``results['img']``."""
         height, width = results["img"][0].shape[:2]
-        # 1e-6: a factor such as 0.58 * 100 must not round down to 57
-        size = (int(width * self.scale + 1e-6), int(height * self.scale + 1e-6))
+        scale, size = self.scale, scaled_size((width, height), self.scale)
+        if self.trained_size is not None and max(size) != max(self.trained_size):
+            scale = max(self.trained_size) / max(width, height)
+            size = scaled_size((width, height), scale)
+            _say_scaled((width, height), size, tuple(self.trained_size))
         if min(size) < 1:
-            raise ValueError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
+            raise ValueError(f"scale {scale} leaves nothing of a {width} x {height} image.")
         matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
         if size != (width, height):
             results["img"] = [mmcv.imresize(img, size) for img in results["img"]]
         for key in ("lidar2img", "img_aug_matrix"):
             results[key] = [matrix @ m for m in results[key]]
         results["img_shape"] = results["pad_shape"] = size[::-1]
-        results["scale_factor"] = self.scale
+        results["scale_factor"] = scale
         return results
+
+
+def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Return width and height of a scaled image, in pixels."""
+    # 1e-6: a factor such as 0.58 * 100 must not round down to 57
+    return int(size[0] * scale + 1e-6), int(size[1] * scale + 1e-6)
+
+
+@cache
+def _say_scaled(found: tuple[int, int], size: tuple[int, int], trained: tuple[int, ...]) -> None:
+    """Say once that images are not scaled as the config says."""
+    worker = get_worker_info()
+    if worker is None or worker.id == 0:
+        print_log(
+            "images of {} x {} are scaled to {} x {}, without cropping or padding, as the model "
+            "was trained at {} x {}; --image-scale gives another factor.".format(
+                *found, *size, *trained
+            ),
+            "current",
+        )
