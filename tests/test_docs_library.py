@@ -1,13 +1,18 @@
-"""The blocks of docs/library.md run, one after the other, and do what the page says."""
+"""The blocks of docs/library.md run, one after the other; the node of ROS 2 runs on a stand-in."""
 
 import json
 import re
+import sys
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-PAGE = Path(__file__).resolve().parents[1] / "docs/library.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGE = DOCS / "library.md"
 
 
 @pytest.fixture(scope="module")
@@ -54,3 +59,99 @@ def test_the_map_lies_where_the_vehicle_is(ran):
     degrees = 360 / 40_030_000
     east, north = (centre - (11.67, 48.26)) / degrees * (np.cos(np.radians(48.26)), 1)
     assert np.hypot(east - 120, north - 45) < 30
+
+
+class Message(SimpleNamespace):
+    """A message of ROS: attributes are there when they are first asked for."""
+
+    LINE_STRIP, DELETEALL = 4, 3
+
+    def __getattr__(self, name: str) -> "Message":
+        if name.startswith("__"):
+            raise AttributeError(name)
+        setattr(self, name, Message())
+        return vars(self)[name]
+
+
+class Node:
+    """What the example uses of a node: topics, and what is published."""
+
+    def __init__(self, name: str) -> None:
+        self.topics, self.published = {}, []
+
+    def create_subscription(self, kind, topic, callback, depth):
+        self.topics[topic] = callback
+
+    def create_publisher(self, kind, topic, depth):
+        return SimpleNamespace(publish=self.published.append)
+
+    def create_timer(self, period_s, callback):
+        assert period_s == 0.5
+
+
+class Buffer:
+    """Transforms of a front camera, 2 m ahead and 1.5 m up, and of its twin to the rear."""
+
+    def lookup_transform(self, target, source, time):
+        assert source == "base_footprint"
+        ahead = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+        turn = ahead if target == "front_optical" else np.array(ahead) @ np.diag([-1, -1, 1])
+        x, y, z, w = Rotation.from_matrix(turn).as_quat()
+        rotation = SimpleNamespace(x=x, y=y, z=z, w=w)
+        shift = np.array(turn) @ [-2.0 if target == "front_optical" else 2.0, 0, -1.5]
+        translation = SimpleNamespace(**dict(zip("xyz", shift, strict=True)))
+        found = SimpleNamespace(rotation=rotation, translation=translation)
+        return SimpleNamespace(transform=found)
+
+
+def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
+    names = {
+        "rclpy": {},
+        "rclpy.node": {"Node": Node},
+        "rclpy.time": {"Time": object},
+        "geometry_msgs.msg": {"Point": Message},
+        "sensor_msgs.msg": {"CameraInfo": Message, "Image": Message},
+        "tf2_ros": {"Buffer": Buffer, "TransformListener": lambda *_: None},
+        "visualization_msgs.msg": {"Marker": Message, "MarkerArray": Message},
+    }
+    for name, content in names.items():
+        for module in (name.partition(".")[0], name):
+            monkeypatch.setitem(sys.modules, module, ModuleType(module))
+        vars(sys.modules[name]).update(content)
+    text = (DOCS / "inference.md").read_text()
+    (block,) = (b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "rclpy" in b)
+    scope = {"__name__": "node"}
+    exec(compile(block, "inference.md", "exec"), scope)
+    node = scope["MapNode"]()
+    node.step()
+    assert node.published == []  # no camera has spoken
+    pixels = np.random.default_rng(0).integers(0, 256, (225, 410, 3), np.uint8)
+    for place in ("front", "rear"):
+        header = Message(frame_id=f"{place}_optical", stamp=7)
+        shape = {"height": 225, "width": 400, "step": 3 * 410, "encoding": "bgr8"}
+        node.topics[f"/{place}/image_rect"](Message(header=header, data=pixels.tobytes(), **shape))
+        p = [320.0, 0, 200, 0, 0, 320, 112, 0, 0, 0, 1, 0]
+        node.topics[f"/{place}/camera_info"](Message(header=header, p=p))
+    image = scope["rgb"](node.images["CAM_FRONT"])
+    np.testing.assert_array_equal(image, pixels[:, :400, ::-1])
+    rigs, live = [], node.inferencer.live
+
+    def scored(*rig, **options):
+        rigs.append(rig)
+        run = live(*rig, **options)
+        return lambda images: replace(found := run(images), scores=np.linspace(0, 1, len(found)))
+
+    node.inferencer.live = scored
+    node.step()
+    node.step()
+    ((intrinsics, mounting, frame),) = rigs  # fitted once
+    np.testing.assert_array_equal(intrinsics["CAM_BACK"], np.reshape(p, (3, 4))[:, :3])
+    place = np.linalg.inv(mounting["CAM_BACK"])[:3, [2, 3]]  # looks back, where it is
+    np.testing.assert_allclose(place.T, [[-1, 0, 0], [-2, 0, 1.5]], atol=1e-12)
+    assert frame == "vehicle"
+    erase, *lines = node.published[1].markers
+    assert erase.action == Message.DELETEALL
+    assert len(lines) > 10
+    assert {line.header.frame_id for line in lines} == {"base_footprint"}
+    assert all(len(line.points) == 20 and line.header.stamp == 7 for line in lines)
+    assert max(abs(point.x) for line in lines for point in line.points) > 20  # ahead is x

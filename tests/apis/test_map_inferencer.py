@@ -13,7 +13,7 @@ from gsmap.apis.loading import load_model
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
-from gsmap.datasets.source import Source, reframed
+from gsmap.datasets.source import Source, ground_from_frame, reframed
 from gsmap.visualization.figure import figure_to_rgb
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -360,6 +360,23 @@ def test_a_live_rig_sees_each_frame_as_if_it_were_alone(inferencer, tmp_path, mo
     small = {name: image[::2, ::2] for name, image in frames[0][0].items()}
     alone = inferencer.elements(inferencer.predict_images(small, *frames[0][1:]))
     np.testing.assert_array_equal(live(small).points, alone.points)  # of another size
+
+
+def test_a_live_map_is_in_the_frame_of_its_calibration(inferencer, tmp_path):
+    """The vehicle's frame is that of nuScenes: its LiDAR 0.94 m ahead, 1.84 m up."""
+    (sample,) = make_samples(tmp_path, 1)
+    images, intrinsics, cam_from_lidar = in_memory(sample, tmp_path)
+    in_lidar = inferencer.live(intrinsics, cam_from_lidar)(images)
+    ground_from_lidar = ground_from_frame(sample, "lidar")
+    np.testing.assert_array_equal(ground_from_lidar[:3, 3], [0.94, 0, 1.84])
+    lidar_from_ground = np.linalg.inv(ground_from_lidar)
+    cam_from_vehicle = {name: cam @ lidar_from_ground for name, cam in cam_from_lidar.items()}
+    found = inferencer.live(intrinsics, cam_from_vehicle, "vehicle")(images)
+    x, y = in_lidar.points.T
+    np.testing.assert_allclose(found.points, np.stack([y + 0.94, -x], 1), atol=1e-3)
+    vehicle = reframed(sample, "lidar", "ego")  # 0.31 m above the road, on the same axle
+    found = inferencer.live(*in_memory(vehicle, tmp_path)[1:], "ego")(images)
+    np.testing.assert_allclose(found.points, np.stack([y + 0.94, -x], 1), atol=1e-3)
 
 
 def test_an_absent_camera_in_memory_is_an_error_or_blank(inferencer, tmp_path):

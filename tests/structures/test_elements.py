@@ -31,6 +31,17 @@ def test_selected_elements_take_their_scores_and_gaussians_along():
     assert (len(none), none.points.shape, none.scales.shape) == (0, (0, 2), (0, 2))
 
 
+def test_moved_elements_turn_with_their_gaussians():
+    """A quarter turn to the left, then 10 m along x, 20 along y, 3 up."""
+    pose = np.array([[0.0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 3], [0, 0, 0, 1]])
+    elements = MapElements.from_polylines([LINE], [0], rotations=[[0.0, 1.0]])
+    moved = elements.moved(pose)
+    np.testing.assert_allclose(moved.points, [[9.0, 20.0], [7.0, 22.0]])
+    np.testing.assert_allclose(moved.rotations, [np.pi / 2, 1 + np.pi / 2])
+    high = MapElements.from_polylines([[[0.0, 1.0, 5.0]]], [0]).moved(pose)
+    np.testing.assert_allclose(high.points, [[9.0, 20.0, 8.0]])
+
+
 def test_z_is_kept_if_all_have_it():
     line_3d = [[0.0, 1.0, 5.0], [2.0, 3.0, 6.0]]
     elements = MapElements.from_polylines([line_3d], [0])

@@ -1,7 +1,7 @@
 """A drive: the maps of its frames, predicted or annotated, in the global frame's plane."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -78,25 +78,6 @@ class Drive:
         return shapely.Polygon(frame.to_global(corners))
 
 
-def to_global(elements: MapElements, sample: MapSample) -> MapElements:
-    """Move a sample's map to the global frame by the position and yaw of its pose.
-
-    Ground truth is cut out of maps in just this way, so that the two are inverse to each other;
-    roll and pitch would move a point 30 m away by centimetres. Heights are dropped.
-
-    Args:
-        elements: The map in the annotation frame.
-        sample: The sample.
-    """
-    frame = DriveFrame(sample, elements)
-    turned = elements.rotations
-    return replace(
-        elements,
-        points=frame.to_global(elements.points[:, :2]),
-        rotations=None if turned is None else turned + frame.yaw_rad,
-    )
-
-
 def read_drive(annotations: AnnotationFile, scene: str, maps: Mapping[str, MapElements]) -> Drive:
     """Gather the frames of a scene.
 
@@ -120,5 +101,7 @@ def read_drive(annotations: AnnotationFile, scene: str, maps: Mapping[str, MapEl
         raise ValueError(
             f"no sample of scene {scene!r} has results: give the results of {annotations.path}."
         )
-    frames = [DriveFrame(s, to_global(maps[s.token], s)) for s in samples]
+    frames = [
+        DriveFrame(s, maps[s.token].with_coordinates(2).moved(s.global_from_frame)) for s in samples
+    ]
     return Drive(scene, meta.classes, meta.x_range, meta.y_range, frames)

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsmap.datasets.memory import Cameras, bgr_by_name, sample_of_rig
-from gsmap.datasets.source import Source
+from gsmap.datasets.memory import VEHICLE, Cameras, bgr_by_name, source_in_memory
+from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.elements import MapElements
+from gsmap.structures.rigid import invert_rigid
 
 if TYPE_CHECKING:
     from mmdet3d.structures import Det3DDataSample
@@ -19,9 +20,19 @@ if TYPE_CHECKING:
 class LiveMap:
     """The map around a vehicle, frame by frame, from images in memory.
 
-    The calibration is fitted to the model once. The models of this project see each frame by
-    itself, so that nothing is kept from one to the next. Arguments are those of
-    ``MapInferencer.predict_images``; ``MapInferencer.live`` makes it.
+    ``MapInferencer.live`` makes it. The calibration is fitted to the model once, with the first
+    frame. The models of this project see each frame by itself: nothing is kept from one to the
+    next.
+
+    Args:
+        inferencer: The trained model.
+        intrinsics: By the cameras' names, or as a list: pinhole matrices, in pixels. each (3, 3)
+        cam_from_frame: In the same form: from the frame to the camera (x right, y down, z ahead),
+            in metres. each (4, 4)
+        frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), or an annotation
+            frame: ``lidar`` (x right, y ahead, at a roof LiDAR) or ``ego`` (x ahead, y left, on the
+            rear axle, 0.31 m above the road); the config's by default.
+        allow_missing_cameras: Whether cameras of the model may be absent.
     """
 
     def __init__(
@@ -41,40 +52,46 @@ class LiveMap:
         self._dataset: VectorizedMapDataset
 
     def __call__(self, images: Cameras) -> MapElements:
-        """Return the map elements in one frame's images; errors as in `predict`."""
-        return self._inferencer.elements(self.predict(images))
+        """Return the map elements of one frame, in the frame of the calibration, as `predict`."""
+        return self._inferencer.elements(self.predict(images)).moved(self._frame_from_models)
 
     def predict(self, images: Cameras) -> "Det3DDataSample":
         """Run the model on one frame.
 
         Args:
-            images: RGB, uint8, as the calibration names or lists the cameras. each (H, W, 3)
+            images: RGB, uint8, at about the size that the model was trained on. each (H, W, 3)
 
         Returns:
             The sample, with ``pred_instances_3d`` on the CPU in the frame of the config.
 
         Raises:
             TypeError: If an image is not uint8.
-            ValueError: As in ``MapInferencer.predict_images``.
+            ValueError: If an array has another shape, a matrix is none of its kind, the cameras of
+                the arguments differ, or they are not those of the model.
         """
         pixels = bgr_by_name(images)
         sizes = {name: image.shape for name, image in pixels.items()}
         if sizes != self._sizes:
-            self._dataset, self._sizes = self._open(pixels), sizes
+            self._open(pixels)
+            self._sizes = sizes
         self._dataset.images_in_memory = pixels
         allowed = self._allow_missing_cameras
         (found,) = self._inferencer.predict(self._dataset, allow_missing_cameras=allowed)
         return found
 
-    def _open(self, pixels: dict[str, np.ndarray]) -> "VectorizedMapDataset":
-        """Check the calibration, and return the data set of one sample that has it."""
-        sample = sample_of_rig(pixels, *self._rig, self._frame)
+    def _open(self, pixels: dict[str, np.ndarray]) -> None:
+        """Check the calibration, and make a data set of one sample that has it."""
+        source = source_in_memory(pixels, *self._rig, self._frame)
         foreign = set(pixels) - set(self._config.get("cameras") or pixels)
         if foreign and foreign != set(pixels):
             raise ValueError(
                 f"the model has the cameras {list(self._config.cameras)}, but not "
                 f"{sorted(foreign)}: name all cameras as it does, or none."
             )
-        dataset = self._inferencer.dataset(Source([sample], self._frame, None, has_poses=False))
+        self._dataset = dataset = self._inferencer.dataset(source)
         Path(dataset.ann_file).unlink()  # it is read, and a rig may be opened often
-        return dataset
+        ground_from_given = np.eye(4)
+        if self._frame != VEHICLE:
+            ground_from_given = ground_from_frame(source.samples[0], source.frame)
+        ground_from_models = ground_from_frame(dataset.sample(0), dataset.metainfo["frame"])
+        self._frame_from_models = invert_rigid(ground_from_given) @ ground_from_models

@@ -305,25 +305,9 @@ class MapInferencer:
     ) -> "Det3DDataSample":
         """Run the model on one frame that lies in memory; ``live`` is faster for many.
 
-        Each argument of cameras maps their names to arrays, or lists arrays: then a camera is taken
-        for the model's that looks most like it, as one of another name is.
-
-        Args:
-            images: RGB, uint8; scaled to the size that the model was trained at. each (H, W, 3)
-            intrinsics: Pinhole matrices, in pixels. each (3, 3)
-            cam_from_frame: From the annotation frame to the camera (x right, y down, z ahead), in
-                metres. each (4, 4)
-            frame: ``lidar`` (x right, y ahead, at a roof LiDAR) or ``ego`` (x ahead, y left, on the
-                ground below the rear axle); the config's by default.
-            allow_missing_cameras: Whether cameras of the model may be absent.
-
-        Returns:
-            The sample, with ``pred_instances_3d`` on the CPU in the frame of the config.
-
-        Raises:
-            TypeError: If an image is not uint8.
-            ValueError: If an array has another shape, a matrix is none of its kind, the cameras of
-                the arguments differ, or they are not those of the model.
+        Arguments, result and errors are those of ``LiveMap`` and its ``predict``. Each argument of
+        cameras maps their names to arrays, or lists arrays: then a camera is taken for the model's
+        that looks most like it, as one of another name is.
         """
         live = self.live(intrinsics, cam_from_frame, frame, allow_missing_cameras)
         return live.predict(images)
@@ -335,7 +319,7 @@ class MapInferencer:
         frame: str | None = None,
         allow_missing_cameras: bool = False,
     ) -> LiveMap:
-        """Return a function of each frame's images; arguments as in ``predict_images``."""
+        """Return a function from each frame's images to its map; arguments as in ``LiveMap``."""
         return LiveMap(self, intrinsics, cam_from_frame, frame, allow_missing_cameras)
 
     def elements(self, data_sample: "Det3DDataSample") -> MapElements:

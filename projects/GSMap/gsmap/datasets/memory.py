@@ -7,7 +7,9 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import check_samples
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapSample
+from gsmap.datasets.source import Source, sample_in_vehicle
 
+VEHICLE = "vehicle"  # frame: x ahead, y left, on the road below the rear axle
 Cameras = Mapping[str, np.ndarray] | Sequence[np.ndarray] | np.ndarray
 
 
@@ -24,26 +26,28 @@ def bgr_by_name(images: Cameras) -> dict[str, np.ndarray]:
     return {name: _bgr(name, image) for name, image in _by_name(images).items()}
 
 
-def sample_of_rig(
+def source_in_memory(
     images: Mapping[str, np.ndarray], intrinsics: Cameras, cam_from_frame: Cameras, frame: str
-) -> MapSample:
+) -> Source:
     """Make a sample of one frame.
 
     Args:
         images: From `bgr_by_name`.
         intrinsics: In the same form as those were, in pixels. each (3, 3)
         cam_from_frame: In the same form, in metres. each (4, 4)
-        frame: The annotation frame, ``lidar`` or ``ego``.
+        frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), or an annotation
+            frame.
 
     Raises:
         ValueError: If an array has another shape, a matrix is none of its kind, or the cameras of
             the arguments differ.
     """
     rig = {"intrinsics": _by_name(intrinsics), "cam_from_frame": _by_name(cam_from_frame)}
+    names = list(images)
     for what, values in rig.items():
-        if set(values) != set(images) or not images:
+        if set(values) != set(names) or not names:
             raise ValueError(
-                f"{what} must have the cameras of images, {list(images)}, got {list(values)}."
+                f"{what} must have the cameras of images, {names}, got {list(values)}."
             )
     cameras = [
         CameraRecord(
@@ -55,9 +59,12 @@ def sample_of_rig(
         )
         for name, image in images.items()
     ]
+    given = "ego" if frame == VEHICLE else frame
     sample = MapSample("in memory", "", "", 0, cameras, np.eye(4))
-    check_samples([sample], AnnotationMeta("memory", frame, "test"))
-    return sample
+    check_samples([sample], AnnotationMeta("memory", given, "test"))
+    if frame == VEHICLE:
+        sample = sample_in_vehicle("in memory", "", 0, cameras, None)
+    return Source([sample], given, None, has_poses=False)
 
 
 def _by_name(values: Cameras) -> dict[str, np.ndarray]:

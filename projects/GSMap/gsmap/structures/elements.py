@@ -113,6 +113,22 @@ class MapElements:
         points = self.points[:, :dim] if len(self.points) else np.empty((0, dim))
         return replace(self, points=np.ascontiguousarray(points))
 
+    def moved(self, transform: FloatArray) -> "MapElements":
+        """Return the elements in another level frame: moved by position and yaw of a pose.
+
+        Ground truth is cut out of maps in just this way, so that the two are inverse to each other;
+        roll and pitch would move a point 30 m away by centimetres.
+
+        Args:
+            transform: From the frame of the elements to the other one, in metres. (4, 4)
+        """
+        cos, sin = transform[:2, 0] / np.hypot(*transform[:2, 0])
+        turn = np.eye(self.points.shape[1])
+        turn[:2, :2] = [[cos, -sin], [sin, cos]]
+        points = self.points @ turn.T + transform[: len(turn), 3]
+        turned = None if self.rotations is None else self.rotations + np.arctan2(sin, cos)
+        return replace(self, points=points, rotations=turned)
+
     def select(self, index: IntArray | BoolArray) -> "MapElements":
         """Return some of the elements, by positions in their order (K,), or by a mask (N,)."""
         rows = np.flatnonzero(index) if index.dtype == np.bool_ else np.asarray(index)
