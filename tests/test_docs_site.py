@@ -72,3 +72,19 @@ def test_lines_are_short(page: Path):
     lines = enumerate(page.read_text(encoding="utf-8").splitlines(), start=1)
     long = [n for n, line in lines if len(line) >= 120 and not line.startswith("|")]
     assert long == [], f"{page}: lines of 120 characters or more"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPO)))
+def test_a_spread_of_figures_is_named(page: Path):
+    """A range (largest minus smallest) or a standard deviation; samples may be evenly spread."""
+    text = page.read_text(encoding="utf-8")
+    assert re.findall(r"(?<!evenly )\bspread\b", text) == []
+
+
+def test_mkdocs_names_pages_that_exist():
+    config = load_config(str(REPO / "mkdocs.yml"))
+    named = re.findall(r"[\w/]+\.md", str(config.nav) + str(config.not_in_nav))
+    outside = (REPO / "docs/site_hooks.py").read_text()
+    assert [
+        p for p in named if not (REPO / "docs" / p).exists() and f'"{p}": "' not in outside
+    ] == []

@@ -32,12 +32,14 @@ from gsmap.datasets.elements import elements_of_instances
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_name, write_text
 from gsmap.visualization.figure import save_figure
 from gsmap.visualization.plots import plot_maps
 from gsmap.visualization.style import MapStyle
 
 FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
+EXTRAS = {"rrd": ("rerun", "viz"), "mcap": ("foxglove", "viz"), "mp4": ("av", "viz")}
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -83,17 +85,31 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
+    """Raise an error, before anything is written, if a format lacks its package or an origin."""
+    for key in EXTRAS.keys() & set(args.formats):
+        import_extra(*EXTRAS[key])
+    origins = {name: origin_of(args, ann, name) for name in set(ann.column("map_name"))}
+    unknown = sorted(name for name, origin in origins.items() if origin is None)
+    if "osm" in args.formats and unknown:
+        raise ValueError(
+            f"Lanelet2 needs longitude and latitude, and the origin of map {unknown[0]!r} is not "
+            "known: give --origin LAT LON (any place will do; nodes keep local_x and local_y)."
+        )
+    if {"osm", "geojson"} & set(args.formats) and len(unknown) < len(origins):
+        import_extra("pyproj", "maps")
+
+
+def origin_of(args: argparse.Namespace, ann: AnnotationFile, map_name: str) -> MapOrigin | None:
+    return MapOrigin(*args.origin) if args.origin else known_origin(ann.meta, map_name)
+
+
 def write_map(
     stem: Path, args: argparse.Namespace, ann: AnnotationFile, drive: Drive, elements: MapElements
 ) -> list[str]:
     """Write a map in all formats; return the files."""
-    classes, name = drive.classes, drive.frames[0].sample.map_name
-    origin = MapOrigin(*args.origin) if args.origin else known_origin(ann.meta, name)
-    if "osm" in args.formats and origin is None:
-        raise ValueError(
-            f"Lanelet2 needs longitude and latitude, and the origin of map {name!r} is not known: "
-            "give --origin LAT LON (any place will do; nodes keep local_x and local_y)."
-        )
+    classes = drive.classes
+    origin = origin_of(args, ann, drive.frames[0].sample.map_name)
     style, root = MapStyle(classes), args.data_root or args.ann.parent
     colours = [style.colour(label) for label in range(len(classes))]
     replay = Replay(drive, elements, ann.meta.frame, colours, root)
@@ -146,6 +162,7 @@ def score(drives: list[Drive], merged: list[MapElements], ann: AnnotationFile, o
 def main(argv: list[str] | None = None) -> str:
     args = parse_args(argv)
     ann = AnnotationFile(args.ann)
+    check_formats(args, ann)
     results, _ = read_samples(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
     config = MergeConfig(
         gaussians=not args.no_gaussians,

@@ -32,7 +32,10 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--max-frames", type=int, default=200, help="largest number of frames")
     parser.add_argument("--score-thr", type=float, default=0.4, help="initial score of the slider")
     parser.add_argument(
-        "--image-width", type=int, default=240, help="width of thumbnails in pixels"
+        "--image-width",
+        type=int,
+        default=320,
+        help="largest width of images in pixels; of the camera ahead twice that",
     )
     parser.add_argument("--no-images", action="store_true", help="leave the camera images out")
     parser.add_argument(

@@ -53,7 +53,9 @@ def camera_drive(tmp_path_factory):
 
 def test_geojson_in_metres_holds_lines_and_polygons(tmp_path, true):
     write_geojson(tmp_path / "map.geojson", true, CLASSES, None)
-    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    written = json.loads((tmp_path / "map.geojson").read_text())
+    assert written["crs"] is None  # local: no program may take the metres for degrees
+    features = written["features"]
     assert [f["properties"]["class"] for f in features] == [CLASSES[k] for k in true.labels]
     for feature, line in zip(features, true.polylines, strict=True):
         shape = shapely.geometry.shape(feature["geometry"])
@@ -69,7 +71,9 @@ def test_geojson_in_metres_holds_lines_and_polygons(tmp_path, true):
 def test_geojson_in_degrees_comes_back_within_a_millimetre(tmp_path, true):
     pyproj = pytest.importorskip("pyproj", reason="pip install -e .[maps]")
     write_geojson(tmp_path / "map.geojson", true, CLASSES, ORIGIN)
-    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    written = json.loads((tmp_path / "map.geojson").read_text())
+    assert written["crs"]["properties"]["name"].endswith("CRS84")
+    features = written["features"]
     lon, lat = np.array(features[0]["geometry"]["coordinates"]).T
     azimuth, _, distance = pyproj.Geod(ellps="WGS84").inv(
         np.full(len(lon), ORIGIN.longitude_deg), np.full(len(lon), ORIGIN.latitude_deg), lon, lat

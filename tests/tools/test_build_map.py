@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from dataclasses import replace
 
 import cv2
@@ -61,6 +62,21 @@ def test_what_a_user_can_get_wrong_is_said(files, tmp_path, options, message):
     results, ann = files
     with pytest.raises(ValueError, match=message):
         main([str(results), "--ann", str(ann), "--out", str(tmp_path), *options])
+
+
+@pytest.mark.parametrize(
+    ("package", "options"),
+    [("rerun", ["geojson", "rrd"]), ("pyproj", ["geojson", "--origin", "48", "11"])],
+)
+def test_a_missing_package_is_said_before_anything_is_written(
+    files, tmp_path, monkeypatch, package, options
+):
+    monkeypatch.setitem(sys.modules, package, None)
+    results, ann = files
+    words = [str(results), "--ann", str(ann), "--out", str(tmp_path / "maps")]
+    with pytest.raises(RuntimeError, match=f"{package} is not installed: `pip install"):
+        main([*words, "--formats", *options])
+    assert not (tmp_path / "maps").exists()
 
 
 def test_samples_without_poses_have_no_map_but_a_film(files, tmp_path):

@@ -86,10 +86,21 @@ def test_panels_follow_what_the_sample_has(tmp_path):
     assert drawn(truth=False)[0] == full[1::2]
     panels, notes = drawn(truth=False, score_thr=0.99)
     assert panels == full[1::2]
-    assert "no score reaches 0.99 (highest 0.9)" in notes
+    assert "no score reaches 0.99\n(highest 0.9)" in notes
     assert drawn(predicted=False)[0] == full[:1]
     visualizer.panels = ("rasters",)
     assert drawn()[0] == ["Rendered masks"]
+
+
+def test_a_note_stays_in_its_panel(tmp_path):
+    visualizer = make_visualizer("note")
+    figure = visualizer.draw_sample(make_sample(tmp_path, cameras=0), score_thr=0.999)
+    panels = [ax for ax in figure.axes for text in ax.texts if "no score" in text.get_text()]
+    assert len(panels) == 3  # beside the ground truth
+    for ax in panels:
+        box, note = ax.get_window_extent(), ax.texts[-1].get_window_extent()
+        assert box.x0 < note.x0 < note.x1 < box.x1
+        assert box.y0 < note.y0 < note.y1 < box.y1
 
 
 def labels(figure):

@@ -77,8 +77,26 @@ def test_values_that_are_not_finite_are_left_out(tmp_path):
     assert read_run(path, "x").series("loss")[0].tolist() == [2]
 
 
-def test_smoothed_is_a_running_mean():
-    np.testing.assert_allclose(smoothed(np.array([2.0, 4, 6, 8]), 2), [2, 3, 5, 7])
+def test_smoothed_is_a_centred_mean_that_starts_and_ends_as_the_values():
+    np.testing.assert_allclose(smoothed(np.array([2.0, 4, 6, 8])), [2, 4, 6, 8])  # too few
+    values = np.zeros(40)
+    values[[0, 20, 39]] = 5, 15, 3
+    found = smoothed(values)  # over five
+    assert found[0] == 5
+    assert found[-1] == 3
+    np.testing.assert_allclose(found[[1, 17, 18, 20, 22, 23]], [5 / 3, 0, 3, 3, 3, 0])
+    np.testing.assert_allclose(smoothed(np.arange(100.0)), np.arange(100.0))  # it does not lag
+
+
+def test_legends_stand_beside_the_curves_and_no_place_is_empty(run):
+    figure = plot_runs([read_run(run)])
+    figure_to_rgb(figure)
+    total, parts, metrics = figure.axes
+    for ax in figure.axes:
+        assert ax.get_legend().get_window_extent().x0 >= ax.get_window_extent().x1
+    assert metrics.get_position().x0 == pytest.approx(total.get_position().x0)
+    assert metrics.get_position().x1 == pytest.approx(parts.get_position().x1, abs=0.1)
+    assert max(metrics.get_ylim()) > 0.75  # the best point is whole
 
 
 def test_unfinished_last_line_is_dropped_but_a_broken_one_is_named(tmp_path):

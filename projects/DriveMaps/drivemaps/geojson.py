@@ -9,6 +9,9 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.utils.files import write_text
 
+# longitude, latitude; programs read the member of the first GeoJSON, RFC 7946 has no other system
+_CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
+
 
 def write_geojson(
     path: str | Path, elements: MapElements, classes: Sequence[str], origin: MapOrigin | None
@@ -19,8 +22,8 @@ def write_geojson(
         path: File to write.
         elements: The map in the global frame.
         classes: Names of the classes.
-        origin: Where the global frame lies; without one, coordinates are metres of that frame,
-            which programs other than this one take for degrees unless they are told.
+        origin: Where the global frame lies; without one, coordinates are metres of that frame, and
+            the file says that it has no coordinate reference system (``"crs": null``).
 
     Raises:
         RuntimeError: If an origin is given and ``pyproj`` is missing.
@@ -42,9 +45,10 @@ def write_geojson(
                 },
             }
         )
-    collection = {"type": "FeatureCollection", "features": features}
+    collection = {"type": "FeatureCollection", "crs": _CRS84 if origin else None}
     if origin is None:
         collection["frame"] = "global frame of the poses, metres"
+    collection["features"] = features
     write_text(path, json.dumps(collection, indent=1) + "\n")
 
 

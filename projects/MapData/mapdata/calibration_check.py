@@ -24,6 +24,7 @@ _OFF_CENTRE = 0.2  # of the image's width or height
 _FIELDS_OF_VIEW_DEG = 15.0, 150.0
 _SIDES = {"left": 90.0, "right": -90.0, "front": 0.0, "back": 180.0, "rear": 180.0}
 _REACH_M = 30.0
+_WIDTH_PX = 3200  # six cameras of about 750 px, large enough to see an error of a few centimetres
 _LINES = ("ahead", "left", "every_5_m", "behind", "right", "cameras")
 
 
@@ -160,6 +161,7 @@ def calibration_figure(sample: MapSample, frame: str, data_root: Path) -> Figure
         style,
         _elements(lines),
         f"ground plane of {sample.token}",
+        width_px=_WIDTH_PX,
     )
 
 

@@ -101,6 +101,8 @@ def open_frame(browser, index):
 
 def test_figures_and_strangers_texts_are_shown_as_text_and_nothing_is_fetched(opened):
     assert text(opened, "h1") == f"case val: good and {STRANGE}"
+    assert len(shown(opened, "table")) == 1  # the means; the others are folded away
+    opened.find_element(By.CSS_SELECTOR, "#figures summary").click()
     assert len(shown(opened, "table")) == 4
     assert len(shown(opened, "#curves figure")) == 6
     assert len(shown(opened, ".card svg")) == FRAMES
@@ -224,15 +226,69 @@ def test_a_phone_shows_everything_in_its_width(opened, frame):
 
 
 def test_small_maps_are_drawn_when_they_come_near(browser, page):
-    browser.get(page.as_uri())  # the tables and curves above the frames are higher than the window
-    drawn = browser.execute_async_script(
-        "requestAnimationFrame(() => setTimeout("
-        "() => arguments[0](document.querySelectorAll('.card svg').length), 100))"
-    )
-    assert drawn == 0
-    choose(browser, "shown", "1")
-    until_drawn(browser)
-    assert len(browser.find_elements(By.CSS_SELECTOR, ".card[href='#frame-0'] .found")) == 1
+    data = report_data(page.with_name("case.arrow"), {}, ReportOptions(image_width=0))
+    write_page(page.with_name("many.html"), data | {"frames": 60 * data["frames"]})
+    browser.get(page.with_name("many.html").as_uri())
+    drawn = "return document.querySelectorAll('.card svg').length"
+    WebDriverWait(browser, 20).until(lambda found: found.execute_script(drawn))
+    assert browser.execute_script(drawn) < 30 * FRAMES
+    browser.execute_script("document.querySelector('.card:last-child').scrollIntoView()")
+    last = (By.CSS_SELECTOR, ".card:last-child svg")
+    WebDriverWait(browser, 20).until(lambda found: found.find_elements(*last))
+
+
+def test_the_first_screen_has_the_best_typical_and_worst_frame(opened):
+    """Frames 0 to 2 find the divider: F1 4 of 5; the others 2 of 6 (below 1 false, 2 missed)."""
+    picks = opened.find_elements(By.CSS_SELECTOR, ".pick")
+    said = [
+        (e.find_element(By.TAG_NAME, "strong").text, e.get_attribute("href")[-1]) for e in picks
+    ]
+    assert said == [("Best", "0"), ("Typical", "3"), ("Worst", "5")]
+    assert [e.text for e in shown(opened, ".pick .figure")] == ["F1 80 %", "F1 40 %", "F1 40 %"]
+    assert len(shown(opened, ".pick .bev")) == len(shown(opened, ".pick .camera")) == 3
+    opened.execute_script("scrollTo(0, 0)")
+    assert max(e.rect["y"] + e.rect["height"] for e in picks) < 600  # no scrolling
+    picks[2].click()
+    until_position(opened, 6)
+
+
+def test_filters_of_class_scene_and_token(opened):
+    choose(opened, "class", "0")  # dividers: 3 hits of 6 frames, none false above 0.4
+    assert text(opened, "#totals").startswith("good: 3 hits, 3 false, 3 missed, F1 50 %; ")
+    assert len(shown(opened, ".card[href='#frame-0'] .line")) == 2
+    choose(opened, "class", "-1")
+    opened.find_element(By.ID, "token").send_keys("T4")
+    assert [e.get_attribute("href")[-1] for e in shown(opened, ".card")] == ["4"]
+    assert "(1 of the 6 frames on this page" in text(opened, "#totals")
+    assert len(shown(opened, ".pick")) == 1
+    opened.find_element(By.ID, "token").send_keys("x")
+    assert not shown(opened, ".card, .pick")
+    scenes = [
+        e.get_attribute("value") for e in opened.find_elements(By.CSS_SELECTOR, "#scene option")
+    ]
+    assert scenes == ["", STRANGE]
+
+
+def test_a_picture_is_enlarged_by_a_click_and_zoomed(opened):
+    open_frame(opened, 1)
+    opened.find_element(By.CSS_SELECTOR, "#maps svg").click()
+    assert text(opened, "#zoom-title") == "good, bird's-eye view"
+    large = opened.find_element(By.CSS_SELECTOR, "#zoomed svg")
+    whole = large.get_dom_attribute("viewBox")
+    for button, factor in (("closer", 0.7), ("farther", 1.0)):
+        opened.find_element(By.ID, button).click()
+        box = [float(v) for v in large.get_dom_attribute("viewBox").split()]
+        assert box[2:] == pytest.approx([30 * factor, 60 * factor])
+    wheel = "arguments[0].dispatchEvent(new WheelEvent('wheel', {deltaY: -1, bubbles: true}))"
+    opened.execute_script(wheel, large)
+    assert float(large.get_dom_attribute("viewBox").split()[2]) == pytest.approx(30 * 0.85)
+    opened.find_element(By.ID, "whole").click()
+    assert large.get_dom_attribute("viewBox") == whole
+    press(opened, Keys.ESCAPE)
+    assert not shown(opened, "#zoom")
+    assert text(opened, "#position") == f"2 of {FRAMES}"  # the frame is still open
+    opened.find_element(By.CSS_SELECTOR, "#cameras svg").click()
+    assert text(opened, "#zoom-title") == "camera front"
 
 
 def test_dark_mode_has_a_dark_page_and_light_text(opened):
@@ -250,7 +306,7 @@ def test_dark_mode_has_a_dark_page_and_light_text(opened):
 
 def test_ground_truth_alone_has_no_controls_of_predictions(browser, page):
     browser.get(page.with_name("truth.html").as_uri())
-    assert not shown(browser, "#figures, #score, #order, #totals")
+    assert not shown(browser, "#figures, #picks, #score, #order, #totals")
     assert [e.text for e in shown(browser, "#legend li")] == [
         "divider",
         "pedestrian crossing",

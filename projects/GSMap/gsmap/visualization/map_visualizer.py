@@ -231,7 +231,7 @@ class MapVisualizer(Visualizer):
         threshold = self.score_thr if score_thr is None else score_thr
         found, note = predicted_elements(data_sample), "no elements"
         if found:
-            note = f"no score reaches {threshold:g} (highest {found.confidence.max():.2g})"
+            note = f"no score reaches {threshold:g}\n(highest {found.confidence.max():.2g})"
             found = found.select(found.confidence >= threshold)
         return compose_figure(
             self.cameras(meta, images),

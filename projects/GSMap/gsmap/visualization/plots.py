@@ -1,6 +1,7 @@
 """Plots: panels in one style, precision over recall, maps of drives."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,9 +25,14 @@ def panel_grid(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
 
 
 def finish_panel(
-    ax: Axes, title: str, x_label: str = "", y_label: str = "", colour: str = "black"
+    ax: Axes,
+    title: str,
+    x_label: str = "",
+    y_label: str = "",
+    colour: str = "black",
+    legend: Mapping[str, Any] | None = None,
 ) -> None:
-    """Set what all plots share."""
+    """Set what all plots share; ``legend`` says where its legend stands."""
     ax.set_title(title, fontsize=9, loc="left", color=colour)
     ax.set_xlabel(x_label, fontsize=8)
     ax.set_ylabel(y_label, fontsize=8)
@@ -35,7 +41,10 @@ def finish_panel(
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=7.5, frameon=False, handlelength=1.4, borderaxespad=0.2)
+        ax.legend(
+            **{"fontsize": 7.5, "frameon": False, "handlelength": 1.4, "borderaxespad": 0.2},
+            **(legend or {}),
+        )
 
 
 def _finish_shares(ax: Axes, *options: str) -> None:

@@ -94,20 +94,19 @@ def read_run(path: str | Path, name: str | None = None) -> RunLog:
     return RunLog(name or path.resolve().name, *ordered)
 
 
-def smoothed(values: np.ndarray, window: int) -> np.ndarray:
-    """Return the running mean over the last ``window`` values, fewer at the start. (n,)"""
-    total = np.cumsum(np.concatenate([[0.0], values]))
-    upper = np.arange(1, len(values) + 1)
-    lower = np.maximum(upper - window, 0)
-    return (total[upper] - total[lower]) / (upper - lower)
+def smoothed(values: np.ndarray) -> np.ndarray:
+    """Return the centred mean over a tenth of the values; it starts and ends as they do. (n,)"""
+    total, at = np.cumsum(np.concatenate([[0.0], values])), np.arange(len(values))
+    half = np.minimum(np.minimum(at, at[::-1]), len(values) // 20)
+    return (total[at + half + 1] - total[at - half]) / (2 * half + 1)
 
 
-def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, window: int, title: str) -> None:
+def _draw_training(ax: Axes, runs: Sequence[RunLog], key: str, title: str) -> None:
     """Draw a figure of training, faintly as it was logged and smoothed, one colour per run."""
     for run, colour in zip(runs, RUN_COLOURS * len(runs), strict=False):
         steps, values = run.series(key)
         ax.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
-        ax.plot(steps, smoothed(values, window), color=colour, linewidth=1.6, label=run.name)
+        ax.plot(steps, smoothed(values), color=colour, linewidth=1.6, label=run.name)
     _finish(ax, title)
 
 
@@ -117,7 +116,7 @@ def _draw_parts_of_loss(ax: Axes, run: RunLog) -> None:
     last = [key for key in keys if not re.match(r"d\d+\.", key)]
     for name, colour in zip(last, RUN_COLOURS * 8, strict=False):
         steps, values = run.series(name)
-        ax.plot(steps, smoothed(values, 10), color=colour, linewidth=1.4, label=name)
+        ax.plot(steps, smoothed(values), color=colour, linewidth=1.4, label=name)
     _finish(ax, f"its parts, last decoder layer ({run.name})")
 
 
@@ -130,12 +129,15 @@ def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
             series = run.series(name, validation=True)
             ax.plot(*series, style, color=colour, marker=".", label=label)
     by_epoch = any("epoch" in record for run in runs for record in run.train)
-    ax.set_ylim(0)
-    finish_panel(ax, "validation", "epoch" if by_epoch else "iteration")
+    _finish(ax, "validation", "epoch" if by_epoch else "iteration")
+    ax.xaxis.get_major_locator().set_params(integer=True)
 
 
-def _finish(ax: Axes, title: str) -> None:
-    """Finish a panel; its y axis is logarithmic if the values span a decade."""
+def _finish(ax: Axes, title: str, x_label: str = "iteration") -> None:
+    """Finish a panel; its y axis is logarithmic if the values span a decade.
+
+    The legend stands beside the panel, off the curves.
+    """
     values = np.concatenate([np.empty(0), *(np.asarray(line.get_ydata()) for line in ax.lines)])
     if len(values) and values.min() > 0 and values.max() > 10 * values.min():
         ax.set_yscale("log")
@@ -144,7 +146,16 @@ def _finish(ax: Axes, title: str) -> None:
         ax.yaxis.set_minor_formatter(NullFormatter())
     elif len(values) and values.min() >= 0:
         ax.set_ylim(0, 1.08 * max(values.max(), 1e-9))
-    finish_panel(ax, title, "iteration")
+    finish_panel(ax, title, x_label, legend={"loc": "upper left", "bbox_to_anchor": (1, 1)})
+
+
+def _fill_row(axes: np.ndarray, panels: int) -> None:
+    """Remove the panels that are not used; the last one that is takes the rest of its row."""
+    for panel in axes.ravel()[panels:]:
+        panel.remove()
+    last, columns = axes.ravel()[panels - 1], axes.shape[1]
+    row, column = divmod(panels - 1, columns)
+    last.set_subplotspec(last.get_gridspec()[row, column:])
 
 
 def plot_runs(runs: Sequence[RunLog]) -> Figure:
@@ -157,11 +168,11 @@ def plot_runs(runs: Sequence[RunLog]) -> Figure:
         raise ValueError("plot_runs needs at least one run that logged a loss.")
     validated = any(run.val for run in runs)
     figure, axes = panel_grid(2 if validated else 1, 2)
-    _draw_training(axes[0, 0], runs, "loss", 10, "training loss")
+    _draw_training(axes[0, 0], runs, "loss", "training loss")
     _draw_parts_of_loss(axes[0, 1], runs[-1])
     if validated:
         _draw_metrics(axes[1, 0], runs)
-        axes[1, 1].remove()
+        _fill_row(axes, 3)
     return figure
 
 
@@ -178,9 +189,8 @@ def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
     columns = min(len(keys), 2)
     figure, axes = panel_grid(-(-len(keys) // columns), columns)
     for panel, key in zip(axes.ravel(), keys, strict=False):
-        _draw_training(panel, runs, key, 5, key)
-    for panel in axes.ravel()[len(keys) :]:
-        panel.remove()
+        _draw_training(panel, runs, key, key)
+    _fill_row(axes, len(keys))
     return figure
 
 

@@ -130,7 +130,7 @@ def cameras_of(
         sample: The sample.
         view: Its ground and orientation.
         data_root: Folder that image paths start from.
-        width_px: Width of the thumbnails; 0 leaves the images out.
+        width_px: Largest width of the images, twice that of the camera ahead; 0 leaves them out.
 
     Raises:
         ValueError: If an image cannot be read.
@@ -143,7 +143,9 @@ def cameras_of(
             title, size = camera_title(camera.name), [camera.width, camera.height]
             entry: dict[str, Any] = {"title": title, "size": size}
             entry["matrix"] = [float(f"{value:.6g}") for value in matrix.ravel()]
-            entry["src"] = thumbnail(data_root / camera.path, width_px) if width_px else ""
+            ahead = not rows and camera is row[len(row) // 2]
+            largest_px = width_px * (2 if ahead else 1)
+            entry["src"] = thumbnail(data_root / camera.path, largest_px) if width_px else ""
             entries.append(entry)
         rows.append(entries)
     return rows

@@ -7,8 +7,9 @@ const NEAR_M = 0.3; // a camera's lines are cut at this depth
 const MASK_PX_PER_M = 4;
 const data = JSON.parse(document.getElementById("data").textContent);
 const pair = data.results.length === 2;
-const state = { score: data.score, shown: 0, frame: null, order: [] };
+const state = { score: data.score, shown: 0, frame: null, order: [], class: -1, scene: "", token: "" };
 const cards = [];
+const picks = []; // the drawings on the first screen
 let opened = []; // the drawings of the frame that is open
 
 function byId(id) {
@@ -65,10 +66,14 @@ function curvePanel(panel) {
 
 // ---- what a score threshold makes of a frame ----
 
+function chosen(item) {
+  return state.class < 0 || item.c === state.class;
+}
+
 function counts(frame, r) {
-  const kept = frame.found[r].filter((item) => item.s >= state.score);
+  const kept = frame.found[r].filter((item) => item.s >= state.score && chosen(item));
   const hits = kept.filter((item) => item.hit >= 0).length;
-  return { hits, wrong: kept.length - hits, missed: frame.truth.length - hits };
+  return { hits, wrong: kept.length - hits, missed: frame.truth.filter(chosen).length - hits };
 }
 
 function f1({ hits, wrong, missed }) {
@@ -81,6 +86,7 @@ function sentence(count) {
 }
 
 function fate(item, r, reached) {
+  if (!chosen(item)) return "below";
   if (item.s === undefined) return r === null ? "truth" : reached.has(item) ? "truth got" : "truth missed";
   return item.s < state.score ? "below" : item.hit >= 0 ? "hit" : "false";
 }
@@ -207,7 +213,9 @@ function ground(labelled) {
       if (labelled) drawn.push(make("svg:text", { class: "tick", x: left + 0.3 * size, y: -at - 0.3 * size, "font-size": size }, text));
     }
   }
+  const glass = -front + 0.3 * (front - rear); // the windscreen: the car has a front
   drawn.push(make("svg:rect", { class: "car", x: -width / 2, y: -front, width, height: front - rear, rx: 0.5 }));
+  drawn.push(make("svg:path", { class: "glass", d: `M${-0.36 * width} ${glass}H${0.36 * width}L${0.28 * width} ${glass + 0.7}H${-0.28 * width}Z` }));
   return drawn;
 }
 
@@ -276,8 +284,34 @@ function shownResult() {
   return data.results.length ? state.shown : null;
 }
 
+// The best, the typical (median) and the worst of the frames that the filters leave.
+function drawPicks() {
+  picks.length = 0;
+  const order = data.results.length ? visible() : [];
+  order.sort((a, b) => f1(counts(data.frames[b], state.shown)) - f1(counts(data.frames[a], state.shown)) || a - b);
+  const places = { Best: 0, Typical: order.length >> 1, Worst: order.length - 1 };
+  byId("picks").replaceChildren(...Object.entries(places).slice(0, order.length).map(([name, at]) => {
+    const frame = data.frames[order[at]];
+    const map = birdsEye(frame, shownResult(), false);
+    const count = counts(frame, state.shown);
+    const said = make("div", {}, make("strong", {}, name),
+      make("span", { class: "figure" }, `F1 ${f1(count).toFixed(0)}\u00a0%`),
+      make("span", { class: "quiet" }, `${count.hits} hits, ${count.wrong} false, ${count.missed} missed. ${frame.title}`));
+    picks.push(map);
+    const front = (frame.cameras[0] || [])[(frame.cameras[0] || []).length >> 1];
+    if (front) {
+      const camera = cameraView(front, imagesOf(order[at])[frame.cameras[0].length >> 1], frame, shownResult());
+      picks.push(camera);
+      said.prepend(camera.view);
+    }
+    return make("a", { class: "pick", href: `#frame-${order[at]}`, "aria-label": `${name} frame: ${frame.title}` }, map.view, said);
+  }));
+  picks.forEach(restyle);
+}
+
 function refresh() {
   byId("score-value").textContent = state.score.toFixed(2);
+  picks.forEach(restyle);
   for (const card of cards) {
     restyle(card);
     const values = data.results.map((_, r) => f1(counts(card.frame, r)).toFixed(0));
@@ -286,12 +320,20 @@ function refresh() {
   opened.forEach(restyle);
   byId("totals").textContent = data.results.map((name, r) => {
     const sum = { hits: 0, wrong: 0, missed: 0 };
-    for (const frame of data.frames) {
-      const count = counts(frame, r);
+    for (const i of state.order) {
+      const count = counts(data.frames[i], r);
       for (const key of Object.keys(sum)) sum[key] += count[key];
     }
     return `${name}: ${sentence(sum)}`;
-  }).join("; ") + ` (the ${data.frames.length} frames on this page, within ${data.match_m.toFixed(1)} m).`;
+  }).join("; ") + ` (${state.order.length} of the ${data.frames.length} frames on this page, within ${data.match_m.toFixed(1)} m).`;
+}
+
+function visible() {
+  const words = state.token.trim().toLowerCase();
+  return data.frames.map((_, i) => i).filter((i) => {
+    const { scene, token, title } = data.frames[i];
+    return (!state.scene || scene === state.scene) && `${token} ${title}`.toLowerCase().includes(words);
+  });
 }
 
 function sortCards() {
@@ -305,8 +347,9 @@ function sortCards() {
     loss: (frame) => value(frame, 1) - value(frame, 0),
   }[how];
   const keys = data.frames.map(key);
-  state.order = data.frames.map((_, i) => i).sort((a, b) => keys[a] - keys[b] || a - b);
+  state.order = visible().sort((a, b) => keys[a] - keys[b] || a - b);
   byId("grid").replaceChildren(...state.order.map((i) => cards[i].link));
+  drawPicks();
 }
 
 // Small maps are drawn when they come near the window.
@@ -333,18 +376,32 @@ function drawCards() {
   sortCards();
 }
 
+function imagesOf(index) {
+  return JSON.parse(document.getElementsByClassName("images")[index].textContent);
+}
+
+// The camera ahead is large, the others stand in a row below it; a portrait stays in its row.
+function cameraRows(rows) {
+  const all = rows.flat();
+  const middle = rows.length ? rows[0].length >> 1 : 0;
+  const wide = all.length > 2 && all[middle].size[0] > all[middle].size[1];
+  if (!wide) return rows.map((row) => ["row", row]);
+  return [["row", [all[middle]]], ["row strip", all.filter((_, i) => i !== middle)]];
+}
+
 function drawFrame() {
   const frame = data.frames[state.frame];
   document.title = `${frame.title}, ${data.title}`;
   byId("frame-title").textContent = frame.title;
   byId("frame-token").textContent = [frame.place, `sample ${frame.token}`].filter(Boolean).join(", ");
+  if (!state.order.includes(state.frame)) state.order = data.frames.map((_, i) => i);
   byId("position").textContent = `${state.order.indexOf(state.frame) + 1} of ${state.order.length}`;
   opened = [];
-  const images = JSON.parse(document.getElementsByClassName("images")[state.frame].textContent);
-  const rows = frame.cameras.map((row) => {
-    const line = make("div", { class: "row" });
+  const images = new Map(frame.cameras.flat().map((camera, i) => [camera, imagesOf(state.frame)[i]]));
+  const rows = cameraRows(frame.cameras).map(([kind, row]) => {
+    const line = make("div", { class: kind });
     for (const camera of row) {
-      const drawing = cameraView(camera, images.shift(), frame, shownResult());
+      const drawing = cameraView(camera, images.get(camera), frame, shownResult());
       opened.push(drawing);
       line.append(make("figure", {}, drawing.view, make("figcaption", {}, camera.title)));
     }
@@ -361,6 +418,57 @@ function drawFrame() {
   });
   byId("maps").replaceChildren(...maps);
   opened.forEach(restyle);
+}
+
+// ---- one picture enlarged ----
+
+function enlarge(view) {
+  const copy = view.cloneNode(true);
+  byId("zoom-title").textContent = view.getAttribute("aria-label");
+  byId("zoomed").replaceChildren(copy);
+  byId("zoom").showModal();
+}
+
+function zoomBy(factor, at) {
+  const box = byId("zoomed").firstChild.viewBox.baseVal;
+  const [x, y] = at || [box.x + box.width / 2, box.y + box.height / 2];
+  byId("zoomed").firstChild.setAttribute("viewBox",
+    `${x - (x - box.x) * factor} ${y - (y - box.y) * factor} ${box.width * factor} ${box.height * factor}`);
+}
+
+function under(event) { // the place of the picture under the pointer
+  const view = byId("zoomed").firstChild;
+  const { x, y } = new DOMPoint(event.clientX, event.clientY).matrixTransform(view.getScreenCTM().inverse());
+  return [x, y];
+}
+
+function startZoom() {
+  for (const id of ["cameras", "maps"]) {
+    byId(id).addEventListener("click", (event) => {
+      const view = event.target.closest("svg");
+      if (view) enlarge(view);
+    });
+  }
+  const whole = () => {
+    const [first] = opened.filter((drawing) => drawing.view.getAttribute("aria-label") === byId("zoom-title").textContent);
+    byId("zoomed").firstChild.setAttribute("viewBox", first.view.getAttribute("viewBox"));
+  };
+  byId("closer").addEventListener("click", () => zoomBy(0.7));
+  byId("farther").addEventListener("click", () => zoomBy(1 / 0.7));
+  byId("whole").addEventListener("click", whole);
+  byId("close").addEventListener("click", () => byId("zoom").close());
+  byId("zoomed").addEventListener("wheel", (event) => {
+    event.preventDefault();
+    zoomBy(event.deltaY < 0 ? 0.85 : 1 / 0.85, under(event));
+  }, { passive: false });
+  let held = null;
+  byId("zoomed").addEventListener("pointerdown", (event) => { held = under(event); });
+  byId("zoomed").addEventListener("pointermove", (event) => {
+    if (!held || !event.buttons) return;
+    const [x, y] = under(event);
+    const box = byId("zoomed").firstChild.viewBox.baseVal;
+    byId("zoomed").firstChild.setAttribute("viewBox", `${box.x + held[0] - x} ${box.y + held[1] - y} ${box.width} ${box.height}`);
+  });
 }
 
 function drawLegend() {
@@ -386,6 +494,7 @@ function route() {
   byId("frame").hidden = byId("panels").hidden = !open;
   byId("figures").hidden = open || !data.tables.length;
   byId("grid").hidden = byId("frames").hidden = open;
+  if (byId("zoom").open) byId("zoom").close();
   if (open) {
     drawFrame();
     if (before === null) scrollTo(0, 0);
@@ -404,7 +513,7 @@ function step(by) {
 
 function onKey(event) {
   const { key, target } = event;
-  if (event.altKey || event.ctrlKey || event.metaKey || target.matches("select, input[type=range], .scroll")) return;
+  if (event.altKey || event.ctrlKey || event.metaKey || byId("zoom").open || target.matches("select, input, .scroll")) return;
   const by = { ArrowLeft: -1, ArrowRight: 1 }[key];
   if (state.frame !== null) {
     if (by) step(by);
@@ -431,12 +540,24 @@ function start() {
   const [left, right, bottom, top] = data.extent;
   document.documentElement.style.setProperty("--aspect", (right - left) / (top - bottom));
   byId("curve-note").textContent = `AP in percent at each threshold${pair ? `: ${data.results.join(" (solid) | ")} (dashed)` : ""}.`;
-  byId("tables").append(...data.tables.map(table));
+  const [means, ...tables] = data.tables.map(table);
+  if (means) byId("means").append(means);
+  byId("tables").append(...tables);
   byId("curves").append(...data.curves.map(curvePanel));
   byId("shown").append(...data.results.map((name, r) => make("option", { value: r }, name)));
   const orders = { time: "as recorded", worst: "worst first", best: "best first" };
   if (pair) Object.assign(orders, { gain: `${data.results[0]} ahead first`, loss: `${data.results[1]} ahead first` });
   byId("order").append(...Object.entries(orders).map(([value, text]) => make("option", { value }, text)));
+  byId("class").append(...data.classes.map((of, c) => make("option", { value: c }, of.title)));
+  byId("scene").append(...[...new Set(data.frames.map((frame) => frame.scene))].map((name) => make("option", { value: name }, name)));
+  for (const [id, kind, read] of [["class", "change", Number], ["scene", "change", String], ["token", "input", String]]) {
+    byId(id).addEventListener(kind, (event) => {
+      state[id] = read(event.target.value);
+      sortCards();
+      refresh();
+    });
+  }
+  startZoom();
   byId("score").min = data.min_score;
   byId("score").value = state.score;
   byId("score").addEventListener("input", (event) => { state.score = Number(event.target.value); refresh(); });

@@ -32,7 +32,8 @@ class ReportOptions:
         data_root: Folder that image paths start from; the annotation file's by default.
         max_frames: Largest number of frames.
         score_thr: Where the slider of the score starts, in [0, 1].
-        image_width: Width of the cameras' thumbnails in pixels; 0 leaves them out.
+        image_width: Largest width of the images in pixels, twice that of the camera ahead, which is
+            drawn large; 0 leaves them out.
         allow_mismatch: Samples without results count as without predictions, results without
             ground truth are left out; otherwise both are errors.
 
@@ -43,7 +44,7 @@ class ReportOptions:
     data_root: Path | None = None
     max_frames: int = 200
     score_thr: float = 0.4
-    image_width: int = 240
+    image_width: int = 320
     allow_mismatch: bool = False
 
     def __post_init__(self) -> None:
@@ -90,6 +91,7 @@ def report_data(
             {
                 "token": sample.token,
                 "title": f"{sample.scene}, {seconds[index]:.1f} s",
+                "scene": sample.scene,
                 "place": sample.map_name,
                 "truth": truth_of(sample, view),
                 "found": [found_of(sample.token, result, view) for result in scored],

@@ -1,0 +1,176 @@
+"""Every Python block of every page runs, in the order of its page.
+
+A reader puts own files and values in the place of some words: ``CONFIG``, ``ROOT/...``, a variable
+that the page describes. ``STAND_INS`` and ``GIVEN`` say what stands for them; a block that needs
+anything else fails. A block that only assigns is a config: its types are looked up.
+"""
+
+import ast
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import mmengine._strategy  # noqa: F401 - and strategies
+import numpy as np
+import pytest
+import shapely
+from mmdet3d import registry as of_mmdet3d
+from mmengine import registry
+from report_case import write_case
+
+import gsmap.registered  # noqa: F401 - the configs name its classes
+
+REPO = Path(__file__).resolve().parents[1]
+PAGES = [REPO / "README.md", *sorted([*(REPO / "docs").rglob("*.md"), *REPO.glob("*/*/README.md")])]
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+WITH_BLOCKS = [page for page in dict.fromkeys(PAGES) if BLOCK.search(page.read_text())]
+OWN_TESTS = {
+    "docs/library.md": "test_docs_library.py",
+    "docs/add_a_method.md": "test_docs_method.py",
+}
+STAND_INS = {
+    "'CONFIG', 'CHECKPOINT', device='cuda'": "'gsmap_r18_minicity', device='cpu'",
+    "open_input('INPUT')": "open_input('val.arrow')",
+    "num_workers=2": "num_workers=0",  # no fork out of a test
+}
+REGISTRIES = [
+    each
+    for each in (*vars(of_mmdet3d).values(), *vars(registry).values())
+    if isinstance(each, registry.Registry)
+]
+MADE = {
+    "docs/inference.md": "sample.png",
+    "docs/visualization.md": "report.html",
+    "docs/deployment.md": "results.json",
+}
+
+
+def line(**more: Any) -> SimpleNamespace:
+    return SimpleNamespace(lines=[np.array([[0.0, -20], [0, 20]])], labels=[0], **more)
+
+
+def samples(folder: Path, minicity: Path) -> dict[str, Any]:
+    """What a reader of docs/visualization.md has: a data set, one of its samples, results."""
+    from gsmap import MapInferencer
+
+    path, results = write_case(folder)
+    shutil.copy(path, folder / "val.arrow")
+    shutil.copy(results["good"], folder / "gsmap.json")
+    inferencer = MapInferencer("gsmap_r18_minicity", device="cpu")
+    dataset = inferencer.dataset(minicity)
+    return {"dataset": dataset, "data_sample": dataset[0]["data_samples"]}
+
+
+def with_exported_model(folder: Path, minicity: Path) -> dict[str, Any]:
+    """Export a model to model.onnx, and give the cameras of a sample."""
+    from gsmap.apis.export import export_onnx
+    from gsmap.apis.map_inferencer import MapInferencer
+
+    inferencer = MapInferencer("gsmap_r18_minicity", device="cpu")
+    cameras = inferencer.cfg.test_dataloader.dataset.cameras
+    export_onnx(inferencer.model, folder / "model.onnx", cameras, (96, 160))
+    cv2.imwrite(str(folder / "image.jpg"), np.full((225, 400, 3), 90, np.uint8))
+    intrinsics = np.array([[320.0, 0, 200], [0, 320, 112], [0, 0, 1]])
+    return {"my_cameras": [("image.jpg", intrinsics, np.eye(4))] * 6}
+
+
+def town(folder: Path, minicity: Path) -> dict[str, Any]:
+    """What a reader of the renderer's page has: a street of 100 m and a camera on it."""
+    left, right = np.array([[0.0, 4], [100, 4]]), np.array([[0.0, -4], [100, -4]])
+    ahead = np.eye(4)
+    ahead[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    ahead[:3, 3] = ahead[:3, :3] @ [-20.0, 0, -1.5]
+    across = np.array([[40.0, -4], [40, 4]])
+    return {
+        "drivable_polygon": shapely.box(0, -5, 100, 5),
+        "left_boundary": left,
+        "lane_boundary": (left + right) / 2,
+        "crossing_edge_1": across,
+        "crossing_edge_2": across + np.array([3, 0]),
+        "heights": np.zeros((200, 400)),
+        "intrinsics": np.array([[50.0, 0, 32], [0, 50, 18], [0, 0, 1]]),
+        "cam_from_world": ahead,
+        **{"x0": -20, "y0": -30, "xmin": 0, "ymin": -20, "xmax": 90, "ymax": 20},
+        **{"seed": 0, "width": 64, "height": 36},
+    }
+
+
+def towns_in(name: str) -> Callable:
+    """Give the annotation file of generated towns a name."""
+
+    def put(folder: Path, minicity: Path) -> dict[str, Any]:
+        (folder / name).parent.mkdir(parents=True)
+        shutil.copy(minicity, folder / name)
+        (folder / "work_dirs").mkdir()
+        (folder / "models").symlink_to(REPO / "models")
+        return {}
+
+    return put
+
+
+def towns(folder: Path, minicity: Path) -> dict[str, Any]:
+    folder.rmdir()
+    shutil.copytree(minicity.parent, folder)
+    (folder / minicity.name).rename(folder / "val.arrow")
+    return {}
+
+
+GIVEN: Mapping[str, Callable[[Path, Path], dict[str, Any]]] = {
+    "docs/data.md": towns_in("data/minicity/gsmap_minicity_val.arrow"),
+    "docs/benchmarks/methods.md": towns_in("ROOT/gsmap_minicity_train.arrow"),
+    "docs/evaluation.md": lambda *_: {"frames": [("t0", line(scores=[0.9]), line())]},
+    "docs/inference.md": towns,
+    "docs/visualization.md": samples,
+    "docs/deployment.md": with_exported_model,
+    "docs/tutorial.md": with_exported_model,
+    "projects/MiniCity/README.md": town,
+}
+
+
+def types_of(value: Any) -> Iterator[str]:
+    """Yield every ``type`` in a config."""
+    if isinstance(value, dict):
+        yield from [value["type"]] if isinstance(value.get("type"), str) else []
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for each in value:
+            yield from types_of(each)
+
+
+def check_types(values: Mapping[str, Any]) -> None:
+    """Raise an error if a config names a type that no registry has."""
+    for name in types_of(list(values.values())):
+        known = any(name in each.module_dict for each in REGISTRIES)
+        assert known or "." in name, f"no registry has a type {name!r}"
+
+
+@pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda page: str(page.relative_to(REPO)))
+def test_the_blocks_of_a_page_run(page: Path, tmp_path, monkeypatch, request):
+    name = str(page.relative_to(REPO))
+    if name in OWN_TESTS:
+        assert (REPO / "tests" / OWN_TESTS[name]).exists()
+        return
+    scope: dict[str, Any] = {"__name__": "page"}
+    if name in GIVEN:
+        minicity = request.getfixturevalue("minicity_annotations")["val"]
+        scope |= GIVEN[name](tmp_path, minicity)
+    monkeypatch.chdir(tmp_path)
+    for block in BLOCK.findall(page.read_text()):
+        for words, stand_in in STAND_INS.items():
+            block = block.replace(words, stand_in)
+        statements = ast.parse(block).body
+        before = dict(scope)
+        exec(block, scope)
+        if all(isinstance(each, ast.Assign) for each in statements):
+            new = scope.keys() - before.keys() - {"__builtins__"}
+            check_types({key: scope[key] for key in new})
+    assert (tmp_path / MADE.get(name, "")).exists()
+
+
+def test_a_stale_type_is_found():
+    with pytest.raises(AssertionError, match="MapVizualizer"):
+        check_types({"visualizer": {"vis_backends": [{"type": "MapVizualizer"}]}})
