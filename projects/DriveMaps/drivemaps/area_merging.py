@@ -7,8 +7,7 @@ import numpy as np
 import shapely
 
 from drivemaps.config import MergeConfig
-from drivemaps.drive import Drive
-from drivemaps.drive_map import MIN_AREA_M2
+from drivemaps.drive import MIN_AREA_M2, Drive
 from drivemaps.truth import components, polygons_of
 from gsmap.structures.elements import FloatArray, IntArray
 

@@ -1,6 +1,6 @@
 """A drive: the maps of its frames, predicted or annotated, in the global frame's plane."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +9,10 @@ import shapely
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+
+MIN_LENGTH_M = 2.0
+MIN_AREA_M2 = 1.0
+SIMPLIFY_M = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +109,22 @@ def read_drive(annotations: AnnotationFile, scene: str, maps: Mapping[str, MapEl
         DriveFrame(s, maps[s.token].with_coordinates(2).moved(s.global_from_frame)) for s in samples
     ]
     return Drive(scene, meta.classes, meta.x_range, meta.y_range, frames)
+
+
+def drive_map(found: Iterable[tuple[int, FloatArray, float]], scored: bool = True) -> MapElements:
+    """Order elements, and drop the vertices that a line does not need.
+
+    Args:
+        found: Label, vertices (n, 2) and score of each element.
+        scored: Whether the map keeps the scores.
+
+    Returns:
+        The elements by class, then by falling score. (N,)
+    """
+    rows = [
+        (label, shapely.get_coordinates(shapely.LineString(line[:, :2]).simplify(SIMPLIFY_M)), s)
+        for label, line, s in found
+    ]
+    rows.sort(key=lambda row: (row[0], -round(row[2], 9), *np.round(row[1][0], 6)))
+    labels, lines, scores = ([row[i] for row in rows] for i in range(3))
+    return MapElements.from_polylines(lines, labels, scores if scored else None)

@@ -4,9 +4,11 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import shapely
+
 from drivemaps.geodetic import MapOrigin
 from gsmap.structures.classes import AREA_CLASSES
-from gsmap.structures.elements import FloatArray, MapElements
+from gsmap.structures.elements import MapElements
 from gsmap.utils.files import write_text
 
 # longitude, latitude; programs read the member of the first GeoJSON, RFC 7946 has no other system
@@ -35,13 +37,14 @@ def write_geojson(
         digits = 4 if origin is None else 9  # a tenth of a millimetre
         points = (line if origin is None else origin.lon_lat(line)).round(digits).tolist()
         area = name in AREA_CLASSES and points[0] == points[-1]
+        clockwise = area and not shapely.is_ccw(shapely.LineString(line))
         features.append(
             {
                 "type": "Feature",
                 "properties": {"class": name, "score": round(float(score), 4)},
                 "geometry": {
                     "type": "Polygon" if area else "LineString",
-                    "coordinates": [points[:: _winding(line)]] if area else points,
+                    "coordinates": [points[:: -1 if clockwise else 1]] if area else points,
                 },
             }
         )
@@ -50,9 +53,3 @@ def write_geojson(
         collection["frame"] = "global frame of the poses, metres"
     collection["features"] = features
     write_text(path, json.dumps(collection, indent=1) + "\n")
-
-
-def _winding(ring: FloatArray) -> int:
-    """Return the step that runs through a ring anticlockwise, as outer rings of GeoJSON do."""
-    x, y = ring.T
-    return 1 if (x[:-1] * y[1:] - x[1:] * y[:-1]).sum() > 0 else -1

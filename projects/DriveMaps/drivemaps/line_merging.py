@@ -12,8 +12,7 @@ import shapely
 from scipy.ndimage import median_filter
 
 from drivemaps.config import MergeConfig
-from drivemaps.drive import Drive
-from drivemaps.drive_map import MIN_LENGTH_M
+from drivemaps.drive import MIN_LENGTH_M, Drive
 from drivemaps.stitching import JOIN_M, stitch
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 from gsmap.structures.polylines import arc_lengths

@@ -28,10 +28,7 @@ def write_mcap(path: str | Path, replay: Replay) -> None:
     """
     foxglove = import_extra("foxglove", "viz")
     log = _Log(foxglove.Context(), replay.colours)
-    with (
-        atomic_write(path, "wb") as file,
-        foxglove.open_mcap(file, context=log.context),
-    ):
+    with atomic_write(path, "wb") as file, foxglove.open_mcap(file, context=log.context):
         for moment in replay.moments():
             sample, time_ns = moment.frame.sample, moment.frame.sample.timestamp_ns
             log.transform(_GLOBAL, _FRAME, sample.global_from_frame, time_ns)

@@ -8,8 +8,7 @@ import shapely
 
 from drivemaps.area_merging import merge_areas
 from drivemaps.config import MergeConfig
-from drivemaps.drive import Drive
-from drivemaps.drive_map import drive_map
+from drivemaps.drive import Drive, drive_map
 from drivemaps.line_merging import merge_lines
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import MapElements

@@ -41,10 +41,8 @@ def write_rerun(path: str | Path, replay: Replay) -> None:
             for camera in sample.cameras:
                 _log_camera(recording, rr, camera, replay.data_root)
             _log_predictions(recording, rr, moment, replay.colours)
-            lines, rgb = (
-                [line for _, line in moment.seen],
-                _rgb([k for k, _ in moment.seen], replay.colours),
-            )
+            rgb = _rgb([label for label, _ in moment.seen], replay.colours)
+            lines = [line for _, line in moment.seen]
             recording.log(_MAP, rr.LineStrips3D(lines, colors=rgb, radii=0.1))
             file.write(stream.read(flush=True))
     recording.disconnect()

@@ -8,8 +8,7 @@ import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from drivemaps.drive import Drive
-from drivemaps.drive_map import MIN_AREA_M2, MIN_LENGTH_M, drive_map
+from drivemaps.drive import MIN_AREA_M2, MIN_LENGTH_M, Drive, drive_map
 from drivemaps.stitching import stitch
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsmap.datasets.source import Source, annotated
-from mapdata.argoverse2.recordings import logs_in, read_logs
+from mapdata.argoverse2.log import logs_in
+from mapdata.argoverse2.samples import read_logs
 from mapdata.bags import is_bag, read_bag
 from mapdata.folders.images import NAMES, read_image_folder
 from mapdata.infos.recordings import read_info_file
-from mapdata.nuscenes.recordings import read_nuscenes, versions_in
+from mapdata.nuscenes.tables import read_nuscenes, versions_in
 
 _FILES = ("*.arrow", "*.pkl")
 KINDS = (

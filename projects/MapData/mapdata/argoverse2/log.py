@@ -137,6 +137,12 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
     return [path for path in found if not logs or path.name.startswith(tuple(logs))]
 
 
+def logs_in(folder: Path) -> list[Path]:
+    """Return the logs at or up to three folders below a folder (``sensor/val/LOG``)."""
+    found = (sorted(folder.glob("*/" * depth + POSES)) for depth in range(4))
+    return [path.parent for path in next(filter(None, found), [])]
+
+
 def _timestamps(folder: Path, suffix: str) -> np.ndarray:
     """Return the times in the names of a folder's files, ascending; none if there is no folder."""
     if not folder.is_dir():

@@ -92,6 +92,37 @@ def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -
     return result
 
 
+def read_logs(
+    log_dirs: list[Path], root: Path, rate_hz: float | None = 2.0
+) -> tuple[list[MapSample], Counter[str]]:
+    """Read the samples of logs, in the frame ``ego``.
+
+    Args:
+        log_dirs: The logs' folders.
+        root: Folder that paths are relative to.
+        rate_hz: Samples per second; None takes every sweep's or image's time.
+
+    Returns:
+        The samples, and how many were left out, by reason.
+
+    Raises:
+        ValueError: If no log has a sample; the message says why.
+    """
+    options = Argoverse2Options(root, rate_hz=rate_hz)
+    samples, left_out = [], Counter[str]()
+    for log_dir in log_dirs:
+        try:
+            result = read_log(log_dir, options, with_map=False)
+        except (OSError, ValueError) as error:
+            left_out[f"{log_dir.name}: {error}"] += 1
+            continue
+        samples += result.samples
+        left_out.update({f"{log_dir.name}: {why}": n for why, n in result.left_out.items()})
+    if not samples:
+        raise ValueError(f"no sample can be read from {root}: {'; '.join(left_out) or 'no log'}.")
+    return samples, left_out
+
+
 def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
     """Return when samples are, in nanoseconds, ascending; ValueError if sensor data lack. (n,)"""
     if options.pose_stride is not None:

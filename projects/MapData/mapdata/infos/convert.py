@@ -31,6 +31,7 @@ from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard, add_shard_options, digest
 from mapdata.command_line import add_range_options
 from mapdata.infos.plain_pickle import load_plain_pickle
+from mapdata.infos.recordings import find_file
 from mapdata.nuscenes.can_bus import pose_signals
 from mapdata.nuscenes.map import NuScenesLocalMap, expansion, open_layers
 from mapdata.nuscenes.tables import pose_of
@@ -42,10 +43,9 @@ _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some cen
 
 def _relative(path: str, root: Path) -> str:
     """Return a path of an info file relative to the data root, wherever it was made."""
+    if (found := find_file(path, root)) is not None:
+        return found.as_posix()
     parts = Path(path.replace("\\", "/")).parts
-    for start in range(len(parts)):
-        if (root / Path(*parts[start:])).is_file() and parts[start] != "/":
-            return Path(*parts[start:]).as_posix()
     for anchor in ("samples", "sweeps", "train", "val", "test"):
         if anchor in parts:
             first = len(parts) - 1 - parts[::-1].index(anchor)

@@ -65,18 +65,23 @@ def _matrix(values: Any, size: int, what: str) -> np.ndarray:
     return matrix
 
 
+def find_file(name: str, root: Path) -> Path | None:
+    """Return the longest end of a path that is a file below ``root``, relative to it, or None."""
+    parts = [part for part in Path(name.replace("\\", "/")).parts if part != "/"]
+    ends = (Path(*parts[start:]) for start in range(len(parts)))
+    return next((end for end in ends if (root / end).is_file()), None)
+
+
 def _locate(name: str, folder: str, root: Path, what: str) -> Path:
     """Find a file, as named or in nuScenes' folders; the result is relative to ``root``."""
-    places = [Path(name), Path("samples") / folder / Path(name).name]
-    for place in places:
-        if not place.is_absolute() and (root / place).is_file():
-            return place
-    if Path(name).is_absolute() and Path(name).is_file() and root in Path(name).parents:
-        return Path(name).relative_to(root)
-    tried = " or ".join(str(root / place) for place in places)
-    raise FileNotFoundError(
-        f"{what}: no file {tried}; give the folder that the paths start from with --data-root."
-    )
+    usual = Path("samples", folder, Path(name).name)
+    found = find_file(name, root) or find_file(str(usual), root)
+    if found is None:
+        raise FileNotFoundError(
+            f"{what}: no file {root / name} or {root / usual}; give the folder that the paths "
+            "start from with --data-root."
+        )
+    return found
 
 
 def _camera(name: str, info: Mapping[str, Any], root: Path, where: str) -> CameraRecord:
