@@ -107,7 +107,7 @@ class LayerLog:
 
     def __init__(self, encoder: HeightQueryEncoder) -> None:
         self.values: list[dict[str, Tensor]] = []
-        self._hooks = [encoder.register_forward_hook(lambda *_: None)]
+        self._hooks: list[Any] = []
         for layer in encoder.layers:
             attention = layer.cross_attn
             self._hooks += [

@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 import torch
-from mmengine.registry import init_default_scope
 from torch import Tensor, nn
 
 from gsmap.checkpoints.key_map import MGMAPNET

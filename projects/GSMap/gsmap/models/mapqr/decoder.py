@@ -5,14 +5,11 @@ from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
-from mmengine.model import xavier_init
 from torch import Tensor, nn
 
 from gsmap.models.maptr.attention import BEVDeformableAttention
 from gsmap.models.maptr.decoder import Decoded, MapDecoder, MapDecoderLayer
 from gsmap.models.maptr.layers import mlp
-
-_TEMPERATURE = 10000.0
 
 
 def sine_code(points: Tensor, channels: int) -> Tensor:
@@ -21,8 +18,8 @@ def sine_code(points: Tensor, channels: int) -> Tensor:
     Each half holds sine and cosine in turn, of 2 pi v / 10000^(2 i / half). (..., 2) -> (..., C)
     """
     half = channels // 2
-    steps = torch.arange(0, half, 2, device=points.device) / half
-    phases = 2 * math.pi * points.flip(-1)[..., None] / _TEMPERATURE**steps  # (..., 2, C / 4)
+    steps = 10000.0 ** (torch.arange(0, half, 2, device=points.device) / half)
+    phases = 2 * math.pi * points.flip(-1)[..., None] / steps  # (..., 2, C / 4)
     return torch.stack([phases.sin(), phases.cos()], -1).flatten(-3)
 
 
@@ -107,11 +104,7 @@ class MapQRDecoderLayer(MapDecoderLayer):
         )
         self.mask_groups = mask_groups
         self.position_proj = nn.Linear(embed_dims, embed_dims)
-
-    def init_weights(self) -> None:
-        """Initialise as released: the code of a point starts without bias."""
-        super().init_weights()
-        xavier_init(self.position_proj, distribution="uniform")
+        nn.init.zeros_(self.position_proj.bias)
 
     def forward(
         self,

@@ -104,18 +104,12 @@ class HeightQueryEncoder(BEVQueryEncoder):
 
     def __init__(self, cross_attn: dict[str, Any] | None = None, **kwargs: Any) -> None:
         super().__init__({"type": HeightKernelAttention, **(cross_attn or {})}, **kwargs)
-        attention = self.layers[0].cross_attn
-        if not isinstance(attention, HeightKernelAttention):
+        kind = type(next(iter(self.layers)).cross_attn)
+        if not issubclass(kind, HeightKernelAttention):
             raise TypeError(
-                f"HeightQueryEncoder needs HeightKernelAttention, got {type(attention).__name__}: "
-                "set bev_encoder.cross_attn.type, or take BEVQueryEncoder."
+                f"HeightQueryEncoder needs HeightKernelAttention, got {kind.__name__}: set "
+                "bev_encoder.cross_attn.type, or take BEVQueryEncoder."
             )
-
-    def init_weights(self) -> None:
-        """Initialise as the base class, with pillars that start evenly."""
-        super().init_weights()
-        for layer in self.layers:
-            constant_init(layer.cross_attn.height_offsets, 0.0)
 
     def project(  # type: ignore[override]
         self, img_from_frame: Tensor, img_shape: tuple[int, int]

@@ -27,14 +27,7 @@ from gsmap.models.maptr.pairs import (
     SamplePredictions,
     SampleTruth,
 )
-from gsmap.models.maptr.parts import (
-    PARTS,
-    AuxHead,
-    by_name,
-    check_classes,
-    class_of,
-    refuse_twins,
-)
+from gsmap.models.maptr.parts import PARTS, AuxHead, by_name, check_classes, class_of, refuse_twins
 from gsmap.models.maptr.references import PointReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32

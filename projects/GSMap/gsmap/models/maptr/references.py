@@ -68,22 +68,14 @@ class PointReference(nn.Module):
         self.grid, self.coords = grid, coords
         self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
         self.points_per_state = points_per_state
-        self.initial = self.starting_network(embed_dims, coords)
-        self.branches = nn.ModuleList(
-            self.moving_network(embed_dims, coords) for _ in range(num_layers)
-        )
+        entries = points_per_state * coords
+        self.initial: nn.Module = nn.Linear(embed_dims, entries)
+        hidden = [embed_dims] * 2
+        if points_per_state > 1:
+            self.initial = mlp(embed_dims, embed_dims, entries)
+            hidden = [2 * embed_dims] * 3
+        self.branches = nn.ModuleList(mlp(embed_dims, *hidden, entries) for _ in range(num_layers))
         self.metainfo: dict[str, float] = {}  # of all predictions
-
-    def starting_network(self, embed_dims: int, entries: int) -> nn.Module:
-        """Return what says the first entries of all points of a query."""
-        if self.points_per_state == 1:
-            return nn.Linear(embed_dims, entries)
-        return mlp(embed_dims, embed_dims, self.points_per_state * entries)
-
-    def moving_network(self, embed_dims: int, entries: int) -> nn.Sequential:
-        """Return what changes entries of all points of a state."""
-        hidden = [embed_dims] * 2 if self.points_per_state == 1 else [2 * embed_dims] * 3
-        return mlp(embed_dims, *hidden, self.points_per_state * entries)
 
     def by_point(self, entries: Tensor) -> Tensor:
         """Sort entries of states by point, at least float32. (..., Q, n * D) -> (..., Q * n, D)"""
