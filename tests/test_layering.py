@@ -48,9 +48,17 @@ MODELS = {
     "mapvr": {"maptr", "encoders"},
     "gemap": {"maptr", "encoders"},
     "mgmapnet": {"maptr", "encoders", "maptrv2"},  # its mask heads are MapTRv2's
+    "mapqr": {"maptr", "encoders"},
     "gsmap": {"maptr", "encoders"},
 }
-METHODS = ("maptrv2", "mapvr", "gemap", "mgmapnet", "gsmap")  # what others are built on stays
+METHODS = (
+    "maptrv2",
+    "mapvr",
+    "gemap",
+    "mgmapnet",
+    "mapqr",
+    "gsmap",
+)  # what others are built on stays
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 
 

@@ -48,6 +48,18 @@ DEPTH = {  # LSS of MapTRv2
     "model.bev_encoder.z_range": (-10.0, 10.0),
     "model.bev_encoder.depth_range": (1.0, 35.0, 0.5),
 }
+MAPQR = {  # GKT-h
+    "model.bev_encoder.cross_attn": {
+        "type": "HeightKernelAttention",
+        "num_heads": 8,
+        "kernel_size": (2, 4),
+    },
+    "model.bev_encoder.z_range": (-2.0, 2.0),
+    "model.bev_encoder.bev_pixel_m": 0.3,
+    "model.bev_encoder.num_layers": 3,
+    "model.bev_encoder.layer_cfg": {"num_heads": 8, "ffn_dims": 512, "dropout": 0.1},
+    "model.map_head.coder.max_num": 50,
+}
 GEMAP = {**SCHEDULE, "optim_wrapper.optimizer.weight_decay": 0.03}
 MGMAPNET = {**SCHEDULE, "train_dataloader.batch_size": 2}
 CONFIGS: dict[str, dict[str, Any]] = {
@@ -79,6 +91,20 @@ CONFIGS: dict[str, dict[str, Any]] = {
         **DEPTH,
         "optim_wrapper.optimizer.lr": 4e-4,
         "train_cfg.max_epochs": 110,
+    },
+    "mapqr/mapqr_r50_24e.py": {**SCHEDULE, **NUSCENES, **MAPQR, "train_cfg.val_interval": 4},
+    "mapqr/mapqr_r50_110e.py": {**SCHEDULE, **MAPQR, "train_cfg.max_epochs": 110},
+    "mapqr/mapqr_r50_masked_24e.py": {"model.map_head.decoder.layer.mask_groups": True},
+    "mapqr/mapqr_r50_av2_6e.py": {
+        **SCHEDULE,
+        **MAPQR,
+        "grid.x_range": (-30.0, 30.0),
+        "grid.y_range": (-15.0, 15.0),
+        "model.bev_encoder.z_range": (-5.0, 3.0),
+        "model.bev_encoder.num_cams": 7,
+        "param_scheduler.0.end": 200,
+        "train_cfg.max_epochs": 6,
+        "train_cfg.val_interval": 1,
     },
     f"{GSMAP}gsmap_maptr_r50_24e.py": {**SCHEDULE, **NUSCENES, **CAMERAS},
     f"{GSMAP}gsmap_maptr_r50_110e.py": {**SCHEDULE, "train_cfg.max_epochs": 110},
@@ -114,6 +140,11 @@ HEADS: dict[str, dict[str, Any]] = {
         "losses": {"pts": 5.0, "dir": 0.005, "mean_loc": 5.0, "ins_seg": 3.0},
         "costs": [2.0, 5.0],
         "aux": {"seg": 3.0, "pv_seg": 2.0, "depth": 3.0},
+    },
+    "mapqr/mapqr_r50_24e.py": {
+        **MAPTR,
+        "queries": [100, 600],
+        "aux": {"seg": 1.0, "pv_seg": 2.0},
     },
     f"{GSMAP}gsmap_maptr_r50_24e.py": {
         "queries": [50],
@@ -170,7 +201,22 @@ def test_a_head_has_the_published_queries_and_weights(name: str):
     assert (head.num_points, head.embed_dims, len(head.decoder.layers)) == (20, 256, 6)
 
 
-@pytest.mark.parametrize("name", ["maptrv2/maptrv2_r50_24e.py", "mgmapnet/mgmapnet_r50_110e.py"])
+def test_mapqr_scatters_and_masks_as_published():
+    head = head_of("mapqr/mapqr_r50_24e.py")
+    layer = head.decoder.layers[0]
+    assert not layer.mask_groups
+    assert (layer.cross_attn.num_heads, layer.cross_attn.num_points) == (8, 4)
+    gather = [part.out_features for part in layer.cross_attn.output_proj if hasattr(part, "bias")]
+    assert gather == [2560, 256, 256]
+    assert (layer.ffn.feedforward_channels, layer.cross_attn.dropout.p) == (512, 0.1)
+    masks = head.aux_heads
+    assert (masks["seg"].pos_weight, masks["pv_seg"].pos_weight) == (4.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["maptrv2/maptrv2_r50_24e.py", "mgmapnet/mgmapnet_r50_110e.py", "mapqr/mapqr_r50_24e.py"],
+)
 def test_each_element_is_matched_six_times_by_the_further_queries(name: str):
     first, further = head_of(name).query_groups
     assert (first.repeats, further.repeats, further.weight) == (1, 6, 1.0)

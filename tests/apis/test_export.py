@@ -51,6 +51,7 @@ CASES = {
     "MapVR": ("configs/mapvr/mapvr_r18_minicity.py", {}),
     "GeMap": ("configs/gemap/gemap_r18_minicity.py", {}),
     "MGMapNet": ("configs/mgmapnet/mgmapnet_r18_minicity.py", {}),
+    "MapQR": ("configs/mapqr/mapqr_r18_minicity.py", {}),
     "GSMap, heights": (
         GSMAP,
         {"model.map_head.reference": {"coords": 3, "z_range": (-5.0, 3.0)}},

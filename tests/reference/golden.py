@@ -3,7 +3,7 @@
 import importlib.util
 import json
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,9 +19,10 @@ from torch import Tensor
 from gsmap import registered  # noqa: F401
 
 NUM_CAMS = 6
+OWN_RECIPES = ("mapqr", "mgmapnet")  # methods whose weights have another scale
 
 
-@dataclass
+@dataclass(eq=False)
 class Golden:
     """Reference data of one variant.
 
@@ -66,10 +67,10 @@ class Golden:
         """The recipe of inputs: ``images(h, w, cameras, seed)`` and others."""
         return self._module("inputs_recipe")
 
-    @cached_property
-    def mgmapnet(self) -> ModuleType:
-        """The recipe of MGMapNet's weights and inputs: ``tensor``, ``normal``, ``uniform``."""
-        return self._module("mgmapnet_recipe")
+    @cache  # noqa: B019 - a few per run
+    def recipe(self, method: str) -> ModuleType:
+        """Return a method's own recipe of weights and inputs: ``tensor``, ``normal``, ``mask``."""
+        return self._module(f"{method}_recipe")
 
     @cached_property
     def cameras(self) -> dict[str, Any]:
@@ -96,7 +97,8 @@ class Golden:
 
     def upstream_state(self, name: str) -> dict[str, Tensor]:
         """Return the upstream state that the recipe makes for a state list."""
-        recipe = self.mgmapnet if name.startswith("mgmapnet") else self.weights
+        method = name.split("_")[0]
+        recipe = self.recipe(method) if method in OWN_RECIPES else self.weights
         arrays = recipe.state(self.state_shapes(name), self.seed)
         return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}
 

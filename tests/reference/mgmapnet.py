@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 import torch
-from mmengine.registry import init_default_scope
 from torch import Tensor, nn
 
 from gsmap.checkpoints.key_map import MGMAPNET
@@ -13,6 +12,7 @@ from gsmap.models.mgmapnet.attention import Granularities, MultiGranularityAtten
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
 from reference.golden import Golden
 from reference.maptr import state_rows
+from reference.parts import GRAD_L2, GoldenParts
 from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 
@@ -21,30 +21,13 @@ STATE = "mgmapnet_state.json"
 B, N, P, C = 2, 12, 20, 256
 BEV = (50, 26)
 TAGS = {"first": 0, "later": 2}  # the layers whose weights the module's golden values have
-GRAD_L2, GRAD_NORM, GRAD_DOT = 1e-2, 2e-3, 1e-2
 
 
-class GoldenParts:
-    """Our modules with the recipe's weights, and the recipe's inputs in our layout."""
+class MGMapNetParts(GoldenParts):
+    """MGMapNet's modules and inputs."""
 
     def __init__(self, golden: Golden) -> None:
-        init_default_scope("mmdet3d")
-        self.golden, self.recipe = golden, golden.mgmapnet
-
-    def load(self, module: nn.Module, prefix: str) -> nn.Module:
-        """Fill a module that lies at ``prefix`` of our model, without dropout."""
-        state = {}
-        for key, value in module.state_dict().items():
-            upstream = MGMAPNET.to_upstream(prefix + key)
-            state[key] = torch.from_numpy(
-                self.recipe.tensor(upstream, value.shape, self.golden.seed)
-            )
-        module.load_state_dict(state)
-        return module.eval()
-
-    def normal(self, name: str, shape: tuple[int, ...], **settings: float) -> Tensor:
-        """Return a normal array of the recipe."""
-        return torch.from_numpy(self.recipe.normal(name, shape, self.golden.seed, **settings))
+        super().__init__(golden, "mgmapnet", MGMAPNET)
 
     def decoder(self) -> MGMapNetDecoder:
         """Return the pyramid and the first layers."""
@@ -75,34 +58,6 @@ class GoldenParts:
         points = self.normal("mgm_point_pre", (B, N, P, C))
         return Granularities(query, points, self.normal("mgm_point_pe_pre", (B, N, P, C)))
 
-    def gradient_rows(
-        self, name: str, tag: str, data: Mapping[str, np.ndarray], gradients: Mapping[str, Tensor]
-    ) -> Iterator[Row]:
-        """Compare the norm of each parameter's gradient, and its product with a noise."""
-        keys = [str(key) for key in data["grad_keys"]]
-        yield Row(name, f"{tag}parameters without gradient", len(set(keys) - set(gradients)), 0)
-        norms, dots = [], []
-        for key in keys:
-            gradient = gradients[key].double().numpy()
-            noise = self.recipe.in_rng(f"gdot:{key}", self.golden.seed)
-            norms.append(np.linalg.norm(gradient))
-            dots.append((gradient * noise.standard_normal(gradient.shape)).sum())
-        # A bias of all keys moves no attention: its gradient is zero, and noise is in the file.
-        floor = np.maximum(data["grad_l2"], 1e-6 * data["grad_l2"].max())
-        off = largest_difference(norms / floor, data["grad_l2"] / floor)
-        yield Row(name, f"{tag}gradient norms (relative)", off, GRAD_NORM)
-        off = largest_difference(dots, data["grad_dot"]) / np.abs(data["grad_dot"]).max()
-        yield Row(name, f"{tag}gradient products (of the largest)", off, GRAD_DOT)
-
-
-def gradients_of(module: nn.Module, prefix: str, upstream_prefix: str = "") -> dict[str, Tensor]:
-    """Return gradients by upstream's key, without its prefix."""
-    return {
-        MGMAPNET.to_upstream(prefix + key).removeprefix(upstream_prefix): parameter.grad
-        for key, parameter in module.named_parameters()
-        if parameter.grad is not None
-    }
-
 
 @check(STATE)
 def check_state(golden: Golden, name: str) -> Iterator[Row]:
@@ -117,7 +72,7 @@ def check_state(golden: Golden, name: str) -> Iterator[Row]:
 @check("mgmapnet_patchmerge_{variant}.npz")
 def check_pyramid(golden: Golden, name: str) -> Iterator[Row]:
     """Compare the halved BEV features and the gradient."""
-    data, parts = golden.read_arrays(name), GoldenParts(golden)
+    data, parts = golden.read_arrays(name), MGMapNetParts(golden)
     pyramid = parts.decoder().bev_pyramid
     cells = parts.normal("mgm_pm_x", (B, BEV[0] * BEV[1], C)).requires_grad_()
     out = pyramid(cells.transpose(1, 2).unflatten(2, BEV))[1]
@@ -130,7 +85,7 @@ def check_pyramid(golden: Golden, name: str) -> Iterator[Row]:
     yield Row(name, "gradient of the features (relative)", off, GRAD_L2)
     prefix = "map_head.decoder.bev_pyramid."
     theirs = "pts_bbox_head.transformer.bev_downsample."
-    yield from parts.gradient_rows(name, "", data, gradients_of(pyramid, prefix, theirs))
+    yield from parts.gradient_rows(name, "", data, parts.gradients_of(pyramid, prefix, theirs))
 
 
 def named(outputs: Granularities) -> dict[str, Tensor]:
@@ -160,7 +115,7 @@ def query_rows(
 @check("mgmapnet_attention_{variant}.npz")
 def check_attention(golden: Golden, name: str) -> Iterator[Row]:
     """Compare the attention alone: what happens inside, outputs, gradients."""
-    data, parts = golden.read_arrays(name), GoldenParts(golden)
+    data, parts = golden.read_arrays(name), MGMapNetParts(golden)
     decoder = parts.decoder()
     start = MultiGranularityAttention().sampling_offsets.bias
     off = largest_difference(start.detach(), data["init_sampling_offsets_bias"])
@@ -206,7 +161,7 @@ def check_attention(golden: Golden, name: str) -> Iterator[Row]:
             yield Row(name, f"{tag}: gradient of {key} (relative)", off, GRAD_L2)
         prefix = f"map_head.decoder.layers.{number}.cross_attn."
         theirs = f"pts_bbox_head.transformer.decoder.layers.{number}.attentions.1."
-        gradients = gradients_of(attention, prefix, theirs)
+        gradients = parts.gradients_of(attention, prefix, theirs)
         yield from parts.gradient_rows(name, f"{tag}: ", own, gradients)
 
 
@@ -255,7 +210,7 @@ def inside_rows(
 @torch.no_grad()
 def check_layer(golden: Golden, name: str) -> Iterator[Row]:
     """Compare one decoder layer, without and with a mask between two groups of instances."""
-    data, parts = golden.read_arrays(name), GoldenParts(golden)
+    data, parts = golden.read_arrays(name), MGMapNetParts(golden)
     decoder = parts.decoder()
     feats = decoder.bev_pyramid(parts.bev)
     group = torch.arange(N) >= 8

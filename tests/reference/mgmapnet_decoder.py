@@ -17,7 +17,8 @@ from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
 from reference.maptr import decoded_rows
 from reference.maptrv2 import all_queries
-from reference.mgmapnet import CONFIG, GRAD_L2, STATE, B, GoldenParts, N, P, gradients_of
+from reference.mgmapnet import CONFIG, STATE, B, MGMapNetParts, N, P
+from reference.parts import GRAD_L2
 from reference.registry import check
 from reference.report import (
     Row,
@@ -85,7 +86,7 @@ LOSS_OF = {  # the outputs that the scalar weighs, by upstream's name, and their
 @check("mgmapnet_decoder_{variant}.npz")
 def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
     """Compare six layers with their branches and masks: values and gradients."""
-    data, parts = golden.read_arrays(name), GoldenParts(golden)
+    data, parts = golden.read_arrays(name), MGMapNetParts(golden)
     head = parts.load(small_head(golden), "map_head.")
     with torch.no_grad():
         outputs = run(head, parts.bev)
@@ -96,7 +97,7 @@ def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
 
 
 def decoder_gradient_rows(
-    name: str, data: Mapping[str, np.ndarray], parts: GoldenParts, head: MapHead
+    name: str, data: Mapping[str, np.ndarray], parts: MGMapNetParts, head: MapHead
 ) -> Iterator[Row]:
     """Compare gradients, ours in float64: in float32 a single ReLU that flips moves them by 1 %."""
     bev = parts.bev.double().requires_grad_()
@@ -112,7 +113,7 @@ def decoder_gradient_rows(
     embedding = head.instance_embedding.weight.grad[:N]
     off = relative_norm(embedding, data["grad_instance_embedding"])
     yield Row(name, "gradient of the queries (relative)", off, GRAD_L2)
-    yield from parts.gradient_rows(name, "", data, gradients_of(head, "map_head."))
+    yield from parts.gradient_rows(name, "", data, parts.gradients_of(head, "map_head."))
     idle = [name for name, p in head.named_parameters() if p.grad is None]
     idle += [key for key in data["no_grad_keys"] if key not in MGMAPNET.unused]
     yield Row(name, "parameters that only one of us trains", len(idle), 0)
@@ -120,7 +121,7 @@ def decoder_gradient_rows(
 
 @torch.no_grad()
 def group_rows(
-    name: str, data: Mapping[str, np.ndarray], parts: GoldenParts, head: MapHead
+    name: str, data: Mapping[str, np.ndarray], parts: MGMapNetParts, head: MapHead
 ) -> Iterator[Row]:
     """Compare the training queries: a mask keeps the groups apart in the self-attention only."""
     with all_queries(head):

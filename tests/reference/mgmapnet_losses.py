@@ -16,7 +16,7 @@ from gsmap.models.maptrv2.aux_heads import BEVMaskHead
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoded
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
-from reference.mgmapnet import BEV, B, GoldenParts
+from reference.mgmapnet import BEV, B, MGMapNetParts
 from reference.mgmapnet_decoder import build_head
 from reference.registry import check
 from reference.report import Row, largest_relative, relative_norm
@@ -58,7 +58,7 @@ def loss_head(golden: Golden, pairing: str) -> MapHead:
     return head
 
 
-def saved_outputs(data: Mapping[str, np.ndarray], parts: GoldenParts) -> dict[str, Tensor]:
+def saved_outputs(data: Mapping[str, np.ndarray], parts: MGMapNetParts) -> dict[str, Tensor]:
     """Return the file's predictions of both groups.
 
     A BEV feature is an instance's mask, and its state is one-hot: their product is the mask.
@@ -77,7 +77,7 @@ def saved_outputs(data: Mapping[str, np.ndarray], parts: GoldenParts) -> dict[st
     return outputs | {"instance_states": states, "bev_feats": masks}
 
 
-def ground_truths(data: Mapping[str, np.ndarray], parts: GoldenParts) -> list[InstanceData]:
+def ground_truths(data: Mapping[str, np.ndarray], parts: MGMapNetParts) -> list[InstanceData]:
     """Return the file's elements with the recipe's masks."""
     gts = []
     for sample in range(B):
@@ -93,7 +93,7 @@ def ground_truths(data: Mapping[str, np.ndarray], parts: GoldenParts) -> list[In
 @check("mgmapnet_losses_{variant}.npz")
 def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     """Compare matches, losses and gradients of fixed predictions."""
-    data, parts = golden.read_arrays(name), GoldenParts(golden)
+    data, parts = golden.read_arrays(name), MGMapNetParts(golden)
     saved, gts = saved_outputs(data, parts), ground_truths(data, parts)
     head = loss_head(golden, "released")
     outputs = predicted(head, kind=MGMapNetDecoded, **saved)
@@ -138,7 +138,9 @@ def match_rows(
         yield Row(name, f"{label}: matches that differ", wrong, 0)
 
 
-def class_mask_rows(name: str, data: Mapping[str, np.ndarray], parts: GoldenParts) -> Iterator[Row]:
+def class_mask_rows(
+    name: str, data: Mapping[str, np.ndarray], parts: MGMapNetParts
+) -> Iterator[Row]:
     """Compare the losses of the recipe's class masks, and their gradient."""
     head = BEVMaskHead(16, pos_weight=1.0, num_masks=3)
     for number in range(len(head)):

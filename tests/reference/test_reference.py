@@ -51,6 +51,13 @@ FILES = [
     "mgmapnet_decoder_*.npz",
     "mgmapnet_losses_*.npz",
     "mgmapnet_forward_reduced_*.npz",
+    "mapqr_state.json",
+    "mapqr_encoder_*.npz",
+    "mapqr_attention_*.npz",
+    "mapqr_layer_*.npz",
+    "mapqr_decoder_*.npz",
+    "mapqr_losses_*.npz",
+    "mapqr_forward_reduced_*.npz",
 ]
 
 

@@ -39,13 +39,18 @@ val_dataloader = dict(
         **_dataset, ann_file='gsmap_nuscenes_val.arrow', split='val', test_mode=True, pipeline=[_load, _scale, _pack]))
 test_dataloader = val_dataloader
 
-# Pipelines for leaves to choose. MapTRv2 learns from LiDAR depth, BEV and camera masks besides map elements.
+# Pipelines for leaves to choose. MapQR learns from BEV and camera masks besides map elements, MapTRv2 from LiDAR
+# depth too.
 _points = dict(type='LoadLidarPoints', coord_type='LIDAR', load_dim=5, use_dim=5)
+_masks = [
+    dict(type='MakeBEVMask', size=(200, 100), num_classes=3),
+    dict(type='MakePVMask', stride=32, num_classes=3),
+]
+_seg = [_load, _scale, _photometric, _targets, *_masks, _pack]
 _depth_seg = [
     _load, _points, _scale, _photometric, _targets,
     dict(type='MakeDepthMap'),
-    dict(type='MakeBEVMask', size=(200, 100), num_classes=3),
-    dict(type='MakePVMask', stride=32, num_classes=3),
+    *_masks,
     dict(type='PackMapInputs', with_points=False),
 ]
 # Models with LiDAR see ten sweeps.

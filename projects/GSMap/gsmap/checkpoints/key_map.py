@@ -107,9 +107,31 @@ MAPTR_BEVFORMER = KeyMap(
     markers=((_DEFORMABLE, _OUR_ENCODER_LAYER + "cross_attn.sampling_offsets."),),
 )
 
+_MASK_RULES = _rules(_HEAD, "map_head.aux_heads.", "seg_head.=seg. pv_seg_head.=pv_seg.")
+# the weight of the foreground in a mask loss, which the config says
+_MASK_WEIGHTS = {
+    _HEAD + "loss_seg.loss_fn.pos_weight": torch.tensor((4.0,)),
+    _HEAD + "loss_pv_seg.loss_fn.pos_weight": torch.tensor((1.0,)),
+}
+_HEIGHTS = (
+    _ENCODER_LAYER + "attentions.1.height_offsets.",
+    _OUR_ENCODER_LAYER + "cross_attn.height_offsets.",
+)
+MAPQR = KeyMap(
+    "mapqr",
+    (
+        _HEIGHTS,
+        *MAPTR.rules,
+        *_MASK_RULES,
+        (_DECODER + "pt_pos_query_projs.{i}.", _LAYER + "position_proj."),
+    ),
+    {**_CODE_WEIGHTS, **_MASK_WEIGHTS},
+    markers=(_HEIGHTS,),
+)
+
 _LIFTED_RULES = (
     *_COMMON_RULES,
-    *_rules(_HEAD, "map_head.aux_heads.", "seg_head.=seg. pv_seg_head.=pv_seg."),
+    *_MASK_RULES,
     *_rules(_ENCODER, "bev_encoder.", "depth_net. downsample."),
 )
 _LIFTED_UNUSED: dict[str, Tensor | None] = {
@@ -134,9 +156,7 @@ _LIFTED_UNUSED: dict[str, Tensor | None] = {
     _ENCODER + "dx": torch.tensor((0.15, 0.15, 20.0)),
     _ENCODER + "bx": torch.tensor((-14.925, -29.925, 0.0)),
     _ENCODER + "nx": torch.tensor((200.0, 400.0, 1.0)),
-    # the weight of the foreground in a mask loss, which the config says
-    _HEAD + "loss_seg.loss_fn.pos_weight": torch.tensor((4.0,)),
-    _HEAD + "loss_pv_seg.loss_fn.pos_weight": torch.tensor((1.0,)),
+    **_MASK_WEIGHTS,
 }
 _LIFTED_MARKER = (_ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv.")
 
@@ -246,7 +266,7 @@ MGMAPNET = KeyMap(
     markers=(_DOWN_SAMPLING,),
 )
 
-KEY_MAPS: list[KeyMap] = [MGMAPNET, GEMAP_FULL, GEMAP, MAPTRV2, MAPTR_BEVFORMER, MAPTR]
+KEY_MAPS: list[KeyMap] = [MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MAPTRV2, MAPTR_BEVFORMER, MAPTR]
 """Known architectures, the most special first; the last needs no marker."""
 
 

@@ -48,6 +48,8 @@ class BEVEncoderLayer(nn.Module):
     """Self-attention, camera cross-attention and feed-forward, each followed by its LayerNorm.
 
     ``num_heads`` and ``num_points`` (samples per head and queue entry) are the self-attention's.
+    With ``released_pairs`` it pairs the query of sample floor(b / 2) with sample b, as upstream; a
+    sample's result then depends on its batch.
     """
 
     def __init__(
@@ -58,8 +60,10 @@ class BEVEncoderLayer(nn.Module):
         num_points: int = 4,
         ffn_dims: int = 512,
         dropout: float = 0.1,
+        released_pairs: bool = False,
     ) -> None:
         super().__init__()
+        self.released_pairs = released_pairs
         self.self_attn = BEVSelfAttention(embed_dims, num_heads, num_points, dropout)
         self.cross_attn = MODELS.build({"embed_dims": embed_dims, **cross_attn})
         self.dropout = nn.Dropout(dropout)
@@ -74,9 +78,9 @@ class BEVEncoderLayer(nn.Module):
         (B, Q, C), (1, Q, C), (B, V, C, h, w) and where the pillars fall -> (B, Q, C)
         """
         centres = grid.norm_from_metres(grid.pixel_centres(feats.device)).view(1, -1, 2)
-        # Differs from upstream for batches: it pairs the query of sample floor(b / 2) with sample b
-        # here.
-        pair = torch.cat([query, query + query_pos], -1)  # (B, Q, 2 C)
+        # of sample floor(b / 2): 0, 0, 1, 1, ...
+        partner = query.repeat_interleave(2, 0)[: len(query)] if self.released_pairs else query
+        pair = torch.cat([partner, query + query_pos], -1)  # (B, Q, 2 C)
         bev = query.transpose(1, 2).unflatten(-1, (grid.height, grid.width))  # (B, C, H, W)
         query = self.norms[0](query + self.self_attn(pair, centres, bev))
         query = self.norms[1](query + self.dropout(self.cross_attn(query, feats, seen)))
@@ -148,13 +152,14 @@ class BEVQueryEncoder(CameraEncoder):
     ) -> dict[str, Tensor]:
         """Return ``bev_feats``, from ``img_from_frame`` (B, V, 4, 4) and ``can_bus`` (B, 18).
 
+        The features are handed on as ``img_feats``.
         ValueError if the number of cameras is not the configured one.
         """
         if feats.shape[1] != len(self.cams_embeds):
             raise ValueError(
                 f"the encoder is built for {len(self.cams_embeds)} cameras, got {feats.shape[1]}."
             )
-        feats = feats + (self.cams_embeds + self.level_embeds[0])[:, :, None, None].to(feats.dtype)
+        tokens = feats + (self.cams_embeds + self.level_embeds[0])[:, :, None, None].to(feats.dtype)
         bev_shape = self.grid.height, self.grid.width
         motion = self.can_bus_mlp(calibration["can_bus"])
         query = self.bev_embedding.weight[None] + motion[:, None]  # (B, Q, C)
@@ -162,13 +167,12 @@ class BEVQueryEncoder(CameraEncoder):
         query_pos = query_pos.flatten(2).transpose(1, 2)  # (1, Q, C)
         seen = self.project(calibration["img_from_frame"], img_shape)
         for layer in self.layers:
-            query = layer(query, query_pos, self.grid, feats, seen)
-        return {"bev_feats": query.transpose(1, 2).unflatten(-1, bev_shape)}
+            query = layer(query, query_pos, self.grid, tokens, seen)
+        bev_feats = query.transpose(1, 2).unflatten(-1, bev_shape)
+        return {"bev_feats": bev_feats, "img_feats": feats}
 
     def project(self, img_from_frame: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
         """Project every cell's pillar into every camera."""
-        # Differs from upstream for batches: it takes the set of seen cells from the first sample
-        # for all.
         pillars = pillar_points(
             grid=self.grid,
             z_range=self.z_range,

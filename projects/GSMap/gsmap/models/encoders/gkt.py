@@ -6,7 +6,7 @@ from mmengine.model import constant_init, xavier_init
 from torch import Tensor, nn
 
 from gsmap.models.encoders.projection import PillarProjection
-from gsmap.ops.deformable_sampling import sum_rows
+from gsmap.ops.deformable_sampling import bilinear_cells, sum_rows
 
 
 def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
@@ -45,22 +45,32 @@ class GeometryKernelAttention(nn.Module):
     Args:
         embed_dims: Channels C; ValueError if they are not divisible by ``num_heads``.
         num_heads: Number of heads; head m looks at pillar height m.
-        kernel_size: Rows and columns of the kernel; ValueError if they are not odd.
+        kernel_size: Rows and columns of the kernel; ValueError if they are not odd and pixels are
+            not bilinear. An even kernel lies half a pixel to the left and up.
+        bilinear: Sample between pixels (MapQR), in place of rounding to one; zero outside the map.
+        released_cells: Let each camera serve the cells that it sees in the first sample of the
+            batch, as released; a sample's result then depends on its batch.
     """
 
     offsets: Tensor
 
     def __init__(
-        self, embed_dims: int = 256, num_heads: int = 4, kernel_size: tuple[int, int] = (3, 5)
+        self,
+        embed_dims: int = 256,
+        num_heads: int = 4,
+        kernel_size: tuple[int, int] = (3, 5),
+        bilinear: bool = False,
+        released_cells: bool = False,
     ) -> None:
         super().__init__()
-        if any(size % 2 == 0 for size in kernel_size):
+        if not bilinear and any(size % 2 == 0 for size in kernel_size):
             raise ValueError(f"kernel_size must be odd, got {tuple(kernel_size)}.")
         if embed_dims % num_heads:
             raise ValueError(
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
             )
         self.num_heads = self.num_heights = num_heads
+        self.bilinear, self.released_cells = bilinear, released_cells
         self.register_buffer("offsets", kernel_offsets(kernel_size), persistent=False)
         self.attention_weights = nn.Linear(embed_dims, num_heads * len(self.offsets))
         self.value_proj = nn.Linear(embed_dims, embed_dims)
@@ -81,16 +91,23 @@ class GeometryKernelAttention(nn.Module):
         batch, num_queries = query.shape[:2]
         num_views, (height, width) = img_feats.shape[1], img_feats.shape[-2:]
         value = self.value_proj(img_feats.flatten(3).transpose(2, 3))  # (B, V, h * w, C)
-        weights = self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1))
-        sample, view, cell = projection.visible.nonzero(as_tuple=True)  # T pairs that see
+        logits = self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1))
+        visible = projection.visible
+        served = visible[:1].expand_as(visible) if self.released_cells else visible
+        sample, view, cell = served.nonzero(as_tuple=True)  # T pairs
         uv = projection.uv[sample, view, cell]  # (T, heads, 2)
-        pixels = kernel_cells(uv, self.offsets, (height, width))  # (T, heads, S)
+        weights = logits.softmax(-1)[sample, cell]  # (T, heads, S)
+        if self.bilinear:
+            places = uv[:, :, None] + self.offsets / uv.new_tensor([width, height])
+            pixels, weights = bilinear_cells(places, weights, (height, width))  # (T, heads, 4 S)
+        else:
+            pixels = kernel_cells(uv, self.offsets, (height, width))
         image = (sample * num_views + view).view(-1, 1, 1)
         head = torch.arange(self.num_heads, device=query.device).view(1, -1, 1)
         rows = (image * (height * width) + pixels) * self.num_heads + head
         table = value.float().reshape(-1, value.shape[-1] // self.num_heads)
-        out = sum_rows(table, rows, weights.softmax(-1)[sample, cell]).flatten(1)  # (T, C)
+        out = sum_rows(table, rows, weights).flatten(1)  # (T, C)
         target = sample * num_queries + cell
         summed = out.new_zeros(batch * num_queries, out.shape[-1]).index_add(0, target, out)
-        count = projection.visible.sum(1).clamp(min=1)  # (B, Q)
+        count = visible.sum(1).clamp(min=1)  # (B, Q)
         return self.output_proj(summed.view(batch, num_queries, -1) / count[..., None])

@@ -46,6 +46,14 @@ def project_pillars(
     with torch.autocast(points.device.type, enabled=False):
         matrices = img_from_frame[:, :, None, None].float()
         projected = torch.matmul(matrices, points[..., None].float())[..., 0]
+    return visible_points(projected, img_shape)
+
+
+def visible_points(projected: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
+    """Divide pillar points (u * d, v * d, d, ...) by their depth, and say who sees a cell.
+
+    (B, V, Q, Z, 3 or 4) in pixels and metres; ``img_shape`` as in `project_pillars`.
+    """
     depth = projected[..., 2]
     uv = projected[..., :2] / depth.clamp(min=_MIN_DEPTH_M)[..., None]
     uv = uv / uv.new_tensor([img_shape[1], img_shape[0]])

@@ -14,7 +14,6 @@ from gsmap.models.maptr.references import PointReference
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.tensors import at_least_float32
 
 
 @MODELS.register_module()
@@ -41,15 +40,16 @@ class GaussianReference(PointReference):
         mlp: bool = False,
         coords: int = 2,
         z_range: Sequence[float] | None = None,
+        points_per_state: int = 1,
         **space: Any,
     ) -> None:
-        super().__init__(grid, embed_dims, num_layers, coords, z_range)
+        super().__init__(grid, embed_dims, num_layers, coords, z_range, points_per_state)
         self.space = GaussianSpace(grid, **space)
         self.metainfo = {"min_scale_m": self.space.floor_m}
-        self.gaussian_init = nn.Linear(embed_dims, 3)
+        self.gaussian_init = nn.Linear(embed_dims, 3 * points_per_state)
         hidden = [embed_dims, embed_dims] if mlp else []
         self.gaussian_branches = nn.ModuleList(
-            layers.mlp(embed_dims, *hidden, 3) for _ in range(num_layers)
+            layers.mlp(embed_dims, *hidden, 3 * points_per_state) for _ in range(num_layers)
         )
         self.reset_gaussian_parts()
 
@@ -67,12 +67,12 @@ class GaussianReference(PointReference):
 
     def start(self, query_pos: Tensor) -> Tensor:
         """Return the Gaussians that the first layer starts from. (..., C) -> (..., D)"""
-        shapes = at_least_float32(self.gaussian_init(query_pos))
+        shapes = self.by_point(self.gaussian_init(query_pos))
         return torch.cat([super().start(query_pos), shapes], -1)
 
     def offsets(self, layer: int, point_states: Tensor) -> Tensor:
         """Return a layer's change of the Gaussians (Eq. 8). (..., C) -> (..., D)"""
-        shapes = at_least_float32(self.gaussian_branches[layer](point_states))
+        shapes = self.by_point(self.gaussian_branches[layer](point_states))
         return torch.cat([super().offsets(layer, point_states), shapes], -1)
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:

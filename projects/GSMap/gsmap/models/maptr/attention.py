@@ -82,7 +82,7 @@ class SamplingAttention(nn.Module):
         self.sampling_offsets = nn.Linear(query_dims, num_heads * num_points * 2)
         self.attention_weights = nn.Linear(query_dims, num_heads * num_points)
         self.value_proj = nn.Linear(embed_dims, embed_dims)
-        self.output_proj = nn.Linear(embed_dims, embed_dims)
+        self.output_proj: nn.Module = nn.Linear(embed_dims, embed_dims)
         self.dropout = nn.Dropout(dropout)
         self.init_weights()
 

@@ -116,10 +116,13 @@ class MapDecoder(BaseModule):
 
     Attributes:
         point_queries: Whether it takes point queries (B, N * P, C), or instance queries (B, N, C).
+        moves_instances: Whether a state and a first reference belong to all points of an instance,
+            `point_states` (B, N, C), or each to its point.
         layer_class: Class of its layers, where their config names none.
     """
 
     point_queries = True
+    moves_instances = False
     layer_class: ClassVar[type[MapDecoderLayer]] = MapDecoderLayer
 
     def __init__(

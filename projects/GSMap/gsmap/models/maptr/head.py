@@ -27,7 +27,7 @@ from gsmap.models.maptr.pairs import (
     SamplePredictions,
     SampleTruth,
 )
-from gsmap.models.maptr.parts import PARTS, AuxHead, by_name, check_classes, refuse_twins
+from gsmap.models.maptr.parts import PARTS, AuxHead, by_name, check_classes, class_of, refuse_twins
 from gsmap.models.maptr.references import PointReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
@@ -120,8 +120,10 @@ class MapHead(BaseModule):
         self.query_groups = [QueryGroup(**group) for group in query_groups]
         num_instances = sum(group.num for group in self.query_groups)
         shared = {"embed_dims": embed_dims, "num_layers": decoder["num_layers"]}
-        point = {"type": "PointReference", "grid": grid, **shared}
-        self.reference: PointReference = MODELS.build({**point, **(reference or {})})
+        moves_instances = getattr(class_of(decoder), "moves_instances", False)
+        points_per_state = num_points if moves_instances else 1
+        point = {"type": "PointReference", "grid": grid, "points_per_state": points_per_state}
+        self.reference: PointReference = MODELS.build({**point, **shared, **(reference or {})})
         handed_on = {"num_points": num_points, "space": self.reference.space}
         self.decoder: MapDecoder = MODELS.build(
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}

@@ -31,11 +31,11 @@ def classification_branch(embed_dims: int, num_classes: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(embed_dims, num_classes))
 
 
-_SAMPLING_WEIGHTS = ("sampling_offsets.weight", "attention_weights.weight")
+_SAMPLING = ("sampling_offsets.weight", "attention_weights.weight", "height_offsets.weight")
 
 
 def init_matrices(module: nn.Module) -> None:
     """Initialise all matrices of a transformer (Xavier) but those that place and weigh samples."""
     for name, parameter in module.named_parameters():
-        if parameter.dim() > 1 and not name.endswith(_SAMPLING_WEIGHTS):
+        if parameter.dim() > 1 and not name.endswith(_SAMPLING):
             nn.init.xavier_uniform_(parameter)

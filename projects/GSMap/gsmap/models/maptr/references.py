@@ -8,7 +8,7 @@ from mmdet3d.registry import MODELS
 from mmengine.model import xavier_init
 from torch import Tensor, nn
 
-from gsmap.models.maptr.layers import mlp
+from gsmap.models.maptr.layers import init_matrices, mlp
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32, check_same_shape
@@ -37,6 +37,8 @@ class PointReference(nn.Module):
         num_layers: Decoder layers.
         coords: 2, or 3 for points with height.
         z_range: Lowest and highest z in metres, for points with height.
+        points_per_state: Points that start from one query and move by one state. More than one have
+            larger networks, as in MapQR.
 
     Raises:
         ValueError: If ``coords`` is not 2 or 3, a height lacks its range, or that is empty.
@@ -54,6 +56,7 @@ class PointReference(nn.Module):
         num_layers: int = 6,
         coords: int = 2,
         z_range: Sequence[float] | None = None,
+        points_per_state: int = 1,
     ) -> None:
         super().__init__()
         if coords not in (2, 3) or (coords == 3) != (z_range is not None):
@@ -64,26 +67,38 @@ class PointReference(nn.Module):
             raise ValueError(f"z_range must be (low, high) with low < high, got {z_range}.")
         self.grid, self.coords = grid, coords
         self.z_range = None if z_range is None else (float(z_range[0]), float(z_range[1]))
-        self.initial = nn.Linear(embed_dims, coords)
-        self.branches = nn.ModuleList(
-            mlp(embed_dims, embed_dims, embed_dims, coords) for _ in range(num_layers)
-        )
+        self.points_per_state = points_per_state
+        entries = points_per_state * coords
+        self.initial: nn.Module = nn.Linear(embed_dims, entries)
+        hidden = [embed_dims] * 2
+        if points_per_state > 1:
+            self.initial = mlp(embed_dims, embed_dims, entries)
+            hidden = [2 * embed_dims] * 3
+        self.branches = nn.ModuleList(mlp(embed_dims, *hidden, entries) for _ in range(num_layers))
         self.metainfo: dict[str, float] = {}  # of all predictions
+
+    def by_point(self, entries: Tensor) -> Tensor:
+        """Sort entries of states by point, at least float32. (..., Q, n * D) -> (..., Q * n, D)"""
+        by_state = at_least_float32(entries).unflatten(-1, (self.points_per_state, -1))
+        return by_state.flatten(-3, -2)
 
     def init_weights(self) -> None:
         """Spread the first points over the map."""
-        xavier_init(self.initial, distribution="uniform", bias=0.0)
+        if self.points_per_state == 1:
+            xavier_init(self.initial, distribution="uniform", bias=0.0)
+        else:
+            init_matrices(self.initial)
 
     def start(self, query_pos: Tensor) -> Tensor:
-        """Return the reference that the first layer starts from. (..., C) -> (..., D)"""
-        return at_least_float32(self.initial(query_pos)).sigmoid()
+        """Return the reference that the first layer starts from. (..., Q, C) -> (..., Q * n, D)"""
+        return self.by_point(self.initial(query_pos)).sigmoid()
 
     def offsets(self, layer: int, point_states: Tensor) -> Tensor:
-        """Return a layer's change of the reference, at least float32. (..., C) -> (..., D)"""
-        return at_least_float32(self.branches[layer](point_states))
+        """Return a layer's change of the reference. (..., Q, C) -> (..., Q * n, D)"""
+        return self.by_point(self.branches[layer](point_states))
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
-        """Return the reference after a layer. (..., C), (..., D) -> (..., D)"""
+        """Return the reference after a layer. (..., Q, C), (..., Q * n, D) -> (..., Q * n, D)"""
         return refine_reference(reference, self.offsets(layer, point_states), self.coords)
 
     def metres(self, points: Tensor) -> Tensor:

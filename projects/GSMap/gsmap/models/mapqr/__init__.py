@@ -1,0 +1,1 @@
+"""MapQR: instance queries that scatter to their points and gather what these see."""

@@ -1,0 +1,505 @@
+"""MapQR: key table, encoder with moving pillars, scatter-and-gather attention, decoder, losses."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from mmdet3d.registry import MODELS
+from mmdet3d.structures import Det3DDataSample
+from mmengine.config import Config
+from mmengine.structures import InstanceData
+from predictions import predicted, stacked
+from torch import Tensor, nn
+
+from gsmap.checkpoints.key_map import MAPQR
+from gsmap.models.encoders.gkt import kernel_offsets
+from gsmap.models.mapqr.decoder import sine_code
+from gsmap.models.mapqr.encoder import HeightQueryEncoder, MovingPillars
+from gsmap.models.maptr.attention import place_samples, sample_map
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptrv2.aux_heads import BEVMaskHead
+from gsmap.structures.grid import BEVGrid
+from reference.golden import NUM_CAMS, Golden
+from reference.maptr import decoded_rows, state_rows
+from reference.maptrv2 import all_queries
+from reference.mgmapnet_losses import GROUPS, REPEATS, match_rows
+from reference.parts import GoldenParts
+from reference.registry import check
+from reference.report import (
+    Row,
+    fraction_beyond,
+    largest_difference,
+    largest_relative,
+    relative_norm,
+)
+
+CONFIG = "mapqr/mapqr_r50_24e.py"
+STATE = "mapqr_state.json"
+B, N, P, C, LAYERS = 2, 12, 20, 256, 6
+BEV = (50, 26)
+HEAD, ENCODER = "map_head.", "bev_encoder."
+FURTHER = 24  # one-to-many queries of the training set
+VISIBLE = 1e-4  # share of cells whose visibility a rounding may turn
+
+
+@check(STATE)
+def check_state(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare MapQR's state with ours."""
+    yield from state_rows(golden, name, CONFIG)
+    listed = golden.read_json(name)
+    model = golden.model(CONFIG, name)
+    total = sum(parameter.numel() for parameter in model.parameters())
+    off = abs(total + 4 - listed["total_params"])  # upstream's code weights are of no effect
+    yield Row(name, "all parameters", off, 0)
+
+
+class MapQRParts(GoldenParts):
+    """MapQR's modules and inputs, with a BEV of few cells."""
+
+    def __init__(self, golden: Golden) -> None:
+        super().__init__(golden, "mapqr", MAPQR)
+        self.cfg = Config.fromfile(golden.configs / CONFIG, import_custom_modules=False)
+        self.grid = BEVGrid(**self.cfg.grid)
+
+    def encoder(self) -> HeightQueryEncoder:
+        """Return the encoder."""
+        pixel_m = [self.grid.extent_m[0] / BEV[1], self.grid.extent_m[1] / BEV[0]]
+        encoder = {**self.cfg.model.bev_encoder, "grid": self.grid, "bev_pixel_m": pixel_m}
+        return self.load(MODELS.build(encoder), ENCODER)
+
+    def head(self, groups: tuple[int, int] = (N, FURTHER), **settings: Any) -> MapHead:
+        """Return the head."""
+        queries = [{"num": groups[0]}, {"name": "o2m", "num": groups[1], "repeats": REPEATS}]
+        shared = {"grid": self.grid, "classes": self.cfg.classes, "query_groups": queries}
+        return self.load(MODELS.build({**self.cfg.model.map_head, **shared, **settings}), HEAD)
+
+    @property
+    def feats(self) -> Tensor:
+        """Image features. (B, V, C, h, w)"""
+        return self.normal("mapqr_feat", (B, NUM_CAMS, C, 6, 10))
+
+    @property
+    def bev(self) -> Tensor:
+        """BEV features. (B, C, H, W)"""
+        tokens = self.normal("mapqr_bev", (B, BEV[0] * BEV[1], C))
+        return tokens.transpose(1, 2).unflatten(2, BEV)
+
+    @property
+    def query(self) -> Tensor:
+        """Instance queries. (B, N, C)"""
+        return self.normal("mapqr_query", (N, B, C)).transpose(0, 1)
+
+    @property
+    def reference(self) -> Tensor:
+        """References. (B, N * P, 2)"""
+        values = self.recipe.uniform("mapqr_ref", (B, N, 2 * P), 0.02, 0.98, self.golden.seed)
+        return torch.from_numpy(values).unflatten(2, (P, 2)).flatten(1, 2)
+
+
+def tokens(feats: Tensor) -> Tensor:
+    """Return the cells of a map. (B, C, H, W) -> (B, cells, C)"""
+    return feats.flatten(2).transpose(1, 2)
+
+
+class LayerLog:
+    """What happens in each layer of an encoder, by the golden names."""
+
+    def __init__(self, encoder: HeightQueryEncoder) -> None:
+        self.values: list[dict[str, Tensor]] = []
+        self._hooks: list[Any] = []
+        for layer in encoder.layers:
+            attention = layer.cross_attn
+            self._hooks += [
+                layer.norms[0].register_forward_pre_hook(self._start),
+                attention.output_proj.register_forward_pre_hook(self._keep("slots")),
+                attention.register_forward_hook(self._pillars),
+                layer.norms[1].register_forward_pre_hook(self._keep("cross")),
+                layer.norms[2].register_forward_hook(
+                    lambda _, __, out: self.values[-1].update(out=out)
+                ),
+            ]
+
+    def _start(self, _: nn.Module, inputs: tuple[Tensor]) -> None:
+        self.values.append({"tsa": inputs[0]})
+
+    def _keep(self, name: str) -> Any:
+        return lambda _, inputs: self.values[-1].update({name: inputs[0]})
+
+    def _pillars(self, _: nn.Module, inputs: tuple[Any, ...], __: Tensor) -> None:
+        pillars: MovingPillars = inputs[2]
+        still = torch.zeros_like(pillars.heights)
+        uv, visible = pillars.move(still, True)
+        depth_m = pillars.feet[..., 2, None] + (
+            (pillars.low_m + pillars.heights[:, None] * pillars.extent_m) * pillars.upwards[..., 2]
+        )
+        inside = (depth_m > 1e-5) & ((uv > 0) & (uv < 1)).all(-1)
+        self.values[-1].update(heights=pillars.heights, uv=uv, inside=inside, visible=visible)
+
+    def close(self) -> None:
+        """Take the hooks away."""
+        for hook in self._hooks:
+            hook.remove()
+
+
+def metas(data: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Return the meta dicts of both samples."""
+    return [
+        {
+            "token": f"rig {number}",
+            "batch_input_shape": (192, 320),
+            "lidar2img": data["lidar2img"][number],
+            "can_bus": data["can_bus"][number],
+        }
+        for number in range(B)
+    ]
+
+
+LAYER_ROWS = {"tsa": (np.s_[:, ::10, ::8], 1e-4), "slots": (np.s_[:, ::13, ::4], 3e-4),
+              "cross": (np.s_[:, ::10, ::8], 1e-4), "out": (np.s_[:, ::5, ::8], 1e-4)}  # fmt: skip
+
+
+@check("mapqr_encoder_{variant}.npz")
+def check_encoder(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare each step of each layer, for each sample alone and for both in one batch."""
+    data, parts = golden.read_arrays(name), MapQRParts(golden)
+    encoder, feats, rigs = parts.encoder(), parts.feats, metas(data)
+    offsets = encoder.layers[0].cross_attn.offsets
+    wanted = data["kernel_offsets_xy_in_weight_order"]
+    yield Row(name, "kernel offsets", largest_difference(offsets, wanted), 0)
+    yield Row(name, "kernel", largest_difference(kernel_offsets((2, 4)), wanted), 0)
+    for sample in range(B):
+        own = {k.removeprefix(f"s{sample}_"): v for k, v in data.items()}
+        value = feats[sample : sample + 1].clone().requires_grad_()
+        log = LayerLog(encoder)
+        bev = tokens(encoder([value], rigs[sample : sample + 1])["bev_feats"])
+        log.close()
+        for layer, values in enumerate(log.values):
+            yield from layer_rows(name, f"s{sample}_l{layer}_", data, values)
+        off = largest_difference(bev.detach()[:, ::13], own["bev_full_channels"])
+        yield Row(name, f"s{sample}: BEV", off, 1e-4)
+        scalar = (bev * parts.normal(f"mapqr_enc_g_s{sample}", tuple(bev.shape))).sum()
+        encoder.zero_grad()
+        scalar.backward()
+        off = largest_relative(scalar.item(), own["scalar"])
+        yield Row(name, f"s{sample}: scalar (relative)", off, 1e-4)
+        off = relative_norm(value.grad[0, :, ::16], own["grad_feat_sub"])
+        yield Row(name, f"s{sample}: gradient of the features (relative)", off, 1e-2)
+        off = relative_norm(
+            encoder.bev_embedding.weight.grad[::13, ::8], own["grad_bev_embedding_sub"]
+        )
+        yield Row(name, f"s{sample}: gradient of the queries (relative)", off, 1e-2)
+        gradients = parts.gradients_of(encoder, ENCODER)
+        yield from parts.gradient_rows(name, f"s{sample}: ", own, gradients, norm=1e-2, dot=1e-2)
+    with torch.no_grad():
+        both = tokens(encoder([feats], rigs)["bev_feats"])[:, ::13]
+    wanted = np.concatenate([data[f"s{sample}_bev_full_channels"] for sample in range(B)])
+    yield Row(name, "BEV of both in one batch", largest_difference(both, wanted), 1e-4)
+    for layer in encoder.layers:
+        layer.released_pairs = layer.cross_attn.released_cells = True
+    with torch.no_grad():
+        second = tokens(encoder([feats], rigs)["bev_feats"])[1, ::5, ::8]
+    off = largest_difference(second, data["b2_released_s1_out"])
+    yield Row(name, "BEV of the second in one batch, as released", off, 1e-4)
+
+
+def layer_rows(
+    name: str, tag: str, data: Mapping[str, np.ndarray], values: dict[str, Tensor]
+) -> Iterator[Row]:
+    """Compare what happened in a layer of the encoder."""
+    for key, (part, tolerance) in LAYER_ROWS.items():
+        ours = values[key].detach()[part]
+        yield Row(name, tag + key, largest_difference(ours, data[tag + key]), tolerance)
+    heights = values["heights"].detach().transpose(1, 2)[:, :, ::5]
+    yield Row(name, tag + "heights", largest_difference(heights, data[tag + "heights"]), 1e-5)
+    uv = values["uv"].detach()[0, :, None, ::26]
+    near = np.abs(data[tag + "uv"]) < 5
+    off = largest_difference(uv.numpy()[near], data[tag + "uv"][near])
+    yield Row(name, tag + "uv", off, 3e-5)
+    seen = np.packbits(values["inside"][0, :, None].numpy())
+    flips = np.unpackbits(seen ^ data[tag + "vis"].ravel()).mean()
+    yield Row(name, tag + "visibility that differs", float(flips), VISIBLE)
+    counts = values["visible"][0].sum(1)[:, None]
+    off = largest_difference(counts, data[tag + "vis_counts"]) / counts.sum()
+    yield Row(name, tag + "seen cells (share)", float(off), VISIBLE)
+
+
+@check("mapqr_attention_{variant}.npz")
+def check_attention(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the scatter-and-gather attention of the third layer: steps, output, gradients."""
+    data, parts = golden.read_arrays(name), MapQRParts(golden)
+    layer = parts.head().decoder.layers[2]
+    attention, query = layer.cross_attn, parts.query.clone().requires_grad_()
+    bev, reference = parts.bev.requires_grad_(), parts.reference.requires_grad_()
+    code = sine_code(reference, C)
+    position = layer.position_proj(code)
+    scattered = query.repeat_interleave(P, 1) + position
+    offsets = attention.offsets_in_cells(scattered)
+    locations = place_samples(offsets, reference, BEV)
+    weights = attention.weights(scattered)
+    sampled = sample_map(attention.values(tokens(bev)), BEV, locations, weights)
+    joined = sampled.unflatten(1, (N, P)).flatten(2)
+    hidden = attention.output_proj[1](attention.output_proj[0](joined))
+    gathered = attention(query, reference, bev, None, position)
+    out = (gathered + query).transpose(0, 1)
+    ours = {
+        "sine": (code.unflatten(1, (N, P))[:, :, ::5], 1e-5),
+        "point_pos": (position.unflatten(1, (N, P))[..., ::8], 1e-5),
+        "point_query": (scattered.unflatten(1, (N, P))[..., ::16], 1e-5),
+        "loc": (locations.unflatten(1, (N, P))[:, :, ::2], 1e-5),
+        "weights": (weights.unflatten(1, (N, P))[:, :, ::2], 1e-5),
+        "sampled": (sampled.unflatten(1, (N, P))[..., ::16], 1e-4),
+        "gather_hidden": (hidden[..., ::20], 1e-4),
+        "gather_out": (gathered, 1e-4),
+        "out": (out, 1e-4),
+    }
+    for key, (value, tolerance) in ours.items():
+        yield Row(name, key, largest_difference(value.detach(), data[key]), tolerance)
+    scalar = (out * parts.normal("mapqr_ga", (N, B, C))).sum()
+    scalar.backward()
+    yield Row(name, "scalar (relative)", largest_relative(scalar.item(), data["scalar"]), 1e-4)
+    ours = {
+        "query": query.grad.transpose(0, 1),
+        "bev_sub": tokens(bev.grad)[..., ::16],
+        "ref": reference.grad.view(B, N, 2 * P),
+    }
+    for key, value in ours.items():
+        off = relative_norm(value, data[f"grad_{key}"])
+        yield Row(name, f"gradient of {key} (relative)", off, 1e-3)
+    gradients = parts.gradients_of(layer, f"{HEAD}decoder.layers.2.")
+    yield from parts.gradient_rows(name, "", data, gradients)
+
+
+@check("mapqr_layer_{variant}.npz")
+@torch.no_grad()
+def check_layer(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare one decoder layer, without and with a mask between two groups of instances."""
+    data, parts = golden.read_arrays(name), MapQRParts(golden)
+    layers = parts.head().decoder.layers
+    group = torch.arange(N) >= 8
+    for tag, number in (("first", 0), ("later", 3), ("later_masked", 3)):
+        layer, steps = layers[number], []
+        layer.mask_groups = tag.endswith("masked")
+        hooks = [
+            norm.register_forward_pre_hook(lambda _, inputs, own=steps: own.append(inputs[0]))
+            for norm in layer.norms[:2]
+        ]
+        out = layer(parts.query, parts.query, parts.reference, parts.bev, group[:, None] != group)
+        for hook in hooks:
+            hook.remove()
+        ours = {"self_attn": steps[0][..., ::2], "cross": steps[1][..., ::2], "out": out}
+        for key, value in ours.items():
+            off = largest_difference(value.transpose(0, 1), data[f"{tag}_{key}"])
+            yield Row(name, f"{tag}_{key}", off, 1e-4)
+
+
+def run(head: MapHead, bev: Tensor, feats: Tensor) -> dict[str, Tensor]:
+    """Return all predictions by the golden names."""
+    outputs = head({"bev_feats": bev})
+    masks = head.aux_heads
+    return {
+        "init_reference": head.reference.start(head.queries()[0]).flatten().view(-1, 2 * P),
+        "query": head.queries()[1],
+        "states": stacked(outputs).instance_states.transpose(1, 2),
+        "all_cls_scores": stacked(outputs).scores,
+        "all_pts_preds": stacked(outputs).pts,
+        "seg": masks["seg"](bev),
+        "pv_seg": masks["pv_seg"](feats.flatten(0, 1)).unflatten(0, feats.shape[:2]),
+    }
+
+
+DECODER_ROWS = {  # what the file holds of each output, and the tolerance
+    "init_reference": (np.s_[:], 1e-5),
+    "query": (np.s_[:], 0),
+    "states": (np.s_[..., ::2], 2e-3),
+    "all_cls_scores": (np.s_[:], 1e-3),
+    "all_pts_preds": (np.s_[:], 1e-4),
+    "seg": (np.s_[:], 1e-4),
+    "pv_seg": (np.s_[:], 1e-4),
+}
+
+
+@check("mapqr_decoder_{variant}.npz")
+def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare six layers with their branches and masks: values and gradients."""
+    data, parts = golden.read_arrays(name), MapQRParts(golden)
+    head, bev, feats = parts.head(coder={"max_num": N}), parts.bev, parts.feats
+    with torch.no_grad():
+        outputs = run(head, bev, feats)
+        decoded = head.predict_by_feat(head({"bev_feats": bev}), [{}] * B)
+    for key, (part, tolerance) in DECODER_ROWS.items():
+        off = largest_difference(outputs[key].detach()[part], data[key])
+        yield Row(name, key, off, tolerance)
+    last = largest_difference(outputs["states"][-1], data["states_full_last"])
+    yield Row(name, "states_full_last", last, 2e-3)
+    position = point_position(head.decoder.layers[-1], outputs["all_pts_preds"][-2])
+    off = largest_difference(position[:, :, ::5, ::8], data["point_pos_last"])
+    yield Row(name, "point_pos_last", off, 1e-3)
+    for sample, result in enumerate(decoded):
+        prefix = f"dec{sample}_"
+        own = {f"dec_{k.removeprefix(prefix)}": v for k, v in data.items() if k.startswith(prefix)}
+        yield from decoded_rows(name, own, result)
+    yield from training_rows(name, data, head, {"bev_feats": bev}, 1)
+    yield from decoder_gradient_rows(name, data, parts, head)
+
+
+@torch.no_grad()
+def point_position(layer: nn.Module, references: Tensor) -> Tensor:
+    """Return the position that a layer adds for references. (B, N, P, 2) -> (B, N, P, C)"""
+    return layer.position_proj(sine_code(references, C))
+
+
+def decoder_gradient_rows(
+    name: str, data: Mapping[str, np.ndarray], parts: MapQRParts, head: MapHead
+) -> Iterator[Row]:
+    """Compare gradients."""
+    bev, feats = parts.bev.requires_grad_(), parts.feats.requires_grad_()
+    outputs = run(head, bev, feats)
+    scalar = sum(
+        (outputs[key] * parts.normal(f"mapqr_gd_{key}", tuple(outputs[key].shape))).sum()
+        for key in ("all_cls_scores", "all_pts_preds", "seg", "pv_seg")
+    )
+    scalar.backward()
+    yield Row(name, "scalar (relative)", largest_relative(scalar.item(), data["scalar"]), 1e-4)
+    ours = {
+        "bev_sub": tokens(bev.grad)[..., ::16],
+        "feat_sub": feats.grad[:, :, ::32],
+        "instance_embedding": head.instance_embedding.weight.grad[:N],
+    }
+    for key, value in ours.items():
+        off = relative_norm(value, data[f"grad_{key}"])
+        yield Row(name, f"gradient of {key} (relative)", off, 2e-2)
+    gradients = parts.gradients_of(head, HEAD)
+    yield from parts.gradient_rows(name, "", data, gradients, norm=1e-2, dot=2e-2)
+
+
+@torch.no_grad()
+def training_rows(
+    name: str,
+    data: Mapping[str, np.ndarray],
+    head: MapHead,
+    bev_outputs: dict[str, Tensor],
+    every: int,
+    tolerances: tuple[float, float] = (1e-3, 1e-4),
+) -> Iterator[Row]:
+    """Compare the training queries, with and without the mask between their groups."""
+    logits, points = tolerances
+    suffix = "" if every == 1 else "_sub"
+    scores = stacked(head(bev_outputs)).scores
+    for tag, masked in (("train_masked", True), ("train", False)):
+        for layer in head.decoder.layers:
+            layer.mask_groups = masked
+        with all_queries(head):
+            first, further = (stacked(own) for _, own in head.split_groups(head(bev_outputs)))
+        ours = {
+            "one2one_cls": (first.scores, logits),
+            "one2one_pts_last": (first.pts[-1], points),
+            f"one2many_cls{suffix}": (further.scores[:, :, ::every], logits),
+            f"one2many_pts_last{suffix}": (further.pts[-1, :, ::every], points),
+            "minus_eval_cls_maxabs": ((first.scores - scores).abs().amax((1, 2, 3)), logits),
+        }
+        for key, (value, tolerance) in ours.items():
+            off = largest_difference(value, data[f"{tag}_{key}"])
+            yield Row(name, f"{tag}_{key}", off, tolerance)
+
+
+@check("mapqr_losses_{variant}.npz")
+def check_losses(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare matches, losses and gradients of fixed predictions."""
+    data, parts = golden.read_arrays(name), MapQRParts(golden)
+    head = parts.head(tuple(GROUPS.values()), aux_heads=[])
+    shapes = {group: (LAYERS, B, num, 3) for group, num in GROUPS.items()}
+    scores, pts = (
+        torch.cat(values, 2).requires_grad_()
+        for values in (
+            [parts.normal(f"mapqr_loss_{group}_cls", shapes[group], shift=-1) for group in GROUPS],
+            [torch.from_numpy(data[f"in_{group}_all_pts_preds"]) for group in GROUPS],
+        )
+    )
+    gts = [
+        InstanceData(
+            labels_3d=torch.from_numpy(data[f"gt_labels_{sample}"]),
+            pts=torch.from_numpy(data[f"gt_fixed_pts_{sample}"]),
+            pts_shifts=torch.from_numpy(data[f"gt_shift_pts_{sample}"]),
+        )
+        for sample in range(B)
+    ]
+    outputs = predicted(head, scores, pts)
+    yield from match_rows(name, data, head, outputs, gts)
+    losses = head.loss_by_feat(outputs, gts, [{}] * B)
+    for group in GROUPS:
+        suffix = "" if group == "o2o" else f"_{group}"
+        for key in ("cls", "pts", "dir"):
+            layers = [*(f"d{layer}." for layer in range(LAYERS - 1)), ""]
+            ours = [losses[f"{layer}loss_{key}{suffix}"].item() for layer in layers]
+            off = largest_relative(ours, data[f"{group}_loss_{key}"])
+            yield Row(name, f"{group}: {key} (relative)", off, 1e-4)
+    masks = {}
+    for number, (key, size) in enumerate({"seg": (1, *BEV), "pv": (NUM_CAMS, 1, 6, 10)}.items()):
+        logits = parts.normal(f"mapqr_loss_{key}", (B, *size), shift=-1).requires_grad_()
+        truth = parts.recipe.mask(f"mapqr_{key}", (B, *size), golden.seed)
+        masks[("seg", "pv_seg")[number]] = logits
+        part = MODELS.build(parts.cfg.model.map_head.aux_heads[number])
+        losses[f"loss_{part.name}"] = mask_loss(part, logits, torch.from_numpy(truth))
+        off = largest_relative(losses[f"loss_{part.name}"].item(), data[f"loss_{part.name}"])
+        yield Row(name, f"loss_{part.name} (relative)", off, 1e-4)
+    total = sum(losses.values())
+    yield Row(name, "total (relative)", largest_relative(total.item(), data["total"]), 1e-4)
+    total.backward()
+    sizes = list(GROUPS.values())
+    ours = {f"grad_{key}": logits.grad for key, logits in masks.items()}
+    for key, value in (("all_cls_scores", scores), ("all_pts_preds", pts)):
+        split = zip(GROUPS, value.grad.split(sizes, 2), strict=True)
+        ours |= {f"grad_{group}_{key}": part for group, part in split}
+    for key, value in ours.items():
+        yield Row(name, f"{key} (relative)", relative_norm(value, data[key]), 1e-3)
+
+
+def mask_loss(head: BEVMaskHead, logits: Tensor, truth: Tensor) -> Tensor:
+    """Return the loss of a mask head whose features are the logits."""
+    for number in range(len(head)):
+        head[number] = nn.Identity()
+    samples = [Det3DDataSample() for _ in range(B)]
+    for sample, masks in zip(samples, truth, strict=True):
+        setattr(sample, head.target, masks)
+    return head.loss({head.feats: logits}, samples)
+
+
+@check("mapqr_forward_reduced_{variant}.npz")
+@torch.no_grad()
+def check_forward(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the way from the images to the detections."""
+    data, meta = golden.read_arrays(name), golden.meta("reduced")
+    model = golden.model(CONFIG, STATE)
+    log = LayerLog(model.bev_encoder)
+    bev_outputs = model.bev_encoder(model.extract_img_feats(golden.images("reduced")), [meta])
+    log.close()
+    cells = np.ix_(data["bev_rows"], data["bev_cols"])
+    for layer, values in enumerate(log.values):
+        out = values["out"][0].view(200, 100, C)[cells].flatten(0, 1)[:, ::2]
+        off = fraction_beyond(out, data[f"layer{layer}_out_sub"], 1e-3)
+        yield Row(name, f"share of layer {layer} off by > 1e-3", off, 1e-3)
+        heights = values["heights"][0].view(200, 100, 8)[cells].flatten(0, 1).T
+        off = largest_difference(heights, data[f"heights_l{layer}_sub"])
+        yield Row(name, f"heights of layer {layer}", off, 1e-5)
+    seen = np.packbits(log.values[-1]["visible"][0].numpy(), axis=-1)
+    flips = np.unpackbits(seen ^ data["seen_last"]).mean()
+    yield Row(name, "seen cells that differ", float(flips), VISIBLE)
+    bev, head = bev_outputs["bev_feats"], model.map_head
+    off = fraction_beyond(bev[0].mean(0), data["bev_embed_channel_mean"], 1e-4)
+    yield Row(name, "share of BEV means off by > 1e-4", off, 1e-3)
+    outputs = run(head, bev, bev_outputs["img_feats"])
+    ours = {
+        "init_reference": (outputs["init_reference"], 1e-5),
+        "states_sub": (outputs["states"][:, ::5, 0, ::4], 5e-3),
+        "all_cls_scores": (outputs["all_cls_scores"], 2e-3),
+        "all_pts_preds": (outputs["all_pts_preds"], 2e-4),
+        "pv_seg": (outputs["pv_seg"], 1e-3),
+    }
+    for key, (value, tolerance) in ours.items():
+        yield Row(name, key, largest_difference(value, data[key]), tolerance)
+    off = fraction_beyond(outputs["seg"][..., ::2, ::2], data["seg"], 1e-3)
+    yield Row(name, "cells with seg off by > 1e-3", off, 0.01)
+    result = head.predict_by_feat(head(bev_outputs), [meta])[0]
+    yield from decoded_rows(name, data, result, 1e-3)
+    yield from training_rows(name, data, head, bev_outputs, 20, (2e-3, 2e-4))
