@@ -17,6 +17,7 @@ from mmengine.registry import init_default_scope
 from torch import Tensor
 
 from gsmap import registered  # noqa: F401
+from gsmap.checkpoints.key_map import PIVOTNET
 
 NUM_CAMS = 6
 
@@ -72,6 +73,11 @@ class Golden:
         return self._module("mgmapnet_recipe")
 
     @cached_property
+    def pivotnet(self) -> ModuleType:
+        """The recipe of PivotNet's weights and inputs: ``tensor``, ``normal``, ``uniform``."""
+        return self._module("pivotnet_recipe")
+
+    @cached_property
     def cameras(self) -> dict[str, Any]:
         """Cameras of the variant."""
         return self.read_json(f"cameras_{self.variant}.json")
@@ -96,6 +102,10 @@ class Golden:
 
     def upstream_state(self, name: str) -> dict[str, Tensor]:
         """Return the upstream state that the recipe makes for a state list."""
+        if name.startswith("pivotnet"):
+            shapes = self.state_shapes(name)
+            made = {key: self.pivotnet.tensor(key, shape, self.seed) for key, shape in shapes.items()}
+            return {k: PIVOTNET.unused[k] if v is None else torch.from_numpy(v) for k, v in made.items()}
         recipe = self.mgmapnet if name.startswith("mgmapnet") else self.weights
         arrays = recipe.state(self.state_shapes(name), self.seed)
         return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}

@@ -22,6 +22,7 @@ FOLDERS = (  # every module of these is imported; a method comes and goes with i
     "gsmap.models.mapvr",
     "gsmap.models.gemap",
     "gsmap.models.mgmapnet",
+    "gsmap.models.pivotnet",
     "gsmap.models.gsmap",
 )
 

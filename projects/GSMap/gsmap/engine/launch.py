@@ -30,7 +30,7 @@ from gsmap.utils.parallel import LAUNCHER, die_with_parent
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 _OWN_KEYS = (
     "backend_args", "classes", "custom_imports", "data_root", "find_unused_parameters", "grid",
-    "model_wrapper_cfg", "runner_type", "strategy", "vis_backends",
+    "model_wrapper_cfg", "runner_type", "strategy", "sync_bn", "vis_backends",
 )  # fmt: skip
 _SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
 

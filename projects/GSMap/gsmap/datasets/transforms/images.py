@@ -57,20 +57,29 @@ class ScaleImages(BaseTransform):
 
     Args:
         scale: Factor, > 0; sizes are rounded down, and the matrices take the exact ratio of each
-            axis. ValueError if it is not positive.
+            axis.
+        size: Rows and columns to resize to, in place of the factor.
+
+    Raises:
+        ValueError: If there is not one of both, or it is not positive.
     """
 
-    scale: float
+    scale: float | None = None
+    size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        if not self.scale > 0:
-            raise ValueError(f"scale must be > 0, got {self.scale}.")
+        if (self.scale is None) == (self.size is None):
+            raise ValueError("ScaleImages needs a scale or a size.")
+        if not min(self.size or (self.scale,)) > 0:
+            raise ValueError(f"scale or size must be > 0, got {self.size or self.scale}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Scale ``results['img']``."""
         height, width = results["img"][0].shape[:2]
-        # 1e-6: a factor such as 0.58 * 100 must not round down to 57
-        size = (int(width * self.scale + 1e-6), int(height * self.scale + 1e-6))
+        if self.size is not None:
+            size = (self.size[1], self.size[0])
+        else:  # 1e-6: a factor such as 0.58 * 100 must not round down to 57
+            size = (int(width * self.scale + 1e-6), int(height * self.scale + 1e-6))
         if min(size) < 1:
             raise ValueError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
         matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
@@ -79,5 +88,5 @@ class ScaleImages(BaseTransform):
         for key in ("lidar2img", "img_aug_matrix"):
             results[key] = [matrix @ m for m in results[key]]
         results["img_shape"] = results["pad_shape"] = size[::-1]
-        results["scale_factor"] = self.scale
+        results["scale_factor"] = size[0] / width
         return results
