@@ -1,19 +1,24 @@
 """PivotNet: key table, targets, matching, decoder, head, projection and the whole model."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, permutations, product
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from mmengine.registry import init_default_scope
+from mmengine.structures import InstanceData
+from scipy.ndimage import binary_dilation
 from torch import Tensor, nn
 
 from gsmap.checkpoints.key_map import PIVOTNET
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.models.pivotnet.encoder import PivotBEVEncoder
-from gsmap.models.pivotnet.head import PivotHead
+from gsmap.models.pivotnet.front import turned
+from gsmap.models.pivotnet.head import PivotHead, PivotPredictions, packed, true_lines
+from gsmap.models.pivotnet.losses import Lines, spaced
 from gsmap.models.pivotnet.matching import match_pivots, path_costs, sequence_costs
 from gsmap.models.pivotnet.targets import FormatPivotTargets
 from gsmap.structures.calibration import calibration_arrays
@@ -29,8 +34,6 @@ CLASSES = ("divider", "crossing", "boundary")
 GRID = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
 B, C, BEV = 2, 256, (64, 32)
 CAMERAS = ("FRONT_LEFT", "FRONT", "FRONT_RIGHT", "BACK_LEFT", "BACK", "BACK_RIGHT")
-# our parameter that stands for two keys of the release, which differ in a dot
-LEAVES = {"query_feat": "query.weight"}
 
 
 def build(golden: Golden, **settings: Any) -> nn.Module:
@@ -62,12 +65,12 @@ def normal(golden: Golden, name: str, shape: tuple[int, ...], **settings: float)
 
 
 def gradient_rows(
-    golden: Golden, name: str, data: Mapping[str, np.ndarray], module: nn.Module, prefix: str
+    golden: Golden, name: str, data: Mapping[str, np.ndarray], parameters: Any, prefix: str
 ) -> Iterator[Row]:
     """Compare the norm of each parameter's gradient, and its product with a noise."""
     gradients = {
         PIVOTNET.to_upstream(prefix + key): parameter.grad
-        for key, parameter in module.named_parameters()
+        for key, parameter in parameters
         if parameter.grad is not None
     }
     keys = [str(key) for key in data["grad_keys"]]
@@ -148,13 +151,22 @@ def check_pivots(golden: Golden, name: str) -> Iterator[Row]:
             wanted = data[f"{tag}_pivots{label}"]
             off = max((largest_difference(line, row[: len(line)]) for line, row in zip(own, wanted, strict=True)), default=0)
             yield Row(name, f"{tag}: pivots {label}", off, 1e-9)
-        for width, transform in (("1", thin), ("8", thick)):
-            masks = transform.masks(parts, pivots, (400, 200))
-            numbers = 2 * np.arange(1, len(parts) + 1) - (width == "1")
-            drawn = np.zeros((3, 400, 200), int)
-            for mask, label, number in zip(masks, labels, numbers, strict=True):
-                drawn[label][mask] = number
-            yield Row(name, f"{tag}: masks of width {width}", largest_difference(drawn, data[f"{tag}_mask{width}"]), 0)
+        masks = thick.masks(parts, pivots, (400, 200))
+        drawn = np.zeros((3, 400, 200), int)
+        for number, (mask, label) in enumerate(zip(masks, labels, strict=True)):
+            drawn[label][mask] = 2 * number + 2
+        off = largest_difference(drawn, data[f"{tag}_mask8"])
+        yield Row(name, f"{tag}: masks of width 8", off, 0)
+        # no loss reads the masks of width 1, and versions of OpenCV draw such lines differently
+        lines = FormatPivotTargets(thickness_px=1).masks(parts, pivots, (400, 200))
+        thin = np.stack([lines[labels == label].any(0) for label in range(3)])
+        far = sum((a & ~wide(b)).sum() for a, b in permutations((thin, data[f"{tag}_mask1"] > 0)))
+        yield Row(name, f"{tag}: pixels of width 1 that are more than one off", far, 0)
+
+
+def wide(masks: np.ndarray) -> np.ndarray:
+    """Return masks widened by one pixel. (n, H, W)"""
+    return binary_dilation(masks, np.ones((1, 3, 3)))
 
 
 @check("pivotnet_projection_{variant}.npz")
@@ -181,3 +193,262 @@ def ground_matrices(golden: Golden, size: tuple[int, int], frame: str = "ego") -
     meta = {"lidar2img": scale @ intrinsics @ cam_from_ego, "lidar2ego": ego_from_frame}
     (matrices,) = calibration_arrays(meta, ["img_from_ground"]).values()
     return torch.from_numpy(matrices)[None]
+
+
+SUBSETS = {  # what the file holds of each gradient
+    "grad_bev_sub": np.s_[:, ::16, ::2, ::2],
+    "grad_query_feat_sub": np.s_[::20, ::4],
+    "grad_query_embed_sub": np.s_[::20, ::4],
+}
+
+
+@check("pivotnet_decoder_{variant}.npz")
+def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the point decoder: states, classes, masks, gradients."""
+    data = golden.read_arrays(name)
+    head = head_of(golden)
+    decoder = head.decoder
+    bev = normal(golden, "pv_bev", (B, C, *BEV)).requires_grad_()
+    outputs = decoder(bev)
+    logits = [torch.cat([own.logits for own in layer], 1) for layer in outputs]
+    masks = [torch.cat([own.masks for own in layer], 1) for layer in outputs]
+    states = [torch.cat([own.states.flatten(1, 2) for own in layer], 1) for layer in outputs]
+    blocked = [decoder.blocked(layer) for layer in outputs]
+    with torch.no_grad():
+        memory = bev.flatten(2).transpose(1, 2) + decoder.level.weight
+        key = memory + decoder.position(bev.new_zeros(1, *BEV)).flatten(2).transpose(1, 2)
+        start = decoder.query.weight.expand(B, -1, -1)
+        cross = decoder.layers[0].look(start, decoder.query_pos.weight, memory, key, blocked[0])
+    ours = {
+        "pred_logits": (torch.stack(logits), 3e-4),
+        "mask_sub": (torch.stack(masks)[:, :, ::6, ::4, ::4], 3e-4),
+        "mask_mean": (torch.stack(masks).mean((3, 4)), 3e-4),
+        "mask_last_sub": (masks[-1][:, ::12], 3e-4),
+        "states_sub": (torch.stack(states)[:, :, ::35, ::8], 3e-4),
+        "states_last_sub": (states[-1][:, ::10, ::2], 3e-4),
+        "cross0_sub": (cross[:, ::35, ::8], 3e-4),
+    }
+    for key, (value, tolerance) in ours.items():
+        yield Row(name, key, largest_difference(value.detach(), data[key]), tolerance)
+    packed = np.packbits(blocked[0][0, ::50].numpy().ravel())
+    wrong = np.unpackbits(packed ^ data["attn_blocked0_packed"]).sum()
+    yield Row(name, "blocked cells of the first layer", wrong, 0)
+    shares = torch.stack(blocked).float().mean(3)[..., ::120]
+    off = largest_difference(shares, data["attn_blocked_fraction"])
+    yield Row(name, "shares of blocked cells", off, 1e-3)
+    scalar = sum(
+        (value * normal(golden, f"pv_gd_logits{i}", tuple(value.shape))).sum()
+        + 0.01 * (mask * normal(golden, f"pv_gd_masks{i}", tuple(mask.shape))).sum()
+        for i, (value, mask) in enumerate(zip(logits, masks, strict=True))
+    )
+    last = states[-1]
+    scalar = scalar + 0.1 * (last * normal(golden, "pv_gd_states", tuple(last.shape))).sum()
+    scalar.backward()
+    yield Row(name, "scalar (relative)", largest_relative(scalar.detach(), data["scalar"]), 1e-4)
+    gradients = {
+        "grad_bev_sub": bev.grad,
+        "grad_query_feat_sub": decoder.query.weight.grad,
+        "grad_query_embed_sub": decoder.query_pos.weight.grad,
+    }
+    for key, gradient in gradients.items():
+        steps = SUBSETS[key]
+        yield Row(name, f"{key} (relative)", relative_norm(gradient[steps], data[key]), 1e-2)
+    yield from gradient_rows(golden, name, data, decoder.named_parameters(), "map_head.decoder.")
+
+
+@check("pivotnet_head_{variant}.npz")
+def check_head(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare points, their kinds and masks from the decoder's states, and gradients."""
+    data, head = golden.read_arrays(name), head_of(golden)
+    bev = normal(golden, "pv_bev", (B, C, *BEV))
+    with torch.no_grad():
+        layers = head.decoder(bev)[1:]
+    leaves = [own.states.requires_grad_() for own in layers[-1]]
+    mean = head.coordinate_feature()
+    off = largest_difference(mean.detach(), data["coords_feature_mean"])
+    yield Row(name, "coords_feature_mean", off, 1e-5)
+    outputs = [head.predictions(layer, mean) for layer in layers]
+    scalar = torch.zeros(())
+    for label, kind in enumerate(CLASSES):
+        own = [output.lines[label] for output in outputs]
+        points, logits = (torch.stack([getattr(o, f) for o in own]) for f in ("points", "point_logits"))
+        ours = {
+            f"points_{kind}": (points, 3e-5),
+            f"point_logits_{kind}": (logits, 3e-4),
+            f"ins_mask_{kind}_sub": (head.enlarged(own[-1].masks)[:, ::5, ::4, ::2], 3e-4),
+        }
+        for key, (value, tolerance) in ours.items():
+            yield Row(name, key, largest_difference(value.detach(), data[key]), tolerance)
+        for word, value in (("ctr", own[-1].points), ("cls", own[-1].point_logits)):
+            weight = normal(golden, f"pv_gh_{word}{label}", tuple(value.shape))
+            scalar = scalar + (value * weight).sum()
+    levels = [normal(golden, f"pv_bev_level{i}", (B, C, *BEV)) for i in range(3)]
+    with torch.no_grad():
+        masks = torch.stack([head.class_masks(turned(level, head.grid)) for level in (*levels, bev)])
+    for label, kind in enumerate(CLASSES):
+        off = largest_difference(masks[:, :, label, ::5, ::5], data[f"sem_mask_{kind}_sub"][:, :, 1])
+        yield Row(name, f"class masks of {kind}", off, 3e-4)
+    scalar.backward()
+    yield Row(name, "scalar (relative)", largest_relative(scalar.detach(), data["scalar"]), 1e-4)
+    gradient = torch.cat([leaf.grad.flatten(1, 2) for leaf in leaves], 1)
+    off = relative_norm(gradient[:, ::10, ::4], data["grad_states_sub"])
+    yield Row(name, "gradient of the states (relative)", off, 1e-2)
+    parameters = [(k, v) for k, v in head.named_parameters() if not k.startswith("decoder.")]
+    yield from gradient_rows(golden, name, data, parameters, "map_head.")
+
+
+class Given:
+    """The recipe's predictions of all layers on a map of 100 x 50 pixels."""
+
+    SHAPES: ClassVar = {  # our part of a line: its name, its shape behind the lines
+        "logits": ("obj", (2,)),
+        "points": ("ctr", (2,)),
+        "point_logits": ("pt", (2,)),
+        "masks": ("mask", (100, 50)),
+    }
+
+    def __init__(self, golden: Golden, head: PivotHead, tag: str, layers: Iterable[int]) -> None:
+        self.golden, self.tag = golden, tag
+        self.layers = [
+            [self.lines(f"{i}_{j}", n, p) for j, (n, p) in enumerate(head.decoder.queries)]
+            for i in layers
+        ]
+
+    def lines(self, number: str, n: int, p: int) -> Lines:
+        """Return the lines of a layer and class."""
+        parts = {}
+        for ours, (theirs, shape) in self.SHAPES.items():
+            full = (1, n, *((p,) if "point" in ours else ()), *shape)
+            key = f"{self.tag}{theirs}{number}"
+            if ours == "points":
+                made = self.golden.pivotnet.uniform(key, full, 0.02, 0.98, self.golden.seed)
+                parts[ours] = torch.from_numpy(made)
+            else:
+                parts[ours] = normal(self.golden, key, full, shift=-float(ours == "masks"))
+            parts[ours].requires_grad_()
+        return Lines(**parts)
+
+
+LOSS_NAMES = {
+    "mask": "ins_msk_loss",
+    "cls": "ins_obj_loss",
+    "pivots": "pts_loss",
+    "collinear": "collinear_pts_loss",
+    "point_cls": "pt_logits_loss",
+    "semantic": "sem_msk_loss",
+}
+
+
+@check("pivotnet_losses_{variant}.npz")
+def check_losses(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare matches, losses, gradients and what is decoded."""
+    data, head = golden.read_arrays(name), head_of(golden)
+    for tag in ("closed", "many", "dividers_only"):
+        yield from loss_rows(golden, name, head, tag, data)
+    yield from post_rows(golden, name, head, data)
+
+
+def truth_of(golden: Golden, tag: str) -> InstanceData:
+    """Return the targets of a set, with masks of every fourth pixel."""
+    only = tag == "dividers_only"
+    found = elements(golden, "many" if only else tag)
+    results = {
+        "map_instances": [e for e in found if e.label == 0 or not only],
+        "token": tag,
+        "x_range": GRID.x_range,
+        "y_range": GRID.y_range,
+    }
+    gt = FormatPivotTargets().transform(results)["gt_instances_3d"]
+    gt.masks = gt.masks[:, ::4, ::4]
+    return gt
+
+
+def loss_rows(
+    golden: Golden, name: str, head: PivotHead, tag: str, data: Mapping[str, np.ndarray]
+) -> Iterator[Row]:
+    """Compare matches, losses and gradients with a set of ground truth."""
+    given = Given(golden, head, "pv_loss_", range(6))
+    semantic = [
+        [normal(golden, f"pv_loss_sem{i}_{j}", (1, 2, 100, 50), shift=-1) for j in range(3)]
+        for i in range(4)
+    ]
+    for part in chain.from_iterable(semantic):
+        part.requires_grad_()
+    truth = true_lines(truth_of(golden, tag), head.grid, head.decoder.queries, head.mask_size)
+    nothing = torch.empty(0)
+    outputs = [PivotPredictions(nothing, nothing, lines) for lines in given.layers]
+    losses, matches = head.line_losses(outputs, [truth], [tag])
+    losses["semantic"] = sum(
+        weight * head.semantic_loss(torch.cat([part[:, 1:] for part in level], 1), [truth])
+        for weight, level in zip(head.level_weights, semantic, strict=True)
+    ) / (4 * 3)
+    wrong, paths = 0.0, []
+    for i, j in product(range(6), range(3)):
+        rows, cols = matches[i][j][0]
+        pairs = torch.stack([rows, cols], 1)
+        expected = data.get(f"{tag}_match_l{i}_c{j}", np.empty((0, 2)))
+        wrong = max(wrong, largest_difference(pairs, expected))
+        lines = Lines(*(part[0] for part in given.layers[i][j]))
+        found, _ = spaced(lines, truth[j], rows, cols)
+        paths += [np.flatnonzero(path) for path in found.numpy()]
+    yield Row(name, f"{tag}: pairs of prediction and ground truth", wrong, 0)
+    width = data[f"{tag}_pivot_matches"].shape[1]
+    filled = [np.pad(path, (0, width - len(path)), constant_values=-1) for path in paths]
+    off = largest_difference(np.stack(filled), data[f"{tag}_pivot_matches"])
+    yield Row(name, f"{tag}: paths of pivots", off, 0)
+    for ours, theirs in LOSS_NAMES.items():
+        off = largest_relative(losses[ours].detach(), data[f"{tag}_{theirs}"])
+        yield Row(name, f"{tag}: {ours} (relative)", off, 1e-4)
+    total = sum(losses.values())
+    off = largest_relative(total.detach(), data[f"{tag}_total_loss"])
+    yield Row(name, f"{tag}: total (relative)", off, 1e-4)
+    total.backward()
+    for j in range(3 * (tag != "dividers_only")):
+        lines = given.layers[5][j]
+        gradients = {
+            f"ctr_im_l5_c{j}": lines.points.grad,
+            f"pts_logits_l5_c{j}": lines.point_logits.grad,
+            f"obj_logits_l5_c{j}": lines.logits.grad,
+            f"mask_l5_c{j}_sub": lines.masks.grad[:, ::5, ::4, ::4],
+            f"sem_l3_c{j}_sub": semantic[3][j].grad[..., ::5, ::5],
+        }
+        for key, value in gradients.items():
+            off = relative_norm(value, data[f"{tag}_grad_{key}"])
+            yield Row(name, f"{tag}: gradient {key} (relative)", off, 1e-3)
+
+
+def post_rows(
+    golden: Golden, name: str, head: PivotHead, data: Mapping[str, np.ndarray]
+) -> Iterator[Row]:
+    """Compare the decoded lines."""
+    lines = Given(golden, head, "pv_post_", [5]).layers[0]
+    yield from decoded_rows(name, head, predicted(lines), data, "post", (100, 50))
+
+
+def predicted(lines: Sequence[Lines]) -> PivotPredictions:
+    """Return what the head would say of such lines."""
+    return packed([Lines(*(part.detach() for part in own)) for own in lines])
+
+
+def decoded_rows(
+    name: str,
+    head: PivotHead,
+    output: PivotPredictions,
+    data: Mapping[str, np.ndarray],
+    tag: str,
+    size: tuple[int, int],
+) -> Iterator[Row]:
+    """Compare the lines, in the file's order: by class and query."""
+    (result,) = head.predict_by_feat([output], [{}])
+    best = head.coder.decode(output.scores[0], result.pts)
+    order = best.query_inds.argsort().numpy()
+    labels = result.labels_3d.numpy()[order] + 1
+    yield Row(name, f"{tag}: classes", largest_difference(labels, data[f"{tag}_labels"]), 0)
+    numbers = result.num_pts.numpy()[order]
+    yield Row(name, f"{tag}: points", largest_difference(numbers, data[f"{tag}_lengths"]), 0)
+    scores = result.scores_3d.numpy()[order]
+    yield Row(name, f"{tag}: scores", largest_difference(scores, data[f"{tag}_scores"]), 1e-4)
+    points = head.grid.front_from_metres(result.pts).numpy()[order] * size
+    found = np.concatenate([line[:number] for line, number in zip(points, numbers, strict=True)])
+    off = largest_difference(found, data[f"{tag}_pivots"]) / max(size)
+    yield Row(name, f"{tag}: pivots ([0, 1])", off, 1e-5 if tag == "post" else 1e-3)

@@ -55,6 +55,22 @@ class PivotPredictions(NamedTuple):
     lines: list[Lines]  # by class, (B, n, ...) each, masks as large as the BEV features
 
 
+def packed(lines: list[Lines]) -> PivotPredictions:
+    """Join what a layer says of the lines of each class; ends are pivots whatever it says."""
+    scores, references = [], []
+    longest = max(own.points.shape[2] for own in lines)
+    for label, own in enumerate(lines):
+        score = own.logits.new_full((*own.logits.shape[:2], len(lines)), -torch.inf)
+        score[..., label] = own.logits[..., LINE] - own.logits[..., 1 - LINE]
+        scores.append(score)
+        pivot = own.point_logits[..., PIVOT] - own.point_logits[..., 1 - PIVOT]
+        ends = torch.ones_like(pivot[..., :1])
+        pivot = torch.cat([ends, pivot[..., 1:-1], ends], -1)
+        both = torch.cat([own.points, pivot[..., None]], -1)
+        references.append(F.pad(both, (0, 0, 0, longest - own.points.shape[2]), value=-1.0))
+    return PivotPredictions(torch.cat(scores, 1), torch.cat(references, 1), lines)
+
+
 @MODELS.register_module()
 class PivotHead(DetectionHead):
     """Predict lines of classes that have queries and numbers of points of their own (PivotNet).
@@ -141,25 +157,14 @@ class PivotHead(DetectionHead):
 
     def predictions(self, layer: Sequence[ClassLines], mean: Tensor) -> PivotPredictions:
         """Return the points, kinds and scores of a layer's lines."""
-        lines, scores, references = [], [], []
-        longest = max(p for _, p in self.decoder.queries)
-        for label, own in enumerate(layer):
-            feature = self.point_branches[label](own.states).float()
+        lines = []
+        branches = zip(layer, self.point_branches, self.kind_branches, strict=True)
+        for own, point_branch, kind_branch in branches:
+            feature = point_branch(own.states).float()
             points = (feature.unflatten(-1, (2, _POINT_DIMS)) @ mean).sigmoid()  # (B, n, p, 2)
-            kinds = self.kind_branches[label](feature).float()
-            logits = own.logits.float()
-            lines.append(Lines(logits, points, kinds, own.masks.float()))
-            score = logits.new_full((*logits.shape[:2], len(self.classes)), -torch.inf)
-            score[..., label] = logits[..., LINE] - logits[..., 1 - LINE]
-            scores.append(score)
-            pivot = kinds[..., PIVOT] - kinds[..., 1 - PIVOT]
-            always = torch.zeros_like(pivot, dtype=torch.bool)
-            always[..., [0, -1]] = True  # the ends
-            pivot = pivot.masked_fill(always, torch.inf)
-            missing = longest - points.shape[2]
-            padded = [F.pad(points, (0, 0, 0, missing)), F.pad(pivot, (0, missing), value=-1.0)[..., None]]
-            references.append(torch.cat(padded, -1))
-        return PivotPredictions(torch.cat(scores, 1), torch.cat(references, 1), lines)
+            kinds = kind_branch(feature).float()
+            lines.append(Lines(own.logits.float(), points, kinds, own.masks.float()))
+        return packed(lines)
 
     def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
         """Run the head and return its losses, sums of all layers."""
