@@ -17,9 +17,10 @@ from mmengine.registry import init_default_scope
 from torch import Tensor
 
 from gsmap import registered  # noqa: F401
+from gsmap.checkpoints.key_map import PIVOTNET
 
 NUM_CAMS = 6
-OWN_RECIPES = ("mapqr", "mgmapnet")  # methods whose weights have another scale
+OWN_RECIPES = ("mapqr", "mgmapnet", "pivotnet")  # methods whose weights have another scale
 
 
 @dataclass(eq=False)
@@ -99,6 +100,13 @@ class Golden:
         """Return the upstream state that the recipe makes for a state list."""
         method = name.split("_")[0]
         recipe = self.recipe(method) if method in OWN_RECIPES else self.weights
+        if method == "pivotnet":
+            shapes = self.state_shapes(name)
+            made = {key: recipe.tensor(key, shape, self.seed) for key, shape in shapes.items()}
+            return {
+                key: PIVOTNET.unused[key] if value is None else torch.from_numpy(value)
+                for key, value in made.items()
+            }
         arrays = recipe.state(self.state_shapes(name), self.seed)
         return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}
 

@@ -16,7 +16,7 @@ from torch.hub import load_state_dict_from_url
 from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, plain
-from gsmap.datasets.transforms.images import ScaleImages, scaled_size
+from gsmap.datasets.transforms.images import ScaleImages
 from gsmap.engine.run_log import innermost
 from gsmap.utils.files import write_bytes, write_text
 
@@ -115,5 +115,5 @@ def _image_size(runner: Runner) -> tuple[int, int] | None:
     cameras = [c for c in cameras if c.name in (dataset.cameras or [c.name])]
     size = max(c.width for c in cameras), max(c.height for c in cameras)
     for step in dataset.pipeline.transforms:
-        size = scaled_size(size, step.scale) if isinstance(step, ScaleImages) else size
+        size = step.scaled(*size) if isinstance(step, ScaleImages) else size
     return size

@@ -33,7 +33,7 @@ from gsmap.utils.parallel import LAUNCHER, die_with_parent
 _COPIED = ("backend_args", "classes", "data_root", "grid", "vis_backends")  # read by no runner
 _OWN_KEYS = (
     *_COPIED, "custom_imports", "find_unused_parameters", "model_wrapper_cfg", "runner_type",
-    "strategy",
+    "strategy", "sync_bn",
 )  # fmt: skip
 _SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
 
@@ -77,7 +77,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
         if not steps:
             raise ValueError(f"--image-scale: no pipeline of {cfg.filename} has ScaleImages.")
         for step in steps:
-            step.scale = factor
+            step.update(scale=factor, size=None)
     _check_keys(cfg)
     with _naming(f"custom_imports of {cfg.filename or 'a config'}"):
         import_modules_from_strings(**cfg.get("custom_imports", {"imports": ["gsmap.registered"]}))

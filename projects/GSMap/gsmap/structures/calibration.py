@@ -19,7 +19,8 @@ def calibration_arrays(
             ``lidar2ego`` (4, 4) and ``can_bus`` (18,) those that the names need. Without
             ``can_bus`` the vehicle's motion is zero.
         names: ``img_from_frame`` and ``frame_from_img``, between metres in the annotation frame and
-            (u * d, v * d, d, 1) in pixels of the network's image; ``cam2img``; ``img_aug_matrix``;
+            (u * d, v * d, d, 1) in pixels of the network's image; ``img_from_ground``, the former
+            with z above the plane on which the vehicle stands; ``cam2img``; ``img_aug_matrix``;
             ``ego_from_cam``; ``can_bus``.
 
     Raises:
@@ -39,8 +40,16 @@ def calibration_arrays(
     # Inverses are taken in float64, so that they are as exact as float32 can hold them.
     derived = {
         "img_from_frame": lambda: field("lidar2img"),
+        "img_from_ground": lambda: field("lidar2img") @ _frame_from_ground(field("lidar2ego")),
         "frame_from_img": lambda: np.linalg.inv(field("lidar2img")),
         "ego_from_cam": lambda: field("lidar2ego") @ np.linalg.inv(field("lidar2cam")),
     }
     values = {name: derived[name]() if name in derived else field(name) for name in names}
     return {name: value.astype(np.float32) for name, value in values.items()}
+
+
+def _frame_from_ground(ego_from_frame: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Return what lifts (x, y, height above z = 0 of the vehicle, 1) to the annotation frame."""
+    lifting = np.eye(4)
+    lifting[2, [0, 1, 3]] = -ego_from_frame[2, [0, 1, 3]] / ego_from_frame[2, 2]
+    return lifting

@@ -93,6 +93,25 @@ class BEVGrid:
         """Map [0, 1] over the extent to metres. (..., 2)"""
         return _affine(points, self.extent_m, (self.x_range[0], self.y_range[0]))
 
+    def front_from_metres(self, points: Array) -> Array:
+        """Map metres to [0, 1] from the front edge to the rear and from the left to the right.
+
+        (..., 2)
+        """
+        order, scale, shift = self._front
+        return _affine(self.norm_from_metres(points)[..., order], scale, shift)
+
+    def metres_from_front(self, points: Array) -> Array:
+        """Map [0, 1] from the front edge and from the left to metres. (..., 2)"""
+        order, scale, shift = self._front
+        return self.metres_from_norm(_affine(points, scale, shift)[..., order])
+
+    @property
+    def _front(self) -> tuple[list[int], tuple[float, float], tuple[float, float]]:
+        """Return how [0, 1] over the map is turned to the front and back: order, scale, shift."""
+        along_x = self.forward == "x"
+        return ([0, 1], (-1, -1), (1, 1)) if along_x else ([1, 0], (-1, 1), (1, 0))
+
     def _in_units(self, points: Array, sizes_m: tuple[float, float]) -> Array:
         """Measure points from the lower corner in units of given sizes. (..., 2)"""
         shift = -self.x_range[0] / sizes_m[0], -self.y_range[0] / sizes_m[1]

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import mmcv
 import numpy as np
@@ -60,40 +60,52 @@ class ScaleImages(BaseTransform):
 
     Args:
         scale: Factor, > 0; sizes are rounded down, and the matrices take the exact ratio of each
-            axis. ValueError if it is not positive.
+            axis.
+        size: Rows and columns to resize to, in place of the factor.
         trained_size: Width and height, in pixels, that a model was trained at: images that
             ``scale`` would make larger or smaller get the longer side of it in place of that. They
             are neither cropped nor padded.
+
+    Raises:
+        ValueError: If there is not one of factor and size, or it is not positive.
     """
 
-    scale: float
+    scale: float | None = None
+    size: tuple[int, int] | None = None
     trained_size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        if not self.scale > 0:
-            raise ValueError(f"scale must be > 0, got {self.scale}.")
+        if (self.scale is None) == (self.size is None):
+            raise ValueError("ScaleImages needs a scale or a size.")
+        if not min(self.size or (self.scale,)) > 0:
+            raise ValueError(f"scale or size must be > 0, got {self.size or self.scale}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Scale ``results['img']``."""
         height, width = results["img"][0].shape[:2]
-        scale, size = self.scale, scaled_size((width, height), self.scale)
+        size = self.scaled(width, height)
         if self.trained_size is not None and max(size) != max(self.trained_size):
-            scale = max(self.trained_size) / max(width, height)
-            size = scaled_size((width, height), scale)
+            size = _times((width, height), max(self.trained_size) / max(width, height))
             _say_scaled((width, height), size, tuple(self.trained_size))
         if min(size) < 1:
-            raise ValueError(f"scale {scale} leaves nothing of a {width} x {height} image.")
+            raise ValueError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
         matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
         if size != (width, height):
             results["img"] = [mmcv.imresize(img, size) for img in results["img"]]
         for key in ("lidar2img", "img_aug_matrix"):
             results[key] = [matrix @ m for m in results[key]]
         results["img_shape"] = results["pad_shape"] = size[::-1]
-        results["scale_factor"] = scale
+        results["scale_factor"] = size[0] / width
         return results
 
+    def scaled(self, width: int, height: int) -> tuple[int, int]:
+        """Return width and height of an image after it, in pixels."""
+        if self.size is not None:
+            return self.size[1], self.size[0]
+        return _times((width, height), cast(float, self.scale))
 
-def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
+
+def _times(size: tuple[int, int], scale: float) -> tuple[int, int]:
     """Return width and height of a scaled image, in pixels."""
     # 1e-6: a factor such as 0.58 * 100 must not round down to 57
     return int(size[0] * scale + 1e-6), int(size[1] * scale + 1e-6)

@@ -30,18 +30,21 @@ class CameraEncoder(BaseModule):
     ) -> dict[str, Any]:
         """Return ``bev_feats`` (B, C, H, W), row 0 at the smallest y, and what else `encode` does.
 
-        Of the image features, a list of (B, V, C, h, w), the first level is used. Samples have
-        ``batch_input_shape`` and what the calibration is read from; ValueError if one lacks a field
+        Image features are a list of (B, V, C, h, w). Samples have ``batch_input_shape`` and what the calibration is read from; ValueError if one lacks a field
         or has another number of cameras.
         """
-        feats = mlvl_feats[0]
-        calibration = stack_calibration(img_metas, self.calibration, feats.device)
+        calibration = stack_calibration(img_metas, self.calibration, mlvl_feats[0].device)
+        feats = self.levels_of(mlvl_feats)
         return self.encode(feats, calibration, img_metas[0]["batch_input_shape"])
 
+    def levels_of(self, mlvl_feats: Sequence[Tensor]) -> Any:
+        """Return the image features that `encode` takes: the first level."""
+        return mlvl_feats[0]
+
     def encode(
-        self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
+        self, feats: Any, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode features (B, V, C, h, w), with the calibration as tensors (B, ...).
+        """Encode features (B, V, C, h, w), or what `levels_of` returns, with the calibration as tensors (B, ...).
 
         ``img_shape`` are rows and columns of the padded images.
         """

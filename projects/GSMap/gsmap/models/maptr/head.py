@@ -67,8 +67,45 @@ class QueryGroup:
             )
 
 
+class DetectionHead(BaseModule):
+    """What every head shares: detections of its last layer.
+
+    Attributes:
+        reference: How references of predictions stand for points (`PointReference`).
+        coder: The choice of detections.
+    """
+
+    reference: Any
+    coder: MapCoder
+
+    def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Fit a checkpoint's state to the model's, in place."""
+
+    def predict(self, bev_outputs: Tensors, batch_data_samples: Samples) -> list[InstanceData]:
+        """Run the head and return its detections."""
+        metas = [sample.metainfo for sample in batch_data_samples]
+        return self.predict_by_feat(self(bev_outputs), metas)
+
+    def predict_by_feat(
+        self, outputs: Sequence[Predictions], batch_img_metas: Metas
+    ) -> list[InstanceData]:
+        """Decode the last layer's predictions, best first.
+
+        They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,), ``pts`` (M, P, 2) in metres
+        and what else the reference decodes.
+        """
+        results = []
+        for scores, references in zip(outputs[-1].scores, outputs[-1].references, strict=True):
+            fields = self.reference.decode(references)
+            best = self.coder.decode(scores, fields["pts"])
+            chosen = {name: value[best.query_inds] for name, value in fields.items()}
+            chosen.update(scores_3d=best.scores, labels_3d=best.labels)
+            results.append(InstanceData(metainfo=self.reference.metainfo, **chosen))
+        return results
+
+
 @MODELS.register_module()
-class MapHead(BaseModule):
+class MapHead(DetectionHead):
     """Predict N map elements of P ordered points from BEV features, as its parts say.
 
     A query is the sum of its instance's and its point's embedding (MapTR); half of its channels are
@@ -325,25 +362,3 @@ class MapHead(BaseModule):
     def statistics(self, pairs: MatchedPairs) -> Tensors:
         """Return figures to log beside the losses; their names do not start with ``loss``."""
         return {}
-
-    def predict(self, bev_outputs: Tensors, batch_data_samples: Samples) -> list[InstanceData]:
-        """Run the head and return its detections."""
-        metas = [sample.metainfo for sample in batch_data_samples]
-        return self.predict_by_feat(self(bev_outputs), metas)
-
-    def predict_by_feat(
-        self, outputs: Sequence[Predictions], batch_img_metas: Metas
-    ) -> list[InstanceData]:
-        """Decode the last layer's predictions, best first.
-
-        They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,), ``pts`` (M, P, 2) in metres
-        and what else the reference decodes.
-        """
-        results = []
-        for scores, references in zip(outputs[-1].scores, outputs[-1].references, strict=True):
-            fields = self.reference.decode(references)
-            best = self.coder.decode(scores, fields["pts"])
-            chosen = {name: value[best.query_inds] for name, value in fields.items()}
-            chosen.update(scores_3d=best.scores, labels_3d=best.labels)
-            results.append(InstanceData(metainfo=self.reference.metainfo, **chosen))
-        return results

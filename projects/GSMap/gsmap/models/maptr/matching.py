@@ -60,31 +60,29 @@ class MapAssigner:
         """
         device, num_gts = pred_instances.scores.device, len(gt_instances.labels)
         if num_gts == 0:
-            self._check_finite(pred_instances.scores[None], ["class scores"], img_meta)
+            check_finite(pred_instances.scores[None], ["class scores"], img_meta)
             return MapMatch(*torch.empty(3, 0, dtype=torch.long, device=device))
         sample = pred_instances, gt_instances, img_meta
         total = torch.stack([cost(*sample).float() for cost in self.match_costs]).cpu()
-        self._check_finite(total, self.names, img_meta)
+        check_finite(total, self.names, img_meta)
         rows, cols = linear_sum_assignment(np.tile(total.sum(0).numpy(), repeats))
         queries = torch.from_numpy(rows).to(device)
         gts = torch.from_numpy(cols % num_gts).to(device)
         offsets = pred_instances.pts[queries, None] - gt_instances.pts_shifts[gts]  # (M, S, P, 2)
         return MapMatch(queries, gts, offsets.abs().sum((-1, -2)).argmin(-1))
 
-    @staticmethod
-    def _check_finite(
-        values: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None
-    ) -> None:
-        """Refuse values that the assignment cannot order; one name for each of the first axis."""
-        finite = values.isfinite().flatten(1).all(1)
-        if not finite.all():
-            token = (img_meta or {}).get("token", "unknown")
-            what = names[int(finite.int().argmin())]
-            raise FloatingPointError(
-                f"{what} of sample {token!r} is not finite before the assignment: look at the "
-                "sample's images and ground truth, then at the learning rate and at the loss scale "
-                "of mixed precision."
-            )
+
+def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None) -> None:
+    """Refuse values that the assignment cannot order; one name for each of the first axis."""
+    finite = values.isfinite().flatten(1).all(1)
+    if not finite.all():
+        token = (img_meta or {}).get("token", "unknown")
+        what = names[int(finite.int().argmin())]
+        raise FloatingPointError(
+            f"{what} of sample {token!r} is not finite before the assignment: look at the "
+            "sample's images and ground truth, then at the learning rate and at the loss scale "
+            "of mixed precision."
+        )
 
 
 class MapCost:

@@ -1,0 +1,206 @@
+"""PivotNet's targets: the pivots of every line, and its mask."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import shapely
+import torch
+from mmcv.transforms import BaseTransform
+from mmdet3d.registry import TRANSFORMS
+from mmengine.structures import InstanceData
+from numpy.typing import NDArray
+
+from gsmap.models.pivotnet.front import front_size
+from gsmap.structures.grid import BEVGrid
+from gsmap.structures.polylines import is_closed
+
+Points = NDArray[np.float64]
+
+
+def significances(points: Points) -> NDArray[np.float64]:
+    """Return the area with which each point is removed, infinite for the ends. (n, 2) -> (n,)
+
+    Visvalingam and Whyatt: the point of the smallest triangle with its neighbours goes first. A
+    point counts at least as much as those removed before it.
+    """
+    areas = np.full(len(points), np.inf)
+    for i in range(1, len(points) - 1):
+        areas[i] = _triangle(*points[i - 1 : i + 2])
+    result, left, next_up = areas.copy(), list(range(len(points))), 0
+    while len(left) > 2:
+        at = next_up or int(np.argmin(areas[left]))
+        smallest = areas[left.pop(at)]
+        next_up = 0
+        for near in (at, at - 1):  # what was on its right and on its left
+            if 0 < near < len(left) - 1:
+                area = _triangle(*points[left[near - 1 : near + 2]])
+                if area <= smallest:
+                    area, next_up = smallest, near
+                areas[left[near]] = result[left[near]] = area
+    return result
+
+
+def _triangle(a: Points, b: Points, c: Points) -> float:
+    """Return the area of a triangle."""
+    return abs(a[0] * (b[1] - c[1]) + b[0] * (c[1] - a[1]) + c[0] * (a[1] - b[1])) / 2
+
+
+def directed(line: Points, tolerance: float, sort_rings: bool = False) -> Points:
+    """Let a line start at its rear end or, of ends at one height, at the one farther right.
+
+    Points are (u, v) from the front and from the left, all in one unit; ends whose heights differ
+    by at most ``tolerance`` lie at one height. ``sort_rings`` lets a ring start at its rearmost
+    vertex and run clockwise. (n, 2) -> (n, 2)
+    """
+    if sort_rings and is_closed(line):
+        ring = np.roll(line[:-1], -int(line[:-1, 0].argmax()), 0)
+        ring = np.concatenate([ring, ring[:1]])
+        turns = ring[:-1, 1] * ring[1:, 0] - ring[1:, 1] * ring[:-1, 0]  # seen with u downwards
+        return ring if turns.sum() > 0 else ring[::-1]
+    (u0, v0), (u1, v1) = line[0], line[-1]
+    starts_well = u0 > u1 if abs(u0 - u1) > tolerance else v0 >= v1
+    return line if starts_well else line[::-1]
+
+
+def longest_edges(ring: Points) -> list[Points]:
+    """Return the two longest edges of a ring, the longest last. 2 x (2, 2)"""
+    lengths = np.linalg.norm(np.diff(ring, axis=0), axis=1)
+    return [ring[i : i + 2] for i in np.argsort(lengths, kind="stable")[-2:]]
+
+
+def sampled(line: Points, step: float) -> Points:
+    """Return a point at every step from the start; the rest at the end is dropped. (n, 2)"""
+    along = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()])
+    at = np.arange(0.0, along[-1], step)
+    return np.stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)], -1)
+
+
+@TRANSFORMS.register_module()
+@dataclass(eq=False)
+class FormatPivotTargets(BaseTransform):
+    """Add ``gt_instances_3d`` with the pivots of lines, from ``map_instances``.
+
+    It has ``labels_3d`` (K,), ``pts`` (K, P, 2) in metres, the last pivot repeated, ``num_pts``
+    (K,) and ``masks`` (K, H, W), with rows from the front and columns from the left.
+
+    Args:
+        num_points: Most pivots P of a line of each class, as in the head.
+        edge_classes: Class indices whose rings become their two longest edges.
+        pixel_m: Side of a pixel of the masks in metres.
+        thickness_px: Width of lines in them.
+        step_m: Lines are sampled at this distance first.
+        min_area_m2: A point is a pivot if its triangle is at least as large.
+        keep_end: Whether a line of too many pivots keeps the most significant ones; by default the
+            first, as released, so that its end is lost.
+        sort_rings: Whether rings start at their rearmost vertex and run clockwise; by default they
+            stay as they are annotated.
+
+    Raises:
+        ValueError: If a class has less than two points.
+    """
+
+    num_points: Sequence[int] = (10, 2, 30)
+    edge_classes: Sequence[int] = (1,)
+    pixel_m: float = 0.15
+    thickness_px: int = 8
+    step_m: float = 1.0
+    min_area_m2: float = 2.0
+    keep_end: bool = False
+    sort_rings: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.num_points, default=0) < 2:
+            raise ValueError(f"num_points must be >= 2 for each class, got {self.num_points}.")
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Add the targets; ValueError without ground truth or for a class that has no number."""
+        if results["map_instances"] is None:
+            raise ValueError(
+                f"sample {results['token']!r} has no ground truth: leave FormatPivotTargets out of "
+                "this pipeline."
+            )
+        grid = BEVGrid(results["x_range"], results["y_range"]).rasterized(self.pixel_m)
+        size_m = np.array(front_size(grid)) * self.pixel_m
+        parts: list[tuple[int, Points]] = []
+        for instance in results["map_instances"]:
+            if not 0 <= instance.label < len(self.num_points):
+                raise ValueError(
+                    f"label {instance.label} of an element, but num_points of FormatPivotTargets "
+                    f"is {self.num_points}: give one for each class."
+                )
+            points = instance.points[:, :2].astype(np.float64)
+            parts += [(instance.label, line) for line in self.lines(points, instance.label, grid)]
+        parts.sort(key=lambda part: part[0])
+        pivots = [self.pivots(line * size_m, self.num_points[label]) for label, line in parts]
+        points = np.zeros((len(parts), max(self.num_points), 2))
+        for row, line in zip(points, pivots, strict=True):
+            row[: len(line)], row[len(line) :] = line, line[-1]
+        masks = self.masks(parts, [line / size_m for line in pivots], front_size(grid))
+        results["gt_instances_3d"] = InstanceData(
+            labels_3d=torch.tensor([label for label, _ in parts], dtype=torch.int64),
+            pts=torch.from_numpy(grid.metres_from_front(points / size_m).astype(np.float32)),
+            num_pts=torch.tensor([len(line) for line in pivots], dtype=torch.int64),
+            masks=torch.from_numpy(masks),
+        )
+        return results
+
+    def lines(self, points: Points, label: int, grid: BEVGrid) -> list[Points]:
+        """Return the parts of an element on the map, [0, 1] from the front and the left."""
+        edges = label in self.edge_classes and is_closed(points)
+        box = shapely.box(grid.x_range[0], grid.y_range[0], grid.x_range[1], grid.y_range[1])
+        found: list[Points] = []
+        for line in longest_edges(points) if edges else [points]:
+            if self.sort_rings and is_closed(line):
+                samples = np.concatenate([sampled(line, self.step_m), line[:1]])
+            else:
+                samples = sampled(line, self.step_m)
+            if len(samples) < 2:
+                continue
+            inside = shapely.LineString(samples).intersection(box)
+            found += [
+                grid.front_from_metres(shapely.get_coordinates(part))
+                for part in shapely.get_parts(inside)
+                if part.geom_type == "LineString" and not part.is_empty
+            ]
+        return found
+
+    def pivots(self, line: Points, num_points: int) -> Points:
+        """Return the pivots of a line in metres from the front and the left. (m, 2)"""
+        line = directed(line, 1.0, self.sort_rings)
+        areas = significances(line)
+        chosen = np.flatnonzero(areas >= self.min_area_m2)
+        if self.keep_end and len(chosen) > num_points:
+            chosen = np.sort(np.argsort(-areas, kind="stable")[:num_points])
+        return line[chosen[:num_points]]
+
+    def masks(
+        self, parts: Sequence[tuple[int, Points]], pivots: Iterable[Points], size: tuple[int, int]
+    ) -> NDArray[np.bool_]:
+        """Draw the lines of each class over each other; by their pivots if one is hidden.
+
+        (K, H, W)
+        """
+        scale = np.array(size)
+        labels = np.array([label for label, _ in parts], int)
+        masks = self._drawn([line * scale for _, line in parts], labels, size)
+        redrawn = self._drawn([line * scale for line in pivots], None, size)
+        hidden = np.isin(labels, labels[~masks.any((1, 2))])
+        masks[hidden] = redrawn[hidden]
+        return masks
+
+    def _drawn(
+        self, lines: Sequence[Points], labels: NDArray[np.int_] | None, size: tuple[int, int]
+    ) -> NDArray[np.bool_]:
+        """Draw lines in pixels; a later line of the same label hides an earlier one."""
+        masks = np.zeros((len(lines), *size), np.uint8)
+        for i, line in enumerate(lines):
+            cv2.polylines(
+                masks[i], [line[:, ::-1].astype(np.int32)], False, (1,), self.thickness_px
+            )
+            if labels is not None:
+                earlier = np.flatnonzero(labels[:i] == labels[i])
+                masks[earlier] &= ~masks[i] & 1
+        return masks.astype(bool)
