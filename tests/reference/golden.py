@@ -72,6 +72,11 @@ class Golden:
         return self._module("mgmapnet_recipe")
 
     @cached_property
+    def streammapnet(self) -> ModuleType:
+        """The recipe of StreamMapNet's weights, inputs and poses."""
+        return self._module("streammapnet_recipe")
+
+    @cached_property
     def cameras(self) -> dict[str, Any]:
         """Cameras of the variant."""
         return self.read_json(f"cameras_{self.variant}.json")
@@ -96,7 +101,8 @@ class Golden:
 
     def upstream_state(self, name: str) -> dict[str, Tensor]:
         """Return the upstream state that the recipe makes for a state list."""
-        recipe = self.mgmapnet if name.startswith("mgmapnet") else self.weights
+        own = {"mgmapnet": "mgmapnet_recipe", "streammapnet": "streammapnet_recipe"}
+        recipe = self._module(own.get(name.split("_")[0], "weights_recipe"))
         arrays = recipe.state(self.state_shapes(name), self.seed)
         return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}
 

@@ -57,17 +57,29 @@ class ScaleImages(BaseTransform):
 
     Args:
         scale: Factor, > 0; sizes are rounded down, and the matrices take the exact ratio of each
-            axis. ValueError if it is not positive.
+            axis.
+        size: In place of a factor, the width and height of every image, without the padding that
+            made them equal.
+
+    ValueError if not one of both is given, and positive.
     """
 
-    scale: float
+    scale: float | None = None
+    size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        if not self.scale > 0:
+        if (self.scale is None) == (self.size is None):
+            raise ValueError(f"give scale or size, got {self.scale} and {self.size}.")
+        if self.size is not None and min(self.size) < 1:
+            raise ValueError(f"size must be positive, got {self.size}.")
+        if self.scale is not None and not self.scale > 0:
             raise ValueError(f"scale must be > 0, got {self.scale}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Scale ``results['img']``."""
+        if self.size is not None:
+            return self._to_size(results, (int(self.size[0]), int(self.size[1])))
+        assert self.scale is not None
         height, width = results["img"][0].shape[:2]
         # 1e-6: a factor such as 0.58 * 100 must not round down to 57
         size = (int(width * self.scale + 1e-6), int(height * self.scale + 1e-6))
@@ -80,4 +92,17 @@ class ScaleImages(BaseTransform):
             results[key] = [matrix @ m for m in results[key]]
         results["img_shape"] = results["pad_shape"] = size[::-1]
         results["scale_factor"] = self.scale
+        return results
+
+    @staticmethod
+    def _to_size(results: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
+        """Bring each image, as large as it was loaded, to a size (width, height)."""
+        for view, (height, width) in enumerate(results["raw_shapes"]):
+            img = results["img"][view][:height, :width]
+            results["img"][view] = mmcv.imresize(img, size)
+            matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
+            for key in ("lidar2img", "img_aug_matrix"):
+                results[key][view] = matrix @ results[key][view]
+        results["raw_shapes"] = [size[::-1]] * len(results["img"])
+        results["img_shape"] = results["pad_shape"] = size[::-1]
         return results
