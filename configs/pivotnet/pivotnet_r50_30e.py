@@ -7,7 +7,7 @@ _base_ = [
 model = dict(grid=_base_.grid, classes=_base_.classes)
 _cameras = [  # neighbours side by side
     'CAM_FRONT_LEFT', 'CAM_FRONT', 'CAM_FRONT_RIGHT', 'CAM_BACK_LEFT', 'CAM_BACK', 'CAM_BACK_RIGHT']
-_scale = dict(type='ScaleImages', size=(512, 896))
+_scale = dict(type='ScaleImages', size=(896, 512))
 _steps = [_base_._load, _scale, dict(type='FormatPivotTargets'), _base_._pack]
 train_dataloader = dict(batch_size=1, dataset=dict(cameras=_cameras, pipeline=_steps))
 val_dataloader = dict(dataset=dict(cameras=_cameras, pipeline=[_base_._load, _scale, _base_._pack]))

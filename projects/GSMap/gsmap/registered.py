@@ -3,6 +3,7 @@
 from importlib import import_module
 from pkgutil import iter_modules
 
+import gsmap.datasets.stream_samplers
 import gsmap.datasets.vectorized_map_dataset
 import gsmap.engine.checkpoint_hook
 import gsmap.engine.gaussian_health_hook
@@ -18,12 +19,14 @@ FOLDERS = (  # every module of these is imported; a method comes and goes with i
     "gsmap.datasets.transforms",
     "gsmap.models.encoders",
     "gsmap.models.maptr",
+    "gsmap.models.streams",
     "gsmap.models.maptrv2",
     "gsmap.models.mapvr",
     "gsmap.models.gemap",
     "gsmap.models.mgmapnet",
     "gsmap.models.mapqr",
     "gsmap.models.pivotnet",
+    "gsmap.models.streammapnet",
     "gsmap.models.gsmap",
 )
 

@@ -329,15 +329,53 @@ PIVOTNET = KeyMap(
     markers=((_POINTS + "query_feat", "map_head.decoder.query.weight"),),
 )
 
+_BACKBONE = "backbone."
+_STREAM_ENCODER = "backbone.transformer.encoder.layers.{i}."
+_STREAM_DECODER = "head.transformer.decoder.layers.{i}."
+_Y, _X = torch.meshgrid(
+    torch.linspace(15.0, -15.0, 50), torch.linspace(-30.0, 30.0, 100), indexing="ij"
+)
+STREAMMAPNET = KeyMap(
+    "streammapnet",
+    (
+        *_rules(_BACKBONE, "", "img_backbone. img_neck."),
+        *_rules(_BACKBONE, "bev_encoder.", "bev_embedding. positional_encoding."),
+        *_rules(_BACKBONE + "transformer.", "bev_encoder.", "level_embeds cams_embeds"),
+        *_rules(
+            _STREAM_ENCODER,
+            _OUR_ENCODER_LAYER,
+            "attentions.0.=self_attn. attentions.1.output_proj.=cross_attn.output_proj. "
+            "attentions.1.deformable_attention.=cross_attn. ffns.0.=ffn. norms.",
+        ),
+        *_rules("head.", "map_head.", "query_embedding.=instance_embedding. cls_branches."),
+        *_rules("head.", "map_head.reference.", "reference_points_embed.=initial."),
+        *_rules("head.", "map_head.reference.", "reg_branches.=branches."),
+        ("head.input_proj.", "map_head.decoder.input_proj."),
+        *_rules(
+            _STREAM_DECODER,
+            _LAYER,
+            "attentions.0.attn.=self_attn. attentions.1.=cross_attn. ffns.0.=ffn. norms.",
+        ),
+        ("head.query_update.fc.", "temporal.queries.fc."),
+        ("stream_fusion_neck.", "temporal.bev."),
+    ),
+    {  # the map's cells, size and corner, which the config says
+        "plane": torch.stack([_X, _Y, torch.zeros_like(_X), torch.ones_like(_X)], -1),
+        "head.roi_size": torch.tensor((60.0, 30.0)),
+        "head.origin": torch.tensor((-30.0, -15.0)),
+    },
+    markers=(("head.input_proj.", "map_head.decoder.input_proj."),),
+)
+
 KEY_MAPS: list[KeyMap] = [
-    PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MAPTRV2, MAPTR_BEVFORMER, MAPTR,
+    STREAMMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MAPTRV2, MAPTR_BEVFORMER, MAPTR,
 ]  # fmt: skip
 """Known architectures, the most special first; the last needs no marker."""
 
 
 def is_upstream(keys: Iterable[str]) -> bool:
     """Return whether state keys are in the format of the earlier systems."""
-    return any(key.startswith((_HEAD, _POINTS)) for key in keys)
+    return any(key.startswith((_HEAD, _POINTS, "head.")) for key in keys)
 
 
 def find_key_map(keys: Iterable[str]) -> KeyMap:

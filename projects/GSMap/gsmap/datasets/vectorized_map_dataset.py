@@ -158,6 +158,16 @@ class VectorizedMapDataset(BaseDataset):
         row = super().get_data_info(idx)["row"]  # opens the file, if that is yet to be done
         return self.annotations[row]
 
+    def scenes(self) -> list[list[int]]:
+        """Return the samples of each scene, sorted by its name, in the order of their times."""
+        self.full_init()
+        names, times = (self.annotations.column(name) for name in ("scene", "timestamp_ns"))
+        found: dict[str, list[tuple[int, int]]] = {}
+        for index in range(len(self)):
+            row = super().get_data_info(index)["row"]
+            found.setdefault(names[row], []).append((times[row], index))
+        return [[index for _, index in sorted(found[name])] for name in sorted(found)]
+
     def get_cat_ids(self, idx: int) -> list[int]:
         """Return the labels of a sample's elements, for mmengine's ``ClassBalancedDataset``."""
         return [instance.label for instance in self.sample(idx).instances or []]

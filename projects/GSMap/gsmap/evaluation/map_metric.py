@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 from mmdet3d.registry import METRICS
+from mmengine.dist import all_gather_object
 from mmengine.evaluator import BaseMetric
 from mmengine.logging import MMLogger, print_log
 
@@ -104,6 +105,8 @@ class MapMetric(BaseMetric):
     def evaluate(self, size: int) -> dict[str, float]:
         """Collect the records of all ranks and compute the metrics of ``size`` samples."""
         self._size = size
+        # MMEngine joins ranks up to the shortest: ranks with whole drives have different lengths
+        self.results = [record for part in all_gather_object(self.results) for record in part]
         # MMEngine would cut the list off at `size` by position; repeated samples go by their token
         return super().evaluate(sys.maxsize)
 

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
+from gsmap.models.streams.memory import StreamMemory
 from gsmap.structures.grid import BEVGrid
 
 Inputs = dict[str, Any]
@@ -37,6 +39,7 @@ class MapDetector(Base3DDetector):
         img_augment: An augmentation of the normalised images in training (GridMask).
         lidar_encoder: The LiDAR's BEV encoder.
         bev_fuser: The fusion of both, with cameras and LiDAR.
+        temporal: Settings of `StreamMemory`, for a model that remembers earlier frames.
         fold_batch_norms: Whether the image backbone runs without gradients as a copy whose batch
             norms are folded into its convolutions (faster, for a second copy of its weights).
         strict_loading: Whether a checkpoint must hold every weight, by our names or upstream's, and
@@ -59,6 +62,7 @@ class MapDetector(Base3DDetector):
         img_augment: dict | None = None,
         lidar_encoder: dict | None = None,
         bev_fuser: dict | None = None,
+        temporal: dict | None = None,
         fold_batch_norms: bool = True,
         strict_loading: bool = True,
         allow_untrained: bool = True,
@@ -82,6 +86,7 @@ class MapDetector(Base3DDetector):
         self.lidar_encoder = MODELS.build({**shared, **lidar_encoder}) if lidar_encoder else None
         self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
         self.map_head = MODELS.build({**shared, "classes": classes, **map_head})
+        self.temporal = None if temporal is None else StreamMemory(self.map_head, **temporal)
 
     def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
         """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
@@ -90,9 +95,11 @@ class MapDetector(Base3DDetector):
         images = imgs.flatten(0, 1)
         if self.training and self.img_augment is not None:
             images = self.img_augment(images)
-        # channels last is what CPU and tensor-core convolutions are fastest with
-        images = images.contiguous(memory_format=torch.channels_last)
         folded, backbone = self.folded_backbone, self.img_backbone
+        # channels last is what CPU and tensor-core convolutions are fastest with; mmcv's deformable
+        # convolution takes them for channels first and is silently wrong
+        if not getattr(backbone, "dcn", None):
+            images = images.contiguous(memory_format=torch.channels_last)
         feats = backbone(images) if folded is None else folded(backbone, images)
         if self.img_neck is not None:
             feats = self.img_neck(feats)
@@ -113,10 +120,19 @@ class MapDetector(Base3DDetector):
             outputs = {**outputs, "bev_feats": feats}
         return outputs
 
+    def over_time(
+        self, outputs: dict[str, Any], batch_data_samples: Samples
+    ) -> AbstractContextManager[dict[str, Any]]:
+        """Return a context in which a batch has its memory, if the model has any."""
+        if self.temporal is None:
+            return nullcontext(outputs)
+        return self.temporal.over(outputs, [sample.metainfo for sample in batch_data_samples])
+
     def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return all losses; FloatingPointError, with the samples, if one is not finite."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
-        losses = self.map_head.loss(outputs, batch_data_samples)
+        with self.over_time(outputs, batch_data_samples) as outputs:
+            losses = self.map_head.loss(outputs, batch_data_samples)
         # mmengine reads each loss anyway: no new synchronisation
         means = torch.stack([loss.detach().float().mean() for loss in losses.values()])
         finite = torch.isfinite(means).tolist()
@@ -132,12 +148,15 @@ class MapDetector(Base3DDetector):
     def predict(self, batch_inputs: Inputs, batch_data_samples: Samples) -> list[Det3DDataSample]:
         """Add ``pred_instances_3d``, as the head's ``predict`` returns them, to the samples."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
-        results = self.map_head.predict(outputs, batch_data_samples)
+        with self.over_time(outputs, batch_data_samples) as outputs:
+            results = self.map_head.predict(outputs, batch_data_samples)
         return self.add_pred_to_datasample(batch_data_samples, results)
 
     def _forward(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return the head's raw outputs."""
-        return self.map_head(self.extract_feat(batch_inputs, batch_data_samples))
+        outputs = self.extract_feat(batch_inputs, batch_data_samples)
+        with self.over_time(outputs, batch_data_samples) as outputs:
+            return self.map_head(outputs)
 
     def _dump_init_info(self) -> None:
         """Log how each weight was initialised, which takes hundreds of lines, to debug only."""

@@ -103,6 +103,24 @@ def equivalent_orders(
     return orders
 
 
+def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
+    """Return the point orders of a resampled line as StreamMapNet takes them.
+
+    An open line has two, as it is and reversed. A closed one starts at each of its P - 1 different
+    points, and each also reversed; it is not resampled again. Unused rows hold ``PADDING``. (P, D)
+    in metres, first = last if closed -> (2 (P - 1), P, D)
+    """
+    orders = np.full((2 * (len(points) - 1), *points.shape), PADDING)
+    if not closed:
+        orders[0], orders[1] = points, points[::-1]
+        return orders
+    ring = points[:-1]
+    turned = [np.roll(way, step, 0) for way in (ring, ring[::-1]) for step in range(len(ring))]
+    orders[:, :-1] = turned
+    orders[:, -1] = orders[:, 0]
+    return orders
+
+
 def bounding_boxes(points: Points) -> Points:
     """Return axis-aligned boxes (xmin, ymin, xmax, ymax) in metres. (..., P, D) -> (..., 4)."""
     xy = np.asarray(points)[..., :2]

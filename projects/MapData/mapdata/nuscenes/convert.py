@@ -45,6 +45,7 @@ class NuScenesOptions(FileOptions):
     dataset: str = "nuscenes"
     split_file: Path | None = None
     max_sweeps: int = 10
+    frame: str = "lidar"
 
 
 def _check_root(root: Path, version: str) -> None:
@@ -116,7 +117,9 @@ class _Conversion:
     def __init__(self, options: NuScenesOptions) -> None:
         self.options = options
         self.summary = ConversionSummary(options.classes)
-        self.tables = NuScenesTables(options.version, options.root, options.max_sweeps)
+        self.tables = NuScenesTables(
+            options.version, options.root, options.max_sweeps, options.frame
+        )
         self.split_of = _splits(options, self.tables, self.summary)
         self.positions: Positions = {split: defaultdict(list) for split in self.split_of.values()}
 
@@ -201,7 +204,7 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
     with ExitStack() as stack:
         writers = {}
         for split in conversion.positions:
-            meta = options.meta(options.dataset, "lidar", split, **made_from)
+            meta = options.meta(options.dataset, options.frame, split, **made_from)
             writer = AnnotationWriter(options.path_of(options.dataset, split), meta, options.shard)
             writers[split] = stack.enter_context(writer)
         conversion.run(writers)
@@ -225,6 +228,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--classes", nargs="+", default=list(CLASSES), choices=MAP_CLASSES, metavar="CLASS",
         help=f"classes in label order, of {', '.join(MAP_CLASSES)} (default: the first three)",
+    )  # fmt: skip
+    add(
+        "--frame", choices=("lidar", "ego"), default="lidar",
+        help="annotation frame: the roof LiDAR or the vehicle (default: %(default)s)",
     )  # fmt: skip
     add_file_options(parser, "lidar", max_sweeps=10)
 

@@ -83,7 +83,8 @@ class NuScenesTables:
         ValueError: If a table is damaged or a record points to one that there is not.
     """
 
-    def __init__(self, version: str, dataroot: Path, max_sweeps: int) -> None:
+    def __init__(self, version: str, dataroot: Path, max_sweeps: int, frame: str = "lidar") -> None:
+        self.frame = frame
         self._folder, self._max_sweeps = dataroot / version, max_sweeps
         self._messages = lru_cache(maxsize=1)(partial(read_messages, dataroot))
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
@@ -183,11 +184,17 @@ class NuScenesTables:
         return global_from_ego @ pose_of(calibration), calibration
 
     def read(self, sample: dict[str, Any], scene: dict[str, Any]) -> MapSample:
-        """Return a sample in the frame of its LiDAR, without instances and absent cameras."""
+        """Return a sample in the annotation frame, without instances and absent cameras."""
         lidar = sample["data"][LIDAR]
-        global_from_frame, calibration = self._global_from(lidar)
-        ego_from_frame, timestamp_ns = pose_of(calibration), sample["timestamp"] * 1000
-        global_from_ego = global_from_frame @ invert_rigid(ego_from_frame)
+        global_from_lidar, calibration = self._global_from(lidar)
+        ego_from_lidar, timestamp_ns = pose_of(calibration), sample["timestamp"] * 1000
+        global_from_ego = global_from_lidar @ invert_rigid(ego_from_lidar)
+        global_from_frame, ego_from_frame, frame_from_lidar = (
+            (global_from_lidar, ego_from_lidar, np.eye(4))
+            if self.frame == "lidar"
+            else (global_from_ego, np.eye(4), ego_from_lidar)
+        )
+        sweeps = self._sweeps(lidar, global_from_frame)
         names = [name for name in CAMERAS if name in sample["data"]]
         return MapSample(
             token=sample["token"],
@@ -196,7 +203,7 @@ class NuScenesTables:
             timestamp_ns=timestamp_ns,
             cameras=[self._camera(n, sample["data"][n], global_from_frame) for n in names],
             global_from_frame=global_from_frame,
-            lidar=LidarRecord(lidar["filename"], np.eye(4), self._sweeps(lidar, global_from_frame)),
+            lidar=LidarRecord(lidar["filename"], frame_from_lidar, sweeps),
             ego_from_frame=ego_from_frame,
             can_bus=signals_at(timestamp_ns, global_from_ego, self._messages(scene["name"])),
         )

@@ -61,7 +61,8 @@ class ScaleImages(BaseTransform):
     Args:
         scale: Factor, > 0; sizes are rounded down, and the matrices take the exact ratio of each
             axis.
-        size: Rows and columns to resize to, in place of the factor.
+        size: In place of a factor, the width and height of every image, without the padding that
+            made them equal.
         trained_size: Width and height, in pixels, that a model was trained at: images that
             ``scale`` would make larger or smaller get the longer side of it in place of that. They
             are neither cropped nor padded.
@@ -76,12 +77,15 @@ class ScaleImages(BaseTransform):
 
     def __post_init__(self) -> None:
         if (self.scale is None) == (self.size is None):
-            raise ValueError("ScaleImages needs a scale or a size.")
+            raise ValueError(f"give scale or size, got {self.scale} and {self.size}.")
         if not min(self.size or (self.scale,)) > 0:
             raise ValueError(f"scale or size must be > 0, got {self.size or self.scale}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Scale ``results['img']``."""
+        if self.size is not None:
+            return self._to_size(results, (int(self.size[0]), int(self.size[1])))
+        assert self.scale is not None
         height, width = results["img"][0].shape[:2]
         size = self.scaled(width, height)
         if self.trained_size is not None and max(size) != max(self.trained_size):
@@ -98,10 +102,23 @@ class ScaleImages(BaseTransform):
         results["scale_factor"] = size[0] / width
         return results
 
+    @staticmethod
+    def _to_size(results: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
+        """Bring each image, as large as it was loaded, to a size (width, height)."""
+        for view, (height, width) in enumerate(results["raw_shapes"]):
+            img = results["img"][view][:height, :width]
+            results["img"][view] = mmcv.imresize(img, size)
+            matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
+            for key in ("lidar2img", "img_aug_matrix"):
+                results[key][view] = matrix @ results[key][view]
+        results["raw_shapes"] = [size[::-1]] * len(results["img"])
+        results["img_shape"] = results["pad_shape"] = size[::-1]
+        return results
+
     def scaled(self, width: int, height: int) -> tuple[int, int]:
         """Return width and height of an image after it, in pixels."""
         if self.size is not None:
-            return self.size[1], self.size[0]
+            return self.size
         return _times((width, height), cast(float, self.scale))
 
 

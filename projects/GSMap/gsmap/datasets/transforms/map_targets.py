@@ -18,7 +18,10 @@ from gsmap.structures.polylines import (
     equivalent_orders,
     is_closed,
     resample,
+    sampled_orders,
 )
+
+ORDERS = ("vertices", "points")
 
 
 def map_targets(
@@ -28,6 +31,7 @@ def map_targets(
     y_range: tuple[float, float],
     dim: int = 2,
     rng: np.random.Generator | None = None,
+    orders_of: str = "vertices",
 ) -> InstanceData:
     """Make a sample's training targets, as MapTR does ("v2" orders).
 
@@ -38,6 +42,9 @@ def map_targets(
         y_range: Smallest and largest y in metres.
         dim: Coordinates per point, 2 or 3; heights are interpolated and kept as they are.
         rng: Draws the orders of rings with more than P - 1 vertices; None spreads them evenly.
+        orders_of: ``vertices``: a ring starts at each vertex, in its own direction (MapTR);
+            ``points``: at each of its P points, in both directions, and a line whose ends almost
+            meet is a ring too (StreamMapNet).
 
     Returns:
         ``labels_3d`` (K,) int64, ``pts`` (K, P, dim), ``pts_shifts`` (K, S, P, dim), ``boxes`` (K,
@@ -45,9 +52,11 @@ def map_targets(
         -10000; polylines are at full resolution, the last vertex repeated up to the longest.
 
     Raises:
-        ValueError: If the elements have fewer coordinates than ``dim``.
+        ValueError: If the elements have fewer coordinates than ``dim``, or ``orders_of`` is unknown.
     """
-    slots = max(num_points - 1, 2)
+    if orders_of not in ORDERS:
+        raise ValueError(f"orders_of must be one of {ORDERS}, got {orders_of!r}.")
+    slots = max(num_points - 1, 2) if orders_of == "vertices" else 2 * (num_points - 1)
     points = np.empty((len(instances), num_points, dim))
     orders = np.empty((len(instances), slots, num_points, dim))
     longest = max((len(instance.points) for instance in instances), default=2)
@@ -60,8 +69,11 @@ def map_targets(
                 f"{instance.points.shape}."
             )
         line = instance.points[:, :dim].astype(np.float64)
-        orders[i] = equivalent_orders(line, num_points, rng)
         points[i] = resample(line, num_points)
+        if orders_of == "vertices":
+            orders[i] = equivalent_orders(line, num_points, rng)
+        else:
+            orders[i] = sampled_orders(points[i], ends_meet(points[i], x_range, y_range))
         polylines[i, : len(line)] = line[:, :2]
         polylines[i, len(line) :] = line[-1, :2]
         closed[i] = is_closed(instance.points[:, :dim])
@@ -77,6 +89,15 @@ def map_targets(
     )
 
 
+def ends_meet(
+    points: np.ndarray, x_range: tuple[float, float], y_range: tuple[float, float]
+) -> bool:
+    """Say whether the ends of a line are within a thousandth of the map of each other. (P, D)"""
+    extent = np.array([x_range[1] - x_range[0], y_range[1] - y_range[0]])
+    first, last = (points[[0, -1], :2] - (x_range[0], y_range[0])) / extent
+    return bool(np.allclose(first, last, atol=1e-3))  # and the relative 1e-5 of numpy
+
+
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class FormatMapTargets(BaseTransform):
@@ -87,9 +108,11 @@ class FormatMapTargets(BaseTransform):
 
     Args:
         num_points: Points P per element.
+        orders_of: Which orders a ring has, see `map_targets`.
     """
 
     num_points: int = 20
+    orders_of: str = "vertices"
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets; ValueError if the sample has no ground truth."""
@@ -107,5 +130,6 @@ class FormatMapTargets(BaseTransform):
             results["y_range"],
             results.get("dim", 2),
             rng,
+            self.orders_of,
         )
         return results

@@ -1,6 +1,7 @@
 """BEV encoder with one learned query per cell that attends to the BEV and to the cameras."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from mmdet.models.layers import LearnedPositionalEncoding
@@ -71,13 +72,13 @@ class BEVEncoderLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
 
     def forward(
-        self, query: Tensor, query_pos: Tensor, grid: BEVGrid, feats: Tensor, seen: PillarProjection
+        self, query: Tensor, query_pos: Tensor, grid: BEVGrid, feats: Any, seen: PillarProjection
     ) -> Tensor:
         """Update the queries of the grid's cells from image features that have their embeddings.
 
-        (B, Q, C), (1, Q, C), (B, V, C, h, w) and where the pillars fall -> (B, Q, C)
+        (B, Q, C), (1, Q, C), (B, V, C, h, w), one or a list, and where the pillars fall -> (B, Q, C)
         """
-        centres = grid.norm_from_metres(grid.pixel_centres(feats.device)).view(1, -1, 2)
+        centres = self.centres(grid, query.device).view(1, -1, 2)
         # of sample floor(b / 2): 0, 0, 1, 1, ...
         partner = query.repeat_interleave(2, 0)[: len(query)] if self.released_pairs else query
         pair = torch.cat([partner, query + query_pos], -1)  # (B, Q, 2 C)
@@ -85,6 +86,10 @@ class BEVEncoderLayer(nn.Module):
         query = self.norms[0](query + self.self_attn(pair, centres, bev))
         query = self.norms[1](query + self.dropout(self.cross_attn(query, feats, seen)))
         return self.norms[2](self.ffn(query))
+
+    def centres(self, grid: BEVGrid, device: torch.device) -> Tensor:
+        """Return where each cell's query looks around itself, [0, 1] over the map. (H, W, 2)"""
+        return grid.norm_from_metres(grid.pixel_centres(device))
 
 
 @MODELS.register_module()
@@ -102,9 +107,11 @@ class BEVQueryEncoder(CameraEncoder):
         num_layers: Number of layers.
         layer_cfg: Further arguments of :class:`BEVEncoderLayer`.
         num_cams: Number of cameras V.
+        with_can_bus: Whether the queries know the vehicle's motion.
+        num_levels: Levels of image features that are used, at most 4.
     """
 
-    calibration = ("img_from_frame", "can_bus")
+    layer_class: ClassVar[type[BEVEncoderLayer]] = BEVEncoderLayer
 
     def __init__(
         self,
@@ -116,6 +123,8 @@ class BEVQueryEncoder(CameraEncoder):
         num_layers: int = 1,
         layer_cfg: dict | None = None,
         num_cams: int = 6,
+        with_can_bus: bool = True,
+        num_levels: int = 1,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
@@ -127,15 +136,19 @@ class BEVQueryEncoder(CameraEncoder):
         )
         self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))  # only the first is used
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))
-        self.can_bus_mlp = nn.Sequential(
-            nn.Linear(NUM_CAN_BUS, embed_dims // 2),
-            nn.ReLU(inplace=True),
-            nn.Linear(embed_dims // 2, embed_dims),
-            nn.ReLU(inplace=True),
-        )
-        self.can_bus_mlp.add_module("norm", nn.LayerNorm(embed_dims))
+        self.calibration, self.can_bus_mlp = ("img_from_frame",), None
+        if with_can_bus:
+            self.calibration = ("img_from_frame", "can_bus")
+            self.can_bus_mlp = nn.Sequential(
+                nn.Linear(NUM_CAN_BUS, embed_dims // 2),
+                nn.ReLU(inplace=True),
+                nn.Linear(embed_dims // 2, embed_dims),
+                nn.ReLU(inplace=True),
+            )
+            self.can_bus_mlp.add_module("norm", nn.LayerNorm(embed_dims))
+        self.num_levels = num_levels
         layer = {"cross_attn": cross_attn, "embed_dims": embed_dims, **(layer_cfg or {})}
-        layers = [BEVEncoderLayer(**layer) for _ in range(num_layers)]
+        layers = [self.layer_class(**layer) for _ in range(num_layers)]
         self.num_heights: int = layers[0].cross_attn.num_heights
         self.layers = nn.ModuleList(layers)
         nn.init.normal_(self.level_embeds)
@@ -145,25 +158,32 @@ class BEVQueryEncoder(CameraEncoder):
         """Initialise the matrices of the layers (Xavier)."""
         super().init_weights()
         init_matrices(self.layers)
-        init_matrices(self.can_bus_mlp)
+        if self.can_bus_mlp is not None:
+            init_matrices(self.can_bus_mlp)
 
     def encode(
-        self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
+        self, feats: Any, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Tensor]:
         """Return ``bev_feats``, from ``img_from_frame`` (B, V, 4, 4) and ``can_bus`` (B, 18).
 
         The features are handed on as ``img_feats``.
         ValueError if the number of cameras is not the configured one.
         """
-        if feats.shape[1] != len(self.cams_embeds):
+        first = feats if isinstance(feats, Tensor) else feats[0]
+        if first.shape[1] != len(self.cams_embeds):
             raise ValueError(
-                f"the encoder is built for {len(self.cams_embeds)} cameras, got {feats.shape[1]}."
+                f"the encoder is built for {len(self.cams_embeds)} cameras, got {first.shape[1]}."
             )
-        tokens = feats + (self.cams_embeds + self.level_embeds[0])[:, :, None, None].to(feats.dtype)
+        codes = (self.cams_embeds + self.level_embeds[:, None])[..., None, None].to(first.dtype)
+        if isinstance(feats, Tensor):
+            tokens = feats + codes[0]
+        else:
+            tokens = [level + code for level, code in zip(feats, codes, strict=False)]
         bev_shape = self.grid.height, self.grid.width
-        motion = self.can_bus_mlp(calibration["can_bus"])
-        query = self.bev_embedding.weight[None] + motion[:, None]  # (B, Q, C)
-        query_pos = self.positional_encoding(feats.new_zeros(1, *bev_shape))
+        query = self.bev_embedding.weight.expand(len(first), -1, -1)  # (B, Q, C)
+        if self.can_bus_mlp is not None:
+            query = query + self.can_bus_mlp(calibration["can_bus"])[:, None]
+        query_pos = self.positional_encoding(first.new_zeros(1, *bev_shape))
         query_pos = query_pos.flatten(2).transpose(1, 2)  # (1, Q, C)
         seen = self.project(calibration["img_from_frame"], img_shape)
         for layer in self.layers:

@@ -1,5 +1,6 @@
 """BEVFormer's spatial cross-attention: deformable sampling around projected BEV pillars."""
 
+from collections.abc import Sequence
 from itertools import product
 
 import torch
@@ -7,7 +8,7 @@ from mmdet3d.registry import MODELS
 from torch import Tensor
 
 from gsmap.models.encoders.projection import PillarProjection
-from gsmap.models.maptr.attention import SamplingAttention, sample_map
+from gsmap.models.maptr.attention import SamplingAttention, directional_offsets, sample_map
 
 
 @MODELS.register_module()
@@ -22,39 +23,56 @@ class SpatialCrossAttention(SamplingAttention):
         num_heads: Number of heads.
         num_points: Samples per head, S; ValueError if it is no multiple of ``num_heights``.
         num_heights: Points per pillar, Z.
+        num_levels: Levels of image features; each head has S samples in every level.
     """
 
     def __init__(
-        self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 8, num_heights: int = 4
+        self,
+        embed_dims: int = 256,
+        num_heads: int = 8,
+        num_points: int = 8,
+        num_heights: int = 4,
+        num_levels: int = 1,
     ) -> None:
         if num_points % num_heights:
             raise ValueError(
                 f"num_points must be a multiple of num_heights, got {num_points} and {num_heights}."
             )
-        super().__init__(embed_dims, num_heads, num_points, dropout=0.0)
-        self.num_heights = num_heights
+        self.num_levels, self.num_heights = num_levels, num_heights
+        super().__init__(embed_dims, num_heads, num_levels * num_points, dropout=0.0)
 
-    def forward(self, query: Tensor, img_feats: Tensor, projection: PillarProjection) -> Tensor:
-        """Collect camera features (B, V, C, h, w) for every cell's query, without the residual.
+    def initial_offsets(self) -> Tensor:
+        """Return the same offsets for every level. (heads, levels * S, 2)"""
+        one = directional_offsets(self.num_heads, self.num_points // self.num_levels)
+        return one.repeat(1, self.num_levels, 1)
 
-        The projected pillars have ``num_heights`` points. (B, Q, C) -> (B, Q, C)
+    def forward(
+        self, query: Tensor, img_feats: Tensor | Sequence[Tensor], projection: PillarProjection
+    ) -> Tensor:
+        """Collect camera features for every cell's query, without the residual.
+
+        Features are (B, V, C, h, w), one or a list of levels; the projected pillars have
+        ``num_heights`` points. (B, Q, C) -> (B, Q, C)
         """
-        height, width = img_feats.shape[-2:]
-        offsets = self.offsets_in_cells(query) / query.new_tensor([width, height])
-        weights = self.weights(query)
-        value = self.values(img_feats.flatten(3).transpose(2, 3)).float()  # (B, V, hw, heads, C')
-        repeats = self.num_points // self.num_heights
+        levels = [img_feats] if isinstance(img_feats, Tensor) else list(img_feats)
+        offsets = self.offsets_in_cells(query).chunk(self.num_levels, 3)  # (B, Q, heads, S, 2)
+        weights = self.weights(query).chunk(self.num_levels, 3)
+        repeats = self.num_points // (self.num_levels * self.num_heights)
         summed = query.new_zeros(query.shape, dtype=torch.float32)
-        for sample, view in product(*(range(n) for n in img_feats.shape[:2])):
-            cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
-            centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
-            locations = centres[:, None] + offsets[sample, cell]  # (T, heads, S, 2)
-            seen = sample_map(
-                value[sample, view][None],
-                shape=(height, width),
-                locations=locations[None],
-                weights=weights[sample, cell][None],
-            )
-            summed[sample] = summed[sample].index_add(0, cell, seen[0])
+        for feats, offset, weight in zip(levels, offsets, weights, strict=True):
+            height, width = feats.shape[-2:]
+            offset = offset / query.new_tensor([width, height])
+            value = self.values(feats.flatten(3).transpose(2, 3)).float()  # (B, V, hw, heads, C')
+            for sample, view in product(*(range(n) for n in feats.shape[:2])):
+                cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
+                centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
+                locations = centres[:, None] + offset[sample, cell]  # (T, heads, S, 2)
+                seen = sample_map(
+                    value[sample, view][None],
+                    shape=(height, width),
+                    locations=locations[None],
+                    weights=weight[sample, cell][None],
+                )
+                summed[sample] = summed[sample].index_add(0, cell, seen[0])
         count = projection.visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])

@@ -24,27 +24,28 @@ class CameraEncoder(BaseModule):
     """A BEV encoder of camera features."""
 
     calibration: tuple[str, ...]  # what it reads of a sample, names of `calibration_arrays`
+    num_levels: int = 1  # of the image features, the finest first
 
     def forward(
         self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]
     ) -> dict[str, Any]:
         """Return ``bev_feats`` (B, C, H, W), row 0 at the smallest y, and what else `encode` does.
 
-        Image features are a list of (B, V, C, h, w). Samples have ``batch_input_shape`` and what the calibration is read from; ValueError if one lacks a field
+        Of the image features, a list of (B, V, C, h, w), the first levels are used. Samples have
+        ``batch_input_shape`` and what the calibration is read from; ValueError if one lacks a field
         or has another number of cameras.
         """
         calibration = stack_calibration(img_metas, self.calibration, mlvl_feats[0].device)
-        feats = self.levels_of(mlvl_feats)
-        return self.encode(feats, calibration, img_metas[0]["batch_input_shape"])
+        return self.encode(self.levels(mlvl_feats), calibration, img_metas[0]["batch_input_shape"])
 
-    def levels_of(self, mlvl_feats: Sequence[Tensor]) -> Any:
-        """Return the image features that `encode` takes: the first level."""
-        return mlvl_feats[0]
+    def levels(self, mlvl_feats: Sequence[Tensor]) -> Any:
+        """Return what `encode` takes of all levels: the first, or a list of the first ones."""
+        return mlvl_feats[0] if self.num_levels == 1 else list(mlvl_feats[: self.num_levels])
 
     def encode(
         self, feats: Any, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode features (B, V, C, h, w), or what `levels_of` returns, with the calibration as tensors (B, ...).
+        """Encode features (B, V, C, h, w), one or a list, with the calibration as tensors (B, ...).
 
         ``img_shape`` are rows and columns of the padded images.
         """

@@ -37,6 +37,8 @@ def can_be_folded(backbone: nn.Module) -> bool:
     """Return whether a folded copy of the backbone would do the same as it does, now."""
     if torch.is_grad_enabled() or torch.compiler.is_compiling() or not isinstance(backbone, ResNet):
         return False
+    if backbone.dcn is not None:  # mmcv would fold the norm of a deformable convolution elsewhere
+        return False
     return not any(
         module.training or module._forward_hooks or module._forward_pre_hooks
         for module in backbone.modules()

@@ -75,6 +75,13 @@ class GaussianReference(PointReference):
         shapes = self.by_point(self.gaussian_branches[layer](point_states))
         return torch.cat([super().offsets(layer, point_states), shapes], -1)
 
+    def moved(self, references: Tensor, motion: Tensor) -> Tensor:
+        """Return Gaussians of an earlier frame as they lie now, turned with the vehicle."""
+        moved = super().moved(references, motion)
+        turn = torch.atan2(motion[:, 1, 0], motion[:, 0, 0]).to(moved)
+        turn = turn.view(-1, *[1] * (moved.dim() - 1)).expand_as(moved[..., :1])
+        return torch.cat([moved[..., :-1], moved[..., -1:] + turn], -1)
+
     def decode(self, references: Tensor) -> dict[str, Tensor]:
         """Add the Gaussians' ``scales`` (N, P, 2) in metres and ``rotations`` (N, P) in radians."""
         gaussians = self.space.decode(references)

@@ -129,7 +129,7 @@ class BEVDeformableAttention(SamplingAttention):
         """
         shape = (feats.shape[-2], feats.shape[-1])
         tokens = feats.flatten(2).transpose(1, 2)  # (B, H * W, C)
-        locations = place_samples(self.offsets_in_cells(query), reference, shape, frames)
+        locations = self.locations(query, reference, shape, frames)
         weights = self.weights(query)
         # Projection and sampling commute: projecting after it pays when few cells are looked at.
         few = weights.numel() * _CORNERS < tokens[..., 0].numel() * self.num_heads
@@ -138,6 +138,12 @@ class BEVDeformableAttention(SamplingAttention):
         else:
             sampled = sample_map(self.values(tokens), shape, locations, weights)
         return self.dropout(self.output_proj(sampled))
+
+    def locations(
+        self, query: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None
+    ) -> Tensor:
+        """Return where each query looks, (x, y) in [0, 1] over the map. (B, Q, heads, S, 2)"""
+        return place_samples(self.offsets_in_cells(query), reference, shape, frames)
 
     def _sample_then_project(
         self, tokens: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule, ModuleList
@@ -22,6 +22,14 @@ class Guidance(nn.Module):
     def frames(self, reference: Tensor, feats: Tensor) -> Tensor | None:
         """Return what turns sampling offsets in cells of the features, if anything. (B, Q, 2, 2)"""
         raise NotImplementedError
+
+
+class Queries(NamedTuple):
+    """The queries between two decoder layers, as the layers hand them on."""
+
+    state: Any  # of points (B, N * P, C), of instances (B, N, C), or what the decoder's layers take
+    position: Tensor  # of the same shape
+    reference: Tensor  # (B, N * P, D)
 
 
 @dataclass(eq=False)
@@ -163,6 +171,7 @@ class MapDecoder(BaseModule):
         bev_feats: Tensor,
         refine: Callable[[int, Tensor, Tensor], Tensor],
         attn_mask: Tensor | None = None,
+        between: Callable[[int, Queries], Queries] | None = None,
     ) -> list[Decoded]:
         """Run all layers, each on the reference that the one before refined.
 
@@ -174,6 +183,8 @@ class MapDecoder(BaseModule):
             refine: Maps a layer's number, its point states (B, N * P, C) and a reference (B, N * P,
                 D) to the refined one.
             attn_mask: True where an instance may not attend to another, or None. (N, N)
+            between: Takes a layer's number and the queries after it, and returns those of the next
+                layer; None leaves them.
 
         Returns:
             The output of every layer.
@@ -186,4 +197,7 @@ class MapDecoder(BaseModule):
             outputs.append(self.read(state, reference))
             if self.detach_reference:
                 reference = reference.detach()
+            if between is not None:
+                queries = Queries(state, query_pos, reference)
+                state, query_pos, reference = between(number, queries)
         return outputs

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -251,11 +252,12 @@ class MapHead(DetectionHead):
             logging.WARNING,
         )
 
-    def forward(self, bev_outputs: Tensors) -> list[Predictions]:
+    def forward(self, bev_outputs: dict[str, Any]) -> list[Predictions]:
         """Predict the elements after every decoder layer.
 
         Args:
-            bev_outputs: What the BEV encoder returns: ``bev_feats`` (B, C, H, W) is read.
+            bev_outputs: What the BEV encoder returns: ``bev_feats`` (B, C, H, W) is read, and with
+                memory ``query_memory``, the queries of the frames before (`Propagation`).
 
         Returns:
             The predictions of each layer, scores in float32 at least.
@@ -263,27 +265,39 @@ class MapHead(DetectionHead):
         feats = bev_outputs["bev_feats"]
         query_pos, query = (part.expand(len(feats), -1, -1) for part in self.queries())
         start, mask = self.reference.start(query_pos), self.attention_mask()
-        layers = self.decoder(query, query_pos, start, feats, self.reference.refine, mask)
-        return [
+        memory = bev_outputs.get("query_memory")
+        between = None if memory is None else partial(memory.between, self)
+        layers = self.decoder(query, query_pos, start, feats, self.reference.refine, mask, between)
+        outputs = [
             self.predictions(at_least_float32(branch(layer.instance_states)), layer, feats)
             for branch, layer in zip(self.cls_branches, layers, strict=True)
         ]
+        if memory is not None:
+            memory.choose(self, outputs[-1].scores)
+        return outputs
 
     def predictions(self, scores: Tensor, decoded: Decoded, bev_feats: Tensor) -> Predictions:
         """Return the predictions of a layer, with what decodes and renders them."""
         return Predictions(scores, decoded, bev_feats, self.reference, self.masks)
 
-    def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
+    def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> Tensors:
         """Run the head and return its losses, those of the auxiliary heads included."""
         gts = [sample.gt_instances_3d for sample in batch_data_samples]
         metas = [sample.metainfo for sample in batch_data_samples]
-        losses = self.loss_by_feat(self(bev_outputs), gts, metas)
+        memory = bev_outputs.get("query_memory")
+        losses = self.loss_by_feat(self(bev_outputs), gts, metas, memory)
+        if memory is not None:
+            losses["loss_trans"] = memory.loss(self)
         for name, head in self.aux_heads.items():
             losses[f"loss_{name}"] = cast(AuxHead, head).loss(bev_outputs, batch_data_samples)
         return losses
 
     def loss_by_feat(
-        self, outputs: Sequence[Predictions], batch_gt_instances: Instances, batch_img_metas: Metas
+        self,
+        outputs: Sequence[Predictions],
+        batch_gt_instances: Instances,
+        batch_img_metas: Metas,
+        memory: Any = None,
     ) -> Tensors:
         """Prepare the ground truth and return the losses of every decoder layer and query group.
 
@@ -294,6 +308,7 @@ class MapHead(DetectionHead):
             outputs: Predictions of each layer, of all query groups.
             batch_gt_instances: Ground truth of each sample, as `GroundTruth` takes it.
             batch_img_metas: Meta dict of each sample.
+            memory: The `Propagation` that keeps what the predicting queries were matched to.
 
         Raises:
             FloatingPointError: If a matching cost is not finite.
@@ -305,6 +320,8 @@ class MapHead(DetectionHead):
                 for number, layer in enumerate(own):
                     pairs = self.match(layer, truths, batch_img_metas, group.repeats)
                     is_last = number == len(own) - 1
+                    if memory is not None and is_last and group is self.query_groups[0]:
+                        memory.keep_targets(pairs)
                     prefix = "" if is_last else f"d{number}."
                     suffix = f"_{group.name}" if group.name else ""
                     for name, value in self.layer_losses(group, pairs, is_last).items():

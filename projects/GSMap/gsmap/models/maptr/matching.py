@@ -38,6 +38,10 @@ class MapAssigner:
             raise ValueError("match_costs must hold at least one cost.")
         self.match_costs = [TASK_UTILS.build(cost) for cost in match_costs]
         self.names = [type(cost).__name__ for cost in self.match_costs]
+        self.between_points = next(
+            (cost.between_points for cost in self.match_costs if hasattr(cost, "between_points")),
+            OrderedPointsCost.between_points,
+        )
 
     @torch.no_grad()
     def assign(
@@ -68,8 +72,9 @@ class MapAssigner:
         rows, cols = linear_sum_assignment(np.tile(total.sum(0).numpy(), repeats))
         queries = torch.from_numpy(rows).to(device)
         gts = torch.from_numpy(cols % num_gts).to(device)
-        offsets = pred_instances.pts[queries, None] - gt_instances.pts_shifts[gts]  # (M, S, P, 2)
-        return MapMatch(queries, gts, offsets.abs().sum((-1, -2)).argmin(-1))
+        orders = gt_instances.pts_shifts[gts]  # (M, S, P, 2)
+        distances = self.between_points(pred_instances.pts[queries, None].expand_as(orders), orders)
+        return MapMatch(queries, gts, distances.sum((-1, -2)).argmin(-1))
 
 
 def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None) -> None:
@@ -131,6 +136,11 @@ class OrderedPointsCost(MapCost):
 
     def __init__(self, weight: float = 5.0) -> None:
         super().__init__(weight)
+
+    @staticmethod
+    def between_points(pts: Tensor, targets: Tensor) -> Tensor:
+        """Return the distance of each coordinate, which also chooses the order of a pair."""
+        return (pts - targets).abs()
 
     def __call__(
         self, pred_instances: "SamplePredictions", gt_instances: "SampleTruth", img_meta: Any = None

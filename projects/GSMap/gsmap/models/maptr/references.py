@@ -127,6 +127,17 @@ class PointReference(nn.Module):
         height = (points[..., 2:].clamp(low, high) - low) / (high - low)
         return torch.cat([points[..., :2], height], -1)
 
+    def moved(self, references: Tensor, motion: Tensor) -> Tensor:
+        """Return references of an earlier frame as they lie now, points moved onto the map.
+
+        The motion (B, 4, 4), float64, takes metres then to metres now. (B, ..., D) -> (B, ..., D)
+        """
+        points = self.metres(references[..., : self.coords].double())
+        turn = motion[:, : self.coords, : self.coords].transpose(1, 2)  # without z: on the ground
+        moved = points.flatten(1, -2) @ turn + motion[:, None, : self.coords, 3]
+        norm = self.norm(moved).clamp(0.0, 1.0).view_as(points).to(references)
+        return torch.cat([norm, references[..., self.coords :]], -1)
+
     def decode(self, references: Tensor) -> dict[str, Tensor]:
         """Return what references (N, P, D) say in metres: ``pts`` (N, P, coords)."""
         return {"pts": self.metres(references[..., : self.coords])}

@@ -158,7 +158,7 @@ class PivotBEVEncoder(CameraEncoder):
         for part in (self.source_layers, self.bev_layers, self.unseen_reference):
             init_matrices(part)
 
-    def levels_of(self, mlvl_feats: Sequence[Tensor]) -> Sequence[Tensor]:
+    def levels(self, mlvl_feats: Sequence[Tensor]) -> Sequence[Tensor]:
         """Return all feature maps."""
         return mlvl_feats
 

@@ -1,0 +1,230 @@
+"""Memory of queries: the best of a frame enter the decoder of the next, moved with the vehicle."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from mmdet3d.registry import MODELS
+from mmengine.model import BaseModule
+from torch import Tensor, nn
+from torch.utils._pytree import tree_flatten, tree_unflatten
+
+from gsmap.models.maptr.decoder import Queries
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.streams.states import QueryState
+
+_POSE = 12  # the first three rows of a motion
+
+
+@MODELS.register_module()
+class QueryMemory(BaseModule):
+    """Hand on the best queries of each frame, for any head (StreamMapNet).
+
+    A query's state is updated by a small network that knows the motion; its reference is moved. In
+    the next frame they take the place of its weakest queries after the first decoder layer. In
+    training an updated query must predict the moved target of the frame before.
+
+    Args:
+        embed_dims: Channels C of the queries.
+        num: Queries that are handed on, K.
+        loss_weight: Weight of that loss.
+        points_weight: Weight of the distance of the points in it.
+        beta: Distance, [0, 1] over the map, below which smooth L1 is a parabola.
+    """
+
+    def __init__(
+        self,
+        embed_dims: int,
+        num: int = 33,
+        loss_weight: float = 0.1,
+        points_weight: float = 50.0,
+        beta: float = 0.01,
+    ) -> None:
+        super().__init__()
+        self.num, self.beta = num, beta
+        self.weight = loss_weight * points_weight
+        self.fc = nn.Sequential(
+            nn.Linear(embed_dims + _POSE, 2 * embed_dims),
+            nn.LayerNorm(2 * embed_dims),
+            nn.ReLU(),
+            nn.Linear(2 * embed_dims, embed_dims),
+        )
+
+    def init_weights(self) -> None:
+        """Let every query stay almost as it is."""
+        super().init_weights()
+        for layer in (self.fc[0], self.fc[3]):
+            nn.init.zeros_(layer.weight)
+
+    def check(self, head: MapHead) -> None:
+        """Raise ValueError if the head predicts with too few queries."""
+        own = head.query_groups[0].num
+        if not 0 < self.num < own:
+            raise ValueError(
+                f"a memory of {self.num} queries does not fit a head of {own}: set "
+                "temporal.queries.num to less than its queries."
+            )
+
+    def update(self, states: Tensor, motion: Tensor) -> Tensor:
+        """Tell states how the vehicle has moved, metres then to metres now. (B, ..., C)"""
+        code = motion[:, :3].flatten(1).to(states).view(len(states), *[1] * (states.dim() - 2), -1)
+        return states + self.fc(torch.cat([states, code.expand(*states.shape[:-1], -1)], -1))
+
+
+def by_instance(leaf: Tensor, num: int) -> Tensor:
+    """Sort queries by their instance, N of them. (B, Q, ...) -> (B, N, Q / N, ...)"""
+    return leaf.unflatten(1, (num, -1))
+
+
+def pick(values: Tensor, order: Tensor) -> Tensor:
+    """Take instances in an order. (B, N, ...), (B, M) -> (B, M, ...)"""
+    return values[torch.arange(len(order), device=order.device)[:, None], order]
+
+
+class Propagation:
+    """The memory of queries in one batch: what enters the decoder, and what is kept of it.
+
+    Args:
+        memory: Its settings and network.
+        states: What each stream has left, or None.
+        motion: Takes metres then to metres now, float64. (B, 4, 4)
+    """
+
+    def __init__(
+        self,
+        memory: QueryMemory,
+        states: Sequence[QueryState | None],
+        motion: Tensor,
+    ) -> None:
+        self.memory, self.motion = memory, motion
+        self.continues = torch.tensor([s is not None for s in states], device=motion.device)
+        self.before = [state for state in states if state is not None]
+        self.handed_on: Queries | None = None  # what entered: leaves by instance (B, K, rows, ...)
+        self.last: Queries | None = None
+        self.total = 0  # queries N
+        self.chosen: Tensor | None = None  # (B, K)
+        self.targets: Tensor | None = None  # (B, N, P, 2 or 3)
+
+    def stack(self, leaves: Sequence[Tensor]) -> Tensor:
+        """Return what continuing streams have, zeros for the others. (B, ...)"""
+        stacked = torch.stack(list(leaves))
+        full = stacked.new_zeros((len(self.continues), *stacked.shape[1:]))
+        full[self.continues] = stacked
+        return full
+
+    def between(self, head: MapHead, number: int, queries: Queries) -> Queries:
+        """Let the memory enter after the first layer, and keep what the last layer returns."""
+        if number == len(head.decoder.layers) - 1:
+            self.last = queries
+        elif number == 0 and self.before:
+            return self.insert(head, queries)
+        return queries
+
+    def insert(self, head: MapHead, queries: Queries) -> Queries:
+        """Return the queries with those of the memory first, in place of the weakest.
+
+        A stream that starts keeps its queries as they are. Further query groups, of training, keep
+        theirs too.
+        """
+        decoded = head.decoder.read(queries.state, queries.reference)
+        total, own = decoded.instance_states.shape[1], head.query_groups[0].num
+        with torch.no_grad():
+            scores = head.cls_branches[0](decoded.instance_states[:, :own]).amax(-1)
+        order = self.order(scores, total)
+        leaves, form = tree_flatten(queries)
+        entering: list[Any] = []
+        for number, leaf in enumerate(leaves):
+            if isinstance(leaf, Tensor):
+                kept = [state.leaves[number] for state in self.before]
+                entering.append(self.stack([k for k in kept if k is not None]).to(leaf.dtype))
+            else:
+                entering.append(leaf)
+        self.handed_on = self.moved(head, tree_unflatten(entering, form))
+        merged: list[Any] = []
+        for leaf, new in zip(leaves, tree_flatten(self.handed_on)[0], strict=True):
+            if isinstance(leaf, Tensor):
+                leaf = torch.cat([new.to(leaf.dtype), by_instance(leaf, total)], 1)
+                leaf = pick(leaf, order).flatten(1, 2)
+            merged.append(leaf)
+        return tree_unflatten(merged, form)
+
+    def order(self, scores: Tensor, total: int) -> Tensor:
+        """Return the queries of the next layer: of the memory (0 to K - 1) or own (K on). (B, N)"""
+        num, own = self.memory.num, scores.shape[1]
+        survivors = scores.topk(own - num).indices + num
+        first = torch.arange(num, device=scores.device).expand(len(scores), -1)
+        stay = torch.arange(num, num + own, device=scores.device)
+        changed = torch.cat([first, survivors], 1)
+        order = torch.where(self.continues[:, None], changed, stay)
+        further = torch.arange(num + own, num + total, device=scores.device)
+        return torch.cat([order, further.expand(len(scores), -1)], 1)
+
+    def moved(self, head: MapHead, queries: Queries) -> Queries:
+        """Update states and references of an earlier frame by the vehicle's motion."""
+        dims = head.embed_dims
+        leaves, form = tree_flatten(queries.state)
+        leaves = [
+            self.memory.update(leaf, self.motion)
+            if isinstance(leaf, Tensor) and leaf.shape[-1] == dims
+            else leaf
+            for leaf in leaves
+        ]
+        state = tree_unflatten(leaves, form)
+        reference = head.reference.moved(queries.reference, self.motion)
+        return Queries(state, queries.position, reference)
+
+    def choose(self, head: MapHead, scores: Tensor) -> None:
+        """Choose what is handed on by the last layer's class logits. (B, N, classes)"""
+        self.total = scores.shape[1]
+        own = scores[:, : head.query_groups[0].num].detach()
+        self.chosen = own.amax(-1).topk(self.memory.num).indices
+
+    def keep_targets(self, pairs: MatchedPairs) -> None:
+        """Keep what the last layer's queries are matched to."""
+        targets = torch.zeros_like(pairs.predictions.pts)
+        targets[pairs.samples, pairs.query_inds] = pairs.gt_pts.to(targets)
+        self.targets = targets
+
+    def states(self) -> list[QueryState]:
+        """Return what each stream hands on."""
+        assert self.last is not None
+        assert self.chosen is not None
+        leaves = [
+            pick(by_instance(leaf.detach(), self.total), self.chosen)
+            if isinstance(leaf, Tensor)
+            else None
+            for leaf in tree_flatten(self.last)[0]
+        ]
+        targets = None if self.targets is None else pick(self.targets.detach(), self.chosen)
+        return [
+            QueryState(
+                tuple(None if leaf is None else leaf[index] for leaf in leaves),
+                None if targets is None else targets[index],
+            )
+            for index in range(len(self.continues))
+        ]
+
+    def loss(self, head: MapHead) -> Tensor:
+        """Return the loss of the updated queries, 0 with a gradient of 0 if no stream continues."""
+        kept = [state.targets for state in self.before]
+        if self.handed_on is None or any(target is None for target in kept):
+            return 0.0 * torch.stack([p.sum() for p in self.memory.parameters()]).sum()
+        stored = self.stack([target for target in kept if target is not None])  # (B, K, P, 2)
+        state, _, reference = self.handed_on
+        state = tree_unflatten(*_flat_rows(state))
+        pred = head.reference.refine(0, head.decoder.point_states(state), reference.flatten(1, 2))
+        pred = pred[..., : stored.shape[-1]].reshape(stored.shape)
+        target = head.reference.moved(stored, self.motion)
+        weight = (stored.flatten(2) != 0).any(-1) & self.continues[:, None]  # (B, K)
+        each = F.smooth_l1_loss(pred, target, reduction="none", beta=self.memory.beta)
+        total = (each.sum((-1, -2)) * weight).sum() / stored.shape[-2]
+        return self.memory.weight * total / (weight.sum() + 1e-10)
+
+
+def _flat_rows(state: Any) -> tuple[list[Any], Any]:
+    """Undo `by_instance` in all tensors of a state."""
+    leaves, form = tree_flatten(state)
+    flat = [leaf.flatten(1, 2) if isinstance(leaf, Tensor) else leaf for leaf in leaves]
+    return flat, form
