@@ -44,7 +44,7 @@ def test_images_of_another_size_become_as_long_as_those_of_the_training(
     images._say_scaled.cache_clear()
     matrices = {"lidar2img": [np.eye(4)], "img_aug_matrix": [np.eye(4)]}
     image = np.zeros((*size[::-1], 3), np.uint8)
-    results = ScaleImages(0.4, (160, 90)).transform({"img": [image], **matrices})
+    results = ScaleImages(0.4, trained_size=(160, 90)).transform({"img": [image], **matrices})
     assert results["img"][0].shape[1::-1] == expected
     ratio = np.divide(expected, size)
     np.testing.assert_allclose(results["lidar2img"][0], np.diag([*ratio, 1, 1]))
