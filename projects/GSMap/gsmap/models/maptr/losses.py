@@ -68,7 +68,7 @@ class MapLoss(nn.Module):
         if not isinstance(self.loss_weight, Sequence):
             return self.loss_weight * (values.sum() / pairs.avg_factor)
         weights = weights_of(self.loss_weight, pairs.gt_labels)
-        return (weights @ values.flatten(1).sum(1)) / pairs.avg_factor
+        return (weights * values.movedim(0, -1)).sum() / pairs.avg_factor
 
 
 @MODELS.register_module()
