@@ -3,7 +3,12 @@ import math
 import pytest
 import torch
 
-from gsmap.structures.gaussians import Gaussians, GaussianSpace, extents_along_line
+from gsmap.structures.gaussians import (
+    Gaussians,
+    GaussianSpace,
+    extents_along_line,
+    gaussians_along,
+)
 from gsmap.structures.grid import BEVGrid
 
 GRID = BEVGrid((-15, 15), (-30, 30))  # y points forward
@@ -98,6 +103,17 @@ def test_extents_along_the_line_by_hand():
     mean = math.sqrt((4 + 0.25) / 2)
     expected = torch.tensor([[2.0, 0.5], [0.5, 2.0], [mean, mean]])
     torch.testing.assert_close(extents_along_line(gaussians), expected)
+
+
+def test_gaussians_along_a_line_by_hand():
+    """Edges of 3 and 5 m: half the distance along, the mean of both at the corner."""
+    points = torch.tensor([[0.0, 0.0], [0.0, 3.0], [4.0, 6.0]])
+    means, scales, rotations = gaussians_along(points, across_m=0.3)
+    assert torch.equal(means, points)
+    torch.testing.assert_close(scales, torch.tensor([[1.5, 0.3], [2.0, 0.3], [2.5, 0.3]]))
+    angles = [math.pi / 2, math.atan2(6, 4), math.atan2(3, 4)]
+    torch.testing.assert_close(rotations, torch.tensor(angles))
+    assert gaussians_along(points, across_m=1.8).scales[0].tolist() == pytest.approx([1.8, 1.8])
 
 
 def test_extents_on_an_oblique_line_by_hand():

@@ -24,6 +24,33 @@ def test_module_weights_and_averages():
     torch.testing.assert_close(module(pairs), 3 * losses.sum() / 8)
 
 
+def test_each_class_has_its_own_weight_and_its_own_overlap_from_which_on_masks_count():
+    """Soft IoUs of 1/3, 1 and 1/3: the first class is not gated, the third counts by 1/3 / 0.5."""
+    target = torch.zeros(3, 21, 33)
+    target[:, :, 10:14] = 1
+    pred = target.roll(2, -1)
+    pred[1] = target[1] * 0.999  # no gradient is lost where masks agree
+    labels = torch.tensor([0, 1, 2])
+    pairs = pairs_of(pred_masks=pred, gt_masks=target, gt_labels=labels, avg_factor=2)
+    single = raster_loss(pred, target)
+    weighted = RasterLoss(loss_weight=(15, 10, 6))(pairs)
+    torch.testing.assert_close(weighted, single @ torch.tensor([15.0, 10, 6]) / 2)
+    gated = RasterLoss(loss_weight=1, full_iou=(0, 0.5, 0.5))(pairs)
+    torch.testing.assert_close(gated, single @ torch.tensor([1, 1, 2 / 3]) / 2)
+    one = RasterLoss(loss_weight=1, full_iou=0.5)(pairs)
+    torch.testing.assert_close(one, single @ torch.tensor([2 / 3, 1, 2 / 3]) / 2)
+
+
+def test_the_overlap_that_weighs_a_loss_has_no_gradient():
+    pred, target = two_masks()
+    pred.requires_grad_()
+    pairs = pairs_of(pred_masks=pred, gt_masks=target, gt_labels=torch.tensor([0, 1]))
+    weights = RasterLoss(full_iou=0.9).values(pairs).detach() / raster_loss(pred, target).detach()
+    (expected,) = torch.autograd.grad(weights @ raster_loss(pred, target), pred)
+    (actual,) = torch.autograd.grad(RasterLoss(1.0, full_iou=0.9)(pairs), pred)
+    torch.testing.assert_close(actual, expected)
+
+
 def test_nothing_matched_gives_zero_with_a_gradient():
     pred = torch.zeros(0, 21, 33, requires_grad=True)
     loss = RasterLoss()(pairs_of(pred_masks=pred, gt_masks=torch.zeros(0, 21, 33)))

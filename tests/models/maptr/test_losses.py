@@ -6,6 +6,7 @@ import pytest
 import torch
 from predictions import pairs_of
 
+from gsmap.models.gemap.losses import EuclideanLoss
 from gsmap.models.maptr.losses import DirectionLoss, MapLoss, PointsLoss
 from gsmap.models.mapvr.losses import SelfDirectionLoss
 
@@ -25,6 +26,14 @@ def test_points_loss_by_hand():
     pred = torch.tensor([[[0.0, 0.0], [1.0, 2.0]]])
     target = torch.tensor([[[0.5, 0.0], [1.0, 0.0]]])
     assert given(PointsLoss(loss_weight=4.0), pred, target, 2.0).item() == 4 * 1.25
+
+
+def test_a_pair_has_the_weight_of_its_class():
+    pred, labels = torch.ones(2, 3, 2), torch.tensor([2, 0])
+    pairs = pairs_of(pred_pts=pred, gt_pts=0 * pred, gt_labels=labels, avg_factor=2.0)
+    assert PointsLoss(loss_weight=(1.0, 5.0, 3.0))(pairs).item() == 6 * (1 + 3) / 2
+    with pytest.raises(TypeError, match="EuclideanLoss is no sum over pairs: give one loss_weight"):
+        EuclideanLoss(loss_weight=(1.0, 5.0, 3.0))
 
 
 def test_direction_loss_by_hand():

@@ -1,5 +1,7 @@
 """Masks of elements: their sizes, their pixels, and that they fit the points beside them."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -12,7 +14,7 @@ from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.models.gsmap.losses import RasterLoss
 from gsmap.models.maptr.masks import ElementMasks
 from gsmap.ops.gaussian_raster import render_gaussians
-from gsmap.structures.gaussians import GaussianSpace
+from gsmap.structures.gaussians import GaussianSpace, gaussians_along
 from gsmap.structures.grid import BEVGrid
 
 
@@ -62,6 +64,18 @@ def test_the_ground_truth_is_drawn_at_full_resolution_or_from_its_points():
     labels = gt.labels_3d
     assert torch.equal(full.draw_sample(gt, full.grid), full.draw(gt.polylines, labels, full.grid))
     assert torch.equal(points.draw_sample(gt, full.grid), full.draw(gt.pts, labels, full.grid))
+
+
+def test_a_mask_of_gaussians_is_one_that_a_prediction_can_equal_as_wide_as_the_band():
+    gt = elements(((-3, -20), (-3, 20)))
+    band, soft = (ElementMasks(ALONG_Y, source=source) for source in ("points", "gaussians"))
+    mask = soft.draw_sample(gt, soft.grid)
+    across_m = 0.75 / math.sqrt(2 * math.pi)
+    own = gaussians_along(gt.pts, across_m)
+    assert torch.equal(mask, render_gaussians(*own, soft.grid))
+    centre = mask.shape[1] // 2  # the row of the middle point, where its neighbours add little
+    drawn = band.draw_sample(gt, soft.grid)
+    assert mask[0, centre].sum().item() == pytest.approx(drawn[0, centre].sum().item(), rel=0.1)
 
 
 def test_targets_without_polylines_are_named():

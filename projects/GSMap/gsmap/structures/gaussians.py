@@ -133,6 +133,27 @@ class GaussianSpace:
         return torch.cat([2 * centre - 1, raw_scales, angle.cos(), angle.sin()], -1)
 
 
+def gaussians_along(points: Tensor, across_m: float) -> Gaussians:
+    """Return Gaussians that cover lines: along them, half as long as their centres are apart.
+
+    Args:
+        points: Ordered centres in metres. (..., P, 2)
+        across_m: Standard deviation across the line, and the smallest along it, in metres.
+    """
+    steps = points.diff(dim=-2).norm(dim=-1)
+    apart = torch.cat([steps[..., :1], (steps[..., 1:] + steps[..., :-1]) / 2, steps[..., -1:]], -1)
+    along = (apart / 2).clamp(min=across_m)
+    scales = torch.stack([along, torch.full_like(along, across_m)], -1)
+    return Gaussians(points, scales, _angles_of_line(points))
+
+
+def _angles_of_line(points: Tensor) -> Tensor:
+    """Return the line's direction at each point, in radians from +x. (..., P, 2) -> (..., P)"""
+    padded = torch.cat([points[..., :1, :], points, points[..., -1:, :]], -2)
+    along = padded[..., 2:, :] - padded[..., :-2, :]
+    return torch.atan2(along[..., 1], along[..., 0])
+
+
 def _rotations(angles: Tensor) -> Tensor:
     """Return rotation matrices (GSMap Eq. 4). (...) -> (..., 2, 2)"""
     cos, sin = angles.cos(), angles.sin()
@@ -145,10 +166,7 @@ def extents_along_line(gaussians: Gaussians) -> Tensor:
     :math:`\sqrt{d^T \Sigma d}` in metres; the line's direction d at a centre joins its neighbours,
     or at an end the end and its neighbour. Two or more Gaussians each. (..., P) -> (..., P, 2)
     """
-    means = gaussians.means
-    padded = torch.cat([means[..., :1, :], means, means[..., -1:, :]], -2)
-    along = padded[..., 2:, :] - padded[..., :-2, :]
-    angles = torch.atan2(along[..., 1], along[..., 0]) - gaussians.rotations
+    angles = _angles_of_line(gaussians.means) - gaussians.rotations
     cos, sin = angles.cos().square(), angles.sin().square()
     first, second = gaussians.scales.square().unbind(-1)
     return torch.stack([first * cos + second * sin, first * sin + second * cos], -1).sqrt()

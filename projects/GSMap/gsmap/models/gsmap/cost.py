@@ -9,6 +9,7 @@ from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.matching import MapCost
 from gsmap.models.maptr.pairs import SamplePredictions, SampleTruth
+from gsmap.models.maptr.parts import WEIGHT, weights_of
 from gsmap.ops.soft_iou import pairwise_dice_loss, pairwise_soft_iou
 
 
@@ -24,7 +25,7 @@ class IoUCost(MapCost):
         ValueError: If ``kind`` is unknown.
     """
 
-    def __init__(self, weight: float = 1.0, kind: str = "iou") -> None:
+    def __init__(self, weight: WEIGHT = 1.0, kind: str = "iou") -> None:
         super().__init__(weight)
         if kind not in ("iou", "dice"):
             raise ValueError(f"kind must be 'iou' or 'dice', got {kind!r}.")
@@ -39,6 +40,7 @@ class IoUCost(MapCost):
     ) -> Tensor:
         """Compare the masks of matching, (N, h, w) and (K, h, w). (N, K)"""
         preds, targets = pred_instances.cost_masks, gt_instances.cost_masks
+        weights = weights_of(self.weight, gt_instances.labels)
         if self.kind == "dice":
-            return self.weight * pairwise_dice_loss(preds, targets)
-        return self.weight * (1 - pairwise_soft_iou(preds, targets))
+            return weights * pairwise_dice_loss(preds, targets)
+        return weights * (1 - pairwise_soft_iou(preds, targets))

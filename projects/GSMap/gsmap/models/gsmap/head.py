@@ -16,7 +16,7 @@ from gsmap.models.maptr.losses import PointsLoss
 from gsmap.models.maptr.masks import ElementMasks
 from gsmap.models.maptr.matching import OrderedPointsCost
 from gsmap.models.maptr.pairs import MatchedPairs
-from gsmap.models.maptr.parts import DEFAULTS, PARTS, brought, with_points_weight
+from gsmap.models.maptr.parts import DEFAULTS, PARTS, WEIGHT, brought, with_points_weight
 from gsmap.structures.grid import BEVGrid
 
 
@@ -34,8 +34,8 @@ class GSMapHead(MapHead):
         iou_cost: Settings of the matching cost of the rendered masks, `IoUCost` of weight 2 if they
             say nothing else, or None to match without it.
         points_weight: Weight of the points in losses and in matching (the paper's lambda_v), or
-            None to leave those of ``losses`` and ``match_costs``; ValueError if a weight is given
-            and they have no points.
+            one for each class, or None to leave those of ``losses`` and ``match_costs``; ValueError
+            if a weight is given and they have no points.
         masks: Settings of `ElementMasks`.
         reference: Settings of `GaussianReference`; its smallest sigma is half a pixel of the masks
             by default.
@@ -49,7 +49,7 @@ class GSMapHead(MapHead):
         match_costs: Sequence[PARTS],
         loss_raster: Mapping[str, Any] | None = DEFAULTS,
         iou_cost: Mapping[str, Any] | None = DEFAULTS,
-        points_weight: float | None = None,
+        points_weight: WEIGHT | None = None,
         masks: PARTS | None = None,
         reference: PARTS | None = None,
         **kwargs: Any,

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
@@ -9,18 +10,34 @@ from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.losses import MapLoss
 from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.maptr.parts import WEIGHT, check_weight, weights_of
 from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
 from gsmap.ops.soft_iou import dice_loss, soft_iou
 
 
 class MaskLoss(MapLoss):
-    """A loss of the rendered masks of matched instances."""
+    """A loss of the rendered masks of matched instances.
+
+    Masks that hardly meet push a prediction anywhere, so such a pair's loss may count less.
+
+    Args:
+        loss_weight: Weight of the loss, or one for each class.
+        full_iou: Soft IoU of a pair's masks from which on its loss counts in full; below, it is
+            multiplied with the share of it that is reached. 0: all count in full. Or one for each
+            class.
+        flags: As in `MapLoss`.
+    """
 
     name = "raster"
 
+    def __init__(self, loss_weight: WEIGHT = 10.0, full_iou: WEIGHT = 0.0, **flags: bool) -> None:
+        super().__init__(loss_weight, **flags)
+        self.full_iou = full_iou
+
     def check(self, head: MapHead) -> None:
-        """Raise ValueError if the head has no Gaussians to render."""
+        """Raise ValueError if the head has no Gaussians to render, or other classes."""
         require_gaussians(self, head)
+        check_weight(self, self.full_iou, head.classes)
 
     def per_instance(self, preds: Tensor, targets: Tensor) -> Tensor:
         """Return one value per instance. 2 x (M, H, W) -> (M,)"""
@@ -28,7 +45,12 @@ class MaskLoss(MapLoss):
 
     def values(self, pairs: MatchedPairs) -> Tensor:
         """Compare rendered and drawn masks. (M,)"""
-        return self.per_instance(pairs.pred_masks, pairs.gt_masks)
+        losses = self.per_instance(pairs.pred_masks, pairs.gt_masks)
+        if self.full_iou == 0:
+            return losses
+        full = weights_of(self.full_iou, pairs.gt_labels)
+        iou = soft_iou(pairs.pred_masks.detach(), pairs.gt_masks)
+        return losses * torch.where(iou < full, iou / full, 1)
 
 
 @MODELS.register_module()
@@ -43,6 +65,7 @@ class RasterLoss(MaskLoss):
             ``"pixels"`` (see `gsmap.ops.raster_loss.raster_loss`).
         window_size: Side of SSIM's window in pixels, odd.
         window_sigma: Standard deviation of SSIM's window in pixels.
+        full_iou: As in `MaskLoss`.
         flags: As in `MapLoss`.
 
     Raises:
@@ -51,15 +74,16 @@ class RasterLoss(MaskLoss):
 
     def __init__(
         self,
-        loss_weight: float = 10.0,
+        loss_weight: WEIGHT = 10.0,
         alpha: float = 0.8,
         foreground_weight: float = 1.0,
         normalize: str = "both",
         window_size: int = 11,
         window_sigma: float = 1.5,
+        full_iou: WEIGHT = 0.0,
         **flags: bool,
     ) -> None:
-        super().__init__(loss_weight, **flags)
+        super().__init__(loss_weight, full_iou, **flags)
         if not 0 <= alpha <= 1:
             raise ValueError(f"alpha must lie in [0, 1], got {alpha}.")
         if foreground_weight <= 0:
@@ -90,14 +114,21 @@ class MaskOverlapLoss(MaskLoss):
     Args:
         loss_weight: Weight of the loss.
         kind: ``"dice"``, as MapVR (`dice_loss`), or ``"iou"``: 1 - sum min / sum max.
+        full_iou: As in `MaskLoss`.
         flags: As in `MapLoss`.
 
     Raises:
         ValueError: If ``kind`` is unknown.
     """
 
-    def __init__(self, loss_weight: float = 10.0, kind: str = "dice", **flags: bool) -> None:
-        super().__init__(loss_weight, **flags)
+    def __init__(
+        self,
+        loss_weight: WEIGHT = 10.0,
+        kind: str = "dice",
+        full_iou: WEIGHT = 0.0,
+        **flags: bool,
+    ) -> None:
+        super().__init__(loss_weight, full_iou, **flags)
         if kind not in ("dice", "iou"):
             raise ValueError(f"kind must be 'dice' or 'iou', got {kind!r}.")
         self.kind = kind

@@ -28,7 +28,15 @@ from gsmap.models.maptr.pairs import (
     SamplePredictions,
     SampleTruth,
 )
-from gsmap.models.maptr.parts import PARTS, AuxHead, by_name, check_classes, class_of, refuse_twins
+from gsmap.models.maptr.parts import (
+    PARTS,
+    AuxHead,
+    by_name,
+    check_classes,
+    check_weight,
+    class_of,
+    refuse_twins,
+)
 from gsmap.models.maptr.references import PointReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
@@ -203,6 +211,11 @@ class MapHead(DetectionHead):
         for part in (*self.losses.values(), *self.assigner.match_costs):
             if isinstance(part, (MapLoss, MapCost)):
                 part.check(self)
+        for part in self.losses.values():
+            check_weight(part, part.loss_weight, self.classes)
+        for part in self.assigner.match_costs:
+            if isinstance(part, MapCost):
+                check_weight(part, part.weight, self.classes)
 
     def init_weights(self) -> None:
         """Initialise the decoder's matrices (Xavier) and let every class start improbable."""

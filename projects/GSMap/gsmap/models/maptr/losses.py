@@ -1,11 +1,13 @@
 """Losses of matched pairs: what they share, and MapTR's, of points and of edges between them."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.maptr.parts import WEIGHT, weights_of
 from gsmap.structures.tensors import check_same_shape
 
 if TYPE_CHECKING:
@@ -18,7 +20,7 @@ class MapLoss(nn.Module):
     """A loss of matched pairs: the weighted sum of its `values` over the number of pairs.
 
     Args:
-        loss_weight: Weight of the loss.
+        loss_weight: Weight of the loss, or one for each class; a pair has that of its ground truth.
         last_layer_only: Leave it out of all decoder layers but the last.
         first_group_only: Leave it out of all query groups but the one that predicts.
 
@@ -26,18 +28,21 @@ class MapLoss(nn.Module):
         name: It is logged as ``loss_<name>``; unique in a head.
 
     Raises:
-        TypeError: If a class sets a flag as its attribute, where a misspelt one would be silent.
+        TypeError: If a class sets a flag as its attribute, where a misspelt one would be silent, or
+            a loss that is no sum over pairs has a weight for each class.
     """
 
     name: str
 
     def __init__(
         self,
-        loss_weight: float = 1.0,
+        loss_weight: WEIGHT = 1.0,
         last_layer_only: bool = False,
         first_group_only: bool = False,
     ) -> None:
         super().__init__()
+        if isinstance(loss_weight, Sequence) and type(self).forward is not MapLoss.forward:
+            raise TypeError(f"{type(self).__name__} is no sum over pairs: give one loss_weight.")
         self.loss_weight = loss_weight
         self.last_layer_only, self.first_group_only = last_layer_only, first_group_only
 
@@ -54,12 +59,16 @@ class MapLoss(nn.Module):
         """Raise ValueError if a head lacks what the loss reads; called when the head is built."""
 
     def values(self, pairs: MatchedPairs) -> Tensor:
-        """Return the values that are summed, of any shape."""
+        """Return the values that are summed, of each pair. (M, ...)"""
         raise NotImplementedError
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Return the weighted loss, 0 with a gradient of 0 if nothing is matched. ()"""
-        return self.loss_weight * (self.values(pairs).sum() / pairs.avg_factor)
+        values = self.values(pairs)
+        if not isinstance(self.loss_weight, Sequence):
+            return self.loss_weight * (values.sum() / pairs.avg_factor)
+        weights = weights_of(self.loss_weight, pairs.gt_labels)
+        return (weights * values.movedim(0, -1)).sum() / pairs.avg_factor
 
 
 @MODELS.register_module()
@@ -73,7 +82,7 @@ class PointsLoss(MapLoss):
 
     name = "pts"
 
-    def __init__(self, loss_weight: float = 5.0, **flags: bool) -> None:
+    def __init__(self, loss_weight: WEIGHT = 5.0, **flags: bool) -> None:
         super().__init__(loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
@@ -96,7 +105,7 @@ class DirectionLoss(MapLoss):
 
     name = "dir"
 
-    def __init__(self, loss_weight: float = 0.005, **flags: bool) -> None:
+    def __init__(self, loss_weight: WEIGHT = 0.005, **flags: bool) -> None:
         super().__init__(loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:

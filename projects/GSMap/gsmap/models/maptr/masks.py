@@ -1,5 +1,6 @@
 """Masks of map elements: their rasters, and how the ground truth is drawn."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,10 +8,12 @@ import torch
 from mmengine.structures import InstanceData
 from torch import Tensor
 
+from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.polyline_raster import draw_polylines
+from gsmap.structures.gaussians import gaussians_along
 from gsmap.structures.grid import BEVGrid
 
-SOURCES = ("full", "points")
+SOURCES = ("full", "points", "gaussians")
 
 
 class ElementMasks:
@@ -24,7 +27,9 @@ class ElementMasks:
         line_width_m: Width of a line in the ground-truth mask, in metres.
         filled_classes: Classes whose ground-truth mask is filled; the others are bands.
         source: ``"full"``: the ground truth is drawn at full resolution; ``"points"``: by its P
-            points in the matched order (in matching, in the annotated one).
+            points in the matched order (in matching, in the annotated one); ``"gaussians"``: as
+            ``"points"``, by Gaussians along them (GSMap Eq. 6), whose mask has the line's width in
+            mass, so that a prediction can equal it.
 
     Raises:
         ValueError: If ``source`` is unknown, or the pixels do not divide the map.
@@ -59,7 +64,10 @@ class ElementMasks:
         return max(self.grid.pixel_size_m) / 2
 
     def draw(self, polylines: Tensor, labels: Tensor, grid: BEVGrid) -> Tensor:
-        """Draw ground truths as bands, or filled, by their class. (K, M, 2) -> (K, H, W)"""
+        """Draw ground truths as bands, filled or by Gaussians. (K, M, 2) -> (K, H, W)"""
+        if self.source == "gaussians":
+            across_m = self.line_width_m / math.sqrt(2 * math.pi)
+            return render_gaussians(*gaussians_along(polylines[..., :2].float(), across_m), grid)
         filled = None
         if self.filled_classes:
             filled = torch.isin(labels, labels.new_tensor(self.filled_classes))
@@ -67,7 +75,7 @@ class ElementMasks:
 
     def draw_sample(self, gt_instances: InstanceData, grid: BEVGrid) -> Tensor:
         """Draw a sample's ground truth, before its matching is known. (K, H, W)"""
-        if self.source == "points":
+        if self.source != "full":
             return self.draw(gt_instances.pts, gt_instances.labels_3d, grid)
         if "polylines" not in gt_instances:
             raise ValueError(

@@ -9,6 +9,8 @@ from mmdet3d.registry import TASK_UTILS
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from gsmap.models.maptr.parts import WEIGHT, weights_of
+
 if TYPE_CHECKING:
     from gsmap.models.maptr.head import MapHead
     from gsmap.models.maptr.pairs import SamplePredictions, SampleTruth
@@ -94,10 +96,10 @@ class MapCost:
     """A matching cost that says what it needs when the head is built; others may be costs as well.
 
     Args:
-        weight: Weight of the cost.
+        weight: Weight of the cost, or one for each class; a pair has that of its ground truth.
     """
 
-    def __init__(self, weight: float = 1.0) -> None:
+    def __init__(self, weight: WEIGHT = 1.0) -> None:
         self.weight = weight
 
     def check(self, head: "MapHead") -> None:
@@ -134,7 +136,7 @@ class OrderedPointsCost(MapCost):
         weight: Weight of the cost.
     """
 
-    def __init__(self, weight: float = 5.0) -> None:
+    def __init__(self, weight: WEIGHT = 5.0) -> None:
         super().__init__(weight)
 
     @staticmethod
@@ -146,4 +148,5 @@ class OrderedPointsCost(MapCost):
         self, pred_instances: "SamplePredictions", gt_instances: "SampleTruth", img_meta: Any = None
     ) -> Tensor:
         """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
-        return order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1) * self.weight
+        distances = order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1)
+        return distances * weights_of(self.weight, gt_instances.labels)

@@ -4,11 +4,13 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Protocol
 
+import torch
 from mmdet3d.registry import MODELS
 from mmengine.registry import Registry
 from torch import Tensor, nn
 
 PARTS = dict[str, Any]
+WEIGHT = float | Sequence[float]  # one for all classes, or one for each
 DEFAULTS: Mapping[str, Any] = MappingProxyType({})  # settings of a part: all as its class has them
 
 
@@ -36,7 +38,7 @@ def brought(kind: type, settings: Mapping[str, Any] | None, **defaults: Any) -> 
 
 
 def with_points_weight(
-    parts: Sequence[PARTS], kind: type, weight: float | None, key: str, registry: Registry = MODELS
+    parts: Sequence[PARTS], kind: type, weight: WEIGHT | None, key: str, registry: Registry = MODELS
 ) -> list[PARTS]:
     """Return configs of losses or costs, with another weight in that of the points.
 
@@ -72,6 +74,21 @@ def refuse_twins(names: Sequence[str], what: str) -> None:
     twins = sorted({name for name in names if names.count(name) > 1})
     if twins:
         raise ValueError(f"two {what} have one name, {twins[0]!r}; there are {list(names)}.")
+
+
+def weights_of(weight: WEIGHT, labels: Tensor) -> Tensor:
+    """Return each element's weight, by its class. (M,) int64 -> (M,) float32 or ()"""
+    weights = torch.tensor(weight, dtype=torch.float32, device=labels.device)
+    return weights[labels] if weights.ndim else weights
+
+
+def check_weight(part: Any, weight: WEIGHT, classes: Sequence[str]) -> None:
+    """Raise ValueError if a part has weights, but not one for each class."""
+    if isinstance(weight, Sequence) and len(weight) != len(classes):
+        raise ValueError(
+            f"{type(part).__name__} has the weights {list(weight)}: give one, or one for each of "
+            f"{list(classes)}."
+        )
 
 
 def check_classes(name: str, indices: Sequence[int], classes: Sequence[str]) -> None:

@@ -9,6 +9,7 @@ from torch import Tensor
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.matching import MapCost
 from gsmap.models.maptr.pairs import SamplePredictions, SampleTruth
+from gsmap.models.maptr.parts import WEIGHT, weights_of
 from gsmap.models.mapvr.losses import ElementRenderer
 from gsmap.ops.soft_iou import pairwise_dice_loss
 
@@ -24,7 +25,7 @@ class RenderedDiceCost(MapCost):
     """
 
     def __init__(
-        self, weight: float = 10.0, size: tuple[int, int] = (128, 64), **rendering: Any
+        self, weight: WEIGHT = 10.0, size: tuple[int, int] = (128, 64), **rendering: Any
     ) -> None:
         super().__init__(weight)
         self.renderer = ElementRenderer(size, **rendering)
@@ -42,4 +43,5 @@ class RenderedDiceCost(MapCost):
         lines = torch.zeros(len(preds), dtype=torch.bool, device=preds.device)
         as_lines = pairwise_dice_loss(self.renderer.render(preds, lines), targets)
         as_polygons = pairwise_dice_loss(self.renderer.render(preds, ~lines), targets)
-        return self.weight * torch.where(is_polygon, as_polygons, as_lines)
+        costs = torch.where(is_polygon, as_polygons, as_lines)
+        return costs * weights_of(self.weight, gt_instances.labels)

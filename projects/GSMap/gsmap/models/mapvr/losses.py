@@ -10,7 +10,7 @@ from torch import Tensor
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.losses import MapLoss, turns
 from gsmap.models.maptr.pairs import MatchedPairs
-from gsmap.models.maptr.parts import check_classes
+from gsmap.models.maptr.parts import WEIGHT, check_classes
 from gsmap.ops.polyline_raster import DISTANCES, soft_rasters
 from gsmap.ops.soft_iou import dice_loss
 
@@ -89,7 +89,7 @@ class RenderedDiceLoss(MapLoss):
 
     def __init__(
         self,
-        loss_weight: float = 15.0,
+        loss_weight: WEIGHT = 15.0,
         size: tuple[int, int] = (256, 128),
         last_layer_only: bool = False,
         first_group_only: bool = False,
@@ -123,7 +123,7 @@ class SelfDirectionLoss(MapLoss):
 
     name = "dir"
 
-    def __init__(self, loss_weight: float = 0.002, **flags: bool) -> None:
+    def __init__(self, loss_weight: WEIGHT = 0.002, **flags: bool) -> None:
         super().__init__(loss_weight, **flags)
 
     def values(self, pairs: MatchedPairs) -> Tensor:
