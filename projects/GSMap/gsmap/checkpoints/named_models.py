@@ -30,6 +30,7 @@ class NamedModel:
         address: Where its file is fetched; None for those that ship.
         figures: Published results on its validation split in percent, by our metrics' names.
         image_size: Width and height that images were scaled to in training, in pixels.
+        can_bus: Whether the training samples had vehicle signals.
     """
 
     name: str
@@ -40,6 +41,7 @@ class NamedModel:
     address: str | None
     figures: dict[str, float]
     image_size: list[int]
+    can_bus: bool
 
     @property
     def file(self) -> Path:
