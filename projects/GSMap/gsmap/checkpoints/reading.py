@@ -75,8 +75,8 @@ def read_checked(path: str | Path) -> Checkpoint:
             raise TypeError(f"meta must be a dictionary, got {meta!r:.60}")
         settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
         named = next((vars(m) for m in named_models().values() if m.file == path), {})
-        size = _checked_size((named | meta).get(IMAGE_SIZE))
-        signals = (named | meta).get(SIGNALS) is True
+        size = _checked_size({**named, **meta}.get(IMAGE_SIZE))
+        signals = {**named, **meta}.get(SIGNALS) is True
         if not isinstance(state, Mapping) or not all(map(_is_weight, state, state.values())):
             state = {}
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]

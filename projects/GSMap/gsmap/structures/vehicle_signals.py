@@ -1,16 +1,19 @@
 """A vehicle's motion as 18 numbers in MapTR's layout (``can_bus``)."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 from pyquaternion import Quaternion
 
 from gsmap.structures.calibration import NUM_CAN_BUS
 
-Pose = tuple[float, np.ndarray]
+Pose = tuple[float, NDArray[np.floating[Any]]]
 """A time in seconds, and the transform from the vehicle to the world then. (4, 4)"""
 _GRAVITY = np.array([0.0, 0.0, 9.81])  # an accelerometer feels it
 
 
-def pose_signals(global_from_ego: np.ndarray) -> np.ndarray:
+def pose_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Return the signals that a vehicle's pose tells, the others zero. (4, 4) -> (18,).
 
     Entries: position (3), orientation (w, x, y, z), acceleration (3), rotation rate (3), velocity
@@ -24,7 +27,9 @@ def pose_signals(global_from_ego: np.ndarray) -> np.ndarray:
     return values
 
 
-def motion_signals(now: Pose, before: Pose | None = None, after: Pose | None = None) -> np.ndarray:
+def motion_signals(
+    now: Pose, before: Pose | None = None, after: Pose | None = None
+) -> NDArray[np.float64]:
     """Return the signals that poses tell: `pose_signals`, and the rates by differences. (18,)
 
     Args:
