@@ -1,4 +1,4 @@
-"""Samples of a bag: images, camera info, transforms and poses of ROS 1 or ROS 2 (also MCAP)."""
+"""Samples of a bag: images, camera info, transforms and poses of ROS 1, ROS 2 or Foxglove."""
 
 import hashlib
 from collections import defaultdict
@@ -29,6 +29,7 @@ from mapdata.folders.rig import (
     rig_samples,
     rotation_of,
 )
+from mapdata.foxglove_mcap import FoxgloveBag, is_foxglove
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
@@ -88,7 +89,8 @@ def read_bag(
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     with naming(path, "see docs/inference.md"):
         with _of_rosbags():
-            bag = highlevel.AnyReader([path], default_typestore=store)
+            bag: Any = highlevel.AnyReader([path], default_typestore=store)
+            bag = FoxgloveBag(path) if is_foxglove(path) else bag
             bag.open()
         try:
             return _read(

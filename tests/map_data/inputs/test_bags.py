@@ -13,6 +13,7 @@ from bag_cases import AXLE_M, Recorder, record
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.source import ground_from_frame, reframed
+from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from mapdata.bag_topics import camera_topics, parse_topics
 from mapdata.inputs import InputOptions, open_input
@@ -236,6 +237,47 @@ def test_a_calibration_file_stands_for_infos_and_transforms(drive, minicity_root
     file.write_text(json.dumps({"cameras": cameras}))
     with pytest.raises(ValueError, match=r"'other'.*beside a bag it needs size_px"):
         open_input(recorder.path, options(tmp_path, calibration=file))
+
+
+def foxglove_file(path, drive, root):
+    pytest.importorskip("foxglove", reason="pip install -e .[viz]")
+    from drivemaps.drive import Drive, DriveFrame
+    from drivemaps.mcap import write_mcap
+    from drivemaps.replay import Replay
+
+    frames = [DriveFrame(sample, MapElements.from_polylines()) for sample in drive]
+    whole = Drive("a", ("divider",), (-15.0, 15.0), (-30.0, 30.0), frames)
+    replay = Replay(whole, MapElements.from_polylines(), "lidar", ["#ff0000"], root)
+    write_mcap(path, replay)
+    return path
+
+
+def test_an_mcap_of_foxgloves_messages_gives_the_samples_that_it_was_written_of(
+    drive, minicity_root, tmp_path
+):
+    path = foxglove_file(tmp_path / "a.mcap", drive, minicity_root)
+    settings = InputOptions(frames_dir=tmp_path / "frames", rate_hz=None)
+    source = open_input(path, settings)
+    assert source.has_poses
+    assert [s.timestamp_ns for s in source.samples] == [s.timestamp_ns for s in drive]
+    nominal = reframed(reframed(drive[0], "lidar", "ego"), "ego", "lidar")
+    found = {camera.name: camera for camera in reframed(source.samples[0], "ego", "lidar").cameras}
+    assert set(found) == {camera.name for camera in drive[0].cameras}
+    for camera in nominal.cameras:
+        other = found[camera.name]
+        np.testing.assert_allclose(other.intrinsics, camera.intrinsics)
+        np.testing.assert_allclose(other.cam_from_frame, camera.cam_from_frame, atol=1e-6)
+        original = (minicity_root / camera.path).read_bytes()
+        assert (source.data_root / other.path).read_bytes() == original
+    for sample, other in zip(source.samples, drive, strict=True):
+        at = sample.global_from_frame @ invert_rigid(ground_from_frame(sample, "ego"))
+        expected = other.global_from_frame @ invert_rigid(ground_from_frame(other, "lidar"))
+        np.testing.assert_allclose(at, expected, atol=1e-6)
+    content = path.read_bytes()
+    for damaged in (content[: len(content) // 2], content.replace(b"CameraCalib", b"CameraKalib")):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"a\.mcap cannot be used"):
+            open_input(path, settings)
 
 
 def starting_at_0(drive, turn=0, **more):
