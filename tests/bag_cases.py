@@ -17,6 +17,8 @@ AXLE_M = 0.3  # height of base_link above the road
 class Recorder:
     """Writes the messages of a test into a bag of one kind."""
 
+    info_topic, image_topic = "/{}/camera_info", "/{}/image_raw"
+
     def __init__(self, path, kind):
         self.ros1 = kind == "ros1"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
@@ -72,7 +74,7 @@ class Recorder:
         values = (np.array(distortion, float), k.ravel(), np.eye(3).ravel(), np.eye(3, 4).ravel())
         roi = self.type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
         self.send(
-            f"/{camera.name}/camera_info",
+            self.info_topic.format(camera.name),
             "sensor_msgs/msg/CameraInfo",
             time_ns,
             header=self.header(time_ns, f"{camera.name}_optical"),
@@ -90,7 +92,7 @@ class Recorder:
         if raw is None:
             data = np.frombuffer(content, np.uint8)
             kind = "sensor_msgs/msg/CompressedImage"
-            topic = f"/{camera.name}/image_raw/compressed"
+            topic = f"{self.image_topic.format(camera.name)}/compressed"
             self.send(topic, kind, time_ns, header=header, format="jpeg", data=data)
             return
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
@@ -105,7 +107,12 @@ class Recorder:
             "step": padded.shape[1],
             "data": padded.ravel(),
         }
-        self.send(f"/{camera.name}/image_raw", "sensor_msgs/msg/Image", time_ns, **fields | changed)
+        self.send(
+            self.image_topic.format(camera.name),
+            "sensor_msgs/msg/Image",
+            time_ns,
+            **fields | changed,
+        )
 
 
 def record(recorder, samples, root, poses="tf", raw=None, distortion=(), more=None, damaged=()):

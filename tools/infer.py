@@ -26,6 +26,7 @@ from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
+from mapdata.bag_topics import parse_topics
 from mapdata.calibration_check import (
     calibration_figure,
     calibration_warnings,
@@ -77,6 +78,19 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--vehicle-ground-z", type=float, default=0.0, help="height of the road in it, in metres"
     )
     group.add_argument(
+        "--topics",
+        nargs="+",
+        default=(),
+        metavar="NAME=IMAGES,INFO",
+        help="a bag's cameras: topics of their images and camera info (default: by their names)",
+    )
+    group.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE.yaml",
+        help="calibration of a bag's cameras, in place of camera info and transforms",
+    )
+    group.add_argument(
         "--allow-missing-cameras", action="store_true", help="leave absent cameras blank"
     )
     group = parser.add_argument_group("running")
@@ -118,6 +132,8 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
         frames_dir=frames or place.with_name(f"{place.name}_frames"),
         vehicle_frame=args.vehicle_frame,
         vehicle_ground_z_m=args.vehicle_ground_z,
+        topics=parse_topics(args.topics),
+        calibration=args.calibration,
     )
     source = open_input(args.input, options)
     for note in source.notes:

@@ -158,6 +158,27 @@ def test_the_shipped_model_predicts_as_in_torch(shipped):
     assert shipped[2].metadata["score_threshold"] is None
 
 
+def test_vehicle_signals_follow_one_rule(shipped):
+    """A record's own values give what the data set's give, in the runner and in the bare graph."""
+    _, dataset, exported = shipped
+    ((_, wanted),) = graph_inputs(exported, dataset, [0])
+    record = dataset.sample(0).can_bus
+    assert record[:3].any()  # where the vehicle is, which the model must not see
+    packed = dataset[0]
+    images = packed["inputs"]["img"].permute(0, 2, 3, 1).numpy()
+    meta = {**packed["data_samples"].metainfo, "can_bus": record}
+    inputs = exported.prepare(images, meta)
+    np.testing.assert_array_equal(inputs["can_bus"], wanted["can_bus"])
+    scores = exported.run(wanted)["scores"]
+    whole = {**wanted, "can_bus": record.astype(np.float32)}
+    np.testing.assert_array_equal(exported.run(whole)["scores"], scores)
+    without = {**wanted, "can_bus": np.zeros(18, np.float32)}
+    assert not np.array_equal(exported.run(without)["scores"], scores)
+    assert "entries 0 to 2 and 17 to zero" in exported.metadata["can_bus"]
+    with pytest.raises(ValueError, match=r"needs can_bus, the 18 values .* From poses: motion_sig"):
+        exported.prepare(images, {**meta, "can_bus": None})
+
+
 def test_files_hold_standard_operators_and_no_word_of_the_machine(shipped):
     import onnx
 

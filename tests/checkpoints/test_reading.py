@@ -103,13 +103,14 @@ def small() -> Config:
     return read_config("configs/maptr/maptr_r18_minicity.py")
 
 
-def test_test_images_get_the_size_that_the_checkpoint_was_trained_at(small, tmp_path):
+def test_test_data_are_as_those_that_the_checkpoint_was_trained_on(small, tmp_path):
     def steps():
         return [small[f"{part}_dataloader"].dataset.pipeline[1] for part in ("test", "train")]
 
     path = save(tmp_path / "a.pth", {"state_dict": {"w": torch.ones(1)}})
     adopt_settings(small, path, None)
     assert "trained_size" not in steps()[0]
+    assert "signals_from_poses" not in small.test_dataloader.dataset
     for options in ({"image_scale": 0.5}, {"test_dataloader.dataset.pipeline.1.scale": 0.5}):
         adopt_settings(small, "maptr_r18_minicity", options)
         assert "trained_size" not in steps()[0]  # asked for by hand
@@ -121,6 +122,7 @@ def test_test_images_get_the_size_that_the_checkpoint_was_trained_at(small, tmp_
     save(path, {"state_dict": {"w": torch.ones(1)}, "meta": {"image_size": [320, 180]}})
     adopt_settings(small, path, None)
     assert steps()[0].trained_size == (320, 180)
+    assert small.test_dataloader.dataset.signals_from_poses is True  # the named model's were given
 
 
 @pytest.mark.parametrize("size", [3, [3], ["a", "b"], [0, 5], [1, 10**9], [1.5, 2], [1, 2, 3]])

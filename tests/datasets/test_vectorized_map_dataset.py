@@ -15,6 +15,7 @@ from PIL import Image
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.errors import BrokenSampleError
+from gsmap.structures.calibration import without_history
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 MINICITY = "_base_/datasets/minicity"
@@ -91,6 +92,25 @@ def test_the_motion_since_the_last_frame_is_zero_as_of_single_frames(
     config = dataset_config(MINICITY, "train_dataloader", minicity_root, ann_file=str(path))
     can_bus = build(**config).get_data_info(0)["can_bus"]
     assert can_bus.tolist() == [0, 0, 0, *range(4, 18), 0]
+
+
+def test_signals_that_a_drive_does_not_have_come_from_its_poses_if_that_is_asked_for(
+    build, minicity_root, minicity_annotations, tmp_path
+):
+    source = AnnotationFile(minicity_annotations["train"])
+    path = tmp_path / "gsmap_minicity_train.arrow"
+    write_annotations(path, source.meta, [replace(s, can_bus=None) for s in source])
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root, ann_file=str(path))
+    assert not build(**config).get_data_info(0)["can_bus"].any()
+    dataset = build(**config, signals_from_poses=True)
+    for row, sample in enumerate(source):
+        found, true = dataset.get_data_info(row)["can_bus"], without_history(sample.can_bus)
+        np.testing.assert_allclose(found[3:7], true[3:7], atol=1e-6)  # orientation
+        np.testing.assert_allclose(found[7:10], true[7:10], atol=1.5)  # acceleration, m/s2
+        np.testing.assert_allclose(found[10:13], true[10:13], atol=0.2)  # turn rate, rad/s
+        np.testing.assert_allclose(found[13:16], true[13:16], atol=1.5)  # velocity, m/s
+        assert found[16] == pytest.approx(true[16])
+        assert found[9] > 9.0  # an accelerometer feels gravity
 
 
 @pytest.fixture(scope="module")

@@ -148,7 +148,14 @@ def test_mcap_holds_images_lines_and_gaussians_of_every_frame(tmp_path, camera_d
         summary = reader.make_reader(file).get_summary()
     counts = summary.statistics.channel_message_counts
     found = {channel.topic: counts[k] for k, channel in summary.channels.items()}
-    topics = {"/map", "/predictions", "/gaussians", "/tf/vehicle", "/tf/CAM_FRONT"}
+    topics = {
+        "/map",
+        "/predictions",
+        "/gaussians",
+        "/tf/vehicle",
+        "/tf/CAM_FRONT",
+        "/tf/base_footprint",
+    }
     assert found == dict.fromkeys(
         topics | {"/CAM_FRONT/image", "/CAM_FRONT/calibration"}, len(drive.frames)
     )

@@ -296,7 +296,8 @@ class Files:
         images = np.random.default_rng(0).integers(0, 255, (2, 4, 6, 3), np.uint8)
 
         def read() -> MapElements:
-            return OnnxInferencer(path)(images, {"lidar2img": np.stack([np.eye(4)] * 2)})
+            meta = {"lidar2img": np.stack([np.eye(4)] * 2), "can_bus": np.zeros(18)}
+            return OnnxInferencer(path)(images, meta)
 
         return Reader(path, read, (mutations.damaged_bytes, mutations.damaged_metadata))
 

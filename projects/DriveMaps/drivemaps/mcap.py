@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from drivemaps.replay import Moment, Replay
 from gsmap.datasets.annotations.record import CameraRecord
+from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.elements import FloatArray
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
 
-_GLOBAL, _FRAME = "global", "vehicle"
+_GLOBAL, _FRAME, _GROUND = "global", "vehicle", "base_footprint"  # x ahead, y left, on the road
 _FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp"}
 
 
@@ -32,6 +33,8 @@ def write_mcap(path: str | Path, replay: Replay) -> None:
         for moment in replay.moments():
             sample, time_ns = moment.frame.sample, moment.frame.sample.timestamp_ns
             log.transform(_GLOBAL, _FRAME, sample.global_from_frame, time_ns)
+            ground = invert_rigid(ground_from_frame(sample, replay.frame_kind))
+            log.transform(_FRAME, _GROUND, ground, time_ns)
             for camera in sample.cameras:
                 log.camera(camera, replay.data_root, time_ns)
             log.predictions(moment, time_ns)

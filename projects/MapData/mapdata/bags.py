@@ -1,4 +1,4 @@
-"""Samples of a bag: images, camera info, transforms and poses of ROS 1 or ROS 2 (also MCAP)."""
+"""Samples of a bag: images, camera info, transforms and poses of ROS 1, ROS 2 or Foxglove."""
 
 import hashlib
 from collections import defaultdict
@@ -17,6 +17,8 @@ from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_name, write_bytes
 from mapdata.argoverse2.samples import thin_out
+from mapdata.bag_topics import camera_topics, chosen_topics, image_topics
+from mapdata.folders.images import read_rig
 from mapdata.folders.rig import (
     PoseAt,
     PoseTrack,
@@ -27,13 +29,11 @@ from mapdata.folders.rig import (
     rig_samples,
     rotation_of,
 )
+from mapdata.foxglove_mcap import FoxgloveBag, is_foxglove
 
-_IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
-_INFO, _ODOMETRY = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"
+_ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _VEHICLE_FRAMES = ("base_footprint", "base_link")
-_GENERIC = ("compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
-            "image_rect_color")  # fmt: skip
 _TOLERANCE_NS = 50_000_000
 _GAP_NS, _FOREVER_NS = 10**9, 10**20
 _TO_BGR: dict[str, int | None] = {
@@ -60,6 +60,8 @@ def read_bag(
     rate_hz: float | None = 2.0,
     vehicle_frame: str | None = None,
     ground_z_m: float = 0.0,
+    topics: Mapping[str, tuple[str, str]] | None = None,
+    calibration: Path | None = None,
 ) -> Recording:
     """Read the samples of a bag, in the frame ``ego``, and write their images as files.
 
@@ -74,6 +76,9 @@ def read_bag(
         vehicle_frame: Frame of the vehicle (x ahead, y left, z up) in the bag's transforms;
             ``base_footprint`` or ``base_link`` by default.
         ground_z_m: Height of the road in that frame.
+        topics: Topic of the images and of the camera info, by camera, where they are not found.
+        calibration: Calibration file of the cameras, in place of their infos and transforms; their
+            names are those of the topics, or its ``images`` are topics.
 
     Raises:
         RuntimeError: If ``rosbags`` is not installed; the message names the extra.
@@ -84,10 +89,13 @@ def read_bag(
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     with naming(path, "see docs/inference.md"):
         with _of_rosbags():
-            bag = highlevel.AnyReader([path], default_typestore=store)
+            bag: Any = highlevel.AnyReader([path], default_typestore=store)
+            bag = FoxgloveBag(path) if is_foxglove(path) else bag
             bag.open()
         try:
-            return _read(bag, path, frames_dir, rate_hz, vehicle_frame, ground_z_m)
+            return _read(
+                bag, path, frames_dir, rate_hz, vehicle_frame, ground_z_m, topics, calibration
+            )
         finally:
             bag.close()
 
@@ -137,14 +145,28 @@ def _read(
     rate_hz: float | None,
     vehicle_frame: str | None,
     ground_z_m: float,
+    chosen: Mapping[str, tuple[str, str]] | None,
+    calibration: Path | None,
 ) -> Recording:
-    topics = _camera_topics(bag)
-    content = _first_pass(bag, topics)
+    kinds, listing = {c.topic: c.msgtype for c in bag.connections}, _listing(bag)
     ground = rigid(np.eye(3), (0, 0, ground_z_m))
-    vehicle = _vehicle_frame(content, vehicle_frame)
-    rig = {
-        topic: _camera(name, topic, content, vehicle, ground) for name, (topic, _) in topics.items()
-    }
+    topics = chosen_topics(kinds, chosen or {}, listing, calibration is None)
+    if calibration is None:
+        topics = topics or camera_topics(kinds, listing)
+        content = _first_pass(bag, topics)
+        vehicle = _vehicle_frame(content, vehicle_frame)
+        rig = {t: _camera(name, t, content, vehicle, ground) for name, (t, _) in topics.items()}
+    else:
+        given, ground = read_rig(calibration, ground)
+        images = {name: t for name, (t, _) in topics.items()} or image_topics(kinds)
+        topics = {
+            camera.name: (_topic_of(camera.name, place, images, kinds), "")
+            for camera, place in given
+        }
+        content = _first_pass(bag, topics)
+        vehicle = _vehicle_frame(content, vehicle_frame) if content.transforms else ""
+        rig = {topics[camera.name][0]: camera for camera, _ in given}
+    content.digest.update(calibration.read_bytes() if calibration else b"")
     times = {name: np.unique(content.times_ns[topic]) for name, (topic, _) in topics.items()}
     first = next((name for name in times if "front" in name.lower()), next(iter(times)))
     wanted = thin_out(times[first], rate_hz)
@@ -168,41 +190,23 @@ def _read(
     return Recording(samples, root, pose_at is not None, tuple(notes))
 
 
+def _topic_of(name: str, place: str, images: Mapping[str, str], kinds: Mapping[str, str]) -> str:
+    """Return the topic of a calibrated camera's images: as its file says, or of its name."""
+    topic = place if place in kinds else images.get(name)
+    if topic is None:
+        raise ValueError(
+            f"camera {name!r} of the calibration has no images: the bag's are {sorted(images)}; "
+            "set its `images` to a topic, or give --topics NAME=IMAGE_TOPIC"
+        )
+    return topic
+
+
 def _listing(bag: Any) -> str:
     """Say what a bag holds."""
     return "; ".join(
         f"{name} ({info.msgtype or 'several types'}, {info.msgcount})"
         for name, info in sorted(bag.topics.items())
     )
-
-
-def _camera_topics(bag: Any) -> dict[str, tuple[str, str]]:
-    """Find the cameras: topic of images and of camera info, by name."""
-    kinds = {c.topic: c.msgtype for c in bag.connections}
-    infos = {c.rsplit("/", 1)[0]: c for c, kind in kinds.items() if kind == _INFO}
-    found: dict[str, tuple[str, str]] = {}
-    for kind in _IMAGES:  # of both kinds of one camera's images, the compressed
-        for topic in sorted(t for t, k in kinds.items() if k == kind):
-            parts = topic.split("/")
-            if parts[-1] == "compressedDepth":
-                continue
-            while len(parts) > 2 and parts[-1] in _GENERIC:
-                parts.pop()
-            base = "/".join(parts)
-            spaces = [s for s in infos if base == s or base.startswith(f"{s}/")]
-            if spaces and base not in found:
-                found[base] = topic, infos[max(spaces, key=len)]
-    if not found:
-        raise ValueError(
-            "it has no camera with images (sensor_msgs Image or CompressedImage) and a CameraInfo "
-            f"in the same namespace; it holds: {_listing(bag) or 'no topic'}"
-        )
-    names = [base.rsplit("/", 1)[-1] for base in found]
-    if len(set(names)) < len(names):
-        names = [base.strip("/").replace("/", "_") for base in found]
-    if len(set(names)) < len(names):
-        raise ValueError(f"the cameras {sorted(found)} get one name: record them under other names")
-    return dict(zip(names, found.values(), strict=True))
 
 
 def _stamp_ns(header: Any) -> int:
@@ -223,7 +227,8 @@ def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:
     content = _Content()
     topic_of: dict[str, list[str]] = defaultdict(list)
     for topic, info in topics.values():
-        topic_of[info].append(topic)
+        if info:
+            topic_of[info].append(topic)
     images = {topic for topic, _ in topics.values()}
     kinds = (*_TRANSFORMS, _ODOMETRY)
     chosen = [c for c in bag.connections if c.topic in images | set(topic_of) or c.msgtype in kinds]
@@ -242,9 +247,12 @@ def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:
         except ValueError as error:
             content.unread[topic].append(str(error))
     for name, (topic, info) in topics.items():
-        if topic not in content.infos or topic not in content.frame_ids:
+        if topic not in content.frame_ids or (info and topic not in content.infos):
             reason = next((content.unread[t][0] for t in (topic, info) if content.unread[t]), "")
-            raise ValueError(f"camera {name!r} has no message on {topic} or {info}. {reason}")
+            raise ValueError(
+                f"camera {name!r} has no message on {topic} or {info or 'its info'}: choose others "
+                f"with --topics, or give --calibration. {reason}"
+            )
     return content
 
 
@@ -282,7 +290,8 @@ def _vehicle_frame(content: _Content, wanted: str | None) -> str:
             return name
     raise ValueError(
         f"its transforms have no frame {wanted or ' or '.join(_VEHICLE_FRAMES)!s}: name the "
-        f"vehicle's with --vehicle-frame; there are {sorted(frames) or 'no transforms at all'}"
+        f"vehicle's with --vehicle-frame, or give --calibration calibration.yaml; there are "
+        f"{sorted(frames) or 'no transforms at all'}"
     )
 
 
@@ -305,8 +314,9 @@ def _camera(
     above, of_vehicle = _chain(content, frame), _chain(content, vehicle)
     if above[-1] != of_vehicle[-1]:
         raise ValueError(
-            f"camera {name!r}: no transform leads from its frame {frame!r} to {vehicle!r}; there "
-            f"are those of {sorted(content.transforms)}"
+            f"camera {name!r}: no transform leads from its frame {frame!r} to {vehicle!r}: give "
+            "--calibration calibration.yaml, or another --vehicle-frame; there are those of "
+            f"{sorted(content.transforms)}"
         )
 
     def root_from(chain: Sequence[str]) -> np.ndarray:

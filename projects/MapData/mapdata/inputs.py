@@ -1,6 +1,7 @@
 """From whatever holds a recording to samples: the one entrance to the readers of this room."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsmap.datasets.source import Source, annotated
@@ -32,6 +33,8 @@ class InputOptions:
             in a folder for each input.
         vehicle_frame: The vehicle's frame in a bag; ``base_footprint`` or ``base_link`` by default.
         vehicle_ground_z_m: Height of the road in that frame.
+        topics: Topics of images and camera info of a bag, by camera (``parse_topics``).
+        calibration: Calibration file of a bag's cameras.
     """
 
     data_root: Path | None = None
@@ -41,6 +44,8 @@ class InputOptions:
     frames_dir: Path = Path("frames")
     vehicle_frame: str | None = None
     vehicle_ground_z_m: float = 0.0
+    topics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    calibration: Path | None = None
 
 
 def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Source:
@@ -62,6 +67,8 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"There is no input {path}.")
+    if not is_bag(path) and (options.topics or options.calibration):
+        raise ValueError(f"--topics and --calibration belong to a bag, and {path} is none.")
     if is_bag(path):
         drive = read_bag(
             path,
@@ -69,6 +76,8 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
             options.rate_hz,
             options.vehicle_frame,
             options.vehicle_ground_z_m,
+            options.topics,
+            options.calibration,
         )
         return Source(drive.samples, "ego", drive.data_root, drive.has_poses, drive.notes)
     if path.is_dir():

@@ -53,7 +53,7 @@ def test_images_of_another_size_become_as_long_as_those_of_the_training(
 
 
 def test_a_scale_that_leaves_no_image_is_refused():
-    with pytest.raises(ValueError, match="scale must be > 0, got 0"):
+    with pytest.raises(ValueError, match="scale or size must be > 0, got 0"):
         ScaleImages(0)
     with pytest.raises(ValueError, match=r"scale 0\.1 leaves nothing of a 9 x 20 image"):
         ScaleImages(0.1).transform({"img": [np.zeros((20, 9, 3), np.uint8)]})

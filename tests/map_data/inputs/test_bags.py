@@ -1,5 +1,6 @@
 """Bags of ROS 1 and ROS 2 become the samples of the drive that was recorded."""
 
+import json
 import re
 import sys
 from dataclasses import replace
@@ -12,7 +13,9 @@ from bag_cases import AXLE_M, Recorder, record
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.source import ground_from_frame, reframed
+from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
+from mapdata.bag_topics import camera_topics, parse_topics
 from mapdata.inputs import InputOptions, open_input
 
 
@@ -90,7 +93,9 @@ def test_what_a_bag_lacks_is_said_with_what_it_holds(drive, minicity_root, tmp_p
         open_input(recorder.path, options(tmp_path))
     recorder = Recorder(tmp_path / "good", "sqlite")
     record(recorder, drive[:1], minicity_root)
-    with pytest.raises(ValueError, match=r"no frame car: .*--vehicle-frame; there are .*'odom'"):
+    with pytest.raises(
+        ValueError, match=r"no frame car: .*--vehicle-frame, .*; there are .*'odom'"
+    ):
         open_input(recorder.path, options(tmp_path, vehicle_frame="car"))
 
 
@@ -115,6 +120,164 @@ def test_cameras_of_one_name_are_told_apart_or_refused(drive, minicity_root, tmp
     assert {camera.name for camera in source.samples[0].cameras} == {"left_cam", "right_cam"}
     with pytest.raises(ValueError, match=r"cameras \['/a/b/cam', '/a_b/cam'\] get one name"):
         open_input(bag("mixed", "a/b/cam", "a_b/cam"), options(tmp_path))
+
+
+def of_other_lenses(drive):
+    """Return the first sample, each camera with a focal length of its own."""
+    cameras = [
+        replace(camera, intrinsics=np.diag([100.0 + i, 100.0 + i, 1.0]))
+        for i, camera in enumerate(drive[0].cameras)
+    ]
+    return replace(drive[0], cameras=cameras)
+
+
+def focal_lengths(source):
+    return {camera.name: camera.intrinsics[0, 0] for camera in source.samples[0].cameras}
+
+
+def test_flat_topics_are_paired_by_camera(drive, minicity_root, tmp_path):
+    sample = of_other_lenses(drive)
+    recorder = Recorder(tmp_path / "flat", "sqlite")
+    recorder.info_topic, recorder.image_topic = "/{}_info", "/{}"
+    record(recorder, [sample], minicity_root)
+    found = focal_lengths(open_input(recorder.path, options(tmp_path)))
+    assert found == {camera.name: camera.intrinsics[0, 0] for camera in sample.cameras}
+
+
+def test_topics_can_be_paired_by_hand(drive, minicity_root, tmp_path):
+    sample = of_other_lenses(drive)
+    recorder = Recorder(tmp_path / "odd", "sqlite")
+    recorder.info_topic, recorder.image_topic = "/lens_of_{}_x", "/{}"
+    record(recorder, [sample], minicity_root)
+    with pytest.raises(ValueError, match=r"which CameraInfo is that of /CAM_.*--topics NAME="):
+        open_input(recorder.path, options(tmp_path))
+    names = [camera.name for camera in sample.cameras]
+    words = [f"my_{n}=/{n}/compressed,/lens_of_{n}_x" for n in names]
+    source = open_input(recorder.path, options(tmp_path, topics=parse_topics(words)))
+    expected = {f"my_{camera.name}": camera.intrinsics[0, 0] for camera in sample.cameras}
+    assert focal_lengths(source) == expected
+    for word, message in (
+        ("a=/nowhere,/lens_of_CAM_BACK_x", r"/nowhere is not there, and must be sensor_msgs"),
+        ("a=/CAM_BACK/compressed,/tf", r"/tf is tf2_msgs/msg/TFMessage, and must be .*CameraInfo"),
+        ("a=/CAM_BACK/compressed", r"names no camera info of a: .*--calibration"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            open_input(recorder.path, options(tmp_path, topics=parse_topics([word])))
+    for words in (["a"], ["=/a"], ["a=b"], ["a=/b", "a=/c"], ["a=/b,/c,/d"], ["a/../b=/c"]):
+        with pytest.raises(ValueError, match="--topics takes NAME="):
+            parse_topics(words)
+    with pytest.raises(ValueError, match=r"belong to a bag, and .* is none"):
+        open_input(minicity_root, options(tmp_path, topics=parse_topics(["a=/b"])))
+
+
+IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+OF_FLAT = "cam_front=/cam_front_info cam_rear=/cam_rear_info"
+
+
+@pytest.mark.parametrize(
+    ("images", "infos", "expected"),
+    [
+        ("/front/image_raw", "/front/camera_info", "front=/front/camera_info"),
+        ("/image_raw", "/camera_info", "image_raw=/camera_info"),
+        ("/a/c /b/c", "/a/camera_info /b/camera_info", "a_c=/a/camera_info b_c=/b/camera_info"),
+        ("/cam_front /cam_rear", "/cam_front_info /cam_rear_info", OF_FLAT),
+        ("/v/front_image", "/v/front_info /v/rear_info", "front_image=/v/front_info"),
+        ("/front/image /debug", "/front/camera_info", "front=/front/camera_info"),
+        ("/front/image /front/seen/image", "/front/camera_info", "front=/front/camera_info"),
+        ("/left/image /right/image", "/camera_info", "is /camera_info that of left or right?"),
+        ("/s/left /s/right", "/s/camera_info", "is /s/camera_info that of left or right?"),
+        ("/left/image /right/image", "/right/camera_info /x_info", "is /x_info that of left?"),
+        ("/front", "/one_info /two_info", "which CameraInfo is that of /front"),
+        ("/debug", "/front/camera_info", "no camera with images"),
+    ],
+)
+def test_images_are_paired_with_camera_info_or_it_is_asked_for(images, infos, expected):
+    kinds = dict.fromkeys(images.split(), IMAGE) | dict.fromkeys(infos.split(), INFO)
+    if "=" in expected:
+        found = camera_topics(kinds, "")
+        assert [f"{name}={info}" for name, (_, info) in found.items()] == expected.split()
+    else:
+        with pytest.raises(ValueError, match=rf"{re.escape(expected)}.*--topics"):
+            camera_topics(kinds, "")
+
+
+def test_a_calibration_file_stands_for_infos_and_transforms(drive, minicity_root, tmp_path):
+    recorder = Recorder(tmp_path / "plain", "mcap")
+    with recorder:
+        for camera in drive[0].cameras:
+            recorder.image(camera, 10**9, (minicity_root / camera.path).read_bytes())
+    with pytest.raises(ValueError, match=r"give --calibration calibration\.yaml, or --topics"):
+        open_input(recorder.path, options(tmp_path))
+    ground = ground_from_frame(drive[0], "lidar")
+    cameras = {
+        camera.name: {
+            "intrinsics": camera.intrinsics.tolist(),
+            "size_px": [camera.width, camera.height],
+            "vehicle_from_camera": (ground @ invert_rigid(camera.cam_from_frame)).tolist(),
+        }
+        for camera in drive[0].cameras
+    }
+    cameras["rear"] = cameras.pop("CAM_BACK") | {"images": "/CAM_BACK/image_raw/compressed"}
+    file = tmp_path / "calibration.json"
+    file.write_text(json.dumps({"cameras": cameras, "ground_z_m": 0.0}))
+    source = open_input(recorder.path, options(tmp_path, calibration=file))
+    assert not source.has_poses
+    (sample,) = source.samples
+    assert {camera.name for camera in sample.cameras} == set(cameras)
+    found = {camera.name: camera for camera in reframed(sample, "ego", "lidar").cameras}
+    for camera in reframed(reframed(drive[0], "lidar", "ego"), "ego", "lidar").cameras:
+        other = found["rear" if camera.name == "CAM_BACK" else camera.name]
+        np.testing.assert_allclose(other.intrinsics, camera.intrinsics)
+        np.testing.assert_allclose(other.cam_from_frame, camera.cam_from_frame, atol=1e-6)
+    cameras["other"] = cameras["rear"] | {"images": "front"}
+    file.write_text(json.dumps({"cameras": cameras}))
+    with pytest.raises(ValueError, match=r"'other' of the calibration has no images: the bag's"):
+        open_input(recorder.path, options(tmp_path, calibration=file))
+    del cameras["other"]["size_px"]
+    file.write_text(json.dumps({"cameras": cameras}))
+    with pytest.raises(ValueError, match=r"'other'.*beside a bag it needs size_px"):
+        open_input(recorder.path, options(tmp_path, calibration=file))
+
+
+def foxglove_file(path, drive, root):
+    pytest.importorskip("foxglove", reason="pip install -e .[viz]")
+    from drivemaps.drive import Drive, DriveFrame
+    from drivemaps.mcap import write_mcap
+    from drivemaps.replay import Replay
+
+    frames = [DriveFrame(sample, MapElements.from_polylines()) for sample in drive]
+    whole = Drive("a", ("divider",), (-15.0, 15.0), (-30.0, 30.0), frames)
+    replay = Replay(whole, MapElements.from_polylines(), "lidar", ["#ff0000"], root)
+    write_mcap(path, replay)
+    return path
+
+
+def test_an_mcap_of_foxgloves_messages_gives_the_samples_that_it_was_written_of(
+    drive, minicity_root, tmp_path
+):
+    path = foxglove_file(tmp_path / "a.mcap", drive, minicity_root)
+    settings = InputOptions(frames_dir=tmp_path / "frames", rate_hz=None)
+    source = open_input(path, settings)
+    assert source.has_poses
+    assert [s.timestamp_ns for s in source.samples] == [s.timestamp_ns for s in drive]
+    nominal = reframed(reframed(drive[0], "lidar", "ego"), "ego", "lidar")
+    found = {camera.name: camera for camera in reframed(source.samples[0], "ego", "lidar").cameras}
+    assert set(found) == {camera.name for camera in drive[0].cameras}
+    for camera in nominal.cameras:
+        other = found[camera.name]
+        np.testing.assert_allclose(other.intrinsics, camera.intrinsics)
+        np.testing.assert_allclose(other.cam_from_frame, camera.cam_from_frame, atol=1e-6)
+        original = (minicity_root / camera.path).read_bytes()
+        assert (source.data_root / other.path).read_bytes() == original
+    for sample, other in zip(source.samples, drive, strict=True):
+        at = sample.global_from_frame @ invert_rigid(ground_from_frame(sample, "ego"))
+        expected = other.global_from_frame @ invert_rigid(ground_from_frame(other, "lidar"))
+        np.testing.assert_allclose(at, expected, atol=1e-6)
+    content = path.read_bytes()
+    for damaged in (content[: len(content) // 2], content.replace(b"CameraCalib", b"CameraKalib")):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"a\.mcap cannot be used"):
+            open_input(path, settings)
 
 
 def starting_at_0(drive, turn=0, **more):

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from gsmap.apis.onnx_inferencer import FORMAT, METADATA_KEY, OnnxInferencer
-from gsmap.structures.calibration import NUM_CAN_BUS
+from gsmap.apis.onnx_inferencer import CAN_BUS_RULE, FORMAT, METADATA_KEY, OnnxInferencer
+from gsmap.structures.calibration import NUM_CAN_BUS, OF_ONE_FRAME
 from gsmap.structures.elements import MapElements
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import write_bytes
@@ -54,7 +54,10 @@ class ExportedDetector(nn.Module):
         # a tensor of four axes is normalised and padded image by image
         images = self.model.data_preprocessor({"inputs": {"img": images}})["inputs"]["imgs"]
         (feats, *_) = self.model.extract_img_feats(images[None])
-        named = dict(zip(self.input_names[1:], (x[None] for x in calibration), strict=True))
+        given = dict(zip(self.input_names[1:], calibration, strict=True))
+        if "can_bus" in given:  # `without_history`
+            given["can_bus"] = nn.functional.pad(given["can_bus"][OF_ONE_FRAME], (3, 1))
+        named = {name: value[None] for name, value in given.items()}
         head = self.model.map_head
         outputs = head(self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:])))
         fields = head.reference.decode(outputs[-1].references[0])
@@ -115,7 +118,7 @@ def export_onnx(
     for part in (proto.graph, *proto.graph.node):  # stack traces of the machine that exported
         del part.metadata_props[:]
     head = model.map_head
-    metadata = {  # for `OnnxInferencer`
+    metadata: dict[str, Any] = {  # for `OnnxInferencer`
         "format": FORMAT,
         "image_size": list(image_size),
         "classes": list(head.classes),
@@ -126,6 +129,8 @@ def export_onnx(
         "margin_m": head.coder.margin_m,
         "score_threshold": head.coder.score_threshold,
     }
+    if "can_bus" in exported.input_names:
+        metadata["can_bus"] = CAN_BUS_RULE
     onnx.helper.set_model_props(proto, {METADATA_KEY: json.dumps(metadata)})
     onnx.checker.check_model(proto)
     write_bytes(out, proto.SerializeToString())

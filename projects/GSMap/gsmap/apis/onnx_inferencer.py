@@ -15,6 +15,9 @@ from gsmap.utils.extras import import_extra
 
 METADATA_KEY = "gsmap"
 FORMAT = 1
+CAN_BUS_RULE = (
+    "the 18 values of a sample's record; the graph itself sets entries 0 to 2 and 17 to zero"
+)
 _OUTPUTS = {"scores", "labels", "points"}
 
 
@@ -92,7 +95,8 @@ class OnnxInferencer:
             meta: ``lidar2img`` (V, 4, 4): from metres in the annotation frame to (u * d, v * d, d,
                 1) in pixels of these images. Depth-aware models (MapTRv2) also read ``lidar2cam``,
                 ``cam2img`` of the original images, ``img_aug_matrix`` (V, 4, 4) from those to
-                these, and ``lidar2ego`` (4, 4). ``can_bus`` (18,) is zero unless it is given.
+                these, and ``lidar2ego`` (4, 4). GKT and BEVFormer read
+                ``can_bus`` (18,), as a record has it; zeros if the model was trained without it.
 
         Returns:
             The elements, best first, with their scores and, if the model has them, Gaussians.
@@ -108,6 +112,11 @@ class OnnxInferencer:
     ) -> dict[str, NDArray[np.float32]]:
         """Return the inputs of the graph; arguments and errors as of a call."""
         self._check_images(images)
+        if "can_bus" in self._calibration and meta.get("can_bus") is None:
+            raise ValueError(
+                f"{self.path.name} needs can_bus, {CAN_BUS_RULE}. From poses: motion_signals of "
+                "gsmap.structures.vehicle_signals; zeros for a model that was trained without."
+            )
         inputs = calibration_arrays(meta, self._calibration)
         for name, array in inputs.items():
             if name != "can_bus" and array.shape != (len(self.cameras), 4, 4):

@@ -31,6 +31,7 @@ class NamedModel:
         address: Where its file is fetched; None for those that ship.
         figures: Published results on its validation split in percent, by our metrics' names.
         image_size: Width and height that images were scaled to in training, in pixels.
+        can_bus: Whether the training samples had vehicle signals.
     """
 
     name: str
@@ -41,6 +42,7 @@ class NamedModel:
     address: str | None
     figures: dict[str, float]
     image_size: list[int]
+    can_bus: bool
 
     @property
     def file(self) -> Path:

@@ -20,6 +20,7 @@ from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import (
     IMAGE_SIZE,
     MODEL_SETTINGS,
+    SIGNALS,
     STARTS,
     checked,
     differences,
@@ -46,11 +47,13 @@ class Checkpoint:
         state: Its weights.
         settings: The model's settings in training, not checked yet; None if they are not there.
         image_size: Width and height that images were scaled to in training, or None.
+        can_bus: Whether the training samples had vehicle signals, as far as it says.
     """
 
     state: dict[str, Tensor]
     settings: Any
     image_size: tuple[int, int] | None
+    can_bus: bool
 
 
 def read_checked(path: str | Path) -> Checkpoint:
@@ -72,8 +75,9 @@ def read_checked(path: str | Path) -> Checkpoint:
         if not isinstance(meta, Mapping):
             raise TypeError(f"meta must be a dictionary, got {meta!r:.60}")
         settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
-        named = (m.image_size for m in named_models().values() if m.file == path)
-        size = _checked_size(meta.get(IMAGE_SIZE, next(named, None)))
+        named = next((vars(m) for m in named_models().values() if m.file == path), {})
+        size = _checked_size({**named, **meta}.get(IMAGE_SIZE))
+        signals = {**named, **meta}.get(SIGNALS) is True
         if not isinstance(state, Mapping) or not all(map(_is_weight, state, state.values())):
             state = {}
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
@@ -96,7 +100,7 @@ def read_checked(path: str | Path) -> Checkpoint:
             "had failed; use an earlier epoch's."
         )
     state = {key.removeprefix("module."): value for key, value in state.items()}
-    return Checkpoint(state, settings, size)
+    return Checkpoint(state, settings, size, signals)
 
 
 def _checked_size(size: Any) -> tuple[int, int] | None:
@@ -123,6 +127,7 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
     """Give a config the model settings that a checkpoint was trained with, and say which changed.
 
     Test images are scaled to the size that it was trained at, unless ``cfg_options`` set the scale.
+    If it was trained with vehicle signals, those of samples without are computed from their poses.
     How training started (`STARTS`) is left out. Parts that were never trained are refused when the
     weights are loaded, unless the config sets ``model.allow_untrained``.
 
@@ -143,6 +148,8 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
     if checkpoint.image_size and not any(n.startswith(_SCALED) for n in cfg_options or {}):
         for step in scale_steps(cfg, "test"):
             step.trained_size = checkpoint.image_size
+    if checkpoint.can_bus:
+        cfg.test_dataloader.dataset.setdefault("signals_from_poses", True)
     config = plain(cfg.model.to_dict())
     allowed = cfg.model.setdefault("allow_untrained", False)
     if settings is None or not differences(settings, config):

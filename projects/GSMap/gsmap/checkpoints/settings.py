@@ -12,6 +12,7 @@ MODEL_SETTINGS = "model_settings"  # key of a checkpoint's meta: JSON, as a conf
 # settings of the start of a training, which may load files
 STARTS = {"init_cfg", "pretrained", "allow_untrained"}
 IMAGE_SIZE = "image_size"  # key of a checkpoint's meta: width and height that images are scaled to
+SIGNALS = "can_bus"  # key of a checkpoint's meta: whether training samples had vehicle signals
 _KEY = re.compile(r"[a-zA-Z]\w*")
 _TEXT = re.compile(r"[\w -]*")  # no name of a file, an address or a module, and no expression
 _LARGEST = 1_000_000  # layers, channels, voxels

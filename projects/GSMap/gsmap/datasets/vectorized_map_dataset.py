@@ -12,11 +12,13 @@ from mmengine.logging import MMLogger, print_log
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import LidarRecord, MapInstance, MapSample
 from gsmap.datasets.errors import BrokenSampleError
-from gsmap.structures.calibration import NUM_CAN_BUS
+from gsmap.datasets.source import ground_from_frame
+from gsmap.structures.calibration import NUM_CAN_BUS, without_history
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.rigid import rigid
+from gsmap.structures.rigid import invert_rigid, rigid
 
 _BROKEN = ("raise", "skip")
+_NEIGHBOUR_S = 5.0  # how far the next pose of a drive may be for its speed
 
 
 @DATASETS.register_module()
@@ -42,6 +44,8 @@ class VectorizedMapDataset(BaseDataset):
         filter_empty_gt: Whether training leaves out samples without any map element.
         shuffle_images_seed: If given, each sample gets the images of another one, drawn with this
             seed: what a model then still scores, it does not see in the images.
+        signals_from_poses: Whether vehicle signals (``can_bus``) of samples that have none are
+            computed from the poses of the drive; otherwise they are zero.
         broken_samples: ``raise`` stops at a sample with a missing or damaged file; ``skip`` takes
             another one in its place, and counts and logs it (in training only).
         max_refetch: How many samples in a row may be skipped.
@@ -68,6 +72,7 @@ class VectorizedMapDataset(BaseDataset):
         test_mode: bool = False,
         filter_empty_gt: bool = True,
         shuffle_images_seed: int | None = None,
+        signals_from_poses: bool = False,
         broken_samples: str = "raise",
         max_refetch: int = 100,
         indices: int | Sequence[int] | None = None,
@@ -99,6 +104,7 @@ class VectorizedMapDataset(BaseDataset):
         self._dim = dim
         self._filter_empty_gt = filter_empty_gt and not test_mode
         self._shuffle_images_seed = shuffle_images_seed
+        self._signals_from_poses = signals_from_poses
         super().__init__(
             ann_file,
             data_root=str(data_root),
@@ -192,14 +198,12 @@ class VectorizedMapDataset(BaseDataset):
             "timestamp": sample.timestamp_ns / 1e9,
             "lidar2global": sample.global_from_frame,
             "lidar2ego": sample.ego_from_frame,
-            "can_bus": np.zeros(NUM_CAN_BUS),
+            "can_bus": self._vehicle_signals(sample, entry["row"]),
             "images": self._images(sample, entry),
             "map_instances": instances,
             "eval_ann_info": None,
         }
         info["cam_names"] = list(info["images"])
-        if sample.can_bus is not None:  # as MapTR sees a single frame: position and yaw change 0
-            info["can_bus"][3:17] = sample.can_bus[3:17]
         if instances is not None:
             info["eval_ann_info"] = {
                 "polylines": [instance.points for instance in instances],
@@ -208,6 +212,25 @@ class VectorizedMapDataset(BaseDataset):
         if sample.lidar is not None:
             info.update(self._lidar(sample.lidar))
         return info
+
+    def _vehicle_signals(self, sample: MapSample, row: int) -> np.ndarray:
+        """Return ``can_bus`` without history; of poses, or zero, where a sample has none. (18,)"""
+        if sample.can_bus is not None:
+            return without_history(sample.can_bus)
+        if not self._signals_from_poses or not self.annotations.meta.options.get("poses", True):
+            return np.zeros(NUM_CAN_BUS)
+        from gsmap.structures.vehicle_signals import motion_signals
+
+        def pose(other: MapSample) -> tuple[float, np.ndarray]:
+            seconds = (other.timestamp_ns - sample.timestamp_ns) / 1e9
+            ground = ground_from_frame(other, self._metainfo["frame"])
+            return seconds, other.global_from_frame @ invert_rigid(ground)
+
+        places = [i for i in (row - 1, row + 1) if 0 <= i < len(self.annotations)]
+        beside = [o for o in map(self.annotations.__getitem__, places) if o.scene == sample.scene]
+        poses = [p for p in map(pose, beside) if 0 < abs(p[0]) <= _NEIGHBOUR_S]
+        before, after = (next((p for p in poses if p[0] * s > 0), None) for s in (-1, 1))
+        return without_history(motion_signals(pose(sample), before, after))
 
     def _images(self, sample: MapSample, entry: dict[str, int]) -> dict[str, dict[str, Any]]:
         """Return path and calibration of each camera; paths may come from another sample."""

@@ -15,8 +15,9 @@ from torch.hub import load_state_dict_from_url
 
 from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.safe_globals import mmengine_globals
-from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, plain
+from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
 from gsmap.datasets.transforms.images import ScaleImages
+from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.run_log import innermost
 from gsmap.utils.files import write_bytes, write_text
 
@@ -60,7 +61,7 @@ class AtomicCheckpointHook(CheckpointHook):
         checkpoint.get("meta", {}).pop("config", None)
 
     def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
-        """Note the model's settings, and the size that images are scaled to.
+        """Note the model's settings, the size of the scaled images, and if there are signals.
 
         Raises:
             FloatingPointError: If a weight is not finite; such a checkpoint is of no use.
@@ -73,9 +74,10 @@ class AtomicCheckpointHook(CheckpointHook):
             )
         settings = plain(runner.cfg.model.to_dict())
         checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
-        size = _image_size(runner)
-        if size is not None:
-            checkpoint["meta"][IMAGE_SIZE] = list(size)
+        dataset = innermost(runner.train_dataloader.dataset)
+        if hasattr(dataset, "sample"):
+            checkpoint["meta"][IMAGE_SIZE] = list(_image_size(dataset))
+            checkpoint["meta"][SIGNALS] = dataset.sample(0).can_bus is not None
 
     def before_train(self, runner: Runner) -> None:
         """Make up for the validation that was due when a run was cut off, then begin as ever."""
@@ -106,11 +108,8 @@ class AtomicCheckpointHook(CheckpointHook):
             write_text(Path(runner.work_dir, VALIDATED), str(runner.iter))
 
 
-def _image_size(runner: Runner) -> tuple[int, int] | None:
-    """Return width and height that training images are scaled to, if the data set tells."""
-    dataset = innermost(runner.train_dataloader.dataset)
-    if not hasattr(dataset, "sample"):
-        return None
+def _image_size(dataset: VectorizedMapDataset) -> tuple[int, int]:
+    """Return width and height that the images of a data set are scaled to."""
     cameras = dataset.sample(0).cameras
     cameras = [c for c in cameras if c.name in (dataset.cameras or [c.name])]
     size = max(c.width for c in cameras), max(c.height for c in cameras)

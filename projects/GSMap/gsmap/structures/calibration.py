@@ -7,6 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 NUM_CAN_BUS = 18
+OF_ONE_FRAME = slice(3, 17)  # of ``can_bus``; the rest are changes since an earlier frame
+
+
+def without_history(can_bus: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Return vehicle signals as MapTR has them of a single frame: `OF_ONE_FRAME`, zeros around it.
+
+    (18,) -> (18,); ValueError if there is another number.
+    """
+    if can_bus.shape != (NUM_CAN_BUS,):
+        raise ValueError(f"can_bus must hold {NUM_CAN_BUS} values, got shape {can_bus.shape}.")
+    return np.pad(can_bus[OF_ONE_FRAME], (OF_ONE_FRAME.start, NUM_CAN_BUS - OF_ONE_FRAME.stop))
 
 
 def calibration_arrays(
@@ -16,8 +27,8 @@ def calibration_arrays(
 
     Args:
         meta: Of ``lidar2img``, ``lidar2cam``, ``cam2img``, ``img_aug_matrix`` (V, 4, 4),
-            ``lidar2ego`` (4, 4) and ``can_bus`` (18,) those that the names need. Without
-            ``can_bus`` the vehicle's motion is zero.
+            ``lidar2ego`` (4, 4) and ``can_bus`` (18,) those that the names need. ``can_bus`` is
+            given `without_history`; without it the vehicle's motion is zero.
         names: ``img_from_frame`` and ``frame_from_img``, between metres in the annotation frame and
             (u * d, v * d, d, 1) in pixels of the network's image; ``img_from_ground``, the former
             with z above the plane on which the vehicle stands; ``cam2img``; ``img_aug_matrix``;
@@ -35,7 +46,8 @@ def calibration_arrays(
                 f"sample {meta.get('token')!r} has no {key!r} in its metainfo: pack it in the "
                 "pipeline; lidar2ego is a record's ego_from_frame (docs/custom_data.md)."
             )
-        return np.asarray(meta[key], dtype=np.float64)
+        value = np.asarray(meta[key], dtype=np.float64)
+        return without_history(value) if key == "can_bus" else value
 
     # Inverses are taken in float64, so that they are as exact as float32 can hold them.
     derived = {

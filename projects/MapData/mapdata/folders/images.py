@@ -55,10 +55,7 @@ def read_image_folder(file: Path, frames_dir: Path) -> Recording:
         ValueError: If the file is malformed; the message names the camera.
     """
     with naming(file, "see docs/inference.md"):
-        content = _content(file)
-        _require_keys(content, _KEYS, "a calibration file")
-        if not isinstance(content.get("cameras"), dict) or not content["cameras"]:
-            raise ValueError("`cameras` must map names to cameras, at least one")
+        content = _calibration(file)
         ground = rigid(np.eye(3), (0, 0, float(content.get("ground_z_m", 0.0))))
         rig, images = [], {}
         for name, camera in content["cameras"].items():
@@ -83,6 +80,32 @@ def read_image_folder(file: Path, frames_dir: Path) -> Recording:
         return Recording(samples, root, pose_at is not None, tuple(chain(*notes)))
 
 
+def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]], np.ndarray]:
+    """Read the cameras of a calibration file whose images lie elsewhere, such as in a bag.
+
+    Args:
+        file: The calibration file; each camera needs ``size_px``.
+        ground: Pose of the road in the vehicle's frame, unless the file has ``ground_z_m``. (4, 4)
+
+    Returns:
+        The cameras, each with its ``images``, and the road's pose.
+
+    Raises:
+        ValueError: If the file is malformed; the message names the camera.
+    """
+    with naming(file, "see docs/inference.md"):
+        content, rig = _calibration(file), []
+        if "ground_z_m" in content:
+            ground = rigid(np.eye(3), (0, 0, float(content["ground_z_m"])))
+        for name, camera in content["cameras"].items():
+            with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
+                _require_keys(camera, _CAMERA_KEYS, "a camera")
+                if "size_px" not in camera:
+                    raise ValueError("beside a bag it needs size_px: [width, height]")
+                rig.append((_camera(str(name), camera, ground, ()), str(camera.get("images", ""))))
+        return rig, ground
+
+
 class _Loader(yaml.SafeLoader):
     """Reads YAML without merge keys (``<<``), which can stand for any number of entries."""
 
@@ -104,6 +127,15 @@ def _content(file: Path) -> Any:
         if len(values) > _MOST_VALUES:
             raise ValueError(f"it holds more than {_MOST_VALUES} values")
     return content
+
+
+def _calibration(file: Path) -> dict[str, Any]:
+    """Read a calibration file, whose keys are known."""
+    content = _content(file)
+    _require_keys(content, _KEYS, "a calibration file")
+    if not isinstance(content.get("cameras"), dict) or not content["cameras"]:
+        raise ValueError("`cameras` must map names to cameras, at least one")
+    return dict(content)
 
 
 def _digest(file: Path, frames: Sequence[RigFrame]) -> str:

@@ -26,13 +26,13 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.errors import naming
 from gsmap.datasets.image_files import image_size
+from gsmap.structures.vehicle_signals import pose_signals
 from gsmap.utils.cli import output_file
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard, add_shard_options, digest
 from mapdata.command_line import add_range_options
 from mapdata.infos.plain_pickle import load_plain_pickle
 from mapdata.infos.recordings import find_file
-from mapdata.nuscenes.can_bus import pose_signals
 from mapdata.nuscenes.map import NuScenesLocalMap, expansion, open_layers
 from mapdata.nuscenes.tables import pose_of
 from mapdata.summary import ConversionSummary

@@ -3,27 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-from pyquaternion import Quaternion
 
 from gsmap.datasets.errors import naming
-from gsmap.structures.calibration import NUM_CAN_BUS
+from gsmap.structures.vehicle_signals import pose_signals
 
 Messages = tuple[np.ndarray, np.ndarray]
 """Their times in microseconds (n,), and accelerations, rotation rates and velocities (n, 9)."""
-
-
-def pose_signals(global_from_ego: np.ndarray) -> np.ndarray:
-    """Return the signals that a vehicle's pose tells, the others zero. (4, 4) -> (18,).
-
-    Entries: position (3), orientation (w, x, y, z), acceleration (3), rotation rate (3), velocity
-    (3), yaw in radians, yaw in degrees in [0, 360).
-    """
-    values = np.zeros(NUM_CAN_BUS)
-    values[:3] = global_from_ego[:3, 3]
-    values[3:7] = Quaternion(matrix=global_from_ego, atol=1e-6, rtol=1e-6).elements
-    yaw_deg = np.degrees(np.arctan2(global_from_ego[1, 0], global_from_ego[0, 0])) % 360.0
-    values[16:] = np.radians(yaw_deg), yaw_deg
-    return values
 
 
 def signals_at(timestamp_ns: int, global_from_ego: np.ndarray, messages: Messages) -> np.ndarray:
