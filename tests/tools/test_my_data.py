@@ -15,7 +15,7 @@ _base_ = '{template}'
 _still = dict(batch_size=1, num_workers=0, persistent_workers=False)
 train_dataloader, val_dataloader, test_dataloader = _still, _still, _still
 param_scheduler = []
-train_cfg = dict(max_epochs=2)
+train_cfg = dict(max_epochs=1)
 visualizer = dict(width_px=400)
 """
 
@@ -44,7 +44,7 @@ def test_own_data_with_one_camera_train_test_and_infer(my_data, tmp_path, monkey
     config.write_text(SMALL.format(template=tmp_path / "my_city.py"))
     command(monkeypatch, "create_data", "check", my_data / "train.arrow", "--data-root", my_data)
     command(monkeypatch, "train", config, "--data-root", my_data, "--work-dir", work)
-    model = config, work / "epoch_2.pth"
+    model = config, work / "epoch_1.pth"
     metrics, found = tmp_path / "metrics.json", tmp_path / "map.json"
     common = ["--work-dir", tmp_path / "test", "--metrics-out", metrics]
     command(monkeypatch, "test", *model, "--data-root", my_data, *common)
