@@ -18,7 +18,7 @@ default_hooks = dict(
     sampler_seed=dict(type='DistSamplerSeedHook'),
     sync_buffers=dict(type='SyncBuffersHook'),  # every rank validates the model that is saved
     visualization=dict(type='MapVisualizationHook', draw=True, num_val_samples=2))
-custom_hooks = [dict(type='RunSummaryHook'), dict(type='GaussianHealthHook')]
+custom_hooks = [dict(type='RunSummaryHook'), dict(type='RigFitHook'), dict(type='GaussianHealthHook')]
 val_evaluator = dict(type='MapMetric', eval=['chamfer'])
 test_evaluator = dict(type='MapMetric', eval=['chamfer', 'raster'])
 vis_backends = [dict(type='LocalVisBackend'), dict(type='TensorboardVisBackend')]

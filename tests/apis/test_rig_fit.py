@@ -1,9 +1,14 @@
 """Which of a model's cameras looks as one of another rig does."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
+from model_cases import build_small, small_config
 
-from gsmap.apis.rig_fit import similar_cameras
+from gsmap.apis.rig_fit import RigFitHook, _origin, fit_start, similar_cameras
+from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
 
 NUSCENES = (
@@ -39,3 +44,107 @@ def test_left_is_left_and_right_is_right():
 def test_a_model_of_unknown_cameras_is_named():
     with pytest.raises(ValueError, match=r"is for the cameras \['a'\], the input has \['west'"):
         similar(("a",))
+
+
+METAINFO = {
+    "classes": ("boundary", "divider", "kerb"),
+    "frame": "ego",
+    "x_range": (-30.0, 30.0),
+    "y_range": (-15.0, 15.0),
+}
+
+
+class Drive:
+    """A data set whose two cameras look left and right, as training knows it."""
+
+    cameras = ("west", "east")
+    metainfo = METAINFO
+
+    def __len__(self) -> int:
+        return 1
+
+    def sample(self, _: int) -> MapSample:
+        cameras = [
+            CameraRecord(name, "a.jpg", 16, 9, np.diag([9.0, 9, 1]), np.array(matrix, float))
+            for name, matrix in zip(self.cameras, (LOOKS_LEFT, LOOKS_RIGHT), strict=True)
+        ]
+        return MapSample("a", "scene", "town", 0, cameras, np.eye(4))
+
+
+ORIGIN = {"cameras": NUSCENES, "classes": ["divider", "ped_crossing", "boundary"], "frame": "lidar"}
+ORIGIN |= {"x_range": [-15.0, 15.0], "y_range": [-30.0, 30.0]}
+
+
+def another_rig() -> torch.nn.Module:
+    """Return a small model for `Drive`."""
+    grid = {"x_range": [-30.0, 30.0], "y_range": [-15.0, 15.0]}
+    encoder = {**small_config()["bev_encoder"], "num_cams": 2}
+    return build_small(1, bev_encoder=encoder, grid=grid, classes=list(METAINFO["classes"]))
+
+
+def test_a_start_is_fitted_to_cameras_cells_and_classes():
+    trained, model, origin = build_small(0).state_dict(), another_rig(), dict(ORIGIN)
+    state = dict(trained)
+    lines = fit_start(state, model, Drive(), origin)
+    model.load_state_dict(state)  # it is strict
+    found = model.state_dict()
+    embeds = "bev_encoder.cams_embeds"
+    torch.testing.assert_close(found[embeds], trained[embeds][[4, 5]])  # back left, back right
+    cells = "bev_encoder.bev_embedding.weight"
+    assert trained[cells].shape == found[cells].shape == (72, 16)  # 12 x 6, 6 x 12
+    old = trained[cells].unflatten(0, (12, 6))
+    new = found[cells].unflatten(0, (6, 12))
+    torch.testing.assert_close(new[0, 0], old[:2, 0].mean(0))  # half as many rows
+    torch.testing.assert_close(new.mean((0, 1)), old.mean((0, 1)))
+    for name, count in (("row", 6), ("col", 12)):
+        key = f"bev_encoder.positional_encoding.{name}_embed.weight"
+        assert len(found[key]) == count
+        torch.testing.assert_close(found[key].mean(0), trained[key].mean(0))
+    last = next(key for key in found if ".cls_branches.0." in key and len(found[key]) == 3)
+    torch.testing.assert_close(found[last][0], trained[last][2])  # boundary
+    torch.testing.assert_close(found[last][1], trained[last][0])  # divider
+    torch.testing.assert_close(found[last][2], another_rig().state_dict()[last][2])  # kerb: new
+    assert [line.partition(":")[0] for line in lines] == [
+        "embeddings of cameras",
+        "queries of 12 x 6 BEV cells interpolated to 6 x 12.",
+        "classes keep their weights",
+        "x_range was [-15.0, 15.0], is (-30.0, 30.0)",
+        "y_range was [-30.0, 30.0], is (-15.0, 15.0)",
+        "frame was lidar, is ego",
+    ]
+
+
+def test_a_start_that_fits_stays_as_it_is():
+    model = another_rig()
+    state = dict(model.state_dict())
+    before = dict(state)
+    assert fit_start(state, model, Drive(), METAINFO | {"cameras": Drive.cameras}) == []
+    assert fit_start(state, model, Drive(), {}) == []  # nothing is known of it
+    assert all(torch.equal(state[key], before[key]) for key in before)
+
+
+def test_unknown_cameras_start_from_the_mean():
+    state, model = dict(build_small(0).state_dict()), another_rig()
+    embeds = state["bev_encoder.cams_embeds"]
+    for cameras in (None, ["a", "b", "c", "d", "e", "f"]):
+        fitted = dict(state)
+        lines = fit_start(fitted, model, Drive(), {"cameras": cameras})
+        assert lines[0].startswith("its cameras are not known")
+        mean = embeds.mean(0).expand(2, -1)
+        torch.testing.assert_close(fitted["bev_encoder.cams_embeds"], mean)
+
+
+def test_what_a_checkpoint_says_of_its_origin_is_checked():
+    assert _origin("a.pth", {}) == {}
+    assert _origin("a.pth", {"meta": {"dataset_meta": 3}}) == {}
+    said = {"cameras": ["front", 3], "classes": 7, "frame": "ego", "x_range": ("a", 1.0)}
+    assert _origin("a.pth", {"meta": {"dataset_meta": said}}) == {"frame": "ego"}
+    known = _origin(find_checkpoint("gsmap_r18_minicity"), {"state_dict": {}})
+    assert (known["frame"], known["x_range"]) == ("lidar", [-15.0, 15.0])
+    assert known["cameras"] == list(NUSCENES)
+
+
+def test_a_resumed_training_and_a_test_take_checkpoints_as_they_are():
+    for resume, loop in ((True, object()), (False, None), (False, {})):
+        runner = SimpleNamespace(_resume=resume, _train_loop=loop)
+        RigFitHook().after_load_checkpoint(runner, {})  # else it would ask for the data

@@ -21,11 +21,6 @@ from gsmap.checkpoints.key_map import PIVOTNET
 
 NUM_CAMS = 6
 OWN_RECIPES = ("mapqr", "mgmapnet", "pivotnet", "streammapnet")  # weights of another scale
-    "mapqr",
-    "mgmapnet",
-    "pivotnet",
-    "streammapnet",
-)  # methods whose weights have another scale
 
 
 @dataclass(eq=False)

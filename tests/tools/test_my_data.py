@@ -12,17 +12,10 @@ import pytest
 REPO = Path(__file__).resolve().parents[2]
 SMALL = """
 _base_ = '{template}'
-_heads = dict(num_heads=4, ffn_dims=16)
-model = dict(
-    img_backbone=dict(base_channels=8),
-    img_neck=dict(in_channels=[16, 32, 64], out_channels=[8, 4, 4]),
-    bev_encoder=dict(embed_dims=16, layer_cfg=_heads),
-    map_head=dict(
-        embed_dims=16, query_groups=[dict(num=5)], decoder=dict(num_layers=2, layer=_heads)))
 _still = dict(batch_size=1, num_workers=0, persistent_workers=False)
 train_dataloader, val_dataloader, test_dataloader = _still, _still, _still
 param_scheduler = []
-train_cfg = dict(max_epochs=2)
+train_cfg = dict(max_epochs=1)
 visualizer = dict(width_px=400)
 """
 
@@ -51,7 +44,7 @@ def test_own_data_with_one_camera_train_test_and_infer(my_data, tmp_path, monkey
     config.write_text(SMALL.format(template=tmp_path / "my_city.py"))
     command(monkeypatch, "create_data", "check", my_data / "train.arrow", "--data-root", my_data)
     command(monkeypatch, "train", config, "--data-root", my_data, "--work-dir", work)
-    model = config, work / "epoch_2.pth"
+    model = config, work / "epoch_1.pth"
     metrics, found = tmp_path / "metrics.json", tmp_path / "map.json"
     common = ["--work-dir", tmp_path / "test", "--metrics-out", metrics]
     command(monkeypatch, "test", *model, "--data-root", my_data, *common)
@@ -65,3 +58,9 @@ def test_own_data_with_one_camera_train_test_and_infer(my_data, tmp_path, monkey
     assert [cv2.imread(str(path)).shape[1] for path in pictures] == [400, 400]
     (log,) = (path.read_text() for path in work.glob("*/*.log"))
     assert "cameras     1, their files 640 x 360" in log
+    said = [line.partition("gsmap_r18_minicity.pth: ")[2] for line in log.splitlines()]
+    assert {
+        "embeddings of cameras: front as CAM_FRONT.",
+        "queries of 50 x 25 BEV cells interpolated to 25 x 50.",
+    } <= set(said)
+    assert sum(line.startswith("frame was lidar, is ego: ") for line in said) == 1

@@ -3,6 +3,7 @@
 from importlib import import_module
 from pkgutil import iter_modules
 
+import gsmap.apis.rig_fit
 import gsmap.datasets.stream_samplers
 import gsmap.datasets.vectorized_map_dataset
 import gsmap.engine.checkpoint_hook

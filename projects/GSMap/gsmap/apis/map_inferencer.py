@@ -187,14 +187,9 @@ class MapInferencer:
             dataset.cameras = names = tuple(name for name in names if name in seen) or names
         if self._camera_embeds is None:
             return dataset
-        from gsmap.apis.rig_fit import similar_cameras
+        from gsmap.apis.rig_fit import camera_rows
 
-        if set(names) <= set(trained):
-            rows = [list(trained).index(name) for name in names]
-        else:
-            first = (dataset.sample(i) for i in range(min(len(dataset), _LOOK_AT)))
-            sample = max(first, key=lambda sample: len(sample.cameras))
-            rows = similar_cameras(sample, dataset.metainfo["frame"], names, trained)
+        rows = camera_rows(dataset, trained)
         for replica, device in zip(self.replicas, self.devices, strict=True):
             embeds = self._camera_embeds.detach()[rows].to(device)
             replica.bev_encoder.cams_embeds = torch.nn.Parameter(embeds)

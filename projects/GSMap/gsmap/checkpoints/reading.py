@@ -3,7 +3,8 @@
 import json
 import pickle
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,24 @@ class Checkpoint:
     can_bus: bool
 
 
+@contextmanager
+def refusing(path: object) -> Iterator[None]:
+    """Say in a line which checkpoint cannot be read, and why."""
+    try:
+        yield
+    except pickle.UnpicklingError as error:
+        reason = str(error).split(". ")[0]
+        raise ValueError(
+            f"{path} was not loaded: it is broken, or holds more than tensors and plain data "
+            f"({reason}); {_REMEDY}"
+        ) from error
+    except _DAMAGE as error:
+        raise ValueError(
+            f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); "
+            "fetch it again, or use an earlier epoch's."
+        ) from error
+
+
 def read_checked(path: str | Path) -> Checkpoint:
     """Read a checkpoint without running code from it, and check its weights.
 
@@ -67,7 +86,7 @@ def read_checked(path: str | Path) -> Checkpoint:
         ValueError: If it cannot be read, holds no weights, or weights that are not finite.
     """
     path = find_checkpoint(path)
-    try:
+    with refusing(path):
         with torch.serialization.safe_globals(mmengine_globals()):
             checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
         state = checkpoint.get("state_dict", checkpoint) if isinstance(checkpoint, Mapping) else {}
@@ -81,17 +100,6 @@ def read_checked(path: str | Path) -> Checkpoint:
         if not isinstance(state, Mapping) or not all(map(_is_weight, state, state.values())):
             state = {}
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
-    except pickle.UnpicklingError as error:
-        reason = str(error).split(". ")[0]
-        raise ValueError(
-            f"{path} was not loaded: it is broken, or holds more than tensors and plain data "
-            f"({reason}); {_REMEDY}"
-        ) from error
-    except _DAMAGE as error:
-        raise ValueError(
-            f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); "
-            "fetch it again, or use an earlier epoch's."
-        ) from error
     if not state:
         raise ValueError(f"{path} holds no state dict of tensors: give a training checkpoint.")
     if broken:

@@ -129,6 +129,7 @@ class VectorizedMapDataset(BaseDataset):
         for name in ("classes", "x_range", "y_range", "dataset", "split", "frame"):
             self._metainfo[name] = getattr(self.annotations.meta, name)
         self._metainfo["dim"] = self._dim or self.annotations.meta.dim
+        self._metainfo["cameras"] = self.cameras
         return [{"row": row, "image_row": row} for row in range(len(self.annotations))]
 
     def filter_data(self) -> list[dict[str, int]]:

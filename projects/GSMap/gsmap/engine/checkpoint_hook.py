@@ -1,7 +1,6 @@
 """Checkpoints that are whole or absent when written, and run no code when read."""
 
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from mmengine.runner import checkpoint as mmengine_checkpoint
 from torch.hub import load_state_dict_from_url
 
 from gsmap.checkpoints.convert import listed
+from gsmap.checkpoints.reading import refusing
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
 from gsmap.datasets.transforms.images import ScaleImages
@@ -37,6 +37,12 @@ class AtomicLocalBackend(LocalBackend):
         self.put(obj.encode(encoding), filepath)
 
 
+def _fetched(address: str, *args: Any, **options: Any) -> Any:
+    """Fetch a checkpoint as torch's hub does, whose default would run code of it."""
+    with refusing(address):
+        return load_state_dict_from_url(address, *args, weights_only=True, **options)
+
+
 @HOOKS.register_module()
 class AtomicCheckpointHook(CheckpointHook):
     """mmengine's hook, for runs that may be killed and for checkpoints from strangers.
@@ -52,8 +58,7 @@ class AtomicCheckpointHook(CheckpointHook):
 
     def before_run(self, runner: Runner) -> None:
         """Let torch read mmengine's checkpoints; mmengine reads one right after this."""
-        # what mmengine fetches, torch would run code of
-        mmengine_checkpoint.load_url = partial(load_state_dict_from_url, weights_only=True)
+        mmengine_checkpoint.load_url = _fetched
         torch.serialization.add_safe_globals(mmengine_globals())
 
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:

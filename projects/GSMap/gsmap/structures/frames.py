@@ -55,6 +55,16 @@ class FrameView:
         return np.concatenate([points, height[..., None]], axis=-1)
 
 
+def viewing_azimuth(img_from_frame: FloatArray, view: FrameView) -> float:
+    """Return where the camera of a projection matrix (4, 4) looks: its angle from straight ahead.
+
+    In radians, in (-pi, pi], to the left positive. The third row of the matrix is the optical axis,
+    up to a positive factor.
+    """
+    right, ahead = view.display_from_frame(np.asarray(img_from_frame)[2, :2])
+    return float(np.arctan2(-right, ahead))
+
+
 # Heights: the roof LiDAR of nuScenes stands 1.84 m above the road, on which its vehicle frame has
 # its origin; the ego frame of Argoverse 2 has its own on the rear axle, 0.31 m above the road
 # (median z of map vertices within 8 m). Vehicles: Renault Zoe, Ford Fusion.

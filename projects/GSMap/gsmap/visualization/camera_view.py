@@ -17,7 +17,7 @@ from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.structures.elements import MapElements
-from gsmap.structures.frames import FrameView
+from gsmap.structures.frames import FrameView, viewing_azimuth
 from gsmap.visualization.camera_projection import project_polygon, project_segments, subdivided
 from gsmap.visualization.style import MapStyle
 
@@ -90,16 +90,6 @@ def camera_views(
             image = np.full((camera.height, camera.width, 3), 128, np.uint8)
         views.append(CameraView(camera.name, image, camera.img_from_frame))
     return views
-
-
-def viewing_azimuth(img_from_frame: np.ndarray, view: FrameView) -> float:
-    """Return where the camera of a projection matrix (4, 4) looks: its angle from straight ahead.
-
-    In radians, in (-pi, pi], to the left positive. The third row of the matrix is the optical axis,
-    up to a positive factor.
-    """
-    right, ahead = view.display_from_frame(np.asarray(img_from_frame)[2, :2])
-    return float(np.arctan2(-right, ahead))
 
 
 def arrange_cameras(cameras: Sequence[Camera], view: FrameView) -> list[list[Camera]]:
