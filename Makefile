@@ -9,7 +9,7 @@ help:
 	@echo "make demo    set up if needed, then a trained GSMap drawn on MiniCity, and one of your own that starts from MapTR"
 	@echo "make lint    ruff, ruff format, codespell, mypy"
 	@echo "make format  let ruff fix what it can"
-	@echo "make docs    the documentation as a site, in site/"
+	@echo "make docs    the documentation as a site, in site/ (python -m http.server -d site shows it with search)"
 
 setup:
 	@tools/setup_env.sh $(VENV)

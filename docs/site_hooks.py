@@ -20,7 +20,7 @@ from mkdocs.structure.pages import Page
 REPO = Path(__file__).resolve().parents[1]
 # page of the site -> file of the repository
 OUTSIDE = {
-    "index.md": "README.md",
+    "overview.md": "README.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
     "security.md": "SECURITY.md",

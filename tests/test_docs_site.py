@@ -1,5 +1,6 @@
 """The documentation builds as a site, whole and without network; its lines are short."""
 
+import json
 import re
 from pathlib import Path
 
@@ -33,6 +34,20 @@ def test_nothing_is_loaded_from_the_network(site: Path):
     pages = [*site.rglob("*.html"), *site.rglob("*.css")]
     assert len(pages) > 50
     assert [page for page in pages if LOADED.search(page.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize("words", ["score my own predictions", "fine-tune"])
+def test_the_search_finds_what_a_user_would_type(site: Path, words: str):
+    """Each page of the search's index has a title, which counts most."""
+    entries = json.loads((site / "search/search_index.json").read_text())["docs"]
+    assert [entry for entry in entries if words in entry["title"].lower()]
+
+
+def test_the_front_page_has_the_picture_tiles_and_three_commands(site: Path):
+    page = (site / "index.html").read_text(encoding="utf-8")
+    assert 'src="images/minicity.jpg"' in page
+    assert len(re.findall(r"<li>\s*<p><strong>", page)) >= 6
+    assert all(command in page for command in ("make demo", "tools/infer.py", "tools/evaluate.py"))
 
 
 def test_no_table_or_list_is_left_as_text(site: Path):

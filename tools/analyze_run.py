@@ -8,10 +8,11 @@ Example: ``python tools/analyze_run.py work_dirs/maptr work_dirs/gsmap --out cur
 import argparse
 from pathlib import Path
 
+from comparison.run_curves import plot_runs, plot_series, read_run, summary_table
+
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_text
 from gsmap.visualization.figure import save_figure
-from gsmap.visualization.run_curves import plot_runs, plot_series, read_run, summary_table
 
 
 def parse_args() -> argparse.Namespace:

@@ -10,10 +10,13 @@ Examples:
 import argparse
 import json
 import time
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from drivemaps.config import MergeConfig
 from drivemaps.drive import Drive, read_drive
@@ -34,8 +37,9 @@ from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_name, write_text
+from gsmap.visualization.bev_view import draw_lines
 from gsmap.visualization.figure import save_figure
-from gsmap.visualization.plots import plot_maps
+from gsmap.visualization.plots import WIDTH_IN, finish_panel, panel_grid
 from gsmap.visualization.style import MapStyle
 
 FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
@@ -142,6 +146,33 @@ def draw(
         maps["true"] = true_map(read_drive(ann, drive.scene, annotated))
     track = np.array([frame.sample.global_from_frame[:2, 3] for frame in drive.frames])
     save_figure(plot_maps(maps, track, style), path)
+
+
+def plot_maps(maps: Mapping[str, MapElements], track: np.ndarray, style: MapStyle) -> Figure:
+    """Draw maps of one drive side by side (long ones one below the other), with the way driven.
+
+    ``maps`` are in the global frame, by their titles; ``track`` holds the vehicle's positions in
+    metres. (n, 2)
+    """
+    points = np.concatenate([track, *(elements.points[:, :2] for elements in maps.values())])
+    low, high = points.min(axis=0) - 5, points.max(axis=0) + 5
+    width, height = high - low
+    rows = len(maps) if width > 2.5 * height else 1
+    figure, axes = panel_grid(rows, len(maps) // rows)
+    across = WIDTH_IN * rows / len(maps) - 0.5  # without the labels
+    figure.set_figheight(0.4 + rows * (across * min(height / width, 2) + 0.5))
+    for ax, (title, elements) in zip(axes.ravel(), maps.items(), strict=True):
+        lines = [line[:, :2] - low for line in elements.polylines]
+        draw_lines(ax, lines, elements.labels, style, style.colours(elements.labels), 0.8)
+        ax.plot(*(track - low).T, ".", color=style.ink, markersize=1.2)
+        ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")
+        finish_panel(ax, title)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter("{x:g} m")
+    labels = sorted({int(label) for elements in maps.values() for label in elements.labels})
+    lines = [Line2D([], [], color=style.colour(i), lw=2, label=style.title(i)) for i in labels]
+    figure.legend(handles=lines, loc="outside upper right", ncols=4, fontsize=8, frameon=False)
+    return figure
 
 
 def has_truth(ann: AnnotationFile) -> bool:

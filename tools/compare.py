@@ -31,6 +31,7 @@ from comparison.report import (
     plot_iterations,
     read_result,
 )
+from comparison.run_curves import plot_precision_recall
 from mmengine.config import DictAction
 
 from gsmap.engine.arguments import data_root_options
@@ -39,7 +40,6 @@ from gsmap.utils.files import read_json, write_text
 from gsmap.utils.progress import Progress
 from gsmap.utils.shipped import shipped
 from gsmap.visualization.figure import save_figure
-from gsmap.visualization.plots import plot_precision_recall
 
 
 def parse_args() -> argparse.Namespace:

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from comparison.run_curves import plot_precision_recall
 
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
-from gsmap.visualization.plots import plot_precision_recall, plot_result
+from gsmap.visualization.plots import plot_result
 from gsmap.visualization.style import CLASS_COLOURS, RUN_COLOURS
 
 CLASSES = ("boundary", "divider")

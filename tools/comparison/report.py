@@ -1,4 +1,4 @@
-"""What a comparison found: figures with their spread, differences, cost, curves."""
+"""What a comparison found: figures with their standard deviation, differences, cost, curves."""
 
 import json
 import re
@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from comparison.plan import RECORD
+from comparison.run_curves import RunLog, read_run
 from gsmap.checkpoints.reading import read_weights
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import newest_checkpoint
@@ -24,7 +25,6 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import read_json
 from gsmap.utils.parallel import default_workers
 from gsmap.visualization.plots import finish_panel, panel_grid
-from gsmap.visualization.run_curves import RunLog, read_run
 from gsmap.visualization.style import RUN_COLOURS
 from mapdata.upstream_configs.fields import Fields
 from mapdata.upstream_configs.reader import read_assignments

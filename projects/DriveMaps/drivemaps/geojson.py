@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import shapely
 
@@ -48,7 +49,7 @@ def write_geojson(
                 },
             }
         )
-    collection = {"type": "FeatureCollection", "crs": _CRS84 if origin else None}
+    collection: dict[str, Any] = {"type": "FeatureCollection", "crs": _CRS84 if origin else None}
     if origin is None:
         collection["frame"] = "global frame of the poses, metres"
     collection["features"] = features

@@ -187,6 +187,7 @@ def test_the_ground_is_drawn_where_the_cameras_see_it(town, minicity_root):
     right = figure_to_rgb(calibration_figure(sample, "lidar", minicity_root)).astype(int)
     wrong = figure_to_rgb(calibration_figure(changed(sample, FRONT, sunk), "lidar", minicity_root))
     assert (np.abs(right - wrong).max(-1) > 50).sum() > 500
+    assert right.shape[1] == 3200  # six cameras large enough to judge
 
 
 def test_the_command_warns_draws_and_says_so_by_its_exit_code(tmp_path, capsys):

@@ -224,8 +224,8 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
         width_pt = 2.6 * style.bev_line_pt
         draw_lines(ax, lines, panel.truth.labels, style, shades, width_pt, zorder=8)
     if not elements:
-        place = {"transform": ax.transAxes, "ha": "center", "va": "bottom"}
-        ax.text(0.5, 0.03, panel.note, fontsize=7, color=style.muted, **place)
+        note = ax.text(0.5, 0.03, panel.note, transform=ax.transAxes, ha="center", va="bottom")
+        note.set(fontsize=7, color=style.muted)
         return
     lines = [view.display_from_frame(line) for line in elements.polylines]
     colours = [MATCH_COLOURS[fate] for fate in fates] or style.colours(elements.labels)

@@ -135,7 +135,7 @@ def cameras_of(
     Raises:
         ValueError: If an image cannot be read.
     """
-    rows = []
+    rows: list[list[dict[str, Any]]] = []
     for row in arrange_cameras(sample.cameras, view):
         entries = []
         for camera in row:

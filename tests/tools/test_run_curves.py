@@ -2,9 +2,9 @@ import json
 
 import numpy as np
 import pytest
+from comparison.run_curves import plot_runs, plot_series, read_run, smoothed, summary_table
 
 from gsmap.visualization.figure import figure_to_rgb
-from gsmap.visualization.run_curves import plot_runs, plot_series, read_run, smoothed, summary_table
 
 
 def write_log(folder, start, records):

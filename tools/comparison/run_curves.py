@@ -1,4 +1,4 @@
-"""Curves and a table of training runs, from the JSON logs that mmengine writes."""
+"""Curves and a table of runs: the JSON logs of their trainings, and what their tests found."""
 
 import json
 import math
@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from gsmap.evaluation.average_precision import precision_recall
+from gsmap.evaluation.report import MetricReport
 from gsmap.utils.files import read_text
-from gsmap.visualization.plots import finish_panel, panel_grid
-from gsmap.visualization.style import RUN_COLOURS
+from gsmap.visualization.plots import finish_panel, finish_shares, panel_grid
+from gsmap.visualization.style import RUN_COLOURS, MapStyle
 
 _TIMING = ("data_time", "time", "step", "epoch", "iter", "memory")
 
@@ -130,7 +132,7 @@ def _draw_metrics(ax: Axes, runs: Sequence[RunLog]) -> None:
             ax.plot(*series, style, color=colour, marker=".", label=label)
     by_epoch = any("epoch" in record for run in runs for record in run.train)
     _finish(ax, "validation", "epoch" if by_epoch else "iteration")
-    ax.xaxis.get_major_locator().set_params(integer=True)
+    ax.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
 
 
 def _finish(ax: Axes, title: str, x_label: str = "iteration") -> None:
@@ -191,6 +193,30 @@ def plot_series(runs: Sequence[RunLog], keys: Sequence[str]) -> Figure:
     for panel, key in zip(axes.ravel(), keys, strict=False):
         _draw_training(panel, runs, key, key)
     _fill_row(axes, len(keys))
+    return figure
+
+
+def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figure:
+    """Draw precision over recall of configs, by name, at the middle threshold.
+
+    ``reports`` are of one run of each; a row is a metric, a panel a class.
+    """
+    first = next(iter(reports.values()))
+    style = MapStyle(tuple(first[0].detections))
+    figure, axes = panel_grid(len(first), len(style.classes))
+    for index, row in enumerate(axes):
+        for label, (name, found) in enumerate(first[index].detections.items()):
+            middle = len(found.thresholds) // 2
+            for of_run, colour in zip(reports.values(), RUN_COLOURS * 9, strict=False):
+                of_class = of_run[index].detections[name]
+                curve = precision_recall(of_class.hits[:, middle], of_class.num_gts)
+                row[label].plot(*curve, color=colour, linewidth=1.3)
+            unit = " m" if first[index].name == "chamfer" else " IoU"
+            title = f"{style.title(label)}, {found.thresholds[middle]:g}{unit}"
+            y_label = "" if label else "precision"
+            finish_shares(row[label], title, "recall", y_label, style.colour(label))
+    lines, names = axes[0, 0].lines, list(reports)
+    figure.legend(lines, names, loc="outside upper left", ncols=4, fontsize=8, frameon=False)
     return figure
 
 
