@@ -184,10 +184,15 @@ def main() -> str:
     if args.configs:
         placed = data_root_options(args.data_root) if args.data_root else {}
         options = [f"{key}={value}" for key, value in placed.items()]
-        rest = (args.out, args.batch, args.init, (*options, *args.cfg_options))
-        runs = plan(
-            [parse_entry(text) for text in args.configs], Protocol(args.seeds, args.budget, *rest)
+        protocol = Protocol(
+            seeds=args.seeds,
+            budget=args.budget,
+            out=args.out,
+            batch=args.batch,
+            init=args.init,
+            options=(*options, *args.cfg_options),
         )
+        runs = plan([parse_entry(text) for text in args.configs], protocol)
     if args.slurm:
         return slurm_commands(runs, args.slurm)
     chosen = [run for run in runs if args.only in (None, run.label)]

@@ -24,7 +24,7 @@ COMMANDS = {
     ),
     "infos": ("mapdata.infos.convert", "convert an info file of MapTR or MapTRv2"),
     "check": ("mapdata.check", "check annotation files completely"),
-    "export": ("mapdata.export", "write an annotation file's vectors as JSON"),
+    "export": ("mapdata.vectors_json", "write an annotation file's vectors as JSON"),
 }
 
 

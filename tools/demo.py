@@ -250,8 +250,8 @@ def training_steps(training: Training, folder: Path, budget: Budget) -> Iterable
     )
     model, tested = [config, str(checkpoint)], training.tested("test")
     yield test_step(f"test and draw {title}", model, tested, val, *drawing(tested))
-    shuffled, how = training.tested("shuffled"), ("--shuffle-images", "0")
-    yield test_step(f"test {title} on images of other samples", model, shuffled, val, *how)
+    title, shuffled = f"test {title} on images of other samples", training.tested("shuffled")
+    yield test_step(title, model, shuffled, val, "--shuffle-images", "0")
 
 
 def table(folder: Path, shipped: Iterable[str], trained: Iterable[Training]) -> str:

@@ -167,8 +167,9 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
         results, source = args.results, digest(args.results)
     else:  # of results in shards, too, the same one is enough
         source = digest_of_common(read_shard(results))
-    rules = evaluator.classes, args.allow_mismatch, args.shard
-    pairs = SamplePairs(results, args.ground_truth, *rules)
+    pairs = SamplePairs(
+        results, args.ground_truth, evaluator.classes, args.allow_mismatch, args.shard
+    )
     matches = list(match_samples(pairs, evaluator, args.workers))
     notes = pairs.notes(evaluator.counts_heights)
     source += digest(args.ground_truth)
@@ -187,8 +188,9 @@ def main(argv: list[str] | None = None) -> str:
     if args.prior:
         outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, args.prior_elements)
     else:
-        rules = evaluator, args.workers, args.allow_mismatch
-        outcome = evaluate_files(args.results, args.ground_truth, *rules)
+        outcome = evaluate_files(
+            args.results, args.ground_truth, evaluator, args.workers, args.allow_mismatch
+        )
     report(outcome, args)
     first = outcome[0][0]
     number = int(first.metrics[f"{first.name}/num_samples"])

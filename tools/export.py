@@ -12,6 +12,7 @@ import argparse
 import logging
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -97,13 +98,19 @@ def write_model(inferencer: MapInferencer, args: argparse.Namespace) -> OnnxInfe
     size = args.size
     if size is None:
         size = open_samples(inferencer, args, args.samples, "test")[0]["inputs"]["img"].shape[-2:]
-    settings = (options.cameras, tuple(size), options.get("frame", "lidar"))
+    write = partial(
+        export_onnx,
+        inferencer.model,
+        cameras=options.cameras,
+        image_size=tuple(size),
+        frame=options.get("frame", "lidar"),
+    )
     if not (args.fp16 or args.int8):
-        export_onnx(inferencer.model, args.out, *settings)
+        write(args.out)
         return OnnxInferencer(args.out)
     with tempfile.TemporaryDirectory(prefix="gsmap-") as folder:
         single = Path(folder, "fp32.onnx")
-        export_onnx(inferencer.model, single, *settings)
+        write(single)
         if args.fp16:
             halve_onnx(single, args.out)
         else:

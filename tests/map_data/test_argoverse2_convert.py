@@ -32,7 +32,7 @@ from mapdata.argoverse2.log import (
 )
 from mapdata.argoverse2.samples import Argoverse2Options, sample_times, thin_out
 from mapdata.command_line import parse_rate
-from mapdata.export import export_json
+from mapdata.vectors_json import write_vectors
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -116,7 +116,7 @@ def test_every_nth_pose_needs_neither_sensors_nor_calibration(tmp_path):
     assert [s.timestamp_ns for s in file] == times[::10].tolist()
     assert file[0].cameras == []
     assert file[0].lidar is None
-    export_json([file.path], tmp_path / "out.json")
+    write_vectors([file.path], tmp_path / "out.json")
     frames = json.loads((tmp_path / "out.json").read_text())["frames"]
     assert [(f["log"], f["row"]) for f in frames] == [("log-a", 0), ("log-a", 10), ("log-a", 20)]
     assert sorted(v["label"] for v in frames[0]["vectors"]) == [0, 1, 2, 2]

@@ -12,11 +12,11 @@ import shapely
 from processes import run_python
 
 from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
-from mapdata.export import export_json
 from mapdata.lane_graph import link_lanes
 from mapdata.nuscenes import convert as nuscenes
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from mapdata.nuscenes.map import MapLayers, NuScenesLocalMap
+from mapdata.vectors_json import write_vectors
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -144,7 +144,7 @@ def test_vectors_equal_the_reference(
     summary = convert_nuscenes(options)
     assert dict(summary.samples) == {"mini_train": 32, "mini_val": 32}
     files = [tmp_path / f"gsmap_nuscenes_{split}.arrow" for split in ("mini_train", "mini_val")]
-    assert export_json(files, tmp_path / "out.json") == 64
+    assert write_vectors(files, tmp_path / "out.json") == 64
     frames = json.loads((tmp_path / "out.json").read_text())["frames"]
     wanted = vector_set(json.loads((golden_dir / "data/E6_A.json").read_text())["frames"])
     found = vector_set(frames)

@@ -251,8 +251,15 @@ def _plan_run(entry: Entry, seed: int, protocol: Protocol, processes: int) -> Ru
     settings["init"] = init and _digest(init)
     folder = protocol.out.resolve() / entry.name / f"seed_{seed}"
     return Run(
-        *(entry.name, seed, folder, entry.config, (*words, *own), epochs, protocol.budget),
-        *(processes, settings),
+        name=entry.name,
+        seed=seed,
+        folder=folder,
+        config=entry.config,
+        options=(*words, *own),
+        epochs=epochs,
+        iterations=protocol.budget,
+        processes=processes,
+        settings=settings,
     )
 
 

@@ -37,8 +37,16 @@ class FileOptions:
 
     def meta(self, dataset: str, frame: str, split: str, **more: Any) -> AnnotationMeta:
         """Describe a split's annotation file; ``more`` are further fields."""
-        given = self.classes, self.x_range, self.y_range
-        return AnnotationMeta(dataset, frame, split, *given, command=self.command, **more)
+        return AnnotationMeta(
+            dataset,
+            frame,
+            split,
+            self.classes,
+            self.x_range,
+            self.y_range,
+            command=self.command,
+            **more,
+        )
 
     def path_of(self, dataset: str, split: str) -> Path:
         """Return where a split goes: ``gsmap_<dataset>_<split><tag>.arrow``."""

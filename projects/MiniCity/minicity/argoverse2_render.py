@@ -201,9 +201,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> str:
     """Render as the command line asks and return the summary."""
-    place, log = (arguments.root, arguments.split), arguments.calibration_from
-    calibration = find_logs(*place, [log])[0] if log else None
+    root, split, log = arguments.root, arguments.split, arguments.calibration_from
+    calibration = find_logs(root, split, [log])[0] if log else None
     options = options_from(RenderOptions, arguments, calibration=calibration)
-    log_dirs = arguments.shard.part(find_logs(*place, arguments.logs))
-    out = arguments.out / (arguments.out_split or arguments.split)
+    log_dirs = arguments.shard.part(find_logs(root, split, arguments.logs))
+    out = arguments.out / (arguments.out_split or split)
     return render_logs(log_dirs, out, options, arguments.workers)

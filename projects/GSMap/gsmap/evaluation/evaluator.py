@@ -83,7 +83,13 @@ class MapEvaluator:
     def match(
         self, token: str, predictions: MapElements, ground_truth: MapElements
     ) -> SampleMatches:
-        """Match one sample, named by its token, under every metric that is asked for."""
+        """Match one sample under every metric that is asked for.
+
+        Args:
+            token: Name of the sample.
+            predictions: Its predictions, in metres in the annotation frame. (N,)
+            ground_truth: Its ground truth at full resolution, likewise. (K,)
+        """
         if self.ground_truth_points is not None:
             points, offsets = ground_truth.points, ground_truth.offsets
             resampled = resample_all(points, offsets, self.ground_truth_points)

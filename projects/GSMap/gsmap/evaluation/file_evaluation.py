@@ -211,7 +211,15 @@ def evaluate_files(
     num_workers: int = 1,
     allow_mismatch: bool = False,
 ) -> Evaluation:
-    """Score a result file in one or more processes; other arguments as of ``SamplePairs``.
+    """Score a result file against ground truth.
+
+    Args:
+        results_path: Results in MapTR's JSON form.
+        truth_path: Annotation file, or ground truth in MapTR's JSON form.
+        evaluator: Metrics and their rules.
+        num_workers: Number of processes.
+        allow_mismatch: Whether the files may have different samples: one without results counts as
+            without predictions, results without ground truth are left out.
 
     Raises:
         FileNotFoundError: If a file does not exist.

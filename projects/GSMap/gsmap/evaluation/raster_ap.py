@@ -128,17 +128,17 @@ def match_raster(
     gt_index = np.flatnonzero(gt_labels >= 0)
     pred = rasterize(predictions.select(rows), config)
     gt = rasterize(ground_truth.select(gt_index), config)
-    labels = predictions.labels[rows], gt_labels[gt_index]
-    ious = kernels.mask_ious(pred, gt, *labels)
+    labels, gt_labels = predictions.labels[rows], gt_labels[gt_index]
+    ious = kernels.mask_ious(pred, gt, labels, gt_labels)
     thresholds = np.array(list(config.thresholds.values()))
-    matched = assign(ious, thresholds[labels[0]])
+    matched = assign(ious, thresholds[labels])
     matched_iou = np.pad(ious, ((0, 0), (0, 1)), constant_values=np.nan)  # column -1: no match
     quality = matched_iou[np.arange(len(rows)), matched[:, 0]]
     matched_gt = np.append(gt_index, -1)[matched]
-    num_gts = np.bincount(labels[1], minlength=num_classes)
-    class_iou = _class_ious(pred, gt, labels, num_classes)
+    num_gts = np.bincount(gt_labels, minlength=num_classes)
+    class_iou = _class_ious(pred, gt, (labels, gt_labels), num_classes)
     scores = predictions.confidence[rows]
-    return FrameMatches(token, rows, labels[0], scores, matched_gt, quality, num_gts, class_iou)
+    return FrameMatches(token, rows, labels, scores, matched_gt, quality, num_gts, class_iou)
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -143,7 +143,13 @@ class SampleFile:
 def read_samples(
     path: str | Path, key: str, classes: Sequence[str], gaussians: bool = False
 ) -> tuple[dict[str, MapElements], Counter[str]]:
-    """Read all samples of a file; arguments and errors as of ``SampleFile``.
+    """Read all samples of a file; errors are those of ``SampleFile``.
+
+    Args:
+        path: The file.
+        key: ``results`` or ``GTs``.
+        classes: Names of the classes; elements of others get the label -1.
+        gaussians: Whether to read the Gaussians of results where all elements have them.
 
     Returns:
         The elements of each sample, by token; and what is ignored.
@@ -158,9 +164,13 @@ def write_results(
     meta: Mapping[str, Any] | None = None,
     key: str = RESULTS_KEY,
 ) -> None:
-    """Write a file of ``results`` or ``GTs`` (``key``), which appears only when it is whole.
+    """Write a file of results or ground truth, which appears only when it is whole.
 
-    Samples are tokens and vectors, taken one by one; ``meta`` is what to say about the file.
+    Args:
+        path: File to write.
+        samples: Tokens and vectors (``vectors_of``), taken one by one.
+        meta: What to say about the file, in JSON's types.
+        key: ``results`` or ``GTs``.
     """
     with atomic_write(path) as file:
         file.write(f'{{"meta":{json.dumps(dict(meta or {}))},"{key}":[')

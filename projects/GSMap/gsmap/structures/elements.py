@@ -48,8 +48,13 @@ class MapElements:
     ) -> "MapElements":
         """Build the elements of a sample from separate polylines.
 
-        Polylines are arrays or nested lists, N x (P, 2 or 3); z is dropped unless all have it. The
-        others are as in the class, labels and scores (N,), scales N x (P, 2), rotations N x (P,).
+        Args:
+            polylines: Arrays or nested lists of vertices in metres; z is dropped unless all have
+                it. N x (P, 2 or 3)
+            labels: Class indices. (N,)
+            scores: Confidences in [0, 1], or None for ground truth. (N,)
+            scales: Standard deviations of the vertices' Gaussians in metres. N x (P, 2)
+            rotations: Angles of their first axes from +x in radians. N x (P,)
 
         Raises:
             ValueError: If the lengths disagree, the points are not (x, y[, z]), a point is not

@@ -77,10 +77,18 @@ def equivalent_orders(
 
     An open polyline has two: as it is, and reversed. A ring, whose last vertex equals its first,
     has one for each of its K vertices, which starts there and runs in the ring's own direction;
-    order k starts at vertex -k. Of more than P - 1 vertices, P - 1 are taken: at random if ``rng``
-    is given, else evenly spread. Orders are resampled at equal arc length; unused rows hold
-    ``PADDING``. ValueError if it is no polyline or ``num_points`` is below 2. Vertices at full
-    resolution in metres (n, D) -> (max(P - 1, 2), P, D)
+    order k starts at vertex -k. Of more than P - 1 vertices, P - 1 are taken.
+
+    Args:
+        points: Vertices at full resolution, in metres. (n, D)
+        num_points: Points P of an order, at equal arc length.
+        rng: Draws which of a ring's vertices are taken; None spreads them evenly.
+
+    Returns:
+        The orders; unused rows hold ``PADDING``. (max(P - 1, 2), P, D)
+
+    Raises:
+        ValueError: If it is no polyline or ``num_points`` is below 2.
     """
     points = _check_polyline(points, num_points)
     slots = max(num_points - 1, 2)
@@ -144,8 +152,15 @@ def clip_to_box(
 
     Direction is kept, further coordinates are interpolated, and a ring that is cut comes back as
     open pieces, none of which ends at the ring's arbitrary start. Pieces that only touch the
-    rectangle are left out. ValueError if it is no polyline. (n, D) in metres -> the pieces inside,
-    in order, each (m >= 2, D)
+    rectangle are left out. ValueError if it is no polyline.
+
+    Args:
+        points: Vertices in metres. (n, D)
+        x_range: Smallest and largest x of the rectangle, in metres.
+        y_range: Smallest and largest y, likewise.
+
+    Returns:
+        The pieces inside, in order. each (m >= 2, D)
     """
     points = _check_polyline(points)
     start, step = points[:-1], np.diff(points, axis=0)

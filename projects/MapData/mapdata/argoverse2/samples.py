@@ -176,9 +176,10 @@ def _sample(
         lidar=_lidar(log, timestamp_ns, np.linalg.inv(city_from_ego), options),
     )
     if log_map is not None:
-        ranges = options.x_range, options.y_range
         with naming(find_map(log.log_dir), "download it again"):
-            found = log_map.extract(city_from_ego, options.classes, options.compat, *ranges)
+            found = log_map.extract(
+                city_from_ego, options.classes, options.compat, options.x_range, options.y_range
+            )
         sample.instances = [
             MapInstance(label, points[:, : options.dim])
             for label, name in enumerate(options.classes)
@@ -200,10 +201,11 @@ def _cameras(
                 limit = MAX_CAMERA_OFFSET_NS / 1e6
                 raise _LeftOut(f"no image of {name} with a pose within {limit:.0f} ms")
             continue
-        path, size_px = f"{folder}/{name}/{image_ns}.jpg", (camera.width_px, camera.height_px)
+        path = f"{folder}/{name}/{image_ns}.jpg"
         motion = np.linalg.inv(city_from_ego_then) @ city_from_ego
         cam_from_frame = camera.ego_SE3_cam.inverse().transform_matrix @ motion
-        yield CameraRecord(name, path, *size_px, camera.intrinsics.K, cam_from_frame)
+        width, height, intrinsics = camera.width_px, camera.height_px, camera.intrinsics.K
+        yield CameraRecord(name, path, width, height, intrinsics, cam_from_frame)
 
 
 def _lidar(

@@ -133,7 +133,12 @@ def write_annotations(
 ) -> int:
     """Write an annotation file from samples, and return how many it has.
 
-    The other arguments are those of ``AnnotationWriter``.
+    Args:
+        path: File to write; parent folders are made.
+        meta: What holds for the whole file.
+        samples: The samples, taken one by one.
+        shard: Part of the file that the samples are; it gets a manifest.
+        source: Digest of what the whole is made from; by default that of ``meta``.
 
     Raises:
         ValueError: If a sample is malformed; then no file is left behind.

@@ -100,21 +100,26 @@ class VoVNet(BaseModule):
         stem += _convolution("stem_3", second, channels, 3, 2)
         self.stem = nn.Sequential(OrderedDict(stem))
         num_layers, num_blocks = LAYERS_AND_BLOCKS[depth]
-        for index, (layer, last) in enumerate(STAGE_CHANNELS):
-            stage = nn.Sequential()
+        stages = [nn.Sequential() for _ in STAGE_CHANNELS]
+        for index, (stage, (layer, last)) in enumerate(zip(stages, STAGE_CHANNELS, strict=True)):
             if index:
                 stage.add_module("Pooling", nn.MaxPool2d(3, 2, ceil_mode=True))
             for block in range(num_blocks[index]):
                 name, sizes = f"OSA{index + 2}_{block + 1}", (channels, layer, last)
                 stage.add_module(name, OneShotAggregation(name, sizes, num_layers, block > 0))
                 channels = last
-            self.add_module(f"stage{index + 2}", stage)
+        self.stage2, self.stage3, self.stage4, self.stage5 = stages
+
+    @property
+    def stages(self) -> tuple[nn.Sequential, ...]:
+        """The stages after the stem."""
+        return self.stage2, self.stage3, self.stage4, self.stage5
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         """Return the chosen stages' features. (n, 3, H, W) -> tuple of (n, C, h, w)"""
         feats, outputs = self.stem(images), []
-        for index in range(len(STAGE_CHANNELS)):
-            feats = getattr(self, f"stage{index + 2}")(feats)
+        for index, stage in enumerate(self.stages):
+            feats = stage(feats)
             if index in self.out_indices:
                 outputs.append(feats)
         return tuple(outputs)
@@ -122,8 +127,7 @@ class VoVNet(BaseModule):
     def train(self, mode: bool = True) -> "VoVNet":
         """Switch to training, but for what is frozen."""
         super().train(mode)
-        stages = [self.stem, *(getattr(self, f"stage{index}") for index in range(2, 6))]
-        for part in stages[: self.frozen_stages + 1]:
+        for part in (self.stem, *self.stages)[: self.frozen_stages + 1]:
             part.eval().requires_grad_(False)
         if self.norm_eval:
             for module in self.modules():

@@ -67,8 +67,17 @@ def bev_pool_conv3x3(
 
     Both steps are linear, so the kernel's nine matrices (O, C, 3, 3) can be applied to the few
     context vectors instead of the many cells: at MapTRv2's size (2,250 pixels, 80,000 cells) this
-    is 35 times less arithmetic. The other arguments are those of `bev_pool`; ValueError if the
-    shapes disagree. -> (B, O, H, W)
+    is 35 times less arithmetic. -> (B, O, H, W)
+
+    Args:
+        probs: Probability of each depth bin. (B, V, D, h, w)
+        context: Image features. (B, V, C, h, w)
+        cells: Cell of each point, -1 for none, from `cell_indices`. (B, V, D, h, w)
+        grid: The cells, H rows and W columns.
+        weight: The kernel. (O, C, 3, 3)
+
+    Raises:
+        ValueError: If the shapes disagree.
     """
     _check_shapes(probs, context, cells)
     if weight.dim() != 4 or weight.shape[1:] != (context.shape[2], 3, 3):

@@ -42,8 +42,12 @@ def bilinear_cells(
     """Return the cells (row-major) around sampling locations, and their weights. 2 x (..., 4 S)
 
     The value of a cell lies at its centre (``align_corners=False``). Outside the map both are zero;
-    a location that is not a number has a valid index and its weight is not a number. Locations (x,
-    y) are [0, 1] over the map (..., S, 2), weights (..., S), the shape rows and columns.
+    a location that is not a number has a valid index and its weight is not a number.
+
+    Args:
+        locations: Sampling points (x, y), [0, 1] over the map. (..., S, 2)
+        weights: Their weights. (..., S)
+        shape: Rows and columns of the map.
     """
     height, width = shape
     x, y = locations[..., 0] * width - 0.5, locations[..., 1] * height - 0.5

@@ -180,14 +180,13 @@ def render_backward(gaussians, frame, grads, out, first, last):
 def render_gaussians(gaussians, frame, height, width):
     """Render float32 Gaussians (N, P, 5), as :func:`render_forward`. (N, H, W)"""
     masks = torch.empty(len(gaussians), height, width, dtype=torch.float32)
-    arguments = gaussians.double(), tuple(frame), masks
-    run_in_threads(render_forward, height * width, *arguments)
+    run_in_threads(render_forward, height * width, gaussians.double(), tuple(frame), masks)
     return masks
 
 
 def render_gaussians_backward(grads, gaussians, frame, height, width):
     """Return the gradient in the Gaussians. (N, P, 5)"""
     gradients = torch.empty(gaussians.shape, dtype=torch.float64)
-    arguments = gaussians.double(), tuple(frame), grads, gradients
-    run_in_threads(render_backward, height * width, *arguments)
+    pixels, wide = height * width, gaussians.double()
+    run_in_threads(render_backward, pixels, wide, tuple(frame), grads, gradients)
     return (gradients.float(),)

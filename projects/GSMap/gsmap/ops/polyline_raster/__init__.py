@@ -59,8 +59,9 @@ def draw_polylines(
     half_width_m, pixel_m = width_m / 2, (dx * dy) ** 0.5
     with torch.autocast(polylines.device.type, enabled=False):
         if choose_backend(backend, polylines, ("cpu",)) == "cpu":
-            size, frame = (grid.height, grid.width), [grid.x_range[0], grid.y_range[0], dx, dy]
-            return _draw(polylines, flags, *size, frame, half_width_m, pixel_m, "cpu")
+            frame = [grid.x_range[0], grid.y_range[0], dx, dy]
+            height, width = grid.height, grid.width
+            return _draw(polylines, flags, height, width, frame, half_width_m, pixel_m, "cpu")
         pixels = grid.pixel_centres(polylines.device, polylines.dtype)
         return draw_reference(polylines, flags, pixels, half_width_m, pixel_m)
 

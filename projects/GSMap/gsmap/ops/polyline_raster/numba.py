@@ -215,22 +215,22 @@ def _settings(softness, plain):
 def soft_rasters(rings, is_polygon, height, width, softness, plain):
     """Render closed float32 rings softly; see ``soft_rasters_reference``. (n, H, W)"""
     masks = torch.empty(len(rings), height, width, dtype=torch.float32)
-    arguments = rings, is_polygon, *_settings(softness, plain), masks
-    run_in_threads(soft_forward, height * width, *arguments)
+    rules = _settings(softness, plain)
+    run_in_threads(soft_forward, height * width, rings, is_polygon, *rules, masks)
     return masks
 
 
 def soft_rasters_backward(grads, rings, is_polygon, height, width, softness, plain):
     """Return the gradient in the rings. (n, V, 2)"""
     gradients = torch.empty(rings.shape, dtype=torch.float64)
-    arguments = rings, is_polygon, *_settings(softness, plain), grads, gradients
-    run_in_threads(soft_backward, height * width, *arguments)
+    rules = _settings(softness, plain)
+    run_in_threads(soft_backward, height * width, rings, is_polygon, *rules, grads, gradients)
     return (gradients.float(),)
 
 
 def draw_polylines(polylines, filled, height, width, frame, half_width, pixel):
     """Draw float32 polylines; see ``draw_reference``. (K, H, W)"""
     masks = torch.empty(len(polylines), height, width, dtype=torch.float32)
-    arguments = polylines, filled, tuple(frame), half_width, pixel, masks
-    run_in_threads(draw, height * width, *arguments)
+    pixels, frame = height * width, tuple(frame)
+    run_in_threads(draw, pixels, polylines, filled, frame, half_width, pixel, masks)
     return masks

@@ -69,14 +69,20 @@ def raster_loss(
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds, targets = preds.to(dtype), targets.detach().to(dtype)
     with torch.autocast(preds.device.type, enabled=False):
-        settings = window_size, window_sigma
         if choose_backend(backend, preds, ("cpu",)) == "cpu":
-            window = gaussian_window(*settings, preds)
+            window = gaussian_window(window_size, window_sigma, preds)
             sums = _raster_loss_sums(preds, targets, window, foreground_weight, "cpu")
         else:
-            arguments = raster_loss_sums_reference, preds, targets, *settings, foreground_weight
-            # nothing is random, and saving its state would wait for a GPU
-            sums = checkpoint(*arguments, use_reentrant=False, preserve_rng_state=False)
+            sums = checkpoint(
+                raster_loss_sums_reference,
+                preds,
+                targets,
+                window_size,
+                window_sigma,
+                foreground_weight,
+                use_reentrant=False,
+                preserve_rng_state=False,  # nothing is random; saving it would wait for a GPU
+            )
         l1, predicted, dissimilarity, foreground, excess, sees_target, sees_either = sums.unbind(-1)
         pixels = math.prod(preds.shape[1:])
         if normalize == "both":

@@ -213,14 +213,14 @@ def loss_backward(preds, targets, window, weight, factors, grads, first, last):
 def raster_loss_sums(preds, targets, window, weight):
     """Return the sums of `raster_loss_sums_reference`; the first three are differentiable."""
     sums = torch.empty(len(preds), 7, dtype=torch.float64)
-    arguments = preds, targets, window, np.float32(weight), sums
-    run_in_threads(loss_forward, preds.shape[1:].numel(), *arguments)
+    pixels, weight = preds.shape[1:].numel(), np.float32(weight)
+    run_in_threads(loss_forward, pixels, preds, targets, window, weight, sums)
     return sums.float()
 
 
 def raster_loss_sums_backward(grads, preds, targets, window, weight):
     """Return the gradient in the predictions. (n, H, W)"""
     gradient = torch.empty(preds.shape, dtype=torch.float32)
-    arguments = preds, targets, window, np.float32(weight), grads[:, :3], gradient
-    run_in_threads(loss_backward, preds.shape[1:].numel(), *arguments)
+    pixels, weight = preds.shape[1:].numel(), np.float32(weight)
+    run_in_threads(loss_backward, pixels, preds, targets, window, weight, grads[:, :3], gradient)
     return (gradient,)

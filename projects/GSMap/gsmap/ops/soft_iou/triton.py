@@ -30,8 +30,8 @@ def pairwise_minima(preds, targets):
     """Sum the minimum of every pair of flat float32 masks. (N, pixels), (K, pixels) -> (N, K)"""
     minima = preds.new_empty(len(preds), len(targets))
     if minima.numel():
-        masks = preds.contiguous(), targets.contiguous()
+        preds, targets = preds.contiguous(), targets.contiguous()
         with torch.cuda.device_of(preds):
             launch = minima_kernel[len(targets), len(preds)]
-            launch(*masks, minima, preds.shape[1], BLOCK=BLOCK, num_warps=4)
+            launch(preds, targets, minima, preds.shape[1], BLOCK=BLOCK, num_warps=4)
     return minima

@@ -39,7 +39,7 @@ def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
     }
 
 
-def export_json(annotations: Sequence[Path], target: Path) -> int:
+def write_vectors(annotations: Sequence[Path], target: Path) -> int:
     """Write the ground truth of one data set's annotation files as one JSON, when it is whole.
 
     Returns the number of samples written.
@@ -89,5 +89,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> str:
     """Export as the command line asks and say how much was written."""
-    count = export_json(arguments.annotations, arguments.target)
+    count = write_vectors(arguments.annotations, arguments.target)
     return f"{count} samples written to {arguments.target}"
