@@ -19,7 +19,7 @@ from torch import Tensor
 from gsmap import registered  # noqa: F401
 
 NUM_CAMS = 6
-OWN_RECIPES = ("mapqr", "mgmapnet")  # methods whose weights have another scale
+OWN_RECIPES = ("mapqr", "mgmap", "mgmapnet")  # methods whose weights have another scale
 
 
 @dataclass(eq=False)

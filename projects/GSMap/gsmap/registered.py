@@ -23,6 +23,7 @@ FOLDERS = (  # every module of these is imported; a method comes and goes with i
     "gsmap.models.gemap",
     "gsmap.models.mgmapnet",
     "gsmap.models.mapqr",
+    "gsmap.models.mgmap",
     "gsmap.models.gsmap",
 )
 

@@ -129,6 +129,111 @@ MAPQR = KeyMap(
     markers=(_HEIGHTS,),
 )
 
+_ENHANCED = _TRANSFORMER + "bevencode."
+_NECK = "map_head.decoder.neck."
+_BLOCKS = tuple((f"{_ENHANCED}layer{n + 1}.{{i}}.", f"{_NECK}stages.{n}.{{i}}.") for n in range(3))
+_ACTIVATION = (_TRANSFORMER + "decoder.ins_conv.", "map_head.decoder.mask_net.")
+_NORMED = ("weight", "bias")
+_NORM = (*_NORMED, "running_mean", "running_var")
+_ATTENTION = "transformer.bevencode.attention."
+_HIDDEN = [
+    (f"{kind}_branches.{{}}", n) for kind, n in (("cls", 0), ("cls", 3), ("reg", 0), ("reg", 2))
+]
+_GLIMPSE = {  # a second name of glimpse_transformer_0, which is read after it
+    **{
+        f"layers.0.{attention}.{leaf}": shape
+        for attention in ("self_attn", "multihead_attn")
+        for leaf, shape in {
+            "in_proj_weight": (768, 256),
+            "in_proj_bias": (768,),
+            "out_proj.weight": (256, 256),
+            "out_proj.bias": (256,),
+        }.items()
+    },
+    "layers.0.linear1.weight": (1024, 256),
+    "layers.0.linear1.bias": (1024,),
+    "layers.0.linear2.weight": (256, 1024),
+    "layers.0.linear2.bias": (256,),
+    **{f"layers.0.norm{n}.{leaf}": (256,) for n in (1, 2, 3) for leaf in _NORMED},
+    **{f"norm.{leaf}": (256,) for leaf in _NORMED},
+}
+_IDLE_CONVS = {"conv_seg.": 128, "transformer.bevencode.fpn_conv.": 256}
+_IDLE_BRANCH = {  # of a refinement that reads the branches of the last layers instead
+    **{f"cls_branches.{{}}.{n}.{leaf}": (256,) for n in (1, 4) for leaf in _NORMED},
+    **{f"{name}.{n}.weight": (256, 256) for name, n in _HIDDEN},
+    **{f"{name}.{n}.bias": (256,) for name, n in _HIDDEN},
+    "cls_branches.{}.6.weight": (3, 256),
+    "cls_branches.{}.6.bias": (3,),
+    "reg_branches.{}.4.weight": (2, 256),
+    "reg_branches.{}.4.bias": (2,),
+}
+MGMAP = KeyMap(
+    "mgmap",
+    (
+        _ACTIVATION,
+        (_TRANSFORMER + "decoder.linear1.", "map_head.decoder.activation."),
+        (_HEAD + "pts_embedding_.", "map_head.pts_embedding."),
+        *_rules(
+            _ENHANCED,
+            _NECK,
+            "conv1.=stem.0. bn1.=stem.1. conv_1.conv.=fusion.0. conv_1.bn.=fusion.1. "
+            "neck.convs.{i}.conv.=levels.{i}.0. neck.convs.{i}.norm.=levels.{i}.1.",
+        ),
+        *(
+            rule
+            for block in _BLOCKS
+            for rule in _rules(*block, "ca.fc.=gates.channel. sa.conv1.=gates.space.")
+        ),
+        *_BLOCKS,
+        *_rules(
+            _HEAD,
+            "map_head.decoder.",
+            "conv_2.conv.=segmentation.0. conv_2.bn.=segmentation.1. "
+            "semantic_output.=segmentation.3. change_channels.conv_expand.=mask_feature.expand. "
+            "change_channels.conv_basicblock.=mask_feature.block. "
+            "process_net.conv_reduce.=mask_feature.reduce. ",
+        ),
+        *_rules(
+            _HEAD,
+            "map_head.decoder.refinements.{i}.",
+            "rcnn_net_{i}.=patch_net. rego_hs_linear_{i}.=memory.0. "
+            "rego_hs_linear_norm_{i}.=memory.1. glimpse_transformer_{i}.decoder.layers.0.=layer. "
+            "glimpse_transformer_{i}.decoder.norm.=norm. rego_hs_fuser_{i}.0.=fuser.0. "
+            "layer_norms_{i}.0.=fuser.1.",
+        ),
+        *MAPTR.rules,
+    ),
+    {
+        **_CODE_WEIGHTS,
+        _HEAD + "loss_fn.loss_fn.pos_weight": None,  # of mask losses, which the config says
+        _HEAD + "loss_fn_.loss_fn.pos_weight": None,
+        **_zeros(_HEAD + "glimpse_transformer.decoder.", _GLIMPSE),
+        **_zeros(
+            _HEAD,
+            {
+                **{f"{name}conv.weight": (256, c, 3, 3) for name, c in _IDLE_CONVS.items()},
+                **{f"{name}bn.{leaf}": (256,) for name in _IDLE_CONVS for leaf in _NORM},
+                **{f"{name}bn.num_batches_tracked": () for name in _IDLE_CONVS},
+                **{f"{_ATTENTION}{n}.weight": (256, 256, 1, 1) for n in (1, 3)},
+                **{f"{_ATTENTION}{n}.bias": (256,) for n in (1, 3)},
+                **{k.format(n): v for k, v in _IDLE_BRANCH.items() for n in range(6, 10)},
+                **{
+                    f"rego_hs_fuser_{g}.{n}.weight": (256, 512 + 256 * g)
+                    for g in (0, 1)
+                    for n in range(1, 6)
+                },
+                **{
+                    f"layer_norms_{g}.{n}.{leaf}": (256,)
+                    for g in (0, 1)
+                    for n in range(1, 6)
+                    for leaf in _NORMED
+                },
+            },
+        ),
+    },
+    markers=(_ACTIVATION,),
+)
+
 _LIFTED_RULES = (
     *_COMMON_RULES,
     *_MASK_RULES,
@@ -206,7 +311,6 @@ _INTERACTION = (
 )
 _DOWN_SAMPLING = (_TRANSFORMER + "bev_downsample.", "map_head.decoder.bev_pyramid.merges.0.")
 _IDLE = "attentions.1.output_proj_instance"
-_NORM = ("weight", "bias", "running_mean", "running_var")
 MGMAPNET = KeyMap(
     "mgmapnet",
     (
@@ -266,7 +370,16 @@ MGMAPNET = KeyMap(
     markers=(_DOWN_SAMPLING,),
 )
 
-KEY_MAPS: list[KeyMap] = [MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MAPTRV2, MAPTR_BEVFORMER, MAPTR]
+KEY_MAPS: list[KeyMap] = [
+    MGMAPNET,
+    GEMAP_FULL,
+    GEMAP,
+    MAPQR,
+    MGMAP,
+    MAPTRV2,
+    MAPTR_BEVFORMER,
+    MAPTR,
+]
 """Known architectures, the most special first; the last needs no marker."""
 
 

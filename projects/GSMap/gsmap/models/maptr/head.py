@@ -89,6 +89,8 @@ class MapHead(BaseModule):
         coder: Settings of `MapCoder`.
         num_points: Points per instance P.
         embed_dims: Channels C.
+        points_from_instances: Let a matrix make the embeddings of an instance's points of its own
+            (MGMap), in place of a table for all instances.
 
     Raises:
         TypeError: If a loss is no `MapLoss`.
@@ -111,6 +113,7 @@ class MapHead(BaseModule):
         coder: PARTS | None = None,
         num_points: int = 20,
         embed_dims: int = 256,
+        points_from_instances: bool = False,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
@@ -129,8 +132,11 @@ class MapHead(BaseModule):
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
         )
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
-        points = nn.Embedding(num_points, 2 * embed_dims) if self.decoder.point_queries else None
-        self.pts_embedding = points
+        self.pts_embedding: nn.Linear | nn.Embedding | None = None
+        if self.decoder.point_queries and points_from_instances:
+            self.pts_embedding = nn.Linear(2 * embed_dims, num_points * 2 * embed_dims)
+        elif self.decoder.point_queries:
+            self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
         self.cls_branches = nn.ModuleList(
             classification_branch(embed_dims, len(self.classes))
             for _ in range(decoder["num_layers"])
@@ -182,7 +188,10 @@ class MapHead(BaseModule):
         both = self.instance_embedding.weight
         if not self.training:
             both = both[: self.query_groups[0].num]
-        if self.pts_embedding is not None:
+        if isinstance(self.pts_embedding, nn.Linear):
+            points = self.pts_embedding(both).unflatten(1, (self.num_points, -1))
+            both = (both[:, None] + points).flatten(0, 1)
+        elif self.pts_embedding is not None:
             both = (both[:, None] + self.pts_embedding.weight).flatten(0, 1)
         return both[:, : self.embed_dims], both[:, self.embed_dims :]
 
@@ -228,8 +237,10 @@ class MapHead(BaseModule):
         start, mask = self.reference.start(query_pos), self.attention_mask()
         layers = self.decoder(query, query_pos, start, feats, self.reference.refine, mask)
         return [
-            self.predictions(at_least_float32(branch(layer.instance_states)), layer, feats)
-            for branch, layer in zip(self.cls_branches, layers, strict=True)
+            self.predictions(
+                at_least_float32(self.cls_branches[number](layer.instance_states)), layer, feats
+            )
+            for number, layer in zip(self.decoder.branches, layers, strict=True)
         ]
 
     def predictions(self, scores: Tensor, decoded: Decoded, bev_feats: Tensor) -> Predictions:
@@ -316,7 +327,7 @@ class MapHead(BaseModule):
             losses["loss_cls"] = group.weight * loss
         for name, loss in cast(Any, self.losses.items()):
             applies = (is_last or not loss.last_layer_only) and (first or not loss.first_group_only)
-            if applies and name in chosen:
+            if applies and name in chosen and loss.reads(pairs):
                 losses[f"loss_{name}"] = group.weight * loss(pairs)
         if is_last and first:
             losses.update(self.statistics(pairs))
