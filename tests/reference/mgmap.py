@@ -85,7 +85,7 @@ def check_neck(golden: Golden, name: str) -> Iterator[Row]:
     def keep(key: str, module: nn.Module) -> None:
         module.register_forward_hook(lambda _, __, out: seen.__setitem__(key, out.detach()))
 
-    keep("stem", neck.stem)
+    keep("stem", neck.stem[1])
     for number, stage in enumerate(neck.stages, 1):
         keep(f"layer{number}", stage)
     keep("block_out_layer2_0", neck.stages[1][0])
@@ -193,7 +193,7 @@ def check_refinement(golden: Golden, name: str) -> Iterator[Row]:
             for key, module in named.items():
                 at = f"glimpse{g}_{key}" if key.startswith("norm") else f"{key}{g}"
                 module.register_forward_hook(
-                    lambda _, __, out, at=at: seen.__setitem__(at, out.detach())
+                    lambda _, __, out, at=at, own=seen: own.__setitem__(at, out.detach())
                 )
         outputs = head({"bev_feats": bev})
         for key, value in seen.items():
@@ -219,6 +219,8 @@ def check_refinement(golden: Golden, name: str) -> Iterator[Row]:
         yield Row(name, f"{tag}_scalar (relative)", off, 1e-4)
         own = {k.removeprefix(f"{tag}_"): v for k, v in data.items() if k.startswith(f"{tag}_")}
         gradients = parts.gradients_of(head, HEAD)
+        first = "pts_bbox_head.glimpse_transformer"  # the release has it under two names
+        gradients = {key.replace(f"{first}_0.", f"{first}."): g for key, g in gradients.items()}
         yield from parts.gradient_rows(name, f"{tag}: ", own, gradients)
     yield from feature_rows(name, data, head, parts.bev)
 
@@ -274,10 +276,12 @@ def check_masks(golden: Golden, name: str) -> Iterator[Row]:
         masks = drawn(cut_elements(golden, case, data[f"{case}_order"]))
         shape = tuple(data[f"{case}_instance_shape"])
         wanted = np.unpackbits(data[f"{case}_instance"])[: np.prod(shape)].reshape(shape)
-        ours = np.zeros(shape)
-        ours[: len(masks)] = masks
-        wrong = np.abs(ours - wanted).sum()
-        yield Row(name, f"{case}: cells of instances that differ", wrong, 0)
+        # the reference also cuts a line where it crosses itself: its parts make our mask
+        joined = np.zeros(masks.shape, bool)
+        for part in wanted[wanted.any((1, 2))].astype(bool):
+            joined[(masks.numpy() & part).sum((1, 2)).argmax()] |= part
+        wrong = (joined != masks.numpy()).sum()
+        yield Row(name, f"{case}: cells of instances that differ", float(wrong), 0)
         shape = tuple(data[f"{case}_semantic_shape"])
         wanted = np.unpackbits(data[f"{case}_semantic"])[: np.prod(shape)].reshape(shape)
         drawn_any = masks.any(0).numpy()

@@ -23,16 +23,23 @@ class KeyMap:
             expects there, for conversion back; None where only some of its models hold the key.
         markers: Pairs of key prefixes (upstream's, ours) that, all present, tell this architecture
             from those after it in ``KEY_MAPS``.
+        idle: Pattern of further upstream keys without a counterpart, which conversion back leaves
+            out.
     """
 
     name: str
     rules: Rules
     unused: Mapping[str, Tensor | None] = field(default_factory=dict)
     markers: Rules = (("", ""),)
+    idle: str = "(?!)"
+
+    def is_unused(self, key: str) -> bool:
+        """Return whether an upstream key has no counterpart."""
+        return key in self.unused or re.match(self.idle, key) is not None
 
     def to_ours(self, key: str) -> str | None:
         """Return our name of an upstream key, or None if there is none."""
-        return None if key in self.unused else _rename(key, self.rules)
+        return None if self.is_unused(key) else _rename(key, self.rules)
 
     def to_upstream(self, key: str) -> str | None:
         """Return upstream's name of one of our keys, or None if there is none."""
@@ -133,40 +140,6 @@ _ENHANCED = _TRANSFORMER + "bevencode."
 _NECK = "map_head.decoder.neck."
 _BLOCKS = tuple((f"{_ENHANCED}layer{n + 1}.{{i}}.", f"{_NECK}stages.{n}.{{i}}.") for n in range(3))
 _ACTIVATION = (_TRANSFORMER + "decoder.ins_conv.", "map_head.decoder.mask_net.")
-_NORMED = ("weight", "bias")
-_NORM = (*_NORMED, "running_mean", "running_var")
-_ATTENTION = "transformer.bevencode.attention."
-_HIDDEN = [
-    (f"{kind}_branches.{{}}", n) for kind, n in (("cls", 0), ("cls", 3), ("reg", 0), ("reg", 2))
-]
-_GLIMPSE = {  # a second name of glimpse_transformer_0, which is read after it
-    **{
-        f"layers.0.{attention}.{leaf}": shape
-        for attention in ("self_attn", "multihead_attn")
-        for leaf, shape in {
-            "in_proj_weight": (768, 256),
-            "in_proj_bias": (768,),
-            "out_proj.weight": (256, 256),
-            "out_proj.bias": (256,),
-        }.items()
-    },
-    "layers.0.linear1.weight": (1024, 256),
-    "layers.0.linear1.bias": (1024,),
-    "layers.0.linear2.weight": (256, 1024),
-    "layers.0.linear2.bias": (256,),
-    **{f"layers.0.norm{n}.{leaf}": (256,) for n in (1, 2, 3) for leaf in _NORMED},
-    **{f"norm.{leaf}": (256,) for leaf in _NORMED},
-}
-_IDLE_CONVS = {"conv_seg.": 128, "transformer.bevencode.fpn_conv.": 256}
-_IDLE_BRANCH = {  # of a refinement that reads the branches of the last layers instead
-    **{f"cls_branches.{{}}.{n}.{leaf}": (256,) for n in (1, 4) for leaf in _NORMED},
-    **{f"{name}.{n}.weight": (256, 256) for name, n in _HIDDEN},
-    **{f"{name}.{n}.bias": (256,) for name, n in _HIDDEN},
-    "cls_branches.{}.6.weight": (3, 256),
-    "cls_branches.{}.6.bias": (3,),
-    "reg_branches.{}.4.weight": (2, 256),
-    "reg_branches.{}.4.bias": (2,),
-}
 MGMAP = KeyMap(
     "mgmap",
     (
@@ -203,35 +176,11 @@ MGMAP = KeyMap(
         ),
         *MAPTR.rules,
     ),
-    {
-        **_CODE_WEIGHTS,
-        _HEAD + "loss_fn.loss_fn.pos_weight": None,  # of mask losses, which the config says
-        _HEAD + "loss_fn_.loss_fn.pos_weight": None,
-        **_zeros(_HEAD + "glimpse_transformer.decoder.", _GLIMPSE),
-        **_zeros(
-            _HEAD,
-            {
-                **{f"{name}conv.weight": (256, c, 3, 3) for name, c in _IDLE_CONVS.items()},
-                **{f"{name}bn.{leaf}": (256,) for name in _IDLE_CONVS for leaf in _NORM},
-                **{f"{name}bn.num_batches_tracked": () for name in _IDLE_CONVS},
-                **{f"{_ATTENTION}{n}.weight": (256, 256, 1, 1) for n in (1, 3)},
-                **{f"{_ATTENTION}{n}.bias": (256,) for n in (1, 3)},
-                **{k.format(n): v for k, v in _IDLE_BRANCH.items() for n in range(6, 10)},
-                **{
-                    f"rego_hs_fuser_{g}.{n}.weight": (256, 512 + 256 * g)
-                    for g in (0, 1)
-                    for n in range(1, 6)
-                },
-                **{
-                    f"layer_norms_{g}.{n}.{leaf}": (256,)
-                    for g in (0, 1)
-                    for n in range(1, 6)
-                    for leaf in _NORMED
-                },
-            },
-        ),
-    },
+    _CODE_WEIGHTS,
     markers=(_ACTIVATION,),
+    # never called, but for a second name of glimpse_transformer_0 and weights in a loss
+    idle=r"pts_bbox_head\.(conv_seg|glimpse_transformer|loss_fn_?|(cls|reg)_branches\.[6-9]|"
+    r"transformer\.bevencode\.(fpn_conv|attention)|(rego_hs_fuser|layer_norms)_\d\.[1-5])\.",
 )
 
 _LIFTED_RULES = (
@@ -311,6 +260,7 @@ _INTERACTION = (
 )
 _DOWN_SAMPLING = (_TRANSFORMER + "bev_downsample.", "map_head.decoder.bev_pyramid.merges.0.")
 _IDLE = "attentions.1.output_proj_instance"
+_NORM = ("weight", "bias", "running_mean", "running_var")
 MGMAPNET = KeyMap(
     "mgmapnet",
     (
