@@ -49,16 +49,11 @@ MODELS = {
     "gemap": {"maptr", "encoders"},
     "mgmapnet": {"maptr", "encoders", "maptrv2"},  # its mask heads are MapTRv2's
     "mapqr": {"maptr", "encoders"},
+    "mgmap": {"maptr", "encoders"},
     "gsmap": {"maptr", "encoders"},
 }
-METHODS = (
-    "maptrv2",
-    "mapvr",
-    "gemap",
-    "mgmapnet",
-    "mapqr",
-    "gsmap",
-)  # what others are built on stays
+# what the others are built on stays
+METHODS = ("maptrv2", "mapvr", "gemap", "mgmapnet", "mapqr", "mgmap", "gsmap")
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 
 

@@ -106,6 +106,22 @@ CONFIGS: dict[str, dict[str, Any]] = {
         "train_cfg.max_epochs": 6,
         "train_cfg.val_interval": 1,
     },
+    "mgmap/mgmap_r50_30e.py": {
+        **SCHEDULE,
+        **NUSCENES,
+        **CAMERAS,
+        "optim_wrapper.optimizer.lr": 3e-4,
+        "train_cfg.max_epochs": 30,
+        "train_cfg.val_interval": 6,
+        "auto_scale_lr.base_batch_size": 8,
+        "find_unused_parameters": True,
+        "model.map_head.decoder.patches": False,
+        "train_dataloader.dataset.pipeline.4": {
+            "type": "MakeInstanceMasks",
+            "size": (200, 100),
+            "mirrored": True,
+        },
+    },
     f"{GSMAP}gsmap_maptr_r50_24e.py": {**SCHEDULE, **NUSCENES, **CAMERAS},
     f"{GSMAP}gsmap_maptr_r50_110e.py": {**SCHEDULE, "train_cfg.max_epochs": 110},
     f"{GSMAP}gsmap_maptr_r50_av2_6e.py": {
@@ -145,6 +161,10 @@ HEADS: dict[str, dict[str, Any]] = {
         **MAPTR,
         "queries": [100, 600],
         "aux": {"seg": 1.0, "pv_seg": 2.0},
+    },
+    "mgmap/mgmap_r50_30e.py": {
+        **MAPTR,
+        "losses": {"pts": 5.0, "dir": 0.005, "ins": 1.0, "seg": 1.0},
     },
     f"{GSMAP}gsmap_maptr_r50_24e.py": {
         "queries": [50],
@@ -199,6 +219,16 @@ def test_a_head_has_the_published_queries_and_weights(name: str):
     focal = head.loss_cls
     assert (focal.loss_weight, focal.alpha, focal.gamma) == (2.0, 0.25, 2.0)
     assert (head.num_points, head.embed_dims, len(head.decoder.layers)) == (20, 256, 6)
+
+
+def test_mgmaps_masks_and_refinement_weigh_as_published():
+    head = head_of("mgmap/mgmap_r50_30e.py")
+    assert (head.losses["ins"].dice_weight, head.losses["seg"].dice_weight) == (2.0, 15.0)
+    assert head.losses["seg"].pos_weight == 4.0
+    assert head.decoder.branches == [0, 1, 2, 3, 4, 5, 4, 5]
+    attention, stage = head.decoder.layers[0].cross_attn, head.decoder.refinements[0].layer
+    assert (attention.num_levels, attention.num_points, attention.num_heads) == (4, 16, 8)
+    assert (stage.linear1.out_features, stage.self_attn.num_heads) == (1024, 8)
 
 
 def test_mapqr_scatters_and_masks_as_published():

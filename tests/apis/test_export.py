@@ -52,6 +52,7 @@ CASES = {
     "GeMap": ("configs/gemap/gemap_r18_minicity.py", {}),
     "MGMapNet": ("configs/mgmapnet/mgmapnet_r18_minicity.py", {}),
     "MapQR": ("configs/mapqr/mapqr_r18_minicity.py", {}),
+    "MGMap": ("configs/mgmap/mgmap_r18_minicity.py", {}),
     "GSMap, heights": (
         GSMAP,
         {"model.map_head.reference": {"coords": 3, "z_range": (-5.0, 3.0)}},

@@ -20,7 +20,7 @@ from gsmap import registered  # noqa: F401
 from gsmap.checkpoints.key_map import PIVOTNET
 
 NUM_CAMS = 6
-OWN_RECIPES = ("mapqr", "mgmapnet", "pivotnet", "streammapnet")  # weights of another scale
+OWN_RECIPES = ("mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet")  # of another scale
 
 
 @dataclass(eq=False)

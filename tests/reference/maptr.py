@@ -42,14 +42,19 @@ def state_rows(golden: Golden, name: str, config: str) -> Iterator[Row]:
     own = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     wrong = set(own.items()) ^ {(key, tuple(value.shape)) for key, value in renamed.items()}
     yield Row(name, "keys or shapes that differ", len(wrong), 0)
-    unused = find_key_map(shapes).unused
+    key_map = find_key_map(shapes)
     trainable = sum(p.numel() for p in model.parameters() if p.requires_grad)
-    for key in unused:  # upstream trains them too, without effect
-        if listed["state"].get(key, {}).get("requires_grad"):
+    twice = {name for name, _ in listed.get("shared_storage", [])}
+    unused = {key for key in shapes if key_map.is_unused(key)}
+    for key in unused - twice:  # upstream trains them too, without effect
+        if listed["state"][key].get("requires_grad"):
             trainable += math.prod(shapes[key])
     yield Row(name, "trainable parameters", abs(trainable - listed["trainable_params"]), 0)
     back = upstream_from_ours(model.state_dict())
-    lost = set(shapes.items()) ^ {(key, tuple(value.shape)) for key, value in back.items()}
+    # what only some models have, or the config says, is not written
+    kept = {key for key, value in key_map.unused.items() if value is not None}
+    wanted = {k: v for k, v in shapes.items() if k in kept or k not in unused}
+    lost = set(wanted.items()) ^ {(key, tuple(value.shape)) for key, value in back.items()}
     yield Row(name, "keys lost on the way back", len(lost), 0)
     original = {k: v for k, v in golden.upstream_state(name).items() if k not in unused}
     changed = max(largest_difference(back[key], value) for key, value in original.items())

@@ -54,6 +54,7 @@ class GoldenParts:
         gradients: Mapping[str, Tensor],
         norm: float = GRAD_NORM,
         dot: float = GRAD_DOT,
+        short: str = "",
     ) -> Iterator[Row]:
         """Compare the norm of each parameter's gradient, and its product with a noise."""
         keys = [str(key) for key in data["grad_keys"]]
@@ -61,7 +62,7 @@ class GoldenParts:
         norms, dots = [], []
         for key in keys:
             gradient = gradients[key].double().numpy()
-            noise = self.recipe.in_rng(f"gdot:{key}", self.golden.seed)
+            noise = self.recipe.in_rng(f"gdot:{key.removeprefix(short)}", self.golden.seed)
             norms.append(np.linalg.norm(gradient))
             dots.append((gradient * noise.standard_normal(gradient.shape)).sum())
         # A bias of all keys moves no attention: its gradient is zero, and noise is in the file.

@@ -58,6 +58,13 @@ FILES = [
     "mapqr_decoder_*.npz",
     "mapqr_losses_*.npz",
     "mapqr_forward_reduced_*.npz",
+    "mgmap_state.json",
+    "mgmap_masks_*.npz",
+    "mgmap_neck_*.npz",
+    "mgmap_decoder_*.npz",
+    "mgmap_refine_*.npz",
+    "mgmap_losses_*.npz",
+    "mgmap_forward_reduced_*.npz",
 ]
 
 

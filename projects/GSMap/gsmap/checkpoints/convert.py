@@ -24,7 +24,7 @@ def ours_from_upstream(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """
     key_map = find_key_map(state)
     names = {key: key_map.to_ours(key) for key in state}
-    unknown = [key for key, name in names.items() if name is None and key not in key_map.unused]
+    unknown = [key for key, name in names.items() if name is None and not key_map.is_unused(key)]
     if unknown:
         raise ValueError(f"keys that no {key_map.name} model has: {listed(unknown)}.")
     return {name: state[key] for key, name in names.items() if name is not None}

@@ -23,16 +23,23 @@ class KeyMap:
             expects there, for conversion back; None where only some of its models hold the key.
         markers: Pairs of key prefixes (upstream's, ours) that, all present, tell this architecture
             from those after it in ``KEY_MAPS``.
+        idle: Pattern of further upstream keys without a counterpart, which conversion back leaves
+            out.
     """
 
     name: str
     rules: Rules
     unused: Mapping[str, Tensor | None] = field(default_factory=dict)
     markers: Rules = (("", ""),)
+    idle: str = "(?!)"
+
+    def is_unused(self, key: str) -> bool:
+        """Return whether an upstream key has no counterpart."""
+        return key in self.unused or re.match(self.idle, key) is not None
 
     def to_ours(self, key: str) -> str | None:
         """Return our name of an upstream key, or None if there is none."""
-        return None if key in self.unused else _rename(key, self.rules)
+        return None if self.is_unused(key) else _rename(key, self.rules)
 
     def to_upstream(self, key: str) -> str | None:
         """Return upstream's name of one of our keys, or None if there is none."""
@@ -127,6 +134,53 @@ MAPQR = KeyMap(
     ),
     {**_CODE_WEIGHTS, **_MASK_WEIGHTS},
     markers=(_HEIGHTS,),
+)
+
+_ENHANCED = _TRANSFORMER + "bevencode."
+_NECK = "map_head.decoder.neck."
+_BLOCKS = tuple((f"{_ENHANCED}layer{n + 1}.{{i}}.", f"{_NECK}stages.{n}.{{i}}.") for n in range(3))
+_ACTIVATION = (_TRANSFORMER + "decoder.ins_conv.", "map_head.decoder.mask_net.")
+MGMAP = KeyMap(
+    "mgmap",
+    (
+        _ACTIVATION,
+        (_TRANSFORMER + "decoder.linear1.", "map_head.decoder.activation."),
+        (_HEAD + "pts_embedding_.", "map_head.pts_embedding."),
+        *_rules(
+            _ENHANCED,
+            _NECK,
+            "conv1.=stem.0. bn1.=stem.1. conv_1.conv.=fusion.0. conv_1.bn.=fusion.1. "
+            "neck.convs.{i}.conv.=levels.{i}.0. neck.convs.{i}.norm.=levels.{i}.1.",
+        ),
+        *(
+            rule
+            for block in _BLOCKS
+            for rule in _rules(*block, "ca.fc.=gates.channel. sa.conv1.=gates.space.")
+        ),
+        *_BLOCKS,
+        *_rules(
+            _HEAD,
+            "map_head.decoder.",
+            "conv_2.conv.=segmentation.0. conv_2.bn.=segmentation.1. "
+            "semantic_output.=segmentation.3. change_channels.conv_expand.=mask_feature.expand. "
+            "change_channels.conv_basicblock.=mask_feature.block. "
+            "process_net.conv_reduce.=mask_feature.reduce. ",
+        ),
+        *_rules(
+            _HEAD,
+            "map_head.decoder.refinements.{i}.",
+            "rcnn_net_{i}.=patch_net. rego_hs_linear_{i}.=memory.0. "
+            "rego_hs_linear_norm_{i}.=memory.1. glimpse_transformer_{i}.decoder.layers.0.=layer. "
+            "glimpse_transformer_{i}.decoder.norm.=norm. rego_hs_fuser_{i}.0.=fuser.0. "
+            "layer_norms_{i}.0.=fuser.1.",
+        ),
+        *MAPTR.rules,
+    ),
+    _CODE_WEIGHTS,
+    markers=(_ACTIVATION,),
+    # never called, but for a second name of glimpse_transformer_0 and weights in a loss
+    idle=r"pts_bbox_head\.(conv_seg|glimpse_transformer|loss_fn_?|(cls|reg)_branches\.[6-9]|"
+    r"transformer\.bevencode\.(fpn_conv|attention)|(rego_hs_fuser|layer_norms)_\d\.[1-5])\.",
 )
 
 _LIFTED_RULES = (
@@ -368,7 +422,8 @@ STREAMMAPNET = KeyMap(
 )
 
 KEY_MAPS: list[KeyMap] = [
-    STREAMMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MAPTRV2, MAPTR_BEVFORMER, MAPTR,
+    STREAMMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MGMAP,
+    MAPTRV2, MAPTR_BEVFORMER, MAPTR,
 ]  # fmt: skip
 """Known architectures, the most special first; the last needs no marker."""
 

@@ -16,6 +16,13 @@ _PV_SAMPLES = 200
 _MIN_DEPTH = 1e-7
 
 
+def cells_of(instance: MapInstance, results: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
+    """Return an element's cells (column, row) on a raster of rows and columns. (n, 2)"""
+    low, high = np.array([results["x_range"], results["y_range"]]).T
+    scale = np.array(size[::-1]) / (high - low)
+    return ((instance.points[:, :2].astype(np.float64) - low) * scale).astype(np.int32)
+
+
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class MakeBEVMask(BaseTransform):
@@ -36,13 +43,48 @@ class MakeBEVMask(BaseTransform):
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Draw the mask."""
         masks = np.zeros((self.num_classes or 1, *self.size), np.uint8)
-        low, high = np.array([results["x_range"], results["y_range"]]).T
-        scale = np.array(self.size[::-1]) / (high - low)
         for instance in results["map_instances"]:
-            pixels = ((instance.points[:, :2].astype(np.float64) - low) * scale).astype(np.int32)
+            pixels = cells_of(instance, results, self.size)
             channel = channel_of(instance, self.num_classes)
             cv2.polylines(masks[channel], [pixels], False, (1,), self.thickness_px)
         results["gt_seg"] = torch.from_numpy(masks.astype(np.float32))
+        return results
+
+
+@TRANSFORMS.register_module()
+@dataclass(eq=False)
+class MakeInstanceMasks(BaseTransform):
+    """Add ``masks`` (K, H, W) to ``gt_instances_3d``: each element's own cells in BEV (MGMap).
+
+    Of elements of one class the later one has the cells of both; near an element of a later class
+    all give way. Cells are truncated as in `MakeBEVMask`.
+
+    Args:
+        size: Rows H and columns W over the ground truth's range.
+        thickness_px: Width of the lines.
+        gap_px: Width around elements of later classes.
+        mirrored: Mirror the masks left to right, as released; they then fit no BEV features.
+    """
+
+    size: tuple[int, int] = (200, 100)
+    thickness_px: int = 3
+    gap_px: int = 7
+    mirrored: bool = True
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Draw the masks."""
+        instances = results["map_instances"]
+        masks, gaps = np.zeros((2, len(instances), *self.size), np.uint8)
+        for number, instance in enumerate(instances):
+            cells = cells_of(instance, results, self.size)
+            cv2.polylines(masks[number], [cells], False, (1,), self.thickness_px)
+            cv2.polylines(gaps[number], [cells], False, (1,), self.gap_px)
+        labels = np.array([instance.label for instance in instances])
+        for number, label in enumerate(labels):
+            later = masks[number + 1 :][labels[number + 1 :] == label]
+            masks[number] &= ~np.concatenate([later, gaps[labels > label]]).any(0)
+        masks = masks[..., ::-1] if self.mirrored else masks
+        results["gt_instances_3d"].masks = torch.from_numpy(masks.astype(bool))
         return results
 
 

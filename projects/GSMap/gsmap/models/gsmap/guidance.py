@@ -66,6 +66,7 @@ class GaussianGuidance(Guidance):
         """
         if not self.sampling:
             return None
-        cell_m = reference.new_tensor(self.space.grid.resized(*feats.shape[-2:]).pixel_size_m)
+        finest = feats if isinstance(feats, Tensor) else feats[0]  # of levels
+        cell_m = reference.new_tensor(self.space.grid.resized(*finest.shape[-2:]).pixel_size_m)
         # The frames act on metres; brought to cells, the identity stays the identity bit by bit.
         return self.space.frames(reference, self.invariant) * (cell_m / cell_m[:, None])

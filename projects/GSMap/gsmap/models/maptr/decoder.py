@@ -127,6 +127,7 @@ class MapDecoder(BaseModule):
         moves_instances: Whether a state and a first reference belong to all points of an instance,
             `point_states` (B, N, C), or each to its point.
         layer_class: Class of its layers, where their config names none.
+        branches: For each output, the number of the branches that read it.
     """
 
     point_queries = True
@@ -145,6 +146,7 @@ class MapDecoder(BaseModule):
         self.num_points, self.detach_reference = num_points, detach_reference
         layer = {"type": self.layer_class, "num_points": num_points, **shared, **layer}
         self.layers = ModuleList(MODELS.build(layer) for _ in range(num_layers))
+        self.branches = list(range(num_layers))
 
     def start(self, query: Tensor, reference: Tensor, bev_feats: Tensor) -> tuple[Any, Tensor, Any]:
         """Return queries, reference and features as the layers take them."""

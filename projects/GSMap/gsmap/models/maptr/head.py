@@ -135,6 +135,8 @@ class MapHead(DetectionHead):
         coder: Settings of `MapCoder`.
         num_points: Points per instance P.
         embed_dims: Channels C.
+        points_from_instances: Let a matrix make the embeddings of an instance's points of its own
+            (MGMap), in place of a table for all instances.
 
     Raises:
         TypeError: If a loss is no `MapLoss`.
@@ -157,6 +159,7 @@ class MapHead(DetectionHead):
         coder: PARTS | None = None,
         num_points: int = 20,
         embed_dims: int = 256,
+        points_from_instances: bool = False,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
@@ -175,8 +178,11 @@ class MapHead(DetectionHead):
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
         )
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
-        points = nn.Embedding(num_points, 2 * embed_dims) if self.decoder.point_queries else None
-        self.pts_embedding = points
+        self.pts_embedding: nn.Linear | nn.Embedding | None = None
+        if self.decoder.point_queries and points_from_instances:
+            self.pts_embedding = nn.Linear(2 * embed_dims, num_points * 2 * embed_dims)
+        elif self.decoder.point_queries:
+            self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
         self.cls_branches = nn.ModuleList(
             classification_branch(embed_dims, len(self.classes))
             for _ in range(decoder["num_layers"])
@@ -233,7 +239,10 @@ class MapHead(DetectionHead):
         both = self.instance_embedding.weight
         if not self.training:
             both = both[: self.query_groups[0].num]
-        if self.pts_embedding is not None:
+        if isinstance(self.pts_embedding, nn.Linear):
+            points = self.pts_embedding(both).unflatten(1, (self.num_points, -1))
+            both = (both[:, None] + points).flatten(0, 1)
+        elif self.pts_embedding is not None:
             both = (both[:, None] + self.pts_embedding.weight).flatten(0, 1)
         return both[:, : self.embed_dims], both[:, self.embed_dims :]
 
@@ -282,8 +291,10 @@ class MapHead(DetectionHead):
         between = None if memory is None else partial(memory.between, self)
         layers = self.decoder(query, query_pos, start, feats, self.reference.refine, mask, between)
         outputs = [
-            self.predictions(at_least_float32(branch(layer.instance_states)), layer, feats)
-            for branch, layer in zip(self.cls_branches, layers, strict=True)
+            self.predictions(
+                at_least_float32(self.cls_branches[number](layer.instance_states)), layer, feats
+            )
+            for number, layer in zip(self.decoder.branches, layers, strict=True)
         ]
         if memory is not None:
             memory.choose(self, outputs[-1].scores)
@@ -383,7 +394,7 @@ class MapHead(DetectionHead):
             losses["loss_cls"] = group.weight * loss
         for name, loss in cast(Any, self.losses.items()):
             applies = (is_last or not loss.last_layer_only) and (first or not loss.first_group_only)
-            if applies and name in chosen:
+            if applies and name in chosen and loss.reads(pairs):
                 losses[f"loss_{name}"] = group.weight * loss(pairs)
         if is_last and first:
             losses.update(self.statistics(pairs))

@@ -58,6 +58,10 @@ class MapLoss(nn.Module):
     def check(self, head: "MapHead") -> None:
         """Raise ValueError if a head lacks what the loss reads; called when the head is built."""
 
+    def reads(self, pairs: MatchedPairs) -> bool:
+        """Return whether a layer has what the loss reads."""
+        return True
+
     def values(self, pairs: MatchedPairs) -> Tensor:
         """Return the values that are summed, of each pair. (M, ...)"""
         raise NotImplementedError

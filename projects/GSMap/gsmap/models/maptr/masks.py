@@ -13,7 +13,7 @@ from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.structures.gaussians import gaussians_along
 from gsmap.structures.grid import BEVGrid
 
-SOURCES = ("full", "points", "gaussians")
+SOURCES = ("full", "points", "gaussians", "targets")
 
 
 class ElementMasks:
@@ -29,7 +29,8 @@ class ElementMasks:
         source: ``"full"``: the ground truth is drawn at full resolution; ``"points"``: by its P
             points in the matched order (in matching, in the annotated one); ``"gaussians"``: as
             ``"points"``, by Gaussians along them (GSMap Eq. 6), whose mask has the line's width in
-            mass, so that a prediction can equal it.
+            mass, so that a prediction can equal it; ``"targets"``: the masks that
+            MakeInstanceMasks has drawn in the pipeline.
 
     Raises:
         ValueError: If ``source`` is unknown, or the pixels do not divide the map.
@@ -59,6 +60,11 @@ class ElementMasks:
         return masks if isinstance(masks, ElementMasks) else cls(grid, **(masks or {}))
 
     @property
+    def of_points(self) -> bool:
+        """Whether the ground truth's P points are drawn, in the matched order."""
+        return self.source in ("points", "gaussians")
+
+    @property
     def half_pixel_m(self) -> float:
         """Half the longer side of a pixel of the losses' masks, in metres."""
         return max(self.grid.pixel_size_m) / 2
@@ -75,8 +81,15 @@ class ElementMasks:
 
     def draw_sample(self, gt_instances: InstanceData, grid: BEVGrid) -> Tensor:
         """Draw a sample's ground truth, before its matching is known. (K, H, W)"""
-        if self.source != "full":
+        if self.of_points:
             return self.draw(gt_instances.pts, gt_instances.labels_3d, grid)
+        if self.source == "targets":
+            if "masks" not in gt_instances:
+                raise ValueError(
+                    "masks of source 'targets' need gt_instances_3d.masks: add MakeInstanceMasks "
+                    "to the training pipeline, behind FormatMapTargets."
+                )
+            return gt_instances.masks
         if "polylines" not in gt_instances:
             raise ValueError(
                 "masks of source 'full' need gt_instances_3d.polylines: make the targets with "

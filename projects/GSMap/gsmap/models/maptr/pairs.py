@@ -221,7 +221,7 @@ class MatchedPairs:
     def gt_masks(self) -> Tensor:
         """Masks drawn of the ground truth. (M, H, W)"""
         masks = self.predictions.masks
-        if masks.source != "full":
+        if masks.of_points:
             return masks.draw(self.gt_pts_m, self.gt_labels, masks.grid)
         return self.truths.masks[self._rows]
 

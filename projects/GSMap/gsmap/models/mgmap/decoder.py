@@ -1,0 +1,189 @@
+"""MGMap's decoder: masks activate the queries, layers look at four levels, patches refine."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from mmdet3d.registry import MODELS
+from mmengine.model import ModuleList
+from torch import Tensor, nn
+
+from gsmap.models.maptr.attention import SamplingAttention, place_samples, sample_map
+from gsmap.models.maptr.decoder import Decoded, MapDecoder
+from gsmap.models.mgmap.neck import EnhancedNeck
+from gsmap.models.mgmap.refinement import (
+    BINS,
+    MaskFeature,
+    PatchRefinement,
+    mask_network,
+    patches_around,
+)
+
+
+@MODELS.register_module()
+class MultiLevelAttention(SamplingAttention):
+    """Deformable attention over levels of BEV features, with one softmax over all their samples.
+
+    Args:
+        num_levels: Number of levels.
+        num_points: Samples per head and level.
+        kwargs: Further arguments of :class:`SamplingAttention`.
+    """
+
+    def __init__(self, num_levels: int = 4, num_points: int = 4, **kwargs: Any) -> None:
+        self.num_levels = num_levels
+        super().__init__(num_points=num_levels * num_points, **kwargs)
+
+    def initial_offsets(self) -> Tensor:
+        """Return the same offsets for every level. (heads, levels * S, 2)"""
+        one = super().initial_offsets()[:, : self.num_points // self.num_levels]
+        return one.repeat(1, self.num_levels, 1)
+
+    def forward(
+        self,
+        query: Tensor,
+        reference: Tensor,
+        feats: Sequence[Tensor],
+        frames: Tensor | None = None,
+    ) -> Tensor:
+        """Sample all levels (B, C, h, w), offsets in cells of each. (B, Q, C) -> (B, Q, C)"""
+        offsets = self.offsets_in_cells(query).chunk(self.num_levels, 3)
+        weights = self.weights(query).chunk(self.num_levels, 3)
+        seen = torch.zeros_like(query)
+        for level, own, weight in zip(feats, offsets, weights, strict=True):
+            shape = (level.shape[-2], level.shape[-1])
+            value = self.values(level.flatten(2).transpose(1, 2))
+            places = place_samples(own, reference, shape, frames)
+            seen = seen + sample_map(value, shape, places, weight)
+        return self.dropout(self.output_proj(seen))
+
+
+@dataclass(eq=False)
+class MaskedDecoded(Decoded):
+    """What a decoder layer returns, with the masks that activated the queries.
+
+    Args:
+        mask_logits: Masks of the instances, the same in all layers. (B, N, H, W)
+    """
+
+    mask_logits: Tensor
+
+
+@dataclass(eq=False)
+class RefinedDecoded(Decoded):
+    """What a stage of the refinement returns.
+
+    Args:
+        segmentation: Logits of elements and of background, of all instances. (B, 2, H, W)
+    """
+
+    segmentation: Tensor
+
+    def of_queries(self, queries: slice) -> Decoded:
+        """Return what belongs to some of the instance queries; the segmentation to all."""
+        plain = Decoded(self.point_states, self.references, self.instance_states)
+        return replace(self, **vars(plain.of_queries(queries)))
+
+
+@MODELS.register_module()
+class MGMapDecoder(MapDecoder):
+    """MapTR's decoder on enhanced BEV features, with activated queries and a refinement (MGMap).
+
+    Args:
+        layer: Config of the layer (`MapDecoderLayer` with `MultiLevelAttention`).
+        embed_dims: Channels C.
+        num_masks: Instance queries of all groups, each with its mask.
+        patches: Show the refinement a patch around each point. The released model shows it zeros,
+            so that every point is corrected alike.
+        refinements: Stages of the refinement; they use the branches of the last layers.
+        refine_ffn_dims: Hidden channels of its feed-forward networks.
+        kwargs: Further arguments of `MapDecoder`.
+
+    Raises:
+        ValueError: If there are more refinements than layers.
+    """
+
+    def __init__(
+        self,
+        layer: dict[str, Any] | None = None,
+        embed_dims: int = 256,
+        num_masks: int = 50,
+        patches: bool = False,
+        refinements: int = 2,
+        refine_ffn_dims: int = 1024,
+        **kwargs: Any,
+    ) -> None:
+        layer = layer or {}
+        levels = {"type": MultiLevelAttention, "num_levels": EnhancedNeck.num_levels}
+        layer = {**layer, "cross_attn": {**levels, **layer.get("cross_attn", {})}}
+        super().__init__(layer, embed_dims=embed_dims, **kwargs)
+        if refinements > len(self.layers):
+            raise ValueError(
+                f"refinements use the branches of layers, got {refinements} and "
+                f"{len(self.layers)} layers."
+            )
+        self.branches = [*self.branches, *self.branches[len(self.layers) - refinements :]]
+        self.num_masks, self.patches = num_masks, patches
+        self.neck = EnhancedNeck(embed_dims)
+        self.mask_net = mask_network(embed_dims, num_masks, nn.ReLU())
+        self.activation = nn.Linear(embed_dims, embed_dims)
+        self.segmentation = mask_network(embed_dims, 2, nn.LeakyReLU(0.01))
+        self.mask_feature = MaskFeature(embed_dims)
+        heads, dropout = layer.get("num_heads", 8), layer.get("dropout", 0.1)
+        self.refinements = ModuleList(
+            PatchRefinement(embed_dims, (1 + g) * embed_dims, heads, refine_ffn_dims, dropout)
+            for g in range(refinements)
+        )
+
+    def forward(
+        self,
+        query: Tensor,
+        query_pos: Tensor,
+        reference: Tensor,
+        bev_feats: Tensor,
+        refine: Callable[[int, Tensor, Tensor], Tensor],
+        attn_mask: Tensor | None = None,
+    ) -> list[Decoded]:
+        """Run all layers, then the refinement; arguments as in `MapDecoder.forward`."""
+        fused, levels = self.neck(bev_feats)
+        masks = self.mask_net(fused)[:, : query.shape[1] // self.num_points]
+        activated = self.activation(self.instance_features(fused, masks))
+        query = query + activated.repeat_interleave(self.num_points, 1)
+        layers = super().forward(query, query_pos, reference, levels, refine, attn_mask)
+        stages = self.refined(layers[-1], fused, refine, attn_mask)
+        return [MaskedDecoded(**vars(layer), mask_logits=masks) for layer in layers] + stages
+
+    @staticmethod
+    def instance_features(feats: Tensor, mask_logits: Tensor) -> Tensor:
+        """Return means of features (B, C, H, W), weighted by masks (B, N, H, W). (B, N, C)"""
+        weights = mask_logits.float().sigmoid()
+        total = weights.sum((2, 3)).clamp(min=1e-6)
+        return torch.einsum("bnhw,bchw->bnc", weights, feats.float()) / total[..., None]
+
+    def refined(
+        self,
+        last: Decoded,
+        fused: Tensor,
+        refine: Callable[[int, Tensor, Tensor], Tensor],
+        attn_mask: Tensor | None,
+    ) -> list[Decoded]:
+        """Correct the points of the last layer in stages, each with a branch of its own."""
+        segmentation = self.segmentation(fused)
+        feats = self.mask_feature(fused, segmentation) if self.patches else None
+        if attn_mask is not None:
+            attn_mask = attn_mask.repeat_interleave(self.num_points, 0)
+            attn_mask = attn_mask.repeat_interleave(self.num_points, 1)
+        states, references = (x.flatten(1, 2) for x in (last.point_states, last.references))
+        patches = fused.new_zeros(1, 1, fused.shape[1], BINS, BINS)
+        outputs: list[Decoded] = []
+        for branch, stage in zip(self.branches[len(self.layers) :], self.refinements, strict=True):
+            references = references.detach()
+            if feats is not None:
+                patches = patches_around(feats, references[..., :2])
+            corrected, seen = stage(states, patches, attn_mask)
+            states = torch.cat([states, seen], -1)
+            references = refine(branch, corrected, references)
+            output = self.read(corrected, references)
+            outputs.append(RefinedDecoded(**vars(output), segmentation=segmentation))
+        return outputs

@@ -1,0 +1,129 @@
+"""MGMap's losses: of the masks that activate the queries, and of the segmentation."""
+
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from mmdet3d.registry import MODELS
+from torch import Tensor
+
+from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.losses import MapLoss
+from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.mgmap.decoder import MaskedDecoded, MGMapDecoder, RefinedDecoded
+from gsmap.structures.tensors import check_same_shape
+
+_EPS = 1e-3
+
+
+def squared_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
+    """Return 1 - 2 sum(p t) / (sum p^2 + sum t^2) of pairs of masks. 2 x (n, ...) -> (n,)"""
+    preds, targets = preds.flatten(1), targets.flatten(1)
+    size = preds.square().sum(1) + targets.square().sum(1) + 2 * _EPS
+    return 1 - 2 * (preds * targets).sum(1) / size
+
+
+class MGMapLoss(MapLoss):
+    """A loss of masks: cross-entropy and dice.
+
+    Args:
+        loss_weight: Weight of the cross-entropy.
+        dice_weight: Weight of the dice loss.
+        flags: As in `MapLoss`.
+    """
+
+    def __init__(self, loss_weight: float, dice_weight: float, **flags: bool) -> None:
+        super().__init__(loss_weight, **flags)
+        self.dice_weight = dice_weight
+
+    def check(self, head: MapHead) -> None:
+        """Raise ValueError if the head has no such masks, or no ground truth of them."""
+        if not isinstance(head.decoder, MGMapDecoder):
+            raise ValueError(
+                f"{type(self).__name__} needs the masks of MGMapDecoder, got "
+                f"{type(head.decoder).__name__}: leave the loss out, or set decoder.type."
+            )
+        if head.masks.source != "targets":
+            raise ValueError(
+                f"{type(self).__name__} needs masks of the pipeline, got masks.source="
+                f"{head.masks.source!r}: set it to 'targets', and add MakeInstanceMasks."
+            )
+
+
+@MODELS.register_module()
+class QueryMaskLoss(MGMapLoss):
+    """The masks that activate the queries, against those of the matched ground truth (MGMap).
+
+    As released, the cross-entropy is a mean over all queries, of which those without a match should
+    be empty, times the share of matched ones; dice counts the matched ones over all.
+
+    Args:
+        loss_weight: Weight of the cross-entropy.
+        dice_weight: Weight of the dice loss.
+        flags: As in `MapLoss`.
+    """
+
+    name = "ins"
+
+    def __init__(self, loss_weight: float = 1.0, dice_weight: float = 2.0, **flags: bool) -> None:
+        super().__init__(loss_weight, dice_weight, **flags)
+
+    def check(self, head: MapHead) -> None:
+        """Raise ValueError if there are other queries than masks."""
+        super().check(head)
+        queries, masks = len(head.instance_embedding.weight), head.decoder.num_masks
+        if queries != masks:
+            raise ValueError(f"decoder.num_masks is {masks}, and there are {queries} queries.")
+
+    def reads(self, pairs: MatchedPairs) -> bool:
+        """Return whether it is a decoder layer: the refinement has no masks of its own."""
+        return isinstance(pairs.predictions.decoded, MaskedDecoded)
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Return the weighted loss."""
+        logits = cast(MaskedDecoded, pairs.predictions.decoded).mask_logits.float()
+        own = pairs.of_queries(logits)  # (M, H, W)
+        masks = pairs.gt_masks.to(own)
+        check_same_shape(logits=own, gt_masks=masks)
+        targets = torch.zeros_like(logits)
+        targets[pairs.samples, pairs.query_inds] = masks
+        share = len(own) / (logits.shape[0] * logits.shape[1])
+        cross_entropy = F.binary_cross_entropy_with_logits(logits, targets) * share
+        dice = squared_dice_loss(own.sigmoid(), masks).sum() / (logits.shape[0] * logits.shape[1])
+        return self.loss_weight * cross_entropy + self.dice_weight * dice
+
+
+@MODELS.register_module()
+class ForegroundLoss(MGMapLoss):
+    """The segmentation of a sample into elements and background (MGMap).
+
+    Args:
+        loss_weight: Weight of the cross-entropy.
+        dice_weight: Weight of the dice loss of both masks together.
+        pos_weight: Weight of the cells of a mask in its cross-entropy.
+    """
+
+    name = "seg"
+
+    def __init__(
+        self, loss_weight: float = 1.0, dice_weight: float = 15.0, pos_weight: float = 4.0
+    ) -> None:
+        super().__init__(loss_weight, dice_weight, last_layer_only=True, first_group_only=True)
+        self.pos_weight = pos_weight
+
+    def check(self, head: MapHead) -> None:
+        """Raise ValueError if there is no segmentation."""
+        super().check(head)
+        if not len(head.decoder.refinements):
+            raise ValueError("ForegroundLoss needs a refinement: set decoder.refinements.")
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Return the weighted loss."""
+        logits = cast(RefinedDecoded, pairs.predictions.decoded).segmentation.float()
+        drawn = torch.stack([sample.masks.bool().any(0) for sample in pairs.truths.samples])
+        targets = torch.stack([drawn, ~drawn], 1).to(logits)  # (B, 2, H, W)
+        check_same_shape(logits=logits, gt_masks=targets)
+        weight = logits.new_tensor(self.pos_weight)
+        cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
+        dice = squared_dice_loss(logits.sigmoid(), targets).mean()
+        return self.loss_weight * cross_entropy + self.dice_weight * dice

@@ -1,0 +1,95 @@
+"""MGMap's neck: BEV features of four levels, and one map of all of them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from mmdet.models.backbones.resnet import BasicBlock
+from mmdet.models.layers import ResLayer
+from torch import Tensor, nn
+
+
+class Gates(nn.Module):
+    """Weigh the channels of a map, then its cells, each by means and maxima over the other."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        hidden = max(channels // 16, 1)
+        self.channel = nn.Sequential(
+            nn.Conv2d(channels, hidden, 1, bias=False),
+            nn.ReLU(),
+            nn.Conv2d(hidden, channels, 1, bias=False),
+        )
+        self.space = nn.Conv2d(2, 1, 7, padding=3, bias=False)
+
+    def forward(self, feats: Tensor) -> Tensor:
+        """Return the weighted map. (B, C, H, W)"""
+        pooled = feats.mean((2, 3), keepdim=True), feats.amax((2, 3), keepdim=True)
+        feats = feats * sum(self.channel(part) for part in pooled).sigmoid()
+        summary = torch.cat([feats.mean(1, keepdim=True), feats.amax(1, keepdim=True)], 1)
+        return feats * self.space(summary).sigmoid()
+
+
+class GatedBlock(BasicBlock):
+    """ResNet's basic block, gated behind its second normalisation."""
+
+    def __init__(self, inplanes: int, planes: int, *args: Any, **kwargs: Any) -> None:
+        super().__init__(inplanes, planes, *args, **kwargs)
+        self.gates = Gates(planes)
+
+    @property
+    def norm2(self) -> Callable[[Tensor], Tensor]:
+        """Second normalisation and gates."""
+        return lambda feats: self.gates(getattr(self, self.norm2_name)(feats))
+
+
+def enlarged(feats: Tensor, shape: torch.Size) -> Tensor:
+    """Resize a map, the centres of its corner cells staying where they are. (B, C, *shape)"""
+    return F.interpolate(feats, size=shape, mode="bilinear", align_corners=True)
+
+
+class EnhancedNeck(nn.Module):
+    """Three stages of gated blocks on the BEV features, which are then put together (MGMap).
+
+    Args:
+        embed_dims: Channels C of the features and of what is returned; the stages have a quarter,
+            a half and all of them.
+    """
+
+    num_levels = 4
+
+    def __init__(self, embed_dims: int = 256) -> None:
+        super().__init__()
+        widths = embed_dims // 4, embed_dims // 2, embed_dims
+        self.stem = nn.Sequential(
+            nn.Conv2d(embed_dims, widths[0], 7, 2, 3, bias=False),
+            nn.BatchNorm2d(widths[0]),
+            nn.ReLU(),
+        )
+        sizes = zip((widths[0], *widths), widths, (1, 2, 2), strict=False)
+        self.stages = nn.ModuleList(
+            ResLayer(GatedBlock, inputs, outputs, 2, stride) for inputs, outputs, stride in sizes
+        )
+        self.fusion = nn.Sequential(
+            nn.Conv2d(sum(widths), embed_dims, 3, padding=1, bias=False),
+            nn.BatchNorm2d(embed_dims),
+            nn.LeakyReLU(0.01),
+        )
+        self.levels = nn.ModuleList(
+            nn.Sequential(
+                nn.Conv2d(width, embed_dims, 1), nn.GroupNorm(min(32, embed_dims), embed_dims)
+            )
+            for width in (*widths, embed_dims)
+        )
+
+    def forward(self, bev_feats: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return one map of all stages (B, C, H, W), and the levels (B, C, h, w)."""
+        feats = stem = self.stem(bev_feats)
+        maps = []
+        for stage in self.stages:
+            feats = stage(feats)
+            maps.append(feats)
+        fused = self.fusion(torch.cat([enlarged(m, bev_feats.shape[2:]) for m in maps], 1))
+        maps.append(enlarged(fused, stem.shape[2:]))
+        return fused, [level(m) for level, m in zip(self.levels, maps, strict=True)]
