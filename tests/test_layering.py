@@ -43,14 +43,16 @@ ALLOWED = {
 MODELS = {
     "maptr": set(),
     "encoders": {"maptr"},
-    "": {"encoders"},
+    "streams": {"maptr"},
+    "": {"encoders", "streams"},
     "maptrv2": {"maptr", "encoders"},
     "mapvr": {"maptr", "encoders"},
     "gemap": {"maptr", "encoders"},
     "mgmapnet": {"maptr", "encoders", "maptrv2"},  # its mask heads are MapTRv2's
+    "streammapnet": {"maptr", "encoders"},
     "gsmap": {"maptr", "encoders"},
 }
-METHODS = ("maptrv2", "mapvr", "gemap", "mgmapnet", "gsmap")  # what others are built on stays
+METHODS = ("maptrv2", "mapvr", "gemap", "mgmapnet", "streammapnet", "gsmap")  # what others are built on stays
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 
 

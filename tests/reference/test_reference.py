@@ -51,6 +51,12 @@ FILES = [
     "mgmapnet_decoder_*.npz",
     "mgmapnet_losses_*.npz",
     "mgmapnet_forward_reduced_*.npz",
+    "streammapnet_state.json",
+    "streammapnet_attention_*.npz",
+    "streammapnet_fusion_*.npz",
+    "streammapnet_stream_*.npz",
+    "streammapnet_losses_*.npz",
+    "streammapnet_forward_reduced_*.npz",
 ]
 
 
