@@ -43,17 +43,22 @@ ALLOWED = {
 MODELS = {
     "maptr": set(),
     "encoders": {"maptr"},
-    "": {"encoders"},
+    "streams": {"maptr"},
+    "": {"encoders", "streams"},
     "maptrv2": {"maptr", "encoders"},
     "mapvr": {"maptr", "encoders"},
     "gemap": {"maptr", "encoders"},
     "mgmapnet": {"maptr", "encoders", "maptrv2"},  # its mask heads are MapTRv2's
     "mapqr": {"maptr", "encoders"},
     "mgmap": {"maptr", "encoders"},
+    "pivotnet": {"maptr", "encoders"},
+    "streammapnet": {"maptr", "encoders"},
     "gsmap": {"maptr", "encoders"},
 }
 # what the others are built on stays
-METHODS = ("maptrv2", "mapvr", "gemap", "mgmapnet", "mapqr", "mgmap", "gsmap")
+METHODS = (
+    "maptrv2", "mapvr", "gemap", "mgmapnet", "mapqr", "mgmap", "pivotnet", "streammapnet", "gsmap",
+)  # fmt: skip
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 
 

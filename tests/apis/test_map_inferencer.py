@@ -427,3 +427,41 @@ def test_load_model_gives_the_model_alone(tmp_path):
     torch.save({"state_dict": state}, tmp_path / "weights.pth")
     loaded = load_model(make_config(), tmp_path / "weights.pth").state_dict()
     assert all((v == 0.01).all() for v in loaded.values() if v.is_floating_point())
+
+
+def drive(folder, count=4, scene="scene"):
+    """Return samples of one drive, 2 m and half a second apart."""
+    return [
+        replace(
+            sample,
+            token=f"{scene}{i}",
+            scene=scene,
+            timestamp_ns=i * 500_000_000,
+            global_from_frame=np.array(
+                [[1, 0, 0, 0], [0, 1, 0, 2.0 * i], [0, 0, 1, 0], [0, 0, 0, 1]]
+            ),
+        )
+        for i, sample in enumerate(make_samples(folder, count))
+    ]
+
+
+def test_a_stream_of_ones_own_gives_what_the_whole_drive_gives(inferencer, tmp_path):
+    cfg = make_config()
+    temporal = {"bev": {}, "queries": {"num": 2}, "embed_dims": 128}
+    cfg.merge_from_dict({"model.temporal": temporal})
+    torch.manual_seed(0)
+    remembering = MapInferencer(cfg, None, device="cpu")
+    samples = drive(tmp_path)
+    whole = remembering(samples, tmp_path)
+    stream = remembering.new_stream()
+    single = [remembering([sample], tmp_path, stream=stream)[0] for sample in samples]
+    for one, other in zip(whole, single, strict=True):
+        torch.testing.assert_close(one.pred_instances_3d.pts, other.pred_instances_3d.pts)
+    alone = remembering(samples[3:], tmp_path)[0]
+    assert not torch.allclose(alone.pred_instances_3d.pts, whole[3].pred_instances_3d.pts)
+    with pytest.raises(ValueError, match=r"'scene1' .* comes too late: its stream is at 'scene3'"):
+        remembering(samples[1:2], tmp_path, stream=stream)
+    with pytest.raises(ValueError, match=r"'other0' .* of another scene than 'scene3'"):
+        remembering(drive(tmp_path, 1, "other"), tmp_path, stream=stream)
+    with pytest.raises(ValueError, match="the model has no memory"):
+        inferencer.new_stream()

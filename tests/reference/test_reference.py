@@ -65,6 +65,12 @@ FILES = [
     "mgmap_refine_*.npz",
     "mgmap_losses_*.npz",
     "mgmap_forward_reduced_*.npz",
+    "streammapnet_state.json",
+    "streammapnet_attention_*.npz",
+    "streammapnet_fusion_*.npz",
+    "streammapnet_stream_*.npz",
+    "streammapnet_losses_*.npz",
+    "streammapnet_forward_reduced_*.npz",
 ]
 
 

@@ -57,3 +57,20 @@ def test_a_scale_that_leaves_no_image_is_refused():
         ScaleImages(0)
     with pytest.raises(ValueError, match=r"scale 0\.1 leaves nothing of a 9 x 20 image"):
         ScaleImages(0.1).transform({"img": [np.zeros((20, 9, 3), np.uint8)]})
+
+
+def test_a_size_takes_each_image_without_its_padding():
+    """Two images of 40 x 20 and 20 x 40, padded to 40 x 40, become 10 x 10 each."""
+    images = [np.zeros((40, 40, 3), np.uint8) for _ in range(2)]
+    images[0][:20] = images[1][:, :20] = 9
+    matrices = {key: [np.eye(4), np.eye(4)] for key in ("lidar2img", "img_aug_matrix")}
+    shapes = [(20, 40), (40, 20)]
+    results = ScaleImages(size=(10, 10)).transform(
+        {"img": images, "raw_shapes": shapes, **matrices}
+    )
+    assert [image.min() for image in results["img"]] == [9, 9]
+    assert results["img_shape"] == (10, 10)
+    np.testing.assert_allclose(results["lidar2img"][0], np.diag([10 / 40, 10 / 20, 1, 1]))
+    np.testing.assert_allclose(results["img_aug_matrix"][1], np.diag([10 / 20, 10 / 40, 1, 1]))
+    with pytest.raises(ValueError, match="give scale or size"):
+        ScaleImages()

@@ -98,3 +98,27 @@ def test_is_the_backbone_itself_when_it_trains_or_is_watched(backbone: nn.Module
 def test_a_config_can_leave_the_backbone_as_it_is():
     model = build_small(fold_batch_norms=False)
     assert model.folded_backbone is None
+
+
+@torch.no_grad()
+def test_a_backbone_with_deformable_convolutions_is_not_folded_nor_fed_channels_last():
+    """mmcv folds their norm into another convolution, and reads channels last as first."""
+    config = dict(
+        type="mmdet.ResNet",
+        depth=50,
+        base_channels=8,
+        stem_channels=8,
+        out_indices=(2,),
+        dcn=dict(type="DCNv2", deform_groups=1, fallback_on_stride=False),
+        stage_with_dcn=(False, False, True, True),
+    )
+    backbone = MODELS.build(config)
+    backbone.eval()
+    for name, parameter in backbone.named_parameters():
+        if "conv_offset" in name:
+            nn.init.normal_(parameter, std=0.3)
+    assert not can_be_folded(backbone)
+    model = build_small(img_backbone=config, img_neck=None).eval()
+    model.img_backbone.load_state_dict(backbone.state_dict())
+    (feats,) = model.extract_img_feats(IMAGES[None])
+    assert_same((feats[0],), backbone(IMAGES))

@@ -5,7 +5,7 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -243,6 +243,7 @@ class MapInferencer:
         num_workers: int = 0,
         allow_missing_cameras: bool = False,
         on_broken: Callable[[BrokenFrame], object] | None = None,
+        stream: Any = None,
     ) -> "Iterator[Det3DDataSample]":
         """Run the model; several devices take turns.
 
@@ -255,13 +256,20 @@ class MapInferencer:
                 sample has are left out.
             on_broken: Called with each sample that cannot be used, which is then left out; None
                 lets it be an error.
+            stream: With a model that remembers, the drive that the samples continue, over several
+                calls (`new_stream`); None starts a new one for each scene.
 
         Yields:
             The samples in order, with ``pred_instances_3d`` on the CPU.
 
         Raises:
-            ValueError: If a file of a sample is missing or damaged, or a camera is absent.
+            ValueError: If a file of a sample is missing or damaged, or a camera is absent; with
+                memory, if frames are out of order, and if there are several devices.
         """
+        if stream is None and self.model.temporal is not None:
+            stream = self._memory().new_scenes()
+        elif stream is not None:
+            self._memory()
         dataset = self._fit_cameras(dataset, allow_missing_cameras)
         frames = FrameDataset(dataset, allow_missing_cameras)
         chosen = frames if indices is None else Subset(frames, indices)
@@ -276,18 +284,37 @@ class MapInferencer:
                     on_broken(frame)
                 if batch is not None:
                     turn = number % len(pools)
-                    pending.append(pools[turn].submit(self._step, turn, batch))
+                    pending.append(pools[turn].submit(self._step, turn, batch, stream))
                 if len(pending) > len(pools):
                     yield from pending.popleft().result()
             while pending:
                 yield from pending.popleft().result()
 
+    def new_stream(self) -> Any:
+        """Return the empty memory of a drive, for `predict`: its frames must come in order.
+
+        A frame that comes twice, too late or is of another scene is an error that names both
+        frames. ValueError if the model has no memory.
+        """
+        return self._memory().new_stream()
+
+    def _memory(self) -> Any:
+        """Return the model's memory; ValueError if it has none, or there are several devices."""
+        if self.model.temporal is None:
+            raise ValueError("the model has no memory (temporal): leave the stream out.")
+        if len(self.devices) > 1:
+            raise ValueError("a model with memory runs on one device: name a single one.")
+        return self.model.temporal
+
     @torch.no_grad()
-    def _step(self, turn: int, batch: dict[str, Any]) -> "list[Det3DDataSample]":
+    def _step(
+        self, turn: int, batch: dict[str, Any], stream: Any = None
+    ) -> "list[Det3DDataSample]":
         """Predict a batch on one device."""
         kind = self.devices[turn].type
         half = torch.bfloat16 if kind == "cpu" else torch.float16
-        with torch.autocast(kind, half, enabled=self.amp):
+        own = nullcontext() if stream is None else self.model.temporal.using(stream)
+        with own, torch.autocast(kind, half, enabled=self.amp):
             return [sample.cpu() for sample in self.replicas[turn].test_step(batch)]
 
     def predict_images(
@@ -333,6 +360,7 @@ class MapInferencer:
         self,
         source: str | Path | Source | Sequence[MapSample],
         data_root: str | Path | None = None,
+        stream: Any = None,
     ) -> "list[Det3DDataSample]":
-        """Predict all samples of a source; arguments as in ``dataset``."""
-        return list(self.predict(self.dataset(source, data_root)))
+        """Predict all samples of a source; arguments as in ``dataset`` and ``predict``."""
+        return list(self.predict(self.dataset(source, data_root), stream=stream))

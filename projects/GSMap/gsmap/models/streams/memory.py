@@ -59,11 +59,19 @@ class StreamMemory(BaseModule):
 
     def train(self, mode: bool = True) -> "StreamMemory":
         """Switch between training and testing, and forget all streams."""
-        self.streams = Slots(self.max_gap_s) if mode else Scenes(self.max_gap_s)
+        self.streams = Slots(self.max_gap_s) if mode else self.new_scenes()
         return super().train(mode)
 
+    def new_scenes(self) -> Scenes:
+        """Return empty memories of scenes."""
+        return Scenes(self.max_gap_s)
+
+    def new_stream(self) -> MapStream:
+        """Return the empty memory of one scene, which a caller keeps."""
+        return MapStream(self.max_gap_s)
+
     @contextmanager
-    def using(self, stream: MapStream) -> Iterator[None]:
+    def using(self, stream: Scenes) -> Iterator[None]:
         """Take a caller's own stream for a while."""
         own, self.streams = self.streams, stream
         try:

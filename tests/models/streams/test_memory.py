@@ -1,0 +1,231 @@
+"""Memory over frames: who continues whom, what is moved, and that no two streams touch."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from head_cases import ALONG_Y, GSMAP, HEAD, LANES, bev, build_head
+from model_cases import build_small, make_images, make_samples, straight_elements
+from mmengine.structures import InstanceData
+
+from gsmap.models.streams.bev_memory import BEVMemory
+from gsmap.models.streams.memory import StreamMemory
+from gsmap.models.streams.states import MapStream, Scenes, Slots
+from gsmap.structures.rigid import rigid
+
+HALF_S = 500_000_000
+
+
+def pose(ahead_m: float, yaw_rad: float = 0.0) -> np.ndarray:
+    """Return a vehicle that has driven along y and turned."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return rigid([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], [0, ahead_m, 0])
+
+
+def meta(number: int, scene: str = "a", **changes) -> dict:
+    """Return the metainfo of a scene's sample, 2 m after the one before."""
+    return {
+        "token": f"{scene}{number}",
+        "scene": scene,
+        "timestamp_ns": number * HALF_S,
+        "lidar2global": pose(2.0 * number, 0.1 * number),
+        **changes,
+    }
+
+
+def with_memory(**settings):
+    """Return a head and its memory, with reproducible weights that do something."""
+    head = build_head({**HEAD, **settings})
+    memory = StreamMemory(head, bev={}, queries={"num": 2}, embed_dims=16)
+    torch.manual_seed(3)
+    for parameter in memory.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    return head.eval(), memory.eval()
+
+
+def step(head, memory, *metas: dict, feats: torch.Tensor | None = None) -> torch.Tensor:
+    """Predict one batch and return the points of the last layer."""
+    outputs = {"bev_feats": bev(len(metas))["bev_feats"] if feats is None else feats}
+    with torch.no_grad(), memory.over(outputs, metas) as outputs:
+        return head(outputs)[-1].pts
+
+
+def features(number: int) -> torch.Tensor:
+    """Return the features of one sample."""
+    return torch.randn(1, 16, 10, 5, generator=torch.Generator().manual_seed(number))
+
+
+@pytest.mark.parametrize("kind", ["MapHead", "GSMapHead"])
+def test_results_are_equal_one_by_one_and_in_batches_of_streams(kind):
+    config = {"MapHead": {}, "GSMapHead": GSMAP}[kind]
+    head, memory = with_memory(**config)
+    alone = {
+        (scene, number): step(head, memory, meta(number, scene), feats=features(10 * seed + number))
+        for seed, scene in enumerate("ab")
+        for number in range(3)
+    }
+    memory.eval()  # forgets
+    for number in range(3):
+        both = torch.cat([features(number), features(10 + number)])
+        found = step(head, memory, meta(number), meta(number, "b"), feats=both)
+        for index, scene in enumerate("ab"):
+            torch.testing.assert_close(found[index], alone[scene, number][0])
+
+
+def test_the_memory_counts_and_a_new_scene_or_a_gap_forgets_it():
+    head, memory = with_memory()
+    fresh = step(head, memory, meta(1), feats=features(1))
+    memory.eval()
+    step(head, memory, meta(0), feats=features(0))
+    assert not torch.allclose(step(head, memory, meta(1), feats=features(1)), fresh)
+    other = meta(1, "b")
+    torch.testing.assert_close(step(head, memory, other, feats=features(1)), fresh)
+    later = meta(9, timestamp_ns=20 * HALF_S, lidar2global=meta(1)["lidar2global"])
+    torch.testing.assert_close(step(head, memory, later, feats=features(1)), fresh)
+
+
+@pytest.mark.parametrize(("again", "what"), [(1, "comes twice"), (0, "comes too late")])
+def test_a_frame_out_of_order_is_named_with_the_one_before(again, what):
+    head, memory = with_memory()
+    for number in range(2):
+        step(head, memory, meta(number))
+    with pytest.raises(ValueError, match=f"'a{again}' .*{what}: its stream is at 'a1'"):
+        step(head, memory, meta(again))
+
+
+def test_two_frames_of_a_scene_do_not_share_a_batch():
+    head, memory = with_memory()
+    with pytest.raises(ValueError, match=r"'a0' .* and 'a1' .* of one scene are in one batch"):
+        step(head, memory, meta(0), meta(1))
+
+
+def test_a_stream_of_ones_own_refuses_another_scene():
+    head, memory = with_memory()
+    stream = MapStream()
+    with memory.using(stream):
+        step(head, memory, meta(0))
+        with pytest.raises(ValueError, match=r"'b1' .* another scene than 'a0'"):
+            step(head, memory, meta(1, "b"))
+    assert stream.last.token == "a0"
+    step(head, memory, meta(0))  # the detector's own streams know nothing of it
+
+
+def test_a_failed_batch_leaves_the_stream_where_it_was():
+    head, memory = with_memory()
+    step(head, memory, meta(0))
+    with pytest.raises(RuntimeError, match="on the way"), memory.over(bev(1), [meta(1)]):
+        raise RuntimeError("on the way")
+    step(head, memory, meta(1))
+
+
+def test_a_sample_without_a_pose_is_named():
+    head, memory = with_memory()
+    with pytest.raises(ValueError, match=r"'a0' has no \['lidar2global'\]"):
+        step(head, memory, meta(0, lidar2global=None))
+
+
+def test_slots_start_anew_where_a_sample_does_not_follow():
+    from gsmap.models.streams.states import Frame, StreamState
+
+    slots = Slots(max_gap_s=2.0)
+    slots.keep([StreamState(Frame.of(meta(4, scene))) for scene in "abcd"])
+    frames = [meta(5), meta(5, "x"), meta(3, "c"), meta(9, "d")]
+    found = slots.previous([Frame.of(each) for each in frames])
+    assert [state is not None for state in found] == [True, False, False, False]
+
+
+def test_only_the_latest_scenes_are_kept():
+    from gsmap.models.streams.states import Frame, StreamState
+
+    scenes = Scenes(2.0, max_streams=2)
+    for scene in "abc":
+        scenes.keep([StreamState(Frame.of(meta(0, scene)))])
+    assert list(scenes.states) == ["b", "c"]
+
+
+def test_a_standing_vehicle_keeps_its_memory_and_a_driving_one_moves_it():
+    """Cells are 6 m x 6 m: driving 6 m ahead (y) moves what was in row 7 to row 6."""
+    memory = BEVMemory(ALONG_Y, embed_dims=16)
+    feats = features(0)
+    still = torch.eye(4, dtype=torch.float64)[None]
+    torch.testing.assert_close(memory.warp(feats, still), feats, atol=1e-5, rtol=0)
+    ahead = still.clone()
+    ahead[:, 1, 3] = 6.0  # metres now to metres then
+    moved = memory.warp(feats, ahead)
+    torch.testing.assert_close(moved[:, :, :-1], feats[:, :, 1:], atol=1e-5, rtol=0)
+    assert moved[:, :, -1].abs().max() < 1e-5  # nothing was seen there
+    released = BEVMemory(ALONG_Y, embed_dims=16, end_points=True)
+    assert (released.warp(feats, still) - feats).abs().max() > 0.1
+
+
+def test_references_move_with_the_vehicle():
+    """The vehicle turned left by 90 degrees: what was ahead is now to the right, the line turns."""
+    head = build_head(GSMAP)
+    motion = torch.as_tensor(np.linalg.inv(pose(0.0, math.pi / 2)))[None]
+    ahead = head.reference.norm(torch.tensor([[0.0, 6.0]]))
+    reference = torch.cat([ahead, torch.tensor([[0.3, 0.2, 0.1]])], -1)[None]
+    moved = head.reference.moved(reference, motion)
+    assert head.reference.metres(moved[0, 0, :2]).tolist() == pytest.approx([6.0, 0.0], abs=1e-4)
+    before, after = (head.reference.space.decode(r).rotations for r in (reference, moved))
+    assert float(after - before) == pytest.approx(-math.pi / 2, abs=1e-5)
+
+
+def test_training_gives_every_weight_a_gradient_and_later_frames_a_loss():
+    head, memory = with_memory()
+    head.train(), memory.train()
+    losses, shares = [], []
+    for number in range(2):
+        with memory.over({"bev_feats": features(number)}, [meta(number)]) as outputs:
+            sample = make_samples(LANES)[0]
+            sample.set_metainfo(meta(number))
+            each = head.loss(outputs, [sample])
+        losses.append(each["loss_trans"])
+        shares.append(sum(value for name, value in each.items() if "loss" in name))
+    assert float(losses[0]) == 0
+    assert float(losses[1]) > 0
+    shares[0].backward()
+    assert all(p.grad is not None for p in memory.parameters())  # as DDP needs
+    head.zero_grad(), memory.zero_grad()
+    shares[1].backward()
+    moved = [float(p.grad.abs().sum()) for p in memory.queries.parameters()]
+    assert all(value > 0 for value in moved)
+
+
+def test_further_query_groups_keep_their_queries():
+    groups = [{"num": 4}, {"name": "one2many", "num": 6, "repeats": 2}]
+    head, memory = with_memory(query_groups=groups)
+    head.train(), memory.train()
+    for number in range(2):
+        with memory.over({"bev_feats": features(number)}, [meta(number)]) as outputs:
+            head(outputs)
+            propagation = outputs["query_memory"]
+            if number == 0:
+                propagation.targets = torch.zeros(1, 10, 5, 2)
+    order = propagation.order(torch.zeros(1, 4), total=10)
+    assert order[0, :2].tolist() == [0, 1]
+    assert sorted(order[0, 2:4].tolist()) < [6, 6]
+    assert order[0, 4:].tolist() == list(range(6, 12))
+
+
+def test_a_memory_that_does_not_fit_is_refused():
+    head = build_head(HEAD)
+    with pytest.raises(ValueError, match="bev=dict"):
+        StreamMemory(head)
+    with pytest.raises(ValueError, match="a memory of 4 queries does not fit a head of 4"):
+        StreamMemory(head, queries={"num": 4})
+
+
+def test_a_detector_remembers():
+    model = build_small(temporal={"bev": {}, "queries": {"num": 3}, "embed_dims": 16}).eval()
+    images = make_images(1)
+    found = []
+    for number in (0, 1):
+        (sample,) = make_samples(straight_elements())
+        sample.set_metainfo(meta(number))
+        with torch.no_grad():
+            (result,) = model.predict(copy.deepcopy(images), [sample])
+        assert isinstance(result.pred_instances_3d, InstanceData)
+        found.append(result.pred_instances_3d.pts)
+    assert not torch.allclose(*found)  # the images are the same, the memory is not
