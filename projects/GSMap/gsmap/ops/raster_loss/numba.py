@@ -5,12 +5,12 @@
 One thread works on one instance at a time. Where neither mask has anything within SSIM's window,
 SSIM is exactly 1 and the L1 term exactly 0, so every step runs, row by row, from the first to the
 last column that can differ: from the masks' own columns, grown by the window's radius for each
-blur. The window is separable, and the row pass takes symmetric taps together.
+blur. The window is separable and a row is blurred when it is needed, so no blurred map is kept.
 
-Nothing is kept for the backward pass but the two masks: the five blurred maps (p, t, p^2, t^2, p t)
-are built again, turned into the derivatives of SSIM by the blurred p, p^2 and p t, and blurred once
-more (the window is symmetric, so the blur is its own transpose). Sums run in a fixed order in one
-thread, so two runs give the same bits.
+Nothing is kept for the backward pass but the two masks: the four blurred maps (p, t, p^2 + t^2,
+p t) are built again, turned into the derivatives of SSIM by the blurred p, p^2 and p t, and blurred
+once more (the window is symmetric, so the blur is its own transpose). Sums run in a fixed order in
+one thread, so two runs give the same bits.
 """
 
 import numpy as np
@@ -23,204 +23,203 @@ from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
 ONE, TWO = np.float32(1), np.float32(2)
 C1, C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
 SEEN_FLOAT32 = np.float32(SEEN)
+TAPS = 6  # that are added at a time, without going back to memory
 
 
-@njit(nogil=True, cache=True)
-def _find_spans(preds, targets, spans):
-    """Write each row's first and one past the last column where a mask is not 0. (H, 2)"""
+@njit(nogil=True, cache=True, fastmath=FASTMATH)
+def _find_spans(preds, targets, radius, spans):
+    """Write each row's first and one past the last column where a mask is not 0, (3, H, 2).
+
+    The second and third spans are those that a window carries the ones before to.
+    """
     height, width = preds.shape
     for row in range(height):
-        left, right = 0, width
-        while left < width and preds[row, left] == 0 and targets[row, left] == 0:
-            left += 1
-        while right > left and preds[row, right - 1] == 0 and targets[row, right - 1] == 0:
-            right -= 1
-        spans[row, 0], spans[row, 1] = left, right
-
-
-@njit(nogil=True, cache=True)
-def _grow_spans(spans, radius, width, grown):
-    """Write the columns that a window of a radius carries each row's span to. (H, 2)"""
-    for row in range(len(spans)):
-        left, right = width, 0
-        for other in range(max(row - radius, 0), min(row + radius + 1, len(spans))):
-            if spans[other, 0] < spans[other, 1]:
-                left, right = min(left, spans[other, 0]), max(right, spans[other, 1])
-        grown[row, 0] = max(left - radius, 0)
-        grown[row, 1] = max(min(right + radius, width), grown[row, 0])
+        left, right = np.int32(width), np.int32(0)
+        for col in range(width):
+            seen = (preds[row, col] != 0) | (targets[row, col] != 0)
+            left = min(left, np.int32(col) if seen else np.int32(width))
+            right = max(right, np.int32(col + 1) if seen else np.int32(0))
+        spans[0, row, 0], spans[0, row, 1] = left, max(left, right)
+    for step in range(2):
+        for row in range(height):
+            left, right = width, 0
+            for other in range(max(row - radius, 0), min(row + radius + 1, height)):
+                if spans[step, other, 0] < spans[step, other, 1]:
+                    left = min(left, spans[step, other, 0])
+                    right = max(right, spans[step, other, 1])
+            left = max(left - radius, 0)
+            spans[step + 1, row] = left, max(min(right + radius, width), left)
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
-def _add_scaled(out, source, factor):
-    """Add ``factor * source`` to ``out``."""
-    for k in range(len(out)):
-        out[k] += factor * source[k]
-
-
-@njit(nogil=True, cache=True, fastmath=FASTMATH)
-def _add_scaled_pair(out, first, second, factor):
-    """Add ``factor * (first + second)`` to ``out``."""
-    for k in range(len(out)):
-        out[k] += factor * (first[k] + second[k])
+def _convolve(source, first, stride, window, out, size):
+    """Write sum_j window[j] source[first + k + j stride] to ``out[k]`` for k < size."""
+    s_1, s_2, s_3 = np.uint64(stride), np.uint64(2 * stride), np.uint64(3 * stride)
+    s_4, s_5 = np.uint64(4 * stride), np.uint64(5 * stride)  # unsigned: an index is not wrapped
+    out[:size] = 0
+    for j in range(0, len(window), TAPS):
+        w_0, w_1, w_2 = window[j], window[j + 1], window[j + 2]
+        w_3, w_4, w_5 = window[j + 3], window[j + 4], window[j + 5]
+        start = np.uint64(first + j * stride)
+        for k in range(np.uint64(size)):
+            i = start + k
+            near = w_0 * source[i] + w_1 * source[i + s_1] + w_2 * source[i + s_2]
+            far = w_3 * source[i + s_3] + w_4 * source[i + s_4] + w_5 * source[i + s_5]
+            out[k] += near + far
 
 
 @njit(nogil=True, cache=True)
-def _blur(images, spans, window, padded, rows, out, out_spans):
-    """Filter images (C, H, W) that are 0 outside ``spans``; fill ``out`` inside ``out_spans``."""
-    radius = len(window) // 2
-    height, width = images.shape[1:]
-    for row in range(height):
-        left, right = spans[row]
-        if left >= right:
-            continue
-        low, high = max(left - radius, 0), min(right + radius, width)
-        size = high - low
-        for c in range(len(images)):
-            padded[: right - left + 4 * radius] = 0  # starts at column left - 2 radius
-            padded[2 * radius : 2 * radius + right - left] = images[c, row, left:right]
-            start = low - left + radius  # of the window's first tap at column low
-            line = rows[c, row, low:high]
-            line[:] = 0
-            for k in range(radius):
-                far = start + 2 * radius - k
-                first, second = padded[start + k : start + k + size], padded[far : far + size]
-                _add_scaled_pair(line, first, second, window[k])
-            _add_scaled(line, padded[start + radius : start + radius + size], window[radius])
-    for row in range(height):
-        out[:, row, out_spans[row, 0] : out_spans[row, 1]] = 0
-        for k in range(len(window)):
-            other = row + k - radius
-            if other < 0 or other >= height or spans[other, 0] >= spans[other, 1]:
-                continue
-            low, high = max(spans[other, 0] - radius, 0), min(spans[other, 1] + radius, width)
-            for c in range(len(images)):
-                _add_scaled(out[c, row, low:high], rows[c, other, low:high], window[k])
+def _blur_row(images, channels, row, span, window, line, out):
+    """Filter a row's span of padded images (H + taps, (W + taps) channels); return its pixels."""
+    pitch, pixels = images.shape[1], span[1] - span[0]
+    first = row * pitch + span[0] * channels  # images start a radius early
+    size = (pixels + len(window)) * channels
+    _convolve(images.reshape(images.size), first, pitch, window, line, size)
+    _convolve(line, 0, channels, window, out, pixels * channels)
+    return pixels
 
 
 @njit(inline="always")
-def _ssim_terms(maps, row, col):
-    """Return the blurred p and t and SSIM's two numerators and two denominators at a pixel."""
-    p, t = maps[0, row, col], maps[1, row, col]
-    top_mean = TWO * p * t + C1
-    top_cov = TWO * (maps[4, row, col] - p * t) + C2
-    low_mean = p * p + t * t + C1
-    low_var = (maps[2, row, col] - p * p) + (maps[3, row, col] - t * t) + C2
-    return p, t, top_mean, top_cov, low_mean, low_var
+def _ssim_terms(p, t, squares, product):
+    """Return SSIM's numerators and denominators of the blurred p, t, p^2 + t^2 and p t."""
+    means = p * p + t * t
+    return TWO * p * t + C1, TWO * (product - p * t) + C2, means + C1, squares - means + C2
 
 
 @njit(nogil=True, cache=True)
-def _dissimilarity(maps, spans):
-    """Return the sum of 1 - SSIM, and on how many pixels the window sees the target, or either."""
+def _dissimilarity(maps, pixels):
+    """Sum a row's 1 - SSIM, and count the pixels whose window sees the target, and either."""
     total, target, either = 0.0, 0.0, 0.0
-    for row in range(len(spans)):
-        for col in range(spans[row, 0], spans[row, 1]):
-            p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(maps, row, col)
-            total += ONE - (top_mean * top_cov) / (low_mean * low_var)
-            target += 1.0 if t > 0 else 0.0
-            either += 1.0 if max(p, t) > SEEN_FLOAT32 else 0.0
+    for k in range(pixels):
+        p, t = maps[4 * k], maps[4 * k + 1]
+        top_mean, top_cov, low_mean, low_var = _ssim_terms(p, t, maps[4 * k + 2], maps[4 * k + 3])
+        total += ONE - (top_mean * top_cov) / (low_mean * low_var)
+        target += 1.0 if t > 0 else 0.0
+        either += 1.0 if max(p, t) > SEEN_FLOAT32 else 0.0
     return total, target, either
 
 
 @njit(nogil=True, cache=True)
-def _derivatives(maps, spans, out):
-    """Fill SSIM's derivatives by the blurred p, p^2 and p t inside the spans. (3, H, W)"""
-    for row in range(len(spans)):
-        for col in range(spans[row, 0], spans[row, 1]):
-            p, t, top_mean, top_cov, low_mean, low_var = _ssim_terms(maps, row, col)
-            scale = ONE / (low_mean * low_var)
-            ssim = top_mean * top_cov * scale
-            out[0, row, col] = TWO * t * (top_cov - top_mean) * scale + TWO * p * ssim * (
-                ONE / low_var - ONE / low_mean
-            )
-            out[1, row, col] = -ssim / low_var
-            out[2, row, col] = TWO * top_mean * scale
+def _derivatives(maps, pixels, out):
+    """Fill a row's derivatives of SSIM by the blurred p, p^2 and p t."""
+    for k in range(pixels):
+        p, t = maps[4 * k], maps[4 * k + 1]
+        top_mean, top_cov, low_mean, low_var = _ssim_terms(p, t, maps[4 * k + 2], maps[4 * k + 3])
+        scale = ONE / (low_mean * low_var)
+        ssim = top_mean * top_cov * scale
+        change = t * (top_cov - top_mean) + p * ssim * (low_mean - low_var)
+        out[3 * k], out[3 * k + 1] = TWO * change * scale, -ssim * scale * low_mean
+        out[3 * k + 2] = TWO * top_mean * scale
 
 
 @njit(nogil=True, cache=True)
-def _weighted_masses(preds, targets, spans, weight):
-    """Return sum w |p - t|, sum w p, sum w t and sum (w - 1) over an instance."""
+def _fill_products(pred, target, weight, out):
+    """Fill a row's p, t, p^2 + t^2 and p t; return sum w |p - t|, w p, w t and w - 1."""
     l1, predicted, foreground, excess = 0.0, 0.0, 0.0, 0.0
-    for row in range(len(spans)):
-        for col in range(spans[row, 0], spans[row, 1]):
-            p, t = preds[row, col], targets[row, col]
-            extra = (weight - ONE) * t
-            l1 += (ONE + extra) * abs(p - t)
-            predicted += (ONE + extra) * p
-            foreground += (ONE + extra) * t
-            excess += extra
+    for k in range(len(pred)):
+        p, t = pred[k], target[k]
+        extra = (weight - ONE) * t
+        l1 += (ONE + extra) * abs(p - t)
+        predicted += (ONE + extra) * p
+        foreground += (ONE + extra) * t
+        excess += extra
+        out[4 * k], out[4 * k + 1], out[4 * k + 2] = p, t, p * p + t * t
+        out[4 * k + 3] = p * t
     return l1, predicted, foreground, excess
 
 
 @njit(nogil=True, cache=True)
-def _buffers(shape, radius):
-    """Return a thread's scratch: products, row pass, blurred maps, padded row, three spans."""
-    images = np.empty((3, 5, shape[0], shape[1]), np.float32)
-    padded = np.empty(shape[1] + 4 * radius, np.float32)
-    return images[0], images[1], images[2], padded, np.empty((3, shape[0], 2), np.int64)
-
-
-@njit(nogil=True, cache=True)
-def _blur_products(preds, targets, window, buffers):
-    """Fill an instance's spans and the blurred p, t, p^2, t^2 and p t inside the second."""
-    products, rows, maps, padded, spans = buffers
-    radius = len(window) // 2
-    _find_spans(preds, targets, spans[0])
-    _grow_spans(spans[0], radius, preds.shape[1], spans[1])
-    _grow_spans(spans[1], radius, preds.shape[1], spans[2])
+def _survey(preds, targets, weight, radius, products, spans, sums):
+    """Fill an instance's spans and products, and add up what needs no window."""
+    _find_spans(preds, targets, radius, spans)
+    products[:] = 0
+    sums[:] = 0
     for row in range(len(preds)):
-        for col in range(spans[0, row, 0], spans[0, row, 1]):
-            p, t = preds[row, col], targets[row, col]
-            products[0, row, col], products[1, row, col] = p, t
-            products[2, row, col], products[3, row, col] = p * p, t * t
-            products[4, row, col] = p * t
-    _blur(products, spans[0], window, padded, rows, maps, spans[1])
+        left, right = spans[0, row, 0], spans[0, row, 1]
+        pred, target = preds[row, left:right], targets[row, left:right]
+        out = products[row + radius, 4 * (left + radius) :]
+        l1, predicted, foreground, excess = _fill_products(pred, target, weight, out)
+        sums[0] += l1
+        sums[1] += predicted
+        sums[3] += foreground
+        sums[4] += excess
 
 
 @njit(nogil=True, cache=True)
-def loss_forward(preds, targets, window, weight, results, first, last):
+def _buffers(shape, taps):
+    """Return a thread's scratch: products, their derivatives, rows of both, three spans."""
+    height, width = shape[0] + taps, shape[1] + taps
+    products = np.empty((height, 4 * width), np.float32)
+    slopes = np.empty((height, 3 * width), np.float32)
+    line, maps = np.empty(4 * width, np.float32), np.empty(4 * width, np.float32)
+    return products, slopes, line, maps, np.empty((3, shape[0], 2), np.int64)
+
+
+@njit(nogil=True, cache=True)
+def loss_forward(preds, targets, window, radius, weight, results, first, last):
     """Write some instances' sums, those of `raster_loss_sums_reference`, float64 (n, 7).
 
-    Masks (n, H, W), the window (size,) and the weight are float32.
+    Masks (n, H, W), the window (size,) and the weight are float32; zeros at the window's end make
+    its size a multiple of ``TAPS``.
     """
-    buffers = _buffers(preds.shape[1:], len(window) // 2)
-    _, _, maps, _, spans = buffers
+    products, _, line, maps, spans = _buffers(preds.shape[1:], len(window))
     for n in range(first, last):
-        _blur_products(preds[n], targets[n], window, buffers)
-        masses = _weighted_masses(preds[n], targets[n], spans[0], weight)
-        results[n, 0], results[n, 1], results[n, 3], results[n, 4] = masses
-        results[n, 2], results[n, 5], results[n, 6] = _dissimilarity(maps, spans[1])
+        _survey(preds[n], targets[n], weight, radius, products, spans, results[n])
+        for row in range(preds.shape[1]):
+            pixels = _blur_row(products, 4, row, spans[1, row], window, line, maps)
+            dissimilarity, target, either = _dissimilarity(maps, pixels)
+            results[n, 2] += dissimilarity
+            results[n, 5] += target
+            results[n, 6] += either
+
+
+@njit(nogil=True, cache=True, fastmath=FASTMATH)
+def _row_gradient(pred, target, maps, weight, factors, grad):
+    """Write a row's gradient of the first three sums, each times its factor."""
+    for k in range(len(grad)):
+        p, t = pred[k], target[k]
+        slope = factors[0] * np.sign(p - t) + factors[1]
+        ssim = maps[3 * k] + TWO * p * maps[3 * k + 1] + t * maps[3 * k + 2]
+        grad[k] = (ONE + (weight - ONE) * t) * slope - factors[2] * ssim
 
 
 @njit(nogil=True, cache=True)
-def loss_backward(preds, targets, window, weight, factors, grads, first, last):
+def loss_backward(preds, targets, window, radius, weight, factors, grads, first, last):
     """Write the gradient (n, H, W) of the first three sums, each times its factor (n, 3)."""
-    buffers = _buffers(preds.shape[1:], len(window) // 2)
-    slopes, rows, maps, padded, spans = buffers
+    products, slopes, line, maps, spans = _buffers(preds.shape[1:], len(window))
+    unused = np.zeros(7)
     for n in range(first, last):
         grads[n] = factors[n, 1]  # outside the spans w is 1, and nothing else depends on p
-        _blur_products(preds[n], targets[n], window, buffers)
-        _derivatives(maps, spans[1], slopes[:3])
-        _blur(slopes[:3], spans[1], window, padded, rows, maps[:3], spans[2])
+        _survey(preds[n], targets[n], weight, radius, products, spans, unused)
+        slopes[:] = 0
         for row in range(preds.shape[1]):
-            for col in range(spans[2, row, 0], spans[2, row, 1]):
-                p, t = preds[n, row, col], targets[n, row, col]
-                slope = factors[n, 0] * np.sign(p - t) + factors[n, 1]
-                ssim = maps[0, row, col] + TWO * p * maps[1, row, col] + t * maps[2, row, col]
-                extra = (weight - ONE) * t
-                grads[n, row, col] = (ONE + extra) * slope - factors[n, 2] * ssim
+            pixels = _blur_row(products, 4, row, spans[1, row], window, line, maps)
+            out = slopes[row + radius, 3 * (spans[1, row, 0] + radius) :]
+            _derivatives(maps, pixels, out)
+        for row in range(preds.shape[1]):
+            _blur_row(slopes, 3, row, spans[2, row], window, line, maps)
+            left, right = spans[2, row, 0], spans[2, row, 1]
+            pred, target = preds[n, row, left:right], targets[n, row, left:right]
+            _row_gradient(pred, target, maps, weight, factors[n], grads[n, row, left:right])
+
+
+def _settings(window, weight):
+    """Return the kernels' window, radius and weight."""
+    padded = torch.nn.functional.pad(window, (0, -len(window) % TAPS))
+    return padded, len(window) // 2, np.float32(weight)
 
 
 def raster_loss_sums(preds, targets, window, weight):
     """Return the sums of `raster_loss_sums_reference`; the first three are differentiable."""
     sums = torch.empty(len(preds), 7, dtype=torch.float64)
-    pixels, weight = preds.shape[1:].numel(), np.float32(weight)
-    run_in_threads(loss_forward, pixels, preds, targets, window, weight, sums)
+    arguments = preds, targets, *_settings(window, weight), sums
+    run_in_threads(loss_forward, preds.shape[1:].numel(), *arguments)
     return sums.float()
 
 
 def raster_loss_sums_backward(grads, preds, targets, window, weight):
     """Return the gradient in the predictions. (n, H, W)"""
     gradient = torch.empty(preds.shape, dtype=torch.float32)
-    pixels, weight = preds.shape[1:].numel(), np.float32(weight)
-    run_in_threads(loss_backward, pixels, preds, targets, window, weight, grads[:, :3], gradient)
+    arguments = preds, targets, *_settings(window, weight), grads[:, :3], gradient
+    run_in_threads(loss_backward, preds.shape[1:].numel(), *arguments)
     return (gradient,)
