@@ -27,7 +27,7 @@ ALLOWED = {
     "datasets": {"structures", "utils"},
     "evaluation": {"datasets", "ops", "structures", "utils"},
     "visualization": {"datasets", "evaluation", "ops", "structures", "utils"},
-    "engine": {"checkpoints", "datasets", "structures", "utils"},
+    "engine": {"checkpoints", "utils"},
     "apis": {
         "checkpoints", "datasets", "engine", "evaluation", "structures", "utils", "visualization",
     },

@@ -48,7 +48,7 @@ infer: VAL --model C --out out.json | give a checkpoint after
 infer: VAL --model C nowhere.pth --out out.json | There is no checkpoint nowhere.pth
 infer: VAL --model C damaged.pth --out out.json | damaged.pth was not loaded: it is broken
 infer: VAL --model C foreign.pth --out out.json | foreign.pth does not belong to this config
-infer: VAL --model C maptr.pth --out out.json | maptr.pth does not belong to this config: the checkpoint was never trained with parts of the config's model: map_head.reference.gaussian_branches
+infer: VAL --model C maptr.pth --out out.json | maptr.pth does not belong to this config: the checkpoint was never trained with parts of the config's model: map_head.decoder.layers.0.guidance
 infer: nowhere --model C K --out out.json | There is no input nowhere
 infer: damaged.arrow --model C K --out out.json | damaged.arrow is not a whole annotation file
 infer: list.pkl --model C K --out out.json | list.pkl

@@ -13,6 +13,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import LidarRecord, MapInstance, MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.source import ground_from_frame
+from gsmap.datasets.transforms.images import ScaleImages
 from gsmap.structures.calibration import NUM_CAN_BUS, without_history
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid, rigid
@@ -174,6 +175,14 @@ class VectorizedMapDataset(BaseDataset):
             row = super().get_data_info(index)["row"]
             found.setdefault(names[row], []).append((times[row], index))
         return [[index for _, index in sorted(found[name])] for name in sorted(found)]
+
+    def scaled_image_size(self) -> tuple[int, int]:
+        """Return width and height that the first sample's images are scaled to, in pixels."""
+        cameras = [c for c in self.sample(0).cameras if c.name in (self.cameras or [c.name])]
+        size = max(c.width for c in cameras), max(c.height for c in cameras)
+        for step in self.pipeline.transforms:
+            size = step.scaled(*size) if isinstance(step, ScaleImages) else size
+        return size
 
     def get_cat_ids(self, idx: int) -> list[int]:
         """Return the labels of a sample's elements, for mmengine's ``ClassBalancedDataset``."""

@@ -16,8 +16,6 @@ from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.reading import refusing
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
-from gsmap.datasets.transforms.images import ScaleImages
-from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.run_log import innermost
 from gsmap.utils.files import write_bytes, write_text
 
@@ -80,8 +78,8 @@ class AtomicCheckpointHook(CheckpointHook):
         settings = plain(runner.cfg.model.to_dict())
         checkpoint["meta"][MODEL_SETTINGS] = json.dumps(settings)
         dataset = innermost(runner.train_dataloader.dataset)
-        if hasattr(dataset, "sample"):
-            checkpoint["meta"][IMAGE_SIZE] = list(_image_size(dataset))
+        if hasattr(dataset, "scaled_image_size"):
+            checkpoint["meta"][IMAGE_SIZE] = list(dataset.scaled_image_size())
             checkpoint["meta"][SIGNALS] = dataset.sample(0).can_bus is not None
 
     def before_train(self, runner: Runner) -> None:
@@ -111,13 +109,3 @@ class AtomicCheckpointHook(CheckpointHook):
         super().after_val_epoch(runner, metrics)
         if runner.rank == 0:
             write_text(Path(runner.work_dir, VALIDATED), str(runner.iter))
-
-
-def _image_size(dataset: VectorizedMapDataset) -> tuple[int, int]:
-    """Return width and height that the images of a data set are scaled to."""
-    cameras = dataset.sample(0).cameras
-    cameras = [c for c in cameras if c.name in (dataset.cameras or [c.name])]
-    size = max(c.width for c in cameras), max(c.height for c in cameras)
-    for step in dataset.pipeline.transforms:
-        size = step.scaled(*size) if isinstance(step, ScaleImages) else size
-    return size

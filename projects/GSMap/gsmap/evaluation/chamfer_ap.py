@@ -58,7 +58,7 @@ class ChamferConfig:
         object.__setattr__(self, "thresholds", thresholds)
         object.__setattr__(self, "classes", checked_classes(self.classes))
         if not (thresholds and 0 < thresholds[0] <= thresholds[-1] < math.inf):
-            raise ValueError(f"thresholds must not be empty, and must be > 0 m, got {thresholds}.")
+            raise ValueError(f"thresholds must be > 0 m, at least one, got {thresholds}.")
         if self.num_points < 2:
             raise ValueError(f"num_points must be >= 2, got {self.num_points}.")
         if self.dim not in (2, 3):
