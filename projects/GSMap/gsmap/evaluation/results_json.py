@@ -23,33 +23,6 @@ SHARD_KIND = "results"
 _LAST_LINE = "]}\n"
 
 
-def _elements(
-    vectors: Sequence[Mapping[str, Any]],
-    classes: Sequence[str],
-    scored: bool,
-    gaussians: bool,
-    ignored: Counter[str],
-) -> MapElements:
-    """Convert the vectors of one sample and count what is ignored; other classes get label -1."""
-    label_of = {name: label for label, name in enumerate(classes)}
-    if not all(isinstance(v["cls_name"], str) for v in vectors):
-        raise TypeError("cls_name is no text")
-    ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in label_of)
-    if any(len(point) == 3 for v in vectors for point in v["pts"][:1]):
-        ignored[THREE_D] += 1
-    extra = {
-        name: [v[f"gaussian_{name}"] for v in vectors]
-        for name in ("scales", "rotations")
-        if gaussians and vectors and all(f"gaussian_{name}" in v for v in vectors)
-    }
-    return MapElements.from_polylines(
-        [v["pts"] for v in vectors],
-        [label_of.get(v["cls_name"], -1) for v in vectors],
-        [v["confidence_level"] for v in vectors] if scored else None,
-        **extra,
-    )
-
-
 def vectors_of(elements: MapElements, classes: Sequence[str]) -> list[dict[str, Any]]:
     """Convert predictions to a sample's ``vectors``, with their Gaussians if they have any."""
     labels, scores = elements.labels.tolist(), elements.confidence.tolist()
@@ -125,19 +98,37 @@ class SampleFile:
         )
 
     def _convert(self, item: Any, ignored: Counter[str]) -> tuple[str, MapElements]:
-        """Return token and elements of a sample."""
+        """Return token and elements of a sample, and count what is ignored."""
         if not isinstance(item, dict) or not {"sample_token", "vectors"} <= item.keys():
             raise ValueError(f"{self.path}: {item!r:.80} has no sample_token or no vectors.")
-        token, scored = str(item["sample_token"]), self._key == RESULTS_KEY
+        token = str(item["sample_token"])
         try:
-            return token, _elements(
-                item["vectors"], self._classes, scored, self._gaussians, ignored
-            )
+            return token, self._elements(item["vectors"], ignored)
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise ValueError(
                 f"{self.path}, sample {token!r}: {error!r}; each vector needs pts, "
                 "cls_name and, in results, confidence_level."
             ) from error
+
+    def _elements(self, vectors: Sequence[Mapping[str, Any]], ignored: Counter[str]) -> MapElements:
+        """Convert the vectors of one sample; other classes get label -1."""
+        label_of = {name: label for label, name in enumerate(self._classes)}
+        if not all(isinstance(v["cls_name"], str) for v in vectors):
+            raise TypeError("cls_name is no text")
+        ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in label_of)
+        if any(len(point) == 3 for v in vectors for point in v["pts"][:1]):
+            ignored[THREE_D] += 1
+        extra = {
+            name: [v[f"gaussian_{name}"] for v in vectors]
+            for name in ("scales", "rotations")
+            if self._gaussians and vectors and all(f"gaussian_{name}" in v for v in vectors)
+        }
+        return MapElements.from_polylines(
+            [v["pts"] for v in vectors],
+            [label_of.get(v["cls_name"], -1) for v in vectors],
+            [v["confidence_level"] for v in vectors] if self._key == RESULTS_KEY else None,
+            **extra,
+        )
 
 
 def read_samples(
