@@ -37,6 +37,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_name, write_text
+from gsmap.utils.words import counted
 from gsmap.visualization.bev_view import draw_lines
 from gsmap.visualization.figure import save_figure
 from gsmap.visualization.plots import WIDTH_IN, finish_panel, panel_grid
@@ -213,11 +214,13 @@ def main(argv: list[str] | None = None) -> str:
         merged.append(merge(drives[-1], config) if has_poses else MapElements.from_polylines())
         spent_s += time.process_time() - start_s
         for path in write_map(args.out / file_name(scene), args, ann, drives[-1], merged[-1]):
-            print(f"{len(merged[-1])} elements of {len(drives[-1].frames)} frames: {path}")
+            seen = counted(len(drives[-1].frames), "frame")
+            print(f"{counted(len(merged[-1]), 'element')} of {seen}: {path}")
     if has_truth(ann):
         score(drives, merged, ann, args.out)
     frames = sum(len(drive.frames) for drive in drives)
-    return f"{len(drives)} drives, {frames} frames, merged in {spent_s:.1f} s of processor time"
+    done = f"{counted(len(drives), 'drive')}, {counted(frames, 'frame')}"
+    return f"{done}, merged in {spent_s:.1f} s of processor time"
 
 
 if __name__ == "__main__":

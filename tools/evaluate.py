@@ -42,6 +42,7 @@ from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.faults import nearest
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest, digest_of_common, read_shard
+from gsmap.utils.words import counted
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -109,6 +110,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--pr-curves", type=output_file, help="draw PR curves and calibration")
     add_shard_options(parser)
     args = parser.parse_args(argv)
+    if args.results and args.results.suffix == ".arrow":
+        parser.error(f"{args.results} holds ground truth: name the result file before it")
     if (args.results is None) == (args.prior is None):
         parser.error("name either a result file or --prior")
     if args.hard and args.thresholds:
@@ -174,7 +177,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
     notes = pairs.notes(evaluator.counts_heights)
     source += digest(args.ground_truth)
     path = write_matches(args.out, args.shard, matches, notes, evaluator, source)
-    return f"{len(matches)} samples matched: {path}"
+    return f"{counted(len(matches), 'sample')} matched: {path}"
 
 
 def main(argv: list[str] | None = None) -> str:
@@ -194,7 +197,7 @@ def main(argv: list[str] | None = None) -> str:
     report(outcome, args)
     first = outcome[0][0]
     number = int(first.metrics[f"{first.name}/num_samples"])
-    return f"{number} samples in {time.perf_counter() - start:.1f} s"
+    return f"{counted(number, 'sample')} in {time.perf_counter() - start:.1f} s"
 
 
 if __name__ == "__main__":

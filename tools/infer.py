@@ -25,6 +25,7 @@ from gsmap.utils.files import write_bytes
 from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
+from gsmap.utils.words import counted
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
 from mapdata.bag_topics import parse_topics
 from mapdata.calibration_check import (
@@ -151,7 +152,8 @@ def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
         print(f"calibration: {line}")
     if args.check_calibration:
         path = save_figure(calibration_figure(sample, source.frame, root), args.check_calibration)
-        print(f"{len(warnings)} warnings; the ground plane as the cameras should see it: {path}")
+        found = counted(len(warnings), "warning")
+        print(f"{found}; the ground plane as the cameras should see it: {path}")
     return warnings
 
 
@@ -190,7 +192,7 @@ def predict(
     tokens, broken = dataset.annotations.column("token"), {}
     with Progress(total=len(chosen), unit="samples", smoothing=0.05) as bar:
         if results and results.done:
-            bar.write(f"going on after {len(results.done)} of {len(chosen)} samples")
+            bar.write(f"going on after {len(results.done)} of {counted(len(chosen), 'sample')}")
             broken.update(results.broken)
             bar.update(len(results.done))
             chosen = [index for index in chosen if tokens[index] not in results.done]
@@ -271,7 +273,7 @@ def report(
     """Say what was written, and leave with `SKIPPED` if frames were broken."""
     out = args.out and args.shard.path_of(args.out)
     where = " and ".join(str(path) for path in (out, args.show_dir) if path)
-    print(f"{count - len(broken)} of {count} samples predicted: {where}")
+    print(f"{count - len(broken)} of {counted(count, 'sample')} predicted: {where}")
     if args.out and not isinstance(source.samples, AnnotationFile):
         annotations = args.out.with_suffix(".arrow")
         write_bytes(annotations, Path(ann_file).read_bytes())

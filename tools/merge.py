@@ -16,6 +16,7 @@ from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.evaluation.results_json import merge_results
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.shards import ShardFile, find_shards
+from gsmap.utils.words import counted
 
 
 def merge_matches(path: Path, shards: list[ShardFile]) -> int:
@@ -42,7 +43,7 @@ def main(argv: list[str] | None = None) -> str:
         if kind not in MERGE:
             raise ValueError(f"{shards[0].path} holds {kind!r}, of which no whole is made.")
         count = MERGE[kind](target, shards)
-        lines.append(f"{target}: {count} samples of {len(shards)} shards")
+        lines.append(f"{target}: {counted(count, 'sample')} of {counted(len(shards), 'shard')}")
     return "\n".join(lines)
 
 

@@ -59,12 +59,15 @@ def writes_alone(work_dir: str) -> AbstractContextManager:
 
 def main() -> None:
     args = parse_args()
+    import torch
     from mmdet3d.registry import RUNNERS
 
     from gsmap.checkpoints.building import building
     from gsmap.engine.launch import load_config
     from gsmap.engine.run_log import MapRunner
 
+    if args.amp and not torch.cuda.is_available():
+        raise ValueError("--amp trains on a GPU, and this machine has none: leave it out.")
     cfg = load_config(args)
     if args.amp:
         cfg.optim_wrapper.type = "AmpOptimWrapper"

@@ -26,4 +26,5 @@ visualizer = dict(type='MapVisualizer', name='visualizer', vis_backends=vis_back
 log_processor = dict(type='MapLogProcessor', window_size=50, by_epoch=True)
 log_level = 'INFO'
 load_from = None
+randomness = dict(seed=0)  # the log says it; None: another one each time
 resume = False

@@ -127,7 +127,7 @@ def test_missing_and_unknown_samples_are_an_error_unless_allowed(tmp_path):
     results, truth = tmp_path / "results.json", tmp_path / "truth.json"
     write_results(results, results_of(3))
     write_results(truth, truth_of(4)[1:], key="GTs")
-    with pytest.raises(ValueError, match=r"1 samples have no results, such as 't3'.*'t0'"):
+    with pytest.raises(ValueError, match=r"1 sample has no results, such as 't3'.*'t0'"):
         evaluate_files(results, truth, EVALUATOR)
     reports, notes = evaluate_files(results, truth, EVALUATOR, allow_mismatch=True)
     assert reports[0].metrics["chamfer/divider/recall@0.5"] == pytest.approx(2 / 3)

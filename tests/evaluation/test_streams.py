@@ -54,7 +54,7 @@ def test_samples_that_lack_a_partner_are_counted_wherever_they_lie(files, tmp_pa
 
     some = rewritten(results, "results", tmp_path / "a.json", change)
     left = CHUNK + 1
-    with pytest.raises(ValueError, match=f"^{COUNT - left} samples have no results.*1 results"):
+    with pytest.raises(ValueError, match=f"^{COUNT - left} samples have no results.*1 result has"):
         evaluate_files(some, truth, EVALUATOR)
     pairs = SamplePairs(some, truth, CLASSES, allow_mismatch=True)
     found = {token: (len(predictions), len(true)) for token, predictions, true in pairs}

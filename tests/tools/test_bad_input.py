@@ -74,6 +74,7 @@ infer: VAL --model C K --out out.json --cfg-options visualizer.widht_px=3 | has 
 train: nowhere.py | There is no config file nowhere.py
 train: C --work-dir plain.txt | plain.txt
 train: C --work-dir w --cfg-options load_from=nowhere.pth | There is no checkpoint nowhere.pth
+train: C --work-dir w --amp | --amp trains on a GPU, and this machine has none
 train: C --work-dir w --resume nowhere.pth | There is no checkpoint nowhere.pth
 train: C --work-dir w --cfg-options train_dataloader.batch_sise=2 | has no setting 'batch_sise'; did you mean 'batch_size'?
 train: C --work-dir w --cfg-options train_cfg.max_epoch=2 | has no setting 'max_epoch'; did you mean 'max_epochs'?
@@ -103,6 +104,7 @@ evaluate: nothing.json VAL --shard / --out out.json | expected I/N with I from 0
 evaluate: nowhere.json VAL | No such file or directory: 'nowhere.json'; check the path.
 evaluate: damaged.json VAL | damaged.json is empty or holds no complete list
 evaluate: list.json VAL | list.json is empty or holds no complete list
+evaluate: VAL nothing.json | holds ground truth: name the result file before it
 evaluate: nothing.json VAL | 2 samples have no results
 evaluate: nothing.json damaged.arrow | damaged.arrow is not a whole annotation file
 evaluate: nothing.json VAL --classes a | has the classes

@@ -37,7 +37,7 @@ def test_ground_truth_as_predictions_scores_1(files, tmp_path, capsys):
     results, ann = files
     formats = ["--formats", "geojson", "png"]
     report = main([str(results), "--ann", str(ann), "--out", str(tmp_path), *formats])
-    assert re.fullmatch(r"1 drives, \d+ frames, merged in \d\.\d s of processor time", report)
+    assert re.fullmatch(r"1 drive, \d+ frames, merged in \d\.\d s of processor time", report)
     scores = json.loads((tmp_path / "scores.json").read_text())
     assert scores["merged"]["AP"]["mean"] == pytest.approx(1.0)
     assert scores["merged"]["completeness@0.5"]["mean"] > 0.99

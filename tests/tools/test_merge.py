@@ -251,5 +251,5 @@ def test_what_a_shard_s_part_lacks_or_nobody_knows_is_an_error(scored, tmp_path)
     with pytest.raises(ValueError, match=r"^1 results have no ground truth, such as 'x'"):
         evaluate(words)
     write_results(results, [(f"t{i}", []) for i in range(4)])
-    with pytest.raises(ValueError, match=r"^1 samples have no results, such as 't4'"):
+    with pytest.raises(ValueError, match=r"^1 sample has no results, such as 't4'"):
         evaluate(words)

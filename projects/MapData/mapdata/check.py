@@ -14,6 +14,7 @@ from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
+from gsmap.utils.words import counted
 from mapdata.command_line import add_workers_option
 
 _SHOWN = 10
@@ -68,7 +69,7 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
     for path in paths:
         file = _open(path)
         mark = "checksum right" if file.sealed else "no checksum, as it is of an earlier version"
-        lines.append(f"{path}: {len(file)} samples, values right, {mark}")
+        lines.append(f"{path}: {counted(len(file), 'sample')}, values right, {mark}")
         if root is not None:
             samples = Progress(file, desc=path.name, unit="samples")
             found = ordered_map(partial(_broken_files, root=root), samples, workers)

@@ -15,6 +15,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.utils.cli import output_file
 from gsmap.utils.files import atomic_write
+from gsmap.utils.words import counted
 
 _DECIMALS = 6
 
@@ -90,4 +91,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> str:
     """Export as the command line asks and say how much was written."""
     count = write_vectors(arguments.annotations, arguments.target)
-    return f"{count} samples written to {arguments.target}"
+    return f"{counted(count, 'sample')} written to {arguments.target}"

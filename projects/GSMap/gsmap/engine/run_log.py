@@ -16,6 +16,7 @@ from torch import nn
 
 from gsmap.engine.launch import newest_checkpoint, rank_timeout_s
 from gsmap.engine.rank_watch import RankWatch
+from gsmap.utils.words import counted
 
 # How mmengine's long records begin, and those that say nothing about the run
 _DUMPS = (
@@ -135,7 +136,7 @@ def _data(runner: Runner) -> dict[str, str]:
     for name, loader in loaders.items():
         dataset = innermost(loader.dataset)
         file = getattr(dataset, "ann_file", type(dataset).__name__)
-        lines[name] = f"{len(loader.dataset)} samples of {file}"
+        lines[name] = f"{counted(len(loader.dataset), 'sample')} of {file}"
     if not hasattr(dataset, "sample"):
         return lines
     cameras = dataset.sample(0).cameras
@@ -152,9 +153,11 @@ def _length(runner: Runner) -> str:
     """Say how long the run is and how often it is validated."""
     loop, loader = runner.train_loop, runner.train_dataloader
     by_epoch = isinstance(loop, EpochBasedTrainLoop)
-    text = f"{loop.max_epochs} epochs of {len(loader)}" if by_epoch else str(loop.max_iters)
-    unit = "epochs" if by_epoch else "iterations"
+    text = f"{counted(loop.max_epochs, 'epoch')} of " if by_epoch else ""
+    iterations = len(loader) if by_epoch else loop.max_iters
+    unit = "epoch" if by_epoch else "iteration"
     return (
-        f"{text} iterations, {loader.batch_size} samples x {runner.world_size} processes each; "
-        f"validation every {loop.val_interval} {unit}"
+        f"{text}{counted(iterations, 'iteration')}, {counted(loader.batch_size, 'sample')} x "
+        f"{counted(runner.world_size, 'process')} each; validation every "
+        f"{counted(loop.val_interval, unit)}"
     )

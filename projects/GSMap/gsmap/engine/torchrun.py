@@ -25,8 +25,9 @@ def reason(error: ChildFailedError) -> tuple[str, int]:
         said, code = f"was killed ({kill.name}{hint})", 128 + kill
     else:
         said, code = f"ended with {failure.exitcode} (its own words stand above)", failure.exitcode
-    text = f"rank {rank} {said}, so the run was stopped; --resume goes on from its last checkpoint."
-    return text, code
+    trains = any(word.endswith("train.py") for word in sys.argv)
+    remedy = "; --resume goes on from its last checkpoint" if trains else ""
+    return f"rank {rank} {said}, so the run was stopped{remedy}.", code
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard
+from gsmap.utils.words import counted
 
 CHUNK = 64  # samples per task: large enough to hide the hand-over, small enough to share evenly
 Evaluation = tuple[list[MetricReport], list[str]]
@@ -99,13 +100,14 @@ def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bo
         ValueError: If the tokens differ and that is not ``allowed``.
     """
     notes = []
-    for these, others, what, treatment in (
-        (truth, results, "samples have no results", "counted as without predictions"),
-        (results, truth, "results have no ground truth", "left out"),
+    for these, others, what, lack, treatment in (
+        (truth, results, "sample", "no results", "counted as without predictions"),
+        (results, truth, "result", "no ground truth", "left out"),
     ):
         alone = [token for token in these if token not in others]
         if alone:
-            said = f"{len(alone)} {what}, such as {alone[0]!r}"
+            verb = "has" if len(alone) == 1 else "have"
+            said = f"{counted(len(alone), what)} {verb} {lack}, such as {alone[0]!r}"
             notes.append(f"{said}: {treatment}" if allowed else said)
     if notes and not allowed:
         raise ValueError(

@@ -27,6 +27,8 @@ from mapdata.argoverse2.log import (
 from mapdata.argoverse2.map import Argoverse2Map, check_rules, find_map
 from mapdata.command_line import FileOptions
 
+_NEEDS_NONE = "`create_data.py av2 --at poses:10` needs none"
+
 
 @dataclass(frozen=True)
 class Argoverse2Options(FileOptions):
@@ -130,12 +132,12 @@ def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
     missing = [name for name in RING_CAMERAS if name not in log.calibration]
     if missing:
         which = ", ".join(missing) if log.calibration else "the ring cameras"
-        raise ValueError(f"no calibration of {which} (--at poses:10 needs none)")
+        raise ValueError(f"no calibration of {which} ({_NEEDS_NONE})")
     times, kind = log.lidar_timestamps_ns, "LiDAR sweeps"
     if options.at == "cameras" or (options.at == "auto" and len(times) == 0):
         times, kind = log.image_timestamps_ns[RING_CAMERAS[0]], f"images of {RING_CAMERAS[0]}"
     if len(times) == 0:
-        raise ValueError(f"no {kind} (--at poses:10 needs neither sweeps nor images)")
+        raise ValueError(f"no {kind} ({_NEEDS_NONE})")
     return thin_out(times, options.rate_hz)
 
 

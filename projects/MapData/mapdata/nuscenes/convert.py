@@ -90,8 +90,8 @@ def _splits(
     with naming(own, "list each scene in one split"):
         split_of, missing = resolve_scenes(wanted, names)
     if missing:
-        total = len(missing) + len(split_of)
-        summary.notes.append(f"{len(missing)} of the splits' {total} scenes are not in the tables.")
+        known = f"{len(split_of)} of the {len(missing) + len(split_of)} scenes of the splits"
+        summary.notes.append(f"{known} are in {options.root / options.version}, which has no more.")
     if not split_of:
         raise ValueError(
             f"none of the split's scenes is in {options.root / options.version}: it has "

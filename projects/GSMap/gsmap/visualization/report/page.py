@@ -17,6 +17,7 @@ from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import write_text
+from gsmap.utils.words import counted
 from gsmap.visualization.bev_view import display_extent
 from gsmap.visualization.report.frames import cameras_of, choose_frames, found_of, truth_of
 from gsmap.visualization.report.scores import MATCH_M, score_result
@@ -180,4 +181,4 @@ def write_page(path: str | Path, data: Mapping[str, Any]) -> str:
     """
     text = page_html(data)
     write_text(path, text)
-    return f"{len(data['frames'])} frames, {len(text) / 1e6:.1f} MB: {path}"
+    return f"{counted(len(data['frames']), 'frame')}, {len(text) / 1e6:.1f} MB: {path}"
