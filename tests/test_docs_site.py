@@ -45,9 +45,10 @@ def test_the_search_finds_what_a_user_would_type(site: Path, words: str):
 
 def test_the_front_page_has_the_picture_tiles_and_three_commands(site: Path):
     page = (site / "index.html").read_text(encoding="utf-8")
+    text = re.sub(r"<[^>]+>", "", page)
     assert 'src="images/minicity.jpg"' in page
     assert len(re.findall(r"<li>\s*<p><strong>", page)) >= 6
-    assert all(command in page for command in ("make demo", "tools/infer.py", "tools/evaluate.py"))
+    assert all(command in text for command in ("make demo", "tools/infer.py", "tools/evaluate.py"))
 
 
 def test_no_table_or_list_is_left_as_text(site: Path):
