@@ -10,7 +10,7 @@ from torch import Tensor
 from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.structures.grid import BEVGrid
 
-SOURCES = ("full", "points", "targets")
+SOURCES = ("full", "points")
 
 
 class ElementMasks:
@@ -24,8 +24,7 @@ class ElementMasks:
         line_width_m: Width of a line in the ground-truth mask, in metres.
         filled_classes: Classes whose ground-truth mask is filled; the others are bands.
         source: ``"full"``: the ground truth is drawn at full resolution; ``"points"``: by its P
-            points in the matched order (in matching, in the annotated one); ``"targets"``: the
-            masks that MakeInstanceMasks has drawn in the pipeline.
+            points in the matched order (in matching, in the annotated one).
 
     Raises:
         ValueError: If ``source`` is unknown, or the pixels do not divide the map.
@@ -70,13 +69,6 @@ class ElementMasks:
         """Draw a sample's ground truth, before its matching is known. (K, H, W)"""
         if self.source == "points":
             return self.draw(gt_instances.pts, gt_instances.labels_3d, grid)
-        if self.source == "targets":
-            if "masks" not in gt_instances:
-                raise ValueError(
-                    "masks of source 'targets' need gt_instances_3d.masks: add MakeInstanceMasks "
-                    "to the training pipeline, behind FormatMapTargets."
-                )
-            return gt_instances.masks
         if "polylines" not in gt_instances:
             raise ValueError(
                 "masks of source 'full' need gt_instances_3d.polylines: make the targets with "
