@@ -85,7 +85,7 @@ def check_neck(golden: Golden, name: str) -> Iterator[Row]:
     def keep(key: str, module: nn.Module) -> None:
         module.register_forward_hook(lambda _, __, out: seen.__setitem__(key, out.detach()))
 
-    keep("stem", neck.stem[1])
+    keep("stem", neck.stem[0])
     for number, stage in enumerate(neck.stages, 1):
         keep(f"layer{number}", stage)
     keep("block_out_layer2_0", neck.stages[1][0])
@@ -312,7 +312,9 @@ def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     losses = head.loss_by_feat(outputs, gts, [{}] * B)
     pairs = SimpleNamespace(
         predictions=outputs[-1],
-        truths=SimpleNamespace(samples=[SimpleNamespace(masks=own) for own in parts_drawn]),
+        truths=SimpleNamespace(
+            samples=[SimpleNamespace(pipeline_masks=own) for own in parts_drawn]
+        ),
     )
     losses["loss_seg"] = segmentation_loss(pairs)
     for key in ("cls", "pts", "dir", "ins"):

@@ -10,5 +10,4 @@ _mgmap = dict(
             dict(type='DirectionLoss', loss_weight=0.005),
             dict(type='QueryMaskLoss', loss_weight=1.0, dice_weight=2.0),
             dict(type='ForegroundLoss', loss_weight=1.0, dice_weight=15.0, pos_weight=4.0),
-        ],
-        masks=dict(source='targets')))
+        ]))

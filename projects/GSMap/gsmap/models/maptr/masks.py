@@ -13,7 +13,7 @@ from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.structures.gaussians import gaussians_along
 from gsmap.structures.grid import BEVGrid
 
-SOURCES = ("full", "points", "gaussians", "targets")
+SOURCES = ("full", "points", "gaussians")
 
 
 class ElementMasks:
@@ -29,8 +29,7 @@ class ElementMasks:
         source: ``"full"``: the ground truth is drawn at full resolution; ``"points"``: by its P
             points in the matched order (in matching, in the annotated one); ``"gaussians"``: as
             ``"points"``, by Gaussians along them (GSMap Eq. 6), whose mask has the line's width in
-            mass, so that a prediction can equal it; ``"targets"``: the masks that
-            MakeInstanceMasks has drawn in the pipeline.
+            mass, so that a prediction can equal it.
 
     Raises:
         ValueError: If ``source`` is unknown, or the pixels do not divide the map.
@@ -83,13 +82,6 @@ class ElementMasks:
         """Draw a sample's ground truth, before its matching is known. (K, H, W)"""
         if self.of_points:
             return self.draw(gt_instances.pts, gt_instances.labels_3d, grid)
-        if self.source == "targets":
-            if "masks" not in gt_instances:
-                raise ValueError(
-                    "masks of source 'targets' need gt_instances_3d.masks: add MakeInstanceMasks "
-                    "to the training pipeline, behind FormatMapTargets."
-                )
-            return gt_instances.masks
         if "polylines" not in gt_instances:
             raise ValueError(
                 "masks of source 'full' need gt_instances_3d.polylines: make the targets with "

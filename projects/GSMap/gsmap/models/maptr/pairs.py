@@ -105,6 +105,16 @@ class SampleTruth:
         return self._drawing.draw_sample(self._instances, self._drawing.grid)
 
     @cached_property
+    def pipeline_masks(self) -> Tensor:
+        """Masks that the pipeline drew; ValueError if it did not. (K, H, W)"""
+        if "masks" not in self._instances:
+            raise ValueError(
+                "a loss needs gt_instances_3d.masks: add MakeInstanceMasks to the training "
+                "pipeline, behind FormatMapTargets, or remove the loss from the model."
+            )
+        return self._instances.masks
+
+    @cached_property
     def cost_masks(self) -> Tensor:
         """Coarser masks, for matching. (K, h, w)"""
         return self._drawing.draw_sample(self._instances, self._drawing.cost_grid)

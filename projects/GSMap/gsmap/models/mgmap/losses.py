@@ -37,16 +37,11 @@ class MGMapLoss(MapLoss):
         self.dice_weight = dice_weight
 
     def check(self, head: MapHead) -> None:
-        """Raise ValueError if the head has no such masks, or no ground truth of them."""
+        """Raise ValueError if the head has no such masks."""
         if not isinstance(head.decoder, MGMapDecoder):
             raise ValueError(
                 f"{type(self).__name__} needs the masks of MGMapDecoder, got "
                 f"{type(head.decoder).__name__}: leave the loss out, or set decoder.type."
-            )
-        if head.masks.source != "targets":
-            raise ValueError(
-                f"{type(self).__name__} needs masks of the pipeline, got masks.source="
-                f"{head.masks.source!r}: set it to 'targets', and add MakeInstanceMasks."
             )
 
 
@@ -83,7 +78,8 @@ class QueryMaskLoss(MGMapLoss):
         """Return the weighted loss."""
         logits = cast(MaskedDecoded, pairs.predictions.decoded).mask_logits.float()
         own = pairs.of_queries(logits)  # (M, H, W)
-        masks = pairs.gt_masks.to(own)
+        drawn = torch.cat([sample.pipeline_masks for sample in pairs.truths.samples])
+        masks = pairs.of_truths(drawn).to(own)
         check_same_shape(logits=own, gt_masks=masks)
         targets = torch.zeros_like(logits)
         targets[pairs.samples, pairs.query_inds] = masks
@@ -120,7 +116,9 @@ class ForegroundLoss(MGMapLoss):
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Return the weighted loss."""
         logits = cast(RefinedDecoded, pairs.predictions.decoded).segmentation.float()
-        drawn = torch.stack([sample.masks.bool().any(0) for sample in pairs.truths.samples])
+        drawn = torch.stack(
+            [sample.pipeline_masks.bool().any(0) for sample in pairs.truths.samples]
+        )
         targets = torch.stack([drawn, ~drawn], 1).to(logits)  # (B, 2, H, W)
         check_same_shape(logits=logits, gt_masks=targets)
         weight = logits.new_tensor(self.pos_weight)
