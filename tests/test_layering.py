@@ -49,8 +49,16 @@ MODELS = {
     "gemap": {"maptr", "encoders"},
     "mgmapnet": {"maptr", "encoders", "maptrv2"},  # its mask heads are MapTRv2's
     "gsmap": {"maptr", "encoders"},
+    "pivotnet": {"maptr", "encoders"},
 }
-METHODS = ("maptrv2", "mapvr", "gemap", "mgmapnet", "gsmap")  # what others are built on stays
+METHODS = (
+    "maptrv2",
+    "mapvr",
+    "gemap",
+    "mgmapnet",
+    "gsmap",
+    "pivotnet",
+)  # what others are built on stays
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 
 

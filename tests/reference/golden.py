@@ -104,8 +104,12 @@ class Golden:
         """Return the upstream state that the recipe makes for a state list."""
         if name.startswith("pivotnet"):
             shapes = self.state_shapes(name)
-            made = {key: self.pivotnet.tensor(key, shape, self.seed) for key, shape in shapes.items()}
-            return {k: PIVOTNET.unused[k] if v is None else torch.from_numpy(v) for k, v in made.items()}
+            made = {
+                key: self.pivotnet.tensor(key, shape, self.seed) for key, shape in shapes.items()
+            }
+            return {
+                k: PIVOTNET.unused[k] if v is None else torch.from_numpy(v) for k, v in made.items()
+            }
         recipe = self.mgmapnet if name.startswith("mgmapnet") else self.weights
         arrays = recipe.state(self.state_shapes(name), self.seed)
         return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}

@@ -113,7 +113,12 @@ def check_matching(golden: Golden, name: str) -> Iterator[Row]:
     for weight in (0, 5):
         ours = sequence_costs(batch[None], data["batch_lens"], weight)[0]
         wanted = data[f"batch_cost_endpoints{weight}"]
-        yield Row(name, f"lines without a path, ends + {weight}", (np.isinf(ours) ^ np.isinf(wanted)).sum(), 0)
+        yield Row(
+            name,
+            f"lines without a path, ends + {weight}",
+            (np.isinf(ours) ^ np.isinf(wanted)).sum(),
+            0,
+        )
         finite = np.isfinite(wanted)
         off = max(off, largest_relative(ours[finite], wanted[finite]))
     yield Row(name, "costs (relative)", off, 1e-6)
@@ -141,15 +146,31 @@ def check_pivots(golden: Golden, name: str) -> Iterator[Row]:
         off = largest_difference(labels, data[f"{tag}_lines_kept_pivot_types"])
         yield Row(name, f"{tag}: classes of lines", off, 0)
         pixels = [(line * (400, 200))[:, ::-1] for _, line in parts]
-        off = max(largest_difference(p, data[f"{tag}_map_pivot_input{i}"]) for i, p in enumerate(pixels))
+        off = max(
+            largest_difference(p, data[f"{tag}_map_pivot_input{i}"]) for i, p in enumerate(pixels)
+        )
         yield Row(name, f"{tag}: lines (pixels)", off, 1e-4)
-        pivots = [thick.pivots(line * (60, 30), thick.num_points[label]) / (60, 30) for label, line in parts]
+        pivots = [
+            thick.pivots(line * (60, 30), thick.num_points[label]) / (60, 30)
+            for label, line in parts
+        ]
         for label in range(3):
             own = [line for line, kind in zip(pivots, labels, strict=True) if kind == label]
             numbers = [len(line) for line in own]
-            yield Row(name, f"{tag}: numbers of pivots {label}", largest_difference(numbers, data[f"{tag}_lengths{label}"]), 0)
+            yield Row(
+                name,
+                f"{tag}: numbers of pivots {label}",
+                largest_difference(numbers, data[f"{tag}_lengths{label}"]),
+                0,
+            )
             wanted = data[f"{tag}_pivots{label}"]
-            off = max((largest_difference(line, row[: len(line)]) for line, row in zip(own, wanted, strict=True)), default=0)
+            off = max(
+                (
+                    largest_difference(line, row[: len(line)])
+                    for line, row in zip(own, wanted, strict=True)
+                ),
+                default=0,
+            )
             yield Row(name, f"{tag}: pivots {label}", off, 1e-9)
         masks = thick.masks(parts, pivots, (400, 200))
         drawn = np.zeros((3, 400, 200), int)
@@ -272,7 +293,9 @@ def check_head(golden: Golden, name: str) -> Iterator[Row]:
     scalar = torch.zeros(())
     for label, kind in enumerate(CLASSES):
         own = [output.lines[label] for output in outputs]
-        points, logits = (torch.stack([getattr(o, f) for o in own]) for f in ("points", "point_logits"))
+        points, logits = (
+            torch.stack([getattr(o, f) for o in own]) for f in ("points", "point_logits")
+        )
         ours = {
             f"points_{kind}": (points, 3e-5),
             f"point_logits_{kind}": (logits, 3e-4),
@@ -285,9 +308,13 @@ def check_head(golden: Golden, name: str) -> Iterator[Row]:
             scalar = scalar + (value * weight).sum()
     levels = [normal(golden, f"pv_bev_level{i}", (B, C, *BEV)) for i in range(3)]
     with torch.no_grad():
-        masks = torch.stack([head.class_masks(turned(level, head.grid)) for level in (*levels, bev)])
+        masks = torch.stack(
+            [head.class_masks(turned(level, head.grid)) for level in (*levels, bev)]
+        )
     for label, kind in enumerate(CLASSES):
-        off = largest_difference(masks[:, :, label, ::5, ::5], data[f"sem_mask_{kind}_sub"][:, :, 1])
+        off = largest_difference(
+            masks[:, :, label, ::5, ::5], data[f"sem_mask_{kind}_sub"][:, :, 1]
+        )
         yield Row(name, f"class masks of {kind}", off, 3e-4)
     scalar.backward()
     yield Row(name, "scalar (relative)", largest_relative(scalar.detach(), data["scalar"]), 1e-4)
@@ -468,7 +495,10 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     images = golden.pivotnet.images(*size, len(CAMERAS), golden.seed)
     order = [golden.cameras["camera_order"].index(f"CAM_{camera}") for camera in CAMERAS]
     feats = model.extract_img_feats(torch.from_numpy(images[order])[None])
-    subsets = {"feat16_sub": feats[0][0][:, ::32, ::3, ::4], "feat32_sub": feats[1][0][:, ::32, ::2, ::2]}
+    subsets = {
+        "feat16_sub": feats[0][0][:, ::32, ::3, ::4],
+        "feat32_sub": feats[1][0][:, ::32, ::2, ::2],
+    }
     encoder, head = model.bev_encoder, model.map_head
     subsets["memory_sub"] = encoder.sources(feats).tokens[0, ::20, ::8]
     bev = encoder.encode(feats, {"img_from_ground": ground_matrices(golden, size)}, size)
@@ -493,7 +523,10 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
         ours = {
             f"point_logits_{kind}": (own[-1].point_logits, data[f"point_logits_{kind}"]),
             f"ins_mask_{kind}_sub": (enlarged, data[f"ins_mask_{kind}_sub"]),
-            f"class masks of {kind}": (masks[:, label, ::20, ::10], data[f"sem_mask_{kind}_sub"][:, 1]),
+            f"class masks of {kind}": (
+                masks[:, label, ::20, ::10],
+                data[f"sem_mask_{kind}_sub"][:, 1],
+            ),
         }
         for key, (value, wanted) in ours.items():
             yield Row(name, key, largest_difference(value, wanted), 3e-4)

@@ -51,6 +51,10 @@ FILES = [
     "mgmapnet_decoder_*.npz",
     "mgmapnet_losses_*.npz",
     "mgmapnet_forward_reduced_*.npz",
+    *(f"pivotnet_{part}_*.npz" for part in ("pivots", "matching", "decoder", "head", "losses")),
+    "pivotnet_projection_*.npz",
+    "pivotnet_forward_reduced_*.npz",
+    "pivotnet_state.json",
 ]
 
 

@@ -20,7 +20,9 @@ def _polylines(instances: Any) -> Any:
     points = _array(instances["pts"])
     if "num_pts" not in instances:
         return points
-    return [line[:number] for line, number in zip(points, _array(instances["num_pts"]), strict=True)]
+    return [
+        line[:number] for line, number in zip(points, _array(instances["num_pts"]), strict=True)
+    ]
 
 
 def elements_of_instances(instances: Sequence[MapInstance]) -> MapElements:

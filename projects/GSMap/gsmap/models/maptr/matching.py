@@ -72,9 +72,7 @@ class MapAssigner:
         return MapMatch(queries, gts, offsets.abs().sum((-1, -2)).argmin(-1))
 
 
-def check_finite(
-    values: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None
-) -> None:
+def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None) -> None:
     """Refuse values that the assignment cannot order; one name for each of the first axis."""
     finite = values.isfinite().flatten(1).all(1)
     if not finite.all():

@@ -212,9 +212,7 @@ class PivotBEVEncoder(CameraEncoder):
         learned = self.unseen_reference(self.bev_pos.weight).sigmoid()
         return torch.where(seen[..., None], uv, learned)
 
-    def project(
-        self, img_from_ground: Tensor, img_shape: tuple[int, int]
-    ) -> tuple[Tensor, Tensor]:
+    def project(self, img_from_ground: Tensor, img_shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Return each cell's centre in its camera, [0, 1] over all, and whether that sees it.
 
         (B, H * W, 2), (B, H * W)
@@ -226,7 +224,10 @@ class PivotBEVEncoder(CameraEncoder):
         # the third row of a matrix to pixels gives the depth
         along = torch.einsum("bvd,qd->bvq", img_from_ground[:, :, 2].float(), points)
         if self.camera_by == "angle":
-            matrix, shift = img_from_ground[..., :3, :3].float(), img_from_ground[..., :3, 3:].float()
+            matrix, shift = (
+                img_from_ground[..., :3, :3].float(),
+                img_from_ground[..., :3, 3:].float(),
+            )
             cameras = -torch.linalg.solve(matrix, shift)[..., 0]  # where they stand (B, V, 3)
             along = along / torch.cdist(cameras, points[None, :, :3].expand(len(cameras), -1, -1))
         camera = along.argmax(1, keepdim=True)  # (B, 1, Q)

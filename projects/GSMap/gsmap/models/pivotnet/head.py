@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -30,7 +31,7 @@ class PivotReference:
     grid: BEVGrid
     outputs = ("pts", "num_pts")
     space = None
-    metainfo: Mapping[str, Any] = None
+    metainfo = MappingProxyType({})
 
     def decode(self, references: Tensor) -> Tensors:
         """Keep the pivots of every line, those of positive logit, in order.

@@ -74,7 +74,8 @@ class PivotLosses:
             [
                 -self.cls * lines.logits.softmax(-1)[:, LINE, None].expand_as(masks).cpu(),
                 self.mask * masks.cpu(),
-                self.pivots * torch.from_numpy(sequence_costs(differences, numbers, self.end_weight)),
+                self.pivots
+                * torch.from_numpy(sequence_costs(differences, numbers, self.end_weight)),
             ]
         ).detach()
         check_finite(parts, ["class scores", "masks", "pivots"], {"token": token})
@@ -110,7 +111,9 @@ class PivotLosses:
         losses = {name: getattr(self, name) * value / number for name, value in sums.items()}
         weight = logits.new_tensor([1.0, self.none_weight])
         losses["cls"] = self.cls * F.cross_entropy(logits, torch.cat(labels), weight)
-        point_logits, is_pivot = (torch.cat(parts).flatten(0, 1) for parts in zip(*kinds, strict=True))
+        point_logits, is_pivot = (
+            torch.cat(parts).flatten(0, 1) for parts in zip(*kinds, strict=True)
+        )
         weight = logits.new_tensor([self.between_weight, 1.0])
         point_cls = F.cross_entropy(point_logits, is_pivot, weight) if len(is_pivot) else zero
         divisor = number if self.point_cls_per_line else 1

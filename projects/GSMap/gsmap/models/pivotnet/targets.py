@@ -197,7 +197,9 @@ class FormatPivotTargets(BaseTransform):
         """Draw lines in pixels; a later line of the same label hides an earlier one."""
         masks = np.zeros((len(lines), *size), np.uint8)
         for i, line in enumerate(lines):
-            cv2.polylines(masks[i], [line[:, ::-1].astype(np.int32)], False, (1,), self.thickness_px)
+            cv2.polylines(
+                masks[i], [line[:, ::-1].astype(np.int32)], False, (1,), self.thickness_px
+            )
             if labels is not None:
                 earlier = np.flatnonzero(labels[:i] == labels[i])
                 masks[earlier] &= ~masks[i] & 1
