@@ -485,7 +485,7 @@ def decoded_rows(
 @check("pivotnet_forward_reduced_{variant}.npz")
 @torch.no_grad()
 def check_forward(golden: Golden, name: str) -> Iterator[Row]:
-    """Compare the way from the images to the lines; images are resized, the map is the vehicle's."""
+    """Compare the way from resized images to the lines, in the frame of the vehicle."""
     data, size = golden.read_arrays(name), (192, 320)
     model = build(
         golden,

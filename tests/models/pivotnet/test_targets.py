@@ -1,4 +1,4 @@
-"""Pivots of the ground truth, by hand, and what the transform refuses; grids seen from the front."""
+"""Pivots of the ground truth by hand, and what the transform refuses."""
 
 import numpy as np
 import pytest

@@ -30,8 +30,9 @@ class CameraEncoder(BaseModule):
     ) -> dict[str, Any]:
         """Return ``bev_feats`` (B, C, H, W), row 0 at the smallest y, and what else `encode` does.
 
-        Image features are a list of (B, V, C, h, w). Samples have ``batch_input_shape`` and what the calibration is read from; ValueError if one lacks a field
-        or has another number of cameras.
+        Image features are a list of (B, V, C, h, w). Samples have ``batch_input_shape`` and what
+        the calibration is read from; ValueError if one lacks a field or has another number of
+        cameras.
         """
         calibration = stack_calibration(img_metas, self.calibration, mlvl_feats[0].device)
         feats = self.levels_of(mlvl_feats)
@@ -44,7 +45,7 @@ class CameraEncoder(BaseModule):
     def encode(
         self, feats: Any, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode features (B, V, C, h, w), or what `levels_of` returns, with the calibration as tensors (B, ...).
+        """Encode what `levels_of` returns, with the calibration as tensors (B, ...).
 
         ``img_shape`` are rows and columns of the padded images.
         """
