@@ -16,6 +16,8 @@ from torch import nn
 import gsmap.registered  # noqa: F401
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.raster_ap import MIN_SCORE, RasterConfig
+from gsmap.models.pivotnet.losses import PivotLosses
+from gsmap.models.pivotnet.targets import FormatPivotTargets
 from gsmap.structures.grid import BEVGrid
 
 REPO = Path(__file__).resolve().parents[1]
@@ -121,6 +123,22 @@ CONFIGS: dict[str, dict[str, Any]] = {
             "size": (200, 100),
             "mirrored": True,
         },
+    },
+    "pivotnet/pivotnet_r50_30e.py": {
+        **NUSCENES,
+        "optim_wrapper.optimizer": {"type": "AdamW", "lr": 2e-4, "weight_decay": 0.01},
+        "optim_wrapper.paramwise_cfg.custom_keys.img_backbone.lr_mult": 0.25,
+        "param_scheduler.0.milestones": [21, 27],
+        "param_scheduler.0.gamma": 0.2,
+        "train_cfg.max_epochs": 30,
+        "train_dataloader.batch_size": 1,
+        "auto_scale_lr.base_batch_size": 8,
+        "model.data_preprocessor.bgr_to_rgb": False,
+        "model.map_head.queries": ((20, 10), (25, 2), (15, 30)),
+    },
+    "pivotnet/pivotnet_r50_110e.py": {
+        "train_cfg.max_epochs": 110,
+        "param_scheduler.0.milestones": [77, 99],
     },
     f"{GSMAP}gsmap_maptr_r50_24e.py": {**SCHEDULE, **NUSCENES, **CAMERAS},
     f"{GSMAP}gsmap_maptr_r50_110e.py": {**SCHEDULE, "train_cfg.max_epochs": 110},
@@ -287,6 +305,20 @@ def test_mapvr_renders_as_released():
         assert (renderer.line_softness, renderer.polygon_softness) == (2.0, 4.0)
         assert (renderer.polygon_classes, renderer.distance) == ((1,), "squared")
     assert all(part.p == 0 for part in head.modules() if isinstance(part, nn.Dropout))
+
+
+def test_pivotnet_weighs_as_released():
+    head = head_of("pivotnet/pivotnet_r50_30e.py")
+    assert head.losses == PivotLosses(2.0, 5.0, 30.0, 10.0, 2.0, 3.0, 5.0, 0.5, 0.2, True)
+    assert head.layer_weights == (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
+    assert head.level_weights == (0.4, 0.8, 1.6, 2.4)
+    assert head.mask_size == (400, 200)
+    targets = FormatPivotTargets()
+    assert (targets.num_points, targets.edge_classes) == ((10, 2, 30), (1,))
+    assert (targets.pixel_m, targets.thickness_px) == (0.15, 8)
+    assert (targets.step_m, targets.min_area_m2) == (1.0, 2.0)
+    assert not targets.keep_end
+    assert not targets.sort_rings
 
 
 def test_detections_are_chosen_as_by_maptr():

@@ -254,7 +254,8 @@ def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
     packed = np.packbits(blocked[0][0, ::50].numpy().ravel())
     wrong = np.unpackbits(packed ^ data["attn_blocked0_packed"]).sum()
     yield Row(name, "blocked cells of the first layer", wrong, 0)
-    shares = torch.stack(blocked).float().mean(3)[..., ::120]
+    ends = [0, 199, 200, 249, 250, 699]  # the first and the last point of every class
+    shares = torch.stack(blocked).float().mean(3)[..., ends]
     off = largest_difference(shares, data["attn_blocked_fraction"])
     yield Row(name, "shares of blocked cells", off, 1e-3)
     scalar = sum(
@@ -481,3 +482,54 @@ def decoded_rows(
     found = np.concatenate([line[:number] for line, number in zip(points, numbers, strict=True)])
     off = largest_difference(found, data[f"{tag}_pivots"]) / max(size)
     yield Row(name, f"{tag}: pivots ([0, 1])", off, 1e-5 if tag == "post" else 1e-3)
+
+
+@check("pivotnet_forward_reduced_{variant}.npz")
+@torch.no_grad()
+def check_forward(golden: Golden, name: str) -> Iterator[Row]:
+    """Compare the way from resized images to the lines, in the frame of the vehicle."""
+    data, size = golden.read_arrays(name), (192, 320)
+    model = build(
+        golden,
+        grid={"x_range": (-30.0, 30.0), "y_range": (-15.0, 15.0)},
+        bev_encoder={"image_size": size},
+    )
+    images = golden.recipe("pivotnet").images(*size, len(CAMERAS), golden.seed)
+    order = [golden.cameras["camera_order"].index(f"CAM_{camera}") for camera in CAMERAS]
+    feats = model.extract_img_feats(torch.from_numpy(images[order])[None])
+    subsets = {
+        "feat16_sub": feats[0][0][:, ::32, ::3, ::4],
+        "feat32_sub": feats[1][0][:, ::32, ::2, ::2],
+    }
+    encoder, head = model.bev_encoder, model.map_head
+    subsets["memory_sub"] = encoder.sources(feats).tokens[0, ::20, ::8]
+    bev = encoder.encode(feats, {"img_from_ground": ground_matrices(golden, size)}, size)
+    levels = [turned(level, head.grid) for level in bev["bev_levels"]]
+    subsets["bev_sub"] = torch.cat(levels)[:, ::8, ::8, ::8]
+    for key, value in subsets.items():
+        yield Row(name, key, largest_difference(value, data[key]), 1e-4)
+    outputs = head(bev)
+    logits = torch.stack([torch.cat([own.logits for own in o.lines], 1) for o in outputs])
+    # one line of a layer may have a mask logit so near 0 that noise lets it see another cell
+    off = np.sort(np.abs(logits.numpy() - data["obj_logits"]).max((1, 3)), 1)  # (layers, lines)
+    yield Row(name, "obj_logits, but for one line of a layer", float(off[:, :-1].max()), 3e-4)
+    yield Row(name, "obj_logits", float(off.max()), 3e-2)
+    masks = head.class_masks(bev["bev_feats"])
+    for label, kind in enumerate(CLASSES):
+        own = [output.lines[label] for output in outputs]
+        points = torch.stack([own[0].points, own[-1].points])
+        off = np.abs(points.numpy() - data[f"points_{kind}"]).max((0, 1, 3, 4))
+        yield Row(name, f"points of {kind}, but for one line", float(np.sort(off)[:-1].max()), 3e-5)
+        yield Row(name, f"points of {kind}", float(off.max()), 3e-3)
+        enlarged = head.enlarged(own[-1].masks)[:, ::5, ::20, ::10]
+        ours = {
+            f"point_logits_{kind}": (own[-1].point_logits, data[f"point_logits_{kind}"]),
+            f"ins_mask_{kind}_sub": (enlarged, data[f"ins_mask_{kind}_sub"]),
+            f"class masks of {kind}": (
+                masks[:, label, ::20, ::10],
+                data[f"sem_mask_{kind}_sub"][:, 1],
+            ),
+        }
+        for key, (value, wanted) in ours.items():
+            yield Row(name, key, largest_difference(value, wanted), 3e-4)
+    yield from decoded_rows(name, head, outputs[-1], data, "dec", (400, 200))

@@ -71,6 +71,10 @@ FILES = [
     "streammapnet_stream_*.npz",
     "streammapnet_losses_*.npz",
     "streammapnet_forward_reduced_*.npz",
+    *(f"pivotnet_{part}_*.npz" for part in ("pivots", "matching", "decoder", "head", "losses")),
+    "pivotnet_projection_*.npz",
+    "pivotnet_forward_reduced_*.npz",
+    "pivotnet_state.json",
 ]
 
 

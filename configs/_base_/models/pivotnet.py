@@ -18,4 +18,4 @@ model = dict(
         style='pytorch',
         init_cfg=dict(type='Pretrained', checkpoint='torchvision://resnet50')),
     bev_encoder=dict(type='PivotBEVEncoder'),
-    map_head=dict(type='PivotHead', decoder=dict(num_layers=6)))
+    map_head=dict(type='PivotHead', queries=((20, 10), (25, 2), (15, 30)), decoder=dict(num_layers=6)))

@@ -36,8 +36,7 @@ class ExportedDetector(nn.Module):
             )
         self.model = model
         self.input_names = ("images", *model.bev_encoder.calibration)
-        shapes = ("scales", "rotations") if model.map_head.reference.space is not None else ()
-        self.output_names = ("scores", "labels", "points", *shapes)
+        self.output_names = ("scores", "labels", "points", *model.map_head.reference.outputs[1:])
 
     def forward(self, images: Tensor, *calibration: Tensor) -> tuple[Tensor, ...]:
         """Find the best map elements, wherever they lie.
@@ -49,11 +48,12 @@ class ExportedDetector(nn.Module):
 
         Returns:
             Scores (M,), labels (M,), points in metres (M, P, 2 or 3), and with Gaussians scales in
-            metres (M, P, 2) and rotations in radians (M, P); best first.
+            metres (M, P, 2) and rotations in radians (M, P), with PivotNet the number of points
+            that count (M,); best first.
         """
         # a tensor of four axes is normalised and padded image by image
         images = self.model.data_preprocessor({"inputs": {"img": images}})["inputs"]["imgs"]
-        (feats, *_) = self.model.extract_img_feats(images[None])
+        feats = self.model.bev_encoder.levels(self.model.extract_img_feats(images[None]))
         given = dict(zip(self.input_names[1:], calibration, strict=True))
         if "can_bus" in given:  # `without_history`
             given["can_bus"] = nn.functional.pad(given["can_bus"][OF_ONE_FRAME], (3, 1))
@@ -225,9 +225,11 @@ def largest_differences(found: MapElements, expected: MapElements) -> tuple[floa
     if not len(found):
         return 0.0, 0.0
     scores = np.abs(np.sort(found.confidence) - np.sort(expected.confidence)).max()
-    points = [np.stack(each.polylines) for each in (found, expected)]  # (N, P, D)
-    apart = np.abs(points[0][:, None] - points[1]).max((2, 3))  # (N, N)
-    apart[found.labels[:, None] != expected.labels] = np.inf
+    apart = np.full((len(found), len(found)), np.inf)
+    for i, ours in enumerate(found.polylines):
+        for j, theirs in enumerate(expected.polylines):
+            if found.labels[i] == expected.labels[j] and ours.shape == theirs.shape:
+                apart[i, j] = np.abs(ours - theirs).max()
     return float(scores), float(apart.min(1).max())
 
 

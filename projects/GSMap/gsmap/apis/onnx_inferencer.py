@@ -187,7 +187,10 @@ class OnnxInferencer:
         kept = {name: values[keep] for name, values in outputs.items()}
         if not np.isin(kept["labels"], range(len(self.classes))).all():
             raise ValueError(f"a label is none of the {len(self.classes)} classes")
-        return MapElements.from_polylines(kept.pop("points"), **kept)
+        points, numbers = kept.pop("points"), kept.pop("num_pts", None)
+        if numbers is not None:
+            points = [line[:number] for line, number in zip(points, numbers, strict=True)]
+        return MapElements.from_polylines(points, **kept)
 
     def write(self, path: str | Path, samples: Iterable[tuple[str, MapElements]]) -> None:
         """Write each sample's token and elements as ``tools/test.py --out`` does."""

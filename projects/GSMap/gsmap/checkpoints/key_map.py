@@ -376,7 +376,7 @@ PIVOTNET = KeyMap(
     ),
     {
         # settings: where each camera stands in the joined image, class weights of two losses
-        _BEV + "image_order": torch.tensor((2, 1, 0, 5, 4, 3)),
+        _BEV + "image_order": torch.arange(6),
         "post_processor.criterion.empty_weight": torch.tensor((1.0, 0.5)),
         "post_processor.criterion.collinear_pt_weight": torch.tensor((0.2, 1.0)),
     },

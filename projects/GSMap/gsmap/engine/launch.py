@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from mmdet3d.registry import OPTIMIZERS, RUNNERS
+from mmdet3d.registry import MODELS, OPTIMIZERS, RUNNERS
 from mmengine.config import Config
 from mmengine.logging import print_log
 from mmengine.registry import init_default_scope
@@ -192,9 +192,10 @@ def check_config(cfg: Config) -> None:
     """Refuse the mistakes in the values of a config that the config system lets through.
 
     Raises:
-        ValueError: If a learning-rate schedule ends at another epoch than the training, or there is
-            no such optimizer or runner.
+        ValueError: If a learning-rate schedule ends at another epoch than the training, there is no
+            such optimizer or runner, or the pipeline lacks a transform that the head needs.
     """
+    _check_targets(cfg)
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
     for scheduler in cfg.get("param_scheduler") or []:
         last = scheduler.get("T_max")
@@ -251,3 +252,17 @@ def _check_keys(cfg: Config) -> None:
             continue
         hint = nearest(key, _known_keys()) or "; names of a config's own values start with '_'."
         raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")
+
+
+def _check_targets(cfg: Config) -> None:
+    """Refuse a training pipeline without the transforms that the head names (``transforms``)."""
+    head = (cfg.get("model") or {}).get("map_head") or {}
+    kind, dataset = head.get("type"), (cfg.get("train_dataloader") or {}).get("dataset") or {}
+    needed = getattr(MODELS.get(kind) if isinstance(kind, str) else kind, "transforms", ())
+    made = {step.get("type") for step in dataset.get("pipeline") or ()}
+    missing = [name for name in needed if name not in made]
+    if missing and dataset:
+        raise ValueError(
+            f"{cfg.filename}: {kind} needs the targets of {missing[0]}: add it to the pipeline of "
+            "train_dataloader.dataset."
+        )

@@ -32,6 +32,8 @@ class GaussianReference(PointReference):
     space: GaussianSpace
     neutral_keys = ("gaussian_init.", "gaussian_branches.")
 
+    outputs = ("pts", "scales", "rotations")
+
     def __init__(
         self,
         grid: BEVGrid,

@@ -45,7 +45,10 @@ class PointReference(nn.Module):
 
     Attributes:
         space: How a reference stands for a Gaussian, None for points.
+        outputs: What `decode` returns.
     """
+
+    outputs: tuple[str, ...] = ("pts",)
 
     space: GaussianSpace | None = None
 

@@ -190,15 +190,16 @@ class PivotBEVEncoder(CameraEncoder):
         found = [tuple(f.shape[-2:]) for f in joined]
         if found != self.shapes:
             raise ValueError(
-                f"the cameras side by side must have {self.shapes} feature pixels, got {found}: set "
+                f"the cameras side by side must have {self.shapes} feature pixels, not {found}: set "
                 "image_size, strides and num_cams of PivotBEVEncoder to those of the images."
             )
         tokens = [
             project(f).flatten(2).transpose(1, 2)
             for project, f in zip(self.input_proj, joined, strict=True)
         ]
-        memory = Levels(torch.cat(tokens, 1), self.shapes)
         position = torch.cat([table.weight for table in self.source_pos])
+        # as released, the content has the position too
+        memory = Levels(torch.cat(tokens, 1) + position, self.shapes)
         reference = torch.cat([centres(shape, position.device) for shape in self.shapes])
         reference = reference.expand(len(memory.tokens), -1, -1)
         for layer in self.source_layers:

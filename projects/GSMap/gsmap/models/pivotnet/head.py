@@ -1,7 +1,8 @@
 """PivotNet's head: points of lines, of which those that are pivots make the map."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -30,7 +31,7 @@ class PivotReference:
     grid: BEVGrid
     outputs = ("pts", "num_pts")
     space = None
-    metainfo: Mapping[str, Any] = None
+    metainfo = MappingProxyType({})
 
     def decode(self, references: Tensor) -> Tensors:
         """Keep the pivots of every line, those of positive logit, in order.

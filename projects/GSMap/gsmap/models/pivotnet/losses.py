@@ -65,8 +65,8 @@ class PivotLosses:
     ) -> tuple[Tensor, Tensor]:
         """Return the matched predictions and annotations. 2 x (M,)
 
-        FloatingPointError, with the sample's ``token``, if a cost is not a number. ``masks`` are the
-        distances of the masks (n, K).
+        ``masks`` are the distances of the masks (n, K). FloatingPointError, with the sample's
+        ``token``, if a cost is not a number.
         """
         differences = distances(lines.points, truth.pivots)
         numbers = truth.numbers.cpu().numpy()
