@@ -52,7 +52,9 @@ MODELS = {
     "streammapnet": {"maptr", "encoders"},
     "gsmap": {"maptr", "encoders"},
 }
-METHODS = ("maptrv2", "mapvr", "gemap", "mgmapnet", "streammapnet", "gsmap")  # what others are built on stays
+METHODS = (  # what others are built on stays
+    "maptrv2", "mapvr", "gemap", "mgmapnet", "streammapnet", "gsmap",
+)  # fmt: skip
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 
 

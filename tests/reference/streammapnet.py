@@ -191,9 +191,8 @@ def check_fusion(golden: Golden, name: str) -> Iterator[Row]:
     off = largest_difference(kept[0, ::16], data["identity_memory_sub"])
     yield Row(name, "memory of a standing vehicle", off, 2e-4)
     change = (flipped(warped) - kept).abs().max()
-    yield Row(
-        name, "its warp", largest_difference(flipped(warped)[0, ::16], data["identity_warp_sub"]), 2e-4
-    )
+    off = largest_difference(flipped(warped)[0, ::16], data["identity_warp_sub"])
+    yield Row(name, "its warp", off, 2e-4)
     off = largest_difference(change, data["identity_warp_maxabs_change"])
     yield Row(name, "its largest change", off, 2e-4)
     right = BEVMemory(GRIDS["r60_"])
@@ -384,9 +383,9 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
             "token": str(frame), "scene": "a", "timestamp_ns": frame * 500_000_000,
             "lidar2global": pose, "lidar2img": data["ego2img"], "batch_input_shape": (192, 320),
         }  # fmt: skip
-        images = torch.from_numpy(
-            recipe.images(192, 320, NUM_CAMS, seed=golden.seed, frame=frame)
-        )[None]
+        images = torch.from_numpy(recipe.images(192, 320, NUM_CAMS, seed=golden.seed, frame=frame))[
+            None
+        ]
         res = model.img_backbone(images[0])
         fpn = model.extract_img_feats(images)
         if frame == 0:
@@ -441,13 +440,9 @@ def image_rows(
         yield Row(name, f"fpn{level}_sub", off, 1e-4)
 
 
-def projection_rows(
-    name: str, data: Mapping[str, np.ndarray], encoder: nn.Module
-) -> Iterator[Row]:
+def projection_rows(name: str, data: Mapping[str, np.ndarray], encoder: nn.Module) -> Iterator[Row]:
     """Compare which cells each camera sees."""
     matrices = torch.as_tensor(data["ego2img"], dtype=torch.float32)[None]
     seen = np.packbits(encoder.project(matrices, (192, 320)).visible[0].numpy(), axis=-1)
     off = np.unpackbits(seen ^ data["cam_hit"]).sum()
     yield Row(name, "cells seen by each camera that differ", float(off), 0)
-
-

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from head_cases import ALONG_Y, GSMAP, HEAD, LANES, bev, build_head
-from model_cases import build_small, make_images, make_samples, straight_elements
 from mmengine.structures import InstanceData
+from model_cases import build_small, make_images, make_samples, straight_elements
 
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.memory import StreamMemory

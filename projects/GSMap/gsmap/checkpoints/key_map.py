@@ -284,7 +284,15 @@ STREAMMAPNET = KeyMap(
     markers=(("head.input_proj.", "map_head.decoder.input_proj."),),
 )
 
-KEY_MAPS: list[KeyMap] = [STREAMMAPNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPTRV2, MAPTR_BEVFORMER, MAPTR]
+KEY_MAPS: list[KeyMap] = [
+    STREAMMAPNET,
+    MGMAPNET,
+    GEMAP_FULL,
+    GEMAP,
+    MAPTRV2,
+    MAPTR_BEVFORMER,
+    MAPTR,
+]
 """Known architectures, the most special first; the last needs no marker."""
 
 

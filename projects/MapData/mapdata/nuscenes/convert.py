@@ -117,7 +117,9 @@ class _Conversion:
     def __init__(self, options: NuScenesOptions) -> None:
         self.options = options
         self.summary = ConversionSummary(options.classes)
-        self.tables = NuScenesTables(options.version, options.root, options.max_sweeps, options.frame)
+        self.tables = NuScenesTables(
+            options.version, options.root, options.max_sweeps, options.frame
+        )
         self.split_of = _splits(options, self.tables, self.summary)
         self.positions: Positions = {split: defaultdict(list) for split in self.split_of.values()}
 

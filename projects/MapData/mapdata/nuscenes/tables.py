@@ -123,9 +123,7 @@ class NuScenesTables:
         ValueError: If a table is damaged or a record points to one that there is not.
     """
 
-    def __init__(
-        self, version: str, dataroot: Path, max_sweeps: int, frame: str = "lidar"
-    ) -> None:
+    def __init__(self, version: str, dataroot: Path, max_sweeps: int, frame: str = "lidar") -> None:
         self.frame = frame
         self._folder, self._max_sweeps = dataroot / version, max_sweeps
         self._messages = lru_cache(maxsize=1)(partial(read_messages, dataroot))

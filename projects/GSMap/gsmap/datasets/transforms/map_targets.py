@@ -21,7 +21,6 @@ from gsmap.structures.polylines import (
     sampled_orders,
 )
 
-
 ORDERS = ("vertices", "points")
 
 

@@ -341,7 +341,9 @@ class MapHead(BaseModule):
         """Return figures to log beside the losses; their names do not start with ``loss``."""
         return {}
 
-    def predict(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> list[InstanceData]:
+    def predict(
+        self, bev_outputs: dict[str, Any], batch_data_samples: Samples
+    ) -> list[InstanceData]:
         """Run the head and return its detections."""
         metas = [sample.metainfo for sample in batch_data_samples]
         return self.predict_by_feat(self(bev_outputs), metas)
