@@ -100,7 +100,7 @@ def drive(*offsets_m: float, scores: tuple[float, ...] = ()) -> list[DriveFrame]
                 str(number),
                 "a",
                 rigid(np.eye(3), [2.0 * number, 0, 0]),
-                MapElements.from_polylines([ends + [0, offset]], [1], [score]),
+                MapElements.from_polylines([ends + np.array([0, offset])], [1], [score]),
                 MapElements.from_polylines([ends], [1]),
             )
         )

@@ -72,7 +72,7 @@ class BEVEncoderLayer(nn.Module):
     ) -> Tensor:
         """Update the queries of the grid's cells from image features that have their embeddings.
 
-        (B, Q, C), (1, Q, C), (B, V, C, h, w), one or a list, and where the pillars fall -> (B, Q, C)
+        (B, Q, C), (1, Q, C), (B, V, C, h, w) or a list, and where the pillars fall -> (B, Q, C)
         """
         centres = self.centres(grid, query.device).view(1, -1, 2)
         # Differs from upstream for batches: it pairs the query of sample floor(b / 2) with sample b
