@@ -102,11 +102,12 @@ def draw_line(line: FloatArray, filled: bool, grid: BEVGrid) -> BoolArray:
     pixels = (norm * (width, height)).astype(np.int32)
     mask = np.zeros((height, width), np.uint8)
     if filled:
-        cv2.fillPoly(mask, [pixels], 1)
+        cv2.fillPoly(mask, [pixels], (1,))
     else:
-        cv2.polylines(mask, [pixels], isClosed=False, color=1, thickness=_LINE_PX)
+        cv2.polylines(mask, [pixels], isClosed=False, color=(1,), thickness=_LINE_PX)
     if mask.sum() < _SMALL_PX:
-        mask = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+        return cv2.dilate(mask, kernel).astype(bool)
     return mask.astype(bool)
 
 

@@ -37,8 +37,8 @@ def drive_frames(
         SampleFile(results, RESULTS_KEY, classes), items_of(results, RESULTS_KEY), strict=True
     )
     for (token, elements, _), (item, _) in pairs:
-        ids = [vector.get(TRACK_KEY) for vector in item["vectors"]]
-        found[token] = elements, _track_ids(ids, results, token)
+        given = [vector.get(TRACK_KEY) for vector in item["vectors"]]
+        found[token] = elements, _track_ids(given, results, token)
     if missing := [token for token in annotations.column("token") if token not in found]:
         raise ValueError(
             f"{results} has no sample {missing[0]!r} ({len(missing)} are missing): consistency "
