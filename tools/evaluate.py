@@ -35,7 +35,7 @@ from gsmap.evaluation.file_evaluation import (
 from gsmap.evaluation.match_files import write_matches
 from gsmap.evaluation.prior import evaluate_prior
 from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.report import format_table, write_figures
+from gsmap.evaluation.report import MetricReport, format_table, write_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, output_file, run_command
@@ -105,6 +105,16 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         action="store_true",
         help="samples without results count as empty, results without ground truth are left out",
     )
+    parser.add_argument(
+        "--consistency",
+        action="store_true",
+        help="C-mAP of MapTracker and jitter over drives; needs an annotation file with poses",
+    )
+    parser.add_argument(
+        "--tracks",
+        type=output_file,
+        help="with --consistency: write the results again, each element with its track_id",
+    )
     parser.add_argument("--workers", type=int, default=1, help="number of processes")
     parser.add_argument("--out", type=output_file, help="write all figures as flat JSON")
     parser.add_argument("--pr-curves", type=output_file, help="draw PR curves and calibration")
@@ -116,6 +126,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error("name either a result file or --prior")
     if args.hard and args.thresholds:
         parser.error("--hard and --thresholds exclude each other")
+    if args.consistency and (args.prior or args.shard.count):
+        parser.error("--consistency needs the results of whole drives: leave out --prior, --shard")
+    if args.tracks and not args.consistency:
+        parser.error("--tracks needs --consistency")
     if args.shard.count and (not args.out or args.prior or args.pr_curves):
         parser.error("--shard needs --out, and can neither fit a --prior nor draw --pr-curves")
     return args
@@ -150,7 +164,11 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
 def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     reports, notes = outcome
     for found in reports:
-        print(format_table(found) + "\n")
+        if found.name == "consistency":
+            lines = (f"{key:<44} {value:.4f}" for key, value in found.metrics.items())
+            print("\n".join(lines) + "\n")
+        else:
+            print(format_table(found) + "\n")
     for note in notes:
         print(f"note: {note}")
     if args.out:
@@ -161,6 +179,29 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         from gsmap.visualization.plots import plot_result
 
         print(f"curves: {save_figure(plot_result(reports), args.pr_curves)}")
+
+
+def consistency_report(args: argparse.Namespace) -> MetricReport:
+    """Score the drives of a result file, and write its tracks if that is asked for."""
+    from gsmap.evaluation.consistency import ConsistencyConfig
+    from gsmap.evaluation.drive_files import evaluate_drives
+
+    if args.ground_truth.suffix.lower() == ".json":
+        raise ValueError(
+            f"--consistency needs poses, which {args.ground_truth} has not: give the "
+            "annotation file (.arrow)."
+        )
+    annotations = AnnotationFile(args.ground_truth)
+    meta = annotations.meta
+    classes = tuple(args.classes or meta.classes)
+    config = ConsistencyConfig(
+        classes,
+        BEVGrid(meta.x_range, meta.y_range),
+        tuple(label for label, name in enumerate(classes) if name in args.polygon_classes),
+        tuple(args.thresholds or CHAMFER_THRESHOLDS),
+    )
+    figures = evaluate_drives(args.results, annotations, config, args.tracks)
+    return MetricReport("consistency", {}, figures, {})
 
 
 def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
@@ -194,6 +235,8 @@ def main(argv: list[str] | None = None) -> str:
         outcome = evaluate_files(
             args.results, args.ground_truth, evaluator, args.workers, args.allow_mismatch
         )
+    if args.consistency:
+        outcome[0].append(consistency_report(args))
     report(outcome, args)
     first = outcome[0][0]
     number = int(first.metrics[f"{first.name}/num_samples"])

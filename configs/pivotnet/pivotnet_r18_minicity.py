@@ -18,7 +18,7 @@ model = dict(
         decoder=dict(num_layers=2, num_heads=4, ffn_dims=2 * _dim)))
 _targets = dict(
     type='FormatPivotTargets', num_points=(10, 10, 16), edge_classes=(), pixel_m=0.46875, thickness_px=2, sort_rings=True)
-_scale = dict(type='ScaleImages', size=(192, 320))  # whatever the size of the files
+_scale = dict(type='ScaleImages', size=(320, 192))  # whatever the size of the files
 train_dataloader = dict(batch_size=2, dataset=dict(pipeline=[_base_._load, _scale, _targets, _base_._pack]))
 val_dataloader = dict(dataset=dict(pipeline=[_base_._load, _scale, _base_._pack]))
 test_dataloader = val_dataloader

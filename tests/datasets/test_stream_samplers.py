@@ -1,6 +1,7 @@
 """Samplers of drives: pieces in order, deterministic and resumable, ranks that share nothing."""
 
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 
@@ -46,7 +47,7 @@ def batches(count: int, **settings) -> list[list[int]]:
 def continued(found: list[list[int]]) -> float:
     """Return the share of samples that follow the one before in their slot and scene."""
     scene = {i: s for s, samples in enumerate(Drives().of_scene) for i in samples}
-    pairs = [p for a, b in zip(found, found[1:]) for p in zip(a, b, strict=True)]
+    pairs = [p for a, b in pairwise(found) for p in zip(a, b, strict=True)]
     return sum(b == a + 1 and scene[a] == scene[b] for a, b in pairs) / len(pairs)
 
 

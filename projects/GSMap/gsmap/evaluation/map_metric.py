@@ -106,7 +106,8 @@ class MapMetric(BaseMetric):
         """Collect the records of all ranks and compute the metrics of ``size`` samples."""
         self._size = size
         # MMEngine joins ranks up to the shortest: ranks with whole drives have different lengths
-        self.results = [record for part in all_gather_object(self.results) for record in part]
+        parts: list[list[dict[str, Any]]] = all_gather_object(self.results)  # type: ignore[has-type]
+        self.results = [record for part in parts for record in part]
         # MMEngine would cut the list off at `size` by position; repeated samples go by their token
         return super().evaluate(sys.maxsize)
 

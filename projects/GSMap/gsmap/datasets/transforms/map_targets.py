@@ -52,7 +52,7 @@ def map_targets(
         -10000; polylines are at full resolution, the last vertex repeated up to the longest.
 
     Raises:
-        ValueError: If the elements have fewer coordinates than ``dim``, or ``orders_of`` is unknown.
+        ValueError: If elements have fewer coordinates than ``dim``, or ``orders_of`` is unknown.
     """
     if orders_of not in ORDERS:
         raise ValueError(f"orders_of must be one of {ORDERS}, got {orders_of!r}.")

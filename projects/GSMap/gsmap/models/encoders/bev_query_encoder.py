@@ -76,7 +76,7 @@ class BEVEncoderLayer(nn.Module):
     ) -> Tensor:
         """Update the queries of the grid's cells from image features that have their embeddings.
 
-        (B, Q, C), (1, Q, C), (B, V, C, h, w), one or a list, and where the pillars fall -> (B, Q, C)
+        (B, Q, C), (1, Q, C), (B, V, C, h, w) or a list, and where the pillars fall -> (B, Q, C)
         """
         centres = self.centres(grid, query.device).view(1, -1, 2)
         # of sample floor(b / 2): 0, 0, 1, 1, ...

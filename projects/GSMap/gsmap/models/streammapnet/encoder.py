@@ -44,16 +44,13 @@ class StreamMapNetEncoder(BEVQueryEncoder):
 
     def __init__(
         self,
-        *args: Any,
         num_levels: int = 3,
         layer_cfg: dict | None = None,
         mirrored_self_attn: bool = False,
         **kwargs: Any,
     ) -> None:
-        layer_cfg = {"mirrored": mirrored_self_attn, **(layer_cfg or {})}
-        super().__init__(
-            *args, num_levels=num_levels, layer_cfg=layer_cfg, with_can_bus=False, **kwargs
-        )
+        kwargs["layer_cfg"] = {"mirrored": mirrored_self_attn, **(layer_cfg or {})}
+        super().__init__(**kwargs, num_levels=num_levels, with_can_bus=False)
 
     def encode(
         self, feats: Any, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]

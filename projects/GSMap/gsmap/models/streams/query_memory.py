@@ -55,8 +55,9 @@ class QueryMemory(BaseModule):
     def init_weights(self) -> None:
         """Let every query stay almost as it is."""
         super().init_weights()
-        for layer in (self.fc[0], self.fc[3]):
-            nn.init.zeros_(layer.weight)
+        for layer in self.fc:
+            if isinstance(layer, nn.Linear):
+                nn.init.zeros_(layer.weight)
 
     def check(self, head: MapHead) -> None:
         """Raise ValueError if the head predicts with too few queries."""

@@ -1,0 +1,107 @@
+"""Drives of a result file: tracks read from it, made, and written beside its elements."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.elements import elements_of_instances
+from gsmap.evaluation.consistency import (
+    ConsistencyConfig,
+    DriveFrame,
+    by_scene,
+    consistency,
+    tracks_of,
+)
+from gsmap.evaluation.json_items import items_of
+from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile, vectors_of, write_results
+from gsmap.structures.elements import IntArray
+
+TRACK_KEY = "track_id"
+
+
+def drive_frames(
+    results: Path, annotations: AnnotationFile, classes: Sequence[str]
+) -> list[DriveFrame]:
+    """Return the frames of an annotation file with a result file's predictions, by scene and time.
+
+    Tracks are those of the results (``track_id`` of a vector), if all vectors have one.
+
+    Raises:
+        FileNotFoundError: If the result file does not exist.
+        ValueError: If it is malformed, or lacks a sample.
+    """
+    found = {}
+    pairs = zip(
+        SampleFile(results, RESULTS_KEY, classes), items_of(results, RESULTS_KEY), strict=True
+    )
+    for (token, elements, _), (item, _) in pairs:
+        given = [vector.get(TRACK_KEY) for vector in item["vectors"]]
+        found[token] = elements, _track_ids(given, results, token)
+    if missing := [token for token in annotations.column("token") if token not in found]:
+        raise ValueError(
+            f"{results} has no sample {missing[0]!r} ({len(missing)} are missing): consistency "
+            "needs whole drives."
+        )
+    order = zip(
+        annotations.column("scene"), annotations.column("timestamp_ns"),
+        range(len(annotations)), strict=True,
+    )  # fmt: skip
+    frames = []
+    for _, _, row in sorted(order):
+        sample = annotations[row]
+        elements, ids = found[sample.token]
+        if sample.instances is None:
+            raise ValueError(f"sample {sample.token!r} has no ground truth: it cannot be scored.")
+        truth = elements_of_instances(sample.instances)
+        frames.append(
+            DriveFrame(sample.token, sample.scene, sample.global_from_frame, elements, truth, ids)
+        )
+    return frames
+
+
+def _track_ids(ids: list[object], results: Path, token: str) -> IntArray | None:
+    """Check the tracks of a sample; None if there are none."""
+    if any(track is None for track in ids) or not ids:
+        return None
+    if not all(isinstance(track, int) and -1 <= track < 2**31 for track in ids):
+        raise ValueError(
+            f"{results}, sample {token!r}: {TRACK_KEY} must be an integer from -1 (no track), got "
+            f"{next(t for t in ids if not isinstance(t, int) or not -1 <= t < 2**31)!r:.40}."
+        )
+    return np.array(ids, np.int64)
+
+
+def write_tracks(path: Path, frames: Sequence[DriveFrame], config: ConsistencyConfig) -> None:
+    """Write results with the track of each element: ``track_id``, -1 for one of a low score.
+
+    Tracks are those that the frames have, or made as `make_tracks` does; they persist over a
+    scene's frames.
+    """
+    samples = []
+    for scene in by_scene(frames):
+        for frame, tracks in zip(scene, tracks_of(scene, config), strict=True):
+            vectors = vectors_of(frame.predictions, config.classes)
+            ids = zip(vectors, tracks.tolist(), strict=True)
+            samples.append((frame.token, [{**vector, TRACK_KEY: t} for vector, t in ids]))
+    write_results(path, samples, {"classes": list(config.classes)})
+
+
+def evaluate_drives(
+    results: Path,
+    annotations: AnnotationFile,
+    config: ConsistencyConfig,
+    tracks_file: Path | None = None,
+) -> dict[str, float]:
+    """Return the figures of `consistency` of a result file; write its tracks if that is asked for.
+
+    Raises:
+        FileNotFoundError: If the result file does not exist.
+        ValueError: If it is malformed, lacks a sample, or the annotations have no ground truth.
+    """
+    frames = drive_frames(results, annotations, config.classes)
+    figures = consistency(frames, config)
+    if tracks_file is not None:
+        write_tracks(tracks_file, frames, config)
+    return figures
