@@ -73,9 +73,9 @@ def image_shape(path: str, args: argparse.Namespace) -> tuple[int, int, int]:
         return len(dataset.cameras), *args.size
     if "_file_size" not in cfg:
         raise ValueError(f"{path} says nothing of _file_size (width, height): give --size H W.")
-    step = next((step for step in dataset.pipeline if step.type == "ScaleImages"), {})
+    step: dict = next((step for step in dataset.pipeline if step.type == "ScaleImages"), {})
     if step.get("size"):
-        return len(dataset.cameras), *step["size"]
+        return len(dataset.cameras), step["size"][1], step["size"][0]
     scale = step.get("scale", 1.0)
     unit = cfg.model.data_preprocessor.get("pad_size_divisor", 1)
     width, height = (math.ceil(int(side * scale + 1e-6) / unit) * unit for side in cfg._file_size)

@@ -189,7 +189,8 @@ class OnnxInferencer:
             raise ValueError(f"a label is none of the {len(self.classes)} classes")
         points, numbers = kept.pop("points"), kept.pop("num_pts", None)
         if numbers is not None:
-            points = [line[:number] for line, number in zip(points, numbers, strict=True)]
+            lines = [line[:number] for line, number in zip(points, numbers, strict=True)]
+            return MapElements.from_polylines(lines, **kept)
         return MapElements.from_polylines(points, **kept)
 
     def write(self, path: str | Path, samples: Iterable[tuple[str, MapElements]]) -> None:

@@ -178,8 +178,9 @@ def _fit_classes(
     kept = {name: list(trained).index(name) for name in names if name in trained}
     for key, new in own.items():
         old = state.get(key)
-        branch = key.startswith("map_head.cls_branches.") and old is not None
-        if branch and len(old) == len(trained) and len(new) == len(names):
+        if old is None or not key.startswith("map_head.cls_branches."):
+            continue
+        if len(old) == len(trained) and len(new) == len(names):
             state[key] = new.detach().clone().to(old)
             for row, name in enumerate(names):
                 if name in kept:

@@ -35,10 +35,10 @@ class AtomicLocalBackend(LocalBackend):
         self.put(obj.encode(encoding), filepath)
 
 
-def _fetched(address: str, *args: Any, **options: Any) -> Any:
+def _fetched(address: str, **options: Any) -> Any:
     """Fetch a checkpoint as torch's hub does, whose default would run code of it."""
     with refusing(address):
-        return load_state_dict_from_url(address, *args, weights_only=True, **options)
+        return load_state_dict_from_url(address, **{**options, "weights_only": True})
 
 
 @HOOKS.register_module()

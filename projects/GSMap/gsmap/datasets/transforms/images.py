@@ -78,14 +78,13 @@ class ScaleImages(BaseTransform):
     def __post_init__(self) -> None:
         if (self.scale is None) == (self.size is None):
             raise ValueError(f"give scale or size, got {self.scale} and {self.size}.")
-        if not min(self.size or (self.scale,)) > 0:
+        if not min(self.size or (cast(float, self.scale),)) > 0:
             raise ValueError(f"scale or size must be > 0, got {self.size or self.scale}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Scale ``results['img']``."""
         if self.size is not None:
             return self._to_size(results, (int(self.size[0]), int(self.size[1])))
-        assert self.scale is not None
         height, width = results["img"][0].shape[:2]
         size = self.scaled(width, height)
         if self.trained_size is not None and max(size) != max(self.trained_size):

@@ -176,7 +176,7 @@ class BEVQueryEncoder(CameraEncoder):
             )
         codes = (self.cams_embeds + self.level_embeds[:, None])[..., None, None].to(first.dtype)
         if isinstance(feats, Tensor):
-            tokens = feats + codes[0]
+            tokens: Any = feats + codes[0]
         else:
             tokens = [level + code for level, code in zip(feats, codes, strict=False)]
         bev_shape = self.grid.height, self.grid.width

@@ -218,7 +218,7 @@ class MapHead(DetectionHead):
             if isinstance(part, (MapLoss, MapCost)):
                 part.check(self)
         for part in self.losses.values():
-            check_weight(part, part.loss_weight, self.classes)
+            check_weight(part, cast(MapLoss, part).loss_weight, self.classes)
         for part in self.assigner.match_costs:
             if isinstance(part, MapCost):
                 check_weight(part, part.weight, self.classes)

@@ -1,7 +1,7 @@
 """Losses of matched pairs: what they share, and MapTR's, of points and of edges between them."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
@@ -33,6 +33,7 @@ class MapLoss(nn.Module):
     """
 
     name: str
+    loss_weight: Any
 
     def __init__(
         self,

@@ -10,7 +10,7 @@ from mmengine.model import ModuleList
 from torch import Tensor, nn
 
 from gsmap.models.maptr.attention import SamplingAttention, place_samples, sample_map
-from gsmap.models.maptr.decoder import Decoded, MapDecoder
+from gsmap.models.maptr.decoder import Decoded, MapDecoder, Queries
 from gsmap.models.mgmap.neck import EnhancedNeck
 from gsmap.models.mgmap.refinement import (
     BINS,
@@ -144,13 +144,14 @@ class MGMapDecoder(MapDecoder):
         bev_feats: Tensor,
         refine: Callable[[int, Tensor, Tensor], Tensor],
         attn_mask: Tensor | None = None,
+        between: Callable[[int, Queries], Queries] | None = None,
     ) -> list[Decoded]:
         """Run all layers, then the refinement; arguments as in `MapDecoder.forward`."""
         fused, levels = self.neck(bev_feats)
         masks = self.mask_net(fused)[:, : query.shape[1] // self.num_points]
         activated = self.activation(self.instance_features(fused, masks))
         query = query + activated.repeat_interleave(self.num_points, 1)
-        layers = super().forward(query, query_pos, reference, levels, refine, attn_mask)
+        layers = super().forward(query, query_pos, reference, levels, refine, attn_mask, between)
         stages = self.refined(layers[-1], fused, refine, attn_mask)
         return [MaskedDecoded(**vars(layer), mask_logits=masks) for layer in layers] + stages
 

@@ -1,7 +1,7 @@
 """PivotNet's BEV encoder: deformable layers over all cameras side by side."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from mmdet3d.registry import MODELS
@@ -190,14 +190,14 @@ class PivotBEVEncoder(CameraEncoder):
         found = [tuple(f.shape[-2:]) for f in joined]
         if found != self.shapes:
             raise ValueError(
-                f"the cameras side by side must have {self.shapes} feature pixels, not {found}: set "
-                "image_size, strides and num_cams of PivotBEVEncoder to those of the images."
+                f"the cameras side by side must have {self.shapes} feature pixels, not {found}; "
+                "set image_size, strides and num_cams of PivotBEVEncoder to those of the images."
             )
         tokens = [
             project(f).flatten(2).transpose(1, 2)
             for project, f in zip(self.input_proj, joined, strict=True)
         ]
-        position = torch.cat([table.weight for table in self.source_pos])
+        position = torch.cat([cast(Tensor, table.weight) for table in self.source_pos])
         # as released, the content has the position too
         memory = Levels(torch.cat(tokens, 1) + position, self.shapes)
         reference = torch.cat([centres(shape, position.device) for shape in self.shapes])

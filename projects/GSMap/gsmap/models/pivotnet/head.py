@@ -1,6 +1,6 @@
 """PivotNet's head: points of lines, of which those that are pivots make the map."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.maptr.coder import MapCoder
-from gsmap.models.maptr.head import DetectionHead, Instances, Samples, Tensors
+from gsmap.models.maptr.head import DetectionHead, Samples, Tensors
 from gsmap.models.maptr.layers import mlp
 from gsmap.models.maptr.parts import PARTS
 from gsmap.models.pivotnet.decoder import ClassLines, PointLineDecoder
@@ -31,7 +31,7 @@ class PivotReference:
     grid: BEVGrid
     outputs = ("pts", "num_pts")
     space = None
-    metainfo = MappingProxyType({})
+    metainfo: Mapping[str, Any] = MappingProxyType({})
 
     def decode(self, references: Tensor) -> Tensors:
         """Keep the pivots of every line, those of positive logit, in order.
@@ -176,7 +176,7 @@ class PivotHead(DetectionHead):
         with torch.autocast(levels[0].device.type, enabled=False):
             truths = [self.truth(sample) for sample in batch_data_samples]
             losses = self.line_losses(outputs, truths, tokens)[0]
-            semantic = sum(
+            semantic: Any = sum(
                 weight * self.semantic_loss(self.class_masks(level), truths)
                 for weight, level in zip(weights, levels, strict=True)
             )
@@ -240,7 +240,7 @@ class PivotHead(DetectionHead):
 
 
 def true_lines(
-    instances: Instances, grid: BEVGrid, queries: Sequence[tuple[int, int]], size: tuple[int, int]
+    instances: Any, grid: BEVGrid, queries: Sequence[tuple[int, int]], size: tuple[int, int]
 ) -> list[TrueLines]:
     """Return annotated lines by class.
 

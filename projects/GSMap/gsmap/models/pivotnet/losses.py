@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
@@ -121,7 +122,7 @@ class PivotLosses:
         return losses, matches
 
 
-def distances(points: Tensor, pivots: Tensor) -> np.ndarray:
+def distances(points: Tensor, pivots: Tensor) -> NDArray[np.float64]:
     """Return |du| + |dv| of all pivots and points. (n, p, 2), (K, m, 2) -> (n, K, m, p)"""
     apart = pivots.detach()[None, :, :, None] - points.detach()[:, None, None]
     return apart.abs().sum(-1).double().cpu().numpy()

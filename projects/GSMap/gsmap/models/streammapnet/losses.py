@@ -10,6 +10,7 @@ from torch import Tensor
 from gsmap.models.maptr.losses import MapLoss
 from gsmap.models.maptr.matching import MapCost
 from gsmap.models.maptr.pairs import MatchedPairs, SamplePredictions, SampleTruth
+from gsmap.models.maptr.parts import weights_of
 from gsmap.structures.tensors import check_same_shape
 
 
@@ -56,4 +57,4 @@ class SmoothPointsCost(MapCost):
         orders = gt_instances.pts_shifts
         pts = pred_instances.pts[:, None, None].expand(-1, *orders.shape)  # (N, K, S, P, 2)
         distances = self.between_points(pts, orders.expand_as(pts)).sum((-1, -2))
-        return distances.amin(-1) * (self.weight / pts.shape[-2])
+        return distances.amin(-1) / pts.shape[-2] * weights_of(self.weight, gt_instances.labels)

@@ -42,13 +42,13 @@ def _find_spans(preds, targets, radius, spans):
         spans[0, row, 0], spans[0, row, 1] = left, max(left, right)
     for step in range(2):
         for row in range(height):
-            left, right = width, 0
+            left, right = np.int32(width), np.int32(0)
             for other in range(max(row - radius, 0), min(row + radius + 1, height)):
                 if spans[step, other, 0] < spans[step, other, 1]:
                     left = min(left, spans[step, other, 0])
                     right = max(right, spans[step, other, 1])
-            left = max(left - radius, 0)
-            spans[step + 1, row] = left, max(min(right + radius, width), left)
+            left = max(left - radius, np.int32(0))
+            spans[step + 1, row] = left, max(min(right + radius, np.int32(width)), left)
 
 
 @njit(nogil=True, cache=True, fastmath=FASTMATH)
