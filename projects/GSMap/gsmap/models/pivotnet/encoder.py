@@ -190,7 +190,7 @@ class PivotBEVEncoder(CameraEncoder):
         found = [tuple(f.shape[-2:]) for f in joined]
         if found != self.shapes:
             raise ValueError(
-                f"the cameras side by side must have {self.shapes} feature pixels, not {found}: set "
+                f"cameras side by side must have {self.shapes} feature pixels, not {found}: set "
                 "image_size, strides and num_cams of PivotBEVEncoder to those of the images."
             )
         tokens = [
