@@ -109,7 +109,7 @@ class DetectionHead(BaseModule):
             best = self.coder.decode(scores, fields["pts"])
             chosen = {name: value[best.query_inds] for name, value in fields.items()}
             chosen.update(scores_3d=best.scores, labels_3d=best.labels)
-            results.append(InstanceData(metainfo=self.reference.metainfo, **chosen))
+            results.append(InstanceData(metainfo=dict(self.reference.metainfo), **chosen))
         return results
 
 
