@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -31,7 +31,7 @@ class PivotReference:
     grid: BEVGrid
     outputs = ("pts", "num_pts")
     space = None
-    metainfo: Mapping[str, Any] = MappingProxyType({})
+    metainfo: ClassVar[Mapping[str, Any]] = MappingProxyType({})
 
     def decode(self, references: Tensor) -> Tensors:
         """Keep the pivots of every line, those of positive logit, in order.
