@@ -362,6 +362,23 @@ def test_a_live_rig_sees_each_frame_as_if_it_were_alone(inferencer, tmp_path, mo
     np.testing.assert_array_equal(live(small).points, alone.points)  # of another size
 
 
+def test_a_live_rig_takes_the_signals_of_the_vehicle(inferencer, tmp_path):
+    (sample,) = make_samples(tmp_path, 1)
+    images, *rig = in_memory(sample, tmp_path)
+    sample.can_bus = np.linspace(-2, 2, 18)
+    (expected,) = inferencer([sample], tmp_path)
+    live = inferencer.live(*rig)
+    standing = live.predict(images).pred_instances_3d.pts
+    found = live.predict(images, sample.can_bus).pred_instances_3d.pts
+    torch.testing.assert_close(found, expected.pred_instances_3d.pts)
+    assert (found - standing).abs().max() > 1e-3  # the signals matter
+    torch.testing.assert_close(live.predict(images).pred_instances_3d.pts, standing)
+    with pytest.raises(ValueError, match="can_bus must hold 18 values, got shape"):
+        live(images, np.zeros(4))
+    with pytest.raises(ValueError, match="can_bus must be finite"):
+        live(images, np.full(18, np.nan))
+
+
 def test_a_live_map_is_in_the_frame_of_its_calibration(inferencer, tmp_path):
     """The vehicle's frame is that of nuScenes: its LiDAR 0.94 m ahead, 1.84 m up."""
     (sample,) = make_samples(tmp_path, 1)

@@ -51,30 +51,36 @@ class LiveMap:
         self._sizes: dict[str, tuple[int, ...]] = {}
         self._dataset: VectorizedMapDataset
 
-    def __call__(self, images: Cameras) -> MapElements:
+    def __call__(self, images: Cameras, can_bus: np.ndarray | None = None) -> MapElements:
         """Return the map elements of one frame, in the frame of the calibration, as `predict`."""
-        return self._inferencer.elements(self.predict(images)).moved(self._frame_from_models)
+        found = self._inferencer.elements(self.predict(images, can_bus))
+        return found.moved(self._frame_from_models)
 
-    def predict(self, images: Cameras) -> "Det3DDataSample":
+    def predict(self, images: Cameras, can_bus: np.ndarray | None = None) -> "Det3DDataSample":
         """Run the model on one frame.
 
         Args:
             images: RGB, uint8, at about the size that the model was trained on. each (H, W, 3)
+            can_bus: Signals of the vehicle, as `motion_signals` makes them of poses; models that
+                were trained with signals see a standing vehicle without. (18,)
 
         Returns:
             The sample, with ``pred_instances_3d`` on the CPU in the frame of the config.
 
         Raises:
             TypeError: If an image is not uint8.
-            ValueError: If an array has another shape, a matrix is none of its kind, the cameras of
-                the arguments differ, or they are not those of the model.
+            ValueError: If an array has another shape, a matrix is none of its kind, a signal is not
+                finite, the cameras of the arguments differ, or they are not those of the model.
         """
+        if can_bus is not None and not np.isfinite(can_bus).all():
+            raise ValueError(f"can_bus must be finite, got {can_bus}.")
         pixels = bgr_by_name(images)
         sizes = {name: image.shape for name, image in pixels.items()}
         if sizes != self._sizes:
             self._open(pixels)
             self._sizes = sizes
         self._dataset.images_in_memory = pixels
+        self._dataset.can_bus_in_memory = None if can_bus is None else np.asarray(can_bus, float)
         allowed = self._allow_missing_cameras
         (found,) = self._inferencer.predict(self._dataset, allow_missing_cameras=allowed)
         return found

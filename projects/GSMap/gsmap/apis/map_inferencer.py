@@ -324,6 +324,7 @@ class MapInferencer:
         cam_from_frame: Cameras,
         frame: str | None = None,
         allow_missing_cameras: bool = False,
+        can_bus: np.ndarray | None = None,
     ) -> "Det3DDataSample":
         """Run the model on one frame that lies in memory; ``live`` is faster for many.
 
@@ -332,7 +333,7 @@ class MapInferencer:
         that looks most like it, as one of another name is.
         """
         live = self.live(intrinsics, cam_from_frame, frame, allow_missing_cameras)
-        return live.predict(images)
+        return live.predict(images, can_bus)
 
     def live(
         self,

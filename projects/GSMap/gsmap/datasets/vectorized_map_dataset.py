@@ -93,6 +93,7 @@ class VectorizedMapDataset(BaseDataset):
         self.broken_samples = broken_samples
         self.broken_tokens: dict[str, str] = {}
         self.images_in_memory: Mapping[str, np.ndarray] = {}  # BGR, by camera, in place of files
+        self.can_bus_in_memory: np.ndarray | None = None  # (18,), in place of a sample's
         self._broken_in_a_row = 0
         self._expected = {
             "classes": None if classes is None else tuple(classes),
@@ -225,8 +226,9 @@ class VectorizedMapDataset(BaseDataset):
 
     def _vehicle_signals(self, sample: MapSample, row: int) -> np.ndarray:
         """Return ``can_bus`` without history; of poses, or zero, where a sample has none. (18,)"""
-        if sample.can_bus is not None:
-            return without_history(sample.can_bus)
+        signals = sample.can_bus if self.can_bus_in_memory is None else self.can_bus_in_memory
+        if signals is not None:
+            return without_history(signals)
         if not self._signals_from_poses or not self.annotations.meta.options.get("poses", True):
             return np.zeros(NUM_CAN_BUS)
         from gsmap.structures.vehicle_signals import motion_signals
