@@ -68,6 +68,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
     "maptr/maptr_r50_24e.py": {**SCHEDULE, **NUSCENES, **CAMERAS},
     "maptr/maptr_r50_110e.py": {**SCHEDULE, "train_cfg.max_epochs": 110},
     "maptr/maptr_r50_av2_6e.py": {
+        "train_dataloader.dataset.rate_hz": 10.0,  # every sweep
         "grid.x_range": (-30.0, 30.0),
         "grid.y_range": (-15.0, 15.0),
         "train_cfg.max_epochs": 6,

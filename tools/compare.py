@@ -107,11 +107,11 @@ def command_of(row: dict[str, Any]) -> str:
 
 
 def figures_of(table: dict[str, Any], row: dict[str, Any]) -> str:
-    """Return the paper's mean APs of a row; its first figure where the table has no mean."""
+    """Return the paper's mean APs and costs of a row; all figures where the table has no mean."""
     if row["paper"] is None:
         return "no figure"
     both = dict(zip(table["columns"], row["paper"], strict=True))
-    means = {name: value for name, value in both.items() if name.endswith("/mAP")} or both
+    means = {name: value for name, value in both.items() if not name.endswith("/AP")} or both
     return ", ".join(f"{name} {'-' if v is None else v}" for name, v in means.items())
 
 

@@ -13,7 +13,7 @@ _train = [_base_._load, _base_._photometric, _scale, dict(_base_._targets, order
 _test = dict(classes=classes, ann_file='gsmap_av2_val_2hz.arrow', pipeline=[_base_._load, _scale, _base_._pack])
 train_dataloader = dict(
     batch_size=4, sampler=dict(_delete_=True, type='StreamTrainSampler', slots=4, single_frame_iters=3750),
-    dataset=dict(classes=classes, ann_file='gsmap_av2_train_2hz.arrow', pipeline=_train))
+    dataset=dict(classes=classes, rate_hz=2.0, ann_file='gsmap_av2_train_2hz.arrow', pipeline=_train))
 val_dataloader = dict(sampler=dict(_delete_=True, type='StreamTestSampler'), dataset=_test)
 test_dataloader = val_dataloader
 param_scheduler = _base_._param_scheduler

@@ -163,6 +163,30 @@ def test_a_file_of_two_coordinates_is_refused_for_three(build, minicity_annotati
         build(ann_file=str(minicity_annotations["val"]), dim=4)
 
 
+def test_a_file_of_another_rate_than_the_config_trains_at_is_refused(
+    build, minicity_annotations, tmp_path
+):
+    """Samples of two drives in turn, of 2 Hz each; one of a drive is missing."""
+    source = AnnotationFile(minicity_annotations["train"])
+    path = tmp_path / "gsmap_minicity_train.arrow"
+    drives = [
+        replace(source[0], token=f"{drive}{i}", scene=drive, timestamp_ns=start + i * 500_000_000)
+        for i in range(5)
+        for drive, start in (("a", 0), ("b", 70_000_000))
+        if (drive, i) != ("b", 2)
+    ]
+    write_annotations(path, source.meta, drives)
+    for rate_hz in (None, 2.0, 1.9, 2.2):
+        assert len(build(ann_file=str(path), rate_hz=rate_hz)) == 9
+    message = r"has 2 samples per second of a drive, the config asks for 10: .*--rate 10hz.*rate_hz"
+    with pytest.raises(ValueError, match=message):
+        build(ann_file=str(path), rate_hz=10.0)
+    with pytest.raises(ValueError, match=r"asks for 2\.5: make it again"):
+        build(ann_file=str(path), rate_hz=2.5)
+    write_annotations(path, source.meta, drives[:2])
+    assert len(build(ann_file=str(path), rate_hz=10.0)) == 2  # no drive says
+
+
 def test_lidar_points_meet_their_depths_in_the_cameras(build, minicity_root, minicity_annotations):
     config = dataset_config(DEPTH_AND_MASKS, "train_dataloader", minicity_root)
     data = build(**config)[0]["data_samples"]

@@ -1,5 +1,6 @@
 """From Argoverse 2 logs to an annotation file: times, sensors, and what is left out."""
 
+import argparse
 import errno
 import json
 from pathlib import Path
@@ -22,7 +23,7 @@ from processes import run_python
 
 from benchmarks.argoverse2 import measure_extraction
 from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
-from mapdata.argoverse2.convert import convert_argoverse2
+from mapdata.argoverse2.convert import add_arguments, convert_argoverse2, run
 from mapdata.argoverse2.log import (
     BROKEN_LOGS,
     MAP_CHANGE_LOGS,
@@ -38,8 +39,8 @@ REPO = Path(__file__).resolve().parents[2]
 
 
 def convert(root: Path, **options) -> tuple[str, AnnotationFile]:
-    """Convert and return the summary's text with the file."""
-    wanted = Argoverse2Options(root, **options)
+    """Convert, at 2 Hz unless told, and return the summary's text with the file."""
+    wanted = Argoverse2Options(root, **{"rate_hz": 2.0, **options})
     summary = convert_argoverse2(wanted)
     return summary.text(), AnnotationFile(wanted.path_of("av2", wanted.split))
 
@@ -106,6 +107,19 @@ def test_times_thin_out_to_the_rate_in_spite_of_jitter(step_ns, rate_hz, kept):
     jitter = np.random.default_rng(1).integers(-(10**6), 10**6, 20)
     times = START_NS + step_ns * np.arange(20) + jitter
     np.testing.assert_array_equal(thin_out(times, rate_hz), times[kept])
+
+
+@pytest.mark.parametrize(("split", "every"), [("train", 1), ("val", 4), ("test", 4)])
+def test_training_takes_every_sweep_and_tests_take_every_fourth(split, every, tmp_path):
+    """As the published systems do: 10 Hz and 2.5 Hz."""
+    write_log(tmp_path / split / "log-a")
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    run(parser.parse_args(["--root", str(tmp_path), "--split", split, "--workers", "1"]))
+    file = AnnotationFile(tmp_path / f"gsmap_av2_{split}.arrow")
+    sweeps = Argoverse2Log(tmp_path / split / "log-a").lidar_timestamps_ns
+    assert [s.timestamp_ns for s in file] == sweeps[::every].tolist()
+    assert file.meta.options["rate_hz"] == 10 / every
 
 
 def test_every_nth_pose_needs_neither_sensors_nor_calibration(tmp_path):

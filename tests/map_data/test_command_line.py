@@ -24,7 +24,7 @@ TOOL = Path(__file__).resolve().parents[2] / "tools/create_data.py"
     [
         (argoverse2, [], {"x_range": (-30.0, 30.0), "y_range": (-15.0, 15.0), "max_sweeps": 0}),
         (nuscenes, [], {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0), "max_sweeps": 10}),
-        (argoverse2_render, ["--out", "b"], {"rate_hz": 2.0, "split": "val", "logs": ()}),
+        (argoverse2_render, ["--out", "b"], {"split": "val", "logs": (), "scale": 0.25}),
     ],
 )
 def test_shared_options_keep_each_command_s_defaults(module, required, expected):

@@ -75,7 +75,7 @@ def test_every_figure_has_a_metric_and_no_row_stands_twice():
         f"{metric}/{name}"
         for metric in ("chamfer", "raster")
         for name in ("mAP", *(f"{c}/AP" for c in base(EXTENDED).classes))
-    }
+    } | {"fps", "params_M", "memory_MB", "seconds_per_step"}
 
 
 def test_the_means_of_the_papers_are_means():
@@ -103,6 +103,8 @@ def test_commands_and_figures_of_a_row_by_hand():
         "--cfg-options model.map_head.loss_raster.loss_weight=5.0"
     )
     assert figures_of(table, row) == "chamfer/mAP 49.1, raster/mAP 32.3"
+    (table,) = read_tables("GSMap Table 7*")
+    assert figures_of(table, table["rows"][1]).endswith("mAP 33.9, memory_MB 11615")
 
 
 def test_the_command_lists_and_names_what_there_is():

@@ -1,6 +1,6 @@
 # Argoverse 2, seven ring cameras at 0.3 of their size (padded to one size first), ground truth of
-# 60 x 30 m in the ego frame. `python tools/create_data.py av2 --root data/av2 --split train --rate 2.5hz`, and
-# the same for val, make the annotation files: every fourth sweep, as in MapTR's evaluation.
+# 60 x 30 m in the ego frame. `python tools/create_data.py av2 --root data/av2 --split train`, and the same for val,
+# make the annotation files: every sweep (10 Hz) for training, every fourth for validation, as in the published systems.
 data_root = 'data/av2/'
 _file_size = (2048, 2048)  # of the image files, width and height, with the padding
 # the one place of range and classes: leaves hand them to the model
@@ -32,6 +32,7 @@ train_dataloader = dict(
         **_dataset,
         ann_file='gsmap_av2_train.arrow',
         split='train',
+        rate_hz=10.0,  # an epoch is as long as the papers' (a file of another rate is refused)
         pipeline=[_load, _scale, _photometric, _targets, _pack]))
 val_dataloader = dict(
     batch_size=1,

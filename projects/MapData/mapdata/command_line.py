@@ -93,15 +93,15 @@ def add_workers_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=cores, help="processes (default: all cores)")
 
 
-def add_log_options(parser: argparse.ArgumentParser) -> None:
-    """Add which Argoverse 2 logs to take, and how often per second."""
+def add_log_options(parser: argparse.ArgumentParser, usual_rate: str) -> None:
+    """Add which Argoverse 2 logs to take, and how often per second; nothing given is no entry."""
     add = parser.add_argument
     add("--root", type=Path, required=True, help="folder that holds train, val and test")
     add("--split", default="val", choices=("train", "val", "test"))
     which = "only these (ids, or their first characters)"
     add("--logs", nargs="+", default=(), metavar="LOG", help=which)
-    rate = "samples or pictures per second, such as 2.5hz, or all (default: %(default)s)"
-    add("--rate", type=parse_rate, default=2.0, dest="rate_hz", help=rate)
+    rate = f"samples or pictures per second, such as 2.5hz, or all (default: {usual_rate})"
+    add("--rate", type=parse_rate, default=argparse.SUPPRESS, dest="rate_hz", help=rate)
 
 
 def parse_rate(text: str) -> float | None:

@@ -188,7 +188,7 @@ def render_logs(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the renderer's options to a parser."""
     add = parser.add_argument
-    add_log_options(parser)
+    add_log_options(parser, "2hz")
     add("--out", type=Path, required=True, help="data root to write")
     splits = ("train", "val", "test")
     add("--out-split", choices=splits, help="split in --out (default: the same)")

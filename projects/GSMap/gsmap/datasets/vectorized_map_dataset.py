@@ -40,6 +40,7 @@ class VectorizedMapDataset(BaseDataset):
         frame: ``lidar`` or ``ego``, which the file must have; None takes any.
         dim: Coordinates per point of the ground truth, 2 or 3; None takes the file's. A file with
             heights also serves 2, which drops them; one without is refused for 3.
+        rate_hz: Samples per second of a drive that the file must have; None takes any.
         cameras: Names of the cameras to use, in order; None takes all of each sample.
         test_mode: Whether every sample is delivered, in order, ground truth or not.
         filter_empty_gt: Whether training leaves out samples without any map element.
@@ -69,6 +70,7 @@ class VectorizedMapDataset(BaseDataset):
         split: str | None = None,
         frame: str | None = None,
         dim: int | None = 2,
+        rate_hz: float | None = None,
         cameras: Sequence[str] | None = None,
         test_mode: bool = False,
         filter_empty_gt: bool = True,
@@ -104,6 +106,7 @@ class VectorizedMapDataset(BaseDataset):
             "dim": 3 if dim == 3 else None,
         }
         self._dim = dim
+        self._rate_hz = rate_hz
         self._filter_empty_gt = filter_empty_gt and not test_mode
         self._shuffle_images_seed = shuffle_images_seed
         self._signals_from_poses = signals_from_poses
@@ -122,6 +125,8 @@ class VectorizedMapDataset(BaseDataset):
         """Open the annotation file, check it, and list its rows."""
         self.annotations = AnnotationFile(self.ann_file)
         self.annotations.require(**self._expected)
+        if self._rate_hz is not None:
+            self.annotations.require_rate(self._rate_hz)
         if not self.annotations.sealed:
             print_log(
                 f"{self.ann_file} is of an earlier version and has no checksum: damage to it may "

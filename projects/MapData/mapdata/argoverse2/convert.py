@@ -114,7 +114,7 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path]) -> AnnotationMet
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the converter's options to a parser."""
     add = parser.add_argument
-    add_log_options(parser)
+    add_log_options(parser, "10hz of train, 2.5hz of val and test, as published")
     add(
         "--at", default="auto",
         help="times: lidar, cameras, auto (sweeps where there are some, else images) "

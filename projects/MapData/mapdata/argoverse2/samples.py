@@ -34,13 +34,15 @@ _NEEDS_NONE = "`create_data.py av2 --at poses:10` needs none"
 class Argoverse2Options(FileOptions):
     """What to convert and how: the options of ``tools/create_data.py av2``.
 
-    Of ``rate_hz`` samples per second, None takes all; ``poses:N`` of ``at`` needs no sensor data.
+    Of ``rate_hz`` samples per second, None takes all. The default is as published: every LiDAR
+    sweep (10 Hz) of ``train``, every fourth of the others. ``poses:N`` of ``at`` needs no sensor
+    data.
     """
 
     _: KW_ONLY
     split: str = "val"
     at: str = "auto"
-    rate_hz: float | None = 2.0
+    rate_hz: float | None = "published"  # type: ignore[assignment]  # a number once it is made
     compat: str = "maptrv2"
     dim: int = 2
     logs: Sequence[str] = ()
@@ -51,6 +53,8 @@ class Argoverse2Options(FileOptions):
     def __post_init__(self) -> None:
         if self.at not in ("auto", "lidar", "cameras") and self.pose_stride is None:
             raise ValueError(f"at must be auto, lidar, cameras or poses:N, got {self.at!r}.")
+        if self.rate_hz == "published":  # type: ignore[comparison-overlap]
+            object.__setattr__(self, "rate_hz", 10.0 if self.split == "train" else 2.5)
         if self.rate_hz is not None and not self.rate_hz > 0:
             raise ValueError(f"rate_hz must be > 0, got {self.rate_hz}.")
         if self.dim not in (2, 3):

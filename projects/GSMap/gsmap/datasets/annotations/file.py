@@ -304,6 +304,28 @@ class AnnotationFile(Sequence[MapSample]):
                     "--help` lists the options."
                 )
 
+    def require_rate(self, wanted_hz: float) -> None:
+        """Refuse a file whose samples follow one another at another rate.
+
+        Args:
+            wanted_hz: Samples per second; the median of all drives may differ by a fifth.
+
+        Raises:
+            ValueError: If it differs by more; the message says what to run.
+        """
+        scenes = np.unique(np.array(self.column("scene"), dtype=str), return_inverse=True)[1]
+        order = np.lexsort((self.seconds_into_scene, scenes))
+        same, steps = (np.diff(np.asarray(v)[order]) for v in (scenes, self.seconds_into_scene))
+        steps = steps[same == 0]
+        if not len(steps) or 0.8 < (ratio := np.median(steps) * wanted_hz) < 1.25:
+            return
+        raise ValueError(
+            f"{self.path} has {wanted_hz / ratio:.3g} samples per second of a drive, the config "
+            f"asks for {wanted_hz:g}: make it again with `--rate {wanted_hz:g}hz`, or set "
+            "train_dataloader.dataset.rate_hz=None if epochs may have another length. It was made "
+            f"with `{self.meta.command or 'an unknown command'}`."
+        )
+
     def __len__(self) -> int:
         return int(self._starts[-1])
 
