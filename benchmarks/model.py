@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from mmdet3d.registry import MODELS
+from mmdet3d.registry import MODELS, TRANSFORMS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 
 from benchmarks.measure import Cost, in_own_process, markdown_table
 from gsmap.checkpoints.building import building
+from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakePVMask
-from gsmap.engine.launch import read_config
+from gsmap.engine.launch import needed_targets, read_config
+from gsmap.structures.grid import BEVGrid
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,7 +110,7 @@ def model_and_batch(
     samples = []
     for _ in range(batch):
         ends = grid.metres_from_norm(torch.rand(elements, 2, 2, generator=generator))
-        steps = torch.linspace(0, 1, model.map_head.num_points)[:, None]
+        steps = torch.linspace(0, 1, getattr(model.map_head, "num_points", 2))[:, None]
         pts = ends[:, :1] * (1 - steps) + ends[:, 1:] * steps  # (K, P, 2)
         labels = torch.randint(len(model.map_head.classes), (elements,), generator=generator)
         sample = Det3DDataSample(metainfo=metainfo)
@@ -119,8 +121,32 @@ def model_and_batch(
             polylines=pts,
         ).to(args.device)
         add_auxiliary_targets(sample, model, shape, stride, generator)
+        add_own_targets(sample, path, grid)
         samples.append(sample.to(args.device))
     return model, {"imgs": images}, samples
+
+
+def add_own_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> None:
+    """Let the transforms that a config's head and losses need make targets of the elements."""
+    cfg = read_config(path)
+    needed = needed_targets(cfg)
+    instances = sample.gt_instances_3d
+    results = {
+        "token": sample.token,
+        "x_range": grid.x_range,
+        "y_range": grid.y_range,
+        "gt_instances_3d": instances,
+        "map_instances": [
+            MapInstance(label, points.numpy())
+            for label, points in zip(
+                instances.labels_3d.tolist(), instances.polylines.cpu(), strict=True
+            )
+        ],
+    }
+    for step in cfg.train_dataloader.dataset.pipeline:
+        if step.type in needed:
+            results = TRANSFORMS.build(step).transform(results)
+    sample.gt_instances_3d = results["gt_instances_3d"]
 
 
 def add_auxiliary_targets(

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks import fps, live, profile, step
-from benchmarks.model import image_shape, mask_stride
+from benchmarks.model import image_shape, mask_stride, model_and_batch
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -44,6 +44,16 @@ def test_images_are_as_large_as_the_configs(config, shape):
 @pytest.mark.parametrize(("config", "stride"), [("r50_24e", 32), ("r18_minicity", 8)])
 def test_camera_masks_are_as_coarse_as_the_configs(config, stride):
     assert mask_stride(str(REPO / f"configs/maptrv2/maptrv2_{config}.py")) == stride
+
+
+@pytest.mark.parametrize(("name", "field"), [("pivotnet", "num_pts"), ("mgmap", "masks")])
+def test_heads_with_targets_of_their_own_have_losses(name, field):
+    args = argparse.Namespace(threads=torch.get_num_threads(), device="cpu", size=None)
+    path = str(REPO / f"configs/{name}/{name}_r18_minicity.py")
+    model, inputs, (sample,) = model_and_batch(path, args)
+    assert len(sample.gt_instances_3d[field]) >= 15
+    losses = model.loss(inputs, [sample])
+    assert all(torch.isfinite(loss) and loss > 0 for loss in losses.values())
 
 
 def test_frames_per_second_are_those_of_the_time(capsys):

@@ -6,6 +6,7 @@ import pytest
 import torch
 from predictions import pairs_of
 
+from gsmap.engine.launch import check_config, read_config
 from gsmap.models.mgmap.decoder import MaskedDecoded
 from gsmap.models.mgmap.losses import ForegroundLoss, QueryMaskLoss, squared_dice_loss
 
@@ -51,3 +52,12 @@ def test_the_segmentation_by_hand():
     dice = 1 - 2 * 1.0 / (1.0 + 2 + 0.002)
     loss = ForegroundLoss(loss_weight=1.0, dice_weight=2.0)(pairs)
     assert loss.item() == pytest.approx(cross_entropy + 2 * dice, rel=1e-5)
+
+
+def test_a_pipeline_without_masks_is_refused_before_training():
+    cfg = read_config("configs/mgmap/mgmap_r18_minicity.py")
+    check_config(cfg)
+    dataset = cfg.train_dataloader.dataset
+    dataset.pipeline = [step for step in dataset.pipeline if step.type != "MakeInstanceMasks"]
+    with pytest.raises(ValueError, match="ForegroundLoss needs the targets of MakeInstanceMasks"):
+        check_config(cfg)

@@ -254,15 +254,27 @@ def _check_keys(cfg: Config) -> None:
         raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")
 
 
-def _check_targets(cfg: Config) -> None:
-    """Refuse a training pipeline without the transforms that the head names (``transforms``)."""
+def needed_targets(cfg: Config) -> dict[str, Any]:
+    """Return which transforms make the targets of a config's head and of its losses.
+
+    Returns:
+        Names of transforms (``transforms`` of the classes), each with the type that needs it.
+    """
     head = (cfg.get("model") or {}).get("map_head") or {}
-    kind, dataset = head.get("type"), (cfg.get("train_dataloader") or {}).get("dataset") or {}
-    needed = getattr(MODELS.get(kind) if isinstance(kind, str) else kind, "transforms", ())
+    losses = head.get("losses")
+    kinds = [part.get("type") for part in (head, *(losses if isinstance(losses, list) else ()))]
+    classes = [(kind, MODELS.get(kind) if isinstance(kind, str) else kind) for kind in kinds]
+    return {name: kind for kind, part in classes for name in getattr(part, "transforms", ())}
+
+
+def _check_targets(cfg: Config) -> None:
+    """Refuse a training pipeline without the transforms that `needed_targets` names."""
+    dataset = (cfg.get("train_dataloader") or {}).get("dataset") or {}
     made = {step.get("type") for step in dataset.get("pipeline") or ()}
-    missing = [name for name in needed if name not in made]
+    missing = [(name, kind) for name, kind in needed_targets(cfg).items() if name not in made]
     if missing and dataset:
+        name, kind = missing[0]
         raise ValueError(
-            f"{cfg.filename}: {kind} needs the targets of {missing[0]}: add it to the pipeline of "
+            f"{cfg.filename}: {kind} needs the targets of {name}: add it to the pipeline of "
             "train_dataloader.dataset."
         )

@@ -32,6 +32,8 @@ class MGMapLoss(MapLoss):
         flags: As in `MapLoss`.
     """
 
+    transforms = ("MakeInstanceMasks",)
+
     def __init__(self, loss_weight: float, dice_weight: float, **flags: bool) -> None:
         super().__init__(loss_weight, **flags)
         self.dice_weight = dice_weight
