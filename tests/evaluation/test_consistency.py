@@ -23,6 +23,7 @@ from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid
+from tools import evaluate
 
 GRID = BEVGrid((-30, 30), (-15, 15))
 CONFIG = ConsistencyConfig(("ped_crossing", "divider", "boundary"), GRID, (0,))
@@ -131,7 +132,11 @@ def test_jitter_is_how_far_a_line_moves_over_the_ground():
     frames = [replace(frame, pose=np.eye(4)) for frame in drive(0.3, 0.0)]
     steps = jitter(frames, track_drive(frames, CONFIG), GRID)
     assert steps.tolist() == pytest.approx([0.3], abs=1e-2)
-    assert jitter(drive(0.0, 0.0), [np.zeros(1, int)] * 2, GRID)[0] < 0.05
+    # driven 2 m, the line came along: its points of every s = 40 m / 199 lie 0.05 s beside one now,
+    # but for the ten behind its end, 2 m - i s from it
+    step = 40 / 199
+    expected = (sum(2 - i * step for i in range(10)) + 190 * 0.05 * step) / 200
+    assert jitter(drive(0.0, 0.0), [np.zeros(1, int)] * 2, GRID)[0] == pytest.approx(expected)
 
 
 @pytest.fixture
@@ -177,6 +182,34 @@ def test_a_missing_sample_and_a_bad_track_are_named(files, tmp_path):
     (tmp_path / "less.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"less\.json has no sample '1' \(1 are missing\)"):
         drive_frames(tmp_path / "less.json", annotations, CONFIG.classes)
+
+
+def test_tracks_of_some_vectors_only_are_refused(files, tmp_path):
+    results, annotations = files
+    content = json.loads(results.read_text())
+    content["results"][1]["vectors"][0]["track_id"] = 3
+    (tmp_path / "some.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"some\.json: sample '1' has tracks, sample '2' has none"):
+        drive_frames(tmp_path / "some.json", annotations, CONFIG.classes)
+    content["results"][1]["vectors"][0]["track_id"] = True
+    (tmp_path / "some.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"track_id must be an integer .* got True"):
+        drive_frames(tmp_path / "some.json", annotations, CONFIG.classes)
+
+
+def test_the_command_scores_drives_and_writes_tracks(files, tmp_path, capsys):
+    results, annotations = files
+    tracks, figures = tmp_path / "tracks.json", tmp_path / "figures.json"
+    words = [str(annotations.path), "--eval", "chamfer", "--consistency"]
+    evaluate.main([str(results), *words, "--tracks", str(tracks), "--out", str(figures)])
+    assert "consistency/C-mAP" in capsys.readouterr().out
+    assert json.loads(figures.read_text())["consistency/C-mAP"] == pytest.approx(1 / 3)
+    evaluate.main([str(tracks), *words])
+    with pytest.raises(FileNotFoundError, match=r"gone\.json"):
+        evaluate.main([str(tmp_path / "gone.json"), *words])
+    tracks.write_text(tracks.read_text().replace('"sample_token":"1"', '"sample_token":"x"'))
+    with pytest.raises(ValueError, match=r"tracks\.json has no sample '1' \(1 are missing\)"):
+        evaluate.main([str(tracks), *words, "--allow-mismatch"])
 
 
 def test_rules_out_of_range_are_refused():

@@ -14,7 +14,7 @@ from gsmap.evaluation.consistency import (
     consistency,
     tracks_of,
 )
-from gsmap.evaluation.json_items import items_of
+from gsmap.utils.json_items import items_of
 from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile, vectors_of, write_results
 from gsmap.structures.elements import IntArray
 
@@ -26,19 +26,26 @@ def drive_frames(
 ) -> list[DriveFrame]:
     """Return the frames of an annotation file with a result file's predictions, by scene and time.
 
-    Tracks are those of the results (``track_id`` of a vector), if all vectors have one.
+    Tracks are those of the results (``track_id`` of a vector), if they have any.
 
     Raises:
         FileNotFoundError: If the result file does not exist.
-        ValueError: If it is malformed, or lacks a sample.
+        ValueError: If it is malformed, lacks a sample, or only some of its vectors have a track.
     """
+    if not annotations.meta.options.get("poses", True):
+        raise ValueError(f"{annotations.path} knows no poses, which consistency needs.")
     found = {}
-    pairs = zip(
-        SampleFile(results, RESULTS_KEY, classes), items_of(results, RESULTS_KEY), strict=True
-    )
-    for (token, elements, _), (item, _) in pairs:
+    items = items_of(results, RESULTS_KEY, "give a result file")
+    samples = SampleFile(results, RESULTS_KEY, classes)  # first, for what it says of a bad file
+    for (token, elements, _), (item, _) in zip(samples, items, strict=True):
         given = [vector.get(TRACK_KEY) for vector in item["vectors"]]
         found[token] = elements, _track_ids(given, results, token)
+    tracked = {ids is not None: token for token, (elements, ids) in found.items() if len(elements)}
+    if len(tracked) > 1:
+        raise ValueError(
+            f"{results}: sample {tracked[True]!r} has tracks, sample {tracked[False]!r} has none: "
+            f"give every vector a {TRACK_KEY}, or none."
+        )
     if missing := [token for token in annotations.column("token") if token not in found]:
         raise ValueError(
             f"{results} has no sample {missing[0]!r} ({len(missing)} are missing): consistency "
@@ -63,13 +70,14 @@ def drive_frames(
 
 def _track_ids(ids: list[object], results: Path, token: str) -> IntArray | None:
     """Check the tracks of a sample; None if there are none."""
-    if any(track is None for track in ids) or not ids:
+    if all(track is None for track in ids):
         return None
-    if not all(isinstance(track, int) and -1 <= track < 2**31 for track in ids):
-        raise ValueError(
-            f"{results}, sample {token!r}: {TRACK_KEY} must be an integer from -1 (no track), got "
-            f"{next(t for t in ids if not isinstance(t, int) or not -1 <= t < 2**31)!r:.40}."
-        )
+    for track in ids:
+        if type(track) is not int or not -1 <= track < 2**31:
+            raise ValueError(
+                f"{results}, sample {token!r}: {TRACK_KEY} must be an integer from -1 (no track), "
+                f"got {track!r:.40}."
+            )
     return np.array(ids, np.int64)
 
 
