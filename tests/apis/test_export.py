@@ -386,3 +386,9 @@ def test_differences_are_of_the_nearest_element_of_a_class():
     b = elements([5.25, 0, 9], [0, 0, 1], [0.5, 0.5, 0.375])
     assert largest_differences(a, b) == pytest.approx((0.025, 0.25))
     assert largest_differences(a, elements([0], [0], [0.5])) == (np.inf, np.inf)
+
+
+def test_a_model_with_memory_is_refused():
+    model = build_small(temporal={"bev": {}, "queries": {"num": 3}, "embed_dims": 16})
+    with pytest.raises(ValueError, match="models with memory cannot be exported"):
+        ExportedDetector(model)

@@ -24,7 +24,7 @@ class ExportedDetector(nn.Module):
     """A `MapDetector` of cameras as a function of tensors alone, for one sample.
 
     Raises:
-        ValueError: If the model reads LiDAR.
+        ValueError: If the model reads LiDAR or has memory.
     """
 
     def __init__(self, model: Any) -> None:
@@ -33,6 +33,11 @@ class ExportedDetector(nn.Module):
             raise ValueError(
                 "only models of cameras can be exported: voxels of LiDAR have no ONNX operator. "
                 "Give a config without lidar_encoder."
+            )
+        if model.temporal is not None:
+            raise ValueError(
+                "models with memory cannot be exported: the file would forget each frame. Give a "
+                "config without temporal, and a checkpoint trained so."
             )
         self.model = model
         self.input_names = ("images", *model.bev_encoder.calibration)
@@ -92,8 +97,8 @@ def export_onnx(
 
     Raises:
         RuntimeError: If the packages of the extra ``onnx`` are not installed.
-        ValueError: If the model reads LiDAR, has another number of cameras, or does something for
-            which ONNX has no operator.
+        ValueError: If the model reads LiDAR or has memory, has another number of cameras, or does
+            something for which ONNX has no operator.
     """
     onnx = import_extra("onnx", "onnx")
     import_extra("onnxscript", "onnx")  # what torch's exporter is written with

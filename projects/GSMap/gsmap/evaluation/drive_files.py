@@ -14,9 +14,9 @@ from gsmap.evaluation.consistency import (
     consistency,
     tracks_of,
 )
-from gsmap.utils.json_items import items_of
 from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile, vectors_of, write_results
 from gsmap.structures.elements import IntArray
+from gsmap.utils.json_items import items_of
 
 TRACK_KEY = "track_id"
 

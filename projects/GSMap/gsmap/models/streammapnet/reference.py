@@ -29,8 +29,9 @@ class LineReference(PointReference):
         num_points: int = 20,
         coords: int = 2,
         z_range: Sequence[float] | None = None,
+        points_per_state: int = 1,
     ) -> None:
-        super().__init__(grid, 1, 0, coords, z_range)
+        super().__init__(grid, 1, 0, coords, z_range, points_per_state)
         self.initial = nn.Linear(embed_dims, num_points * coords)
         layers: list[nn.Module] = []
         dims = embed_dims

@@ -128,7 +128,7 @@ class Scenes:
             if frame.scene in batch:
                 raise ValueError(
                     f"frames {batch[frame.scene]} and {frame} of one scene are in one batch: one "
-                    "needs what the other leaves; set batch_size=1 or use the StreamSampler."
+                    "needs what the other leaves; set batch_size=1 or use StreamBatches."
                 )
             batch[frame.scene] = frame
             found.append(self._followed(frame))
