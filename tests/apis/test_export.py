@@ -237,7 +237,7 @@ def test_wrong_images_and_matrices_are_named(shipped):
     with pytest.raises(ValueError, match=r"of CAM_FRONT_RIGHT has shape \(4, 8, 3\): scale it"):
         exported([images[0], np.zeros((4, 8, 3)), *images[2:]], {"lidar2img": matrices})
     with pytest.raises(ValueError, match=r"img_from_frame .* each of its 6 cameras .*\(5, 4, 4\)"):
-        exported(images, {"lidar2img": matrices[:5]})
+        exported(images, {"lidar2img": matrices[:5], "can_bus": np.zeros(18)})
     with pytest.raises(ValueError, match="has no 'lidar2img'"):
         exported(images, {})
 
@@ -341,7 +341,8 @@ def small_inputs(exported, count=2):
     generator = np.random.default_rng(0)
     images = generator.integers(0, 255, (count, 6, 64, 96, 3), dtype=np.uint8)
     lidar2img = ring_of_cameras(NUM_CAMS, *IMAGE_SHAPE)
-    return [exported.prepare(each, {"lidar2img": lidar2img}) for each in images]
+    meta = {"lidar2img": lidar2img, "can_bus": np.zeros(18)}
+    return [exported.prepare(each, meta) for each in images]
 
 
 def test_half_precision_and_8_bits_stay_close(small, tmp_path):

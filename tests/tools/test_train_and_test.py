@@ -297,5 +297,5 @@ def test_a_rank_that_fails_ends_the_others_with_its_reason(tmp_path):
     code, lines = end("tools/dist_run.sh", 2, tmp_path / "waits.py", path=tmp_path)
     assert code == 2
     assert "error: sample 'a' is broken" in lines
-    assert re.fullmatch(r"error: rank \d ended with 2 \(.* so the run was stopped; .*", lines[-1])
+    assert re.fullmatch(r"error: rank \d ended with 2 \(.*\), so the run was stopped\.", lines[-1])
     assert all(line.startswith("error: ") for line in lines[-2:])

@@ -384,6 +384,7 @@ PIVOTNET = KeyMap(
 )
 
 _BACKBONE = "backbone."
+_STREAM_INPUT = "head.input_proj."
 _STREAM_ENCODER = "backbone.transformer.encoder.layers.{i}."
 _STREAM_DECODER = "head.transformer.decoder.layers.{i}."
 _Y, _X = torch.meshgrid(
@@ -404,7 +405,7 @@ STREAMMAPNET = KeyMap(
         *_rules("head.", "map_head.", "query_embedding.=instance_embedding. cls_branches."),
         *_rules("head.", "map_head.reference.", "reference_points_embed.=initial."),
         *_rules("head.", "map_head.reference.", "reg_branches.=branches."),
-        ("head.input_proj.", "map_head.decoder.input_proj."),
+        (_STREAM_INPUT, "map_head.decoder.input_proj."),
         *_rules(
             _STREAM_DECODER,
             _LAYER,
@@ -418,7 +419,7 @@ STREAMMAPNET = KeyMap(
         "head.roi_size": torch.tensor((60.0, 30.0)),
         "head.origin": torch.tensor((-30.0, -15.0)),
     },
-    markers=(("head.input_proj.", "map_head.decoder.input_proj."),),
+    markers=((_STREAM_INPUT, "map_head.decoder.input_proj."),),
 )
 
 KEY_MAPS: list[KeyMap] = [
@@ -430,7 +431,7 @@ KEY_MAPS: list[KeyMap] = [
 
 def is_upstream(keys: Iterable[str]) -> bool:
     """Return whether state keys are in the format of the earlier systems."""
-    return any(key.startswith((_HEAD, _POINTS, "head.")) for key in keys)
+    return any(key.startswith((_HEAD, _POINTS, _STREAM_INPUT)) for key in keys)
 
 
 def find_key_map(keys: Iterable[str]) -> KeyMap:
