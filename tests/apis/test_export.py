@@ -239,7 +239,7 @@ def test_wrong_images_and_matrices_are_named(shipped):
     with pytest.raises(ValueError, match=r"img_from_frame .* each of its 6 cameras .*\(5, 4, 4\)"):
         exported(images, {"lidar2img": matrices[:5], "can_bus": np.zeros(18)})
     with pytest.raises(ValueError, match="has no 'lidar2img'"):
-        exported(images, {})
+        exported(images, {"can_bus": np.zeros(18)})
 
 
 def test_elements_beyond_the_margin_are_left_out(tmp_path):
