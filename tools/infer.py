@@ -190,18 +190,20 @@ def predict(
 ) -> dict[str, str]:
     """Predict samples, draw them and keep what was found; return the broken ones' reasons."""
     tokens, broken = dataset.annotations.column("token"), {}
+    done = set(results.done) if results else set()
     with Progress(total=len(chosen), unit="samples", smoothing=0.05) as bar:
-        if results and results.done:
-            bar.write(f"going on after {len(results.done)} of {counted(len(chosen), 'sample')}")
+        if results and done:
+            bar.write(f"going on after {len(done)} of {counted(len(chosen), 'sample')}")
             broken.update(results.broken)
-            bar.update(len(results.done))
-            chosen = [index for index in chosen if tokens[index] not in results.done]
+            if inferencer.model.temporal is None:  # memory needs the frames before
+                bar.update(len(done))
+                chosen = [index for index in chosen if tokens[index] not in done]
 
         def skip(frame: "BrokenFrame") -> None:
             broken[frame.token] = frame.reason
             bar.write(f"broken frame skipped: {frame.reason}")
             bar.update()
-            if results:
+            if results and frame.token not in done:
                 results.add_broken(frame.token, frame.reason)
 
         for sample in inferencer.predict(
@@ -210,7 +212,7 @@ def predict(
             token = str(sample.metainfo["token"])
             if args.show_dir:
                 draw(args, inferencer, dataset, sample)
-            if results:
+            if results and token not in done:
                 results.add(token, inferencer.vectors(sample))
             bar.update()
     return broken
@@ -249,6 +251,10 @@ def main(argv: list[str] | None = None) -> str | None:
     from gsmap.apis.map_inferencer import select_samples
 
     inferencer = open_model(args)
+    if args.shard.count and inferencer.model.temporal is not None:
+        raise ValueError(
+            "--shard cuts drives, which a model with memory needs whole: leave it out."
+        )
     dataset = inferencer.dataset(source)
     tokens = dataset.annotations.column("token")
     chosen = args.shard.part(select_samples(tokens, args.token, args.max_samples))

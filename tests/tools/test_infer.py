@@ -95,6 +95,35 @@ def test_a_killed_run_goes_on_and_broken_frames_are_named(
     assert not unfinished.exists()
 
 
+def test_memory_sees_the_frames_before_after_a_kill_too(
+    drive, tiny_config, tmp_path, capsys, monkeypatch
+):
+    config, weights = tmp_path / "remembers.py", tmp_path / "weights.pth"
+    temporal = "dict(bev=dict(), queries=dict(num=2), embed_dims=16)"
+    config.write_text(f"_base_ = {str(tiny_config)!r}\nmodel = dict(temporal={temporal})\n")
+    torch.manual_seed(0)
+    torch.save({"state_dict": MODELS.build(read_config(config).model).state_dict()}, weights)
+    words = [str(drive), "--model", str(config), str(weights), "--out"]
+    infer.main([*words, str(tmp_path / "whole.json")])
+    original, calls = MapInferencer.vectors, []
+
+    def killed_at_the_third(self, sample):
+        calls.append(sample)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return original(self, sample)
+
+    monkeypatch.setattr(MapInferencer, "vectors", killed_at_the_third)
+    with pytest.raises(KeyboardInterrupt):
+        infer.main([*words, str(tmp_path / "killed.json")])
+    infer.main([*words, str(tmp_path / "killed.json")])
+    assert "going on after 2 of 4 samples" in capsys.readouterr().out
+    assert len(calls) == 5  # three, and the two that were not there
+    assert results(tmp_path / "killed.json") == results(tmp_path / "whole.json")
+    with pytest.raises(ValueError, match="--shard cuts drives, which a model with memory needs"):
+        infer.main([*words, str(tmp_path / "part.json"), "--shard", "1/2"])
+
+
 def test_other_settings_start_anew(drive, model, tmp_path, capsys):
     out = tmp_path / "map.json"
     (tmp_path / "map.json.unfinished").write_text('{"other": 1}\n{"sample_token": "x"}\n')

@@ -212,7 +212,7 @@ class VectorizedMapDataset(BaseDataset):
             **{key: self._metainfo[key] for key in ("x_range", "y_range", "dim")},
             "seconds": self.annotations.seconds_into_scene[entry["row"]],
             "timestamp": sample.timestamp_ns / 1e9,
-            "lidar2global": sample.global_from_frame,
+            "lidar2global": sample.global_from_frame if self._has_poses else None,
             "lidar2ego": sample.ego_from_frame,
             "can_bus": self._vehicle_signals(sample, entry["row"]),
             "images": self._images(sample, entry),
@@ -229,12 +229,17 @@ class VectorizedMapDataset(BaseDataset):
             info.update(self._lidar(sample.lidar))
         return info
 
+    @property
+    def _has_poses(self) -> bool:
+        """Whether the samples' poses are known."""
+        return bool(self.annotations.meta.options.get("poses", True))
+
     def _vehicle_signals(self, sample: MapSample, row: int) -> np.ndarray:
         """Return ``can_bus`` without history; of poses, or zero, where a sample has none. (18,)"""
         signals = sample.can_bus if self.can_bus_in_memory is None else self.can_bus_in_memory
         if signals is not None:
             return without_history(signals)
-        if not self._signals_from_poses or not self.annotations.meta.options.get("poses", True):
+        if not self._signals_from_poses or not self._has_poses:
             return np.zeros(NUM_CAN_BUS)
         from gsmap.structures.vehicle_signals import motion_signals
 
