@@ -2,6 +2,7 @@
 
 import importlib
 import re
+from pathlib import Path
 
 import pytest
 from processes import run_python
@@ -9,6 +10,7 @@ from processes import run_python
 import gsmap
 from gsmap.utils.lazy import lazy_names
 
+REPO = Path(__file__).resolve().parents[1]
 NAMES = [
     *("gsmap.BEVGrid", "gsmap.MapElements", "gsmap.MapEvaluator", "gsmap.MapInferencer"),
     *("gsmap.RasterLoss", "gsmap.list_models", "gsmap.load_model", "gsmap.render_gaussians"),
@@ -64,11 +66,14 @@ def test_every_name_of_every_table_exists():
         assert all(getattr(module, name) for name in module.__all__)
 
 
-def test_the_packages_text_names_modules_that_exist():
-    named = re.findall(r"\bgsmap(?:\.\w+)+", gsmap.__doc__)
-    assert len(named) >= 4
-    for name in named:
+def test_the_packages_text_names_modules_and_pages_that_exist():
+    modules = re.findall(r"\bgsmap(?:\.\w+)+", gsmap.__doc__)
+    assert modules
+    for name in modules:
         importlib.import_module(name)
+    pages = re.findall(r"\bdocs/\w+\.md", gsmap.__doc__)
+    assert pages
+    assert all((REPO / page).exists() for page in pages)
 
 
 def test_importing_the_library_imports_no_other_package():
