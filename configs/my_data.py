@@ -15,14 +15,12 @@ classes = ['divider', 'ped_crossing', 'boundary']  # as in the annotation files
 # What follows from it
 _cells = [round((b - a) / _base_.model.bev_encoder.bev_pixel_m) for a, b in (grid['y_range'], grid['x_range'])]
 _data = dict(data_root=data_root, frame=_frame, cameras=_cameras, grid=grid, classes=classes)
-_load = [dict(type='LoadCameraImages', to_float32=False), dict(type='ScaleImages', scale=_scale)]
-_targets = [dict(type='FormatMapTargets', num_points=20), dict(type='MakeBEVMask', size=_cells, thickness_px=1)]
-_pack = [dict(type='PackMapInputs')]
+_load = [_base_._load, dict(type='ScaleImages', scale=_scale)]
+_targets = [_base_._targets, dict(type='MakeBEVMask', size=_cells, thickness_px=1)]
 
 _encoder = dict(num_cams=len(_cameras), z_range=(_ground_z - 0.25, _ground_z + 1.75))
 optim_wrapper = dict(optimizer=dict(lr=3e-4))  # half of the base's, as training goes on from a trained model
 model = dict(grid=grid, classes=classes, bev_encoder=_encoder, map_head=dict(type='GSMapHead'))
-train_dataloader = dict(dataset=dict(**_data, ann_file='train.arrow', pipeline=[*_load, *_targets, *_pack]))
-val_dataloader = dict(dataset=dict(**_data, ann_file='val.arrow', pipeline=[*_load, *_pack]))
-test_dataloader = val_dataloader
+train_dataloader = dict(dataset=dict(**_data, ann_file='train.arrow', pipeline=[*_load, *_targets, _base_._pack]))
+val_dataloader = test_dataloader = dict(dataset=dict(**_data, ann_file='val.arrow', pipeline=[*_load, _base_._pack]))
 visualizer = dict(ground_z_m=_ground_z)  # drop this line where records have ego_from_frame: the road may be tilted

@@ -69,7 +69,7 @@ def gsmap(site: Path, folder: Path, *words: object) -> str:
 
 def test_a_wheel_infers_from_any_folder_by_the_name_of_a_model(site, minicity_root, tmp_path):
     words = ("--model", "gsmap_r18_minicity", "--max-samples", 1, "--out", "map.json")
-    assert "1 of 1 samples predicted" in gsmap(site, tmp_path, "infer", minicity_root, *words)
+    assert "1 of 1 sample predicted" in gsmap(site, tmp_path, "infer", minicity_root, *words)
     (sample,) = json.loads((tmp_path / "map.json").read_text())["results"]
     assert len(sample["vectors"][0]["pts"]) == 20
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from mmdet3d.registry import MODELS
+from mmdet3d.registry import MODELS, TRANSFORMS
 from mmengine.config import Config
 from processes import run_python
 
@@ -21,6 +21,7 @@ ROWS = [
     for row in table["rows"]
     if row["config"]
 ]
+TARGETS = {"FormatMapTargets", "FormatPivotTargets"}
 EXTENDED = "configs/maptr/maptr_r50_extended_24e.py"
 
 
@@ -57,10 +58,10 @@ def test_a_rows_config_is_changed_by_its_overrides_and_builds(row):
         assert before.get(name, "unset") != value, f"{name} is {value} anyway"
     check_config(cfg)
     model = build(cfg)
-    steps = [step for step in cfg.train_dataloader.dataset.pipeline if "num_points" in step]
+    steps = [s for s in cfg.train_dataloader.dataset.pipeline if s.type in TARGETS]
     head = model.map_head
     own = tuple(p for _, p in head.decoder.queries) if "pivotnet" in row["config"] else None
-    assert [step.num_points for step in steps] == [own or head.num_points]
+    assert [TRANSFORMS.build(step).num_points for step in steps] == [own or head.num_points]
 
 
 def test_every_figure_has_a_metric_and_no_row_stands_twice():

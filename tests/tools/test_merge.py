@@ -248,7 +248,7 @@ def test_what_a_shard_s_part_lacks_or_nobody_knows_is_an_error(scored, tmp_path)
     results, truth = scored
     words = [str(results), str(truth), "--out", str(tmp_path / "m.json"), "--shard", "1/2"]
     write_results(results, [(f"t{i}", []) for i in range(9)] + [("x", [])])
-    with pytest.raises(ValueError, match=r"^1 results have no ground truth, such as 'x'"):
+    with pytest.raises(ValueError, match=r"^1 result has no ground truth, such as 'x'"):
         evaluate(words)
     write_results(results, [(f"t{i}", []) for i in range(4)])
     with pytest.raises(ValueError, match=r"^1 sample has no results, such as 't4'"):

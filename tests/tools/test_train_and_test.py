@@ -151,7 +151,7 @@ def test_a_data_set_is_browsed_as_a_page(tiny_config, tmp_path):
         sys.executable, "tools/browse_dataset.py", tiny_config, "--num", "1", "--split", "val",
         "--web", page,
     )  # fmt: skip
-    assert done.splitlines()[-1].startswith("1 frames, ")
+    assert done.splitlines()[-1].startswith("1 frame, ")
     assert "<title>minicity val: ground truth</title>" in page.read_text()
 
 
