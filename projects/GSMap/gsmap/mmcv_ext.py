@@ -2,9 +2,9 @@
 
 ``mmcv-lite`` is mmcv's Python without its compiled module, but mmdet and mmdet3d import
 ``mmcv.ops``, which asks that module for every operator. GSMap uses two of them, the hard
-voxelisation of LiDAR and the deformable convolution, and torch does both here. Every other name is a function that says, when it
-is called, which operator is missing and how to get it. ``gsmap/__init__.py`` puts `MmcvExtFinder`
-in place.
+voxelisation of LiDAR and the deformable convolution, and torch does both here. Every other name is
+a function that says, when it is called, which operator is missing and how to get it.
+``gsmap/__init__.py`` puts `MmcvExtFinder` in place.
 """
 
 from __future__ import annotations
@@ -103,10 +103,14 @@ def _deform_conv(inputs: Sequence[Tensor], geometry: dict[str, Any]) -> Tensor:
     from gsmap.ops.modulated_deform_conv import modulated_deform_conv
 
     images, weight, bias, offset, mask = inputs
-    pairs = [(geometry[f"{k}_h"], geometry[f"{k}_w"]) for k in ("stride", "pad", "dilation")]
-    groups = geometry["group"], geometry["deformable_group"]
+    stride, pad, dilation = (
+        (geometry[f"{name}_h"], geometry[f"{name}_w"]) for name in ("stride", "pad", "dilation")
+    )
+    groups, deform_groups = geometry["group"], geometry["deformable_group"]
     own = bias if geometry["with_bias"] else None
-    return modulated_deform_conv(images, weight, own, offset, mask, *pairs, *groups)
+    return modulated_deform_conv(
+        images, weight, own, offset, mask, stride, pad, dilation, groups, deform_groups
+    )
 
 
 def __getattr__(name: str) -> Callable[..., NoReturn]:
