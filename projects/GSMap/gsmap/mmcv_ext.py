@@ -1,10 +1,10 @@
 """Stands in for mmcv's compiled operators (``mmcv._ext``) where mmcv was installed without them.
 
 ``mmcv-lite`` is mmcv's Python without its compiled module, but mmdet and mmdet3d import
-``mmcv.ops``, which asks that module for every operator. GSMap uses a single one of them, the hard
-voxelisation of LiDAR, and torch does that here. Every other name is a function that says, when it
-is called, which operator is missing and how to get it. ``gsmap/__init__.py`` puts `MmcvExtFinder`
-in place.
+``mmcv.ops``, which asks that module for every operator. GSMap uses two of them, the hard
+voxelisation of LiDAR and the deformable convolution, and torch does both here. Every other name is
+a function that says, when it is called, which operator is missing and how to get it.
+``gsmap/__init__.py`` puts `MmcvExtFinder` in place.
 """
 
 from __future__ import annotations
@@ -58,6 +58,59 @@ def hard_voxelize_forward(
     for out, values in zip((voxels, coors, num_points_per_voxel), found, strict=True):
         out[: len(values)] = values
     voxel_num.fill_(len(found[0]))
+
+
+def modulated_deform_conv_forward(
+    images: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    _ones: Tensor,
+    offset: Tensor,
+    mask: Tensor,
+    output: Tensor,
+    _columns: Tensor,
+    **geometry: Any,
+) -> None:
+    """Fill mmcv's output tensor."""
+    output.copy_(_deform_conv((images, weight, bias, offset, mask), geometry))
+
+
+def modulated_deform_conv_backward(
+    images: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    _ones: Tensor,
+    offset: Tensor,
+    mask: Tensor,
+    _columns: Tensor,
+    *grads_and_grad_output: Tensor,
+    **geometry: Any,
+) -> None:
+    """Fill mmcv's gradients of images, weight, bias, offset and mask."""
+    import torch
+
+    *grads, grad_output = grads_and_grad_output
+    inputs = [t.detach().requires_grad_() for t in (images, weight, bias, offset, mask)]
+    with torch.enable_grad():
+        out = _deform_conv(inputs, geometry)
+    found = torch.autograd.grad(out, inputs, grad_output, materialize_grads=True)
+    for grad, values in zip(grads, found, strict=True):
+        grad.copy_(values)
+
+
+def _deform_conv(inputs: Sequence[Tensor], geometry: dict[str, Any]) -> Tensor:
+    """Convolve images, weight, bias, offset and mask with mmcv's names of the settings."""
+    from gsmap.ops.modulated_deform_conv import modulated_deform_conv
+
+    images, weight, bias, offset, mask = inputs
+    stride, pad, dilation = (
+        (geometry[f"{name}_h"], geometry[f"{name}_w"]) for name in ("stride", "pad", "dilation")
+    )
+    groups, deform_groups = geometry["group"], geometry["deformable_group"]
+    own = bias if geometry["with_bias"] else None
+    return modulated_deform_conv(
+        images, weight, own, offset, mask, stride, pad, dilation, groups, deform_groups
+    )
 
 
 def __getattr__(name: str) -> Callable[..., NoReturn]:

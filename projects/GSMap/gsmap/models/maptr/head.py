@@ -188,7 +188,7 @@ class MapHead(DetectionHead):
             for _ in range(decoder["num_layers"])
         )
         self.loss_cls = MODELS.build(loss_cls)
-        self.losses = by_name([MODELS.build(loss) for loss in losses])
+        self.losses = by_name([MODELS.build(loss) for loss in losses if loss])
         self.aux_heads = by_name(
             [MODELS.build({"embed_dims": embed_dims, **head}) for head in aux_heads]
         )
