@@ -68,7 +68,7 @@ def depth_data(root: Path, **options) -> torch.utils.data.Dataset:
     init_default_scope("mmdet3d")
     convert_argoverse2(Argoverse2Options(root, rate_hz=None, **options))
     config = Config.fromfile(CONFIG).train_dataloader.dataset
-    config.update(data_root=str(root), ann_file="gsmap_av2_val.arrow", split="val")
+    config.update(data_root=str(root), ann_file="gsmap_av2_val.arrow", split="val", rate_hz=None)
     return DATASETS.build(config)
 
 
