@@ -69,7 +69,7 @@ def test_argoverse2_logs(tmp_path, monkeypatch):
     def make(shard: Shard) -> None:
         run(monkeypatch, "av2", "--root", tmp_path, "--workers", "1", *words_of(shard))
 
-    assert assert_joined(make, tmp_path / "gsmap_av2_val.arrow", 2) == [2, 4]
+    assert assert_joined(make, tmp_path / "gsmap_av2_val.arrow", 2) == [3, 6]
 
 
 def test_info_files(tmp_path, monkeypatch):
