@@ -163,7 +163,7 @@ def annotations(minicity_root: Path, tmp_path_factory) -> Callable[[ConfigDict],
 def on_minicity(dataset: ConfigDict, root: Path, annotations: Callable[[ConfigDict], Path]) -> None:
     """Let a data set's config read MiniCity."""
     dataset.update(data_root=str(root), ann_file=str(annotations(dataset)))
-    dataset.update(frame="lidar", cameras=None)
+    dataset.update(frame="lidar", cameras=None, rate_hz=None)
 
 
 def check_gradients(model: torch.nn.Module, losses: dict[str, torch.Tensor]) -> None:
@@ -201,8 +201,9 @@ SETTINGS = {  # every line of the table in GSMap's README, with another value th
     "query_groups.1.repeats": 3,
     "iou_cost.weight": 10.0,
     "iou_cost.kind": "dice",
-    "points_weight": 1.0,
-    "losses.1.loss_weight": 0.0,
+    "points_weight": [1.0, 5.0, 1.0],
+    "losses.1.loss_weight": [0.05, 0.005, 0.05],
+    "loss_raster.full_iou": [0.0, 0.15, 0.0],
 }
 
 

@@ -91,8 +91,10 @@ def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     tables = read_json(shipped("configs/tables.json"))
     chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
     if not chosen:
-        names = ", ".join(table["table"] for table in tables)
-        raise ValueError(f"no table is named {pattern!r}; there are: {names}.")
+        raise ValueError(
+            f"no table is named {pattern!r}: compare.py --list names all {len(tables)}, and a "
+            "pattern like 'GSMap*' chooses several."
+        )
     return chosen
 
 
