@@ -38,7 +38,7 @@ def frame_cost(path: str, args: argparse.Namespace) -> Cost:
 
     @torch.no_grad()
     def predict() -> None:
-        with torch.autocast(args.device, torch.float16, enabled=args.fp16):
+        with torch.autocast(args.device, enabled=args.fp16):
             model.predict(inputs, samples)
 
     return measure(predict, torch.device(args.device), args.repeats)

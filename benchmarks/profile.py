@@ -48,7 +48,7 @@ def profile(path: str, args: argparse.Namespace) -> tuple[dict[str, float], list
         return result
 
     for _ in range(args.repeats + 1):  # the first is a warm-up
-        with torch.autocast(args.device, torch.float16, enabled=args.fp16):
+        with torch.autocast(args.device, enabled=args.fp16):
             features = timed("image backbone", model.folded_backbone, model.img_backbone, images)
             features = timed("image neck", model.img_neck, features)
             features = [feature.unflatten(0, (1, -1)) for feature in features]

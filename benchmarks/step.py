@@ -48,7 +48,7 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
 
     def step() -> None:
         model.zero_grad(set_to_none=True)
-        with torch.autocast(args.device, torch.float16, enabled=args.fp16):
+        with torch.autocast(args.device, enabled=args.fp16):
             losses = model.loss(inputs, samples)
         sum(losses.values()).backward()
 

@@ -66,12 +66,12 @@ def main() -> None:
     from gsmap.engine.launch import load_config
     from gsmap.engine.run_log import MapRunner
 
-    if args.amp and not torch.cuda.is_available():
-        raise ValueError("--amp trains on a GPU, and this machine has none: leave it out.")
     cfg = load_config(args)
-    if args.amp:
+    if args.amp and torch.cuda.is_available():
         cfg.optim_wrapper.type = "AmpOptimWrapper"
         cfg.optim_wrapper.setdefault("loss_scale", "dynamic")
+    elif args.amp:
+        cfg.optim_wrapper.type = "CPUAutocastOptimWrapper"
     if args.auto_scale_lr:
         if "base_batch_size" not in cfg.get("auto_scale_lr", {}):
             raise ValueError(f"{args.config} names no auto_scale_lr.base_batch_size to scale from.")

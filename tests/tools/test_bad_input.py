@@ -74,7 +74,6 @@ infer: VAL --model C K --out out.json --cfg-options visualizer.widht_px=3 | has 
 train: nowhere.py | There is no config file nowhere.py
 train: C --work-dir plain.txt | plain.txt
 train: C --work-dir w --cfg-options load_from=nowhere.pth | There is no checkpoint nowhere.pth
-train: C --work-dir w --amp | --amp trains on a GPU, and this machine has none
 train: C --work-dir w --resume nowhere.pth | There is no checkpoint nowhere.pth
 train: C --work-dir w --cfg-options train_dataloader.batch_sise=2 | has no setting 'batch_sise'; did you mean 'batch_size'?
 train: C --work-dir w --cfg-options train_cfg.max_epoch=2 | has no setting 'max_epoch'; did you mean 'max_epochs'?

@@ -184,6 +184,31 @@ def test_two_processes_learn_what_one_learns_from_the_same_batch(tiny_config, tm
         torch.testing.assert_close(weights[1][name], value, rtol=0, atol=1e-6, msg=name)
 
 
+def test_a_cpu_trains_in_bfloat16(tiny_config, trained, tmp_path, monkeypatch):
+    types = set()
+    forward = torch.nn.Linear.forward
+
+    def noted(self, x):
+        result = forward(self, x)
+        types.add(result.dtype)
+        return result
+
+    monkeypatch.setattr(torch.nn.Linear, "forward", noted)
+    args = ["train.py", str(tiny_config), "--work-dir", str(tmp_path), "--amp"]
+    monkeypatch.setattr("sys.argv", [*args, "--cfg-options", "train_cfg.max_epochs=1"])
+    train()
+    assert torch.bfloat16 in types
+    half, full = (
+        json.loads(min(path.glob("*/vis_data/scalars.json")).read_text().splitlines()[0])
+        for path in (tmp_path, trained)
+    )
+    assert half["step"] == full["step"] == 1
+    assert half["loss"] == pytest.approx(full["loss"], rel=0.01)
+    assert half["loss"] != full["loss"]
+    saved = read_checked(tmp_path / "epoch_1.pth").state
+    assert torch.bfloat16 not in {weight.dtype for weight in saved.values()}
+
+
 def test_the_config_chooses_the_runner(tiny_config, tmp_path, monkeypatch):
     built = []
     monkeypatch.setattr(FlexibleRunner, "train", lambda runner: built.append(runner))

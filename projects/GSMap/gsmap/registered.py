@@ -7,6 +7,7 @@ import gsmap.apis.rig_fit
 import gsmap.datasets.stream_samplers
 import gsmap.datasets.vectorized_map_dataset
 import gsmap.engine.checkpoint_hook
+import gsmap.engine.cpu_autocast
 import gsmap.engine.gaussian_health_hook
 import gsmap.engine.log_processor
 import gsmap.engine.run_log

@@ -311,10 +311,8 @@ class MapInferencer:
         self, turn: int, batch: dict[str, Any], stream: Any = None
     ) -> "list[Det3DDataSample]":
         """Predict a batch on one device."""
-        kind = self.devices[turn].type
-        half = torch.bfloat16 if kind == "cpu" else torch.float16
         own = nullcontext() if stream is None else self.model.temporal.using(stream)
-        with own, torch.autocast(kind, half, enabled=self.amp):
+        with own, torch.autocast(self.devices[turn].type, enabled=self.amp):
             return [sample.cpu() for sample in self.replicas[turn].test_step(batch)]
 
     def predict_images(

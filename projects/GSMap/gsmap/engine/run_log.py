@@ -14,6 +14,7 @@ from mmengine.optim import AmpOptimWrapper
 from mmengine.runner import EpochBasedTrainLoop, Runner
 from torch import nn
 
+from gsmap.engine.cpu_autocast import CPUAutocastOptimWrapper
 from gsmap.engine.launch import newest_checkpoint, rank_timeout_s
 from gsmap.engine.rank_watch import RankWatch
 from gsmap.utils.words import counted
@@ -84,7 +85,7 @@ def _what_to_lower(runner: Runner) -> str:
     """Say how to go on after a divergence; ``--resume`` keeps the learning rate."""
     last = newest_checkpoint(runner.work_dir)
     group = runner.optim_wrapper.param_groups[0]
-    amp = isinstance(runner.optim_wrapper, AmpOptimWrapper)
+    amp = isinstance(runner.optim_wrapper, (AmpOptimWrapper, CPUAutocastOptimWrapper))
     return (
         f"The training has diverged at iteration {runner.iter}: start it "
         f"{'from its last good checkpoint' if last else 'again'} with a lower learning rate than "
