@@ -40,7 +40,13 @@ def true_map(drive: Drive) -> MapElements:
 
 
 def components(count: int, first: IntArray, second: IntArray) -> list[IntArray]:
-    """Return the groups that pairs connect, in the order of their first members. each (n,)"""
+    """Return the groups that pairs connect, in the order of their first members. each (n,)
+
+    Args:
+        count: Number of members.
+        first: One member of each pair. (pairs,)
+        second: The other. (pairs,)
+    """
     graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
     groups, member_of = connected_components(graph, directed=False)
     return [np.flatnonzero(member_of == group) for group in range(groups)]

@@ -60,6 +60,11 @@ def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
 def found_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str, Any]]:
     """Return a sample's predictions that AP_raster does not drop, in descending order of score.
 
+    Args:
+        token: The sample.
+        result: Predictions and their matches.
+        view: Turns the annotation frame to the display.
+
     Returns:
         Per prediction its class ``c``, score ``s``, points ``p``, the index of the ground truth
         that it hits within 1 m or -1, and, if it has Gaussians, sigma along both axes in
