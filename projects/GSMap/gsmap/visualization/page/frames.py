@@ -15,7 +15,7 @@ from gsmap.datasets.image_files import encode_jpeg, read_image
 from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.structures.frames import FrameView
 from gsmap.visualization.camera_view import arrange_cameras, camera_title
-from gsmap.visualization.report.scores import ScoredResult
+from gsmap.visualization.page.scores import ScoredResult
 
 _JPEG_QUALITY = 70
 
@@ -112,7 +112,7 @@ def thumbnail(path: Path, width_px: int) -> str:
         ValueError: If there is no image, or it is damaged.
     """
     try:
-        image = read_image(str(path), "report")
+        image = read_image(str(path), "page")
     except BrokenSampleError as error:
         raise ValueError(
             f"no readable image at {path}: give the folder that image paths start from as "
