@@ -63,8 +63,8 @@ class BEVPanel:
         """What becomes of each element with ``hits`` and of each ground truth in ``truth``."""
         hits = () if self.hits is None else self.hits
         truth = range(len(self.truth or ()))
-        elements = ["hit" if hit >= 0 else "false" for hit in hits]
-        return elements, ["found" if index in hits else "missed" for index in truth]
+        fates = ["hit" if hit >= 0 else "false" for hit in hits]
+        return fates, ["found" if index in hits else "missed" for index in truth]
 
 
 def display_extent(grid: BEVGrid, view: FrameView) -> tuple[float, float, float, float]:
@@ -133,7 +133,7 @@ def draw_lines(
         colours: A colour for each.
         width_pt: Width of the lines in points.
         zorder: Height of the lines over the rest of the drawing.
-        fates: ``"true"`` or ``"false"`` for each; empty draws no dashes.
+        fates: ``hit`` or ``false`` for each; empty draws no dashes.
     """
     areas = [i for i, label in enumerate(labels) if style.is_closed(label)]
     faces = [(*mcolors.to_rgb(colours[i]), 0.2) for i in areas]
