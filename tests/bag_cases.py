@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.rigid import invert_rigid
-from mapdata.inputs import InputOptions
+from mapdata.options import InputOptions
 
 AXLE_M = 0.3  # height of base_link above the road
 

@@ -34,7 +34,8 @@ from mapdata.calibration_check import (
     image_warnings,
 )
 from mapdata.command_line import parse_rate
-from mapdata.inputs import InputOptions, open_input
+from mapdata.inputs import open_input
+from mapdata.options import InputOptions
 
 if TYPE_CHECKING:  # slow to import
     from mmdet3d.structures import Det3DDataSample

@@ -14,7 +14,8 @@ from gsmap.datasets.source import ground_from_frame, reframed
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from mapdata.bag_topics import camera_topics, parse_topics
-from mapdata.inputs import InputOptions, open_input
+from mapdata.inputs import open_input
+from mapdata.options import InputOptions
 
 
 def assert_recorded(source, drive, root):
