@@ -20,13 +20,8 @@ _OVERLAP_M = 0.2  # pieces that share so much length are of one line
 def true_map(drive: Drive) -> MapElements:
     """Put the samples' ground truth together.
 
-    Pieces that run along each other are one line; areas that overlap are one area.
-
-    Args:
-        drive: Frames with their ground truth.
-
-    Returns:
-        Lines and rings in the global frame, without scores. (N,)
+    Pieces that run along each other are one line; areas that overlap are one area. The map is in
+    the global frame and has no scores.
     """
     found = []
     for label, name in enumerate(drive.classes):

@@ -183,7 +183,7 @@ def test_the_command_writes_the_page_and_says_its_size(case, tmp_path):
 
 def test_the_package_carries_the_page():
     config = (REPO / "pyproject.toml").read_text()
-    pattern = re.search(r'"gsmap\.visualization\.report" = \["(.*)"\]', config)[1]
+    pattern = re.search(r'"gsmap\.visualization\.page" = \["(.*)"\]', config)[1]
     carried = {
         path.name for path in (REPO / "projects/GSMap/gsmap/visualization/page").glob(pattern)
     }

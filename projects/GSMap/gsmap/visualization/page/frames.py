@@ -53,8 +53,7 @@ def _centimetres(points: np.ndarray, view: FrameView) -> list[int]:
 def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
     """Return a sample's ground truth: class ``c`` and points ``p`` in centimetres."""
     elements = elements_of_instances(sample.instances or [])
-    pairs = zip(elements.labels.tolist(), elements.polylines, strict=True)
-    return [{"c": label, "p": _centimetres(line, view)} for label, line in pairs]
+    return [{"c": label, "p": _centimetres(line, view)} for line, label, _ in elements.rows]
 
 
 def found_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str, Any]]:
@@ -75,15 +74,10 @@ def found_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str
     if not kept.any():
         return []
     elements = result.predictions[token].select(matches.pred_index[kept])
+    rows = zip(elements.rows, hits[kept].tolist(), strict=True)
     found = [
         {"c": label, "s": round(score, 6), "hit": hit, "p": _centimetres(line, view)}
-        for label, score, hit, line in zip(
-            elements.labels.tolist(),
-            elements.confidence.tolist(),
-            hits[kept].tolist(),
-            elements.polylines,
-            strict=True,
-        )
+        for (line, label, score), hit in rows
     ]
     if elements.scales is not None and elements.rotations is not None:
         degrees = np.degrees(elements.rotations + view.display_turn_rad)[:, None]
