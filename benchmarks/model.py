@@ -93,7 +93,7 @@ def mask_stride(path: str) -> int:
 
 
 def model_and_batch(
-    path: str, args: argparse.Namespace, batch: int = 1, raster: str = "", elements: int = 15
+    path: str, args: argparse.Namespace, batch: int = 1, raster: str = "", num_elements: int = 15
 ) -> tuple[Any, dict[str, torch.Tensor], list[Det3DDataSample]]:
     """Build a config's model as ``build`` does, and random inputs for it.
 
@@ -109,10 +109,10 @@ def model_and_batch(
     grid = model.map_head.grid
     samples = []
     for _ in range(batch):
-        ends = grid.metres_from_norm(torch.rand(elements, 2, 2, generator=generator))
+        ends = grid.metres_from_norm(torch.rand(num_elements, 2, 2, generator=generator))
         steps = torch.linspace(0, 1, getattr(model.map_head, "num_points", 2))[:, None]
         pts = ends[:, :1] * (1 - steps) + ends[:, 1:] * steps  # (K, P, 2)
-        labels = torch.randint(len(model.map_head.classes), (elements,), generator=generator)
+        labels = torch.randint(len(model.map_head.classes), (num_elements,), generator=generator)
         sample = Det3DDataSample(metainfo=metainfo)
         sample.gt_instances_3d = InstanceData(
             labels_3d=labels,

@@ -1,5 +1,7 @@
 """Bags of ROS 1 and ROS 2, written from a drive."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
@@ -10,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.rigid import invert_rigid
+from mapdata.options import InputOptions
 
 AXLE_M = 0.3  # height of base_link above the road
 
@@ -147,3 +150,20 @@ def record(recorder, samples, root, poses="tf", raw=None, distortion=(), more=No
             recorder.image(camera, at, content, raw, **changed)
         for topic in damaged:
             recorder.writer.write(recorder.connections[topic], 1, b"\0\1\0\0\1\2\3")
+
+
+def options(tmp_path, **more):
+    """Return how a test reads its bag: frames beside it, every image a sample."""
+    return InputOptions(
+        frames_dir=tmp_path / "frames", rate_hz=None, vehicle_ground_z_m=-AXLE_M, **more
+    )
+
+
+def starting_at_0(drive, turn=0, **more):
+    """Return the first sample at time 0; cameras may have one another's images."""
+    sample, paths = drive[0], [camera.path for camera in drive[0].cameras]
+    cameras = [
+        replace(camera, path=paths[(i + turn) % len(paths)], **more)
+        for i, camera in enumerate(sample.cameras)
+    ]
+    return replace(sample, timestamp_ns=10_000_000, cameras=cameras)

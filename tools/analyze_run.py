@@ -37,10 +37,10 @@ def main() -> None:
     if len(names) != len(args.runs):
         raise ValueError(f"--names gives {len(names)} names for {len(args.runs)} runs.")
     runs = [read_run(path, name) for path, name in zip(args.runs, names, strict=True)]
-    report = summary_table(runs)
-    print(report)  # before anything is written: a disk may be full
+    table = summary_table(runs)
+    print(table)  # before anything is written: a disk may be full
     if args.table:
-        write_text(args.table, report + "\n")
+        write_text(args.table, table + "\n")
     if args.out:
         figure = plot_series(runs, args.keys) if args.keys else plot_runs(runs)
         print(f"curves: {save_figure(figure, args.out)}")

@@ -12,7 +12,7 @@ from gsmap.engine.arguments import add_config_options
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.progress import Progress
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
-from gsmap.visualization.report.page import ReportOptions, report_data, write_page
+from gsmap.visualization.page.page import PageOptions, page_data, write_page
 
 
 def parse_args() -> argparse.Namespace:
@@ -48,8 +48,8 @@ def main() -> str:
     with building(cfg):
         dataset = DATASETS.build(cfg[f"{args.split}_dataloader"].dataset)
     if args.web:
-        options = ReportOptions(Path(dataset.data_root), args.num)
-        return write_page(args.web, report_data(dataset.ann_file, {}, options))
+        options = PageOptions(Path(dataset.data_root), args.num)
+        return write_page(args.web, page_data(dataset.ann_file, {}, options))
     visualizer = MapVisualizer("browse", show_order=args.order)
     visualizer.dataset_meta = dataset.metainfo
     indices = spread_evenly(len(dataset), args.num)

@@ -23,7 +23,7 @@ from typing import Any
 
 from comparison.jobs import execute
 from comparison.plan import Protocol, Run, parse_entry, plan
-from comparison.report import (
+from comparison.results import (
     apply_rescoring,
     as_json,
     check_one_test_set,
@@ -167,15 +167,15 @@ def tabulate(runs: list[Run], args: argparse.Namespace) -> str:
     title = f"Comparison under {rules}" if rules else "Comparison"
     stem = "rescored" if rules else "comparison"
     command = shlex.join(["python", *sys.argv])
-    report = markdown(results, title, command)
-    write_text(args.out / f"{stem}.md", report)
+    tables = markdown(results, title, command)
+    write_text(args.out / f"{stem}.md", tables)
     write_text(args.out / f"{stem}.json", as_json(results, title, command))
     if reports:
         save_figure(plot_precision_recall(reports), args.out / f"{stem}_precision_recall.png")
     curves = plot_iterations(results)
     if curves:
         save_figure(curves, args.out / "iterations.png")
-    return f"{report}\nwritten to {args.out}"
+    return f"{tables}\nwritten to {args.out}"
 
 
 def main() -> str:
@@ -202,12 +202,12 @@ def main() -> str:
         raise ValueError(f"no run is {args.only}; there are {[run.label for run in runs]}.")
     if not args.rescore:
         train(chosen)
-    report = "" if args.only else tabulate(runs, args)
+    tables = "" if args.only else tabulate(runs, args)
     failed = [run.label for run in chosen if not run.done]
     if failed:
-        sys.stdout.write(f"{report}\n")
+        sys.stdout.write(f"{tables}\n")
         raise RuntimeError(f"{', '.join(failed)} did not end: the table says why.")
-    return report
+    return tables
 
 
 if __name__ == "__main__":

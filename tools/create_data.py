@@ -29,7 +29,7 @@ COMMANDS = {
 
 
 def make() -> str | None:
-    """Run the command that is asked for and return its report."""
+    """Run the command that is asked for and return what it has to say."""
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -23,6 +23,7 @@ from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.shipped import shipped
+from gsmap.utils.words import markdown_table
 
 MODELS = {"GSMap": "gsmap_r18_minicity", "MapTR": "maptr_r18_minicity"}  # that ship
 NEXT = """
@@ -266,12 +267,12 @@ def table(folder: Path, shipped: Iterable[str], trained: Iterable[Training]) -> 
     keys = [[f"{metric}/{c}/AP" for c in CLASSES] for metric in ("chamfer", "raster")]
     keys = [*keys[0], "chamfer/mAP", *keys[1], "raster/mAP"]
     head = ["model", *(key.replace("/AP", "").replace("/", " ") for key in keys)]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    lines = []
     for name, path in rows.items():
         figures = json.loads(path.read_text())
         cells = [f"{100 * figures[key]:.1f}" if key in figures else "" for key in keys]
-        lines.append("| " + " | ".join([name, *cells]) + " |")
-    return "\n".join(lines)
+        lines.append([name, *cells])
+    return markdown_table(head, lines)
 
 
 def first_picture(folder: Path) -> Path:

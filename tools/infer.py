@@ -34,7 +34,8 @@ from mapdata.calibration_check import (
     image_warnings,
 )
 from mapdata.command_line import parse_rate
-from mapdata.inputs import InputOptions, open_input
+from mapdata.inputs import open_input
+from mapdata.options import InputOptions
 
 if TYPE_CHECKING:  # slow to import
     from mmdet3d.structures import Det3DDataSample
@@ -269,11 +270,11 @@ def main(argv: list[str] | None = None) -> str | None:
         if results:
             count = results.finish({"classes": list(dataset.metainfo["classes"])})
             args.shard.seal(args.out, RESULTS, made_from, settings, count)
-    report(args, source, dataset.ann_file, len(chosen), broken)
+    print_summary(args, source, dataset.ann_file, len(chosen), broken)
     return None
 
 
-def report(
+def print_summary(
     args: argparse.Namespace, source: Source, ann_file: str, count: int, broken: dict[str, str]
 ) -> None:
     """Say what was written, and leave with `SKIPPED` if frames were broken."""

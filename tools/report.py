@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 from gsmap.utils.cli import CommandParser, output_file, run_command
-from gsmap.visualization.report.page import ReportOptions, report_data, write_page
+from gsmap.visualization.page.page import PageOptions, page_data, write_page
 
 
 def parse_args() -> argparse.Namespace:
@@ -52,14 +52,14 @@ def main() -> str:
     names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     if len(names) != len(paths) or len(set(names)) != len(names):
         raise ValueError(f"--names must give {len(paths)} different names, got {names}.")
-    options = ReportOptions(
+    options = PageOptions(
         args.data_root,
         args.max_frames,
         args.score_thr,
         0 if args.no_images else args.image_width,
         args.allow_mismatch,
     )
-    data = report_data(args.ann, dict(zip(names, paths, strict=True)), options)
+    data = page_data(args.ann, dict(zip(names, paths, strict=True)), options)
     return write_page(args.out, data)
 
 

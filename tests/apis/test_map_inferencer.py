@@ -1,92 +1,18 @@
 """A small MapTR with random weights on generated samples."""
 
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
-from mmengine.config import Config
+from inferencer_cases import NAMES, make_config, make_samples
 
 from gsmap.apis.loading import load_model
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.file import write_annotations
-from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, LidarRecord, MapSample
-from gsmap.datasets.source import Source, ground_from_frame, reframed
+from gsmap.datasets.annotations.record import AnnotationMeta
+from gsmap.datasets.source import Source, reframed
 from gsmap.visualization.figure import figure_to_rgb
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-NAMES = ("CAM_FRONT", "CAM_BACK")
-
-
-def make_config():
-    cfg = Config.fromfile(CONFIGS / "_base_/default_runtime.py")
-    cfg.model = Config.fromfile(CONFIGS / "maptr/maptr_r18_minicity.py").model
-    del cfg.model.map_head["aux_heads"]
-    cfg.merge_from_dict(
-        {
-            "model.bev_encoder.num_cams": 2,
-            "model.bev_encoder.bev_pixel_m": 6.0,
-            "model.img_backbone.base_channels": 8,
-            "model.img_neck.in_channels": [16, 32, 64],
-            "model.map_head.query_groups": [{"num": 6}],
-            "model.map_head.coder.max_num": 6,
-            "visualizer.width_px": 400,
-            "test_dataloader": {
-                "dataset": {
-                    "type": "VectorizedMapDataset",
-                    "ann_file": "none.arrow",
-                    "frame": "lidar",
-                    "split": "val",
-                    "cameras": list(NAMES),
-                    "pipeline": [
-                        {"type": "LoadCameraImages"},
-                        {"type": "ScaleImages", "scale": 0.5},
-                        {"type": "PackMapInputs"},
-                    ],
-                }
-            },
-        }
-    )
-    return cfg
-
-
-def camera(folder, name, token, seed):
-    path = folder / f"{token}_{name}.jpg"
-    pixels = np.random.default_rng(seed).integers(0, 255, (12, 20, 3), dtype=np.uint8)
-    image = cv2.resize(pixels, (320, 180), interpolation=cv2.INTER_CUBIC)
-    cv2.imwrite(str(path), image)
-    sign = 1 if name == "CAM_FRONT" else -1
-    cam_from_frame = np.eye(4)
-    cam_from_frame[:3, :3] = [[sign, 0, 0], [0, 0, -1], [0, sign, 0]]
-    intrinsics = np.array([[250.0, 0, 160], [0, 250, 90], [0, 0, 1]])
-    return CameraRecord(name, path.name, 320, 180, intrinsics, cam_from_frame)
-
-
-def make_samples(folder, count=3):
-    points = np.array([[1, 2, -1.8, 0, 0], [3, 4, -1.8, 0, 0]], np.float32)
-    points.tofile(folder / "sweep.bin")
-    shifted = np.eye(4)
-    shifted[0, 3] = 10
-    return [
-        MapSample(
-            token=f"t{i}",
-            scene="scene",
-            map_name="",
-            timestamp_ns=i,
-            cameras=[camera(folder, name, f"t{i}", 10 * i + j) for j, name in enumerate(NAMES)],
-            global_from_frame=np.eye(4),
-            lidar=LidarRecord("sweep.bin", shifted),
-        )
-        for i in range(count)
-    ]
-
-
-@pytest.fixture(scope="module")
-def inferencer():
-    torch.manual_seed(0)
-    return MapInferencer(make_config(), None, device="cpu")
 
 
 def test_annotation_file_and_samples_give_the_same(inferencer, tmp_path):
@@ -298,142 +224,6 @@ def test_samples_of_another_frame_are_seen_from_the_model_s(inferencer, tmp_path
     (found,) = inferencer(Source(samples, "ego", tmp_path))
     (expected,) = inferencer([reframed(s, "ego", "lidar") for s in samples], tmp_path)
     torch.testing.assert_close(found.pred_instances_3d.pts, expected.pred_instances_3d.pts)
-
-
-def in_memory(sample, folder):
-    """Return a sample's images (RGB), intrinsics and cam_from_frame, by camera."""
-    images = {c.name: cv2.imread(str(folder / c.path))[..., ::-1] for c in sample.cameras}
-    intrinsics = {c.name: c.intrinsics for c in sample.cameras}
-    return images, intrinsics, {c.name: c.cam_from_frame for c in sample.cameras}
-
-
-def test_images_in_memory_give_what_their_files_give(inferencer, tmp_path):
-    (sample,) = make_samples(tmp_path, 1)
-    for camera in sample.cameras:  # a file that holds the very pixels
-        image = cv2.imread(str(tmp_path / camera.path))
-        camera.path = f"{camera.name}.png"
-        cv2.imwrite(str(tmp_path / camera.path), image)
-    (expected,) = inferencer([sample], tmp_path)
-    arrays = in_memory(sample, tmp_path)
-    found = inferencer.predict_images(*arrays)
-    torch.testing.assert_close(found.pred_instances_3d.pts, expected.pred_instances_3d.pts)
-    assert figure_to_rgb(inferencer.draw(found, score_thr=0.0)).shape[1] == 400
-    assert len(inferencer.visualizer.cameras(found.metainfo)) == 2
-    lines = inferencer.elements(found)
-    np.testing.assert_array_equal(lines.points.reshape(-1, 20, 2), found.pred_instances_3d.pts)
-    # as a list, turned round: each camera is the model's that looks as it does
-    listed = inferencer.predict_images(*(list(by_name.values())[::-1] for by_name in arrays))
-    torch.testing.assert_close(
-        listed.pred_instances_3d.pts, expected.pred_instances_3d.pts, atol=1e-3, rtol=0
-    )
-    vehicle = reframed(sample, "lidar", "ego")
-    (seen,) = inferencer([reframed(vehicle, "ego", "lidar")], tmp_path)
-    found = inferencer.predict_images(*in_memory(vehicle, tmp_path), frame="ego")
-    torch.testing.assert_close(found.pred_instances_3d.pts, seen.pred_instances_3d.pts)
-
-
-def test_a_drive_in_memory_leaves_no_files_and_its_images_as_they_are(inferencer, tmp_path):
-    (sample,) = make_samples(tmp_path, 1)
-    arrays = in_memory(sample, tmp_path)
-    before = {name: image.copy() for name, image in arrays[0].items()}
-    scratch = Path(inferencer._scratch.name)
-    files = sorted(scratch.rglob("*"))
-    inferencer.predict_images(*arrays)
-    assert sorted(scratch.rglob("*")) == files
-    for name, image in before.items():
-        np.testing.assert_array_equal(arrays[0][name], image)
-
-
-def test_a_live_rig_sees_each_frame_as_if_it_were_alone(inferencer, tmp_path, monkeypatch):
-    opened = []
-    dataset = inferencer.dataset
-    monkeypatch.setattr(inferencer, "dataset", lambda s: opened.append(s) or dataset(s))
-    frames = [in_memory(sample, tmp_path) for sample in make_samples(tmp_path, 3)]
-    live = inferencer.live(*frames[0][1:])
-    found = [live(images) for images, *_ in frames]
-    assert len(opened) == 1  # the calibration is fitted once
-    for elements, frame in zip(found, frames, strict=True):
-        alone = inferencer.elements(inferencer.predict_images(*frame))
-        np.testing.assert_array_equal(elements.points, alone.points)
-        np.testing.assert_array_equal(elements.scores, alone.scores)
-    assert abs(found[0].points - found[1].points).max() > 1e-3  # the images matter
-    small = {name: image[::2, ::2] for name, image in frames[0][0].items()}
-    alone = inferencer.elements(inferencer.predict_images(small, *frames[0][1:]))
-    np.testing.assert_array_equal(live(small).points, alone.points)  # of another size
-
-
-def test_a_live_rig_takes_the_signals_of_the_vehicle(inferencer, tmp_path):
-    (sample,) = make_samples(tmp_path, 1)
-    images, *rig = in_memory(sample, tmp_path)
-    sample.can_bus = np.linspace(-2, 2, 18)
-    (expected,) = inferencer([sample], tmp_path)
-    live = inferencer.live(*rig)
-    standing = live.predict(images).pred_instances_3d.pts
-    found = live.predict(images, sample.can_bus).pred_instances_3d.pts
-    torch.testing.assert_close(found, expected.pred_instances_3d.pts)
-    assert (found - standing).abs().max() > 1e-3  # the signals matter
-    torch.testing.assert_close(live.predict(images).pred_instances_3d.pts, standing)
-    with pytest.raises(ValueError, match="can_bus must hold 18 values, got shape"):
-        live(images, np.zeros(4))
-    with pytest.raises(ValueError, match="can_bus must be finite"):
-        live(images, np.full(18, np.nan))
-
-
-def test_a_live_map_is_in_the_frame_of_its_calibration(inferencer, tmp_path):
-    """The vehicle's frame is that of nuScenes: its LiDAR 0.94 m ahead, 1.84 m up."""
-    (sample,) = make_samples(tmp_path, 1)
-    images, intrinsics, cam_from_lidar = in_memory(sample, tmp_path)
-    in_lidar = inferencer.live(intrinsics, cam_from_lidar)(images)
-    ground_from_lidar = ground_from_frame(sample, "lidar")
-    np.testing.assert_array_equal(ground_from_lidar[:3, 3], [0.94, 0, 1.84])
-    lidar_from_ground = np.linalg.inv(ground_from_lidar)
-    cam_from_vehicle = {name: cam @ lidar_from_ground for name, cam in cam_from_lidar.items()}
-    found = inferencer.live(intrinsics, cam_from_vehicle, "vehicle")(images)
-    x, y = in_lidar.points.T
-    np.testing.assert_allclose(found.points, np.stack([y + 0.94, -x], 1), atol=1e-3)
-    vehicle = reframed(sample, "lidar", "ego")  # 0.31 m above the road, on the same axle
-    found = inferencer.live(*in_memory(vehicle, tmp_path)[1:], "ego")(images)
-    np.testing.assert_allclose(found.points, np.stack([y + 0.94, -x], 1), atol=1e-3)
-
-
-def test_an_absent_camera_in_memory_is_an_error_or_blank(inferencer, tmp_path):
-    (sample,) = make_samples(tmp_path, 1)
-    del sample.cameras[0]
-    arrays = in_memory(sample, tmp_path)
-    with pytest.raises(ValueError, match=r"lacks the cameras \['CAM_FRONT'\]"):
-        inferencer.predict_images(*arrays)
-    found = inferencer.predict_images(*arrays, allow_missing_cameras=True)
-    assert found.metainfo["cam_names"] == ["CAM_BACK"]
-
-
-@pytest.mark.parametrize(
-    ("which", "value", "error", "text"),
-    [
-        (0, np.zeros((4, 6, 3)), TypeError, "image of 'CAM_BACK' must be uint8, RGB, got float64"),
-        (0, np.zeros((4, 6), np.uint8), ValueError, r"'CAM_BACK' must have shape \(H, W, 3\)"),
-        (1, np.eye(4), ValueError, r"CAM_BACK: intrinsics must be numbers of shape \(3, 3\)"),
-        (1, np.zeros((3, 3)), ValueError, "intrinsics must be finite, with focal lengths > 0"),
-        (2, np.ones((4, 4)), ValueError, "cam_from_frame is no rigid transform"),
-        (2, None, ValueError, r"cam_from_frame must have the cameras of images, \['CAM_FRONT', "),
-    ],
-)
-def test_wrong_arrays_are_refused(inferencer, tmp_path, which, value, error, text):
-    arrays = in_memory(make_samples(tmp_path, 1)[0], tmp_path)
-    arrays[which]["CAM_BACK"] = value
-    if value is None:
-        del arrays[which]["CAM_BACK"]
-    with pytest.raises(error, match=text):
-        inferencer.predict_images(*arrays)
-
-
-def test_a_foreign_camera_or_frame_in_memory_is_refused(inferencer, tmp_path):
-    arrays = in_memory(make_samples(tmp_path, 1)[0], tmp_path)
-    with pytest.raises(ValueError, match=r"frame must be one of .*'lidar', 'ego'.* got 'world'"):
-        inferencer.predict_images(*arrays, frame="world")
-    for by_name in arrays:
-        by_name["roof"] = by_name.pop("CAM_BACK")
-    with pytest.raises(ValueError, match=r"has the cameras .* but not \['roof'\]: name all"):
-        inferencer.predict_images(*arrays)
 
 
 def test_load_model_gives_the_model_alone(tmp_path):

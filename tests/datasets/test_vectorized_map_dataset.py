@@ -1,57 +1,22 @@
 """The data set on a generated MiniCity: what it hands on, and what it says of bad input."""
 
 import pickle
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from dataset_cases import CONFIGS, DEPTH_AND_MASKS, MINICITY, SWEEPS, dataset_config
 from height_cases import write_raised
 from mmengine.config import Config
-from PIL import Image
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
-from gsmap.datasets.errors import BrokenSampleError
 from gsmap.structures.calibration import without_history
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-MINICITY = "_base_/datasets/minicity"
-DEPTH_AND_MASKS = "maptrv2/maptrv2_r50_24e"
-SWEEPS = "maptr/maptr_r50_pointpillars_24e"
 CAMERAS = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def build():
-    from mmdet3d.registry import DATASETS
-    from mmengine.registry import init_default_scope
-
-    import gsmap.registered  # noqa: F401
-
-    init_default_scope("mmdet3d")
-    return lambda **config: DATASETS.build({"type": "VectorizedMapDataset", **config})
-
-
-def dataset_config(name: str, loader: str, root: Path, **changes) -> dict:
-    config = Config.fromfile(CONFIGS / f"{name}.py")[loader].dataset
-    config.update(data_root=str(root), ann_file=config.ann_file.replace("nuscenes", "minicity"))
-    config.update(changes)
-    return config
-
-
-@pytest.fixture
-def copied_root(minicity_root: Path, minicity_annotations: dict[str, Path], tmp_path: Path) -> Path:
-    """A copy whose files a test may damage."""
-    root = tmp_path / "root"
-    shutil.copytree(minicity_root / "samples", root / "samples")
-    for path in minicity_annotations.values():
-        shutil.copy(path, root)
-    return root
 
 
 def test_a_training_sample_is_packed_as_the_contract_says(
@@ -314,92 +279,6 @@ def test_samples_without_elements_train_only_if_asked(build, minicity_annotation
 def test_what_does_not_fit_is_refused(build, minicity_annotations, option, message):
     with pytest.raises(ValueError, match=message):
         build(ann_file=str(minicity_annotations["val"]), **option)
-
-
-def test_missing_truncated_and_foreign_images_are_named(build, copied_root):
-    dataset = build(**dataset_config(MINICITY, "val_dataloader", copied_root))
-    path = copied_root / dataset.sample(0).cameras[1].path
-    name, token = dataset.sample(0).cameras[1].name, dataset.sample(0).token
-    path.with_name("whole.jpg").write_bytes(content := path.read_bytes())
-    turned = Image.Exif()
-    turned[0x0112] = 3  # upside down, of the same size
-    for damaged in (content[:-3000], content[:-3000] + b"\xff\xd9", content[:-2]):
-        path.write_bytes(damaged)
-        with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*truncated or damaged"):
-            dataset[0]
-    image = cv2.imread(str(path.with_name("whole.jpg")))
-    for damage, message in (
-        (cv2.resize(image, (200, 112)), "has 200 x 112 pixels, its record says"),
-        (cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE), "has 225 x 400 pixels"),
-    ):
-        cv2.imwrite(str(path), damage)
-        with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*{message}"):
-            dataset[0]
-    Image.fromarray(image).save(path, exif=turned)
-    with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*wants it turned, orientation 3"):
-        dataset[0]
-    path.write_bytes(b"no picture \xff\xd9")
-    with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*not an image"):
-        dataset[0]
-    path.unlink()
-    with pytest.raises(BrokenSampleError, match=f"{token}.*{name}.*no image at .*data_root"):
-        dataset[0]
-
-
-def test_missing_and_truncated_points_are_named(build, copied_root):
-    dataset = build(**dataset_config(DEPTH_AND_MASKS, "train_dataloader", copied_root))
-    path = copied_root / dataset.sample(0).lidar.path
-    path.write_bytes(path.read_bytes()[:-6])
-    with pytest.raises(BrokenSampleError, match=f"{dataset.sample(0).token}.*copy it again"):
-        dataset[0]
-    path.unlink()
-    with pytest.raises(BrokenSampleError, match="no LiDAR file at"):
-        dataset[0]
-
-
-def test_a_missing_earlier_sweep_is_named_with_the_remedy(build, copied_root):
-    dataset = build(**dataset_config(SWEEPS, "val_dataloader", copied_root))
-    sample = dataset.sample(1)
-    path = copied_root / sample.lidar.sweeps[0].path
-    message = f"{sample.token}.*no earlier LiDAR sweep at {path}.*--max-sweeps 0"
-    with pytest.raises(BrokenSampleError, match=message):
-        dataset[1]
-
-
-def test_broken_samples_are_skipped_and_counted_on_demand(build, copied_root):
-    config = dataset_config(MINICITY, "train_dataloader", copied_root, broken_samples="skip")
-    dataset = build(**config)
-    token = dataset.sample(0).token
-    (copied_root / dataset.sample(0).cameras[0].path).unlink()
-    for _ in range(2):
-        assert dataset[0]["data_samples"].metainfo["token"] == dataset.sample(1).token
-    assert list(dataset.broken_tokens) == [token]
-    (copied_root / dataset.sample(1).cameras[0].path).unlink()
-    with pytest.raises(RuntimeError, match=r"in a row are broken.*no image"):
-        dataset[1]
-
-
-def test_an_absent_camera_is_named(build, minicity_annotations, minicity_root, tmp_path):
-    file = AnnotationFile(minicity_annotations["val"])
-    samples = list(file)
-    del samples[0].cameras[0]
-    write_annotations(tmp_path / "five.arrow", file.meta, samples)
-    config = dataset_config(MINICITY, "val_dataloader", minicity_root)
-    config.ann_file = str(tmp_path / "five.arrow")
-    with pytest.raises(BrokenSampleError, match=f"{samples[0].token}.*no camera 'CAM_FRONT'"):
-        build(**config)[0]
-
-
-def test_nan_in_an_image_is_named(build, minicity_annotations, minicity_root):
-    def poison(results: dict) -> dict:
-        results["img"][2] = results["img"][2].astype(np.float32)
-        results["img"][2][5, 7, 1] = np.nan
-        return results
-
-    config = dataset_config(MINICITY, "val_dataloader", minicity_root)
-    dataset = build(**{**config, "pipeline": [*config.pipeline[:-1], poison, config.pipeline[-1]]})
-    with pytest.raises(BrokenSampleError, match="CAM_FRONT_LEFT: the image holds NaN"):
-        dataset[0]
 
 
 def test_it_keeps_the_contract_of_a_base_dataset(build, minicity_root, minicity_annotations):

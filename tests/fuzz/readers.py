@@ -38,6 +38,7 @@ from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
+from gsmap.datasets.source import Source
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points
 from gsmap.engine.launch import check_config, read_config
 from gsmap.evaluation.match_files import SHARD_KIND as MATCHES
@@ -49,13 +50,13 @@ from mapdata.argoverse2.samples import Argoverse2Options, read_log
 from mapdata.bags import read_bag
 from mapdata.custom import from_records
 from mapdata.folders.images import read_image_folder
-from mapdata.folders.rig import Recording
 from mapdata.infos.convert import convert_infos
 from mapdata.infos.recordings import read_info_file
 from mapdata.nuscenes.can_bus import read_messages, signals_at
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from mapdata.nuscenes.map import NuScenesLocalMap, open_layers
 from mapdata.nuscenes.tables import LIDAR, NuScenesTables
+from mapdata.options import InputOptions
 from mapdata.splits import read_split_file
 from tools.build_map import main as build_map
 from tools.convert_config import convert
@@ -191,7 +192,7 @@ class Files:
 
         return Reader(path, read, (mutations.damaged_pickle,))
 
-    def recorded(self, read: Callable[[Path], Recording]) -> Pictures:
+    def recorded(self, read: Callable[[Path], Source]) -> Pictures:
         """Read a recording and look at the images that it makes."""
         frames = self.out / "frames"
         shutil.rmtree(frames, ignore_errors=True)
@@ -234,7 +235,9 @@ class Files:
         path = recorder.path
         pattern = {"sqlite": "*.db3", "mcap": "*.mcap"}.get(kind)
         path = next(path.glob(pattern)) if pattern else path
-        read = partial(self.recorded, lambda frames: read_bag(path, frames))
+        read = partial(
+            self.recorded, lambda frames: read_bag(path, InputOptions(frames_dir=frames))
+        )
         damaged = path / "metadata.yaml" if path.is_dir() else path
         texts = (mutations.damaged_yaml,) if path.is_dir() else ()
         names = mutations.renamed(self.sample.cameras[0].name)

@@ -16,8 +16,9 @@ from bag_cases import Recorder, record
 from fuzz.mutations import damaged_column, write
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.evaluation.results_json import write_results
-from mapdata.inputs import InputOptions, open_input
+from mapdata.inputs import open_input
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
+from mapdata.options import InputOptions
 from tools.build_map import main as build_map
 
 

@@ -1,5 +1,6 @@
 """The nuScenes converter: the reference's vectors, splits, clear errors, counted omissions."""
 
+import argparse
 import json
 import tarfile
 from collections import Counter
@@ -12,9 +13,10 @@ import shapely
 from processes import run_python
 
 from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
+from gsmap.datasets.annotations.record import MapSample
 from mapdata.lane_graph import link_lanes
 from mapdata.nuscenes import convert as nuscenes
-from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
+from mapdata.nuscenes.convert import NuScenesOptions, add_arguments, convert_nuscenes, run
 from mapdata.nuscenes.map import MapLayers, NuScenesLocalMap
 from mapdata.vectors_json import write_vectors
 
@@ -183,6 +185,46 @@ def test_minicity_converts_and_names_itself(minicity_root: Path, minicity_annota
     assert forward[1] > 0.9
     yaw = np.arctan2(sample.global_from_frame[1, 1], sample.global_from_frame[0, 1])
     assert sample.can_bus[16] % (2 * np.pi) == pytest.approx(yaw % (2 * np.pi), abs=0.05)
+
+
+def test_the_vehicle_s_frame_holds_the_same_world(
+    minicity_root: Path, minicity_annotations: dict, tmp_path: Path
+):
+    """What the command writes with ``--frame ego``, against the file in LIDAR_TOP's frame."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    words = f"--root {minicity_root} --out-dir {tmp_path} --frame ego --tag _ego --workers 1"
+    ranges = "--x-range -30 30 --y-range -15 15"
+    run(parser.parse_args([*words.split(), *ranges.split()], argparse.Namespace(command="make it")))
+    found = AnnotationFile(tmp_path / "gsmap_minicity_train_ego.arrow")
+    found.require(frame="ego", x_range=(-30.0, 30.0), y_range=(-15.0, 15.0))
+    for ego, lidar in zip(found, AnnotationFile(minicity_annotations["train"]), strict=True):
+        ego_from_lidar = lidar.ego_from_frame
+        assert ego_from_lidar[2, 3] > 1  # on the roof
+        np.testing.assert_array_equal(ego.ego_from_frame, np.eye(4))
+        at = ego.global_from_frame @ ego_from_lidar
+        np.testing.assert_allclose(at, lidar.global_from_frame, atol=1e-9)
+        for camera, other in zip(ego.cameras, lidar.cameras, strict=True):
+            cam_from_lidar = camera.cam_from_frame @ ego_from_lidar
+            np.testing.assert_allclose(cam_from_lidar, other.cam_from_frame, atol=1e-9)
+        np.testing.assert_allclose(ego.lidar.frame_from_lidar, ego_from_lidar)
+        for sweep, other in zip(ego.lidar.sweeps, lidar.lidar.sweeps, strict=True):
+            expected = ego_from_lidar @ other.frame_from_lidar
+            np.testing.assert_allclose(sweep.frame_from_lidar, expected, atol=1e-9)
+        np.testing.assert_array_equal(ego.can_bus, lidar.can_bus)
+        both = shapely.box(-25, -14, 25, 14)  # which the two ranges share
+        for label in range(3):
+            own, other = of_label(ego, label, np.eye(4)), of_label(lidar, label, ego_from_lidar)
+            # pitch and roll of the roof shorten the plane by less than 5 cm
+            assert own.intersection(both).difference(other.buffer(0.05)).is_empty
+            assert other.intersection(both).difference(own.buffer(0.05)).is_empty
+
+
+def of_label(sample: MapSample, label: int, ego_from_frame: np.ndarray) -> shapely.MultiLineString:
+    """Return a sample's elements of one class as the vehicle sees them from above."""
+    lines = [i.points[:, :2] for i in sample.instances if i.label == label]
+    rotation, shift = ego_from_frame[:2, :2], ego_from_frame[:2, 3]
+    return shapely.MultiLineString([line @ rotation.T + shift for line in lines])
 
 
 def test_own_splits_by_name_and_token(options: NuScenesOptions, tmp_path: Path):

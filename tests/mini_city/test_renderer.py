@@ -1,22 +1,13 @@
 import numpy as np
 import pytest
-from shapely.geometry import Polygon, box
+from shapely.geometry import box
 
 from minicity.camera import Camera, clip_near
 from minicity.lighting import Lighting
 from minicity.meshes import Mesh, add_building
 from minicity.renderer import SceneRenderer, render_camera
 from minicity.rig import CAMERAS, mounted_camera, world_from_ego
-from minicity.scene_map import (
-    HeightGrid,
-    Marking,
-    SceneMap,
-    Surface,
-    dashed_line,
-    double_line,
-    solid_line,
-    zebra,
-)
+from minicity.scene_map import HeightGrid, Marking, SceneMap, Surface, solid_line
 from minicity.town import Building
 from minicity.vehicles import Vehicle
 
@@ -190,21 +181,6 @@ def test_one_call_renders_one_picture() -> None:
     image = render_camera(scene, front_camera(), DAY, [RED])
     assert image.shape == (225, 400, 3)
     assert image.dtype == np.uint8
-
-
-def test_marking_shapes_worked_by_hand() -> None:
-    line = np.array([[0.0, 0.0], [10.0, 0.0]])
-    (solid,) = solid_line(line, 0.2)
-    assert Polygon(solid).area == pytest.approx(2.0)
-    dashes = [Polygon(d) for d in dashed_line(line, 0.2, 3.0, 3.0)]
-    assert [d.bounds[0] for d in dashes] == pytest.approx([0.0, 6.0])
-    assert [d.bounds[2] for d in dashes] == pytest.approx([3.0, 9.0])
-    left, right = (Polygon(d) for d in double_line(line, 0.1, 0.2))
-    assert (left.bounds[1], left.bounds[3]) == pytest.approx((0.1, 0.2))
-    assert (right.bounds[1], right.bounds[3]) == pytest.approx((-0.2, -0.1))
-    stripes = [Polygon(s) for s in zebra(line, line + np.array([0.0, 3.0]))]
-    assert len(stripes) == 9
-    assert sum(s.area for s in stripes) == pytest.approx(9 * 0.5 * 3.0)
 
 
 def test_bad_input_is_named() -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from comparison.jobs import Job
 from comparison.plan import Protocol, Run, parse_entry, plan
-from comparison.report import (
+from comparison.results import (
     check_one_test_set,
     differences_to_first,
     evaluator_for,

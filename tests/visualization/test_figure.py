@@ -320,5 +320,5 @@ def test_bad_arguments(tmp_path):
 
 
 def test_pictures_and_pages_need_neither_torch_nor_openmmlab():
-    code = "import sys, gsmap.visualization, gsmap.visualization.report.page, drivemaps.video\n"
+    code = "import sys, gsmap.visualization, gsmap.visualization.page.page, drivemaps.video\n"
     run_python("-c", code + "assert not {'torch', 'mmengine'} & set(sys.modules)", check=True)

@@ -26,14 +26,10 @@ class MergeConfig:
     min_area_confidence: float = 0.1
 
     def variances(self, frame: DriveFrame) -> FloatArray:
-        """Return the variance of each predicted vertex across its line, in square metres.
+        """Return the variance of each predicted vertex across its line, in square metres. (M,)
 
-        Args:
-            frame: A frame with its predictions.
-
-        Returns:
-            That of the vertices' Gaussians, or of a fixed deviation, plus a part that grows with
-            the distance from the vehicle. (M,)
+        It is that of the vertices' Gaussians, or of a fixed deviation, plus a part that grows with
+        the distance from the vehicle.
         """
         elements = frame.elements
         distances = np.linalg.norm(frame.to_frame(elements.points), axis=1)

@@ -43,13 +43,9 @@ class MapOrigin:
         return import_extra("pyproj", "maps").Proj(ellps="WGS84", **place)
 
     def lon_lat(self, points: FloatArray) -> FloatArray:
-        """Return longitude and latitude in degrees.
+        """Return longitude and latitude, in degrees on the WGS 84 ellipsoid. (n, 2)
 
-        Args:
-            points: Points of the global frame in metres. (n, >= 2)
-
-        Returns:
-            Degrees on the WGS 84 ellipsoid. (n, 2)
+        Points (n, >= 2) are in metres of the global frame.
         """
         east, north = self._projection(self.longitude_deg, self.latitude_deg)
         x, y = np.asarray(points)[:, :2].T
@@ -61,13 +57,7 @@ def known_origin(meta: AnnotationMeta, map_name: str) -> MapOrigin | None:
 
     nuScenes' devkit takes the south-western corner of a map for both the reference coordinate that
     it lists and the origin of the poses; Argoverse 2 shifts the UTM grid to the origin of a city.
-
-    Args:
-        meta: Metadata of an annotation file.
-        map_name: Name of the map or city.
-
-    Returns:
-        The origin, or None: other data sets, and maps that the devkit does not list.
+    None stands for other data sets, and maps that the devkit does not list.
     """
     if meta.dataset == "nuscenes":
         from nuscenes.scripts.export_poses import REFERENCE_COORDINATES

@@ -32,8 +32,7 @@ def write_geojson(
         RuntimeError: If an origin is given and ``pyproj`` is missing.
     """
     features = []
-    rows = zip(elements.polylines, elements.labels.tolist(), elements.confidence, strict=True)
-    for line, label, score in rows:
+    for line, label, score in elements.rows:
         name = classes[label]
         digits = 4 if origin is None else 9  # a tenth of a millimetre
         points = (line if origin is None else origin.lon_lat(line)).round(digits).tolist()
@@ -42,7 +41,7 @@ def write_geojson(
         features.append(
             {
                 "type": "Feature",
-                "properties": {"class": name, "score": round(float(score), 4)},
+                "properties": {"class": name, "score": round(score, 4)},
                 "geometry": {
                     "type": "Polygon" if area else "LineString",
                     "coordinates": [points[:: -1 if clockwise else 1]] if area else points,

@@ -38,7 +38,7 @@ def write_lanelet2(
     """
     root = ElementTree.Element("osm", version="0.6", generator="gsmap")
     ways, identity = [], 0
-    for line, label in zip(elements.polylines, elements.labels.tolist(), strict=True):
+    for line, label, _ in elements.rows:
         ring = len(line) > 3 and bool((line[0] == line[-1]).all())
         nodes = []
         vertices = line[:-1] if ring else line

@@ -27,15 +27,9 @@ def confident(drive: Drive, min_score: float) -> Drive:
 
 
 def merge(drive: Drive, config: MergeConfig | None = None) -> MapElements:
-    """Merge the predictions of all frames into one map.
+    """Merge the predictions of all frames into one map; the same input gives the same map.
 
-    Args:
-        drive: Frames with their predictions.
-        config: Rules.
-
-    Returns:
-        Lines and closed rings in the global frame, with their confidence; the same input gives the
-        same map. (N,)
+    Its lines and closed rings are in the global frame, with their confidence as scores.
     """
     config, found = config or MergeConfig(), []
     for label, name in enumerate(drive.classes):
@@ -48,31 +42,15 @@ def suppress(drive: Drive) -> MapElements:
     """Thin the predictions of all frames out by non-maximum suppression: the plain baseline.
 
     By falling score, a polyline is dropped if a kept one of its class is within 1 m of more than
-    half of it.
-
-    Args:
-        drive: Frames with their predictions.
-
-    Returns:
-        The kept polylines in the global frame, with their scores. (N,)
+    half of it. The map is in the global frame and keeps the scores.
     """
-    rows = [
-        (score, label, line)
-        for frame in drive.frames
-        for score, label, line in zip(
-            frame.elements.confidence.tolist(),
-            frame.elements.labels.tolist(),
-            frame.elements.polylines,
-            strict=True,
-        )
-        if len(line) > 1
-    ]
-    rows = [rows[i] for i in np.argsort([-score for score, *_ in rows], kind="stable")]
-    lines = np.array([shapely.LineString(line) for *_, line in rows], dtype=object)
+    rows = [row for frame in drive.frames for row in frame.elements.rows if len(row[0]) > 1]
+    rows.sort(key=lambda row: -row[2])
+    lines = np.array([shapely.LineString(line) for line, *_ in rows], dtype=object)
     strips = shapely.buffer(lines, _RADIUS_M)
     tree, kept = shapely.STRtree(strips), np.zeros(len(rows), dtype=bool)
     for i, (_, label, _) in enumerate(rows):
         near = [j for j in tree.query(lines[i]) if kept[j] and rows[j][1] == label]
         along = shapely.length(shapely.intersection(lines[i], strips[near]))
         kept[i] = lines[i].length > 0.0 and not (along > _SHARE * lines[i].length).any()
-    return drive_map((label, line, score) for score, label, line in compress(rows, kept))
+    return drive_map((label, line, score) for line, label, score in compress(rows, kept))

@@ -12,6 +12,7 @@ from gsmap.evaluation.report import flat_metrics
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.polylines import clip_to_box
+from gsmap.utils.words import markdown_table
 
 NUM_POINTS = 1000  # elements are hundreds of metres long
 
@@ -72,9 +73,7 @@ def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapE
     box = shapely.box(x0, y0, x1, y1)
     scores: list[float] = []
     lines, labels = [], []
-    for line, label, score in zip(
-        elements.polylines, elements.labels.tolist(), elements.confidence.tolist(), strict=True
-    ):
+    for line, label, score in elements.rows:
         local = frame.to_frame(line)
         if drive.classes[label] in AREA_CLASSES and len(local) > 3:
             areas = shapely.get_parts(shapely.make_valid(shapely.Polygon(local)) & box)
@@ -139,9 +138,9 @@ def figures_table(figures: Mapping[str, Mapping[str, Mapping[str, float]]]) -> s
     """
     of_first = next(iter(figures.values()))
     columns = [*dict.fromkeys(c for row in of_first.values() for c in row if c != "mean"), "mean"]
-    lines = ["| figure | map | " + " | ".join(columns) + " |", "| --- " * (2 + len(columns)) + "|"]
-    for name in of_first:
-        for way, found in figures.items():
-            cells = [f"{100 * found[name][c]:.1f}" if c in found[name] else "-" for c in columns]
-            lines.append(f"| {name} | {way} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    rows = [
+        [name, way, *(f"{100 * found[name][c]:.1f}" if c in found[name] else "-" for c in columns)]
+        for name in of_first
+        for way, found in figures.items()
+    ]
+    return markdown_table(["figure", "map", *columns], rows)

@@ -20,13 +20,8 @@ _OVERLAP_M = 0.2  # pieces that share so much length are of one line
 def true_map(drive: Drive) -> MapElements:
     """Put the samples' ground truth together.
 
-    Pieces that run along each other are one line; areas that overlap are one area.
-
-    Args:
-        drive: Frames with their ground truth.
-
-    Returns:
-        Lines and rings in the global frame, without scores. (N,)
+    Pieces that run along each other are one line; areas that overlap are one area. The map is in
+    the global frame and has no scores.
     """
     found = []
     for label, name in enumerate(drive.classes):
@@ -40,7 +35,13 @@ def true_map(drive: Drive) -> MapElements:
 
 
 def components(count: int, first: IntArray, second: IntArray) -> list[IntArray]:
-    """Return the groups that pairs connect, in the order of their first members. each (n,)"""
+    """Return the groups that pairs connect, in the order of their first members. each (n,)
+
+    Args:
+        count: Number of members.
+        first: One member of each pair. (pairs,)
+        second: The other. (pairs,)
+    """
     graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
     groups, member_of = connected_components(graph, directed=False)
     return [np.flatnonzero(member_of == group) for group in range(groups)]

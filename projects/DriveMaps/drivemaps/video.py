@@ -20,6 +20,11 @@ from gsmap.visualization.style import MapStyle
 def write_video(path: str | Path, replay: Replay, width_px: int = 1280) -> None:
     """Write a film (``.mp4``) in H.264, as fast as the drive was; an empty map has no panel.
 
+    Args:
+        path: File to write.
+        replay: The drive and its map.
+        width_px: Width of the film in pixels.
+
     Raises:
         ValueError: If an image is missing or damaged.
         RuntimeError: If ``av`` (PyAV) is missing.

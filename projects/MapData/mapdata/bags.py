@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.datasets.errors import naming
+from gsmap.datasets.source import Source
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_name
@@ -21,7 +22,6 @@ from mapdata.folders.images import read_rig
 from mapdata.folders.rig import (
     PoseAt,
     PoseTrack,
-    Recording,
     RigCamera,
     RigFrame,
     nearest_images,
@@ -29,6 +29,7 @@ from mapdata.folders.rig import (
     rotation_of,
 )
 from mapdata.foxglove_mcap import FoxgloveBag, is_foxglove
+from mapdata.options import InputOptions
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
@@ -44,31 +45,12 @@ def is_bag(path: Path) -> bool:
     return path.suffix in (".bag", ".mcap", ".db3")
 
 
-def read_bag(
-    path: Path,
-    frames_dir: Path,
-    rate_hz: float | None = 2.0,
-    vehicle_frame: str | None = None,
-    ground_z_m: float = 0.0,
-    topics: Mapping[str, tuple[str, str]] | None = None,
-    calibration: Path | None = None,
-) -> Recording:
+def read_bag(path: Path, options: InputOptions) -> Source:
     """Read the samples of a bag, in the frame ``ego``, and write their images as files.
 
     A message that cannot be read is left out and noted. An image that cannot be decoded is noted
-    and not written, so that its frame is known to be broken.
-
-    Args:
-        path: The bag.
-        frames_dir: Folder for folders of images; that of a bag is named by its content, and images
-            that are there are kept.
-        rate_hz: Samples per second of the first camera; None takes all of its images.
-        vehicle_frame: Frame of the vehicle (x ahead, y left, z up) in the bag's transforms;
-            ``base_footprint`` or ``base_link`` by default.
-        ground_z_m: Height of the road in that frame.
-        topics: Topic of the images and of the camera info, by camera, where they are not found.
-        calibration: Calibration file of the cameras, in place of their infos and transforms; their
-            names are those of the topics, or its ``images`` are topics.
+    and not written, so that its frame is known to be broken. The folder of a bag's images is named
+    by its content, and images that are there are kept.
 
     Raises:
         RuntimeError: If ``rosbags`` is not installed; the message names the extra.
@@ -83,9 +65,7 @@ def read_bag(
             bag = FoxgloveBag(path) if is_foxglove(path) else bag
             bag.open()
         try:
-            return _read(
-                bag, path, frames_dir, rate_hz, vehicle_frame, ground_z_m, topics, calibration
-            )
+            return _read(bag, path, options)
         finally:
             bag.close()
 
@@ -128,19 +108,11 @@ class _Content:
     unread: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
 
 
-def _read(
-    bag: Any,
-    path: Path,
-    frames_dir: Path,
-    rate_hz: float | None,
-    vehicle_frame: str | None,
-    ground_z_m: float,
-    chosen: Mapping[str, tuple[str, str]] | None,
-    calibration: Path | None,
-) -> Recording:
+def _read(bag: Any, path: Path, options: InputOptions) -> Source:
     kinds, listing = {c.topic: c.msgtype for c in bag.connections}, _listing(bag)
-    ground = rigid(np.eye(3), (0, 0, ground_z_m))
-    topics = chosen_topics(kinds, chosen or {}, listing, calibration is None)
+    calibration, vehicle_frame = options.calibration, options.vehicle_frame
+    ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m))
+    topics = chosen_topics(kinds, options.topics, listing, calibration is None)
     if calibration is None:
         topics = topics or camera_topics(kinds, listing)
         content = _first_pass(bag, topics)
@@ -159,7 +131,7 @@ def _read(
     content.digest.update(calibration.read_bytes() if calibration else b"")
     times = {name: np.unique(content.times_ns[topic]) for name, (topic, _) in topics.items()}
     first = next((name for name in times if "front" in name.lower()), next(iter(times)))
-    wanted = thin_out(times[first], rate_hz)
+    wanted = thin_out(times[first], options.rate_hz)
     nearest = nearest_images(times, wanted.tolist(), _TOLERANCE_NS)
     frames = [
         RigFrame(
@@ -171,13 +143,13 @@ def _read(
     ]
     pose_at = _pose_at(content, vehicle, ground)
     samples = rig_samples(path.stem, list(rig.values()), frames, pose_at)
-    root = frames_dir / f"{file_name(path.stem)}-{content.digest.hexdigest()[:16]}"
+    root = options.frames_dir / f"{file_name(path.stem)}-{content.digest.hexdigest()[:16]}"
     notes = [
         f"{len(reasons)} messages of {topic!r} cannot be read and are left out: {reasons[0]}"
         for topic, reasons in content.unread.items()
     ]
     notes += _write_images(bag, rig, frames, root)
-    return Recording(samples, root, pose_at is not None, tuple(notes))
+    return Source(samples, "ego", root, pose_at is not None, tuple(notes))
 
 
 def _topic_of(name: str, place: str, images: Mapping[str, str], kinds: Mapping[str, str]) -> str:

@@ -63,7 +63,13 @@ def fingerprint(sizes: Mapping[str, int], contents: Iterable[Path] = ()) -> str:
 
 
 def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: int) -> None:
-    """Add what every converter of a data set asks; by default its frame's usual range."""
+    """Add what every converter of a data set asks.
+
+    Args:
+        parser: Gets the options.
+        frame: Annotation frame, whose usual range is the default.
+        max_sweeps: Default of the number of earlier LiDAR sweeps per sample.
+    """
     add = parser.add_argument
     add_range_options(parser, RANGES[frame])
     sweeps = "earlier LiDAR sweeps to list per sample (default: %(default)s)"

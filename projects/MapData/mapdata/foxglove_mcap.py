@@ -19,11 +19,9 @@ def is_foxglove(path: Path) -> bool:
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             return False
-    bag = FoxgloveBag(path)
-    with bag.path.open("rb") as file:
-        summary = bag.reader(file).get_summary()
+    summary = FoxgloveBag(path).summary
     return bool(summary) and any(
-        channel.message_encoding == "protobuf" for channel in summary.channels.values()
+        c.message_encoding == "protobuf" for c in summary.channels.values()
     )
 
 
@@ -50,14 +48,18 @@ class FoxgloveBag:
         return import_extra("mcap.reader", "bags").make_reader(file)
 
     @cached_property
+    def summary(self) -> Any:
+        """What the file says of itself, or None."""
+        with self.path.open("rb") as file:
+            return self.reader(file).get_summary()
+
+    @cached_property
     def _channels(self) -> dict[str, tuple[str, Callable[[bytes], Any]]]:
         """Name of the messages of each topic, and what parses them."""
         parsers: dict[int, Callable[[bytes], Any]] = {}
         found = {}
-        with self.path.open("rb") as file:
-            summary = self.reader(file).get_summary()
-        for channel in summary.channels.values() if summary else ():
-            schema = summary.schemas.get(channel.schema_id)
+        for channel in self.summary.channels.values() if self.summary else ():
+            schema = self.summary.schemas.get(channel.schema_id)
             if schema is not None and schema.encoding == "protobuf":
                 if schema.id not in parsers:
                     parsers[schema.id] = _parser(schema.name, schema.data)
@@ -75,10 +77,9 @@ class FoxgloveBag:
     @cached_property
     def topics(self) -> dict[str, Any]:
         """Type and number of the messages of each topic."""
-        with self.path.open("rb") as file:
-            summary = self.reader(file).get_summary()
-        counts = summary.statistics.channel_message_counts if summary.statistics else {}
-        number = {c.topic: counts.get(c.id, 0) for c in summary.channels.values()}
+        statistics = self.summary.statistics
+        counts = statistics.channel_message_counts if statistics else {}
+        number = {c.topic: counts.get(c.id, 0) for c in self.summary.channels.values()}
         return {
             topic: SimpleNamespace(msgtype=name, msgcount=number[topic])
             for topic, (name, _) in self._channels.items()

@@ -1,7 +1,5 @@
 """From whatever holds a recording to samples: the one entrance to the readers of this room."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsmap.datasets.source import Source, annotated
@@ -11,6 +9,7 @@ from mapdata.bags import is_bag, read_bag
 from mapdata.folders.images import NAMES, read_image_folder
 from mapdata.infos.recordings import read_info_file
 from mapdata.nuscenes.tables import read_nuscenes, versions_in
+from mapdata.options import InputOptions
 
 _FILES = ("*.arrow", "*.pkl")
 KINDS = (
@@ -20,35 +19,7 @@ KINDS = (
 )
 
 
-@dataclass(frozen=True)
-class InputOptions:
-    """How inputs are read; each kind reads what concerns it.
-
-    Args:
-        data_root: Folder that paths of an annotation or info file start from.
-        allow_missing_cameras: Whether an info file may name images that do not exist.
-        version: Version folder of a nuScenes-format root; the only one by default.
-        rate_hz: Samples per second of Argoverse 2 logs and bags; None takes all.
-        frames_dir: Folder for images that have to be made, a bag's and those of distorted cameras,
-            in a folder for each input.
-        vehicle_frame: The vehicle's frame in a bag; ``base_footprint`` or ``base_link`` by default.
-        vehicle_ground_z_m: Height of the road in that frame.
-        topics: Topics of images and camera info of a bag, by camera (``parse_topics``).
-        calibration: Calibration file of a bag's cameras.
-    """
-
-    data_root: Path | None = None
-    allow_missing_cameras: bool = False
-    version: str | None = None
-    rate_hz: float | None = 2.0
-    frames_dir: Path = Path("frames")
-    vehicle_frame: str | None = None
-    vehicle_ground_z_m: float = 0.0
-    topics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    calibration: Path | None = None
-
-
-def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Source:
+def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
     """Read the samples of an input.
 
     Args:
@@ -64,22 +35,13 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
         FileNotFoundError: If there is nothing there, or what it names.
         ValueError: If it is none of these, or damaged; the message says why.
     """
-    path = Path(path)
+    path, options = Path(path), options or InputOptions()
     if not path.exists():
         raise FileNotFoundError(f"There is no input {path}.")
     if not is_bag(path) and (options.topics or options.calibration):
         raise ValueError(f"--topics and --calibration belong to a bag, and {path} is none.")
     if is_bag(path):
-        drive = read_bag(
-            path,
-            options.frames_dir,
-            options.rate_hz,
-            options.vehicle_frame,
-            options.vehicle_ground_z_m,
-            options.topics,
-            options.calibration,
-        )
-        return Source(drive.samples, "ego", drive.data_root, drive.has_poses, drive.notes)
+        return read_bag(path, options)
     if path.is_dir():
         return _open_folder(path, options)
     if path.suffix == ".arrow":
@@ -89,8 +51,7 @@ def open_input(path: str | Path, options: InputOptions = InputOptions()) -> Sour
         samples = read_info_file(path, root, options.allow_missing_cameras)
         return Source(samples, "lidar", root)
     if path.suffix in (".yaml", ".yml", ".json"):
-        drive = read_image_folder(path, options.frames_dir)
-        return Source(drive.samples, "ego", drive.data_root, drive.has_poses, drive.notes)
+        return read_image_folder(path, options.frames_dir)
     raise ValueError(f"{path} is no input: it must be {KINDS}.")
 
 

@@ -36,8 +36,8 @@ class ConversionSummary:
     def text(self) -> str:
         """Return the summary as lines for a terminal."""
         samples = ", ".join(f"{split} {count}" for split, count in self.samples.items()) or "none"
-        elements = ", ".join(f"{name} {self.instances[name]}" for name in self.classes)
-        lines = [f"samples: {samples}", f"map elements: {elements}"]
+        counts = ", ".join(f"{name} {self.instances[name]}" for name in self.classes)
+        lines = [f"samples: {samples}", f"map elements: {counts}"]
         for reason, count in self.problems.most_common():
             lines.append(f"{count:>7} x {reason}, for example {', '.join(self.examples[reason])}")
         return "\n".join(lines + self.notes)

@@ -9,7 +9,7 @@ from minicity import cli, devkit_plots
 
 
 def main() -> str:
-    """Run the command that is asked for and return its report."""
+    """Run the command that is asked for and return what it has to say."""
     parser = CommandParser(prog="python -m minicity", description=__doc__)
     commands = parser.add_subparsers(required=True)
     for name, module in (("generate", cli), ("draw", devkit_plots)):

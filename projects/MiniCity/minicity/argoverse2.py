@@ -36,7 +36,11 @@ def make_scene(
     """Lay out what the map of a log says about the ground.
 
     Paint is where the map says that there is some; lane boundaries without paint stay invisible.
-    ``bounds`` are xmin, ymin, xmax, ymax of the part that will be seen, city frame, in metres.
+
+    Args:
+        static_map: The map of the log.
+        heights: Height of its ground.
+        bounds: xmin, ymin, xmax, ymax of the part that will be seen, city frame, in metres.
 
     Raises:
         ValueError: If no ground height is known inside the bounds.

@@ -19,7 +19,13 @@ def resample(points: Array, spacing_m: float) -> Array:
 
 
 def interpolate(values: Array, lengths: Array, at: Array) -> Array:
-    """Rows of ``values``, which belong to arc lengths ``lengths``, interpolated at ``at``."""
+    """Interpolate between rows of values. (k, D)
+
+    Args:
+        values: A row at each arc length. (n, D)
+        lengths: Ascending arc lengths. (n,)
+        at: Arc lengths of the result. (k,)
+    """
     left = np.clip(np.searchsorted(lengths, at, side="right") - 1, 0, len(lengths) - 2)
     span = np.maximum(lengths[left + 1] - lengths[left], 1e-12)
     share = np.clip((at - lengths[left]) / span, 0.0, 1.0)[:, None]
@@ -27,7 +33,13 @@ def interpolate(values: Array, lengths: Array, at: Array) -> Array:
 
 
 def subline(points: Array, start_m: float, end_m: float) -> Array:
-    """The part of a polyline between two arc lengths. (n, 2) -> (m, 2)"""
+    """Return the part of a polyline between two arc lengths. (m, 2)
+
+    Args:
+        points: The polyline, in metres. (n, 2)
+        start_m: Arc length of the first point.
+        end_m: Arc length of the last point.
+    """
     lengths = arc_lengths(points)
     inner = lengths[(lengths > start_m + 1e-6) & (lengths < end_m - 1e-6)]
     return interpolate(points, lengths, np.concatenate([[start_m], inner, [end_m]]))
@@ -85,7 +97,14 @@ def strip(points: Array, half_width_m: float) -> Array:
 
 
 def rectangle(center: Array, yaw_rad: float, length_m: float, width_m: float) -> Array:
-    """Corners of a rectangle, anticlockwise. (4, 2)"""
+    """Return the corners of a rectangle, anticlockwise. (4, 2)
+
+    Args:
+        center: Its middle (x, y) in metres. (2,)
+        yaw_rad: Direction of its length, anticlockwise from +x.
+        length_m: Extent along that direction.
+        width_m: Extent across it.
+    """
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * [length_m, width_m]
     return corners @ np.array([[c, s], [-s, c]]) + center

@@ -143,7 +143,18 @@ def render_flat_ground(
 def render_uneven_ground(
     camera: Camera, texture: GroundTexture, background: Image, border: Color, height: HeightGrid
 ) -> tuple[Image, Array]:
-    """Draw uneven ground into a picture of the sky, as ``render_flat_ground`` does flat ground."""
+    """Draw uneven ground into a picture of the sky, as ``render_flat_ground`` does flat ground.
+
+    Args:
+        camera: The camera in the world.
+        texture: The ground from above.
+        background: Picture of the sky. (H, W, 3)
+        border: Colour beyond the texture, BGR.
+        height: Height of the ground in metres.
+
+    Returns:
+        The picture (H, W, 3), and the distance to the ground in metres, inf in the sky. (H, W)
+    """
     image = background.copy()
     terrain = see_terrain(camera, height)
     skyline = terrain.horizon()

@@ -55,7 +55,13 @@ def _outward(road: Road, at_start: bool) -> Array:
 
 
 def make_junction(node: int, arms: list[tuple[int, bool]], roads: list[Road]) -> Junction:
-    """Join the mouths of the roads at a node by rounded kerbs."""
+    """Join the mouths of the roads at a node by rounded kerbs.
+
+    Args:
+        node: Index of the node.
+        arms: Index of each road, and whether its start is here; anticlockwise.
+        roads: All roads.
+    """
     mouths = [mouth(roads[r], at_start) for r, at_start in arms]
     outward = [_outward(roads[r], at_start) for r, at_start in arms]
     corners = []

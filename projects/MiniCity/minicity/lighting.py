@@ -136,7 +136,13 @@ def haze_ground(image: Image, distance_m: Array, eye_m: float, lighting: Lightin
 
 
 def finish(image: Image, lighting: Lighting, rng: np.random.Generator) -> Image:
-    """Exposure, rain streaks and sensor noise. (H, W, 3)"""
+    """Return a picture with exposure, rain streaks and sensor noise. (H, W, 3)
+
+    Args:
+        image: The picture, BGR. (H, W, 3)
+        lighting: Gain, streaks and noise.
+        rng: Draws streaks and noise.
+    """
     table = np.clip(np.arange(256)[:, None] * np.array(lighting.gain), 0, 255).astype(np.uint8)
     image = cv2.LUT(image, np.ascontiguousarray(table[:, None]))
     if lighting.streaks:

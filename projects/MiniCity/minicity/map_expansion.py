@@ -242,6 +242,11 @@ def town_to_map(town: Town, seed: int) -> dict[str, Any]:
 def write_map(root: Path, town: Town, seed: int) -> str:
     """Write a town's expansion file and its drivable-area picture.
 
+    Args:
+        root: Data root.
+        town: The town.
+        seed: Number that tokens are made of.
+
     Returns:
         The picture's path relative to ``root``.
     """

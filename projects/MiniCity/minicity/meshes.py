@@ -149,13 +149,27 @@ def patches(face: Array, left: Array, right: Array, bottom: Array, top: Array) -
 
 
 def patch(face: Array, left: float, right: float, bottom: float, top: float) -> Array:
-    """One part of a quad. (4, 3)"""
+    """Return one part of a quad. (4, 3)
+
+    Args:
+        face: Corners: bottom left, bottom right, top right, top left, in metres. (4, 3)
+        left: Where it begins along the bottom, of 1.
+        right: Where it ends along the bottom, of 1.
+        bottom: Where it begins along the height, of 1.
+        top: Where it ends along the height, of 1.
+    """
     edges = (np.array([edge]) for edge in (left, right, bottom, top))
     return patches(face, *edges)[0]
 
 
 def add_building(mesh: Mesh, building: Building, lit_windows: bool = False) -> None:
-    """Walls with rows of windows, and a roof."""
+    """Add walls with rows of windows, and a roof.
+
+    Args:
+        mesh: Gets the quads, in world coordinates.
+        building: Footprint, height and colour.
+        lit_windows: Whether light shines in the windows.
+    """
     mesh.begin(np.append(building.footprint.mean(0), 0.0), backdrop=True)
     glass = (110.0, 190.0, 235.0) if lit_windows else (95.0, 80.0, 62.0)
     *walls, roof = prism_faces(building.footprint, 0.0, building.height_m)
@@ -176,7 +190,13 @@ def add_building(mesh: Mesh, building: Building, lit_windows: bool = False) -> N
 
 
 def add_tree(mesh: Mesh, tree: Array, ground_z_m: float = 0.0) -> None:
-    """A trunk and a crown of discs; ``tree`` is x, y, height. (3,)"""
+    """Add a trunk and a crown of discs.
+
+    Args:
+        mesh: Gets the quads and discs, in world coordinates.
+        tree: x, y and height in metres. (3,)
+        ground_z_m: Height of the ground.
+    """
     x, y, height = (float(v) for v in tree)
     mesh.begin(np.array([x, y, ground_z_m]))
     trunk = rectangle(np.array([x, y]), 0.0, TRUNK_M, TRUNK_M)
@@ -191,7 +211,13 @@ def add_tree(mesh: Mesh, tree: Array, ground_z_m: float = 0.0) -> None:
 
 
 def add_pole(mesh: Mesh, pole: Array, ground_z_m: float = 0.0) -> None:
-    """A lamp post; ``pole`` is x, y, height. (3,)"""
+    """Add a lamp post.
+
+    Args:
+        mesh: Gets the quads, in world coordinates.
+        pole: x, y and height in metres. (3,)
+        ground_z_m: Height of the ground.
+    """
     x, y, height = (float(v) for v in pole)
     at = np.array([x, y])
     mesh.begin(np.array([x, y, ground_z_m]))

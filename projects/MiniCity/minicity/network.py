@@ -41,7 +41,13 @@ class Node:
 
 
 def make_nodes(side: int, seed: int, name: str) -> list[Node]:
-    """Grid nodes, moved and turned at random, with some of the streets left out."""
+    """Make grid nodes, moved and turned at random, with some of the streets left out.
+
+    Args:
+        side: Nodes along each side of the grid.
+        seed: Seed of all towns.
+        name: Name of the town.
+    """
     rng = make_rng(seed, name, "nodes")
     nodes = []
     for i in range(side * side):
@@ -145,7 +151,13 @@ def _join(first: Array, second: Array) -> Array:
 
 
 def make_chains(nodes: list[Node], seed: int, name: str) -> list[Chain]:
-    """All streets; a node of degree two is a bend of its street, any other an end."""
+    """Make all streets; a node of degree two is a bend of its street, any other an end.
+
+    Args:
+        nodes: Nodes of the town.
+        seed: Seed of all towns.
+        name: Name of the town.
+    """
     chains = []
     used: set[tuple[int, int]] = set()
     for i, node in enumerate(nodes):
@@ -216,6 +228,12 @@ def make_roads(
     nodes: list[Node], chains: list[Chain], seed: int, name: str
 ) -> tuple[list[Road], list]:
     """Cut the streets back to their junctions.
+
+    Args:
+        nodes: Nodes of the town.
+        chains: Streets between nodes.
+        seed: Seed of all towns.
+        name: Name of the town.
 
     Returns:
         The roads and, per node, (road index, at its start, angle) anticlockwise by angle.

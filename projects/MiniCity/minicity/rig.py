@@ -71,7 +71,15 @@ def ego_from_lidar() -> Array:
 
 
 def world_from_ego(x: float, y: float, yaw: float, pitch: float = 0.0, roll: float = 0.0) -> Array:
-    """Pose of the car on the ground: turned by roll, then pitch, then yaw. (4, 4)"""
+    """Return the pose of the car on the ground: turned by roll, then pitch, then yaw. (4, 4)
+
+    Args:
+        x: East in metres.
+        y: North in metres.
+        yaw: Anticlockwise from east, in radians.
+        pitch: Nose down, in radians.
+        roll: Right side down, in radians.
+    """
     (cy, sy), (cp, sp), (cr, sr) = ((math.cos(a), math.sin(a)) for a in (yaw, pitch, roll))
     return np.array(
         [
@@ -84,7 +92,14 @@ def world_from_ego(x: float, y: float, yaw: float, pitch: float = 0.0, roll: flo
 
 
 def mounted_camera(mount: CameraMount, width: int, height: int, ego_pose: Array) -> Camera:
-    """The camera as it stands in the world when the car is at ``ego_pose`` (world_from_ego)."""
+    """Return the camera as it stands in the world.
+
+    Args:
+        mount: Lens and place in the car.
+        width: Width of the picture in pixels.
+        height: Height of the picture in pixels.
+        ego_pose: Pose of the car (``world_from_ego``). (4, 4)
+    """
     return Camera(
         mount.intrinsics(width, height), width, height, np.linalg.inv(ego_pose @ mount.ego_from_cam)
     )

@@ -97,14 +97,27 @@ def solid_line(line: Array, width_m: float) -> list[Array]:
 
 
 def dashed_line(line: Array, width_m: float, dash_m: float, gap_m: float) -> list[Array]:
-    """The painted areas of a dashed line. (n, 2) -> list of (m, 2)"""
+    """Return the painted areas of a dashed line. each (m, 2)
+
+    Args:
+        line: Its middle, in metres. (n, 2)
+        width_m: Width of the paint.
+        dash_m: Length of a dash.
+        gap_m: Length between dashes.
+    """
     total = float(arc_lengths(line)[-1]) if len(line) > 1 else 0.0
     starts = np.arange(0.0, max(total - 0.3, 0.0), dash_m + gap_m)
     return [strip(subline(line, s, min(s + dash_m, total)), width_m / 2) for s in starts]
 
 
 def double_line(line: Array, width_m: float, gap_m: float) -> list[Array]:
-    """The painted areas of two unbroken lines side by side. (n, 2) -> two (2n, 2)"""
+    """Return the painted areas of two unbroken lines side by side. two (2n, 2)
+
+    Args:
+        line: The middle between them, in metres. (n, 2)
+        width_m: Width of each line.
+        gap_m: Distance between them.
+    """
     if len(line) < 2:
         return []
     band, inner = strip(line, gap_m / 2 + width_m), strip(line, gap_m / 2)

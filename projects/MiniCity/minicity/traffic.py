@@ -87,7 +87,16 @@ def follow_lanes(town: Town, first: Lane, length_m: float, rng: np.random.Genera
 
 
 def plan_ego(town: Town, scene: int, duration_s: float, rng: np.random.Generator) -> Drive:
-    """The ego vehicle's drive; scenes of one town start on different roads, often at junctions."""
+    """Plan the ego vehicle's drive.
+
+    Scenes of one town start on different roads, often at junctions.
+
+    Args:
+        town: The town.
+        scene: Number of the scene in its town.
+        duration_s: Length of the scene in seconds.
+        rng: Draws lane, speed and start.
+    """
     order = np.random.default_rng(len(town.roads)).permutation(len(town.roads))
     for attempt in range(60):
         road = town.roads[int(order[(scene + attempt * 7) % len(order)])]
@@ -152,7 +161,14 @@ def _stand(model: Vehicle, x: float, y: float, yaw: float) -> Actor:
 
 
 def make_actors(town: Town, ego: Drive, duration_s: float, rng: np.random.Generator) -> list[Actor]:
-    """Traffic around the ego vehicle's drive; nobody touches it or one another."""
+    """Make the traffic around the ego vehicle's drive; nobody touches it or one another.
+
+    Args:
+        town: The town.
+        ego: The ego vehicle's drive.
+        duration_s: Length of the scene in seconds.
+        rng: Draws who is there.
+    """
     times = np.linspace(0.0, duration_s, 8).tolist()
     ego_track = np.array([ego.pose(t)[:2] for t in times])
     density = float(rng.uniform(0.25, 1.0))

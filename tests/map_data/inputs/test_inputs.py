@@ -16,7 +16,8 @@ from gsmap.datasets.source import ground_from_frame, reframed
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.rigid import invert_rigid
 from mapdata.argoverse2.log import Argoverse2Log
-from mapdata.inputs import InputOptions, open_input
+from mapdata.inputs import open_input
+from mapdata.options import InputOptions
 
 LOG = Path("av2/sensor/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede")
 

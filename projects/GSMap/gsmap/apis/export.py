@@ -175,8 +175,13 @@ def quantize_onnx(
 ) -> None:
     """Write a file of `export_onnx` anew, with convolutions in 8 bits, calibrated on samples.
 
-    ``inputs`` are those of the graph for some samples, as `OnnxInferencer.prepare` returns them;
-    ValueError if there are none.
+    Args:
+        path: The file of `export_onnx`.
+        out: The file to write.
+        inputs: Inputs of the graph for some samples, as `OnnxInferencer.prepare` returns them.
+
+    Raises:
+        ValueError: If there are no inputs.
     """
     from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 
@@ -206,7 +211,12 @@ def quantize_onnx(
 def graph_inputs(
     inferencer: OnnxInferencer, dataset: Any, indices: Iterable[int]
 ) -> Iterator[tuple[str, dict[str, NDArray[np.float32]]]]:
-    """Yield token and inputs of some samples of a data set with its test pipeline.
+    """Yield token and inputs of some samples.
+
+    Args:
+        inferencer: The exported graph.
+        dataset: Data set with the test pipeline.
+        indices: Samples of the data set.
 
     Raises:
         ValueError: If images or matrices are not those of the file's cameras.

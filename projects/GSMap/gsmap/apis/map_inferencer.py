@@ -41,7 +41,12 @@ _LOOK_AT = 100  # samples whose cameras are an input's
 def select_samples(
     tokens: Sequence[str], wanted: Sequence[str] | None = None, max_num: int | None = None
 ) -> list[int]:
-    """Choose samples by token, and of these at most ``max_num``, spread evenly.
+    """Choose samples by token, and of these at most a number, spread evenly.
+
+    Args:
+        tokens: Tokens of all samples.
+        wanted: Tokens of those to choose from; None is all.
+        max_num: Largest number of samples; None takes all.
 
     Returns:
         Indices into ``tokens``, in the order of ``wanted`` if that is given.

@@ -25,9 +25,12 @@ def plain(settings: Any) -> Any:
 
 
 def differences(ours: Any, others: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
-    """Compare nested dictionaries, lists and plain values.
+    """Return both values of what differs, by dotted name; None is what is not there.
 
-    Returns both values by dotted name, which begins with ``name``; None is what is not there.
+    Args:
+        ours: Nested dictionaries, lists and plain values.
+        others: What to compare them with.
+        name: What the names begin with.
     """
     if isinstance(ours, list) and isinstance(others, list):
         return differences(dict(enumerate(ours)), dict(enumerate(others)), name)

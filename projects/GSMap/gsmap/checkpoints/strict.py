@@ -31,9 +31,15 @@ def adapt_state(
 ) -> None:
     """Rename upstream's keys in place, then compare the state with what the model expects.
 
-    Batch counters of BatchNorm may be missing, as in old checkpoints. Neutral keys (`neutral_keys`)
-    may be missing all together, unless ``allow_untrained`` is False. Both states have ``prefix``;
-    ``fit`` changes the renamed state in place before it is compared.
+    Batch counters of BatchNorm may be missing, as in old checkpoints.
+
+    Args:
+        state: What a checkpoint has, under ``prefix``.
+        expected: What the model has, under ``prefix``.
+        prefix: What the keys begin with.
+        neutral: Keys that may be missing all together (``neutral_keys``).
+        fit: Changes the renamed state in place before it is compared.
+        allow_untrained: Whether the neutral keys may be missing.
 
     Raises:
         ValueError: If a key is missing, left over or of another shape.

@@ -62,6 +62,12 @@ def decode_image(
     """Decode the content of an image file, as ``read_image`` does.
 
     Of a JPEG even a decoder's warning counts: OpenCV paints what is missing grey and says nothing.
+
+    Args:
+        content: What the file holds.
+        path: Its path, for messages.
+        where: What messages begin with, such as the sample and the camera.
+        size: Width and height in pixels that it must have; None takes any.
     """
     try:
         found = _size(content)

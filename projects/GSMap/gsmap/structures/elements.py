@@ -1,6 +1,6 @@
 """The map of one sample, predicted or annotated: all its polylines and rings in flat arrays."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from typing import Any
@@ -97,6 +97,12 @@ class MapElements:
     def polylines(self) -> list[FloatArray]:
         """The vertices of each element, as views. N x (P, D)"""
         return [self.points[a:b] for a, b in pairwise(self.offsets.tolist())]
+
+    @property
+    def rows(self) -> Iterator[tuple[FloatArray, int, float]]:
+        """Vertices (P, D), label and confidence of one element after another."""
+        values = self.labels.tolist(), self.confidence.tolist()
+        return zip(self.polylines, *values, strict=True)
 
     @property
     def confidence(self) -> FloatArray:

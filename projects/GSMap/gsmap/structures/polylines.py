@@ -49,9 +49,12 @@ def resample(points: Points, num_points: int) -> NDArray[np.float64]:
 def resample_all(
     points: Points, offsets: NDArray[np.integer[Any]], num_points: int
 ) -> NDArray[np.float64]:
-    """Resample many polylines as `resample` does one, to P points each; none give zeros.
+    """Resample many polylines as `resample` does one. (N, P, D)
 
-    Polyline i owns the vertices ``offsets[i]:offsets[i + 1]``. (M, D), (N + 1,) -> (N, P, D)
+    Args:
+        points: Vertices of all polylines. (M, D)
+        offsets: Polyline i has the vertices ``offsets[i]:offsets[i + 1]``, zeros if none. (N + 1,)
+        num_points: Points P of each result, at equal distances in the plane.
     """
     counts = np.diff(offsets)
     resampled = np.zeros((len(counts), num_points, points.shape[1]))
@@ -136,9 +139,12 @@ def bounding_boxes(points: Points) -> Points:
 
 
 def clamp(points: Points, x_range: tuple[float, float], y_range: tuple[float, float]) -> Points:
-    """Return points with those outside a rectangle moved to its nearest edge. (..., D) -> (..., D)
+    """Return points with those outside a rectangle moved to its nearest edge. (..., D)
 
-    Ranges are in metres; entries after (x, y) are kept.
+    Args:
+        points: Points that begin with (x, y); further entries are kept. (..., D)
+        x_range: Smallest and largest x, in the unit of the points.
+        y_range: Smallest and largest y.
     """
     clamped = np.array(points)
     clamped[..., :2] = np.clip(clamped[..., :2], *np.transpose([x_range, y_range]))

@@ -39,7 +39,7 @@ def is_first_rank() -> bool:
 
 
 def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> None:
-    """Run a command, print what it reports, and leave in words whatever a user can cause.
+    """Run a command, print what it returns, and leave in words whatever a user can cause.
 
     A file that cannot be read, understood or written, and whatever a ``raise`` statement says, end
     with ``error: ...`` and exit code 2 (`faults.in_words`); Ctrl-C with one line and 130; ``kill``
@@ -64,9 +64,9 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     if heed_kill and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup wants it
         signal.signal(signal.SIGHUP, end)
     try:
-        report = command()
-        if report is not None:
-            sys.stdout.write(f"{report}\n")
+        text = command()
+        if text is not None:
+            sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
     except KeyboardInterrupt:
         if is_first_rank():

@@ -63,8 +63,8 @@ class BEVPanel:
         """What becomes of each element with ``hits`` and of each ground truth in ``truth``."""
         hits = () if self.hits is None else self.hits
         truth = range(len(self.truth or ()))
-        elements = ["hit" if hit >= 0 else "false" for hit in hits]
-        return elements, ["found" if index in hits else "missed" for index in truth]
+        fates = ["hit" if hit >= 0 else "false" for hit in hits]
+        return fates, ["found" if index in hits else "missed" for index in truth]
 
 
 def display_extent(grid: BEVGrid, view: FrameView) -> tuple[float, float, float, float]:
@@ -123,7 +123,18 @@ def draw_lines(
     zorder: float = 10,
     fates: Sequence[str] = (),
 ) -> None:
-    """Draw polylines in these colours, false ones dashed, and fill those of closed classes."""
+    """Draw polylines, false ones dashed, and fill those of closed classes.
+
+    Args:
+        ax: Where to draw.
+        lines: Polylines in display coordinates, in metres. each (n, 2)
+        labels: Their class indices. (N,)
+        style: Says which classes are closed.
+        colours: A colour for each.
+        width_pt: Width of the lines in points.
+        zorder: Height of the lines over the rest of the drawing.
+        fates: ``hit`` or ``false`` for each; empty draws no dashes.
+    """
     areas = [i for i, label in enumerate(labels) if style.is_closed(label)]
     faces = [(*mcolors.to_rgb(colours[i]), 0.2) for i in areas]
     shapes = [lines[i] for i in areas]
@@ -212,7 +223,15 @@ def _draw_rasters(ax: Axes, picture: np.ndarray, view: FrameView) -> None:
 
 
 def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: MapStyle) -> None:
-    """Draw one panel of a map with the extent of ``grid``."""
+    """Draw one panel of a map.
+
+    Args:
+        ax: Where to draw.
+        panel: What to draw, in the annotation frame.
+        grid: The extent of the drawing.
+        view: How the annotation frame is turned in the display.
+        style: Colours and sizes.
+    """
     elements = panel.elements
     fates, truth_fates = panel.fates
     _draw_ground(ax, panel.points, grid, view, style)

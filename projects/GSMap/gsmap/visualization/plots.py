@@ -29,7 +29,16 @@ def finish_panel(
     colour: str = "black",
     legend: Mapping[str, Any] | None = None,
 ) -> None:
-    """Set what all plots share; ``legend`` says where its legend stands."""
+    """Set what all plots share.
+
+    Args:
+        ax: The finished plot.
+        title: Its title, at the left.
+        x_label: What is along x, with its unit.
+        y_label: What is along y, with its unit.
+        colour: Colour of the title.
+        legend: Options of its legend, such as where it stands.
+    """
     ax.set_title(title, fontsize=9, loc="left", color=colour)
     ax.set_xlabel(x_label, fontsize=8)
     ax.set_ylabel(y_label, fontsize=8)

@@ -103,7 +103,13 @@ class Argoverse2Log:
 
 
 def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> int | None:
-    """Return which of ascending times (n,) is closest to the wanted one; None beyond tolerance."""
+    """Return the time that is closest to a wanted one.
+
+    Args:
+        timestamps_ns: Ascending times in nanoseconds. (n,)
+        wanted_ns: The wanted time in nanoseconds.
+        tolerance_ns: Largest distance in nanoseconds; beyond it the result is None.
+    """
     if len(timestamps_ns) == 0:
         return None
     after = int(np.searchsorted(timestamps_ns, wanted_ns))
@@ -113,9 +119,12 @@ def closest_ns(timestamps_ns: np.ndarray, wanted_ns: int, tolerance_ns: int) -> 
 
 
 def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
-    """Return the folders of a split's logs whose ids begin as asked (empty takes all), sorted.
+    """Return the folders of a split's logs, sorted.
 
-    The split is a folder of the data root, or of its folder ``sensor``.
+    Args:
+        root: Data root. The split is a folder in it or in its folder ``sensor``.
+        split: ``train``, ``val`` or ``test``.
+        logs: First characters of the ids of the logs to take; empty takes all.
 
     Raises:
         FileNotFoundError: If there is no such split, or no log that begins as asked.

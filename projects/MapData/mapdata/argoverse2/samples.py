@@ -78,7 +78,12 @@ class LogSamples:
 
 
 def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -> LogSamples:
-    """Make the samples of one log, with ground truth unless ``with_map`` is false.
+    """Make the samples of one log.
+
+    Args:
+        log_dir: Folder of the log.
+        options: What a sample is: rate, frame, range, classes.
+        with_map: Whether to add the ground truth.
 
     Raises:
         FileNotFoundError: If the map or the poses are missing.

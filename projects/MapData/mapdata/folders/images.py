@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError, naming
 from gsmap.datasets.image_files import image_size, read_image
+from gsmap.datasets.source import Source
 from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
 from gsmap.utils.files import file_name
 from mapdata.folders.rig import (
     PoseTrack,
-    Recording,
     RigCamera,
     RigFrame,
     nearest_images,
@@ -42,7 +42,7 @@ _MOST_VALUES = 100_000  # in a calibration file
 _TIME = re.compile(r"(?:^|\D)(\d{10}(?:\d{3}|\d{6}|\d{9})?)(?:\.(\d{1,9}))?$")
 
 
-def read_image_folder(file: Path, frames_dir: Path) -> Recording:
+def read_image_folder(file: Path, frames_dir: Path) -> Source:
     """Read the samples that a calibration file describes, in the frame ``ego``.
 
     Args:
@@ -77,7 +77,7 @@ def read_image_folder(file: Path, frames_dir: Path) -> Recording:
         if any(camera.is_distorted for camera in rig):
             root = frames_dir / f"{file_name(scene)}-{_digest(file, frames)}"
             notes = [_rectify(sample, rig, file.parent, root) for sample in samples]
-        return Recording(samples, root, pose_at is not None, tuple(chain(*notes)))
+        return Source(samples, "ego", root, pose_at is not None, tuple(chain(*notes)))
 
 
 def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]], np.ndarray]:

@@ -107,23 +107,6 @@ class RigCamera:
         write_bytes(path, encode_jpeg(image, 95))
 
 
-@dataclass(frozen=True)
-class Recording:
-    """What a reader of a recording returns.
-
-    Args:
-        samples: The samples, in the frame ``ego``.
-        data_root: Folder that their paths start from.
-        has_poses: Whether the vehicle's pose is known.
-        notes: What could not be read.
-    """
-
-    samples: list[MapSample]
-    data_root: Path
-    has_poses: bool
-    notes: tuple[str, ...] = ()
-
-
 def rotation_of(wxyz: Iterable[Any]) -> np.ndarray:
     """Return the rotation of a quaternion, which must have length 1. (3, 3)"""
     w, x, y, z = (float(value) for value in wxyz)

@@ -12,7 +12,13 @@ Messages = tuple[np.ndarray, np.ndarray]
 
 
 def signals_at(timestamp_ns: int, global_from_ego: np.ndarray, messages: Messages) -> np.ndarray:
-    """Return the vehicle's pose (4, 4) with the latest message, as ``pose_signals`` says. (18,)"""
+    """Return the signals of the vehicle at a time, as ``pose_signals`` orders them. (18,)
+
+    Args:
+        timestamp_ns: The time in nanoseconds.
+        global_from_ego: Pose of the vehicle at that time. (4, 4)
+        messages: Times of the CAN bus in microseconds and what was measured; the latest counts.
+    """
     values = pose_signals(global_from_ego)
     times_us, measured = messages
     latest = int(np.searchsorted(times_us, timestamp_ns // 1000, side="right")) - 1

@@ -85,9 +85,14 @@ def expansion(root: Path, name: str) -> Path:
 
 
 def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
-    """Collect the geometries that the classes (of ``MAP_CLASSES``) need from a data root's map.
+    """Collect the geometries that the classes need from a map, in metres of the map.
 
     Lines without two nodes and invalid polygons are left out and counted.
+
+    Args:
+        root: Data root.
+        name: Name of the map, such as ``boston-seaport``.
+        classes: Wanted classes, of ``MAP_CLASSES``.
 
     Raises:
         FileNotFoundError: If the map is missing or unknown.

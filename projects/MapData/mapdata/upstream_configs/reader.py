@@ -81,10 +81,10 @@ def _value(node: ast.expr, names: _Names) -> Any:
             return value
         case ast.Name(name):
             return names.take(name)
-        case ast.List(elements):
-            return [_value(element, names) for element in elements]
-        case ast.Tuple(elements):
-            return tuple(_value(element, names) for element in elements)
+        case ast.List(items):
+            return [_value(item, names) for item in items]
+        case ast.Tuple(items):
+            return tuple(_value(item, names) for item in items)
         case ast.Dict(keys, values):
             return _mapping(zip(keys, values, strict=True), names)
         case ast.Subscript(value, index):

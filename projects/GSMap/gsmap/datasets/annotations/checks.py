@@ -25,19 +25,19 @@ def check_batch(batch: pa.RecordBatch, meta: AnnotationMeta) -> None:
     Raises:
         ValueError: If a value is wrong or missing; the message names the sample.
     """
-    checks = _Checks(batch.column("token"), meta)
+    walk = _Walk(batch.column("token"), meta)
     for name in batch.schema.names:
-        checks.walk(batch.column(name), name, np.arange(len(batch)))
+        walk.check(batch.column(name), name, np.arange(len(batch)))
 
 
-class _Checks:
+class _Walk:
     """A walk through a batch, which checks every array and all that is in it."""
 
     def __init__(self, tokens: pa.StringArray, meta: AnnotationMeta) -> None:
         self.tokens = tokens
         self.meta = meta
 
-    def walk(self, array: pa.Array, name: str, rows: np.ndarray, where: str = "") -> None:
+    def check(self, array: pa.Array, name: str, rows: np.ndarray, where: str = "") -> None:
         """Check an array; ``rows`` are the samples that its items belong to. (items,)."""
         if array.null_count:
             known = array.is_valid().to_numpy(zero_copy_only=False)
@@ -45,13 +45,13 @@ class _Checks:
             array, rows = array.drop_null(), rows[known]
         if pa.types.is_struct(array.type):
             for part in array.type:
-                self.walk(array.field(part.name), part.name, rows, where + _PLACES.get(name, ""))
+                self.check(array.field(part.name), part.name, rows, where + _PLACES.get(name, ""))
         elif pa.types.is_list(array.type):
             lengths = np.diff(array.offsets.to_numpy())
             if lengths.sum() != len(array.values):
                 raise ValueError(f"{where}{name} has items that belong to no sample.")
             if pa.types.is_struct(array.type.value_type):
-                self.walk(array.values, f"{name}[]", np.repeat(rows, lengths), where)
+                self.check(array.values, f"{name}[]", np.repeat(rows, lengths), where)
         if name in _RULES:
             rule, wrong = _RULES[name]
             good = rule(array, rows, self.meta)
@@ -90,8 +90,8 @@ def _are_own_names(names: pa.StringArray, rows: np.ndarray, _meta: AnnotationMet
     return (np.bincount(each)[each] == 1) & _are_inside(names)
 
 
-def _are_elements(lists: pa.ListArray, _rows: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
-    """Say which elements have two finite points or more."""
+def _are_polylines(lists: pa.ListArray, _rows: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
+    """Say which polylines have two finite points or more."""
     counts = np.diff(lists.offsets.to_numpy())
     good = (counts % meta.dim == 0) & (counts >= 2 * meta.dim)
     finite = np.isfinite(lists.values.to_numpy(zero_copy_only=False))
@@ -136,6 +136,6 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
         lambda labels, _, meta: (labels.to_numpy() >= 0) & (labels.to_numpy() < len(meta.classes)),
         " {0} is none of the classes {1.classes}",
     ),
-    "points": (_are_elements, " of an element must be (n >= 2, {1.dim}), not NaN or infinite"),
+    "points": (_are_polylines, " of an element must be (n >= 2, {1.dim}), not NaN or infinite"),
 }
 """By field: which items of an array are good, and what is said of the first that is not."""

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import cached_property, partial
-from itertools import chain, pairwise
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from gsmap.datasets.annotations.checks import check_batch
+from gsmap.datasets.annotations.messages import SEAL_KEY, checksums, read_messages
 from gsmap.datasets.annotations.record import FORMAT_VERSION, AnnotationMeta, MapSample
 from gsmap.datasets.annotations.schema import (
     FIELDS,
@@ -34,10 +35,6 @@ from gsmap.utils.shards import WHOLE, Shard, ShardFile
 
 SHARD_KIND = "annotations"
 _ROWS_PER_BATCH = 256
-# An Arrow file is a stream of messages between "ARROW1" and a footer that says where each begins.
-_START, _END = b"ARROW1\0\0", b"ARROW1"
-# The last message has no rows; its metadata hold the checksum of all bytes before it.
-SEAL_KEY = b"gsmap_seal"
 
 
 class AnnotationWriter:
@@ -205,7 +202,7 @@ class AnnotationFile(Sequence[MapSample]):
             self._map = pa.memory_map(str(self.path))
             self._state = self._current_state()
             self._content = self._map.read_buffer()
-            schema, self._batches, seal, ends = _messages(self._content)
+            schema, self._batches, seal, ends = read_messages(self._content)
             self.meta = _meta_of(schema)
         except (pa.ArrowException, OSError, ValueError, TypeError) as error:
             raise ValueError(
@@ -215,7 +212,7 @@ class AnnotationFile(Sequence[MapSample]):
         self.sealed = seal is not None
         try:
             # Where each message ends, and the checksum of all bytes up to there.
-            self._sums = sums or _sums(self._content, ends)
+            self._sums = sums or checksums(self._content, ends)
             self._intact = set() if sums else set(range(len(self._batches)))
             if sums is None:
                 self._check(seal)
@@ -369,38 +366,3 @@ def _meta_of(schema: pa.Schema) -> AnnotationMeta:
             f"this program reads: make it again with `{command or 'tools/create_data.py'}`"
         )
     return AnnotationMeta(**values)
-
-
-def _messages(
-    content: pa.Buffer,
-) -> tuple[pa.Schema, list[pa.RecordBatch], bytes | None, list[int]]:
-    """Read a file's messages in their order: schema, batches, and the seal if there is one.
-
-    Last come the ends of nothing, the schema and each batch, in bytes.
-    """
-    size = content.size
-    if size < len(_START) + 10 or content[: len(_START)].to_pybytes() != _START:
-        raise ValueError("it does not begin as an Arrow file")
-    source = pa.BufferReader(content)
-    source.seek(len(_START))
-    reader = pa.ipc.open_stream(source)
-    ends, found = [0, source.tell()], []
-    for message in reader.iter_batches_with_custom_metadata():
-        ends.append(source.tell())
-        found.append(message)
-    tail = content[source.tell() :].to_pybytes()
-    if tail[-6:] != _END or int.from_bytes(tail[-10:-6], "little") != len(tail) - 10:
-        raise ValueError("it ends too early")
-    seal = (found[-1].custom_metadata or {}).get(SEAL_KEY) if found else None
-    batches = [batch for batch, _ in (found if seal is None else found[:-1])]
-    if not all(map(len, batches)):
-        raise ValueError("it has an empty part")  # as a seal with a damaged name would be
-    return reader.schema, batches, seal, ends[: len(batches) + 2]
-
-
-def _sums(content: pa.Buffer, ends: Sequence[int]) -> list[tuple[int, int]]:
-    """Return the places and the checksums of all bytes before each."""
-    view, sums = memoryview(content), [(0, 0)]
-    for start, end in pairwise(ends):
-        sums.append((end, zlib.crc32(view[start:end], sums[-1][1])))
-    return sums

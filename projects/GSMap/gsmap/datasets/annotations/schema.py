@@ -74,9 +74,13 @@ def schema_of(meta: AnnotationMeta) -> pa.Schema:
 def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]:
     """Return a sample, or a record in it, as the nested values of an Arrow row.
 
+    Args:
+        record: The sample or record.
+        meta: What holds for the whole file.
+        where: What the message of an error begins with.
+
     Raises:
-        ValueError: If a matrix or an element has another shape, or holds no numbers; the message
-            begins with ``where``.
+        ValueError: If a matrix or an element has another shape, or holds no numbers.
     """
     where += f"sample {record.token!r}: " if isinstance(record, MapSample) else ""
     where += f"{record.name}: " if isinstance(record, CameraRecord) else ""
@@ -126,9 +130,12 @@ def matrices_of(array: pa.FixedSizeListArray, *shape: int) -> np.ndarray:
 
 
 def decoder_of(array: pa.Array, dim: int, name: str = "") -> Callable[[int], Any]:
-    """Return what makes the record of a row, or its field ``name``, from a valid array.
+    """Return a function that makes the record of a row from a valid array.
 
-    Points have ``dim`` coordinates.
+    Args:
+        array: Structures, or the values of one field of them.
+        dim: Coordinates per point, 2 or 3.
+        name: The field that the array holds; by default the whole record.
     """
     decode = _decoder_of(array, dim, name)
     if not array.null_count:

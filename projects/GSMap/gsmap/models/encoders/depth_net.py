@@ -31,9 +31,14 @@ def _camera_mlp(channels: int) -> nn.Sequential:
 def camera_vector(cam2img: Tensor, img_aug_matrix: Tensor, ego_from_cam: Tensor) -> Tensor:
     """Write a camera's parameters as the 22 numbers that MapTRv2's depth net reads. (..., 22)
 
-    fx, fy, cx, cy of the original image in pixels (..., >= 3, >= 3); a00, a01, tx, a10, a11, ty of
-    the augmentation, which acts on (u * d, v * d, d, 1), translation in pixels in the third column
-    (..., 4, 4); the upper three rows of the camera's pose in the vehicle, in metres (..., 4, 4).
+    These are fx, fy, cx, cy; a00, a01, tx, a10, a11, ty of the augmentation; the upper three rows
+    of the pose.
+
+    Args:
+        cam2img: Intrinsics of the original image, in pixels. (..., >= 3, >= 3)
+        img_aug_matrix: Augmentation, which acts on (u * d, v * d, d, 1); its translation in pixels
+            is in the third column. (..., 4, 4)
+        ego_from_cam: Pose of the camera in the vehicle, in metres. (..., 4, 4)
     """
     intrinsics = [cam2img[..., 0, 0], cam2img[..., 1, 1], cam2img[..., 0, 2], cam2img[..., 1, 2]]
     augmentation = img_aug_matrix[..., :2, :3].flatten(-2)

@@ -20,9 +20,16 @@ class PillarProjection(NamedTuple):
 def pillar_points(
     grid: BEVGrid, z_range: tuple[float, float], num_heights: int, device: torch.device
 ) -> Tensor:
-    """Return the middle of ``num_heights`` (Z) equal slices of ``z_range`` over every cell centre.
+    """Return the middle of equal slices of a range of heights over every cell centre.
 
-    Homogeneous points (x, y, z, 1) in metres, cells row-major, Q = H x W of the grid. (Q, Z, 4)
+    Args:
+        grid: The cells, H x W = Q.
+        z_range: Smallest and largest height in the annotation frame, in metres.
+        num_heights: Number Z of slices.
+        device: Where the points go.
+
+    Returns:
+        Homogeneous points (x, y, z, 1) in metres, cells row by row. (Q, Z, 4)
     """
     # Fractions first, then metres, in float32: kernel positions round, so the order of operations
     # matters.
@@ -39,9 +46,12 @@ def pillar_points(
 def project_pillars(
     points: Tensor, img_from_frame: Tensor, img_shape: tuple[int, int]
 ) -> PillarProjection:
-    """Project homogeneous points in metres (Q, Z, 4) by matrices to pixels (B, V, 4, 4).
+    """Project points to pixels.
 
-    ``img_shape`` are rows and columns of the padded image.
+    Args:
+        points: Homogeneous points in the annotation frame, in metres. (Q, Z, 4)
+        img_from_frame: Matrices to pixels. (B, V, 4, 4)
+        img_shape: Rows and columns of the padded image.
     """
     with torch.autocast(points.device.type, enabled=False):
         matrices = img_from_frame[:, :, None, None].float()

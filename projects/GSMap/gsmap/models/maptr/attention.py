@@ -28,7 +28,14 @@ def has_compiled_op(value: Tensor) -> bool:
 
 
 def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor) -> Tensor:
-    """Do what `deformable_sample` does, by mmcv's compiled op on a GPU where it was built."""
+    """Do what `deformable_sample` does, by mmcv's compiled op on a GPU where it was built.
+
+    Args:
+        value: Cells of the map, row by row. (B, H * W, heads, C)
+        shape: Rows H and columns W of the map.
+        locations: (x, y) in [0, 1] over the map. (B, Q, heads, S, 2)
+        weights: Weight of each sample. (B, Q, heads, S)
+    """
     if not has_compiled_op(value):
         return deformable_sample(value, shape, locations, weights)
     shapes = torch.tensor([shape], device=value.device)
@@ -42,8 +49,11 @@ def place_samples(
 ) -> Tensor:
     """Place samples around reference points, (x, y) in [0, 1] over the map. (B, Q, heads, S, 2)
 
-    Offsets are in cells (B, Q, heads, S, 2), turned by the frames (B, Q, 2, 2) if there are any;
-    the reference's (B, Q, D) first two entries are the point; ``shape`` is rows and columns.
+    Args:
+        offsets: From the reference point, in cells. (B, Q, heads, S, 2)
+        reference: Begins with the point (x, y) in [0, 1] over the map. (B, Q, D)
+        shape: Rows and columns of the map.
+        frames: Turn the offsets of a query, if given. (B, Q, 2, 2)
     """
     if frames is not None:
         offsets = torch.sum(frames[:, :, None, None] * offsets[..., None, :], -1)

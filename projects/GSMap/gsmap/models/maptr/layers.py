@@ -19,7 +19,13 @@ def mlp(*dims: int) -> nn.Sequential:
 
 
 def feed_forward(embed_dims: int, ffn_dims: int, dropout: float) -> FFN:
-    """Return mmcv's feed-forward network with its residual; its ReLU as in `mlp`."""
+    """Return mmcv's feed-forward network with its residual; its ReLU as in `mlp`.
+
+    Args:
+        embed_dims: Channels of input and output.
+        ffn_dims: Channels between.
+        dropout: Share of values set to zero in training.
+    """
     return FFN(embed_dims, ffn_dims, act_cfg={"type": "ReLU"}, ffn_drop=dropout)
 
 

@@ -80,7 +80,16 @@ class MapAssigner:
 
 
 def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None) -> None:
-    """Refuse values that the assignment cannot order; one name for each of the first axis."""
+    """Refuse values that the assignment cannot order.
+
+    Args:
+        values: Costs or predictions. (n, ...)
+        names: What each entry of the first axis is. (n,)
+        img_meta: Has the token of the sample, for the message.
+
+    Raises:
+        FloatingPointError: If a value is not finite.
+    """
     finite = values.isfinite().flatten(1).all(1)
     if not finite.all():
         token = (img_meta or {}).get("token", "unknown")

@@ -83,7 +83,13 @@ def weights_of(weight: WEIGHT, labels: Tensor) -> Tensor:
 
 
 def check_weight(part: Any, weight: WEIGHT, classes: Sequence[str]) -> None:
-    """Raise ValueError if a part has weights, but not one for each class."""
+    """Raise ValueError if a part has weights, but not one for each class.
+
+    Args:
+        part: The loss or cost, for the message.
+        weight: Its weight, or one for each class.
+        classes: Names of the classes.
+    """
     if isinstance(weight, Sequence) and len(weight) != len(classes):
         raise ValueError(
             f"{type(part).__name__} has the weights {list(weight)}: give one, or one for each of "
@@ -92,6 +98,12 @@ def check_weight(part: Any, weight: WEIGHT, classes: Sequence[str]) -> None:
 
 
 def check_classes(name: str, indices: Sequence[int], classes: Sequence[str]) -> None:
-    """Raise ValueError if a setting names a class index that does not exist."""
+    """Raise ValueError if a setting names a class that does not exist.
+
+    Args:
+        name: Name of the setting, for the message.
+        indices: Class indices that it has.
+        classes: Names of the classes.
+    """
     if any(not 0 <= index < len(classes) for index in indices):
         raise ValueError(f"{name} must be indices of {list(classes)}, got {tuple(indices)}.")

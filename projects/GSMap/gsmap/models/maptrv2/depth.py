@@ -7,12 +7,21 @@ from gsmap.structures.tensors import num_depth_bins
 
 
 def depth_bins(depth_m: Tensor, stride: int, depth_range: tuple[float, float, float]) -> Tensor:
-    """Return the depth bin of each block of ``stride`` x ``stride`` pixels, -1 for none, int64.
+    """Return the depth bin of each block of pixels, -1 for none, int64.
 
-    A block takes its nearest return. Bin 0 of ``(low, high, step)`` starts at ``low``; a block
-    whose nearest return lies in front of it or beyond the last bin has no target, even if a further
-    one would. ValueError if the size is no multiple of ``stride``. Depth along the optical axis in
-    metres, 0 without a return (..., H, W) -> (..., H / stride, W / stride)
+    A block takes its nearest return. If that lies in front of the first bin or beyond the last, the
+    block has no target, even if a further return would have.
+
+    Args:
+        depth_m: Depth along the optical axis in metres, 0 without a return. (..., H, W)
+        stride: Side of a block in pixels.
+        depth_range: Where bin 0 starts, where the last ends, and the step, in metres.
+
+    Returns:
+        Indices of bins. (..., H / stride, W / stride)
+
+    Raises:
+        ValueError: If the size is no multiple of ``stride``.
     """
     height, width = depth_m.shape[-2:]
     if height % stride or width % stride:

@@ -16,8 +16,16 @@ def gaussian_densities(means: Tensor, scales: Tensor, rotations: Tensor, grid: B
     r"""Evaluate every Gaussian at every pixel centre.
 
     :math:`G(p) = \exp(-\frac12 (p - \mu)^T \Sigma^{-1} (p - \mu))` (GSMap Eq. 2) with
-    :math:`\Sigma = R\,\mathrm{diag}(\sigma^2)\,R^T`; parameters as of `render_gaussians`. Densities
-    in [0, 1]. (..., P, H, W)
+    :math:`\Sigma = R\,\mathrm{diag}(\sigma^2)\,R^T`.
+
+    Args:
+        means: Centres in metres. (..., P, 2)
+        scales: Standard deviations along the own axes, in metres, > 0. (..., P, 2)
+        rotations: Angle of the first axis from +x, in radians, anticlockwise. (..., P)
+        grid: The raster, in the frame of the Gaussians.
+
+    Returns:
+        Densities in [0, 1]. (..., P, H, W)
     """
     pixels = grid.pixel_centres(means.device, means.dtype)  # (H, W, 2)
     offsets = pixels - means[..., None, None, :]  # (..., P, H, W, 2)
@@ -31,6 +39,13 @@ def gaussian_densities(means: Tensor, scales: Tensor, rotations: Tensor, grid: B
 def render_gaussians_reference(
     means: Tensor, scales: Tensor, rotations: Tensor, grid: BEVGrid
 ) -> Tensor:
-    r"""Render :math:`1 - \prod_i (1 - G_i(p))` (Eq. 6) as ``-expm1(sum log1p(-G))``. (..., H, W)"""
+    r"""Render :math:`1 - \prod_i (1 - G_i(p))` (Eq. 6) as ``-expm1(sum log1p(-G))``. (..., H, W)
+
+    Args:
+        means: Centres in metres. (..., P, 2)
+        scales: Standard deviations along the own axes, in metres, > 0. (..., P, 2)
+        rotations: Angle of the first axis from +x, in radians, anticlockwise. (..., P)
+        grid: The raster, in the frame of the Gaussians.
+    """
     densities = gaussian_densities(means, scales, rotations, grid).clamp(max=MAX_DENSITY)
     return -torch.expm1(torch.log1p(-densities).sum(-3))

@@ -119,13 +119,13 @@ def soft_rasters(
         return soft_rasters_reference(rings, flags, height, width, softness, plain)
 
 
-def _flags(flags: Tensor | None, name: str, elements: Tensor) -> Tensor:
-    """Check a flag per element, or make them all false. (n,)"""
+def _flags(flags: Tensor | None, name: str, polylines: Tensor) -> Tensor:
+    """Check a flag per polyline, or make them all false. (n,)"""
     if flags is None:
-        return torch.zeros(len(elements), dtype=torch.bool, device=elements.device)
-    if flags.shape != elements.shape[:1] or flags.dtype != torch.bool:
+        return torch.zeros(len(polylines), dtype=torch.bool, device=polylines.device)
+    if flags.shape != polylines.shape[:1] or flags.dtype != torch.bool:
         raise ValueError(
-            f"{name} must be bool of shape {(len(elements),)}, one flag per element, "
+            f"{name} must be bool of shape {(len(polylines),)}, one flag per polyline, "
             f"got {flags.dtype} of shape {tuple(flags.shape)}."
         )
     return flags

@@ -71,8 +71,16 @@ def soft_rasters_reference(
 ) -> Tensor:
     r"""Render closed rings: :math:`\exp(-D / s)`, or :math:`\sigma(\pm D / s)` for polygons.
 
-    Rings (n, V, 2) are in pixels, sampled at integer positions; ``softness`` is s of lines and of
-    polygons; D is the distance to the nearest edge if ``plain``, else its square. (n, H, W)
+    Args:
+        rings: Vertices in pixels; pixels are at integer positions. (n, V, 2)
+        is_polygon: Whether a ring is an area. (n,)
+        height: Rows H of the raster.
+        width: Columns W of the raster.
+        softness: s of lines and of polygons. (2,)
+        plain: Whether D is the distance to the nearest edge, and not its square.
+
+    Returns:
+        Values in [0, 1]. (n, H, W)
     """
     x = torch.arange(width, device=rings.device, dtype=rings.dtype)
     y = torch.arange(height, device=rings.device, dtype=rings.dtype)
@@ -88,10 +96,14 @@ def soft_rasters_reference(
 def draw_reference(
     polylines: Tensor, filled: Tensor, pixels: Tensor, half_width: float, pixel: float
 ) -> Tensor:
-    """Draw lines of half a width, or filled polygons (K,), of vertices (K, P, 2). (K, H, W)
+    """Draw polylines and filled polygons, all in one unit of length. (K, H, W)
 
-    All are in one unit: pixels are their centres (H, W, 2), ``pixel`` is the side of the square
-    that is as large as one.
+    Args:
+        polylines: Vertices. (K, P, 2)
+        filled: Whether a polyline is an area. (K,)
+        pixels: Centres of the pixels. (H, W, 2)
+        half_width: Half the width of a line.
+        pixel: Side of the square that is as large as a pixel.
     """
     to_line = _edge_distances(pixels, polylines[:, :-1], polylines[:, 1:]).sqrt()
     to_closing = _edge_distances(pixels, polylines[:, -1:], polylines[:, :1]).sqrt()

@@ -12,7 +12,13 @@ SEEN = 1e-3
 
 
 def gaussian_window(size: int, sigma: float, like: Tensor) -> Tensor:
-    """Return a 1D Gaussian window that sums to one. (size,)"""
+    """Return a 1D Gaussian window that sums to one. (size,)
+
+    Args:
+        size: Number of values.
+        sigma: Standard deviation in values.
+        like: Its type and device are those of the window.
+    """
     offsets = torch.arange(size, device=like.device, dtype=like.dtype) - (size - 1) / 2
     window = torch.exp(-0.5 * (offsets / sigma).square())
     return window / window.sum()
@@ -39,10 +45,17 @@ def dssim_map(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, T
 def raster_loss_sums_reference(
     preds: Tensor, targets: Tensor, window_size: int, window_sigma: float, weight: float
 ) -> Tensor:
-    """Sum what Eq. 12 is made of over each instance's pixels. 2 x (n, H, W) -> (n, 7)
+    """Sum what Eq. 12 is made of over each instance's pixels. (n, 7)
 
     With w = 1 + (weight - 1) t: sum w |p - t|, sum w p, sum (1 - SSIM), sum w t, sum (w - 1), and
     the number of pixels whose window sees the target, and either mask.
+
+    Args:
+        preds: Predicted masks p in [0, 1]. (n, H, W)
+        targets: True masks t in [0, 1]. (n, H, W)
+        window_size: Side of SSIM's window in pixels.
+        window_sigma: Standard deviation of SSIM's window in pixels.
+        weight: Weight of a foreground pixel, where the background has 1.
     """
     excess = (weight - 1) * targets
     weights = 1 + excess

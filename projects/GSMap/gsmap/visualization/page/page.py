@@ -19,14 +19,14 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 from gsmap.visualization.bev_view import display_extent
-from gsmap.visualization.report.frames import cameras_of, choose_frames, found_of, truth_of
-from gsmap.visualization.report.scores import MATCH_M, score_result
-from gsmap.visualization.report.tables import class_tables, curves, summary_table
+from gsmap.visualization.page.frames import cameras_of, choose_frames, found_of, truth_of
+from gsmap.visualization.page.scores import MATCH_M, score_result
+from gsmap.visualization.page.tables import class_tables, curves, summary_table
 from gsmap.visualization.style import MATCH_COLOURS, MapStyle
 
 
 @dataclass(frozen=True)
-class ReportOptions:
+class PageOptions:
     """What goes onto the page.
 
     Args:
@@ -56,8 +56,8 @@ class ReportOptions:
             )
 
 
-def report_data(
-    annotations: str | Path, results: Mapping[str, str | Path], options: ReportOptions
+def page_data(
+    annotations: str | Path, results: Mapping[str, str | Path], options: PageOptions
 ) -> dict[str, Any]:
     """Gather all that the page shows.
 
@@ -131,11 +131,11 @@ def page_html(data: Mapping[str, Any]) -> str:
     """Return the page: one file that fetches nothing and runs no script but its own.
 
     Args:
-        data: From ``report_data``. Its texts are strangers' input: they stand in a block of JSON
+        data: From ``page_data``. Its texts are strangers' input: they stand in a block of JSON
             without a single ``<``, and the script shows them as text.
     """
     parts = {
-        name: files("gsmap.visualization.report").joinpath(f"page.{name}").read_text("utf-8")
+        name: files("gsmap.visualization.page").joinpath(f"page.{name}").read_text("utf-8")
         for name in ("html", "css", "js")
     }
     frames, images = [], []
@@ -174,7 +174,7 @@ def write_page(path: str | Path, data: Mapping[str, Any]) -> str:
 
     Args:
         path: The HTML file; parent folders are made.
-        data: From ``report_data``.
+        data: From ``page_data``.
 
     Returns:
         What was written, in words, with its size.

@@ -13,11 +13,11 @@ from report_case import CLASSES, FRAMES, STRANGE, write_case
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.frames import FRAME_VIEWS
-from gsmap.visualization.report.frames import cameras_of, choose_frames
-from gsmap.visualization.report.page import ReportOptions, page_html, report_data
+from gsmap.visualization.page.frames import cameras_of, choose_frames
+from gsmap.visualization.page.page import PageOptions, page_data, page_html
 
 REPO = Path(__file__).resolve().parents[3]
-NO_IMAGES = ReportOptions(image_width=0)
+NO_IMAGES = PageOptions(image_width=0)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def case(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def data(case):
-    return report_data(*case, ReportOptions())
+    return page_data(*case, PageOptions())
 
 
 def test_predictions_hit_within_a_metre_and_the_tables_agree(data):
@@ -68,7 +68,7 @@ def test_frames_are_spread_evenly_and_the_worst_are_added(case):
     assert choose_frames(tokens, 4, [], 0.4) == [0, 3, 6, 9]
     # three evenly (0, 4, 9), then the worst that is not among them
     assert choose_frames(tokens, 4, [Result()], 0.4) == [0, 4, 8, 9]
-    some = report_data(*case, replace(NO_IMAGES, max_frames=4))
+    some = page_data(*case, replace(NO_IMAGES, max_frames=4))
     assert some["notes"] == [
         "The page shows 4 of 6 frames: 3 evenly spread and the 1 worst of good."
     ]
@@ -88,7 +88,7 @@ def test_cameras_stand_as_on_the_car_and_see_the_ground(case):
 
 def test_a_frame_that_looks_along_x_is_turned_to_look_up(tmp_path):
     path, results = write_case(tmp_path, frame="ego")
-    data = report_data(path, results, NO_IMAGES)
+    data = page_data(path, results, NO_IMAGES)
     assert data["extent"] == (-30.0, 30.0, -15.0, 15.0)
     frame = data["frames"][0]
     assert frame["truth"][2]["p"] == [2000, 500, -2000, 500]  # x = 5 m ahead, y = 20 m to the left
@@ -117,16 +117,16 @@ def test_texts_of_files_cannot_leave_the_block_of_data(data):
 
 
 def test_thumbnails_are_small_jpegs_and_a_missing_image_is_an_error(case, tmp_path):
-    small = report_data(*case, ReportOptions(image_width=32, max_frames=1))
+    small = page_data(*case, PageOptions(image_width=32, max_frames=1))
     source = small["frames"][0]["cameras"][0][0]["src"]
     assert source.startswith("data:image/jpeg;base64,/9j/")
     assert len(source) < 1500
     with pytest.raises(ValueError, match=r"no readable image at .*--data-root"):
-        report_data(*case, ReportOptions(data_root=tmp_path))
+        page_data(*case, PageOptions(data_root=tmp_path))
 
 
 def test_without_results_the_page_shows_ground_truth(case):
-    data = report_data(case[0], {}, replace(NO_IMAGES, max_frames=2))
+    data = page_data(case[0], {}, replace(NO_IMAGES, max_frames=2))
     assert data["title"] == "case val: ground truth"
     assert data["tables"] == data["curves"] == data["frames"][0]["found"] == []
     assert data["notes"] == ["The page shows 2 of 6 frames: evenly spread."]
@@ -137,8 +137,8 @@ def test_results_of_other_samples_are_an_error_unless_allowed(case, tmp_path):
     strange = {"cls_name": "kerb", "pts": [[0, 0], [1, 0]], "confidence_level": 0.5}
     other.write_text(json.dumps({"results": [{"sample_token": "t0", "vectors": [strange]}]}))
     with pytest.raises(ValueError, match=r"other\.json: 5 samples have no results"):
-        report_data(case[0], {"other": other}, NO_IMAGES)
-    allowed = report_data(case[0], {"other": other}, replace(NO_IMAGES, allow_mismatch=True))
+        page_data(case[0], {"other": other}, NO_IMAGES)
+    allowed = page_data(case[0], {"other": other}, replace(NO_IMAGES, allow_mismatch=True))
     assert allowed["frames"][3]["found"] == [[]]
     assert "5 samples have no results" in allowed["notes"][0]
     assert allowed["notes"][1] == "other: 1 predictions of class 'kerb' are not scored"
@@ -147,7 +147,7 @@ def test_results_of_other_samples_are_an_error_unless_allowed(case, tmp_path):
 @pytest.mark.parametrize("wrong", [{"max_frames": 0}, {"score_thr": 1.2}, {"image_width": -1}])
 def test_options_out_of_range_are_refused(wrong):
     with pytest.raises(ValueError, match="must be"):
-        ReportOptions(**wrong)
+        PageOptions(**wrong)
 
 
 def test_gaussians_are_read_where_all_vectors_have_them(case, tmp_path):
@@ -183,8 +183,8 @@ def test_the_command_writes_the_page_and_says_its_size(case, tmp_path):
 
 def test_the_package_carries_the_page():
     config = (REPO / "pyproject.toml").read_text()
-    pattern = re.search(r'"gsmap\.visualization\.report" = \["(.*)"\]', config)[1]
+    pattern = re.search(r'"gsmap\.visualization\.page" = \["(.*)"\]', config)[1]
     carried = {
-        path.name for path in (REPO / "projects/GSMap/gsmap/visualization/report").glob(pattern)
+        path.name for path in (REPO / "projects/GSMap/gsmap/visualization/page").glob(pattern)
     }
     assert {"page.html", "page.css", "page.js"} <= carried

@@ -9,7 +9,7 @@ from report_case import CLASSES, FRAMES, STRANGE, write_case
 
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.grid import BEVGrid
-from gsmap.visualization.report.page import ReportOptions, report_data, write_page
+from gsmap.visualization.page.page import PageOptions, page_data, write_page
 from gsmap.visualization.style import MATCH_COLOURS
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
@@ -37,9 +37,9 @@ ARGUMENTS = [
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
-    data = report_data(*write_case(folder), ReportOptions())
+    data = page_data(*write_case(folder), PageOptions())
     write_page(folder / "report.html", data)
-    write_page(folder / "truth.html", report_data(folder / "case.arrow", {}, ReportOptions()))
+    write_page(folder / "truth.html", page_data(folder / "case.arrow", {}, PageOptions()))
     return folder / "report.html"
 
 
@@ -226,7 +226,7 @@ def test_a_phone_shows_everything_in_its_width(opened, frame):
 
 
 def test_small_maps_are_drawn_when_they_come_near(browser, page):
-    data = report_data(page.with_name("case.arrow"), {}, ReportOptions(image_width=0))
+    data = page_data(page.with_name("case.arrow"), {}, PageOptions(image_width=0))
     write_page(page.with_name("many.html"), data | {"frames": 60 * data["frames"]})
     browser.get(page.with_name("many.html").as_uri())
     drawn = "return document.querySelectorAll('.card svg').length"

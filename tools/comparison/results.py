@@ -24,6 +24,7 @@ from gsmap.evaluation.report import MetricReport, flat_metrics
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import read_json
 from gsmap.utils.parallel import default_workers
+from gsmap.utils.words import markdown_table
 from gsmap.visualization.plots import finish_panel, panel_grid
 from gsmap.visualization.style import RUN_COLOURS
 from mapdata.upstream_configs.fields import Fields
@@ -192,12 +193,6 @@ def _cell(values: Sequence[float], factor: float = 1.0, form: str = ".1f") -> st
     return f"{mean(scaled):{form}}{spread}"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Lay out a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
 def differences_to_first(results: Sequence[Result]) -> dict[str, dict[str, list[float]]]:
     """Return, by name and figure, each seed's difference to the first config with that seed."""
     done = [r for r in results if r.figures]
@@ -240,19 +235,19 @@ def markdown(results: Sequence[Result], title: str, command: str) -> str:
         where = [str(r.folder), r.record.get("machine", "-"), " to ".join(at) or "-"]
         runs.append([r.name, str(r.seed), r.state, *where])
     parts = [
-        f"# {title}\n\n`{command}`\n",
-        "AP in percent, mean and standard deviation over seeds.\n",
-        _table(["config", "seeds", *heads], figures),
+        f"# {title}\n\n`{command}`",
+        "AP in percent, mean and standard deviation over seeds.",
+        markdown_table(["config", "seeds", *heads], figures),
     ]
     if changes:
-        parts.append(f"Differences to {names[0]}, seed by seed.\n")
-        parts.append(_table(["config", "pairs", *heads], changes))
+        parts.append(f"Differences to {names[0]}, seed by seed.")
+        parts.append(markdown_table(["config", "pairs", *heads], changes))
     parts += [
-        "Cost. Peak memory is the largest process's, or the GPU's.\n",
-        _table(["config", *_COSTS], costs),
-        _table(["config", "seed", "state", "folder", "machine", "load"], runs),
+        "Cost. Peak memory is the largest process's, or the GPU's.",
+        markdown_table(["config", *_COSTS], costs),
+        markdown_table(["config", "seed", "state", "folder", "machine", "load"], runs),
     ]
-    return "\n".join(parts)
+    return "\n\n".join(parts) + "\n"
 
 
 def as_json(results: Sequence[Result], title: str, command: str) -> str:

@@ -9,7 +9,7 @@ from gsmap.evaluation.average_precision import precision_recall
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS
 from gsmap.evaluation.matches import ClassDetections
 from gsmap.evaluation.report import UNDEFINED, MetricReport, flat_metrics
-from gsmap.visualization.report.scores import ScoredResult
+from gsmap.visualization.page.scores import ScoredResult
 from gsmap.visualization.style import MapStyle
 
 Table = dict[str, Any]

@@ -15,7 +15,7 @@ from gsmap.datasets.image_files import encode_jpeg, read_image
 from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.structures.frames import FrameView
 from gsmap.visualization.camera_view import arrange_cameras, camera_title
-from gsmap.visualization.report.scores import ScoredResult
+from gsmap.visualization.page.scores import ScoredResult
 
 _JPEG_QUALITY = 70
 
@@ -53,12 +53,16 @@ def _centimetres(points: np.ndarray, view: FrameView) -> list[int]:
 def truth_of(sample: MapSample, view: FrameView) -> list[dict[str, Any]]:
     """Return a sample's ground truth: class ``c`` and points ``p`` in centimetres."""
     elements = elements_of_instances(sample.instances or [])
-    pairs = zip(elements.labels.tolist(), elements.polylines, strict=True)
-    return [{"c": label, "p": _centimetres(line, view)} for label, line in pairs]
+    return [{"c": label, "p": _centimetres(line, view)} for line, label, _ in elements.rows]
 
 
 def found_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str, Any]]:
     """Return a sample's predictions that AP_raster does not drop, in descending order of score.
+
+    Args:
+        token: The sample.
+        result: Predictions and their matches.
+        view: Turns the annotation frame to the display.
 
     Returns:
         Per prediction its class ``c``, score ``s``, points ``p``, the index of the ground truth
@@ -70,15 +74,10 @@ def found_of(token: str, result: ScoredResult, view: FrameView) -> list[dict[str
     if not kept.any():
         return []
     elements = result.predictions[token].select(matches.pred_index[kept])
+    rows = zip(elements.rows, hits[kept].tolist(), strict=True)
     found = [
         {"c": label, "s": round(score, 6), "hit": hit, "p": _centimetres(line, view)}
-        for label, score, hit, line in zip(
-            elements.labels.tolist(),
-            elements.confidence.tolist(),
-            hits[kept].tolist(),
-            elements.polylines,
-            strict=True,
-        )
+        for (line, label, score), hit in rows
     ]
     if elements.scales is not None and elements.rotations is not None:
         degrees = np.degrees(elements.rotations + view.display_turn_rad)[:, None]
@@ -107,7 +106,7 @@ def thumbnail(path: Path, width_px: int) -> str:
         ValueError: If there is no image, or it is damaged.
     """
     try:
-        image = read_image(str(path), "report")
+        image = read_image(str(path), "page")
     except BrokenSampleError as error:
         raise ValueError(
             f"no readable image at {path}: give the folder that image paths start from as "
