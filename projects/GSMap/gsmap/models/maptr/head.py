@@ -169,7 +169,8 @@ class MapHead(DetectionHead):
         self.query_groups = [QueryGroup(**group) for group in query_groups]
         num_instances = sum(group.num for group in self.query_groups)
         shared = {"embed_dims": embed_dims, "num_layers": decoder["num_layers"]}
-        moves_instances = getattr(class_of(decoder), "moves_instances", False)
+        kind = class_of(decoder) or MapDecoder
+        moves_instances = issubclass(kind, MapDecoder) and kind.moves_instances
         points_per_state = num_points if moves_instances else 1
         point = {"type": "PointReference", "grid": grid, "points_per_state": points_per_state}
         self.reference: PointReference = MODELS.build({**point, **shared, **(reference or {})})
