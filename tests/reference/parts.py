@@ -26,9 +26,8 @@ class GoldenParts:
         state = {}
         for key, value in module.state_dict().items():
             upstream = self.key_map.to_upstream(prefix + key)
-            state[key] = torch.from_numpy(
-                self.recipe.tensor(upstream, value.shape, self.golden.seed)
-            )
+            made = self.recipe.tensor(upstream, value.shape, self.golden.seed)
+            state[key] = torch.from_numpy(np.asarray(made))
         module.load_state_dict(state)
         return module.eval()
 
