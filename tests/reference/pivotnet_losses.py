@@ -68,7 +68,7 @@ def check_pivots(golden: Golden, name: str) -> Iterator[Row]:
         parts = [
             (element.label, line)
             for element in elements(golden, tag)
-            for line in thick.lines(element.points.astype(float), element.label, grid)
+            for line in thick.lines(element, grid)
         ]
         labels = np.array([label for label, _ in parts])
         off = largest_difference(labels, data[f"{tag}_lines_kept_pivot_types"])
@@ -78,10 +78,7 @@ def check_pivots(golden: Golden, name: str) -> Iterator[Row]:
             largest_difference(p, data[f"{tag}_map_pivot_input{i}"]) for i, p in enumerate(pixels)
         )
         yield Row(name, f"{tag}: lines (pixels)", off, 1e-4)
-        pivots = [
-            thick.pivots(line * (60, 30), thick.num_points[label]) / (60, 30)
-            for label, line in parts
-        ]
+        pivots = [thick.pivots(line, label, grid) for label, line in parts]
         for label in range(3):
             own = [line for line, kind in zip(pivots, labels, strict=True) if kind == label]
             numbers = [len(line) for line in own]
