@@ -13,8 +13,7 @@ from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
 from gsmap.models.encoders.folded_backbone import tensor_versions
-from gsmap.models.maptr.coder import MapCoder
-from gsmap.models.maptr.head import DetectionHead, Samples, Tensors
+from gsmap.models.maptr.coder import DetectionHead, MapCoder, Samples, Tensors
 from gsmap.models.maptr.layers import mlp
 from gsmap.models.maptr.parts import PARTS
 from gsmap.models.pivotnet.decoder import ClassLines, PointLineDecoder
@@ -32,6 +31,7 @@ from gsmap.models.pivotnet.losses import (
 from gsmap.structures.grid import BEVGrid
 
 _POINT_DIMS = 64  # channels of each coordinate of a point
+# of the losses of decoder layers, and of the class masks of BEV levels; of fewer, the last ones
 LAYER_WEIGHTS = (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
 LEVEL_WEIGHTS = (0.4, 0.8, 1.6, 2.4)
 
@@ -94,14 +94,12 @@ class PivotHead(DetectionHead):
         decoder: Settings of `PointLineDecoder`.
         mask_pixel_m: Side of a pixel of the losses' masks in metres, as in `FormatPivotTargets`.
         losses: Settings of `PivotLosses`.
-        layer_weights: Weights of the losses of decoder layers; of fewer layers, the last ones.
-        level_weights: Weights of the class masks of BEV levels; of fewer levels, the last ones.
         score_threshold: Lines of at most this score are dropped: 0.5 as long as there are just
             lines and none.
         embed_dims: Channels C.
 
     Raises:
-        ValueError: If queries do not fit the classes, or layers have no weight.
+        ValueError: If queries do not fit the classes, or there are more layers than weights.
     """
 
     transforms = ("FormatPivotTargets",)
@@ -114,8 +112,6 @@ class PivotHead(DetectionHead):
         decoder: PARTS | None = None,
         mask_pixel_m: float = 0.15,
         losses: PARTS | None = None,
-        layer_weights: Sequence[float] = LAYER_WEIGHTS,
-        level_weights: Sequence[float] = LEVEL_WEIGHTS,
         score_threshold: float = 0.5,
         embed_dims: int = 256,
         init_cfg: dict | None = None,
@@ -131,14 +127,14 @@ class PivotHead(DetectionHead):
         own = {"type": "PointLineDecoder", "queries": queries, "embed_dims": embed_dims}
         self.decoder: PointLineDecoder = MODELS.build({**own, **(decoder or {})})
         num_layers = len(self.decoder.layers)
-        if not 0 < num_layers <= len(layer_weights):
+        if not 0 < num_layers <= len(LAYER_WEIGHTS):
             raise ValueError(
-                f"layer_weights must hold one for each of {num_layers} layers, got {layer_weights}."
+                f"decoder.num_layers must be 1 to {len(LAYER_WEIGHTS)}, which have weights in the "
+                f"losses, got {num_layers}."
             )
-        self.layer_weights, self.level_weights = layer_weights[-num_layers:], level_weights
+        self.layer_weights = LAYER_WEIGHTS[-num_layers:]
         self.reference = PivotReference(grid)
         self.coder = MapCoder(grid, sum(n for n, _ in queries), None, score_threshold)
-        dims, both = embed_dims, 2 * _POINT_DIMS
         dims, both = [embed_dims] * 3, 2 * _POINT_DIMS
         self.semantic_branches = nn.ModuleList(nn.Conv2d(embed_dims, 2, 1) for _ in classes)
         self.point_branches = nn.ModuleList(mlp(*dims, both) for _ in classes)
@@ -263,7 +259,7 @@ class PivotHead(DetectionHead):
         drawn = [torch.stack([own.masks.sum(0).clamp(max=1) for own in truth]) for truth in truths]
         terms = [
             weight * mask_distances(masks, own).diagonal().mean()
-            for weight, level in zip(self.level_weights[-len(levels) :], levels, strict=True)
+            for weight, level in zip(LEVEL_WEIGHTS[-len(levels) :], levels, strict=True)
             for masks, own in zip(level, drawn, strict=True)
         ]
         return self.losses.semantic * torch.stack(terms).mean()

@@ -103,7 +103,7 @@ class FormatPivotTargets(BaseTransform):
             stay as they are annotated.
 
     Raises:
-        ValueError: If a class has less than two points.
+        ValueError: If a class has less than two points, or ``edge_classes`` names one that is not.
     """
 
     num_points: Sequence[int] = (10, 2, 30)
@@ -118,6 +118,11 @@ class FormatPivotTargets(BaseTransform):
     def __post_init__(self) -> None:
         if min(self.num_points, default=0) < 2:
             raise ValueError(f"num_points must be >= 2 for each class, got {self.num_points}.")
+        if not set(self.edge_classes) <= set(range(len(self.num_points))):
+            raise ValueError(
+                f"edge_classes must be indices of the {len(self.num_points)} classes of "
+                f"num_points, got {self.edge_classes}."
+            )
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets; ValueError without ground truth or for a class that has no number."""
