@@ -16,6 +16,7 @@ from torch import nn
 import gsmap.registered  # noqa: F401
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.raster_ap import MIN_SCORE, RasterConfig
+from gsmap.models.pivotnet.head import LEVEL_WEIGHTS
 from gsmap.models.pivotnet.losses import PivotLosses
 from gsmap.models.pivotnet.targets import FormatPivotTargets
 from gsmap.structures.grid import BEVGrid
@@ -312,7 +313,7 @@ def test_pivotnet_weighs_as_released():
     head = head_of("pivotnet/pivotnet_r50_30e.py")
     assert head.losses == PivotLosses(2.0, 5.0, 30.0, 10.0, 2.0, 3.0, 5.0, 0.5, 0.2, True)
     assert head.layer_weights == (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
-    assert head.level_weights == (0.4, 0.8, 1.6, 2.4)
+    assert LEVEL_WEIGHTS == (0.4, 0.8, 1.6, 2.4)
     assert head.mask_size == (400, 200)
     targets = FormatPivotTargets()
     assert (targets.num_points, targets.edge_classes) == ((10, 2, 30), (1,))

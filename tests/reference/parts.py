@@ -7,7 +7,7 @@ import torch
 from mmengine.registry import init_default_scope
 from torch import Tensor, nn
 
-from gsmap.checkpoints.key_map import KeyMap
+from gsmap.checkpoints.key_rules import KeyMap
 from reference.golden import Golden
 from reference.report import Row, largest_difference
 
@@ -26,9 +26,8 @@ class GoldenParts:
         state = {}
         for key, value in module.state_dict().items():
             upstream = self.key_map.to_upstream(prefix + key)
-            state[key] = torch.from_numpy(
-                self.recipe.tensor(upstream, value.shape, self.golden.seed)
-            )
+            made = self.recipe.tensor(upstream, value.shape, self.golden.seed)
+            state[key] = torch.from_numpy(np.asarray(made))
         module.load_state_dict(state)
         return module.eval()
 

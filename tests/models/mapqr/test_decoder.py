@@ -86,6 +86,12 @@ def test_it_learns_with_both_query_groups(base):
     assert {"loss_cls", "loss_pts", "d0.loss_dir", "loss_pts_one2many"} <= set(losses)
 
 
+def test_it_learns_with_gemaps_loss():
+    losses = train_a_step(mapqr(losses=[*HEAD["losses"], {"type": "EuclideanLoss"}]), LANES)
+    assert losses["loss_euclidean"] > 0
+    assert "d0.loss_euclidean_one2many" in losses
+
+
 def test_gaussians_start_neutral_on_it():
     """The points are those of the model without Gaussians; each has its own sigma and theta."""
     plain, gsmap = mapqr().eval(), mapqr(GSMAP).eval()

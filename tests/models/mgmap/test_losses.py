@@ -8,14 +8,7 @@ from predictions import pairs_of
 
 from gsmap.engine.launch import check_config, read_config
 from gsmap.models.mgmap.decoder import MaskedDecoded
-from gsmap.models.mgmap.losses import ForegroundLoss, QueryMaskLoss, squared_dice_loss
-
-
-def test_dice_by_hand():
-    """1 - 2 x 0.5 / (0.25 + 1 + 1 + 0.002), and 1 for masks that do not meet."""
-    preds, targets = torch.tensor([[0.5, 1.0], [1.0, 0.0]]), torch.tensor([[1.0, 0.0], [0.0, 1.0]])
-    wanted = [1 - 1 / 2.252, 1.0]
-    assert squared_dice_loss(preds, targets).tolist() == pytest.approx(wanted)
+from gsmap.models.mgmap.losses import ForegroundLoss, QueryMaskLoss
 
 
 def test_masks_of_queries_by_hand():

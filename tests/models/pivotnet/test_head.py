@@ -88,12 +88,25 @@ def test_predictions_are_lines_more_likely_than_none():
     assert (found.num_pts >= 2).all()
 
 
+def test_the_mean_of_the_coordinates_is_kept_until_a_weight_changes(monkeypatch):
+    built, calls = head().eval(), []
+    mean = PivotHead._mean_feature
+    monkeypatch.setattr(PivotHead, "_mean_feature", lambda self: calls.append(1) or mean(self))
+    with torch.no_grad():
+        first = built.coordinate_feature()
+        assert built.coordinate_feature() is first
+        built.coordinates[0].weight.mul_(2.0)
+        assert not torch.equal(built.coordinate_feature(), first)
+    assert len(calls) == 2
+    assert built.coordinate_feature().requires_grad
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"queries": ((3, 4),)}, "queries must be lines"),
         ({"queries": ((3, 4), (2, 1))}, "queries must be lines"),
-        ({"layer_weights": (1.0,)}, "one for each of 2 layers"),
+        ({"decoder": {**HEAD["decoder"], "num_layers": 7}}, "num_layers must be 1 to 6"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(settings, message):

@@ -57,6 +57,8 @@ def test_no_element_and_elements_that_cannot_be():
         targets(MapInstance(3, np.array([[0.0, 0], [0, 9]])))
     with pytest.raises(ValueError, match="num_points must be >= 2"):
         FormatPivotTargets(num_points=(10, 1))
+    with pytest.raises(ValueError, match="edge_classes must be indices of the 3 classes"):
+        FormatPivotTargets(edge_classes=(3,))
     with pytest.raises(ValueError, match="leave FormatPivotTargets out"):
         FormatPivotTargets().transform({"map_instances": None, "token": "a"})
 

@@ -26,11 +26,16 @@ class FoldedBackbone:
         if not can_be_folded(backbone):
             self.folded = None
             return backbone(images)
-        tensors = [*backbone.parameters(), *backbone.buffers()]
-        state = [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]
+        state = tensor_versions(backbone)
         if self.folded is None or state != self.state:
             self.folded, self.state = fuse_conv_bn(copy.deepcopy(backbone)), state
         return self.folded(images)
+
+
+def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:
+    """Return address and version of a module's tensors, which change with every weight."""
+    tensors = [*module.parameters(), *module.buffers()]
+    return [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]
 
 
 def can_be_folded(backbone: nn.Module) -> bool:

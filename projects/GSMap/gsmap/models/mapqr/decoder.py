@@ -106,20 +106,14 @@ class MapQRDecoderLayer(MapDecoderLayer):
         self.position_proj = nn.Linear(embed_dims, embed_dims)
         nn.init.zeros_(self.position_proj.bias)
 
-    def forward(
-        self,
-        query: Tensor,
-        query_pos: Tensor,
-        reference: Tensor,
-        bev_feats: Tensor,
-        attn_mask: Tensor | None = None,
-    ) -> Tensor:
+    def forward(self, query: Tensor, _: Tensor, *inputs: Any) -> Tensor:  # type: ignore[override]
         """Update the instance queries. (B, N, C) -> (B, N, C)
 
         As in `MapDecoderLayer`, but that references are of the points (B, N * P, D) and that the
         learned position, which the first reference comes from, is not used.
         """
-        mask = attn_mask if self.mask_groups else None
+        reference, bev_feats, *masks = inputs
+        mask = masks[0] if self.mask_groups else None
         query = self.norms[0](self.self_attn(query, torch.zeros_like(query), mask))
         code = sine_code(reference[..., :2], query.shape[-1])
         position, frames = self.position_proj(code), None

@@ -7,6 +7,8 @@ with its residual; the layer normalises them.
 """
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from mmcv.ops import get_compiling_cuda_version
@@ -169,6 +171,47 @@ class BEVDeformableAttention(SamplingAttention):
         return (projected + cell_weights.sum(-1, keepdim=True) * bias).flatten(2)  # (B, Q, C)
 
 
+@MODELS.register_module()
+class MultiLevelAttention(SamplingAttention):
+    """Deformable attention over several maps, with one softmax over the samples in all of them.
+
+    Args:
+        num_levels: Number of maps.
+        num_points: Samples per head and map.
+        kwargs: Further arguments of :class:`SamplingAttention`.
+    """
+
+    def __init__(self, num_levels: int = 4, num_points: int = 4, **kwargs: Any) -> None:
+        self.num_levels = num_levels
+        super().__init__(num_points=num_levels * num_points, **kwargs)
+
+    def initial_offsets(self) -> Tensor:
+        """Return the same offsets for every map. (heads, levels * S, 2)"""
+        one = super().initial_offsets()[:, : self.num_points // self.num_levels]
+        return one.repeat(1, self.num_levels, 1)
+
+    def forward(
+        self,
+        query: Tensor,
+        reference: Tensor,
+        feats: Sequence[Tensor],
+        frames: Tensor | None = None,
+    ) -> Tensor:
+        """Sample all maps (B, C, h, w), offsets in cells of each. (B, Q, C) -> (B, Q, C)
+
+        References and frames are as in `place_samples`.
+        """
+        offsets = self.offsets_in_cells(query).chunk(self.num_levels, 3)
+        weights = self.weights(query).chunk(self.num_levels, 3)
+        seen = torch.zeros_like(query)
+        for level, own, weight in zip(feats, offsets, weights, strict=True):
+            shape = (level.shape[-2], level.shape[-1])
+            value = self.values(level.flatten(2).transpose(1, 2))
+            places = place_samples(own, reference, shape, frames)
+            seen = seen + sample_map(value, shape, places, weight)
+        return self.dropout(self.output_proj(seen))
+
+
 def directional_offsets(num_heads: int, num_points: int) -> Tensor:
     """Return offsets with the heads spread over a square, sample s at s + 1. (heads, S, 2)"""
     angles = torch.arange(num_heads, dtype=torch.float32) * (2 * math.pi / num_heads)
@@ -193,9 +236,14 @@ class PointSelfAttention(nn.MultiheadAttention):
         self, query: Tensor, query_pos: Tensor, attn_mask: Tensor | None = None
     ) -> Tensor:
         """Let all points attend to each other. (B, N * P, C) -> (B, N * P, C)"""
-        if attn_mask is not None:
-            attn_mask = attn_mask.repeat_interleave(self.num_points, 0)
-            attn_mask = attn_mask.repeat_interleave(self.num_points, 1)
+        attn_mask = mask_of_points(attn_mask, self.num_points)
         key = query + query_pos
         attended = super().forward(key, key, query, attn_mask=attn_mask, need_weights=False)[0]
         return query + self.output_dropout(attended)
+
+
+def mask_of_points(mask: Tensor | None, num_points: int) -> Tensor | None:
+    """Return a mask of instances (N, N) as one of their points. (N * P, N * P)"""
+    if mask is None:
+        return None
+    return mask.repeat_interleave(num_points, 0).repeat_interleave(num_points, 1)

@@ -1,11 +1,19 @@
 """From class scores and points of all queries to the best detections."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
+from mmdet3d.structures import Det3DDataSample
+from mmengine.model import BaseModule
+from mmengine.structures import InstanceData
 from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
+
+Tensors = dict[str, Tensor]
+Samples = Sequence[Det3DDataSample]
+Metas = Sequence[dict[str, Any]]
 
 
 class Detections(NamedTuple):
@@ -62,3 +70,38 @@ class MapCoder:
         best, index = flat.topk(min(self.max_num, len(flat)))
         query = torch.div(index, scores.shape[-1], rounding_mode="floor")
         return Detections(best, index % scores.shape[-1], query)
+
+
+class DetectionHead(BaseModule):
+    """What every head shares: detections of its last layer.
+
+    Attributes:
+        reference: How references of predictions stand for points (`PointReference`).
+        coder: The choice of detections.
+    """
+
+    reference: Any
+    coder: MapCoder
+
+    def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
+        """Fit a checkpoint's state to the model's, in place."""
+
+    def predict(self, bev_outputs: Tensors, batch_data_samples: Samples) -> list[InstanceData]:
+        """Run the head and return its detections."""
+        metas = [sample.metainfo for sample in batch_data_samples]
+        return self.predict_by_feat(self(bev_outputs), metas)
+
+    def predict_by_feat(self, outputs: Sequence[Any], batch_img_metas: Metas) -> list[InstanceData]:
+        """Decode the last layer's predictions, best first.
+
+        They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,), ``pts`` (M, P, 2) in metres
+        and what else the reference decodes.
+        """
+        results = []
+        for scores, references in zip(outputs[-1].scores, outputs[-1].references, strict=True):
+            fields = self.reference.decode(references)
+            best = self.coder.decode(scores, fields["pts"])
+            chosen = {name: value[best.query_inds] for name, value in fields.items()}
+            chosen.update(scores_3d=best.scores, labels_3d=best.labels)
+            results.append(InstanceData(metainfo=dict(self.reference.metainfo), **chosen))
+        return results

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from gsmap.models.maptr.layers import feed_forward
 from gsmap.structures.gaussians import GaussianSpace
 
+Refine = Callable[[int, Tensor, Tensor], Tensor]  # layer, point states, reference -> reference
+
 
 class Guidance(nn.Module):
     """What a decoder layer takes from its references, for whichever attentions it has."""
@@ -171,7 +173,7 @@ class MapDecoder(BaseModule):
         query_pos: Tensor,
         reference: Tensor,
         bev_feats: Tensor,
-        refine: Callable[[int, Tensor, Tensor], Tensor],
+        refine: Refine,
         attn_mask: Tensor | None = None,
         between: Callable[[int, Queries], Queries] | None = None,
     ) -> list[Decoded]:

@@ -9,13 +9,12 @@ from typing import Any, cast
 import torch
 import torch.nn.functional as F
 from mmdet3d.registry import MODELS
-from mmdet3d.structures import Det3DDataSample
 from mmengine.logging import print_log
-from mmengine.model import BaseModule, bias_init_with_prob
+from mmengine.model import bias_init_with_prob
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
-from gsmap.models.maptr.coder import MapCoder
+from gsmap.models.maptr.coder import DetectionHead, MapCoder, Metas, Samples, Tensors
 from gsmap.models.maptr.decoder import Decoded, MapDecoder
 from gsmap.models.maptr.layers import classification_branch, init_matrices
 from gsmap.models.maptr.losses import MapLoss
@@ -42,10 +41,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 
 _PRIOR_PROBABILITY = 0.01
-Tensors = dict[str, Tensor]
-Samples = Sequence[Det3DDataSample]
 Instances = Sequence[InstanceData]
-Metas = Sequence[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -74,43 +70,6 @@ class QueryGroup:
             raise ValueError(
                 f"a query group needs num >= 1 and repeats >= 1, got {self.num} and {self.repeats}."
             )
-
-
-class DetectionHead(BaseModule):
-    """What every head shares: detections of its last layer.
-
-    Attributes:
-        reference: How references of predictions stand for points (`PointReference`).
-        coder: The choice of detections.
-    """
-
-    reference: Any
-    coder: MapCoder
-
-    def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
-        """Fit a checkpoint's state to the model's, in place."""
-
-    def predict(self, bev_outputs: Tensors, batch_data_samples: Samples) -> list[InstanceData]:
-        """Run the head and return its detections."""
-        metas = [sample.metainfo for sample in batch_data_samples]
-        return self.predict_by_feat(self(bev_outputs), metas)
-
-    def predict_by_feat(
-        self, outputs: Sequence[Predictions], batch_img_metas: Metas
-    ) -> list[InstanceData]:
-        """Decode the last layer's predictions, best first.
-
-        They are, per sample, ``scores_3d`` (M,), ``labels_3d`` (M,), ``pts`` (M, P, 2) in metres
-        and what else the reference decodes.
-        """
-        results = []
-        for scores, references in zip(outputs[-1].scores, outputs[-1].references, strict=True):
-            fields = self.reference.decode(references)
-            best = self.coder.decode(scores, fields["pts"])
-            chosen = {name: value[best.query_inds] for name, value in fields.items()}
-            chosen.update(scores_3d=best.scores, labels_3d=best.labels)
-            results.append(InstanceData(metainfo=dict(self.reference.metainfo), **chosen))
-        return results
 
 
 @MODELS.register_module()
@@ -169,7 +128,8 @@ class MapHead(DetectionHead):
         self.query_groups = [QueryGroup(**group) for group in query_groups]
         num_instances = sum(group.num for group in self.query_groups)
         shared = {"embed_dims": embed_dims, "num_layers": decoder["num_layers"]}
-        moves_instances = getattr(class_of(decoder), "moves_instances", False)
+        kind = class_of(decoder) or MapDecoder
+        moves_instances = issubclass(kind, MapDecoder) and kind.moves_instances
         points_per_state = num_points if moves_instances else 1
         point = {"type": "PointReference", "grid": grid, "points_per_state": points_per_state}
         self.reference: PointReference = MODELS.build({**point, **shared, **(reference or {})})

@@ -1,6 +1,5 @@
 """MGMap's decoder: masks activate the queries, layers look at four levels, patches refine."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,8 +8,8 @@ from mmdet3d.registry import MODELS
 from mmengine.model import ModuleList
 from torch import Tensor, nn
 
-from gsmap.models.maptr.attention import SamplingAttention, place_samples, sample_map
-from gsmap.models.maptr.decoder import Decoded, MapDecoder, Queries
+from gsmap.models.maptr.attention import MultiLevelAttention, mask_of_points
+from gsmap.models.maptr.decoder import Decoded, MapDecoder, Refine
 from gsmap.models.mgmap.neck import EnhancedNeck
 from gsmap.models.mgmap.refinement import (
     BINS,
@@ -19,44 +18,6 @@ from gsmap.models.mgmap.refinement import (
     mask_network,
     patches_around,
 )
-
-
-@MODELS.register_module()
-class MultiLevelAttention(SamplingAttention):
-    """Deformable attention over levels of BEV features, with one softmax over all their samples.
-
-    Args:
-        num_levels: Number of levels.
-        num_points: Samples per head and level.
-        kwargs: Further arguments of :class:`SamplingAttention`.
-    """
-
-    def __init__(self, num_levels: int = 4, num_points: int = 4, **kwargs: Any) -> None:
-        self.num_levels = num_levels
-        super().__init__(num_points=num_levels * num_points, **kwargs)
-
-    def initial_offsets(self) -> Tensor:
-        """Return the same offsets for every level. (heads, levels * S, 2)"""
-        one = super().initial_offsets()[:, : self.num_points // self.num_levels]
-        return one.repeat(1, self.num_levels, 1)
-
-    def forward(
-        self,
-        query: Tensor,
-        reference: Tensor,
-        feats: Sequence[Tensor],
-        frames: Tensor | None = None,
-    ) -> Tensor:
-        """Sample all levels (B, C, h, w), offsets in cells of each. (B, Q, C) -> (B, Q, C)"""
-        offsets = self.offsets_in_cells(query).chunk(self.num_levels, 3)
-        weights = self.weights(query).chunk(self.num_levels, 3)
-        seen = torch.zeros_like(query)
-        for level, own, weight in zip(feats, offsets, weights, strict=True):
-            shape = (level.shape[-2], level.shape[-1])
-            value = self.values(level.flatten(2).transpose(1, 2))
-            places = place_samples(own, reference, shape, frames)
-            seen = seen + sample_map(value, shape, places, weight)
-        return self.dropout(self.output_proj(seen))
 
 
 @dataclass(eq=False)
@@ -136,23 +97,15 @@ class MGMapDecoder(MapDecoder):
             for g in range(refinements)
         )
 
-    def forward(
-        self,
-        query: Tensor,
-        query_pos: Tensor,
-        reference: Tensor,
-        bev_feats: Tensor,
-        refine: Callable[[int, Tensor, Tensor], Tensor],
-        attn_mask: Tensor | None = None,
-        between: Callable[[int, Queries], Queries] | None = None,
-    ) -> list[Decoded]:
-        """Run all layers, then the refinement; arguments as in `MapDecoder.forward`."""
+    def forward(self, query: Tensor, *inputs: Any) -> list[Decoded]:  # type: ignore[override]
+        """Run all layers, then the refinement; inputs as of `MapDecoder.forward`."""
+        query_pos, reference, bev_feats, *flow = inputs
         fused, levels = self.neck(bev_feats)
         masks = self.mask_net(fused)[:, : query.shape[1] // self.num_points]
         activated = self.activation(self.instance_features(fused, masks))
         query = query + activated.repeat_interleave(self.num_points, 1)
-        layers = super().forward(query, query_pos, reference, levels, refine, attn_mask, between)
-        stages = self.refined(layers[-1], fused, refine, attn_mask)
+        layers = super().forward(query, query_pos, reference, levels, *flow)
+        stages = self.refined(layers[-1], fused, *flow[:2])
         return [MaskedDecoded(**vars(layer), mask_logits=masks) for layer in layers] + stages
 
     @staticmethod
@@ -163,18 +116,12 @@ class MGMapDecoder(MapDecoder):
         return torch.einsum("bnhw,bchw->bnc", weights, feats.float()) / total[..., None]
 
     def refined(
-        self,
-        last: Decoded,
-        fused: Tensor,
-        refine: Callable[[int, Tensor, Tensor], Tensor],
-        attn_mask: Tensor | None,
+        self, last: Decoded, fused: Tensor, refine: Refine, attn_mask: Tensor | None
     ) -> list[Decoded]:
         """Correct the points of the last layer in stages, each with a branch of its own."""
         segmentation = self.segmentation(fused)
         feats = self.mask_feature(fused, segmentation) if self.patches else None
-        if attn_mask is not None:
-            attn_mask = attn_mask.repeat_interleave(self.num_points, 0)
-            attn_mask = attn_mask.repeat_interleave(self.num_points, 1)
+        mask = mask_of_points(attn_mask, self.num_points)
         states, references = (x.flatten(1, 2) for x in (last.point_states, last.references))
         patches = fused.new_zeros(1, 1, fused.shape[1], BINS, BINS)
         outputs: list[Decoded] = []
@@ -182,9 +129,9 @@ class MGMapDecoder(MapDecoder):
             references = references.detach()
             if feats is not None:
                 patches = patches_around(feats, references[..., :2])
-            corrected, seen = stage(states, patches, attn_mask)
+            corrected, seen = stage(states, patches, mask)
             states = torch.cat([states, seen], -1)
             references = refine(branch, corrected, references)
-            output = self.read(corrected, references)
-            outputs.append(RefinedDecoded(**vars(output), segmentation=segmentation))
+            output = vars(self.read(corrected, references))
+            outputs.append(RefinedDecoded(**output, segmentation=segmentation))
         return outputs

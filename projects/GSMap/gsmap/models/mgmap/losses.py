@@ -4,6 +4,7 @@ from typing import cast
 
 import torch
 import torch.nn.functional as F
+from mmdet.models.losses.dice_loss import dice_loss
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
@@ -13,42 +14,9 @@ from gsmap.models.maptr.pairs import MatchedPairs
 from gsmap.models.mgmap.decoder import MaskedDecoded, MGMapDecoder, RefinedDecoded
 from gsmap.structures.tensors import check_same_shape
 
-_EPS = 1e-3
-
-
-def squared_dice_loss(preds: Tensor, targets: Tensor) -> Tensor:
-    """Return 1 - 2 sum(p t) / (sum p^2 + sum t^2) of pairs of masks. 2 x (n, ...) -> (n,)"""
-    preds, targets = preds.flatten(1), targets.flatten(1)
-    size = preds.square().sum(1) + targets.square().sum(1) + 2 * _EPS
-    return 1 - 2 * (preds * targets).sum(1) / size
-
-
-class MGMapLoss(MapLoss):
-    """A loss of masks: cross-entropy and dice.
-
-    Args:
-        loss_weight: Weight of the cross-entropy.
-        dice_weight: Weight of the dice loss.
-        flags: As in `MapLoss`.
-    """
-
-    transforms = ("MakeInstanceMasks",)
-
-    def __init__(self, loss_weight: float, dice_weight: float, **flags: bool) -> None:
-        super().__init__(loss_weight, **flags)
-        self.dice_weight = dice_weight
-
-    def check(self, head: MapHead) -> None:
-        """Raise ValueError if the head has no such masks."""
-        if not isinstance(head.decoder, MGMapDecoder):
-            raise ValueError(
-                f"{type(self).__name__} needs the masks of MGMapDecoder, got "
-                f"{type(head.decoder).__name__}: leave the loss out, or set decoder.type."
-            )
-
 
 @MODELS.register_module()
-class QueryMaskLoss(MGMapLoss):
+class QueryMaskLoss(MapLoss):
     """The masks that activate the queries, against those of the matched ground truth (MGMap).
 
     As released, the cross-entropy is a mean over all queries, of which those without a match should
@@ -61,14 +29,15 @@ class QueryMaskLoss(MGMapLoss):
     """
 
     name = "ins"
+    transforms = ("MakeInstanceMasks",)
 
     def __init__(self, loss_weight: float = 1.0, dice_weight: float = 2.0, **flags: bool) -> None:
-        super().__init__(loss_weight, dice_weight, **flags)
+        super().__init__(loss_weight, **flags)
+        self.dice_weight = dice_weight
 
     def check(self, head: MapHead) -> None:
-        """Raise ValueError if there are other queries than masks."""
-        super().check(head)
-        queries, masks = len(head.instance_embedding.weight), head.decoder.num_masks
+        """Raise ValueError if there are other queries than masks, or none of both."""
+        queries, masks = len(head.instance_embedding.weight), decoder_of(self, head).num_masks
         if queries != masks:
             raise ValueError(f"decoder.num_masks is {masks}, and there are {queries} queries.")
 
@@ -85,14 +54,14 @@ class QueryMaskLoss(MGMapLoss):
         check_same_shape(logits=own, gt_masks=masks)
         targets = torch.zeros_like(logits)
         targets[pairs.samples, pairs.query_inds] = masks
-        share = len(own) / (logits.shape[0] * logits.shape[1])
-        cross_entropy = F.binary_cross_entropy_with_logits(logits, targets) * share
-        dice = squared_dice_loss(own.sigmoid(), masks).sum() / (logits.shape[0] * logits.shape[1])
-        return self.loss_weight * cross_entropy + self.dice_weight * dice
+        queries = logits.shape[0] * logits.shape[1]
+        cross_entropy = F.binary_cross_entropy_with_logits(logits, targets) * len(own)
+        dice = dice_loss(own.sigmoid(), masks, reduction="sum")
+        return (self.loss_weight * cross_entropy + self.dice_weight * dice) / queries
 
 
 @MODELS.register_module()
-class ForegroundLoss(MGMapLoss):
+class ForegroundLoss(MapLoss):
     """The segmentation of a sample into elements and background (MGMap).
 
     Args:
@@ -102,28 +71,36 @@ class ForegroundLoss(MGMapLoss):
     """
 
     name = "seg"
+    transforms = ("MakeInstanceMasks",)
 
     def __init__(
         self, loss_weight: float = 1.0, dice_weight: float = 15.0, pos_weight: float = 4.0
     ) -> None:
-        super().__init__(loss_weight, dice_weight, last_layer_only=True, first_group_only=True)
-        self.pos_weight = pos_weight
+        super().__init__(loss_weight, last_layer_only=True, first_group_only=True)
+        self.dice_weight, self.pos_weight = dice_weight, pos_weight
 
     def check(self, head: MapHead) -> None:
         """Raise ValueError if there is no segmentation."""
-        super().check(head)
-        if not len(head.decoder.refinements):
+        if not len(decoder_of(self, head).refinements):
             raise ValueError("ForegroundLoss needs a refinement: set decoder.refinements.")
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Return the weighted loss."""
         logits = cast(RefinedDecoded, pairs.predictions.decoded).segmentation.float()
-        drawn = torch.stack(
-            [sample.pipeline_masks.bool().any(0) for sample in pairs.truths.samples]
-        )
-        targets = torch.stack([drawn, ~drawn], 1).to(logits)  # (B, 2, H, W)
-        check_same_shape(logits=logits, gt_masks=targets)
+        drawn = [sample.pipeline_masks.bool().any(0) for sample in pairs.truths.samples]
+        targets = torch.stack([torch.stack([own, ~own]) for own in drawn]).to(logits)
+        check_same_shape(logits=logits, gt_masks=targets)  # (B, 2, H, W)
         weight = logits.new_tensor(self.pos_weight)
         cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
-        dice = squared_dice_loss(logits.sigmoid(), targets).mean()
+        dice = dice_loss(logits.sigmoid(), targets)
         return self.loss_weight * cross_entropy + self.dice_weight * dice
+
+
+def decoder_of(loss: MapLoss, head: MapHead) -> MGMapDecoder:
+    """Return the head's decoder; ValueError if it has no masks for the loss."""
+    if not isinstance(head.decoder, MGMapDecoder):
+        raise ValueError(
+            f"{type(loss).__name__} needs the masks of MGMapDecoder, got "
+            f"{type(head.decoder).__name__}: leave the loss out, or set decoder.type."
+        )
+    return head.decoder

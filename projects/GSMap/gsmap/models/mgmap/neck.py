@@ -1,6 +1,5 @@
 """MGMap's neck: BEV features of four levels, and one map of all of them."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -38,10 +37,11 @@ class GatedBlock(BasicBlock):
         super().__init__(inplanes, planes, *args, **kwargs)
         self.gates = Gates(planes)
 
-    @property
-    def norm2(self) -> Callable[[Tensor], Tensor]:
-        """Second normalisation and gates."""
-        return lambda feats: self.gates(getattr(self, self.norm2_name)(feats))
+    def forward(self, feats: Tensor) -> Tensor:
+        """Return the block's output. (B, C, H, W)"""
+        inner = self.relu(self.norm1(self.conv1(feats)))
+        kept = feats if self.downsample is None else self.downsample(feats)
+        return self.relu(self.gates(self.norm2(self.conv2(inner))) + kept)
 
 
 def enlarged(feats: Tensor, shape: torch.Size) -> Tensor:

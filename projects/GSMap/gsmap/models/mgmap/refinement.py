@@ -7,46 +7,32 @@ from mmdet.models.backbones.resnet import BasicBlock
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.ops.deformable_sampling import sum_rows
+from gsmap.ops.deformable_sampling import deformable_sample
 
 BINS, SAMPLES = 5, 2  # bins of a patch and samples of a bin along each axis
 _BOX = 0.1  # side of a patch, of the map's side
 
 
-def _along(centres: Tensor, cells: int) -> tuple[Tensor, Tensor]:
-    """Return the cells beside the samples of boxes along one axis, and their weights.
-
-    As RoI-align does without its half-cell shift: values lie at whole numbers, and samples more
-    than a cell outside count as zero. Centres are [0, 1] over the map. (...) -> 2 x (..., 10, 2)
-    """
-    number = BINS * SAMPLES
-    steps = (torch.arange(number, device=centres.device) + 0.5) / number * max(_BOX * cells, 1.0)
-    place = (centres.clamp(max=1.0)[..., None] - _BOX / 2) * cells + steps
-    inside = (place >= -1) & (place <= cells)
-    place = place.clamp(0, cells - 1)
-    low = place.floor()
-    weights = torch.stack([1 - (place - low), place - low], -1) * inside[..., None]
-    return torch.stack([low, (low + 1).clamp(max=cells - 1)], -1).long(), weights
-
-
 def patches_around(feats: Tensor, centres: Tensor) -> Tensor:
     """Cut patches of a tenth of the map's sides out of it, bilinearly (RoI-align).
 
-    Maps (B, C, H, W), centres (x, y) in [0, 1] over them (B, Q, 2). -> (B, Q, C, 5, 5)
+    As RoI-align does without its half-cell shift: values lie at whole numbers, and samples more
+    than a cell outside count as zero. Maps (B, C, H, W), centres (x, y) in [0, 1] over them
+    (B, Q, 2). -> (B, Q, C, 5, 5)
     """
-    batch, _, height, width = feats.shape
-    x, wx = _along(centres[..., 0], width)
-    y, wy = _along(centres[..., 1], height)
-    sample = torch.arange(batch, device=feats.device).view(-1, 1, 1, 1, 1, 1)
-    rows = (sample * height + y[:, :, :, None, :, None]) * width + x[:, :, None, :, None, :]
-    weights = wy[:, :, :, None, :, None] * wx[:, :, None, :, None, :]  # (B, Q, 10, 10, 2, 2)
-
-    def by_bin(values: Tensor) -> Tensor:
-        split = values.unflatten(3, (BINS, SAMPLES)).unflatten(2, (BINS, SAMPLES))
-        return split.transpose(3, 4).flatten(4)  # (B, Q, 5, 5, 16)
-
-    table = feats.float().permute(0, 2, 3, 1).flatten(0, 2)
-    return sum_rows(table, by_bin(rows), by_bin(weights) / SAMPLES**2).movedim(-1, 2)
+    height, width = feats.shape[2:]
+    size = centres.new_tensor([width, height])
+    steps = (torch.arange(BINS * SAMPLES, device=feats.device) + 0.5) / (BINS * SAMPLES)
+    grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)  # (10, 10, 2)
+    corners = (centres.clamp(max=1.0) - _BOX / 2) * size
+    places = corners[:, :, None, None] + grid * (_BOX * size).clamp(min=1.0)
+    places = places.unflatten(3, (BINS, SAMPLES)).unflatten(2, (BINS, SAMPLES))
+    places = places.transpose(3, 4).flatten(4, 5).flatten(1, 3)[:, :, None]  # (B, Q * 25, 1, 4, 2)
+    inside = ((places >= -1) & (places <= size)).all(-1)
+    locations = (places.clamp(min=0.0).minimum(size - 1) + 0.5) / size
+    values = feats.float().flatten(2).transpose(1, 2)[:, :, None]  # (B, cells, 1, C)
+    seen = deformable_sample(values, (height, width), locations, inside / SAMPLES**2)
+    return seen.unflatten(1, (-1, BINS, BINS)).movedim(-1, 2)
 
 
 class MaskFeature(nn.Module):

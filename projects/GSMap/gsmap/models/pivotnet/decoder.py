@@ -31,22 +31,16 @@ class PointLayer(nn.Module):
         self.ffn = feed_forward(embed_dims, ffn_dims, dropout=0.0)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
 
-    def look(
-        self, states: Tensor, pos: Tensor, memory: Tensor, key: Tensor, blocked: Tensor | None
+    def forward(
+        self, states: Tensor, pos: Tensor, key: Tensor, memory: Tensor, blocked: Tensor | None
     ) -> Tensor:
         """Update points by the cells (B, S, C) that are not blocked (B, Q, S). (B, Q, C)"""
         if blocked is not None:
             blocked = blocked.repeat_interleave(self.cross_attn.num_heads, 0)
-        seen = self.cross_attn(states + pos, key, memory, attn_mask=blocked, need_weights=False)[0]
-        return self.norms[0](states + seen)
-
-    def forward(
-        self, states: Tensor, pos: Tensor, memory: Tensor, key: Tensor, blocked: Tensor | None
-    ) -> Tensor:
-        """Update the points; arguments as of `look`."""
-        states = self.look(states, pos, memory, key, blocked)
+        seen, _ = self.cross_attn(states + pos, key, memory, attn_mask=blocked, need_weights=False)
+        states = self.norms[0](states + seen)
         query = states + pos
-        shared = self.self_attn(query, query, states, need_weights=False)[0]
+        shared, _ = self.self_attn(query, query, states, need_weights=False)
         return self.norms[2](self.ffn(self.norms[1](states + shared)))
 
 
@@ -80,9 +74,8 @@ class PointLineDecoder(BaseModule):
             PointLayer(embed_dims, num_heads, ffn_dims) for _ in range(num_layers)
         )
         self.norm = nn.LayerNorm(embed_dims)
-        joined = [p * embed_dims for _, p in self.queries]
-        self.cls_branches = nn.ModuleList(nn.Linear(dims, 2) for dims in joined)
-        dims = (embed_dims, embed_dims, embed_dims)
+        joined, dims = [p * embed_dims for _, p in self.queries], [embed_dims] * 3
+        self.cls_branches = nn.ModuleList(nn.Linear(inputs, 2) for inputs in joined)
         self.mask_branches = nn.ModuleList(mlp(inputs, *dims) for inputs in joined)
 
     def init_weights(self) -> None:
@@ -99,7 +92,7 @@ class PointLineDecoder(BaseModule):
         outputs = [self.lines(states, bev)]
         for layer in self.layers:
             blocked = self.blocked(outputs[-1]) if self.line_masks else None
-            states = layer(states, self.query_pos.weight, memory, key, blocked)
+            states = layer(states, self.query_pos.weight, key, memory, blocked)
             outputs.append(self.lines(states, bev))
         return outputs
 
@@ -107,10 +100,8 @@ class PointLineDecoder(BaseModule):
         """Return what the states of all points (B, Q, C) say."""
         found = []
         points = self.norm(states).split([n * p for n, p in self.queries], 1)
-        branches = zip(self.cls_branches, self.mask_branches, strict=True)
-        for own, (_, p), (cls_branch, mask_branch) in zip(
-            points, self.queries, branches, strict=True
-        ):
+        parts = zip(points, self.queries, self.cls_branches, self.mask_branches, strict=True)
+        for own, (_, p), cls_branch, mask_branch in parts:
             by_line = own.unflatten(1, (-1, p))
             joined = by_line.flatten(2)
             masks = torch.einsum("bnc,bchw->bnhw", mask_branch(joined), bev)

@@ -1,20 +1,16 @@
 """PivotNet's BEV encoder: deformable layers over all cameras side by side."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any
 
 import torch
+import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import project_pillars
-from gsmap.models.maptr.attention import (
-    SamplingAttention,
-    directional_offsets,
-    place_samples,
-    sample_map,
-)
+from gsmap.models.maptr.attention import MultiLevelAttention
 from gsmap.models.maptr.layers import feed_forward, init_matrices
 from gsmap.models.pivotnet.front import centres, front_size, turned
 from gsmap.structures.grid import BEVGrid
@@ -22,68 +18,32 @@ from gsmap.structures.grid import BEVGrid
 Shapes = Sequence[tuple[int, int]]
 
 
-class Levels(NamedTuple):
-    """Feature maps one after another, and their rows and columns."""
-
-    tokens: Tensor  # (B, all cells, C)
-    shapes: Shapes
-
-    @property
-    def sizes(self) -> list[int]:
-        """Number of cells of each map."""
-        return [height * width for height, width in self.shapes]
-
-
-class LevelsAttention(SamplingAttention):
-    """Deformable attention over several maps; arguments as in `SamplingAttention`."""
-
-    def __init__(self, num_levels: int = 1, num_points: int = 8, **kwargs: Any) -> None:
-        self.num_levels = num_levels
-        super().__init__(num_points=num_levels * num_points, **kwargs)
-
-    def initial_offsets(self) -> Tensor:
-        """Return the same offsets for every map. (heads, levels * S, 2)"""
-        offsets = directional_offsets(self.num_heads, self.num_points // self.num_levels)
-        return offsets.repeat(1, self.num_levels, 1)
-
-    def forward(self, query: Tensor, reference: Tensor, levels: Levels) -> Tensor:
-        """Sample the maps around references, [0, 1] over each. (B, Q, C), (B, Q, 2) -> (B, Q, C)"""
-        parts = zip(
-            self.values(levels.tokens).split(levels.sizes, 1),
-            levels.shapes,
-            self.offsets_in_cells(query).chunk(self.num_levels, 3),
-            self.weights(query).chunk(self.num_levels, 3),
-            strict=True,
-        )
-        seen: list[Tensor] = [
-            sample_map(values, shape, place_samples(offsets, reference, shape), weights)
-            for values, shape, offsets, weights in parts
-        ]
-        return self.dropout(self.output_proj(torch.stack(seen).sum(0)))
-
-
 class DeformableLayer(nn.Module):
-    """Attention to the own maps, then perhaps to others, and a feed-forward network, post-norm."""
+    """Attentions to maps, one after another, and a feed-forward network, post-norm.
+
+    Args:
+        levels: Maps of each attention.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Dropout of every sublayer.
+        sizes: ``embed_dims``, ``num_heads`` and ``num_points`` of the attentions.
+    """
 
     def __init__(self, levels: Sequence[int], ffn_dims: int, dropout: float, **sizes: int) -> None:
         super().__init__()
         self.attns = nn.ModuleList(
-            LevelsAttention(number, dropout=dropout, **sizes) for number in levels
+            MultiLevelAttention(number, dropout=dropout, **sizes) for number in levels
         )
         self.ffn = feed_forward(sizes["embed_dims"], ffn_dims, dropout)
-        norms = len(levels) + 1
-        self.norms = nn.ModuleList(nn.LayerNorm(sizes["embed_dims"]) for _ in range(norms))
+        self.norms = nn.ModuleList(nn.LayerNorm(sizes["embed_dims"]) for _ in (*levels, "ffn"))
 
     def forward(
-        self, own: Levels, position: Tensor, references: Sequence[Tensor], other: Levels | None
+        self, tokens: Tensor, position: Tensor, *views: tuple[Sequence[Tensor], Tensor]
     ) -> Tensor:
-        """Update tokens by maps at references (B, Q, 2) in each; values have no position."""
-        tokens = own.tokens
-        for attn, norm, reference, levels in zip(
-            self.attns, self.norms, references, (own, other), strict=False
-        ):
-            tokens = norm(tokens + attn(tokens + position, reference, levels))
-        return self.norms[-1](self.ffn(tokens))
+        """Update tokens (B, Q, C) by maps (B, C, h, w) at references (B, Q, 2) in each of them."""
+        *norms, last = self.norms
+        for attn, norm, (maps, reference) in zip(self.attns, norms, views, strict=True):
+            tokens = norm(tokens + attn(tokens + position, reference, maps))
+        return last(self.ffn(tokens))
 
 
 @MODELS.register_module()
@@ -142,10 +102,9 @@ class PivotBEVEncoder(CameraEncoder):
         )
         defaults = {"num_heads": 8, "num_points": 8, "ffn_dims": 1024, "dropout": 0.1}
         settings = {"embed_dims": embed_dims, **defaults, **(layer_cfg or {})}
-        levels = len(strides)
         self.source_layers, self.bev_layers = (
-            nn.ModuleList(DeformableLayer(seen, **settings) for _ in range(number))
-            for seen, number in zip(((levels,), (1, levels)), num_layers, strict=True)
+            nn.ModuleList(DeformableLayer(levels, **settings) for _ in range(number))
+            for levels, number in zip(((len(strides),), (1, len(strides))), num_layers, strict=True)
         )
         cells = self.grid.height * self.grid.width
         self.bev_embedding = nn.Embedding(cells, embed_dims)
@@ -172,67 +131,56 @@ class PivotBEVEncoder(CameraEncoder):
 
         ValueError if they have other sizes than the position tables.
         """
-        memory = self.sources(feats)
-        position = self.bev_pos.weight
-        reference = self.references(calibration["img_from_ground"], img_shape)
-        shape, batch = front_size(self.grid), len(memory.tokens)
-        own = centres(shape, position.device).expand(batch, -1, -1)
-        cells = self.bev_embedding.weight.expand(batch, -1, -1)
-        bev = []
+        sources, position = self.sources(feats), self.bev_pos.weight
+        uv, seen = self.project(calibration["img_from_ground"], img_shape)
+        reference = torch.where(seen[..., None], uv, self.unseen_reference(position).sigmoid())
+        shapes = [front_size(self.grid)]
+        own = centres(shapes, position.device).expand_as(reference)
+        cells, bev = self.bev_embedding.weight.expand(len(uv), -1, -1), []
         for layer in self.bev_layers:
-            cells = layer(Levels(cells, [shape]), position, (own, reference), memory)
-            bev.append(turned(cells.transpose(1, 2).unflatten(2, shape), self.grid))
+            cells = layer(cells, position, (maps_of(cells, shapes), own), (sources, reference))
+            bev.append(turned(maps_of(cells, shapes)[0], self.grid))
         return {"bev_feats": bev[-1], "bev_levels": bev}
 
-    def sources(self, feats: Sequence[Tensor]) -> Levels:
-        """Return the cameras side by side, mixed."""
-        joined = [f.permute(0, 2, 3, 1, 4).flatten(3) for f in feats]  # (B, C, h, V * w)
+    def sources(self, feats: Sequence[Tensor]) -> list[Tensor]:
+        """Return the cameras side by side, mixed. (B, C, h, V * w) each"""
+        joined = [f.permute(0, 2, 3, 1, 4).flatten(3) for f in feats]
         found = [tuple(f.shape[-2:]) for f in joined]
         if found != self.shapes:
             raise ValueError(
                 f"the cameras side by side must have {self.shapes} feature pixels, not {found}; "
                 "set image_size, strides and num_cams of PivotBEVEncoder to those of the images."
             )
-        tokens = [
-            project(f).flatten(2).transpose(1, 2)
-            for project, f in zip(self.input_proj, joined, strict=True)
-        ]
-        position = torch.cat([cast(Tensor, table.weight) for table in self.source_pos])
-        # as released, the content has the position too
-        memory = Levels(torch.cat(tokens, 1) + position, self.shapes)
-        reference = torch.cat([centres(shape, position.device) for shape in self.shapes])
-        reference = reference.expand(len(memory.tokens), -1, -1)
+        maps = zip(self.input_proj, joined, strict=True)
+        tokens = torch.cat([project(f).flatten(2) for project, f in maps], 2).transpose(1, 2)
+        position = torch.cat([*self.source_pos.parameters()])
+        tokens = tokens + position  # as released, the content has the position too
+        reference = centres(self.shapes, position.device).expand(len(tokens), -1, -1)
         for layer in self.source_layers:
-            memory = memory._replace(tokens=layer(memory, position, (reference,), None))
-        return memory
-
-    def references(self, img_from_ground: Tensor, img_shape: tuple[int, int]) -> Tensor:
-        """Return where cells look, [0, 1] over the cameras side by side. (B, H * W, 2)"""
-        uv, seen = self.project(img_from_ground, img_shape)
-        learned = self.unseen_reference(self.bev_pos.weight).sigmoid()
-        return torch.where(seen[..., None], uv, learned)
+            tokens = layer(tokens, position, (maps_of(tokens, self.shapes), reference))
+        return maps_of(tokens, self.shapes)
 
     def project(self, img_from_ground: Tensor, img_shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Return each cell's centre in its camera, [0, 1] over all, and whether that sees it.
 
         (B, H * W, 2), (B, H * W)
         """
-        places = centres(front_size(self.grid), img_from_ground.device).flip(-1)
-        ground = self.grid.metres_from_front(places)
-        points = torch.cat([ground, ground.new_tensor([0.0, 1.0]).expand(len(ground), 2)], -1)
-        projection = project_pillars(points[:, None], img_from_ground, img_shape)
-        # the third row of a matrix to pixels gives the depth
-        along = torch.einsum("bvd,qd->bvq", img_from_ground[:, :, 2].float(), points)
+        matrices = img_from_ground.float()
+        places = centres([front_size(self.grid)], matrices.device).flip(-1)
+        points = F.pad(self.grid.metres_from_front(places), (0, 1))  # on the ground
+        points = F.pad(points, (0, 1), value=1.0)  # (Q, 4)
+        uv, visible = project_pillars(points[:, None], matrices, img_shape)
+        score = torch.einsum("bvd,qd->bvq", matrices[:, :, 2], points)  # the depth
         if self.camera_by == "angle":
-            matrix, shift = (
-                img_from_ground[..., :3, :3].float(),
-                img_from_ground[..., :3, 3:].float(),
-            )
-            cameras = -torch.linalg.solve(matrix, shift)[..., 0]  # where they stand (B, V, 3)
-            along = along / torch.cdist(cameras, points[None, :, :3].expand(len(cameras), -1, -1))
-        camera = along.argmax(1, keepdim=True)  # (B, 1, Q)
-        seen = projection.visible.gather(1, camera)[:, 0]
-        place = projection.uv[..., 0, :]  # (B, V, Q, 2)
-        uv = place.gather(1, camera[..., None].expand(-1, -1, -1, 2))[:, 0]
-        number = camera[:, 0] / img_from_ground.shape[1]
-        return torch.stack([uv[..., 0] / img_from_ground.shape[1] + number, uv[..., 1]], -1), seen
+            cameras = torch.linalg.inv(matrices)[..., :3, 3]  # where they stand (B, V, 3)
+            score = score / torch.cdist(cameras, points[None, :, :3].expand(len(cameras), -1, -1))
+        camera = score.argmax(1, keepdim=True)  # (B, 1, Q)
+        u, v = (part.gather(1, camera)[:, 0] for part in uv[..., 0, :].unbind(-1))
+        u = (u + camera[:, 0]) / matrices.shape[1]
+        return torch.stack([u, v], -1), visible.gather(1, camera)[:, 0]
+
+
+def maps_of(tokens: Tensor, shapes: Shapes) -> list[Tensor]:
+    """Return the maps whose cells stand one after another. (B, cells, C) -> (B, C, h, w) each"""
+    parts = tokens.transpose(1, 2).split([height * width for height, width in shapes], 2)
+    return [part.unflatten(2, shape) for part, shape in zip(parts, shapes, strict=True)]

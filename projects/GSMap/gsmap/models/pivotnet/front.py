@@ -1,5 +1,7 @@
 """BEV features and masks as PivotNet sees them: rows from the front, columns from the left."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -16,7 +18,7 @@ def turned(feats: Tensor, grid: BEVGrid) -> Tensor:
     return feats.flip(-2) if grid.forward == "y" else feats.transpose(-1, -2).flip(-2, -1)
 
 
-def centres(shape: tuple[int, int], device: torch.device) -> Tensor:
-    """Return the centres (x, y) of a map's cells, [0, 1] over it, row-major. (rows * columns, 2)"""
-    rows, cols = ((torch.arange(n, device=device) + 0.5) / n for n in shape)
-    return torch.stack(torch.meshgrid(rows, cols, indexing="ij")[::-1], -1).flatten(0, 1)
+def centres(shapes: Sequence[tuple[int, int]], device: torch.device) -> Tensor:
+    """Return the centres (x, y) of maps' cells, [0, 1] over each, row-major. (all cells, 2)"""
+    grids = [BEVGrid((0.0, 1.0), (0.0, 1.0), *shape) for shape in shapes]
+    return torch.cat([grid.pixel_centres(device).flatten(0, 1) for grid in grids])

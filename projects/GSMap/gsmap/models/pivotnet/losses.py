@@ -1,23 +1,23 @@
 """PivotNet's losses of one map class: lines, their masks, pivots and the points between."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from gsmap.models.maptr.matching import check_finite
-from gsmap.models.pivotnet.matching import match_pivots, sequence_costs
+from gsmap.models.pivotnet.matching import Floats, match_pivots, sequence_costs
 
 PIVOT, LINE = 1, 0  # the places of their logits; the others are a point between and none
 
 
 class Lines(NamedTuple):
-    """Predicted lines of one class in one sample."""
+    """Predicted lines of one class, in one sample (n, ...) or in a batch (B, n, ...)."""
 
     logits: Tensor  # of a line and of none (n, 2)
     points: Tensor  # [0, 1] from the front and from the left (n, p, 2)
@@ -31,6 +31,24 @@ class TrueLines(NamedTuple):
     pivots: Tensor  # [0, 1] from the front and from the left; beyond their number unused (K, P, 2)
     numbers: Tensor  # of pivots (K,)
     masks: Tensor  # 0 and 1, float (K, H, W)
+
+
+class Case(NamedTuple):
+    """Lines of one class in one sample."""
+
+    lines: Lines
+    truth: TrueLines
+    apart: Tensor  # distances of their masks (n, K)
+    token: str
+
+
+class Pairs(NamedTuple):
+    """Matched lines of a case."""
+
+    rows: Tensor  # numbers of the predicted ones (M,)
+    cols: Tensor  # and of the annotated ones (M,)
+    is_pivot: Tensor  # which points are matched with pivots (M, p)
+    expected: Tensor  # where the points should be, evenly spaced between pivots (M, p, 2)
 
 
 @dataclass(frozen=True)
@@ -61,91 +79,81 @@ class PivotLosses:
     between_weight: float = 0.2
     point_cls_per_line: bool = True
 
-    def match(
-        self, lines: Lines, truth: TrueLines, masks: Tensor, token: str
-    ) -> tuple[Tensor, Tensor]:
-        """Return the matched predictions and annotations. 2 x (M,)
+    @torch.no_grad()
+    def match(self, cases: Sequence[Case]) -> list[Pairs]:
+        """Match the lines of each case; FloatingPointError if a cost is not a number."""
+        parts = [part for case in cases for part in self.costs(case)]
+        # all in one copy from the device
+        values = torch.cat([part.flatten() for part in parts]).cpu().double()
+        arrays = [
+            own.view(part.shape).numpy()
+            for own, part in zip(values.split([p.numel() for p in parts]), parts, strict=True)
+        ]
+        matched = zip(cases, arrays[::4], arrays[1::4], arrays[2::4], arrays[3::4], strict=True)
+        return [self.pairs(*case) for case in matched]
 
-        ``masks`` are the distances of the masks (n, K). FloatingPointError, with the sample's
-        ``token``, if a cost is not a number.
+    def costs(self, case: Case) -> tuple[Tensor, ...]:
+        """Return what a case is matched by: two costs, differences of points, the pivots.
+
+        (2, n, K), |du| + |dv| (n, K, m, p), (K, m, 2), numbers (K,)
         """
-        differences = distances(lines.points, truth.pivots)
-        numbers = truth.numbers.cpu().numpy()
-        parts = torch.stack(
-            [
-                -self.cls * lines.logits.softmax(-1)[:, LINE, None].expand_as(masks).cpu(),
-                self.mask * masks.cpu(),
-                self.pivots
-                * torch.from_numpy(sequence_costs(differences, numbers, self.end_weight)),
-            ]
-        ).detach()
-        check_finite(parts, ["class scores", "masks", "pivots"], {"token": token})
-        rows, cols = linear_sum_assignment(parts.sum(0).numpy())
-        return torch.from_numpy(rows), torch.from_numpy(cols)
+        score = case.lines.logits.softmax(-1)[:, LINE, None].expand_as(case.apart)
+        plain = torch.stack([-self.cls * score, self.mask * case.apart])
+        pivots = case.truth.pivots
+        apart = pivots[None, :, :, None] - case.lines.points[:, None, None]
+        return plain, apart.abs().sum(-1), pivots, case.truth.numbers
 
-    def of_class(
-        self, samples: list[tuple[Lines, TrueLines, str]]
-    ) -> tuple[dict[str, Tensor], list[tuple[Tensor, Tensor]]]:
-        """Return the weighted losses of the lines of one class in a batch, and the matches."""
-        number = max(sum(len(truth.numbers) for _, truth, _ in samples), 1)
-        logits = torch.cat([lines.logits for lines, _, _ in samples])
-        zero = logits.sum() * 0
-        sums = {"mask": zero, "pivots": zero, "collinear": zero}
-        labels, kinds, matches = [], [], []
-        for lines, truth, token in samples:
-            masks = mask_distances(lines.masks, truth.masks)
-            rows, cols = self.match(lines, truth, masks, token)
-            matches.append((rows, cols))
-            label = torch.full((len(lines.logits),), 1 - LINE, device=logits.device)
-            label[rows] = LINE
-            labels.append(label)
-            sums["mask"] = sums["mask"] + masks[rows, cols].sum()
-            is_pivot, expected = spaced(lines, truth, rows, cols)
-            offsets = (lines.points[rows] - expected).abs().sum(-1)  # (M, p)
-            weight = is_pivot.float()
-            weight[:, [0, -1]] += self.end_weight
-            sums["pivots"] = sums["pivots"] + ((offsets * weight).sum(1) / weight.sum(1)).sum()
-            between = (~is_pivot).float()
-            means = (offsets * between).sum(1) / between.sum(1).clamp(min=1)
-            sums["collinear"] = sums["collinear"] + means.sum()
-            kinds.append((lines.point_logits[rows], is_pivot.long()))
-        losses = {name: getattr(self, name) * value / number for name, value in sums.items()}
-        weight = logits.new_tensor([1.0, self.none_weight])
-        losses["cls"] = self.cls * F.cross_entropy(logits, torch.cat(labels), weight)
-        point_logits, is_pivot = (
-            torch.cat(parts).flatten(0, 1) for parts in zip(*kinds, strict=True)
+    def pairs(
+        self, case: Case, plain: Floats, differences: Floats, pivots: Floats, numbers: Floats
+    ) -> Pairs:
+        """Match a case by what `costs` says."""
+        counts = numbers.astype(int)
+        sequences = self.pivots * sequence_costs(differences, counts, self.end_weight)
+        costs = torch.from_numpy(np.concatenate([plain, sequences[None]]))
+        check_finite(costs, ["class scores", "masks", "pivots"], {"token": case.token})
+        rows, cols = linear_sum_assignment(costs.sum(0).numpy())
+        points = np.arange(differences.shape[-1])
+        is_pivot, expected = (
+            np.zeros((len(rows), len(points))),
+            np.zeros((len(rows), len(points), 2)),
         )
-        weight = logits.new_tensor([self.between_weight, 1.0])
-        point_cls = F.cross_entropy(point_logits, is_pivot, weight) if len(is_pivot) else zero
-        divisor = number if self.point_cls_per_line else 1
-        losses["point_cls"] = self.point_cls * point_cls / divisor
-        return losses, matches
+        for pair, (row, col) in enumerate(zip(rows, cols, strict=True)):
+            line = pivots[col, : counts[col]]
+            path = match_pivots(differences[row, col, : len(line)])
+            is_pivot[pair, path] = 1
+            expected[pair] = np.stack([np.interp(points, path, axis) for axis in line.T], -1)
+        found = rows, cols, is_pivot.astype(bool), expected.astype(np.float32)
+        return Pairs(*(torch.from_numpy(part).to(case.apart.device) for part in found))
 
-
-def distances(points: Tensor, pivots: Tensor) -> NDArray[np.float64]:
-    """Return |du| + |dv| of all pivots and points. (n, p, 2), (K, m, 2) -> (n, K, m, p)"""
-    apart = pivots.detach()[None, :, :, None] - points.detach()[:, None, None]
-    return apart.abs().sum(-1).double().cpu().numpy()
-
-
-def spaced(lines: Lines, truth: TrueLines, rows: Tensor, cols: Tensor) -> tuple[Tensor, Tensor]:
-    """Return which points of the pairs are pivots, and where all should be. (M, p), (M, p, 2)
-
-    Between two pivots, points should be spaced evenly by their index.
-    """
-    num_points = lines.points.shape[1]
-    is_pivot = np.zeros((len(rows), num_points), bool)
-    expected = np.zeros((len(rows), num_points, 2))
-    pivots, numbers = truth.pivots.double().cpu().numpy(), truth.numbers.tolist()
-    for pair, (row, col) in enumerate(zip(rows.tolist(), cols.tolist(), strict=True)):
-        own = truth.pivots[None, col, : numbers[col]]
-        path = match_pivots(distances(lines.points[row, None], own)[0, 0])
-        is_pivot[pair, path] = True
-        for axis in (0, 1):
-            line = pivots[col, : numbers[col], axis]
-            expected[pair, :, axis] = np.interp(np.arange(num_points), path, line)
-    placed = torch.from_numpy(expected).to(lines.points)
-    return torch.from_numpy(is_pivot).to(placed.device), placed
+    def __call__(self, cases: Sequence[Case], matches: Sequence[Pairs]) -> dict[str, Tensor]:
+        """Return the weighted losses of a layer and class, from the cases of all samples."""
+        number = max(sum(len(case.truth.numbers) for case in cases), 1)
+        labels = [torch.full_like(case.lines.logits[:, 0], 1 - LINE).long() for case in cases]
+        for label, pairs in zip(labels, matches, strict=True):
+            label[pairs.rows] = LINE
+        both = list(zip(cases, matches, strict=True))
+        masks = torch.cat([case.apart[pairs.rows, pairs.cols] for case, pairs in both])
+        points = torch.cat([case.lines.points[pairs.rows] for case, pairs in both])
+        kinds = torch.cat([case.lines.point_logits[pairs.rows] for case, pairs in both])
+        is_pivot = torch.cat([pairs.is_pivot for pairs in matches])
+        offsets = (points - torch.cat([pairs.expected for pairs in matches])).abs().sum(-1)
+        weight = is_pivot.float()
+        weight[:, [0, -1]] += self.end_weight
+        between = (~is_pivot).float()
+        collinear = (offsets * between).sum(1) / between.sum(1).clamp(min=1)
+        point_cls = kinds.sum()  # 0 without pairs
+        if len(kinds):
+            classes = kinds.new_tensor([self.between_weight, 1.0])
+            point_cls = F.cross_entropy(kinds.flatten(0, 1), is_pivot.flatten().long(), classes)
+        logits = torch.cat([case.lines.logits for case in cases])
+        cls = F.cross_entropy(logits, torch.cat(labels), logits.new_tensor([1.0, self.none_weight]))
+        return {
+            "mask": self.mask * masks.sum() / number,
+            "pivots": self.pivots * ((offsets * weight).sum(1) / weight.sum(1)).sum() / number,
+            "collinear": self.collinear * collinear.sum() / number,
+            "cls": self.cls * cls,
+            "point_cls": self.point_cls * point_cls / (number if self.point_cls_per_line else 1),
+        }
 
 
 def mask_distances(logits: Tensor, masks: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gsmap.models.pivotnet.front import front_size
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.polylines import is_closed
+from gsmap.structures.polylines import arc_lengths, is_closed
 
 Points = NDArray[np.float64]
 
@@ -65,17 +65,21 @@ def directed(line: Points, tolerance: float, sort_rings: bool = False) -> Points
     return line if starts_well else line[::-1]
 
 
-def longest_edges(ring: Points) -> list[Points]:
-    """Return the two longest edges of a ring, the longest last. 2 x (2, 2)"""
-    lengths = np.linalg.norm(np.diff(ring, axis=0), axis=1)
-    return [ring[i : i + 2] for i in np.argsort(lengths, kind="stable")[-2:]]
-
-
 def sampled(line: Points, step: float) -> Points:
     """Return a point at every step from the start; the rest at the end is dropped. (n, 2)"""
-    along = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()])
+    along = arc_lengths(line)
     at = np.arange(0.0, along[-1], step)
-    return np.stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)], -1)
+    return np.stack([np.interp(at, along, axis) for axis in line.T], -1)
+
+
+def drawn(lines: Iterable[Points], size: tuple[int, int], thickness_px: int) -> NDArray[np.bool_]:
+    """Draw lines, [0, 1] from the front and the left, each on a raster of its own. (K, H, W)"""
+    masks = []
+    for line in lines:
+        cells = (line * size)[:, ::-1].astype(np.int32)
+        mask = cv2.polylines(np.zeros(size, np.uint8), [cells], False, (1,), thickness_px)
+        masks.append(mask.astype(bool))
+    return np.array(masks).reshape(-1, *size).astype(bool)
 
 
 @TRANSFORMS.register_module()
@@ -99,7 +103,7 @@ class FormatPivotTargets(BaseTransform):
             stay as they are annotated.
 
     Raises:
-        ValueError: If a class has less than two points.
+        ValueError: If a class has less than two points, or ``edge_classes`` names one that is not.
     """
 
     num_points: Sequence[int] = (10, 2, 30)
@@ -114,6 +118,11 @@ class FormatPivotTargets(BaseTransform):
     def __post_init__(self) -> None:
         if min(self.num_points, default=0) < 2:
             raise ValueError(f"num_points must be >= 2 for each class, got {self.num_points}.")
+        if not set(self.edge_classes) <= set(range(len(self.num_points))):
+            raise ValueError(
+                f"edge_classes must be indices of the {len(self.num_points)} classes of "
+                f"num_points, got {self.edge_classes}."
+            )
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets; ValueError without ground truth or for a class that has no number."""
@@ -123,58 +132,51 @@ class FormatPivotTargets(BaseTransform):
                 "this pipeline."
             )
         grid = BEVGrid(results["x_range"], results["y_range"]).rasterized(self.pixel_m)
-        size_m = np.array(front_size(grid)) * self.pixel_m
-        parts: list[tuple[int, Points]] = []
-        for instance in results["map_instances"]:
-            if not 0 <= instance.label < len(self.num_points):
-                raise ValueError(
-                    f"label {instance.label} of an element, but num_points of FormatPivotTargets "
-                    f"is {self.num_points}: give one for each class."
-                )
-            points = instance.points[:, :2].astype(np.float64)
-            parts += [(instance.label, line) for line in self.lines(points, instance.label, grid)]
-        parts.sort(key=lambda part: part[0])
-        pivots = [self.pivots(line * size_m, self.num_points[label]) for label, line in parts]
-        points = np.zeros((len(parts), max(self.num_points), 2))
-        for row, line in zip(points, pivots, strict=True):
-            row[: len(line)], row[len(line) :] = line, line[-1]
-        masks = self.masks(parts, [line / size_m for line in pivots], front_size(grid))
+        elements = sorted(results["map_instances"], key=lambda element: element.label)
+        parts = [(own.label, line) for own in elements for line in self.lines(own, grid)]
+        pivots = [self.pivots(line, label, grid) for label, line in parts]
+        most = max(self.num_points)
+        points = [np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in pivots]
+        points_m = grid.metres_from_front(np.array(points).reshape(-1, most, 2))
         results["gt_instances_3d"] = InstanceData(
             labels_3d=torch.tensor([label for label, _ in parts], dtype=torch.int64),
-            pts=torch.from_numpy(grid.metres_from_front(points / size_m).astype(np.float32)),
+            pts=torch.from_numpy(points_m.astype(np.float32)),
             num_pts=torch.tensor([len(line) for line in pivots], dtype=torch.int64),
-            masks=torch.from_numpy(masks),
+            masks=torch.from_numpy(self.masks(parts, pivots, front_size(grid))),
         )
         return results
 
-    def lines(self, points: Points, label: int, grid: BEVGrid) -> list[Points]:
+    def lines(self, element: Any, grid: BEVGrid) -> list[Points]:
         """Return the parts of an element on the map, [0, 1] from the front and the left."""
-        edges = label in self.edge_classes and is_closed(points)
+        if not 0 <= element.label < len(self.num_points):
+            raise ValueError(
+                f"label {element.label} of an element, but num_points of FormatPivotTargets is "
+                f"{self.num_points}: give one for each class."
+            )
         box = shapely.box(grid.x_range[0], grid.y_range[0], grid.x_range[1], grid.y_range[1])
-        found: list[Points] = []
-        for line in longest_edges(points) if edges else [points]:
+        whole = element.points[:, :2].astype(np.float64)
+        lines, found = [whole], []
+        if is_closed(whole) and element.label in self.edge_classes:
+            longest = np.argsort(np.linalg.norm(np.diff(whole, axis=0), axis=1), kind="stable")[-2:]
+            lines = [whole[i : i + 2] for i in longest]
+        for line in lines:
+            samples = sampled(line, self.step_m)
             if self.sort_rings and is_closed(line):
-                samples = np.concatenate([sampled(line, self.step_m), line[:1]])
-            else:
-                samples = sampled(line, self.step_m)
-            if len(samples) < 2:
-                continue
-            inside = shapely.LineString(samples).intersection(box)
-            found += [
-                grid.front_from_metres(shapely.get_coordinates(part))
-                for part in shapely.get_parts(inside)
-                if part.geom_type == "LineString" and not part.is_empty
-            ]
-        return found
+                samples = np.concatenate([samples, line[:1]])
+            if len(samples) > 1:  # as released, a line that crosses itself becomes several
+                parts = shapely.get_parts(shapely.LineString(samples).intersection(box))
+                found += [shapely.get_coordinates(part) for part in parts]
+        return [grid.front_from_metres(line) for line in found if len(line) > 1]
 
-    def pivots(self, line: Points, num_points: int) -> Points:
-        """Return the pivots of a line in metres from the front and the left. (m, 2)"""
-        line = directed(line, 1.0, self.sort_rings)
-        areas = significances(line)
+    def pivots(self, line: Points, label: int, grid: BEVGrid) -> Points:
+        """Return the pivots of a line, [0, 1] from the front and the left. (m, 2)"""
+        size_m, most = np.array(front_size(grid)) * self.pixel_m, self.num_points[label]
+        line_m = directed(line * size_m, 1.0, self.sort_rings)
+        areas = significances(line_m)
         chosen = np.flatnonzero(areas >= self.min_area_m2)
-        if self.keep_end and len(chosen) > num_points:
-            chosen = np.sort(np.argsort(-areas, kind="stable")[:num_points])
-        return line[chosen[:num_points]]
+        if self.keep_end and len(chosen) > most:
+            chosen = np.sort(np.argsort(-areas, kind="stable")[:most])
+        return line_m[chosen[:most]] / size_m
 
     def masks(
         self, parts: Sequence[tuple[int, Points]], pivots: Iterable[Points], size: tuple[int, int]
@@ -183,24 +185,10 @@ class FormatPivotTargets(BaseTransform):
 
         (K, H, W)
         """
-        scale = np.array(size)
         labels = np.array([label for label, _ in parts], int)
-        masks = self._drawn([line * scale for _, line in parts], labels, size)
-        redrawn = self._drawn([line * scale for line in pivots], None, size)
+        masks = drawn((line for _, line in parts), size, self.thickness_px)
+        for i in range(len(masks)):
+            masks[:i][labels[:i] == labels[i]] &= ~masks[i]
         hidden = np.isin(labels, labels[~masks.any((1, 2))])
-        masks[hidden] = redrawn[hidden]
+        masks[hidden] = drawn(pivots, size, self.thickness_px)[hidden]
         return masks
-
-    def _drawn(
-        self, lines: Sequence[Points], labels: NDArray[np.int_] | None, size: tuple[int, int]
-    ) -> NDArray[np.bool_]:
-        """Draw lines in pixels; a later line of the same label hides an earlier one."""
-        masks = np.zeros((len(lines), *size), np.uint8)
-        for i, line in enumerate(lines):
-            cv2.polylines(
-                masks[i], [line[:, ::-1].astype(np.int32)], False, (1,), self.thickness_px
-            )
-            if labels is not None:
-                earlier = np.flatnonzero(labels[:i] == labels[i])
-                masks[earlier] &= ~masks[i] & 1
-        return masks.astype(bool)
