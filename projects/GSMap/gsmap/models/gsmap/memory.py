@@ -62,7 +62,7 @@ class GaussianMemory(QueryMemory):
         points = super().moved(head, references, past)
         if self.covariance == "points":
             return torch.cat([points[..., :-3], torch.zeros_like(points[..., -3:])], -1)
-        space = head.reference.space
+        space = require_gaussians(self, head).space
         spread = past.seconds.sqrt()
         with torch.autocast(points.device.type, enabled=False):
             gaussians = moved_gaussians(
@@ -77,7 +77,7 @@ class GaussianMemory(QueryMemory):
         """Return refined Gaussians fused with those before, but where these left the map."""
         if self.covariance != "fused":
             return refined
-        space = head.reference.space
+        space = require_gaussians(self, head).space
         with torch.autocast(refined.device.type, enabled=False):
             gaussians = fused_gaussians(space.decode(before), space.decode(refined))
             fused = space.encode(gaussians, refined)
