@@ -53,7 +53,7 @@ MODELS = {
     "mgmap": {"maptr", "encoders"},
     "pivotnet": {"maptr", "encoders"},
     "streammapnet": {"maptr", "encoders"},
-    "gsmap": {"maptr", "encoders"},
+    "gsmap": {"maptr", "encoders", "streams"},
 }
 # what the others are built on stays
 METHODS = (

@@ -19,6 +19,7 @@ from gsmap.evaluation.raster_ap import MIN_SCORE, RasterConfig
 from gsmap.models.pivotnet.head import LEVEL_WEIGHTS
 from gsmap.models.pivotnet.losses import PivotLosses
 from gsmap.models.pivotnet.targets import FormatPivotTargets
+from gsmap.models.streams.memory import StreamMemory
 from gsmap.structures.grid import BEVGrid
 
 REPO = Path(__file__).resolve().parents[1]
@@ -65,6 +66,15 @@ MAPQR = {  # GKT-h
 }
 GEMAP = {**SCHEDULE, "optim_wrapper.optimizer.weight_decay": 0.03}
 MGMAPNET = {**SCHEDULE, "train_dataloader.batch_size": 2}
+STREAMMAPNET = {
+    **SCHEDULE,
+    "optim_wrapper.optimizer.lr": 5e-4,
+    "param_scheduler.1.eta_min_ratio": 3e-3,
+    "train_dataloader.sampler.slots": 4,
+    "model.data_preprocessor.mean": [103.53, 116.28, 123.675],
+    "model.bev_encoder.z_range": pytest.approx((-11 / 3, 17 / 3)),  # slices at -2.5 to 4.5 m
+    "model.temporal": {"bev": {}, "queries": {"num": 33}},
+}
 CONFIGS: dict[str, dict[str, Any]] = {
     "maptr/maptr_r50_24e.py": {**SCHEDULE, **NUSCENES, **CAMERAS},
     "maptr/maptr_r50_110e.py": {**SCHEDULE, "train_cfg.max_epochs": 110},
@@ -141,6 +151,39 @@ CONFIGS: dict[str, dict[str, Any]] = {
     "pivotnet/pivotnet_r50_110e.py": {
         "train_cfg.max_epochs": 110,
         "param_scheduler.0.milestones": [77, 99],
+    },
+    "streammapnet/streammapnet_r50_24e.py": {
+        **STREAMMAPNET,
+        "grid.x_range": (-30.0, 30.0),  # the vehicle's frame
+        "grid.y_range": (-15.0, 15.0),
+        "model.bev_encoder.bev_pixel_m": 0.6,  # 100 x 50 cells
+        "train_cfg.max_epochs": 24,
+        "train_dataloader.sampler.single_frame_iters": 3480,
+    },
+    "streammapnet/streammapnet_r50_100x50_24e.py": {
+        **STREAMMAPNET,
+        "train_cfg.max_epochs": 24,
+        "grid.x_range": (-50.0, 50.0),
+        "model.bev_encoder.bev_pixel_m": 1.0,
+        "test_evaluator.thresholds": [1.0, 1.5, 2.0],
+    },
+    "streammapnet/streammapnet_r50_single_30e.py": {
+        "model.temporal": None,
+        "model.map_head.loss_cls.loss_weight": 4.0,
+        "model.map_head.match_costs.0.weight": 4.0,
+        "train_cfg.max_epochs": 30,
+    },
+    "streammapnet/streammapnet_r50_av2_30e.py": {
+        **STREAMMAPNET,
+        "model.bev_encoder.num_cams": 7,
+        "train_dataloader.dataset.rate_hz": 2.0,
+        "train_dataloader.dataset.pipeline.2.size": (608, 608),
+        "train_dataloader.sampler.single_frame_iters": 3750,
+        "train_cfg.max_epochs": 30,
+    },
+    "streammapnet/streammapnet_r50_av2_100x50_30e.py": {
+        "train_dataloader.dataset.pipeline.2.size": (640, 640),
+        "train_cfg.max_epochs": 30,
     },
     f"{GSMAP}gsmap_maptr_r50_24e.py": {**SCHEDULE, **NUSCENES, **CAMERAS},
     f"{GSMAP}gsmap_maptr_r50_110e.py": {**SCHEDULE, "train_cfg.max_epochs": 110},
@@ -261,6 +304,27 @@ def test_mapqr_scatters_and_masks_as_published():
     assert (layer.ffn.feedforward_channels, layer.cross_attn.dropout.p) == (512, 0.1)
     masks = head.aux_heads
     assert (masks["seg"].pos_weight, masks["pv_seg"].pos_weight) == (4.0, 1.0)
+
+
+def test_streammapnets_head_and_memory_weigh_as_released():
+    """Section 3 and 4 of the release's description: 5 and 50 for classes and lines, 0.1 x 50."""
+    cfg, head = (of("streammapnet/streammapnet_r50_24e.py") for of in (load, head_of))
+    assert [group.num for group in head.query_groups] == [100]
+    assert [(loss.loss_weight, loss.beta) for loss in head.losses.values()] == [(50.0, 0.01)]
+    assert [cost.weight for cost in head.assigner.match_costs] == [5.0, 50.0]
+    assert (head.loss_cls.loss_weight, head.loss_cls.alpha, head.loss_cls.gamma) == (5.0, 0.25, 2.0)
+    assert (head.num_points, head.embed_dims, len(head.decoder.layers)) == (20, 512, 6)
+    attention = head.decoder.layers[0].cross_attn
+    assert (attention.num_heads, attention.num_points) == (8, 20)
+    assert head.coder.max_num == 100
+    memory = StreamMemory(head, **cfg.model.temporal)
+    assert (memory.bev.end_points, memory.bev.kept_dims, memory.half) == (False, None, False)
+    queries = memory.queries
+    assert (queries.num, queries.loss_weight, queries.beta) == (33, 5.0, 0.01)
+    released = load("streammapnet/streammapnet_r50_released_24e.py")
+    assert released.model.temporal.bev.end_points
+    assert released.model.bev_encoder.mirrored_self_attn
+    assert released.train_dataloader.sampler.late_switch
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,39 @@ def test_a_cosine_schedule_of_another_length_is_refused():
     check_config(Config(cfg))
 
 
+STREAMS = {"type": "StreamTrainSampler", "slots": 2}
+WITH_MEMORY = {
+    "model": {"temporal": {"bev": {}}},
+    "train_dataloader": {"batch_size": 2, "sampler": STREAMS},
+    "test_dataloader": {"batch_size": 1, "sampler": {"type": "StreamTestSampler"}},
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        (
+            {"test_dataloader": {"sampler": {"type": "DefaultSampler"}}},
+            r"test_dataloader\.sampler is 'DefaultSampler', .*several ranks .* to 'StreamTest",
+        ),
+        ({"val_dataloader": {"batch_size": 1}}, r"val_dataloader\.sampler is None"),
+        (
+            {"train_dataloader": {"sampler": {"type": "DefaultSampler"}}},
+            r"train_dataloader\.sampler .* to 'StreamTrainSampler', or model\.temporal=",
+        ),
+        (
+            {"train_dataloader": {"batch_size": 4, "sampler": STREAMS}},
+            r"batch_size is 4 and sampler\.slots is 2: .* set both",
+        ),
+    ],
+)
+def test_loaders_that_tear_streams_apart_are_refused(changes, reason):
+    check_config(read_config(Config(WITH_MEMORY)))
+    with pytest.raises(ValueError, match=reason):
+        check_config(read_config(Config({**WITH_MEMORY, **changes})))
+    check_config(read_config(Config({**WITH_MEMORY, **changes, "model": {"temporal": None}})))
+
+
 def test_the_newest_whole_checkpoint_is_found_whatever_is_noted(tmp_path, capsys):
     assert newest_checkpoint(tmp_path) is None
     for number in (2, 9, 10, 11):

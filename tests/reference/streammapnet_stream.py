@@ -12,8 +12,8 @@ from torch import Tensor
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.streams.memory import StreamMemory
 from gsmap.models.streams.query_memory import Propagation
-from gsmap.models.streams.states import Frame
 from gsmap.structures.polylines import sampled_orders
+from gsmap.structures.streams import Frame
 from reference.golden import Golden
 from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
@@ -106,17 +106,17 @@ class Recorder:
 
     def keep_memory(self, memory: Propagation, scores: Tensor) -> None:
         """Keep what entered from the memory, and what stays in it."""
-        states = [state.queries for state in self.memory.streams.states]
+        states = [state.values for state in self.memory.streams.states]
         self.keep(
             mem_scores=scores.amax(-1).topk(KEPT + 1).values,
-            mem_query=torch.stack([state.leaves[0] for state in states])[:, :, 0, ::4],
-            mem_ref=torch.stack([state.leaves[2] for state in states]),
-            mem_target=torch.stack([state.targets for state in states]),
+            mem_query=torch.stack([state["queries_0"] for state in states])[:, :, 0, ::4],
+            mem_ref=torch.stack([state["references"] for state in states]),
+            mem_target=torch.stack([state["targets"] for state in states]),
         )
         inserted = torch.full((BATCH, KEPT, 128), torch.nan)
         if memory.handed_on is not None:
             inserted = memory.handed_on.state[:, :, 0, ::4].detach()
-        self.keep(prop_query=inserted, pose12=memory.motion[:, :3].flatten(1).float())
+        self.keep(prop_query=inserted, pose12=memory.past.now_from_then[:, :3].flatten(1).float())
 
 
 def mirrored(points: Tensor) -> Tensor:

@@ -11,9 +11,10 @@ from mmengine.structures import InstanceData
 from model_cases import build_small, make_images, make_samples, straight_elements
 
 from gsmap.models.streams.bev_memory import BEVMemory
-from gsmap.models.streams.memory import StreamMemory
-from gsmap.models.streams.states import MapStream, Scenes, Slots
+from gsmap.models.streams.memory import StreamMemory, recalled
+from gsmap.models.streams.past import Past
 from gsmap.structures.rigid import rigid
+from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamState
 
 HALF_S = 500_000_000
 
@@ -112,6 +113,19 @@ def test_a_stream_of_ones_own_refuses_another_scene():
     step(head, memory, meta(0))  # the detector's own streams know nothing of it
 
 
+def test_a_stream_of_one_model_is_refused_by_another_and_both_are_named():
+    (head, memory), (_, other) = with_memory(), with_memory()
+    memory.name, other.name = "a.py with a.pth", "b.py with b.pth"
+    stream, unused = memory.new_stream(), MapStream()
+    with memory.using(stream):
+        step(head, memory, meta(0))
+    refusal = r"is of a\.py with a\.pth, and b\.py with b\.pth cannot read"
+    with pytest.raises(ValueError, match=refusal), other.using(stream):
+        pass
+    with other.using(unused), pytest.raises(ValueError, match=r"of b\.py .* a\.py .*new_stream"):
+        unused.claim(memory)
+
+
 def test_a_failed_batch_leaves_the_stream_where_it_was():
     head, memory = with_memory()
     step(head, memory, meta(0))
@@ -127,8 +141,6 @@ def test_a_sample_without_a_pose_is_named():
 
 
 def test_slots_start_anew_where_a_sample_does_not_follow():
-    from gsmap.models.streams.states import Frame, StreamState
-
     slots = Slots(max_gap_s=2.0)
     slots.keep([StreamState(Frame.of(meta(4, scene))) for scene in "abcd"])
     frames = [meta(5), meta(5, "x"), meta(3, "c"), meta(9, "d")]
@@ -137,8 +149,6 @@ def test_slots_start_anew_where_a_sample_does_not_follow():
 
 
 def test_only_the_latest_scenes_are_kept():
-    from gsmap.models.streams.states import Frame, StreamState
-
     scenes = Scenes(2.0, max_streams=2)
     for scene in "abc":
         scenes.keep([StreamState(Frame.of(meta(0, scene)))])
@@ -193,6 +203,28 @@ def test_training_gives_every_weight_a_gradient_and_later_frames_a_loss():
     assert all(value > 0 for value in moved)
 
 
+@pytest.mark.parametrize("config", [HEAD, {**GSMAP, "loss_raster": None, "iou_cost": None}])
+def test_a_query_that_has_moved_as_the_vehicle_has_no_loss(config):
+    """Targets of the frame before, after a turn of half a circle, lie where they are predicted."""
+    head, memory = with_memory(**config)
+    head.train(), memory.train()
+    start, turned = (meta(n, lidar2global=pose(0.0, n * math.pi)) for n in range(2))
+    with memory.over({"bev_feats": features(0)}, [start]) as outputs:
+        (sample,) = make_samples(LANES)
+        head.loss(outputs, [sample])
+    past = recalled([Frame.of(turned)], memory.streams.states, torch.device("cpu"))
+    outputs = memory.enter({"bev_feats": features(1)}, past)
+    head(outputs)
+    propagation = outputs["query_memory"]
+    assert float(propagation.loss(head)) > 0.1
+    state, _, reference = (leaf.flatten(1, 2) for leaf in propagation.handed_on)
+    predicted = head.reference.refine(0, state, reference)[..., :2].detach()
+    targets = head.reference.moved_points(predicted, past.then_from_now).view(1, 2, 5, 2)
+    memories = {**past.memory, "targets": targets}
+    propagation.past = Past(memories, past.now_from_then, past.seconds, past.continues)
+    assert float(propagation.loss(head)) < 1e-6
+
+
 def test_further_query_groups_keep_their_queries():
     groups = [{"num": 4}, {"name": "one2many", "num": 6, "repeats": 2}]
     head, memory = with_memory(query_groups=groups)
@@ -215,6 +247,11 @@ def test_a_memory_that_does_not_fit_is_refused():
         StreamMemory(head)
     with pytest.raises(ValueError, match="a memory of 4 queries does not fit a head of 4"):
         StreamMemory(head, queries={"num": 4})
+    with pytest.raises(ValueError, match=r"kept_dims must be 1 to 16, .* got 17"):
+        StreamMemory(head, bev={"kept_dims": 17}, embed_dims=16)
+    single = build_head(HEAD, decoder={**HEAD["decoder"], "num_layers": 1})
+    with pytest.raises(ValueError, match=r"set map_head\.decoder\.num_layers to 2 or more"):
+        StreamMemory(single, queries={"num": 2})
 
 
 def test_a_detector_remembers():

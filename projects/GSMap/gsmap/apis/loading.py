@@ -48,4 +48,6 @@ def load_model(
     if checkpoint is not None:
         load_weights(model, checkpoint)
     model.cfg = cfg
+    if model.temporal is not None:
+        model.temporal.name = f"{cfg.filename or 'a config'} with {checkpoint or 'initial weights'}"
     return model.to(device).eval()

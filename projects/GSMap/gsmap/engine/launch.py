@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from mmdet3d.registry import MODELS, OPTIMIZERS, RUNNERS
+from mmdet3d.registry import DATA_SAMPLERS, MODELS, OPTIMIZERS, RUNNERS
 from mmengine.config import Config
 from mmengine.logging import print_log
 from mmengine.registry import init_default_scope
@@ -193,9 +193,11 @@ def check_config(cfg: Config) -> None:
 
     Raises:
         ValueError: If a learning-rate schedule ends at another epoch than the training, there is no
-            such optimizer or runner, or the pipeline lacks a transform that the head needs.
+            such optimizer or runner, the pipeline lacks a transform that the head needs, or a
+            loader tears the streams of a model with memory apart.
     """
     _check_targets(cfg)
+    _check_streams(cfg)
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
     for scheduler in cfg.get("param_scheduler") or []:
         last = scheduler.get("T_max")
@@ -278,3 +280,27 @@ def _check_targets(cfg: Config) -> None:
             f"{cfg.filename}: {kind} needs the targets of {name}: add it to the pipeline of "
             "train_dataloader.dataset."
         )
+
+
+def _check_streams(cfg: Config) -> None:
+    """Refuse loaders that would not hand a model with memory the frames of each scene in order."""
+    if (cfg.get("model") or {}).get("temporal") is None:
+        return
+    test = "StreamTestSampler"
+    for part, wanted in (("train", "StreamTrainSampler"), ("val", test), ("test", test)):
+        loader = cfg.get(f"{part}_dataloader") or {}
+        sampler = loader.get("sampler") or {}
+        kind = sampler.get("type")
+        found = DATA_SAMPLERS.get(kind) if isinstance(kind, str) else kind
+        if loader and wanted not in [base.__name__ for base in inspect.getmro(found or object)]:
+            raise ValueError(
+                f"{cfg.filename}: {part}_dataloader.sampler is {kind!r}, which tears scenes apart "
+                "(several ranks take turns with their frames), so model.temporal would remember "
+                f"other frames than the last: set its type to '{wanted}', or model.temporal=None."
+            )
+        slots, size = sampler.get("slots"), loader.get("batch_size")
+        if part == "train" and slots != size:
+            raise ValueError(
+                f"{cfg.filename}: train_dataloader.batch_size is {size} and sampler.slots is "
+                f"{slots}: a place of the batch is a stream, so set both to one number."
+            )

@@ -1,7 +1,7 @@
 """2D Gaussians as parts of map elements, and how a network's numbers become Gaussians."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -12,6 +12,8 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 
 ACTIVATIONS = ("sigmoid", "softplus", "exp")
+_ROUND = 1e-6  # relative difference of both variances, below which a Gaussian has no direction
+_MARGIN = 1e-4  # of the range of sigma, kept off its ends where no number stands for it
 AT_FLOOR = 1.1  # a Gaussian is at its floor if both sigmas are below this multiple of it
 
 
@@ -58,6 +60,7 @@ class GaussianSpace:
     init_scales_m: tuple[float, float] = (1.0, 0.4)
     activation: str = "sigmoid"
     literal_covariance: bool = False
+    _start: tuple[float, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "init_scales_m", tuple(float(s) for s in self.init_scales_m))
@@ -68,6 +71,8 @@ class GaussianSpace:
             )
         if self.activation not in ACTIVATIONS:
             raise ValueError(f"activation must be one of {ACTIVATIONS}, got {self.activation!r}.")
+        first = torch.tensor(self.init_scales_m, dtype=torch.float64)
+        object.__setattr__(self, "_start", tuple(self._before_activation(first).tolist()))
 
     @property
     def floor_m(self) -> float:
@@ -99,13 +104,41 @@ class GaussianSpace:
     def scales(self, raw: Tensor) -> Tensor:
         """Activate sigma: zero gives ``init_scales_m``. (..., 2) -> (..., 2) metres"""
         low, high = self.min_scale_m, self.max_scale_m
-        at_zero, activate = {
-            "sigmoid": (lambda s: (s - low) / (high - s), lambda x: (high - low) * x.sigmoid()),
-            "softplus": (lambda s: math.expm1(s - low), F.softplus),
-            "exp": (lambda s: s - low, torch.exp),
-        }[self.activation]
-        start = raw.new_tensor([math.log(at_zero(s)) for s in self.init_scales_m])
-        return (low + activate(raw + start)).clamp(max=high)
+        shifted = raw + raw.new_tensor(self._start)
+        above = {
+            "sigmoid": lambda x: (high - low) * x.sigmoid(),
+            "softplus": F.softplus,
+            "exp": torch.exp,
+        }[self.activation](shifted)
+        return (low + above).clamp(max=high)
+
+    def _before_activation(self, scales: Tensor) -> Tensor:
+        """Return s + s_0 of sigma in metres, between the smallest and the largest. (...)"""
+        above = scales - self.min_scale_m
+        if self.activation == "sigmoid":
+            return (above / (self.max_scale_m - scales)).log()
+        return (above.expm1() if self.activation == "softplus" else above).log()
+
+    def encode(self, gaussians: Gaussians, like: Tensor) -> Tensor:
+        """Return references that stand for Gaussians: the inverse of `decode`.
+
+        What no reference can say is made the nearest one: a centre off the map, a sigma beyond its
+        range.
+
+        Args:
+            gaussians: Their (...).
+            like: References whose heights, if there are any, are taken over. (..., D)
+
+        Returns:
+            The references, differentiable. (..., D)
+        """
+        centres = self.grid.norm_from_metres(gaussians.means).clamp(0.0, 1.0)
+        scales = gaussians.scales.sqrt() if self.literal_covariance else gaussians.scales
+        margin = _MARGIN * (self.max_scale_m - self.min_scale_m)
+        scales = scales.clamp(self.min_scale_m + margin, self.max_scale_m - margin)
+        raw = self._before_activation(scales) - scales.new_tensor(self._start)
+        theta = gaussians.rotations[..., None] - self.heading_rad
+        return torch.cat([centres, like[..., 2:-3], raw, theta], -1)
 
     def frames(self, reference: Tensor, invariant: bool = False) -> Tensor:
         r"""Return what turns an offset into the Gaussian's own frame, the identity at the start.
@@ -131,6 +164,81 @@ class GaussianSpace:
         centre, raw_scales, theta = reference[..., :2], reference[..., -3:-1], reference[..., -1:]
         angle = 2 * (theta + self.heading_rad)
         return torch.cat([2 * centre - 1, raw_scales, angle.cos(), angle.sin()], -1)
+
+
+def covariances(gaussians: Gaussians) -> Tensor:
+    """Return the covariances (GSMap Eq. 2) in square metres. (...) -> (..., 2, 2)"""
+    axes = _rotations(gaussians.rotations) * gaussians.scales[..., None, :]
+    return axes @ axes.transpose(-1, -2)
+
+
+def with_covariances(means: Tensor, covariances: Tensor, near: Tensor) -> Gaussians:
+    """Return Gaussians of given covariances, differentiable also where they are round.
+
+    Args:
+        means: Their centres in metres. (..., 2)
+        covariances: Symmetric, positive definite, in square metres. (..., 2, 2)
+        near: Angle that a first axis is close to, within an eighth of a turn, in radians: half
+            turns and the order of the axes are free otherwise. (...)
+    """
+    near = near.detach()  # the Gaussian itself does not depend on it
+    frame = _rotations(near)
+    inside = frame.transpose(-1, -2) @ covariances @ frame
+    middle = (inside[..., 0, 0] + inside[..., 1, 1]) / 2
+    half = (inside[..., 0, 0] - inside[..., 1, 1]) / 2
+    cross = (inside[..., 0, 1] + inside[..., 1, 0]) / 2
+    is_round = half.square() + cross.square() <= (_ROUND * middle).square()
+    half = torch.where(is_round, torch.ones_like(half), half)  # neither root nor angle has a
+    cross = torch.where(is_round, torch.zeros_like(cross), cross)  # gradient at zero
+    sign = torch.where(half < 0, -1.0, 1.0)
+    angle = torch.atan2(sign * cross, half.abs()) / 2
+    radius = torch.where(is_round, 0.0, sign * (half.square() + cross.square()).sqrt())
+    scales = torch.stack([middle + radius, middle - radius], -1).sqrt()
+    return Gaussians(means, scales, near + angle)
+
+
+def moved_gaussians(
+    gaussians: Gaussians, motion: Tensor, drift_m: Tensor, drift_rad: Tensor
+) -> Gaussians:
+    r"""Return Gaussians as another frame sees them, less certain by the noise of the motion.
+
+    With the motion's rotation R and its translation, the centre becomes :math:`R \mu + t` and the
+    covariance :math:`R \Sigma R^T + \sigma_t^2 I + \sigma_r^2 p p^T`, p being the new centre turned
+    by a quarter: a wrong angle moves what is far off further.
+
+    Args:
+        gaussians: Their (B, ...).
+        motion: From metres of their frame to those of the other. (B, 4, 4)
+        drift_m: Standard deviation of the motion's translation along each axis, in metres. (B,)
+        drift_rad: Standard deviation of its angle, in radians. (B,)
+    """
+    shape = (-1, *[1] * (gaussians.rotations.dim() - 1))
+    turn = motion[:, :2, :2].to(gaussians.means).view(*shape, 2, 2)
+    shift = motion[:, :2, 3].to(gaussians.means).view(*shape, 2)
+    drift_m, drift_rad = (d.to(shift).view(*shape, 1, 1) for d in (drift_m, drift_rad))
+    means = (turn @ gaussians.means[..., None])[..., 0] + shift
+    aside = torch.stack([-means[..., 1], means[..., 0]], -1)[..., None]
+    covariance = turn @ covariances(gaussians) @ turn.transpose(-1, -2)
+    noise = drift_m.square() * torch.eye(2).to(shift)
+    noise = noise + drift_rad.square() * (aside @ aside.transpose(-1, -2))
+    angles = gaussians.rotations + torch.atan2(turn[..., 1, 0], turn[..., 0, 0])
+    return with_covariances(means, covariance + noise, angles)
+
+
+def fused_gaussians(first: Gaussians, second: Gaussians) -> Gaussians:
+    r"""Return the product of two Gaussians each: a Kalman update of the first by the second.
+
+    With :math:`K = \Sigma_1 (\Sigma_1 + \Sigma_2)^{-1}` the centre is
+    :math:`\mu_1 + K (\mu_2 - \mu_1)` and the covariance :math:`K \Sigma_2`; its first axis is the
+    one close to the second's. (...), (...) -> (...)
+    """
+    one, two = covariances(first), covariances(second)
+    (a, b), (c, d) = ((one + two)[..., row, :].unbind(-1) for row in (0, 1))
+    adjugate = torch.stack([d, -b, -c, a], -1).unflatten(-1, (2, 2))
+    gain = one @ adjugate / (a * d - b * c)[..., None, None]
+    apart = (second.means - first.means)[..., None]
+    means = first.means + (gain @ apart)[..., 0]
+    return with_covariances(means, gain @ two, second.rotations)
 
 
 def gaussians_along(points: Tensor, across_m: float) -> Gaussians:

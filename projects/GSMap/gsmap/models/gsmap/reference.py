@@ -96,10 +96,11 @@ class GaussianReference(PointReference):
         return render_gaussians(means, scales, rotations, grid)
 
 
-def require_gaussians(part: Any, head: MapHead) -> None:
-    """Raise ValueError if a loss or a cost of rendered masks is given to a head of points."""
-    if not isinstance(head.reference, GaussianReference):
-        raise ValueError(
-            f"{type(part).__name__} needs Gaussians, got {type(head.reference).__name__}: set "
-            "reference=dict(type='GaussianReference'), or take GSMapHead."
-        )
+def require_gaussians(part: Any, head: MapHead) -> GaussianReference:
+    """Return a head's Gaussians; ValueError if a part of a model needs them and gets points."""
+    if isinstance(head.reference, GaussianReference):
+        return head.reference
+    raise ValueError(
+        f"{type(part).__name__} needs Gaussians, got {type(head.reference).__name__}: set "
+        "reference=dict(type='GaussianReference'), or take GSMapHead."
+    )

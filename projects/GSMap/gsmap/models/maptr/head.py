@@ -248,8 +248,10 @@ class MapHead(DetectionHead):
         query_pos, query = (part.expand(len(feats), -1, -1) for part in self.queries())
         start, mask = self.reference.start(query_pos), self.attention_mask()
         memory = bev_outputs.get("query_memory")
-        between = None if memory is None else partial(memory.between, self)
-        layers = self.decoder(query, query_pos, start, feats, self.reference.refine, mask, between)
+        refine, between = self.reference.refine, None
+        if memory is not None:
+            refine, between = partial(memory.refine, self), partial(memory.between, self)
+        layers = self.decoder(query, query_pos, start, feats, refine, mask, between)
         outputs = [
             self.predictions(
                 at_least_float32(self.cls_branches[number](layer.instance_states)), layer, feats

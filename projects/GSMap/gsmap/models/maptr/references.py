@@ -131,15 +131,22 @@ class PointReference(nn.Module):
         return torch.cat([points[..., :2], height], -1)
 
     def moved(self, references: Tensor, motion: Tensor) -> Tensor:
-        """Return references of an earlier frame as they lie now, points moved onto the map.
+        """Return references of an earlier frame as they lie now. (B, ..., D) -> (B, ..., D)
 
-        The motion (B, 4, 4), float64, takes metres then to metres now. (B, ..., D) -> (B, ..., D)
+        The motion (B, 4, 4) takes metres then to metres now.
         """
-        points = self.metres(references[..., : self.coords].double())
+        points = self.moved_points(references[..., : self.coords], motion)
+        return torch.cat([points, references[..., self.coords :]], -1)
+
+    def moved_points(self, points: Tensor, motion: Tensor) -> Tensor:
+        """Return normalised points (B, ..., coords) after a motion (B, 4, 4), put onto the map.
+
+        It is computed in the motion's precision.
+        """
+        metres = self.metres(points.to(motion))
         turn = motion[:, : self.coords, : self.coords].transpose(1, 2)  # without z: on the ground
-        moved = points.flatten(1, -2) @ turn + motion[:, None, : self.coords, 3]
-        norm = self.norm(moved).clamp(0.0, 1.0).view_as(points).to(references)
-        return torch.cat([norm, references[..., self.coords :]], -1)
+        moved = metres.flatten(1, -2) @ turn + motion[:, None, : self.coords, 3]
+        return self.norm(moved).clamp(0.0, 1.0).view_as(points).to(points)
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:
         """Return what references (N, P, D) say in metres: ``pts`` (N, P, coords)."""

@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.models.streams.past import Past
 from gsmap.structures.grid import BEVGrid
 
 
@@ -22,11 +23,27 @@ class BEVMemory(nn.Module):
         end_points: Take the cells to lie from edge to edge of the map, as released, instead of at
             their centres. Then the memory of a standing vehicle moves too; the released weights
             need it.
+        kept_dims: Channels that are kept, the first ones; the others of h are those of x, as in a
+            first frame. None keeps all, as published.
+
+    Raises:
+        ValueError: If there are not as many channels.
     """
 
-    def __init__(self, grid: BEVGrid, embed_dims: int = 256, end_points: bool = False) -> None:
+    def __init__(
+        self,
+        grid: BEVGrid,
+        embed_dims: int = 256,
+        end_points: bool = False,
+        kept_dims: int | None = None,
+    ) -> None:
         super().__init__()
-        self.grid, self.end_points = grid, end_points
+        if kept_dims is not None and not 0 < kept_dims <= embed_dims:
+            raise ValueError(
+                f"temporal.bev.kept_dims must be 1 to {embed_dims}, the channels of the map's "
+                f"features, got {kept_dims}."
+            )
+        self.grid, self.end_points, self.kept_dims = grid, end_points, kept_dims
         self.convz, self.convr, self.convq = (
             nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=False) for _ in range(3)
         )
@@ -47,9 +64,9 @@ class BEVMemory(nn.Module):
     def places(self, motion: Tensor, height: int, width: int) -> Tensor:
         """Return where each cell's ground lay in the frame before, [-1, 1]. (B, H, W, 2)
 
-        The motion (B, 4, 4), float64, takes metres now to metres then.
+        The motion (B, 4, 4) takes metres now to metres then.
         """
-        cells = self.cells(height, width).to(motion.device)
+        cells = self.cells(height, width).to(motion)
         moved = cells.flatten(0, 1) @ motion[:, :2, :2].transpose(1, 2) + motion[:, None, :2, 3]
         norm = self.grid.norm_from_metres(moved.unflatten(1, (height, width)))
         return 2 * norm - 1
@@ -59,24 +76,21 @@ class BEVMemory(nn.Module):
         places = self.places(motion, *memory.shape[-2:])
         return F.grid_sample(memory, places.to(memory), align_corners=False)
 
-    def forward(
-        self, feats: Tensor, memory: Tensor | None, motion: Tensor, continues: Tensor
-    ) -> Tensor:
-        """Return the fused features, which are the next frame's memory. (B, C, H, W)
-
-        Args:
-            feats: Features of now. (B, C, H, W)
-            memory: Those of the frames before, without gradient; None if no stream continues.
-                (B, C, H, W)
-            motion: Takes metres now to metres then, float64. (B, 4, 4)
-            continues: Which streams continue. (B,)
-        """
+    def forward(self, feats: Tensor, past: Past) -> Tensor:
+        """Return the features of now (B, C, H, W), fused with those of the frames before."""
         hidden = feats.detach()
+        memory = past.memory.get("bev_feats")
         if memory is not None:
-            warped = self.warp(memory.to(feats), motion)
-            hidden = torch.where(continues.view(-1, 1, 1, 1), warped, hidden)
+            warped = self.warp(memory.to(feats), past.then_from_now)
+            if self.kept_dims is not None:
+                warped = torch.cat([warped, hidden[:, self.kept_dims :]], 1)
+            hidden = torch.where(past.continues.view(-1, 1, 1, 1), warped, hidden)
         joined = torch.cat([hidden, feats], 1)
         update, reset = self.convz(joined).sigmoid(), self.convr(joined).sigmoid()
         candidate = self.convq(torch.cat([reset * hidden, feats], 1))
         fused = (1 - update) * hidden + update * candidate
         return self.ln(fused.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+    def kept(self, fused: Tensor) -> Tensor:
+        """Return what the next frame remembers of fused features. (B, C, H, W)"""
+        return fused.detach()[:, : self.kept_dims]

@@ -12,8 +12,11 @@ from torch import Tensor
 
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.streams.bev_memory import BEVMemory
+from gsmap.models.streams.past import Past
 from gsmap.models.streams.query_memory import Propagation, QueryMemory
-from gsmap.models.streams.states import Frame, MapStream, Scenes, Slots, StreamState
+from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamState
+
+_EXACT = ("references", "targets")  # half precision would move a point by centimetres
 
 
 class StreamMemory(BaseModule):
@@ -29,6 +32,10 @@ class StreamMemory(BaseModule):
         queries: Settings of `QueryMemory`, or None without memory of queries.
         embed_dims: Channels of the map's features.
         max_gap_s: A longer pause between two frames, in seconds, starts a stream anew.
+        half: Keep what is no place in half precision.
+
+    Attributes:
+        name: The model's, for errors.
 
     Raises:
         ValueError: If there is neither memory, or one does not fit the head.
@@ -41,11 +48,13 @@ class StreamMemory(BaseModule):
         queries: dict[str, Any] | None = None,
         embed_dims: int = 256,
         max_gap_s: float = 2.0,
+        half: bool = False,
     ) -> None:
         super().__init__()
         if bev is None and queries is None:
             raise ValueError("temporal needs bev=dict(...), queries=dict(...) or both.")
-        self.max_gap_s = max_gap_s
+        self.max_gap_s, self.half = max_gap_s, half
+        self.name = f"a model with {type(head).__name__}"
         self.bev: BEVMemory | None = None
         if bev is not None:
             part = {"type": "BEVMemory", "grid": head.grid, "embed_dims": embed_dims}
@@ -56,6 +65,9 @@ class StreamMemory(BaseModule):
             self.queries = MODELS.build({**part, **queries})
             self.queries.check(head)
         self.streams: Slots | Scenes = Slots(max_gap_s)
+
+    def __str__(self) -> str:
+        return self.name
 
     def train(self, mode: bool = True) -> "StreamMemory":
         """Switch between training and testing, and forget all streams."""
@@ -68,11 +80,14 @@ class StreamMemory(BaseModule):
 
     def new_stream(self) -> MapStream:
         """Return the empty memory of one scene, which a caller keeps."""
-        return MapStream(self.max_gap_s)
+        stream = MapStream(self.max_gap_s)
+        stream.claim(self)
+        return stream
 
     @contextmanager
     def using(self, stream: Scenes) -> Iterator[None]:
-        """Take a caller's own stream for a while."""
+        """Take a caller's own stream for a while; ValueError if it is another model's."""
+        stream.claim(self)
         own, self.streams = self.streams, stream
         try:
             yield
@@ -94,41 +109,55 @@ class StreamMemory(BaseModule):
         """
         frames = [Frame.of(meta) for meta in metas]
         before = self.streams.previous(frames)
-        feats = outputs["bev_feats"]
-        now_from_then = motions(frames, before, feats.device)
-        outputs = dict(outputs)
-        if self.bev is not None:
-            kept = [None if s is None else s.bev_feats for s in before]
-            continues = torch.tensor([k is not None for k in kept], device=feats.device)
-            memory = stack_or_none(kept, feats)
-            with torch.autocast(feats.device.type, enabled=False):
-                back = torch.linalg.inv(now_from_then)
-                outputs["bev_feats"] = self.bev(feats.float(), memory, back, continues)
-        propagation = None
-        if self.queries is not None:
-            kept_queries = [None if state is None else state.queries for state in before]
-            propagation = Propagation(self.queries, kept_queries, now_from_then)
-            outputs["query_memory"] = propagation
+        outputs = self.enter(outputs, recalled(frames, before, outputs["bev_feats"].device))
         yield outputs
-        maps = outputs["bev_feats"].detach() if self.bev is not None else [None] * len(frames)
-        queries = [None] * len(frames) if propagation is None else propagation.states()
-        left = zip(frames, maps, queries, strict=True)
-        self.streams.keep([StreamState(*parts) for parts in left])
+        left = self.left(outputs)
+        self.streams.keep(
+            [
+                StreamState(frame, {name: values[index] for name, values in left.items()})
+                for index, frame in enumerate(frames)
+            ]
+        )
+
+    def enter(self, outputs: dict[str, Any], past: Past) -> dict[str, Any]:
+        """Return a batch's outputs with its memory, as `over` yields them."""
+        outputs = dict(outputs)
+        feats = outputs["bev_feats"]
+        if self.bev is not None:
+            with torch.autocast(feats.device.type, enabled=False):
+                outputs["bev_feats"] = self.bev(feats.float(), past)
+        if self.queries is not None:
+            outputs["query_memory"] = Propagation(self.queries, past)
+        return outputs
+
+    def left(self, outputs: dict[str, Any]) -> dict[str, Tensor]:
+        """Return what a batch leaves after its head, by name, without gradient. (B, ...) each"""
+        left: dict[str, Tensor] = {}
+        if self.bev is not None:
+            left["bev_feats"] = self.bev.kept(outputs["bev_feats"])
+        if self.queries is not None:
+            left |= outputs["query_memory"].left()
+        return {
+            name: values.half() if self.half and name not in _EXACT else values
+            for name, values in left.items()
+        }
 
 
-def motions(
+def recalled(
     frames: Sequence[Frame], before: Sequence[StreamState | None], device: torch.device
-) -> Tensor:
-    """Return what takes metres then to metres now, the identity where a stream starts. (B, 4, 4)"""
-    each = [
-        np.eye(4) if state is None else frame.motion_from(state.frame)
-        for frame, state in zip(frames, before, strict=True)
-    ]
-    return torch.as_tensor(np.stack(each), device=device)
-
-
-def stack_or_none(parts: Sequence[Tensor | None], like: Tensor) -> Tensor | None:
-    """Stack the streams' maps, zeros where a stream starts; None if all do. (B, C, H, W)"""
-    if all(part is None for part in parts):
-        return None
-    return torch.stack([torch.zeros_like(like[0]) if p is None else p.to(like) for p in parts])
+) -> Past:
+    """Return what the frames' streams have left, on a device."""
+    pairs = list(zip(frames, before, strict=True))
+    motions = [np.eye(4) if s is None else frame.motion_from(s.frame) for frame, s in pairs]
+    seconds = [0.0 if s is None else frame.seconds_after(s.frame) for frame, s in pairs]
+    like = next((state.values for state in before if state is not None), {})
+    memory = {
+        name: torch.stack([torch.zeros_like(v) if s is None else s.values[name] for s in before])
+        for name, v in like.items()
+    }
+    return Past(
+        {name: values.to(device) for name, values in memory.items()},
+        torch.as_tensor(np.stack(motions), device=device),
+        torch.tensor(seconds, dtype=torch.float64, device=device),
+        torch.tensor([state is not None for state in before], device=device),
+    )

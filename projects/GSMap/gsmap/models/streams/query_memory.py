@@ -1,6 +1,5 @@
 """Memory of queries: the best of a frame enter the decoder of the next, moved with the vehicle."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from gsmap.models.maptr.decoder import Queries
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.pairs import MatchedPairs
-from gsmap.models.streams.states import QueryState
+from gsmap.models.streams.past import Past
 
 _POSE = 12  # the first three rows of a motion
 
@@ -29,22 +28,15 @@ class QueryMemory(BaseModule):
     Args:
         embed_dims: Channels C of the queries.
         num: Queries that are handed on, K.
-        loss_weight: Weight of that loss.
-        points_weight: Weight of the distance of the points in it.
+        loss_weight: Weight of that loss, 0.1 of the points' 50 as published.
         beta: Distance, [0, 1] over the map, below which smooth L1 is a parabola.
     """
 
     def __init__(
-        self,
-        embed_dims: int,
-        num: int = 33,
-        loss_weight: float = 0.1,
-        points_weight: float = 50.0,
-        beta: float = 0.01,
+        self, embed_dims: int, num: int = 33, loss_weight: float = 5.0, beta: float = 0.01
     ) -> None:
         super().__init__()
-        self.num, self.beta = num, beta
-        self.weight = loss_weight * points_weight
+        self.num, self.loss_weight, self.beta = num, loss_weight, beta
         self.fc = nn.Sequential(
             nn.Linear(embed_dims + _POSE, 2 * embed_dims),
             nn.LayerNorm(2 * embed_dims),
@@ -60,7 +52,12 @@ class QueryMemory(BaseModule):
                 nn.init.zeros_(layer.weight)
 
     def check(self, head: MapHead) -> None:
-        """Raise ValueError if the head predicts with too few queries."""
+        """Raise ValueError if the head predicts with too few queries, or in one layer."""
+        if len(head.decoder.layers) < 2:
+            raise ValueError(
+                "a memory of queries enters after the first decoder layer, and the head has no "
+                "other: set map_head.decoder.num_layers to 2 or more."
+            )
         own = head.query_groups[0].num
         if not 0 < self.num < own:
             raise ValueError(
@@ -73,10 +70,26 @@ class QueryMemory(BaseModule):
         code = motion[:, :3].flatten(1).to(states).view(len(states), *[1] * (states.dim() - 2), -1)
         return states + self.fc(torch.cat([states, code.expand(*states.shape[:-1], -1)], -1))
 
+    def moved(self, head: MapHead, references: Tensor, past: Past) -> Tensor:
+        """Return references of the frame before as they lie now. (B, K, P, D)"""
+        return head.reference.moved(references, past.now_from_then)
+
+    def fused(self, refined: Tensor, before: Tensor, head: MapHead) -> Tensor:
+        """Return the last layer's references of queries that were handed on. (B, K, P, D)
+
+        ``refined`` is what the decoder has made of ``before``, what `moved` has returned.
+        """
+        return refined
+
 
 def by_instance(leaf: Tensor, num: int) -> Tensor:
     """Sort queries by their instance, N of them. (B, Q, ...) -> (B, N, Q / N, ...)"""
     return leaf.unflatten(1, (num, -1))
+
+
+def leaf_names(count: int) -> list[str]:
+    """Return under which names `Queries` of so many leaves are kept: states, then references."""
+    return [*(f"queries_{number}" for number in range(count - 1)), "references"]
 
 
 def pick(values: Tensor, order: Tensor) -> Tensor:
@@ -89,37 +102,33 @@ class Propagation:
 
     Args:
         memory: Its settings and network.
-        states: What each stream has left, or None.
-        motion: Takes metres then to metres now, float64. (B, 4, 4)
+        past: What the streams have left.
     """
 
-    def __init__(
-        self,
-        memory: QueryMemory,
-        states: Sequence[QueryState | None],
-        motion: Tensor,
-    ) -> None:
-        self.memory, self.motion = memory, motion
-        self.continues = torch.tensor([s is not None for s in states], device=motion.device)
-        self.before = [state for state in states if state is not None]
+    def __init__(self, memory: QueryMemory, past: Past) -> None:
+        self.memory, self.past = memory, past
         self.handed_on: Queries | None = None  # what entered: leaves by instance (B, K, rows, ...)
         self.last: Queries | None = None
         self.total = 0  # queries N
         self.chosen: Tensor | None = None  # (B, K)
         self.targets: Tensor | None = None  # (B, N, P, 2 or 3)
 
-    def stack(self, leaves: Sequence[Tensor]) -> Tensor:
-        """Return what continuing streams have, zeros for the others. (B, ...)"""
-        stacked = torch.stack(list(leaves))
-        full = stacked.new_zeros((len(self.continues), *stacked.shape[1:]))
-        full[self.continues] = stacked
-        return full
+    def refine(self, head: MapHead, number: int, point_states: Tensor, reference: Tensor) -> Tensor:
+        """Return the references after a layer, as `PointReference.refine`. (B, N * P, D)"""
+        refined = head.reference.refine(number, point_states, reference)
+        if number < len(head.decoder.layers) - 1 or self.handed_on is None:
+            return refined
+        lines, before = head.decoder.by_instance(refined), self.handed_on.reference
+        own = lines[:, : self.memory.num]
+        fused = self.memory.fused(own, before, head)
+        first = torch.where(self.past.continues.view(-1, 1, 1, 1), fused, own)
+        return torch.cat([first, lines[:, self.memory.num :]], 1).flatten(1, 2)
 
     def between(self, head: MapHead, number: int, queries: Queries) -> Queries:
         """Let the memory enter after the first layer, and keep what the last layer returns."""
         if number == len(head.decoder.layers) - 1:
             self.last = queries
-        elif number == 0 and self.before:
+        elif number == 0 and self.past.memory:
             return self.insert(head, queries)
         return queries
 
@@ -135,13 +144,11 @@ class Propagation:
             scores = head.cls_branches[0](decoded.instance_states[:, :own]).amax(-1)
         order = self.order(scores, total)
         leaves, form = tree_flatten(queries)
-        entering: list[Any] = []
-        for number, leaf in enumerate(leaves):
-            if isinstance(leaf, Tensor):
-                kept = [state.leaves[number] for state in self.before]
-                entering.append(self.stack([k for k in kept if k is not None]).to(leaf.dtype))
-            else:
-                entering.append(leaf)
+        names = leaf_names(len(leaves))
+        entering = [
+            self.past.memory[name].to(leaf.dtype) if isinstance(leaf, Tensor) else leaf
+            for name, leaf in zip(names, leaves, strict=True)
+        ]
         self.handed_on = self.moved(head, tree_unflatten(entering, form))
         merged: list[Any] = []
         for leaf, new in zip(leaves, tree_flatten(self.handed_on)[0], strict=True):
@@ -158,7 +165,7 @@ class Propagation:
         first = torch.arange(num, device=scores.device).expand(len(scores), -1)
         stay = torch.arange(num, num + own, device=scores.device)
         changed = torch.cat([first, survivors], 1)
-        order = torch.where(self.continues[:, None], changed, stay)
+        order = torch.where(self.past.continues[:, None], changed, stay)
         further = torch.arange(num + own, num + total, device=scores.device)
         return torch.cat([order, further.expand(len(scores), -1)], 1)
 
@@ -167,13 +174,13 @@ class Propagation:
         dims = head.embed_dims
         leaves, form = tree_flatten(queries.state)
         leaves = [
-            self.memory.update(leaf, self.motion)
+            self.memory.update(leaf, self.past.now_from_then)
             if isinstance(leaf, Tensor) and leaf.shape[-1] == dims
             else leaf
             for leaf in leaves
         ]
         state = tree_unflatten(leaves, form)
-        reference = head.reference.moved(queries.reference, self.motion)
+        reference = self.memory.moved(head, queries.reference, self.past)
         return Queries(state, queries.position, reference)
 
     def choose(self, head: MapHead, scores: Tensor) -> None:
@@ -188,40 +195,34 @@ class Propagation:
         targets[pairs.samples, pairs.query_inds] = pairs.gt_pts.to(targets)
         self.targets = targets
 
-    def states(self) -> list[QueryState]:
-        """Return what each stream hands on."""
+    def left(self) -> dict[str, Tensor]:
+        """Return what the streams hand on, best first, by name. (B, K, rows, ...) each"""
         assert self.last is not None
         assert self.chosen is not None
-        leaves = [
-            pick(by_instance(leaf.detach(), self.total), self.chosen)
+        leaves = tree_flatten(self.last)[0]
+        left = {
+            name: pick(by_instance(leaf.detach(), self.total), self.chosen)
+            for name, leaf in zip(leaf_names(len(leaves)), leaves, strict=True)
             if isinstance(leaf, Tensor)
-            else None
-            for leaf in tree_flatten(self.last)[0]
-        ]
-        targets = None if self.targets is None else pick(self.targets.detach(), self.chosen)
-        return [
-            QueryState(
-                tuple(None if leaf is None else leaf[index] for leaf in leaves),
-                None if targets is None else targets[index],
-            )
-            for index in range(len(self.continues))
-        ]
+        }
+        if self.targets is not None:
+            left["targets"] = pick(self.targets.detach(), self.chosen)
+        return left
 
     def loss(self, head: MapHead) -> Tensor:
         """Return the loss of the updated queries, 0 with a gradient of 0 if no stream continues."""
-        kept = [state.targets for state in self.before]
-        if self.handed_on is None or any(target is None for target in kept):
+        stored = self.past.memory.get("targets")  # (B, K, P, 2 or 3)
+        if self.handed_on is None or stored is None:
             return 0.0 * torch.stack([p.sum() for p in self.memory.parameters()]).sum()
-        stored = self.stack([target for target in kept if target is not None])  # (B, K, P, 2)
         state, _, reference = self.handed_on
         state = tree_unflatten(*_flat_rows(state))
         pred = head.reference.refine(0, head.decoder.point_states(state), reference.flatten(1, 2))
         pred = pred[..., : stored.shape[-1]].reshape(stored.shape)
-        target = head.reference.moved(stored, self.motion)
-        weight = (stored.flatten(2) != 0).any(-1) & self.continues[:, None]  # (B, K)
+        target = head.reference.moved_points(stored, self.past.now_from_then)
+        weight = (stored.flatten(2) != 0).any(-1) & self.past.continues[:, None]  # (B, K)
         each = F.smooth_l1_loss(pred, target, reduction="none", beta=self.memory.beta)
         total = (each.sum((-1, -2)) * weight).sum() / stored.shape[-2]
-        return self.memory.weight * total / (weight.sum() + 1e-10)
+        return self.memory.loss_weight * total / (weight.sum() + 1e-10)
 
 
 def _flat_rows(state: Any) -> tuple[list[Any], Any]:

@@ -2,12 +2,11 @@
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from gsmap.structures.rigid import invert_rigid
 
@@ -53,26 +52,16 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class QueryState:
-    """Queries that a frame hands on, best first, without gradient.
+class StreamState:
+    """The memory of one stream after a frame.
 
     Args:
-        leaves: Their states, positions and references, by instance. (K, rows, ...) each
-        targets: What they were matched to in training, [0, 1] over the map, zeros where nothing
-            (K, P, 2 or 3); None in testing.
+        frame: The frame.
+        values: What it leaves, by name: tensors without gradient, or arrays.
     """
 
-    leaves: tuple[Tensor | None, ...]
-    targets: Tensor | None = None
-
-
-@dataclass(frozen=True)
-class StreamState:
-    """The memory of one stream after a frame, without gradient."""
-
     frame: Frame
-    bev_feats: Tensor | None = None  # (C, H, W)
-    queries: QueryState | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Slots:
@@ -115,6 +104,17 @@ class Scenes:
     def __init__(self, max_gap_s: float, max_streams: int = 16) -> None:
         self.max_gap_s, self.max_streams = max_gap_s, max_streams
         self.states: OrderedDict[str, StreamState] = OrderedDict()
+        self.owner: object = None
+
+    def claim(self, owner: object) -> None:
+        """Belong to a model from its first frame on; ValueError, with both names, for another."""
+        if self.owner is None:
+            self.owner = owner
+        if self.owner is not owner:
+            raise ValueError(
+                f"this stream is of {self.owner}, and {owner} cannot read what that remembers: "
+                "start a new stream for each model (new_stream)."
+            )
 
     def previous(self, frames: Sequence[Frame]) -> list[StreamState | None]:
         """Return the state that each frame continues, or None.
