@@ -106,6 +106,11 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="samples without results count as empty, results without ground truth are left out",
     )
     parser.add_argument(
+        "--allow-other-split",
+        action="store_true",
+        help="the model may be trained on another split, which may hold places of this one",
+    )
+    parser.add_argument(
         "--consistency",
         action="store_true",
         help="C-mAP of MapTracker and jitter over drives; needs an annotation file with poses",
@@ -212,7 +217,12 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
     else:  # of results in shards, too, the same one is enough
         source = digest_of_common(read_shard(results))
     pairs = SamplePairs(
-        results, args.ground_truth, evaluator.classes, args.allow_mismatch, args.shard
+        results,
+        args.ground_truth,
+        evaluator.classes,
+        args.allow_mismatch,
+        args.shard,
+        args.allow_other_split,
     )
     matches = list(match_samples(pairs, evaluator, args.workers))
     notes = pairs.notes(evaluator.counts_heights)
@@ -233,7 +243,12 @@ def main(argv: list[str] | None = None) -> str:
         outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, args.prior_elements)
     else:
         outcome = evaluate_files(
-            args.results, args.ground_truth, evaluator, args.workers, args.allow_mismatch
+            args.results,
+            args.ground_truth,
+            evaluator,
+            args.workers,
+            args.allow_mismatch,
+            args.allow_other_split,
         )
     if args.consistency:
         outcome[0].append(consistency_report(args))

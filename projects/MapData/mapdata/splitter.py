@@ -26,7 +26,7 @@ def _near(scenes: np.ndarray, positions: np.ndarray, distance_m: float) -> np.nd
 
 
 def _grow(near: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Choose scenes of a map from a random one on, always the one that costs the fewest others.
+    """Choose scenes of a map from a random one on, always what costs training the least.
 
     Returns which are chosen, and which are neither chosen nor near a chosen one. 2 x (S,)
     """
@@ -38,7 +38,7 @@ def _grow(near: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.nd
         covered |= near[scene]
         if chosen.sum() >= count:
             return chosen, ~covered
-        cost = (near & ~covered).sum(1) - ~covered
+        cost = (near & ~covered).sum(1)
         scene = min(np.flatnonzero(~chosen).tolist(), key=lambda s: (cost[s], rank[s]))
 
 
