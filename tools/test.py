@@ -25,7 +25,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--eval",
         nargs="*",
-        choices=["chamfer", "raster"],
+        choices=["chamfer", "chamfer_hard", "raster"],
         default=["chamfer", "raster"],
         help="metrics; none at all with --out only writes the predictions",
     )

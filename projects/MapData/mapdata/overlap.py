@@ -69,7 +69,8 @@ def read_places(paths: Sequence[Path]) -> Places:
             column += values
         poses = np.array(file.column("global_from_frame"), np.float64).reshape(-1, 4, 4)
         positions.append(poses[:, :2, 3])
-    return Places(*(np.array(column, str) for column in columns), np.concatenate(positions))
+    tokens, scenes, maps = (np.array(column, str) for column in columns)
+    return Places(tokens, scenes, maps, np.concatenate(positions))
 
 
 def nearest_by_map(train: _ByMap, val: _ByMap) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -153,9 +154,9 @@ def draw_overlap(train: Places, val: Places, distance_m: np.ndarray) -> "Figure"
             ("validation within 5 m", val, near, "#C8321E"),
         )
         for label, places, chosen, colour in parts:
-            label = label if name == names[0] else None
             at = places.positions[chosen & (places.maps == name)]
-            ax.scatter(*at.T, s=1.5, color=colour, label=label, linewidths=0, rasterized=True)
+            legend = label if name == names[0] else None
+            ax.scatter(*at.T, s=1.5, color=colour, label=legend, linewidths=0, rasterized=True)
         ax.set_aspect("equal", "datalim")
         finish_panel(
             ax, name.replace("$", "") or "map", "x (m)", "y (m)", legend={"markerscale": 5}

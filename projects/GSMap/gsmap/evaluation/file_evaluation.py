@@ -82,6 +82,14 @@ class AnnotatedTruth:
         return replace(elements, labels=self._labels[elements.labels])
 
 
+def scenes_of(path: str | Path) -> dict[str, str]:
+    """Return the scene of each sample of an annotation file, by token; ValueError for JSON."""
+    if Path(path).suffix.lower() == ".json":
+        raise ValueError(f"{path} knows no scenes: give the annotation file (.arrow).")
+    file = AnnotationFile(path)
+    return dict(zip(file.column("token"), file.column("scene"), strict=True))
+
+
 def open_ground_truth(
     path: str | Path, classes: Sequence[str], shard: Shard = WHOLE
 ) -> AnnotatedTruth | SampleFile:
