@@ -11,9 +11,9 @@ from test_files import annotated, command, results_of
 from gsmap.evaluation.average_precision import area_ap, interpolated_ap
 from gsmap.evaluation.bootstrap import (
     Resamples,
-    _resampled_aps,
     ap_differences,
     ap_intervals,
+    resampled_aps,
     resampled_figures,
 )
 from gsmap.evaluation.evaluator import MapEvaluator
@@ -105,7 +105,7 @@ def test_the_kernel_equals_the_metrics_own_ap(interpolated):
     for share in (0.0, 0.3, 1.0):
         hits = rng.random(60) < share
         scene, gts = rng.integers(0, 4, 60), np.array([20.0, 0, 30, 12])
-        (found,) = _resampled_aps(np.flatnonzero(hits), scene, np.ones((1, 4)), gts, interpolated)
+        found = resampled_aps(hits[:, None], scene, np.ones((1, 4)), gts, interpolated)[0, 0]
         wanted = (interpolated_ap if interpolated else area_ap)(hits, 62)
         assert found == pytest.approx(wanted, abs=1e-14)
 

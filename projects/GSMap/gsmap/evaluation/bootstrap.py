@@ -13,7 +13,7 @@ from numba import njit
 
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.evaluation.report import UNDEFINED, MetricReport
-from gsmap.structures.elements import FloatArray, IntArray
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
 _RECALL_POINTS = np.linspace(0.0, 1.0, 101)
 _SPACING = np.spacing(1.0)  # that COCO adds to a denominator
@@ -73,23 +73,26 @@ class Resamples:
 
 @njit(cache=True)
 def _weighted_ap(
-    copies: FloatArray, counted: FloatArray, total: float, interpolated: bool
+    hits: IntArray, copies: FloatArray, counted: FloatArray, total: float, interpolated: bool
 ) -> float:
-    """Return the AP of hits of which each has some copies.
+    """Return the AP of predictions of which each has some copies.
 
     From the lowest score on, the precision envelope is the largest precision so far.
 
     Args:
-        copies: Copies of each hit, in descending order of score. (H,)
-        counted: Predictions up to the last copy of each hit. (H,)
+        hits: The predictions that match, in descending order of score. (H,)
+        copies: Copies of each prediction. (N,)
+        counted: Copies of all predictions up to each. (N,)
         total: Number of ground truths, > 0.
         interpolated: Whether AP is the mean at 101 recalls, else the area.
     """
-    found, envelope, ap = copies.sum(), 0.0, 0.0
+    found, envelope, ap = 0.0, 0.0, 0.0
+    for i in hits:
+        found += copies[i]
     point = len(_RECALL_POINTS) - 1
     while _RECALL_POINTS[point] > found / total:
         point -= 1
-    for i in range(len(copies) - 1, -1, -1):
+    for i in hits[::-1]:
         if copies[i] == 0:
             continue
         envelope = max(envelope, found / (counted[i] + _SPACING if interpolated else counted[i]))
@@ -103,27 +106,46 @@ def _weighted_ap(
 
 
 @njit(cache=True)
-def _resampled_aps(
-    rows: IntArray, scene: IntArray, drawn: FloatArray, gts: FloatArray, interpolated: bool
+def _aps(
+    rows: IntArray,
+    ends: IntArray,
+    scene: IntArray,
+    drawn: FloatArray,
+    gts: FloatArray,
+    interpolated: bool,
 ) -> FloatArray:
-    """Return the AP of each resample, NaN without ground truths. (B,)
+    """Return the AP of each resample and threshold; arguments as in ``resampled_aps``. (B, T)
+
+    ``rows`` are the hits of one threshold after another, ``ends`` where each ends.
+    """
+    aps = np.full((len(drawn), len(ends)), np.nan)
+    copies, counted = np.empty(len(scene)), np.empty(len(scene))
+    for b in range(len(drawn)):
+        total, so_far = (drawn[b] * gts).sum(), 0.0
+        for i in range(len(scene)):
+            copies[i] = drawn[b, scene[i]]
+            so_far += copies[i]
+            counted[i] = so_far
+        for t in range(len(ends) if total > 0 else 0):
+            hits = rows[ends[t - 1] if t else 0 : ends[t]]
+            aps[b, t] = _weighted_ap(hits, copies, counted, total, interpolated)
+    return aps
+
+
+def resampled_aps(
+    hits: BoolArray, scene: IntArray, drawn: FloatArray, gts: FloatArray, interpolated: bool
+) -> FloatArray:
+    """Return the AP of each resample and threshold, NaN without ground truths. (B, T)
 
     Args:
-        rows: The predictions that match, in descending order of score. (H,)
+        hits: Whether each prediction matches, in descending order of score. (N, T)
         scene: Scene of each prediction. (N,)
         drawn: How often each scene is drawn. (B, S)
         gts: Number of ground truths of each scene. (S,)
-        interpolated: As in ``_weighted_ap``.
+        interpolated: Whether AP is the mean at 101 recalls, else the area.
     """
-    aps, counted = np.full(len(drawn), np.nan), np.empty(len(scene))
-    for b in range(len(drawn)):
-        weights, total, sum_so_far = drawn[b], (drawn[b] * gts).sum(), 0.0
-        for i in range(len(scene)):
-            sum_so_far += weights[scene[i]]
-            counted[i] = sum_so_far
-        if total > 0:
-            aps[b] = _weighted_ap(weights[scene[rows]], counted[rows], total, interpolated)
-    return aps
+    ends, rows = np.cumsum(hits.sum(axis=0)), np.nonzero(hits.T)[1]
+    return _aps(rows, ends, scene, drawn, gts, interpolated)
 
 
 def resampled_figures(report: MetricReport, resamples: Resamples) -> dict[str, FloatArray]:
@@ -138,13 +160,8 @@ def resampled_figures(report: MetricReport, resamples: Resamples) -> dict[str, F
     of_class: dict[str, FloatArray] = {}
     figures: dict[str, FloatArray] = {}
     for name, found in report.detections.items():
-        gts = np.bincount(scenes, weights=found.gts_of_sample, minlength=drawn.shape[1])
-        of_pred = scenes[found.samples]
-        columns = [
-            _resampled_aps(np.flatnonzero(hits), of_pred, drawn, gts, not by_area)
-            for hits in found.hits.T
-        ]
-        aps = np.stack(columns, axis=1)  # (B, T)
+        gts = np.bincount(scenes, found.gts_of_sample, drawn.shape[1]).astype(np.float64)
+        aps = resampled_aps(found.hits, scenes[found.samples], drawn, gts, not by_area)
         of_class[name] = aps
         known = np.nan_to_num(aps) if by_area else aps  # as the metric takes an absent class
         for t, threshold in enumerate(found.thresholds):
