@@ -129,6 +129,15 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="C-mAP of MapTracker and jitter over drives; needs an annotation file with poses",
     )
     parser.add_argument(
+        "--topology",
+        action="store_true",
+        help="count elements in pieces, elements joined and lines that fold back; with --dim 3 "
+        "also measure heights",
+    )
+    parser.add_argument(
+        "--min-score", type=float, default=0.4, help="of predictions that --topology counts"
+    )
+    parser.add_argument(
         "--tracks",
         type=output_file,
         help="with --consistency: write the results again, each element with its track_id",
@@ -163,6 +172,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error("--consistency needs the results of whole drives: leave out --prior, --shard")
     if args.tracks and not args.consistency:
         parser.error("--tracks needs --consistency")
+    if args.topology and (args.prior or args.shard.count):
+        parser.error("--topology needs a result file as a whole: leave out --prior and --shard")
     if args.against and args.prior:
         parser.error("--against compares two result files: leave out --prior")
     if args.shard.count and (args.bootstrap is not None or args.against):
@@ -204,7 +215,7 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     for found in reports:
         if found.name == "intervals":  # printed
             continue
-        if found.name == "consistency":
+        if not found.groups:
             lines = (f"{key:<44} {value:.4f}" for key, value in found.metrics.items())
             print("\n".join(lines) + "\n")
         else:
@@ -220,6 +231,23 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
 
         figure = plot_result([found for found in reports if found.detections])
         print(f"curves: {save_figure(figure, args.pr_curves)}")
+
+
+def topology_reports(args: argparse.Namespace, evaluator: MapEvaluator) -> list[MetricReport]:
+    """Count breaks, false joints and folds, and measure heights if they count."""
+    from gsmap.evaluation.topology import TopologyConfig, height_figures, topology_figures
+
+    classes = evaluator.classes
+    areas = tuple(label for label, name in enumerate(classes) if name in args.polygon_classes)
+    config = TopologyConfig(classes, areas, args.min_score)
+    inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard, True
+    found = {"topology": topology_figures(SamplePairs(*inputs), config)}
+    if evaluator.chamfer is not None and evaluator.counts_heights:
+        found["heights"] = height_figures(SamplePairs(*inputs), evaluator.chamfer)
+    return [
+        MetricReport(name, {}, {f"{name}/{key}": value for key, value in figures.items()}, {})
+        for name, figures in found.items()
+    ]
 
 
 def consistency_report(args: argparse.Namespace) -> MetricReport:
@@ -320,6 +348,8 @@ def main(argv: list[str] | None = None) -> str:
         outcome = evaluate(args.results, args, evaluator)
     if resamples is not None:
         outcome[0].append(interval_report(outcome, resamples, args, evaluator))
+    if args.topology:
+        outcome[0].extend(topology_reports(args, evaluator))
     if args.consistency:
         outcome[0].append(consistency_report(args))
     report(outcome, args)
