@@ -23,6 +23,8 @@ COMMANDS = {
         "render camera images for real Argoverse 2 logs",
     ),
     "infos": ("mapdata.infos.convert", "convert an info file of MapTR or MapTRv2"),
+    "split": ("mapdata.splitter", "split scenes by place, at a distance from each other"),
+    "overlap": ("mapdata.overlap", "say which validation samples lie near training"),
     "check": ("mapdata.check", "check annotation files completely"),
     "export": ("mapdata.vectors_json", "write an annotation file's vectors as JSON"),
 }

@@ -20,17 +20,24 @@ from pathlib import Path
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, RANGES
+from gsmap.evaluation.bootstrap import (
+    Resamples,
+    ap_differences,
+    ap_intervals,
+    format_intervals,
+)
 from gsmap.evaluation.chamfer_ap import (
     CHAMFER_THRESHOLDS,
     HARD_CHAMFER_THRESHOLDS,
     ChamferConfig,
 )
-from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.evaluator import HARD_NAME, METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.file_evaluation import (
     Evaluation,
     SamplePairs,
     evaluate_files,
     match_samples,
+    scenes_of,
 )
 from gsmap.evaluation.match_files import write_matches
 from gsmap.evaluation.prior import evaluate_prior
@@ -60,7 +67,13 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="score the best fixed set of elements, fitted on this ground truth",
     )
     parser.add_argument("--prior-elements", type=int, default=50, help="elements in that set")
-    parser.add_argument("--eval", nargs="+", default=list(METRIC_NAMES), choices=METRIC_NAMES)
+    parser.add_argument(
+        "--eval",
+        nargs="+",
+        default=list(METRIC_NAMES),
+        choices=(*METRIC_NAMES, HARD_NAME),
+        help="metrics; chamfer_hard: besides chamfer also at 0.2, 0.5 and 1.0 m, matched once",
+    )
     parser.add_argument(
         "--thresholds", nargs="+", type=float, help="of AP_chamfer, in metres (0.5 1.0 1.5)"
     )
@@ -106,14 +119,43 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="samples without results count as empty, results without ground truth are left out",
     )
     parser.add_argument(
+        "--allow-other-split",
+        action="store_true",
+        help="the model may be trained on another split, which may hold places of this one",
+    )
+    parser.add_argument(
         "--consistency",
         action="store_true",
         help="C-mAP of MapTracker and jitter over drives; needs an annotation file with poses",
     )
     parser.add_argument(
+        "--topology",
+        action="store_true",
+        help="count elements in pieces, elements joined and lines that fold back; with --dim 3 "
+        "also measure heights",
+    )
+    parser.add_argument(
+        "--min-score", type=float, default=0.4, help="of predictions that --topology counts"
+    )
+    parser.add_argument(
         "--tracks",
         type=output_file,
         help="with --consistency: write the results again, each element with its track_id",
+    )
+    parser.add_argument(
+        "--bootstrap",
+        type=int,
+        nargs="?",
+        const=1000,
+        metavar="N",
+        help="intervals of 95 %% of every AP, of N resamples of the scenes (1000)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the resamples")
+    parser.add_argument(
+        "--against",
+        type=Path,
+        metavar="OTHER",
+        help="second result file: what the first has more in every AP, with its interval",
     )
     parser.add_argument("--workers", type=int, default=1, help="number of processes")
     parser.add_argument("--out", type=output_file, help="write all figures as flat JSON")
@@ -130,6 +172,12 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error("--consistency needs the results of whole drives: leave out --prior, --shard")
     if args.tracks and not args.consistency:
         parser.error("--tracks needs --consistency")
+    if args.topology and (args.prior or args.shard.count):
+        parser.error("--topology needs a result file as a whole: leave out --prior and --shard")
+    if args.against and args.prior:
+        parser.error("--against compares two result files: leave out --prior")
+    if args.shard.count and (args.bootstrap is not None or args.against):
+        parser.error("--bootstrap and --against need all samples: leave out --shard")
     if args.shard.count and (not args.out or args.prior or args.pr_curves):
         parser.error("--shard needs --out, and can neither fit a --prior nor draw --pr-curves")
     return args
@@ -147,7 +195,8 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
     if args.range:
         x_range, y_range = tuple(args.range[::2]), tuple(args.range[1::2])
     chamfer = raster = None
-    if "chamfer" in args.eval:
+    hard = HARD_NAME in args.eval
+    if "chamfer" in args.eval or hard:
         thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
         chamfer = ChamferConfig(
             classes,
@@ -158,13 +207,15 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
         )
     if "raster" in args.eval:
         raster = RasterConfig(classes, BEVGrid(x_range, y_range), tuple(args.polygon_classes))
-    return MapEvaluator(chamfer, raster, args.gt_points)
+    return MapEvaluator(chamfer, raster, args.gt_points, hard)
 
 
 def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     reports, notes = outcome
     for found in reports:
-        if found.name == "consistency":
+        if found.name == "intervals":  # printed
+            continue
+        if not found.groups:
             lines = (f"{key:<44} {value:.4f}" for key, value in found.metrics.items())
             print("\n".join(lines) + "\n")
         else:
@@ -178,7 +229,25 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         from gsmap.visualization.figure import save_figure  # matplotlib takes a second
         from gsmap.visualization.plots import plot_result
 
-        print(f"curves: {save_figure(plot_result(reports), args.pr_curves)}")
+        figure = plot_result([found for found in reports if found.detections])
+        print(f"curves: {save_figure(figure, args.pr_curves)}")
+
+
+def topology_reports(args: argparse.Namespace, evaluator: MapEvaluator) -> list[MetricReport]:
+    """Count breaks, false joints and folds, and measure heights if they count."""
+    from gsmap.evaluation.topology import TopologyConfig, height_figures, topology_figures
+
+    classes = evaluator.classes
+    areas = tuple(label for label, name in enumerate(classes) if name in args.polygon_classes)
+    config = TopologyConfig(classes, areas, args.min_score)
+    inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard, True
+    found = {"topology": topology_figures(SamplePairs(*inputs), config)}
+    if evaluator.chamfer is not None and evaluator.counts_heights:
+        found["heights"] = height_figures(SamplePairs(*inputs), evaluator.chamfer)
+    return [
+        MetricReport(name, {}, {f"{name}/{key}": value for key, value in figures.items()}, {})
+        for name, figures in found.items()
+    ]
 
 
 def consistency_report(args: argparse.Namespace) -> MetricReport:
@@ -212,13 +281,53 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
     else:  # of results in shards, too, the same one is enough
         source = digest_of_common(read_shard(results))
     pairs = SamplePairs(
-        results, args.ground_truth, evaluator.classes, args.allow_mismatch, args.shard
+        results,
+        args.ground_truth,
+        evaluator.classes,
+        args.allow_mismatch,
+        args.shard,
+        args.allow_other_split,
     )
     matches = list(match_samples(pairs, evaluator, args.workers))
     notes = pairs.notes(evaluator.counts_heights)
     source += digest(args.ground_truth)
     path = write_matches(args.out, args.shard, matches, notes, evaluator, source)
     return f"{counted(len(matches), 'sample')} matched: {path}"
+
+
+def evaluate(results: Path, args: argparse.Namespace, evaluator: MapEvaluator) -> Evaluation:
+    """Score a result file."""
+    return evaluate_files(
+        results,
+        args.ground_truth,
+        evaluator,
+        args.workers,
+        args.allow_mismatch,
+        args.allow_other_split,
+    )
+
+
+def interval_report(
+    outcome: Evaluation, resamples: Resamples, args: argparse.Namespace, evaluator: MapEvaluator
+) -> MetricReport:
+    """Print the intervals of every AP, and of what it has more than in another result file."""
+    what = f"of {resamples.count} resamples of the scenes, seed {resamples.seed}"
+    found = {"": ap_intervals(outcome[0], resamples)}
+    print(format_intervals(found[""], f"AP with intervals of 95 % {what}") + "\n")
+    if args.against:
+        others, notes = evaluate(args.against, args, evaluator)
+        outcome[1].extend(f"{args.against}: {note}" for note in notes)
+        found["minus_other/"] = ap_differences(outcome[0], others, resamples)
+        title = f"{args.results} minus {args.against}, {what}"
+        print(format_intervals(found["minus_other/"], title, signed=True) + "\n")
+    flat = {
+        f"{prefix}{key}/{part}": value
+        for prefix, intervals in found.items()
+        for key, interval in intervals.items()
+        for part, value in vars(interval).items()
+        if prefix or part != "value"
+    }
+    return MetricReport("intervals", {}, flat, {})
 
 
 def main(argv: list[str] | None = None) -> str:
@@ -229,12 +338,18 @@ def main(argv: list[str] | None = None) -> str:
     evaluator = evaluator_from(args)
     if args.shard.count:
         return match_shard(args, evaluator)
+    resamples = None
+    if args.bootstrap is not None or args.against:
+        count = 1000 if args.bootstrap is None else args.bootstrap
+        resamples = Resamples(scenes_of(args.ground_truth), count, args.seed)
     if args.prior:
         outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, args.prior_elements)
     else:
-        outcome = evaluate_files(
-            args.results, args.ground_truth, evaluator, args.workers, args.allow_mismatch
-        )
+        outcome = evaluate(args.results, args, evaluator)
+    if resamples is not None:
+        outcome[0].append(interval_report(outcome, resamples, args, evaluator))
+    if args.topology:
+        outcome[0].extend(topology_reports(args, evaluator))
     if args.consistency:
         outcome[0].append(consistency_report(args))
     report(outcome, args)

@@ -12,7 +12,7 @@ import sys
 from contextlib import nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gsmap.apis.result_log import ResultLog
 from gsmap.checkpoints.named_models import checkpoint_for
@@ -25,6 +25,7 @@ from gsmap.utils.files import write_bytes
 from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
+from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
 from gsmap.utils.words import counted
 from gsmap.visualization.figure import FORMATS, sample_name, save_figure
 from mapdata.bag_topics import parse_topics
@@ -173,6 +174,20 @@ def open_model(args: argparse.Namespace) -> "MapInferencer":
     return inferencer
 
 
+def about_results(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, Any]:
+    """Return what a result file says of itself: classes, and lists of scenes where known."""
+    from gsmap.checkpoints.reading import read_checked
+
+    about = {"classes": list(data["classes"])}
+    if identity := data.get(SPLIT_LIST):
+        about[SPLIT_LIST] = identity
+        checkpoint = checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
+        dataset, trained_on = read_checked(checkpoint).trained_on
+        if trained_on and dataset == data["dataset"]:
+            about[TRAINED_ON] = trained_on
+    return about
+
+
 def run_settings(args: argparse.Namespace) -> dict[str, str]:
     """Return what decides the predictions of a run, besides its samples."""
     checkpoint = checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
@@ -268,7 +283,7 @@ def main(argv: list[str] | None = None) -> str | None:
         if chosen and len(broken) == len(chosen):
             raise ValueError(f"no frame can be used: {next(iter(broken.values()))}")
         if results:
-            count = results.finish({"classes": list(dataset.metainfo["classes"])})
+            count = results.finish(about_results(args, dataset.metainfo))
             args.shard.seal(args.out, RESULTS, made_from, settings, count)
     print_summary(args, source, dataset.ann_file, len(chosen), broken)
     return None

@@ -25,7 +25,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--eval",
         nargs="*",
-        choices=["chamfer", "raster"],
+        choices=["chamfer", "chamfer_hard", "raster"],
         default=["chamfer", "raster"],
         help="metrics; none at all with --out only writes the predictions",
     )
@@ -45,6 +45,11 @@ def parse_args() -> argparse.Namespace:
         metavar="SEED",
         help="give every sample the images of another one, to see what a model scores without them",
     )
+    parser.add_argument(
+        "--allow-other-split",
+        action="store_true",
+        help="score data of another split than that of the training, whose places it may share",
+    )
     add_common_arguments(parser)
     return parser.parse_args()
 
@@ -59,6 +64,8 @@ def apply_options(cfg: Config, args: argparse.Namespace) -> None:
         "out_file": args.out and str(args.out),
     }
     cfg.test_evaluator = [cfg.test_evaluator, {"type": "GaussianMetric"}]
+    if args.allow_other_split:
+        cfg.default_hooks.checkpoint.allow_other_split = True
     if args.show_dir:
         cfg.default_hooks.visualization.update(
             draw=True,

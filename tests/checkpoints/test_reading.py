@@ -7,7 +7,12 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from torch import nn
 
-from gsmap.checkpoints.reading import adopt_settings, load_weights, read_weights
+from gsmap.checkpoints.reading import (
+    adopt_settings,
+    load_weights,
+    read_checked,
+    read_weights,
+)
 from gsmap.checkpoints.settings import MODEL_SETTINGS, differences, plain
 from gsmap.engine.launch import read_config
 
@@ -23,6 +28,19 @@ def test_weights_are_loaded_from_a_training_checkpoint_and_a_bare_state(tmp_path
         load_weights(target, save(tmp_path / "a.pth", content))
         torch.testing.assert_close(target.weight, source.weight)
         nn.init.zeros_(target.weight)
+
+
+def test_a_checkpoint_says_which_scenes_it_was_trained_on(tmp_path):
+    def saved(**said):
+        content = {"state_dict": {"x": torch.ones(1)}, "meta": {"dataset_meta": said}}
+        return save(tmp_path / "a.pth", content)
+
+    identity = "near@" + "0" * 16
+    found = read_checked(saved(dataset="av2", split_list=identity))
+    assert found.trained_on == ("av2", identity)
+    assert read_checked(saved(dataset="av2")).trained_on == ("av2", "")
+    with pytest.raises(ValueError, match=r"a.pth is not .*split_list must be a name with a digest"):
+        read_checked(saved(dataset="av2", split_list=["near"]))
 
 
 def test_weights_that_several_processes_trained_lose_their_prefix(tmp_path):

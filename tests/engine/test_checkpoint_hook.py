@@ -177,7 +177,19 @@ class Nothing(BaseMetric):
         return {"figure": 1.0}
 
 
-def learn(work_dir, epochs, resume_from=None, **options) -> int:
+class Listed(list):
+    """Samples of a data set, some of a split."""
+
+    metainfo: dict
+
+
+def listed(split_list: str, count: int = 1) -> Listed:
+    data = Listed([{"inputs": torch.ones(1)}] * count)
+    data.metainfo = {"dataset": "nuscenes", "split_list": split_list}
+    return data
+
+
+def learn(work_dir, epochs, resume_from=None, train=None, val=None, **options) -> int:
     """Train for some epochs, with a validation after every second and the last; return how many."""
     Learner.validations = 0
     before = torch.serialization.get_safe_globals()
@@ -185,8 +197,8 @@ def learn(work_dir, epochs, resume_from=None, **options) -> int:
     runner = Runner(
         Learner(),
         str(work_dir),
-        train_dataloader=torch.utils.data.DataLoader(data),
-        val_dataloader=torch.utils.data.DataLoader(data[:1]),
+        train_dataloader=torch.utils.data.DataLoader(train or data),
+        val_dataloader=torch.utils.data.DataLoader(val or data[:1]),
         train_cfg={"by_epoch": True, "max_epochs": epochs, "val_interval": 2},
         val_cfg={},
         val_evaluator=Evaluator(Nothing()),
@@ -212,6 +224,20 @@ def test_a_validation_that_a_kill_prevented_is_made_up_for(tmp_path):
     (tmp_path / "last_validation").write_text("4")  # as after a kill between epoch 3 and its end
     assert learn(tmp_path, 3, tmp_path / "epoch_3.pth") == 1
     assert learn(tmp_path, 3, tmp_path / "epoch_2.pth") == 2  # that of epoch 2, then 3's
+
+
+def test_data_of_another_split_is_refused_unless_allowed(tmp_path):
+    near, far = listed("near@" + "0" * 16, 2), listed("far@" + "0" * 16)
+    with pytest.raises(
+        ValueError, match=r"trained on the split near@0+, .* is of far@0+, .*allow_"
+    ):
+        learn(tmp_path, 2, train=near, val=far)
+    learn(tmp_path, 1, train=near, val=far, allow_other_split=True)
+    said = torch.load(tmp_path / "epoch_1.pth", weights_only=False)["meta"]["dataset_meta"]
+    assert said["split_list"] == near.metainfo["split_list"]
+    with pytest.raises(ValueError, match="the model was trained on the split near"):
+        learn(tmp_path, 2, tmp_path / "epoch_1.pth", train=far, val=far)
+    assert learn(tmp_path, 2, tmp_path / "epoch_1.pth", train=near, val=listed("")) == 1
 
 
 def test_the_best_of_the_validations_is_kept(tmp_path):

@@ -279,3 +279,35 @@ def test_elements_of_other_classes_have_no_label_and_are_counted(tmp_path):
     found, ignored = read_ground_truth(path, ("boundary", "divider"))
     assert found["a"].labels.tolist() == [1, -1, -1, 0]
     assert +ignored == {"ped_crossing": 2}  # without the zeros
+
+
+def annotated(path: Path, count: int, scenes: int = 1, **options: object) -> Path:
+    """Write the truth of ``truth_of`` as an annotation file of some scenes."""
+    lines = [np.array(LINE, np.float32), np.array(RING, np.float32)]
+    samples = (
+        MapSample(
+            f"t{i}", f"s{i % scenes}", "town", i, [], np.eye(4),
+            instances=[MapInstance(label, line) for label, line in enumerate(lines)],
+        )
+        for i in range(count)
+    )  # fmt: skip
+    write_annotations(path, AnnotationMeta("nuscenes", "lidar", "val", options=options), samples)
+    return path
+
+
+@pytest.mark.parametrize("name", ["trained_on", "split_list"])
+def test_results_of_a_model_of_another_split_are_refused_unless_allowed(tmp_path, name):
+    here, other = ("near@" + digit * 16 for digit in "01")
+    truth = annotated(tmp_path / "val.arrow", 4, split_list=here)
+    for said in (here, None):
+        write_results(tmp_path / "own.json", results_of(4), {name: said})
+        evaluate_files(tmp_path / "own.json", truth, EVALUATOR)
+    results = tmp_path / "other.json"
+    write_results(results, results_of(4), {name: other})
+    with pytest.raises(ValueError, match=f"other.json was trained on the split {other}, .*{here}"):
+        evaluate_files(results, truth, EVALUATOR)
+    evaluate_files(results, truth, EVALUATOR, allow_other_split=True)
+    for hostile in ("near\n", ["near"], 5):
+        write_results(results, results_of(4), {name: hostile})
+        with pytest.raises(ValueError, match="split_list must be a name with a digest"):
+            evaluate_files(results, truth, EVALUATOR)

@@ -260,7 +260,10 @@ def test_the_tool_converts_and_names_its_command(tmp_path):
     assert "samples: val 2" in done.stdout
     meta = AnnotationFile(tmp_path / "gsmap_av2_val.arrow").meta
     assert "av2 --root" in meta.command
-    assert meta.options == {"at": "auto", "rate_hz": 2.0, "compat": "maptrv2", "num_sweeps": 0}
+    assert meta.options == {
+        "at": "auto", "rate_hz": 2.0, "compat": "maptrv2", "num_sweeps": 0,
+        "split_list": "official",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

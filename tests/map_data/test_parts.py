@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapdata.splits import overlap_share, read_split_file, resolve_scenes
+from mapdata.overlap import overlap_share
+from mapdata.splits import read_split_file, resolve_scenes
 
 
 def test_split_files_are_checked(tmp_path: Path):
@@ -22,7 +23,7 @@ def test_split_files_are_checked(tmp_path: Path):
         with pytest.raises(ValueError, match=message):
             read_split_file(path)
     path.write_text('{"train": ["a"], "val": []}')
-    assert read_split_file(path) == {"train": ["a"], "val": []}
+    assert read_split_file(path).scenes == {"train": ["a"], "val": []}
 
 
 def test_scenes_resolve_by_name_or_token():

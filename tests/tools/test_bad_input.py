@@ -111,6 +111,10 @@ evaluate: nothing.json VAL --thresholds nan | thresholds must be > 0 m
 evaluate: nothing.json VAL --polygon-classes divder | no class 'divder'; did you mean 'divider'?
 evaluate: nothing.json VAL --range 3 3 1 1 | x_range must be (low, high)
 evaluate: nothing.json VAL --out . | Is a directory
+evaluate: nothing.json VAL --bootstrap 1 | intervals need two scenes, two resamples
+evaluate: nothing.json nothing.json --against nothing.json | nothing.json knows no scenes
+evaluate: nothing.json VAL --shard 0/2 --out o.json --bootstrap | need all samples: leave out --shard
+evaluate: nothing.json VAL --topology --shard 0/2 --out o.json | leave out --prior and --shard
 evaluate: VAL --prior nowhere.arrow | no annotation file at nowhere.arrow
 report: damaged.json --ann VAL | damaged.json is empty or holds no complete list
 report: nothing.json --ann VAL | nothing.json: 2 samples have no results
@@ -134,6 +138,10 @@ convert_config: empty.py out.py | empty.py cannot be converted: None is not supp
 create_data: nuscenes --root nowhere | no data set at nowhere
 create_data: nuscenes --root . | no version 'v1.0-trainval' in .
 create_data: av2 --root . | no folder val
+create_data: av2 --root . --split-name streammapnet | no Argoverse 2 log in the folders train, val
+create_data: split damaged.arrow --out own.json | damaged.arrow is not a whole annotation file
+create_data: split VAL --out own.json --min-distance 1e6 | give a smaller --min-distance
+create_data: overlap damaged.arrow VAL | damaged.arrow is not a whole annotation file
 create_data: av2-render --root . --out r | no folder val
 create_data: infos nowhere.pkl out.arrow --data-root . | nowhere.pkl
 create_data: infos list.pkl out.arrow --data-root . | list.pkl

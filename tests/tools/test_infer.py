@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -170,3 +171,16 @@ def test_a_bag_with_one_bad_image_loses_one_frame(
     assert f"camera '{bad.name}', image at {time_ns} ns: its message is not an image" in printed
     assert f"1 broken frames skipped: drive_{time_ns}\n" in printed
     assert len(results(tmp_path / "map.json")) == len(others)
+
+
+def test_results_name_the_scenes_of_data_and_training(monkeypatch):
+    trained = SimpleNamespace(trained_on=("nuscenes", "near@" + "0" * 16))
+    monkeypatch.setattr("gsmap.checkpoints.reading.read_checked", lambda path: trained)
+    args = SimpleNamespace(model=["gsmap_r18_minicity"])
+    data = {"classes": ("divider",), "dataset": "nuscenes", "split_list": "official"}
+    about = infer.about_results(args, data)
+    assert about == {
+        "classes": ["divider"], "split_list": "official", "trained_on": trained.trained_on[1],
+    }  # fmt: skip
+    assert "trained_on" not in infer.about_results(args, {**data, "dataset": "minicity"})
+    assert infer.about_results(args, {"classes": ("divider",)}) == {"classes": ["divider"]}

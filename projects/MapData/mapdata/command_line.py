@@ -34,6 +34,9 @@ class FileOptions:
     workers: int = 1
     shard: Shard = WHOLE
     command: str = ""
+    split_name: str = ""
+    split_file: Path | None = None
+    allow_missing: bool = False
 
     def meta(self, dataset: str, frame: str, split: str, **more: Any) -> AnnotationMeta:
         """Describe a split's annotation file; ``more`` are further fields."""
@@ -49,8 +52,12 @@ class FileOptions:
         )
 
     def path_of(self, dataset: str, split: str) -> Path:
-        """Return where a split goes: ``gsmap_<dataset>_<split><tag>.arrow``."""
-        name = file_name(f"gsmap_{dataset}_{split}{self.tag}")
+        """Return where a split goes: ``gsmap_<dataset>_<split><tag>.arrow``.
+
+        Without a tag, files of a published split end in its name.
+        """
+        tag = self.tag or (f"_{self.split_name}" if self.split_name else "")
+        name = file_name(f"gsmap_{dataset}_{split}{tag}")
         return (self.out_dir or self.root) / f"{name}.arrow"
 
 
@@ -78,6 +85,16 @@ def add_file_options(parser: argparse.ArgumentParser, frame: str, max_sweeps: in
     add("--tag", default="", help="appended to the file names, such as _extended")
     add_workers_option(parser)
     add_shard_options(parser)
+
+
+def add_split_options(parser: argparse.ArgumentParser, names: tuple[str, ...]) -> None:
+    """Add which list of scenes to take; ``names`` are those of the published ones."""
+    add = parser.add_argument
+    text = f"a published split by place: {', '.join(names)}"
+    add("--split-name", default="", choices=names, metavar="NAME", help=text)
+    add("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
+    text = "convert a published split of which scenes are missing"
+    add("--allow-missing", action="store_true", help=text)
 
 
 def add_range_options(

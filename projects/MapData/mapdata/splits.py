@@ -1,22 +1,80 @@
-"""Which scenes belong to which split, and whether splits overlap on the ground."""
+"""Which scenes belong to which split: published lists by name, lists in files, official ones."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from scipy.spatial import cKDTree
+from gsmap.utils.files import file_name, read_json
+from gsmap.utils.split_lists import list_identity
 
-from gsmap.utils.files import read_json
-
-OVERLAP_DISTANCE_M = 5.0
-# (x, y) in metres of the samples of each split, by map name
-Positions = Mapping[str, Mapping[str, list[np.ndarray]]]
+OFFICIAL = "official"
+_FAMILIES = ("streammapnet", "lilja_near", "lilja_far")  # files of published lists
 
 
-def read_split_file(path: Path) -> dict[str, list[str]]:
+@dataclass(frozen=True)
+class SplitList:
+    """The scenes of each part of a split, such as ``train`` and ``val``, by name or token.
+
+    Args:
+        name: What the list is called.
+        scenes: Scenes by part.
+        complete: Whether the data set must have all of them, for figures that compare with others.
+    """
+
+    name: str
+    scenes: Mapping[str, Collection[str]]
+    complete: bool = False
+
+    @cached_property
+    def identity(self) -> str:
+        """Name and digest, as annotation files have it."""
+        return list_identity(self.name, self.scenes)
+
+    def missing_note(self, missing: Collection[str], total: int, where: str, allowed: bool) -> str:
+        """Say that scenes are not there.
+
+        Raises:
+            ValueError: If all must be there, and it is not ``allowed`` that some are missing.
+        """
+        known = f"{total - len(missing)} of the {total} scenes of the splits are in {where}"
+        if self.complete and not allowed:
+            raise ValueError(
+                f"split {self.name!r}: only {known}, {min(missing)!r} is not: add the parts of the "
+                "data set that hold the others (docs/data.md), or take those that are there with "
+                "--allow-missing, for figures that compare with no others."
+            )
+        return f"{known}, which has no more."
+
+
+def split_names(dataset: str) -> tuple[str, ...]:
+    """Return the names of the published splits of a data set, ``nuscenes`` or ``av2``."""
+    return tuple(name for family in _FAMILIES for name in _family(family)[dataset]["splits"])
+
+
+def _family(name: str) -> Any:
+    """Read a file of lists: groups of scenes, and the groups of each part of its splits."""
+    return read_json(Path(str(files("mapdata").joinpath(f"split_lists/{name}.json"))))
+
+
+def published_split(name: str, dataset: str) -> SplitList:
+    """Return a published split of a data set; ValueError if there is none of this name."""
+    for family in _FAMILIES:
+        lists = _family(family)[dataset]
+        if name in lists["splits"]:
+            parts = lists["splits"][name].items()
+            scenes = {p: [s for g in groups for s in lists["scenes"][g]] for p, groups in parts}
+            return SplitList(name, scenes, complete=True)
+    known = ", ".join(split_names(dataset))
+    raise ValueError(f"there is no split {name!r} of {dataset}: name one of {known}.")
+
+
+def read_split_file(path: Path) -> SplitList:
     """Read a split file: JSON, an object with a list of scene names or tokens for each split.
 
-    It is the format of the nuScenes devkit's own ``splits.json``.
+    It is the format of the nuScenes devkit's own ``splits.json``. The list has the file's name.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no split file at {path}.")
@@ -28,7 +86,16 @@ def read_split_file(path: Path) -> dict[str, list[str]]:
         raise ValueError(
             f'split file {path} must look like {{"train": ["scene-0001", ...], "val": [...]}}.'
         )
-    return splits
+    return SplitList(file_name(path.stem)[:100], splits)
+
+
+def asked_split(options: Any, dataset: str) -> SplitList | None:
+    """Return the list that ``split_name`` or ``split_file`` of the options name, if any."""
+    if options.split_name and options.split_file:
+        raise ValueError("name either --split-name or --split-file.")
+    if options.split_name:
+        return published_split(options.split_name, dataset)
+    return read_split_file(options.split_file) if options.split_file else None
 
 
 def resolve_scenes(
@@ -57,31 +124,3 @@ def resolve_scenes(
                 other = split_of[known[entry]]
                 raise ValueError(f"scene {known[entry]} is in both {other} and {split}.")
     return split_of, missing
-
-
-def overlap_share(
-    train: Mapping[str, Sequence[np.ndarray]], val: Mapping[str, Sequence[np.ndarray]]
-) -> float:
-    """Return the share of validation positions within 5 m of a training position on the same map.
-
-    Positions are (x, y) in metres by map name, each (n, 2). Without any the share is 0.
-    """
-    near = [
-        cKDTree(train[name]).query(positions)[0] <= OVERLAP_DISTANCE_M
-        for name, positions in val.items()
-        if len(positions) and len(train.get(name, ()))
-    ]
-    total = sum(len(positions) for positions in val.values())
-    return sum(int(found.sum()) for found in near) / total if total else 0.0
-
-
-def overlap_notes(positions: Positions) -> list[str]:
-    """Say, if so, how many validation samples lie near a training sample."""
-    train = next((s for s in positions if s.endswith("train")), "")
-    val = next((s for s in positions if s.endswith("val")), "")
-    share = overlap_share(positions[train], positions[val]) if train and val else 0.0
-    warning = (
-        f"warning: {share:.1%} of the {val} samples lie within 5 m of a {train} sample: "
-        "scores on them say little about new places. docs/data.md names disjoint splits."
-    )
-    return [warning] if share else []

@@ -10,7 +10,7 @@ import pytest
 from processes import run_python
 from report_case import CLASSES, FRAMES, STRANGE, write_case
 
-from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.visualization.page.frames import cameras_of, choose_frames
@@ -48,6 +48,38 @@ def test_predictions_hit_within_a_metre_and_the_tables_agree(data):
     assert data["tables"][0]["rows"][0][1:] == ["50.0", "33.3", "-16.7"]
 
 
+def test_the_page_shows_intervals_of_scenes_and_where_results_differ_most(case, tmp_path):
+    """Scenes of two samples: F1 is 4/5 and 2/4 in the first three samples, then 2/5 and 2/4."""
+    path, results = case
+    file = AnnotationFile(path)
+    samples = [replace(sample, scene=f"s{i // 2}") for i, sample in enumerate(file)]
+    write_annotations(tmp_path / "scenes.arrow", file.meta, samples)
+    tables = report_data(tmp_path / "scenes.arrow", results, NO_IMAGES)["tables"]
+    for cell, value, sign in zip(
+        tables[0]["rows"][0][1:], ("50.0", "33.3", "-16.7"), ("", "", "[+-]"), strict=True
+    ):
+        low, high = re.fullmatch(rf"{value} \(({sign}[\d.]+) to ({sign}[\d.]+)\)", cell).groups()
+        assert float(low) <= float(value) <= float(high)
+    assert tables[0]["rows"][0][2] == "33.3 (33.3 to 33.3)"  # boundaries are perfect everywhere
+    rows = tables[-1]["rows"]
+    assert rows[0][1:] == ["t0", "0.80", "0.50", "-0.30"]
+    assert rows[3][1:] == ["t3", "0.40", "0.50", "+0.10"]
+    assert [row[1] for row in rows] == [f"t{i}" for i in range(FRAMES)]
+
+
+def test_of_two_results_the_frames_in_which_they_differ_are_added():
+    class Result:
+        def __init__(self, **low):
+            self.low = low
+
+        def f1(self, token, score_thr):
+            return self.low.get(token, 1.0)
+
+    tokens = list("abcdefghij")
+    both = [Result(h=0.0, i=0.1), Result(h=0.0, i=0.5, g=0.9)]
+    assert choose_frames(tokens, 4, both, 0.4) == [0, 4, 8, 9]
+
+
 def test_curves_end_at_the_recall_that_is_reached(data):
     divider = next(p for p in data["curves"] if p["metric"] == "AP_chamfer" and p["class"] == 0)
     line = next(line for line in divider["lines"] if line["label"] == "1.0 m")
@@ -70,7 +102,7 @@ def test_frames_are_spread_evenly_and_the_worst_are_added(case):
     assert choose_frames(tokens, 4, [Result()], 0.4) == [0, 4, 8, 9]
     some = page_data(*case, replace(NO_IMAGES, max_frames=4))
     assert some["notes"] == [
-        "The page shows 4 of 6 frames: 3 evenly spread and the 1 worst of good."
+        "The page shows 4 of 6 frames: 3 evenly spread and 1 in which both results differ most."
     ]
 
 

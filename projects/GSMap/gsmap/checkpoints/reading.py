@@ -29,6 +29,7 @@ from gsmap.checkpoints.settings import (
     scale_steps,
 )
 from gsmap.utils.faults import in_words
+from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
 # what torch's reader raises on bytes that make no sense
 _DAMAGE = (
@@ -49,12 +50,14 @@ class Checkpoint:
         settings: The model's settings in training, not checked yet; None if they are not there.
         image_size: Width and height that images were scaled to in training, or None.
         can_bus: Whether the training samples had vehicle signals, as far as it says.
+        trained_on: The training's data set and its list of scenes, empty where it does not say.
     """
 
     state: dict[str, Tensor]
     settings: Any
     image_size: tuple[int, int] | None
     can_bus: bool
+    trained_on: tuple[str, str] = ("", "")
 
 
 @contextmanager
@@ -97,6 +100,9 @@ def read_checked(path: str | Path) -> Checkpoint:
         named = next((vars(m) for m in named_models().values() if m.file == path), {})
         size = _checked_size({**named, **meta}.get(IMAGE_SIZE))
         signals = {**named, **meta}.get(SIGNALS) is True
+        said = meta.get("dataset_meta")
+        said = said if isinstance(said, Mapping) else {}
+        trained_on = str(said.get("dataset", "")), checked_identity(said.get(SPLIT_LIST))
         if not isinstance(state, Mapping) or not all(map(_is_weight, state, state.values())):
             state = {}
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
@@ -108,7 +114,7 @@ def read_checked(path: str | Path) -> Checkpoint:
             "had failed; use an earlier epoch's."
         )
     state = {key.removeprefix("module."): value for key, value in state.items()}
-    return Checkpoint(state, settings, size, signals)
+    return Checkpoint(state, settings, size, signals, trained_on)
 
 
 def _checked_size(size: Any) -> tuple[int, int] | None:

@@ -17,6 +17,7 @@ from gsmap.datasets.transforms.images import ScaleImages
 from gsmap.structures.calibration import NUM_CAN_BUS, without_history
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.split_lists import SPLIT_LIST
 
 _BROKEN = ("raise", "skip")
 _NEIGHBOUR_S = 5.0  # how far the next pose of a drive may be for its speed
@@ -133,7 +134,7 @@ class VectorizedMapDataset(BaseDataset):
                 f"go unnoticed until you {self.annotations.remedy}",
                 "current",
             )
-        for name in ("classes", "x_range", "y_range", "dataset", "split", "frame"):
+        for name in ("classes", "x_range", "y_range", "dataset", "split", "frame", SPLIT_LIST):
             self._metainfo[name] = getattr(self.annotations.meta, name)
         self._metainfo["dim"] = self._dim or self.annotations.meta.dim
         self._metainfo["cameras"] = self.cameras

@@ -8,7 +8,7 @@ import torch
 from mmdet3d.registry import HOOKS
 from mmengine.fileio import LocalBackend, register_backend
 from mmengine.hooks import CheckpointHook
-from mmengine.runner import EpochBasedTrainLoop, Runner
+from mmengine.runner import BaseLoop, EpochBasedTrainLoop, Runner
 from mmengine.runner import checkpoint as mmengine_checkpoint
 from torch.hub import load_state_dict_from_url
 
@@ -18,6 +18,12 @@ from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
 from gsmap.engine.run_log import innermost
 from gsmap.utils.files import write_bytes, write_text
+from gsmap.utils.split_lists import (
+    SPLIT_LIST,
+    TRAINED_ON,
+    checked_identity,
+    require_same_list,
+)
 
 VALIDATED = "last_validation"  # file of a work folder: the iteration validated last
 
@@ -41,6 +47,11 @@ def _fetched(address: str, **options: Any) -> Any:
         return load_state_dict_from_url(address, **{**options, "weights_only": True})
 
 
+def _metainfo(loader: Any) -> dict[str, Any]:
+    """Return what a data set says of itself; nothing if it is none of mmengine's."""
+    return getattr(loader.dataset, "metainfo", {})
+
+
 @HOOKS.register_module()
 class AtomicCheckpointHook(CheckpointHook):
     """mmengine's hook, for runs that may be killed and for checkpoints from strangers.
@@ -49,10 +60,20 @@ class AtomicCheckpointHook(CheckpointHook):
     always finds a whole one, and a validation that it missed is made up for on resuming. A
     checkpoint holds the model's settings. What is loaded, fetched and resumed from is read with
     torch's ``weights_only``, to which the hook names mmengine's own data when a run begins.
+
+    Data to score of another split than a model is or was trained on is refused (``ValueError``),
+    unless ``allow_other_split``: the training may hold its places.
     """
 
-    def __init__(self, *args: Any, backend_args: dict | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        backend_args: dict | None = None,
+        allow_other_split: bool = False,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(*args, backend_args=backend_args or {"backend": "atomic"}, **kwargs)
+        self.allow_other_split = allow_other_split
 
     def before_run(self, runner: Runner) -> None:
         """Let torch read mmengine's checkpoints; mmengine reads one right after this."""
@@ -60,8 +81,13 @@ class AtomicCheckpointHook(CheckpointHook):
         torch.serialization.add_safe_globals(mmengine_globals())
 
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
-        """Drop the text that mmengine would run as a config when it resumes."""
-        checkpoint.get("meta", {}).pop("config", None)
+        """Drop the text that mmengine would run as a config; check and note the model's split."""
+        meta = checkpoint.get("meta", {})
+        meta.pop("config", None)
+        trained = meta.get("dataset_meta")
+        for loop in (runner._val_loop, runner._test_loop):
+            if isinstance(loop, BaseLoop) and isinstance(trained, dict):
+                self._check_split(trained, loop)
 
     def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
         """Note the model's settings, the size of the scaled images, and if there are signals.
@@ -82,9 +108,22 @@ class AtomicCheckpointHook(CheckpointHook):
             checkpoint["meta"][IMAGE_SIZE] = list(dataset.scaled_image_size())
             checkpoint["meta"][SIGNALS] = dataset.sample(0).can_bus is not None
 
+    def _check_split(self, trained: dict[str, Any], loop: Any) -> None:
+        """Refuse data of another split, and tell results what the model was trained on."""
+        scored = _metainfo(loop.dataloader)
+        if trained.get("dataset") != scored.get("dataset"):
+            return
+        identity = checked_identity(trained.get(SPLIT_LIST))
+        if not self.allow_other_split:
+            remedy = "--cfg-options default_hooks.checkpoint.allow_other_split=True"
+            require_same_list(identity, scored.get(SPLIT_LIST), "the model", remedy)
+        loop.evaluator.dataset_meta = scored | {TRAINED_ON: identity}
+
     def before_train(self, runner: Runner) -> None:
         """Make up for the validation that was due when a run was cut off, then begin as ever."""
         super().before_train(runner)
+        if isinstance(runner.val_loop, BaseLoop):
+            self._check_split(_metainfo(runner.train_dataloader), runner.val_loop)
         loop, marker = runner.train_loop, Path(runner.work_dir, VALIDATED)
         by_epoch = isinstance(loop, EpochBasedTrainLoop)
         done, end = (loop.epoch, loop.max_epochs) if by_epoch else (loop.iter, loop.max_iters)

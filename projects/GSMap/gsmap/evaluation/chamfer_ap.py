@@ -7,7 +7,8 @@ heights, distances are in space, as in MapTRv2's; lines are resampled and strips
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -152,24 +153,42 @@ def match_chamfer(
     return FrameMatches(token, rows, labels, scores, matched, quality, num_gts)
 
 
-def chamfer_report(matches: MatchTable, config: ChamferConfig) -> MetricReport:
+def chamfer_report(
+    matches: MatchTable,
+    config: ChamferConfig,
+    thresholds: Sequence[float] | None = None,
+    name: str = "chamfer",
+) -> MetricReport:
     """Compute AP_chamfer from the matches of all samples.
 
     A class without ground truth counts as 0 in ``mAP``, as in MapTR, but in no mean per threshold.
+
+    Args:
+        matches: Matches at the thresholds of ``config``.
+        config: Rules that they were made by.
+        thresholds: Those of its thresholds that count; None takes all.
+        name: What the keys of the figures begin with.
     """
-    classes, thresholds = config.classes, config.thresholds
-    detections = matches.detections(dict.fromkeys(classes, thresholds))
+    classes, thresholds = config.classes, tuple(thresholds or config.thresholds)
+    detections = matches.detections(dict.fromkeys(classes, config.thresholds))
+    columns = [config.thresholds.index(threshold) for threshold in thresholds]
+    if thresholds != config.thresholds:
+        detections = {
+            of_class: replace(found, thresholds=thresholds, hits=found.hits[:, columns])
+            for of_class, found in detections.items()
+        }
     metrics: dict[str, float] = {}
-    for name, found in detections.items():
+    for of_class, found in detections.items():
         figures = class_figures(found, area_ap, absent=0.0)
         for t, threshold in enumerate(thresholds):
             errors = found.quality[found.hits[:, t]]
             figures[f"error_m@{threshold}"] = float(errors.mean()) if len(errors) else UNDEFINED
-        metrics |= {f"chamfer/{name}/{key}": value for key, value in figures.items()}
-    present = [name for name, found in detections.items() if found.num_gts]
+        metrics |= {f"{of_class}/{key}": value for key, value in figures.items()}
+    present = [of_class for of_class, found in detections.items() if found.num_gts]
     for threshold in thresholds:
-        aps = [metrics[f"chamfer/{name}/AP@{threshold}"] for name in present]
-        metrics[f"chamfer/AP@{threshold}"] = float(np.mean(aps)) if aps else 0.0
-    metrics["chamfer/mAP"] = float(np.mean([metrics[f"chamfer/{name}/AP"] for name in classes]))
-    metrics["chamfer/num_samples"] = float(len(matches))
-    return MetricReport("chamfer", {"class": classes}, metrics, detections)
+        aps = [metrics[f"{of_class}/AP@{threshold}"] for of_class in present]
+        metrics[f"AP@{threshold}"] = float(np.mean(aps)) if aps else 0.0
+    metrics["mAP"] = float(np.mean([metrics[f"{of_class}/AP"] for of_class in classes]))
+    metrics["num_samples"] = float(len(matches))
+    flat = {f"{name}/{key}": value for key, value in metrics.items()}
+    return MetricReport(name, {"class": classes}, flat, detections, matches.tokens)

@@ -1,10 +1,15 @@
 """Both metrics over a stream of samples: match each sample once, keep only its matches."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
+from gsmap.evaluation.chamfer_ap import (
+    HARD_CHAMFER_THRESHOLDS,
+    ChamferConfig,
+    chamfer_report,
+    match_chamfer,
+)
 from gsmap.evaluation.matches import FrameMatches, MatchTable
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
 from gsmap.evaluation.report import MetricReport, flat_metrics
@@ -12,6 +17,8 @@ from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import resample_all
 
 METRIC_NAMES = ("chamfer", "raster")
+HARD_NAME = "chamfer_hard"
+"""AP_chamfer at the hard thresholds besides, of the same matching."""
 Sample = tuple[str, MapElements, MapElements]  # token, predictions, ground truth
 SampleMatches = dict[str, FrameMatches]  # by the name of the metric
 
@@ -28,6 +35,7 @@ class MapEvaluator:
         raster: Rules of AP_raster, or None to leave it out.
         ground_truth_points: To how many points ground truth is first resampled, such as the 20 of
             the training targets; None keeps its full resolution.
+        hard: Whether a second report has AP_chamfer at 0.2, 0.5 and 1.0 m.
 
     Raises:
         ValueError: If both are left out, or their classes differ.
@@ -36,6 +44,7 @@ class MapEvaluator:
     chamfer: ChamferConfig | None
     raster: RasterConfig | None
     ground_truth_points: int | None = None
+    hard: bool = False
 
     def __post_init__(self) -> None:
         classes = {config.classes for config in (self.chamfer, self.raster) if config}
@@ -68,6 +77,14 @@ class MapEvaluator:
         """Forget all samples."""
         self._matches.clear()
 
+    @cached_property
+    def _chamfer(self) -> ChamferConfig | None:
+        """Rules of the matching by distance, at the thresholds of all reports."""
+        if self.chamfer is None or not self.hard:
+            return self.chamfer
+        thresholds = {*self.chamfer.thresholds, *HARD_CHAMFER_THRESHOLDS}
+        return replace(self.chamfer, thresholds=tuple(thresholds))
+
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the classes."""
@@ -97,8 +114,8 @@ class MapEvaluator:
             polylines = [new if len(old) >= 2 else old for old, new in pairs]
             ground_truth = MapElements.from_polylines(polylines, ground_truth.labels)
         found: SampleMatches = {}
-        if self.chamfer:
-            found["chamfer"] = match_chamfer(predictions, ground_truth, self.chamfer, token)
+        if self._chamfer:
+            found["chamfer"] = match_chamfer(predictions, ground_truth, self._chamfer, token)
         if self.raster:
             found["raster"] = match_raster(predictions, ground_truth, self.raster, token)
         return found
@@ -106,8 +123,8 @@ class MapEvaluator:
     def require_fitting(self, found: SampleMatches) -> None:
         """Raise ValueError unless matches that come from elsewhere fit the rules."""
         wanted = {}
-        if self.chamfer:
-            wanted["chamfer"] = len(self.chamfer.thresholds)
+        if self._chamfer:
+            wanted["chamfer"] = len(self._chamfer.thresholds)
         if self.raster:
             wanted["raster"] = len(next(iter(self.raster.thresholds.values())))
         for name in wanted.keys() | found.keys():
@@ -133,8 +150,11 @@ class MapEvaluator:
                 raster.add(sample["raster"])
         if not (len(chamfer) or len(raster)):
             raise ValueError("there is no sample to score.")
-        if self.chamfer:
-            found.append(chamfer_report(chamfer, self.chamfer))
+        if self.chamfer and self._chamfer:
+            found.append(chamfer_report(chamfer, self._chamfer, self.chamfer.thresholds))
+            if self.hard:
+                hard = HARD_CHAMFER_THRESHOLDS
+                found.append(chamfer_report(chamfer, self._chamfer, hard, HARD_NAME))
         if self.raster:
             found.append(raster_report(raster, self.raster))
         return found

@@ -19,6 +19,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard
+from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON, require_same_list
 from gsmap.utils.words import counted
 
 CHUNK = 64  # samples per task: large enough to hide the hand-over, small enough to share evenly
@@ -63,6 +64,11 @@ class AnnotatedTruth:
             )
             yield sample.token, self._elements(sample), row
 
+    @property
+    def split_list(self) -> str:
+        """The list of scenes behind the file; empty if unknown."""
+        return self._file.meta.split_list
+
     def tokens(self) -> list[str]:
         """Return the tokens of all samples, whatever the shard."""
         return self._file.column("token")
@@ -74,6 +80,14 @@ class AnnotatedTruth:
     def _elements(self, sample: MapSample) -> MapElements:
         elements = elements_of_instances(sample.instances or [])
         return replace(elements, labels=self._labels[elements.labels])
+
+
+def scenes_of(path: str | Path) -> dict[str, str]:
+    """Return the scene of each sample of an annotation file, by token; ValueError for JSON."""
+    if Path(path).suffix.lower() == ".json":
+        raise ValueError(f"{path} knows no scenes: give the annotation file (.arrow).")
+    file = AnnotationFile(path)
+    return dict(zip(file.column("token"), file.column("scene"), strict=True))
 
 
 def open_ground_truth(
@@ -129,6 +143,8 @@ class SamplePairs:
         allow_mismatch: A sample without results counts as without predictions, and results without
             ground truth are left out; otherwise both are errors, after the last pair.
         shard: Which part of the ground truth's samples to take.
+        allow_other_split: Whether results may be of a model that was trained on another split than
+            that of the annotation file; otherwise that is an error, after the last pair.
     """
 
     def __init__(
@@ -138,7 +154,9 @@ class SamplePairs:
         classes: Sequence[str],
         allow_mismatch: bool = False,
         shard: Shard = WHOLE,
+        allow_other_split: bool = False,
     ) -> None:
+        self._allow_other_split = allow_other_split
         self._results = SampleFile(results_path, RESULTS_KEY, classes)
         self._truth = open_ground_truth(truth_path, classes, shard)
         self._allow_mismatch = allow_mismatch
@@ -173,6 +191,13 @@ class SamplePairs:
                     yield self._counted(token, pair[own], pair[other])
                 else:
                     waiting[own][token] = elements if len(waiting[own]) < CHUNK else place
+        if isinstance(self._truth, AnnotatedTruth) and not self._allow_other_split:
+            for name in (TRAINED_ON, SPLIT_LIST):
+                of_model, subject = (
+                    self._results.about.get(name),
+                    f"the model of {self._results.path}",
+                )
+                require_same_list(of_model, self._truth.split_list, subject, "--allow-other-split")
         self._mismatches = mismatch_notes(*waiting, self._allow_mismatch)
         nothing = MapElements.from_polylines()
         for token, kept in waiting[1].items():
@@ -212,6 +237,7 @@ def evaluate_files(
     evaluator: MapEvaluator,
     num_workers: int = 1,
     allow_mismatch: bool = False,
+    allow_other_split: bool = False,
 ) -> Evaluation:
     """Score a result file against ground truth.
 
@@ -222,12 +248,15 @@ def evaluate_files(
         num_workers: Number of processes.
         allow_mismatch: Whether the files may have different samples: one without results counts as
             without predictions, results without ground truth are left out.
+        allow_other_split: Whether the model may be of another split than the annotation file.
 
     Raises:
         FileNotFoundError: If a file does not exist.
-        ValueError: If a file is malformed or the samples differ.
+        ValueError: If a file is malformed, or samples or splits differ.
     """
-    pairs = SamplePairs(results_path, truth_path, evaluator.classes, allow_mismatch)
+    pairs = SamplePairs(
+        results_path, truth_path, evaluator.classes, allow_mismatch, WHOLE, allow_other_split
+    )
     reports = evaluator.reports(match_samples(pairs, evaluator, num_workers))
     return reports, pairs.notes(evaluator.counts_heights)
 

@@ -12,11 +12,12 @@ from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_truth
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.evaluator import HARD_NAME, METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import flat_metrics, format_table
 from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
 
 
 @METRICS.register_module()
@@ -29,8 +30,8 @@ class MapMetric(BaseMetric):
     (``classes``, ``x_range``, ``y_range``, ``dim``).
 
     Args:
-        eval: Metrics to compute: ``chamfer``, ``raster``; may be empty if only ``out_file`` is
-            wanted.
+        eval: Metrics to compute: ``chamfer``, ``raster``, and besides ``chamfer`` also
+            ``chamfer_hard``; may be empty if only ``out_file`` is wanted.
         thresholds: Thresholds of AP_chamfer in metres.
         out_file: Where to write the predictions in MapTR's JSON form, or None.
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
@@ -49,8 +50,9 @@ class MapMetric(BaseMetric):
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
-        if set(eval) - set(METRIC_NAMES) or (not eval and out_file is None):
-            raise ValueError(f"eval must name metrics of {METRIC_NAMES}, got {list(eval)}.")
+        names = (*METRIC_NAMES, HARD_NAME)
+        if set(eval) - set(names) or (not eval and out_file is None):
+            raise ValueError(f"eval must name metrics of {names}, got {list(eval)}.")
         self.eval = tuple(eval)
         self.thresholds = tuple(thresholds)
         self.out_file = out_file
@@ -68,13 +70,14 @@ class MapMetric(BaseMetric):
             return None
         classes = tuple(self._meta("classes"))
         chamfer = raster = None
-        if "chamfer" in self.eval:
+        hard = HARD_NAME in self.eval
+        if "chamfer" in self.eval or hard:
             dim = self.dataset_meta.get("dim", 2)
             chamfer = ChamferConfig(classes, self.thresholds, dim=dim)
         if "raster" in self.eval:
             grid = BEVGrid(self._meta("x_range"), self._meta("y_range"))
             raster = RasterConfig(classes, grid)
-        return MapEvaluator(chamfer, raster)
+        return MapEvaluator(chamfer, raster, hard=hard)
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
         """Match one batch and keep its matches.
@@ -125,6 +128,8 @@ class MapMetric(BaseMetric):
             MMLogger.get_current_instance().info("\n%s", format_table(report))
         if self.out_file is not None:  # after the figures: a disk may be full
             samples = ((record["token"], record["vectors"]) for record in records)
-            write_results(self.out_file, samples, {"classes": list(self._meta("classes"))})
+            about = {name: self.dataset_meta.get(name) for name in (SPLIT_LIST, TRAINED_ON)}
+            about = {name: identity for name, identity in about.items() if identity}
+            write_results(self.out_file, samples, {"classes": list(self._meta("classes")), **about})
             print_log(f"Results of {len(records)} samples written to {self.out_file}", "current")
         return flat_metrics(reports)

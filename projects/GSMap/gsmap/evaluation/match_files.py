@@ -128,4 +128,5 @@ def _evaluator(options: dict[str, Any]) -> MapEvaluator:
         rules(ChamferConfig, "chamfer"),
         rules(RasterConfig, "raster", **({"grid": grid} if grid else {})),
         options["ground_truth_points"],
+        options["hard"],
     )

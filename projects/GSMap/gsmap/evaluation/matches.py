@@ -61,6 +61,8 @@ class ClassDetections:
         quality: As in ``FrameMatches``. (N,)
         ranks: Rank of the prediction among those of its class and sample, from 0. (N,)
         num_gts: Number of ground truths.
+        samples: Number of the prediction's sample, in the order of the tokens. (N,)
+        gts_of_sample: Number of ground truths of each sample, in that order. (S,)
     """
 
     thresholds: Sequence[float]
@@ -69,6 +71,8 @@ class ClassDetections:
     quality: FloatArray
     ranks: IntArray
     num_gts: int
+    samples: IntArray
+    gts_of_sample: IntArray
 
 
 def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:
@@ -143,9 +147,14 @@ class MatchTable:
                 column.frombytes(np.asarray(values[name], column.typecode).tobytes())
 
     @property
+    def tokens(self) -> list[str]:
+        """The tokens of all samples, in their order. (S,)"""
+        return sorted(self._number)
+
+    @property
     def _order(self) -> IntArray:
         """The samples in the order of their tokens. (S,)"""
-        return np.array([self._number[token] for token in sorted(self._number)], np.int64)
+        return np.array([self._number[token] for token in self.tokens], np.int64)
 
     def class_iou(self, label: int) -> FloatArray:
         """Return ``FrameMatches.class_iou`` of one class in all samples. (S,)"""
@@ -166,7 +175,7 @@ class MatchTable:
         frame = np.repeat(np.arange(len(self)), lengths)
         labels, scores = columns["labels"][by_token], columns["scores"][by_token]
         hits = columns["hits"].reshape(-1, len(next(iter(thresholds.values())))) > 0
-        num_gts = columns["num_gts"].reshape(-1, len(thresholds)).sum(axis=0)
+        num_gts = columns["num_gts"].reshape(-1, len(thresholds))[order]
         found = {}
         for label, (name, of_class) in enumerate(thresholds.items()):
             rows = np.flatnonzero(labels == label)
@@ -180,7 +189,9 @@ class MatchTable:
                 hits[places],
                 columns["quality"][places],
                 ranks[best],
-                int(num_gts[label]),
+                int(num_gts[:, label].sum()),
+                frame[rows],
+                num_gts[:, label],
             )
         return found
 

@@ -173,4 +173,4 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
     metrics["mIoU"] = _mean(found["mIoU"] for found in figures.values())
     metrics["num_samples"] = float(len(matches))
     flat = {f"raster/{key}": value for key, value in metrics.items()}
-    return MetricReport("raster", groups, flat, detections)
+    return MetricReport("raster", groups, flat, detections, matches.tokens)

@@ -25,12 +25,19 @@ class MetricReport:
         metrics: Figures by flat keys such as ``chamfer/divider/AP@0.5``; -1 marks a figure that
             does not exist. The keys are listed in docs/evaluation.md.
         detections: The ranked predictions of each class, from which curves are drawn.
+        tokens: The samples, sorted.
     """
 
     name: str
     groups: Mapping[str, Sequence[str]]
     metrics: Mapping[str, float]
     detections: Mapping[str, ClassDetections]
+    tokens: Sequence[str] = ()
+
+    @property
+    def by_distance(self) -> bool:
+        """Whether thresholds are distances, of which the last is the loosest."""
+        return self.name != "raster"
 
 
 def flat_metrics(reports: Iterable[MetricReport]) -> dict[str, float]:
@@ -69,7 +76,7 @@ def format_table(report: MetricReport) -> str:
     Classes with the same thresholds stand together; the recall, the error and the calibration are
     those at the loosest threshold.
     """
-    chamfer = report.name == "chamfer"
+    chamfer = report.by_distance
     unit, quality = ("m", "error m") if chamfer else ("IoU", "mIoU")
     lines = [f"AP_{report.name}"]
     for group, names in report.groups.items():

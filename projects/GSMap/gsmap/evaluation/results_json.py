@@ -56,6 +56,7 @@ class SampleFile:
     Attributes:
         ignored: Of the samples so far, how many elements are of which other class, and how many
             samples have points with heights (``THREE_D``).
+        about: What the file says of itself, after the last sample; a stranger's words.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class SampleFile:
         self.path, self._key, self._classes = Path(path), key, classes
         self._gaussians = gaussians
         self.ignored = Counter[str]()
+        self.about: dict[str, Any] = {}
 
     def __iter__(self) -> Iterator[tuple[str, MapElements, Place]]:
         """Yield token, elements and place of each sample.
@@ -74,12 +76,14 @@ class SampleFile:
                 token occurs twice; the message names the file and the sample.
         """
         seen, form = set(), f'{{"{self._key}": [{{"sample_token": ..., "vectors": [...]}}, ...]}}'
-        for item, place in items_of(self.path, self._key, f"it must be {form}"):
+        beside: dict[str, Any] = {"meta": None}
+        for item, place in items_of(self.path, self._key, f"it must be {form}", beside):
             token, elements = self._convert(item, self.ignored)
             if token in seen:
                 raise ValueError(f"{self.path} holds sample {token!r} more than once.")
             seen.add(token)
             yield token, elements, place
+        self.about = beside["meta"] if isinstance(beside["meta"], dict) else {}
 
     def tokens(self) -> list[str]:
         """Return the tokens of all samples."""

@@ -14,7 +14,9 @@ _SPACE = re.compile(r"[ \t\n\r]*")
 _DECODER = json.JSONDecoder()
 
 
-def items_of(path: Path, key: str | None, advice: str) -> Iterator[tuple[Any, Place]]:
+def items_of(
+    path: Path, key: str | None, advice: str, beside: dict[str, Any] | None = None
+) -> Iterator[tuple[Any, Place]]:
     """Yield value and place of each item of a list.
 
     What is in memory does not grow with the list.
@@ -23,6 +25,7 @@ def items_of(path: Path, key: str | None, advice: str) -> Iterator[tuple[Any, Pl
         path: The file.
         key: Of the file's object, where the list is; None: the file is the list.
         advice: What to do if it is not, for the message.
+        beside: Gets the values of the object that have the names in it, as they are found.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -30,7 +33,7 @@ def items_of(path: Path, key: str | None, advice: str) -> Iterator[tuple[Any, Pl
     """
     with path.open("rb") as file:
         try:
-            yield from _Text(file).items(key)
+            yield from _Text(file).items(key, beside or {})
         except (ValueError, RecursionError) as error:
             under = "" if key is None else f" under {key!r}"
             raise ValueError(
@@ -47,8 +50,8 @@ class _Text:
         self._at = 0  # where the next value begins, in the text
         self._byte = 0  # and in the file
 
-    def items(self, key: str | None) -> Iterator[tuple[Any, Place]]:
-        """Yield the items of the list under a key."""
+    def items(self, key: str | None, beside: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
+        """Yield the items of the list under a key, and note the values of names in ``beside``."""
         found = False
         for _ in () if key is None else self._parts("{", "}"):
             if self._sign() != '"':
@@ -56,7 +59,9 @@ class _Text:
             name, _ = self._value()
             self._take(":")
             if name != key:
-                self._value()
+                value, _ = self._value()
+                if name in beside:
+                    beside[name] = value
                 continue
             if found or self._sign() != "[":
                 raise self._error(f"a second {key!r}" if found else "no list")

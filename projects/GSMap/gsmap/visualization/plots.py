@@ -67,7 +67,7 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
     style = MapStyle(tuple(reports[0].detections))
     figure, axes = panel_grid(len(reports), len(style.classes) + 1)
     for row, report in zip(axes, reports, strict=True):
-        loosest = -1 if report.name == "chamfer" else 0
+        loosest = -1 if report.by_distance else 0
         row[-1].plot([0, 1], [0, 1], color=style.grid, linewidth=1)
         for label, (name, found) in enumerate(report.detections.items()):
             count = len(found.thresholds)

@@ -10,17 +10,21 @@ import shapely
 
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
+from gsmap.datasets.errors import naming
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
-from mapdata.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_logs
+from gsmap.utils.split_lists import SPLIT_LIST
+from mapdata.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_all_logs, find_logs
 from mapdata.argoverse2.map import COMPAT_MODES
 from mapdata.argoverse2.samples import Argoverse2Options, LogSamples, read_log
 from mapdata.command_line import (
     add_file_options,
     add_log_options,
+    add_split_options,
     fingerprint,
     options_from,
 )
+from mapdata.splits import OFFICIAL, SplitList, asked_split, resolve_scenes, split_names
 from mapdata.summary import ConversionSummary
 
 
@@ -37,9 +41,14 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     """
     summary = ConversionSummary(options.classes)
     target = options.path_of("av2", options.split)
-    log_dirs = find_logs(options.root, options.split, options.logs)
+    wanted = asked_split(options, "av2")
+    if wanted is None:
+        log_dirs = find_logs(options.root, options.split, options.logs)
+    else:
+        log_dirs = _listed_logs(wanted, options, summary)
     log_dirs = _drop_listed(log_dirs, options.keep_map_changes, summary)
-    meta, log_dirs = _meta(options, log_dirs), options.shard.part(log_dirs)
+    identity = OFFICIAL if wanted is None else wanted.identity
+    meta, log_dirs = _meta(options, log_dirs, identity), options.shard.part(log_dirs)
     offsets_ns: list[int] = []
     bar = Progress(log_dirs, desc=f"av2 {options.split}", unit="logs")
     with bar as logs, AnnotationWriter(target, meta, options.shard) as writer:
@@ -67,6 +76,29 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
     return summary
 
 
+def _listed_logs(
+    wanted: SplitList, options: Argoverse2Options, summary: ConversionSummary
+) -> list[Path]:
+    """Return the logs of a list, wherever they are: published lists mix the official folders."""
+    if options.split not in wanted.scenes:
+        raise ValueError(
+            f"split {wanted.name!r} has no part {options.split!r}: name one of "
+            f"{', '.join(wanted.scenes)} with --split."
+        )
+    by_name = {log.name: log for log in find_all_logs(options.root)}
+    with naming(options.split_file or f"split {wanted.name!r}", "list each log in one split"):
+        part_of, absent = resolve_scenes(wanted.scenes, {name: name for name in by_name})
+    listed = set(wanted.scenes[options.split])
+    if missing := listed.intersection(absent):
+        where, allowed = str(options.root), options.allow_missing
+        summary.notes.append(wanted.missing_note(missing, len(listed), where, allowed))
+    found = [by_name[name] for name in sorted(listed.intersection(part_of))]
+    chosen = [log for log in found if not options.logs or log.name.startswith(tuple(options.logs))]
+    if not chosen:
+        raise FileNotFoundError(f"no log of split {wanted.name!r} as asked for in {options.root}.")
+    return chosen
+
+
 def _try_log(log_dir: Path, options: Argoverse2Options) -> LogSamples | str:
     """Read a log; return the reason where that fails (a bug of ours still stops everything)."""
     try:
@@ -91,7 +123,7 @@ def _drop_listed(
     return [log_dir for log_dir in log_dirs if log_dir.name not in left_out]
 
 
-def _meta(options: Argoverse2Options, log_dirs: Iterable[Path]) -> AnnotationMeta:
+def _meta(options: Argoverse2Options, log_dirs: Iterable[Path], identity: str) -> AnnotationMeta:
     """Describe the file: what it holds, and what it was made from."""
     sizes = {
         f"{log_dir.name}/{path.name}": path.stat().st_size
@@ -107,7 +139,7 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path]) -> AnnotationMet
         dim=options.dim,
         source_fingerprint=fingerprint(sizes),
         versions={**versions, "geos": ".".join(map(str, shapely.geos_version))},
-        options={**made_with, "num_sweeps": options.max_sweeps},
+        options={**made_with, "num_sweeps": options.max_sweeps, SPLIT_LIST: identity},
     )
 
 
@@ -128,6 +160,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--centerline", action="store_true", help="add the class centerline")
     what = "keep the four logs whose map was changed on purpose"
     add("--keep-map-changes", action="store_true", help=what)
+    add_split_options(parser, split_names("av2"))
     add_file_options(parser, "ego", max_sweeps=0)
 
 

@@ -129,21 +129,40 @@ def find_logs(root: Path, split: str, logs: Sequence[str] = ()) -> list[Path]:
     Raises:
         FileNotFoundError: If there is no such split, or no log that begins as asked.
     """
-    folder = next((f for f in (root / split, root / "sensor" / split) if f.is_dir()), None)
+    folder = _split_folder(root, split)
     if folder is None:
         raise FileNotFoundError(
             f"no folder {root / split} (nor {root / 'sensor' / split}): --root must name the "
             "folder that holds train, val and test of the Argoverse 2 sensor data set "
             "(https://www.argoverse.org/av2.html#download-link)."
         )
-    holding = {path.parent for part in ("map", POSES) for path in folder.glob(f"*/{part}")}
-    found = sorted(path for path in holding if path.suffix != PARTIAL)
+    found = _logs_of(folder)
     for prefix in logs:
         if not any(path.name.startswith(prefix) for path in found):
             raise FileNotFoundError(f"no log in {folder} begins with {prefix!r}.")
     if not found:
         raise FileNotFoundError(f"no Argoverse 2 log in {folder}.")
     return [path for path in found if not logs or path.name.startswith(tuple(logs))]
+
+
+def find_all_logs(root: Path) -> list[Path]:
+    """Return the logs of all official splits that are there; FileNotFoundError without any."""
+    folders = [_split_folder(root, split) for split in ("train", "val", "test")]
+    found = [log for folder in folders if folder is not None for log in _logs_of(folder)]
+    if not found:
+        raise FileNotFoundError(f"no Argoverse 2 log in the folders train, val and test of {root}.")
+    return found
+
+
+def _split_folder(root: Path, split: str) -> Path | None:
+    """Return the folder of an official split, None without."""
+    return next((f for f in (root / split, root / "sensor" / split) if f.is_dir()), None)
+
+
+def _logs_of(folder: Path) -> list[Path]:
+    """Return the logs in a folder, sorted."""
+    holding = {path.parent for part in ("map", POSES) for path in folder.glob(f"*/{part}")}
+    return sorted(path for path in holding if path.suffix != PARTIAL)
 
 
 def logs_in(folder: Path) -> list[Path]:

@@ -19,10 +19,25 @@ from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
 from gsmap.datasets.errors import naming
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
-from mapdata.command_line import FileOptions, add_file_options, fingerprint, options_from
+from gsmap.utils.split_lists import SPLIT_LIST, list_identity
+from mapdata.command_line import (
+    FileOptions,
+    add_file_options,
+    add_split_options,
+    fingerprint,
+    options_from,
+)
 from mapdata.nuscenes.map import MAP_CLASSES, NuScenesLocalMap, check_classes, open_layers
 from mapdata.nuscenes.tables import CAMERAS, LIDAR, NuScenesTables
-from mapdata.splits import Positions, overlap_notes, read_split_file, resolve_scenes
+from mapdata.overlap import Positions, overlap_notes
+from mapdata.splits import (
+    OFFICIAL,
+    SplitList,
+    asked_split,
+    read_split_file,
+    resolve_scenes,
+    split_names,
+)
 from mapdata.summary import ConversionSummary
 
 _OFFICIAL_SPLITS = {
@@ -30,22 +45,27 @@ _OFFICIAL_SPLITS = {
     "v1.0-test": ("test",),
 }  # fmt: skip
 _FRAMES_PER_WORKER = 500  # a process takes about as long to start as these take
+_Scene = tuple[dict[str, Any], NuScenesTables]  # its record, and the tables that it is of
 
 
 @dataclass(frozen=True)
 class NuScenesOptions(FileOptions):
     """What to convert and how: the options of ``tools/create_data.py nuscenes``.
 
-    Without ``split_file``, ``<root>/<version>/splits.json`` counts if it is there, else the
-    official splits.
+    Without ``split_name`` and ``split_file``, ``<root>/<version>/splits.json`` counts if it is
+    there, else the official splits. Several versions may be joined, as published splits need it.
     """
 
-    version: str
+    version: str | tuple[str, ...]
     _: KW_ONLY
     dataset: str = "nuscenes"
-    split_file: Path | None = None
     max_sweeps: int = 10
     frame: str = "lidar"
+
+    @property
+    def versions(self) -> tuple[str, ...]:
+        """The folders with tables."""
+        return (self.version,) if isinstance(self.version, str) else self.version
 
 
 def _check_root(root: Path, version: str) -> None:
@@ -69,35 +89,46 @@ def _check_root(root: Path, version: str) -> None:
         )
 
 
-def _splits(
-    options: NuScenesOptions, tables: NuScenesTables, summary: ConversionSummary
-) -> dict[str, str]:
-    """Return the split of each scene, by name; scenes that the data set lacks are noted."""
+def _wanted(options: NuScenesOptions) -> tuple[SplitList, str]:
+    """Return the splits to make, and what files say of them: nothing of a data set's own splits."""
     from nuscenes.utils.splits import create_splits_scenes
 
-    own = options.split_file or options.root / options.version / "splits.json"
-    if options.split_file is not None or own.is_file():
-        wanted: dict[str, list[str]] = read_split_file(own)
-    elif options.version in _OFFICIAL_SPLITS:
-        official = create_splits_scenes()
-        wanted = {name: official[name] for name in _OFFICIAL_SPLITS[options.version]}
-    else:
-        raise ValueError(
-            f"version {options.version!r} has no official splits: give --split-file, or write "
-            f"{own} (docs/data.md says how)."
-        )
-    names = {scene["token"]: scene["name"] for scene in tables.scene}
-    with naming(own, "list each scene in one split"):
-        split_of, missing = resolve_scenes(wanted, names)
-    if missing:
-        known = f"{len(split_of)} of the {len(missing) + len(split_of)} scenes of the splits"
-        summary.notes.append(f"{known} are in {options.root / options.version}, which has no more.")
+    if (asked := asked_split(options, "nuscenes")) is not None:
+        return asked, asked.identity
+    own = options.root / options.versions[0] / "splits.json"
+    if own.is_file():
+        return read_split_file(own), ""
+    official = create_splits_scenes()
+    for each in options.versions:
+        if each not in _OFFICIAL_SPLITS:
+            raise ValueError(
+                f"version {each!r} has no official splits: give --split-file, or write {own} "
+                "(docs/data.md says how)."
+            )
+    parts = [part for each in options.versions for part in _OFFICIAL_SPLITS[each]]
+    everything = {part: official[part] for part in ("train", "val", "test")}  # mini is of these
+    wanted = SplitList(OFFICIAL, {part: official[part] for part in parts})
+    return wanted, list_identity(OFFICIAL, everything)
+
+
+def _resolved(
+    wanted: SplitList, options: NuScenesOptions, scenes: list[dict[str, Any]]
+) -> tuple[dict[str, str], list[str]]:
+    """Return the split of each scene, by name, and notes of scenes that the data set lacks."""
+    names = {scene["token"]: scene["name"] for scene in scenes}
+    where = " and ".join(str(options.root / version) for version in options.versions)
+    with naming(
+        options.split_file or f"split {wanted.name!r} of {where}", "list each scene in one split"
+    ):
+        split_of, missing = resolve_scenes(wanted.scenes, names)
     if not split_of:
         raise ValueError(
-            f"none of the split's scenes is in {options.root / options.version}: it has "
-            f"{sorted(names.values())[:5]}; give --split-file."
+            f"none of the split's scenes is in {where}: it has {sorted(names.values())[:5]}; give "
+            "--split-file."
         )
-    return split_of
+    total = len(missing) + len(split_of)
+    note = missing and wanted.missing_note(missing, total, where, options.allow_missing)
+    return split_of, [note] if note else []
 
 
 def _instances_of(local_map: NuScenesLocalMap, poses: np.ndarray) -> list[list[MapInstance] | str]:
@@ -111,27 +142,38 @@ def _instances_of(local_map: NuScenesLocalMap, poses: np.ndarray) -> list[list[M
     return results
 
 
+def _location(of_version: _Scene) -> str:
+    """Return the name of a scene's map."""
+    scene, tables = of_version
+    return tables.location_of(scene)
+
+
 class _Conversion:
     """One run over all scenes."""
 
     def __init__(self, options: NuScenesOptions) -> None:
         self.options = options
         self.summary = ConversionSummary(options.classes)
-        self.tables = NuScenesTables(
-            options.version, options.root, options.max_sweeps, options.frame
-        )
-        self.split_of = _splits(options, self.tables, self.summary)
+        of_each = [
+            NuScenesTables(version, options.root, options.max_sweeps, options.frame)
+            for version in options.versions
+        ]
+        self.scenes = [(scene, tables) for tables in of_each for scene in tables.scene]
+        wanted, self.identity = _wanted(options)
+        self.split_of, notes = _resolved(wanted, options, [scene for scene, _ in self.scenes])
+        self.summary.notes += notes
         self.positions: Positions = {split: defaultdict(list) for split in self.split_of.values()}
 
     def run(self, writers: dict[str, AnnotationWriter]) -> None:
         """Convert map by map, so that one map at a time is in memory."""
-        scenes = [scene for scene in self.tables.scene if scene["name"] in self.split_of]
-        scenes = self.options.shard.part(sorted(scenes, key=self.tables.location_of))
+        scenes = [each for each in self.scenes if each[0]["name"] in self.split_of]
+        scenes = self.options.shard.part(sorted(scenes, key=_location))
         with Progress(
-            desc=f"{self.options.dataset} {self.options.version}", unit="samples", smoothing=0.05,
-            total=sum(scene["nbr_samples"] for scene in scenes),
+            desc=f"{self.options.dataset} {'+'.join(self.options.versions)}",
+            unit="samples", smoothing=0.05,
+            total=sum(scene["nbr_samples"] for scene, _ in scenes),
         ) as bar:  # fmt: skip
-            for location, local in groupby(scenes, key=self.tables.location_of):
+            for location, local in groupby(scenes, key=_location):
                 for sample, instances in self._with_instances(location, list(local)):
                     bar.update()
                     if isinstance(instances, str):
@@ -145,7 +187,7 @@ class _Conversion:
                     self.positions[split][sample.map_name].append(place)
 
     def _with_instances(
-        self, location: str, scenes: list[dict[str, Any]]
+        self, location: str, scenes: list[_Scene]
     ) -> Iterator[tuple[MapSample, list[MapInstance] | str]]:
         """Yield the samples of one map with their instances, or why there are none."""
         options = self.options
@@ -153,7 +195,7 @@ class _Conversion:
         for reason, count in layers.skipped.items():
             self.summary.add_problem(f"{reason} left out", location, count)
         local_map = NuScenesLocalMap(layers, options.classes, options.x_range, options.y_range)
-        frames = sum(scene["nbr_samples"] for scene in scenes)
+        frames = sum(scene["nbr_samples"] for scene, _ in scenes)
         workers = max(1, min(options.workers, len(scenes), frames // _FRAMES_PER_WORKER))
         samples, ahead = tee(map(self._scene_samples, scenes))
         poses = (np.array([s.global_from_frame for s in scene]) for scene in ahead)
@@ -161,10 +203,11 @@ class _Conversion:
         for of_scene, instances in zip(samples, results, strict=True):
             yield from zip(of_scene, instances, strict=True)
 
-    def _scene_samples(self, scene: dict[str, Any]) -> list[MapSample]:
+    def _scene_samples(self, of_version: _Scene) -> list[MapSample]:
         """Read a scene's samples without ground truth, counting what is missing."""
         samples = []
-        for record in self.tables.samples_of(scene):
+        scene, tables = of_version
+        for record in tables.samples_of(scene):
             token = record["token"]
             if LIDAR not in record["data"]:  # its frame is not known
                 self.summary.add_problem(f"sample left out: no {LIDAR} key frame", token)
@@ -172,7 +215,7 @@ class _Conversion:
             for name in CAMERAS:
                 if name not in record["data"]:
                     self.summary.add_problem(f"{name} absent (sample kept without it)", token)
-            sample = self.tables.read(record, scene)
+            sample = tables.read(record, scene)
             files = {f"{camera.name} image": camera.path for camera in sample.cameras}
             for name, path in {**files, LIDAR: sample.lidar.path}.items():  # type: ignore[union-attr]
                 if not (self.options.root / path).is_file():
@@ -191,15 +234,24 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         ValueError: If splits or classes do not fit the data set.
     """
     check_classes(options.classes)
-    _check_root(options.root, options.version)
+    for each in options.versions:
+        _check_root(options.root, each)
     conversion = _Conversion(options)
-    tables = options.root / options.version
+    folders = [options.root / each for each in options.versions]
     maps = sorted((options.root / "maps/expansion").glob("*.json"))
-    sizes = {path.name: path.stat().st_size for path in sorted(tables.glob("*.json"))}
+    sizes = {
+        path.name if folder == folders[0] else f"{folder.name}/{path.name}": path.stat().st_size
+        for folder in folders
+        for path in sorted(folder.glob("*.json"))
+    }
     made_from = {
-        "source_fingerprint": fingerprint(sizes, [tables / "scene.json", *maps]),
+        "source_fingerprint": fingerprint(sizes, [*(f / "scene.json" for f in folders), *maps]),
         "versions": {name: version(name) for name in ("nuscenes-devkit", "shapely", "pyarrow")},
-        "options": {"version": options.version, "max_sweeps": options.max_sweeps},
+        "options": {
+            "version": "+".join(options.versions),
+            "max_sweeps": options.max_sweeps,
+            **({SPLIT_LIST: conversion.identity} if conversion.identity else {}),
+        },
     }
     with ExitStack() as stack:
         writers = {}
@@ -222,9 +274,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``tools/create_data.py nuscenes``."""
     add = parser.add_argument
     add("--root", type=Path, required=True, help="data root with maps, samples, v1.0-...")
-    add("--version", default="v1.0-trainval", help="version folder (default: %(default)s)")
+    add(
+        "--version", nargs="+", default=["v1.0-trainval"], metavar="VERSION",
+        help="version folder, or several to join (default: v1.0-trainval)",
+    )  # fmt: skip
     add("--dataset", help="name in the files (default: minicity or nuscenes)")
-    add("--split-file", type=Path, help="own splits as JSON (docs/data.md)")
+    add_split_options(parser, split_names("nuscenes"))
     add(
         "--classes", nargs="+", default=list(CLASSES), choices=MAP_CLASSES, metavar="CLASS",
         help=f"classes in label order, of {', '.join(MAP_CLASSES)} (default: the first three)",

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
+
 FORMAT_VERSION = 1
 CLASSES = ("divider", "ped_crossing", "boundary")
 RANGES = {"lidar": ((-15.0, 15.0), (-30.0, 30.0)), "ego": ((-30.0, 30.0), (-15.0, 15.0))}
@@ -156,6 +158,9 @@ class AnnotationMeta:
         for name in ("dataset", "split", "source_fingerprint", "command"):
             if not isinstance(getattr(self, name), str):
                 raise ValueError(f"{name} must be a text, got {getattr(self, name)!r}.")
+        if not isinstance(self.options, dict):
+            raise ValueError(f"options must be a dictionary, got {self.options!r:.60}.")
+        checked_identity(self.split_list)
         if self.frame not in RANGES:
             raise ValueError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
         if self.dim not in (2, 3):
@@ -171,3 +176,8 @@ class AnnotationMeta:
             if not -np.inf < low < high < np.inf:
                 raise ValueError(f"{name} must be (low, high) with low < high, got {(low, high)}.")
             object.__setattr__(self, name, (low, high))
+
+    @property
+    def split_list(self) -> str:
+        """Name and digest of the list of scenes that splits were made by; empty if unknown."""
+        return self.options.get(SPLIT_LIST, "")

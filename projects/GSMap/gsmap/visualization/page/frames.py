@@ -23,7 +23,9 @@ _JPEG_QUALITY = 70
 def choose_frames(
     tokens: Sequence[str], max_frames: int, results: Sequence[ScoredResult], score_thr: float
 ) -> list[int]:
-    """Choose samples: three quarters evenly, and those of the first result's lowest F1.
+    """Choose samples: three quarters evenly, and of the others those with the lowest F1.
+
+    Of two results, they are those in which F1 differs most.
 
     Args:
         tokens: All samples, in order.
@@ -39,8 +41,9 @@ def choose_frames(
     even = max_frames - max_frames // 4 if results else max_frames
     chosen = set(np.linspace(0, len(tokens) - 1, even).round().astype(int).tolist())
     if results:
-        f1 = np.array([results[0].f1(token, score_thr) for token in tokens])
-        worst = (i for i in np.argsort(f1, kind="stable").tolist() if i not in chosen)
+        f1 = np.array([[result.f1(token, score_thr) for token in tokens] for result in results])
+        order = np.argsort(f1[0] if len(f1) == 1 else -abs(f1[0] - f1[1]), kind="stable")
+        worst = (i for i in order.tolist() if i not in chosen)
         chosen.update(i for i, _ in zip(worst, range(max_frames - even), strict=False))
     return sorted(chosen)
 

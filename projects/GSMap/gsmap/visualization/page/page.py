@@ -4,7 +4,7 @@ import base64
 import hashlib
 import html
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -12,6 +12,7 @@ from string import Template
 from typing import Any
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.evaluation.bootstrap import Resamples
 from gsmap.evaluation.file_evaluation import read_ground_truth
 from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.structures.frames import FRAME_VIEWS
@@ -20,8 +21,14 @@ from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 from gsmap.visualization.bev_view import display_extent
 from gsmap.visualization.page.frames import cameras_of, choose_frames, found_of, truth_of
-from gsmap.visualization.page.scores import MATCH_M, score_result
-from gsmap.visualization.page.tables import class_tables, curves, summary_table
+from gsmap.visualization.page.scores import MATCH_M, ScoredResult, score_result
+from gsmap.visualization.page.tables import (
+    Table,
+    class_tables,
+    curves,
+    difference_table,
+    summary_table,
+)
 from gsmap.visualization.style import MATCH_COLOURS, MapStyle
 
 
@@ -91,7 +98,7 @@ def page_data(
         frames.append(
             {
                 "token": sample.token,
-                "title": f"{sample.scene}, {seconds[index]:.1f} s",
+                "title": _title(sample.scene, seconds[index]),
                 "scene": sample.scene,
                 "place": sample.map_name,
                 "truth": truth_of(sample, view),
@@ -103,8 +110,11 @@ def page_data(
     if len(chosen) < len(tokens):
         how = "evenly spread"
         if scored:
-            worst = options.max_frames // 4
-            how = f"{len(chosen) - worst} evenly spread and the {worst} worst of {scored[0].name}"
+            rest = options.max_frames // 4
+            which = f"the {rest} worst of {scored[0].name}"
+            if len(scored) == 2:
+                which = f"{rest} in which both results differ most"
+            how = f"{len(chosen) - rest} evenly spread and {which}"
         notes.append(f"The page shows {len(chosen)} of {len(tokens)} frames: {how}.")
     return {
         "title": f"{meta.dataset} {meta.split}: {' and '.join(results) or 'ground truth'}",
@@ -121,10 +131,29 @@ def page_data(
         "min_score": MIN_SCORE,
         "score": options.score_thr,
         "results": [result.name for result in scored],
-        "tables": [summary_table(scored), *class_tables(scored, style)] if scored else [],
+        "tables": _tables(scored, style, file, options.score_thr) if scored else [],
         "curves": curves(scored, style) if scored else [],
         "frames": frames,
     }
+
+
+def _title(scene: str, seconds: float) -> str:
+    """Return what the page calls a sample."""
+    return f"{scene}, {seconds:.1f} s"
+
+
+def _tables(
+    scored: Sequence[ScoredResult], style: MapStyle, file: AnnotationFile, score_thr: float
+) -> list[Table]:
+    """Return the tables of one or two results, with intervals where there are several scenes."""
+    scene_of = dict(zip(file.column("token"), file.column("scene"), strict=True))
+    resamples = Resamples(scene_of) if len(set(scene_of.values())) > 1 else None
+    tables = [summary_table(scored, resamples), *class_tables(scored, style)]
+    if len(scored) == 2:
+        pairs = zip(scene_of.items(), file.seconds_into_scene, strict=True)
+        titles = {token: _title(scene, seconds) for (token, scene), seconds in pairs}
+        tables.append(difference_table(scored, titles, score_thr))
+    return tables
 
 
 def page_html(data: Mapping[str, Any]) -> str:

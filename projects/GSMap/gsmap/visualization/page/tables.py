@@ -1,11 +1,12 @@
 """Tables and curves of scored results, as the page shows them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from gsmap.evaluation.average_precision import precision_recall
+from gsmap.evaluation.bootstrap import Interval, Resamples, ap_differences, ap_intervals
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS
 from gsmap.evaluation.matches import ClassDetections
 from gsmap.evaluation.report import UNDEFINED, MetricReport, flat_metrics
@@ -14,6 +15,7 @@ from gsmap.visualization.style import MapStyle
 
 Table = dict[str, Any]
 _CURVE_POINTS = 120
+_DIFFERENCES = 12  # samples in which two results differ most
 _UNITS = {"chamfer": "m", "raster": "IoU"}
 
 
@@ -22,25 +24,74 @@ def _figure(value: float, factor: float = 100, digits: int = 1) -> str:
     return "\N{EN DASH}" if value == UNDEFINED else f"{factor * value:.{digits}f}"
 
 
-def summary_table(results: Sequence[ScoredResult]) -> Table:
+def summary_table(results: Sequence[ScoredResult], resamples: Resamples | None = None) -> Table:
     """Return the means over the classes: a row per figure, a column per result.
 
     Args:
         results: One result, or two with their difference in a last column.
+        resamples: Scenes to compute intervals of 95 % from; None shows none.
     """
+    reports = [result.reports for result in results]
+    of_each: list[Mapping[str, Interval]] = [{} for _ in results]
+    of_difference: Mapping[str, Interval] = {}
+    if resamples is not None:
+        of_each = [ap_intervals(of_result, resamples) for of_result in reports]
+        if len(results) == 2:
+            of_difference = ap_differences(reports[1], reports[0], resamples)
     metrics = [flat_metrics(result.reports) for result in results]
     keys = {f"mAP_{report.name} (%)": f"{report.name}/mAP" for report in results[0].reports}
     for threshold in CHAMFER_THRESHOLDS:
         keys[f"AP_chamfer at {threshold} m (%)"] = f"chamfer/AP@{threshold}"
     head = ["mean over classes", *(result.name for result in results)]
-    rows = [[title, *(_figure(m[key]) for m in metrics)] for title, key in keys.items()]
+    columns = [
+        [_figure(figures[key]) + _range(intervals.get(key)) for key in keys.values()]
+        for figures, intervals in zip(metrics, of_each, strict=True)
+    ]
+    rows = [[title, *cells] for title, *cells in zip(keys, *columns, strict=True)]
     if len(results) == 2:
         head.append(f"{results[1].name} minus {results[0].name}")
         for row, key in zip(rows, keys.values(), strict=True):
             first, second = (m[key] for m in metrics)
             known = UNDEFINED not in (first, second)
-            row.append(f"{100 * (second - first):+.1f}" if known else _figure(UNDEFINED))
-    return {"caption": "Summary", "head": head, "rows": rows}
+            difference = f"{100 * (second - first):+.1f}" if known else _figure(UNDEFINED)
+            row.append(difference + _range(of_difference.get(key), "+"))
+    caption = "Summary" + (", intervals of 95 % over scenes" if resamples else "")
+    return {"caption": caption, "head": head, "rows": rows}
+
+
+def _range(interval: Interval | None, sign: str = "") -> str:
+    """Write an interval behind its figure, in percent; nothing where it does not exist."""
+    if interval is None or UNDEFINED in (interval.value, interval.low, interval.high):
+        return ""
+    return f" ({100 * interval.low:{sign}.1f} to {100 * interval.high:{sign}.1f})"
+
+
+def difference_table(
+    results: Sequence[ScoredResult], titles: Mapping[str, str], score_thr: float
+) -> Table:
+    """Return the samples in which two results differ most in F1, the largest difference first.
+
+    Args:
+        results: Two results.
+        titles: What the page calls each sample, by token.
+        score_thr: Smallest score that F1 counts.
+    """
+    rows = []
+    for token, title in titles.items():
+        first, second = (result.f1(token, score_thr) for result in results)
+        rows.append((abs(second - first), [title, token, first, second, second - first]))
+    rows.sort(key=lambda row: -row[0])
+    shown = [
+        [title, token, f"{first:.2f}", f"{second:.2f}", f"{difference:+.2f}"]
+        for apart, (title, token, first, second, difference) in rows[:_DIFFERENCES]
+        if apart > 0
+    ]
+    head = ["sample", "token", *(f"F1 of {result.name}" for result in results), "difference"]
+    return {
+        "caption": f"Where they differ most, from score {score_thr:g}",
+        "head": head,
+        "rows": shown,
+    }
 
 
 def _columns(report: MetricReport, class_name: str) -> list[tuple[str, str, float, int]]:

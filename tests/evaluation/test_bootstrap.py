@@ -1,0 +1,164 @@
+"""Intervals of AP: equal to matching files of resampled scenes anew, paired, and repeatable."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from golden_data import CLASSES, EVALUATOR
+from test_files import annotated, command, results_of
+
+from gsmap.evaluation.average_precision import area_ap, interpolated_ap
+from gsmap.evaluation.bootstrap import (
+    Resamples,
+    ap_differences,
+    ap_intervals,
+    resampled_aps,
+    resampled_figures,
+)
+from gsmap.evaluation.evaluator import MapEvaluator
+from gsmap.evaluation.results_json import write_results
+from gsmap.structures.elements import MapElements
+
+HARD = replace(EVALUATOR, hard=True)
+COUNT = 20
+
+
+def drive(seed: int, offset_m: float) -> list[tuple[str, str, MapElements, MapElements]]:
+    """Samples of five scenes: token, scene, predictions some way off, ground truth of lines.
+
+    Predictions of different samples may have the same score. The last class is in one scene only.
+    """
+    rng = np.random.default_rng(seed)
+    samples = []
+    for i in range(15):
+        labels = rng.integers(0, 2 if i >= 3 else 3, 4)
+        x = rng.uniform(-12, 12, 4)
+        lines = [np.array([[a, -20.0], [a, 15.0]]) for a in x]
+        shifts = rng.exponential(offset_m, 4) * rng.choice([-1, 1], 4)
+        found = [line + np.array([dx, 0]) for line, dx in zip(lines, shifts, strict=True)]
+        scores = rng.choice(np.round(np.linspace(0.1, 0.9, 6), 2), 4, replace=False)
+        samples.append(
+            (
+                f"t{i:02d}", f"s{i // 3}",
+                MapElements.from_polylines(found, labels, scores),
+                MapElements.from_polylines(lines, labels),
+            )
+        )  # fmt: skip
+    return samples
+
+
+def reports_of(samples: list, evaluator: MapEvaluator = HARD) -> list:
+    return evaluator.reports(evaluator.match(t, p, g) for t, _, p, g in samples)
+
+
+def resamples_of(samples: list) -> Resamples:
+    return Resamples({token: scene for token, scene, *_ in samples}, COUNT, seed=3)
+
+
+def repeated(samples: list, drawn: np.ndarray) -> list:
+    """The samples of a resample as a file would have them: copies with tokens of their own."""
+    return [
+        (f"{token}-{copy}", scene, predictions, truth)
+        for token, scene, predictions, truth in samples
+        for copy in range(int(drawn[int(scene[1:])]))
+    ]
+
+
+def test_resampled_figures_equal_those_of_files_with_the_scenes_repeated():
+    samples = drive(0, 0.6)
+    resamples = resamples_of(samples)
+    _, drawn = resamples.draw([token for token, *_ in samples])
+    assert (drawn.sum(1) == 5).all()
+    found = {}
+    for report in reports_of(samples):
+        found |= resampled_figures(report, resamples)
+    assert {"chamfer/mAP", "chamfer_hard/divider/AP@0.2", "raster/line/AP", "raster/mAP"} <= set(
+        found
+    )
+    for b in range(COUNT):
+        wanted = {}
+        for report in reports_of(repeated(samples, drawn[b])):
+            wanted |= report.metrics
+        absent = [key for key, values in found.items() if np.isnan(values[b])]
+        assert all(wanted[key] == -1 for key in absent)
+        for key in found.keys() - set(absent):
+            assert found[key][b] == pytest.approx(wanted[key], abs=1e-12), (b, key)
+    assert (drawn[:, 0] == 0).any(), "no resample is without the last class"
+
+
+def test_every_ap_has_an_interval_and_no_other_figure():
+    (report, *_) = reports_of(drive(0, 0.6))
+    found = ap_intervals([report], resamples_of(drive(0, 0.6)))
+    wanted = {key for key in report.metrics if key.split("/")[-1].startswith(("AP", "mAP"))}
+    assert set(found) == wanted
+    for key, interval in found.items():
+        assert interval.value == report.metrics[key]
+        assert interval.low <= interval.high
+    assert found["chamfer/mAP"].low < found["chamfer/mAP"].value < found["chamfer/mAP"].high
+
+
+@pytest.mark.parametrize("interpolated", [False, True])
+def test_the_kernel_equals_the_metrics_own_ap(interpolated):
+    """Each scene drawn once: the AP of the metric, also without a hit and with all."""
+    rng = np.random.default_rng(1)
+    for share in (0.0, 0.3, 1.0):
+        hits = rng.random(60) < share
+        scene, gts = rng.integers(0, 4, 60), np.array([20.0, 0, 30, 12])
+        found = resampled_aps(hits[:, None], scene, np.ones((1, 4)), gts, interpolated)[0, 0]
+        wanted = (interpolated_ap if interpolated else area_ap)(hits, 62)
+        assert found == pytest.approx(wanted, abs=1e-14)
+
+
+def test_a_difference_is_paired_scene_by_scene():
+    """The same predictions with a constant gain differ less than their intervals are wide."""
+    good, bad = drive(0, 0.3), drive(0, 0.9)
+    resamples = resamples_of(good)
+    found = ap_differences(reports_of(good), reports_of(bad), resamples)["chamfer/mAP"]
+    ours, theirs = (reports_of(s)[0].metrics["chamfer/mAP"] for s in (good, bad))
+    assert found.value == ours - theirs
+    assert 0 < found.low < found.value < found.high
+    same = ap_differences(reports_of(good), reports_of(good), resamples)
+    assert all((i.value, i.low, i.high) == (0, 0, 0) for i in same.values())
+    with pytest.raises(ValueError, match="on the same samples and metrics only"):
+        ap_differences(reports_of(good), reports_of(bad[:-1]), resamples)
+
+
+def test_resamples_are_repeatable_and_need_scenes():
+    scenes = {f"t{i}": f"s{i}" for i in range(6)}
+    draw = [Resamples(scenes, 50, seed).draw(list(scenes))[1] for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(draw[0], draw[1])
+    assert (draw[0] != draw[2]).any()
+    with pytest.raises(ValueError, match="two scenes, two resamples"):
+        Resamples({"a": "s", "b": "s"})
+    with pytest.raises(ValueError, match="scene of sample 'x' is not known"):
+        Resamples(scenes).draw(["x"])
+
+
+def test_the_command_writes_intervals_and_differences(tmp_path, capsys):
+    truth = annotated(tmp_path / "val.arrow", 8, scenes=4)
+    write_results(tmp_path / "a.json", results_of(8))
+    write_results(tmp_path / "b.json", [(token, found[:1]) for token, found in results_of(8)])
+    words = [str(tmp_path / "a.json"), str(truth), "--out", str(tmp_path / "m.json")]
+    command()([*words, "--against", str(tmp_path / "b.json"), "--bootstrap", "200"])
+    text = capsys.readouterr().out
+    assert "AP with intervals of 95 % of 200 resamples of the scenes, seed 0" in text
+    assert "a.json minus" in text
+    found = json.loads((tmp_path / "m.json").read_text())
+    assert found["chamfer/mAP/low"] <= found["chamfer/mAP"] <= found["chamfer/mAP/high"]
+    assert found["minus_other/chamfer/mAP/value"] == pytest.approx(0.5 / 3, abs=1e-9)
+    with pytest.raises(ValueError, match="knows no scenes"):
+        command()([words[0], str(tmp_path / "t.json"), "--bootstrap"])
+
+
+def test_hard_thresholds_beside_the_others_are_those_of_their_own_run(tmp_path):
+    samples = drive(2, 0.6)
+    both = reports_of(samples)
+    assert [report.name for report in both] == ["chamfer", "chamfer_hard", "raster"]
+    easy, _ = reports_of(samples, EVALUATOR)
+    alone = replace(EVALUATOR.chamfer, thresholds=(0.2, 0.5, 1.0))
+    (hard,) = reports_of(samples, MapEvaluator(alone, None))
+    assert both[0].metrics == easy.metrics
+    renamed = {key.replace("chamfer/", "chamfer_hard/"): v for key, v in hard.metrics.items()}
+    assert both[1].metrics == renamed
+    assert set(both[1].detections) == set(CLASSES)
