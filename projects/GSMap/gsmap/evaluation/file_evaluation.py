@@ -129,6 +129,7 @@ class SamplePairs:
         allow_mismatch: A sample without results counts as without predictions, and results without
             ground truth are left out; otherwise both are errors, after the last pair.
         shard: Which part of the ground truth's samples to take.
+        gaussians: Whether to read the Gaussians of results.
     """
 
     def __init__(
@@ -138,8 +139,9 @@ class SamplePairs:
         classes: Sequence[str],
         allow_mismatch: bool = False,
         shard: Shard = WHOLE,
+        gaussians: bool = False,
     ) -> None:
-        self._results = SampleFile(results_path, RESULTS_KEY, classes)
+        self._results = SampleFile(results_path, RESULTS_KEY, classes, gaussians)
         self._truth = open_ground_truth(truth_path, classes, shard)
         self._allow_mismatch = allow_mismatch
         self._elsewhere: set[str] = set()  # what belongs to other shards is theirs
