@@ -13,6 +13,7 @@ from gsmap.evaluation.calibration import reliability as coverage
 from gsmap.evaluation.report import MetricReport
 from gsmap.visualization.style import MapStyle
 
+_LINE: dict[str, Any] = {"linewidth": 1.3, "markersize": 3}
 WIDTH_IN = 7.5  # so that text of 7.5 points stays legible where a plot is shown 800 px wide
 
 
@@ -101,4 +102,18 @@ def plot_uncertainty(vertices: Vertices, classes: Sequence[str]) -> Figure:
         finish_shares(left, f"reliability {name}", "interval", "share of errors")
         right.set(xlim=(0, 1), ylim=(0, None))
         finish_panel(right, f"sparsification {name}", "share taken away", "mean error (m)")
+    return figure
+
+
+def plot_severities(
+    values: Mapping[str, Sequence[float]], clean: float, severities: Sequence[int]
+) -> Figure:
+    """Draw the AP in percent over the severity of each corruption, from that without any."""
+    figure, axes = panel_grid(1, 1)
+    ax = axes[0, 0]
+    for number, (kind, aps) in enumerate(values.items()):
+        ax.plot([0, *severities], [clean, *aps], "o-", color=f"C{number}", label=kind, **_LINE)
+    ax.set_ylim(0, None)
+    legend = {"loc": "center left", "bbox_to_anchor": (1, 0.5)}
+    finish_panel(ax, "corruptions", "severity", "AP_chamfer (%)", legend=legend)
     return figure
