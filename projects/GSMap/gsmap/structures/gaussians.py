@@ -202,8 +202,8 @@ def line_errors(points: Tensor, targets: Tensor, lines: Tensor | None = None) ->
     """Return how far points of predicted lines are off, along and across, in metres.
 
     Along: the distance from the point's own target, in the direction of the predicted line (as in
-    `extents_along_line`). Across: the distance from the straight line through the nearest segment
-    of the true line, so that a line that is too long is not off to the side.
+    `extents_along_line`). Across: the distance from the true line, whose ends go on straight, so
+    that a line that is too long is not off to the side.
 
     Args:
         points: Predicted points in metres. (..., P, 2)
@@ -220,9 +220,10 @@ def line_errors(points: Tensor, targets: Tensor, lines: Tensor | None = None) ->
     steps = lines.diff(dim=-2)[..., None, :, :]  # (..., 1, S - 1, 2)
     offsets = points[..., None, :] - lines[..., None, :-1, :]  # (..., P, S - 1, 2)
     lengths = steps.square().sum(-1)
-    place = ((offsets * steps).sum(-1) / lengths.clamp(min=_TINY)).clamp(0, 1)
-    apart = (offsets - place[..., None] * steps).square().sum(-1)
-    nearest = apart.masked_fill(lengths < _TINY, torch.inf).argmin(-1, keepdim=True)
-    aside = offsets[..., 0] * steps[..., 1] - offsets[..., 1] * steps[..., 0]
-    across = (aside.abs() / lengths.clamp(min=_TINY).sqrt()).gather(-1, nearest)[..., 0]
-    return torch.stack([along, across], -1)
+    place = (offsets * steps).sum(-1) / lengths.clamp(min=_TINY)
+    closed = (lines[..., :1, :] == lines[..., -1:, :]).all(-1, keepdim=True)  # (..., 1, 1)
+    beyond = torch.where(closed, 0.0, torch.inf)
+    inner = torch.zeros_like(lengths[..., 1:])
+    low, high = torch.cat([-beyond, inner], -1), torch.cat([inner, beyond], -1) + 1
+    apart = (offsets - place.clamp(low, high)[..., None] * steps).square().sum(-1)
+    return torch.stack([along, apart.amin(-1).clamp(min=_TINY).sqrt()], -1)
