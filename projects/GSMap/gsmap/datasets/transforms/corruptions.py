@@ -149,7 +149,7 @@ def night(image: Image, level: int, rng: np.random.Generator) -> Image:
 
 def motion_blur(image: Image, level: int, rng: np.random.Generator) -> Image:
     """Return an image blurred along its rows, as of a vehicle that turns. (H, W, 3)"""
-    length = max(2, round(_BLURS[level] * image.shape[1]))
+    length = 2 * round(_BLURS[level] * image.shape[1] / 2) + 1  # odd: nothing is shifted
     return cv2.blur(image, (length, 1))
 
 
