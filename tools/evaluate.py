@@ -26,6 +26,11 @@ from gsmap.evaluation.bootstrap import (
     ap_intervals,
     format_intervals,
 )
+from gsmap.evaluation.calibration import (
+    format_uncertainty,
+    matched_vertices,
+    uncertainty_report,
+)
 from gsmap.evaluation.chamfer_ap import (
     CHAMFER_THRESHOLDS,
     HARD_CHAMFER_THRESHOLDS,
@@ -157,6 +162,14 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         metavar="OTHER",
         help="second result file: what the first has more in every AP, with its interval",
     )
+    parser.add_argument(
+        "--uncertainty",
+        action="store_true",
+        help="whether Gaussians say how far off matched vertices are: likelihood, coverage, ranks",
+    )
+    parser.add_argument(
+        "--reliability", type=output_file, help="with --uncertainty: draw its curves"
+    )
     parser.add_argument("--workers", type=int, default=1, help="number of processes")
     parser.add_argument("--out", type=output_file, help="write all figures as flat JSON")
     parser.add_argument("--pr-curves", type=output_file, help="draw PR curves and calibration")
@@ -178,6 +191,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error("--against compares two result files: leave out --prior")
     if args.shard.count and (args.bootstrap is not None or args.against):
         parser.error("--bootstrap and --against need all samples: leave out --shard")
+    if args.uncertainty and (args.prior or args.shard.count):
+        parser.error("--uncertainty needs the results of a model: leave out --prior, --shard")
+    if args.reliability and not args.uncertainty:
+        parser.error("--reliability needs --uncertainty")
     if args.shard.count and (not args.out or args.prior or args.pr_curves):
         parser.error("--shard needs --out, and can neither fit a --prior nor draw --pr-curves")
     return args
@@ -218,6 +235,8 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         if not found.groups:
             lines = (f"{key:<44} {value:.4f}" for key, value in found.metrics.items())
             print("\n".join(lines) + "\n")
+        elif found.name == "uncertainty":
+            print(format_uncertainty(found.metrics) + "\n")
         else:
             print(format_table(found) + "\n")
     for note in notes:
@@ -271,6 +290,22 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
     )
     figures = evaluate_drives(args.results, annotations, config, args.tracks)
     return MetricReport("consistency", {}, figures, {})
+
+
+def report_of_gaussians(args: argparse.Namespace, evaluator: MapEvaluator) -> MetricReport:
+    """Score the Gaussians of a result file, and draw their curves if that is asked for."""
+    classes = evaluator.classes
+    pairs = SamplePairs(
+        args.results, args.ground_truth, classes, args.allow_mismatch, gaussians=True
+    )
+    vertices = matched_vertices(pairs, evaluator.chamfer or ChamferConfig(classes))
+    if args.reliability:
+        from gsmap.visualization.figure import save_figure
+        from gsmap.visualization.plots import plot_uncertainty
+
+        figure = plot_uncertainty(vertices, classes)
+        print(f"reliability: {save_figure(figure, args.reliability)}")
+    return uncertainty_report(vertices, classes, args.polygon_classes)
 
 
 def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
@@ -352,6 +387,8 @@ def main(argv: list[str] | None = None) -> str:
         outcome[0].extend(topology_reports(args, evaluator))
     if args.consistency:
         outcome[0].append(consistency_report(args))
+    if args.uncertainty:
+        outcome[0].append(report_of_gaussians(args, evaluator))
     report(outcome, args)
     first = outcome[0][0]
     number = int(first.metrics[f"{first.name}/num_samples"])

@@ -8,6 +8,8 @@ from gsmap.structures.gaussians import (
     GaussianSpace,
     extents_along_line,
     gaussians_along,
+    line_errors,
+    stretched,
 )
 from gsmap.structures.grid import BEVGrid
 
@@ -180,3 +182,61 @@ def test_a_reference_of_points_is_refused():
         ValueError, match=r"reference must have shape \(\.\.\., 5\) or more, got \(4, 2\)"
     ):
         SPACE.decode(torch.zeros(4, 2))
+
+
+def test_errors_along_and_across_the_line_by_hand():
+    """A line along x, predicted 0.2 m to its left and 0.5 m too far along; the last point is beyond
+    its end and still only 0.2 m aside.
+
+    ::
+
+        predicted   x----x----x
+        true      o----o----o
+    """
+    targets = torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
+    line = torch.tensor([[0.0, 0.0], [0.7, 0.0], [0.7, 0.0], [2.0, 0.0]])
+    points = targets + torch.tensor([0.5, 0.2])
+    expected = torch.tensor([[0.5, 0.2]]).expand(3, 2)
+    torch.testing.assert_close(line_errors(points, targets), expected)
+    torch.testing.assert_close(line_errors(points, targets, line), expected)
+    turned = torch.tensor([[0.0, 1.0], [-1.0, 0.0]])  # by 90 degrees: the same errors
+    torch.testing.assert_close(line_errors(points @ turned, targets @ turned), expected)
+    assert line_errors(points, torch.zeros(3, 2)).isfinite().all()
+
+
+def test_a_ring_does_not_go_on_behind_its_first_vertex():
+    """Points in front of the first corner of a square, 1 m from it, and of the next one."""
+    ring = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [0.0, 0.0]])
+    points = torch.tensor([[-1.0, 0.0], [2.6, -0.8], [1.0, 1.0]])
+    across = line_errors(points, points, ring)[:, 1]
+    torch.testing.assert_close(across, torch.tensor([1.0, 1.0, 1.0]))
+    open_line = line_errors(points, points, ring[:-1])[:, 1]
+    torch.testing.assert_close(open_line[0], torch.tensor(1e-6))  # on its straight continuation
+
+
+def test_errors_have_a_gradient_where_points_lie_apart():
+    generator = torch.Generator().manual_seed(0)
+    points, targets = torch.randn(2, 2, 5, 2, generator=generator, dtype=torch.float64).unbind()
+    assert torch.autograd.gradcheck(line_errors, (points.requires_grad_(), targets))
+
+
+def test_factors_stretch_the_extents_along_and_across_the_line():
+    """Whatever the Gaussians' own axes are; a factor of one leaves them as they are."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(4, 6, 2, generator=generator, dtype=torch.float64)
+    scales = torch.rand(4, 6, 2, generator=generator, dtype=torch.float64) + 0.05
+    gaussians = Gaussians(means, scales, 3 * means[..., 0])
+    factors = torch.tensor([2.0, 0.3], dtype=torch.float64)
+    found = stretched(gaussians, factors)
+    torch.testing.assert_close(extents_along_line(found), extents_along_line(gaussians) * factors)
+    area = found.scales.prod(-1) / gaussians.scales.prod(-1)
+    torch.testing.assert_close(area, torch.full_like(area, 0.6))
+    same = stretched(gaussians, torch.ones(2, dtype=torch.float64))
+    torch.testing.assert_close(same.scales, gaussians.scales.sort(descending=True).values)
+    torch.testing.assert_close(covariances(same), covariances(gaussians))
+
+
+def covariances(gaussians: Gaussians) -> torch.Tensor:
+    cos, sin = gaussians.rotations.cos(), gaussians.rotations.sin()
+    axes = torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], -1)
+    return axes * gaussians.scales.square()[..., None, :] @ axes.transpose(-1, -2)

@@ -54,7 +54,7 @@ def test_the_page_shows_intervals_of_scenes_and_where_results_differ_most(case, 
     file = AnnotationFile(path)
     samples = [replace(sample, scene=f"s{i // 2}") for i, sample in enumerate(file)]
     write_annotations(tmp_path / "scenes.arrow", file.meta, samples)
-    tables = report_data(tmp_path / "scenes.arrow", results, NO_IMAGES)["tables"]
+    tables = page_data(tmp_path / "scenes.arrow", results, NO_IMAGES)["tables"]
     for cell, value, sign in zip(
         tables[0]["rows"][0][1:], ("50.0", "33.3", "-16.7"), ("", "", "[+-]"), strict=True
     ):

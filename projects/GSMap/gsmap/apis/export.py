@@ -65,10 +65,10 @@ class ExportedDetector(nn.Module):
         named = {name: value[None] for name, value in given.items()}
         head = self.model.map_head
         outputs = head(self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:])))
-        fields = head.reference.decode(outputs[-1].references[0])
         best = head.coder.best(outputs[-1].scores[0])
+        fields = head.detected(head.reference.decode(outputs[-1].references[0]), best)
         names = ("pts", *self.output_names[3:])
-        return (best.scores, best.labels, *(fields[name][best.query_inds] for name in names))
+        return (best.scores, best.labels, *(fields[name] for name in names))
 
     def example_inputs(self, num_cams: int, image_size: tuple[int, int]) -> tuple[Tensor, ...]:
         """Return inputs of the right shapes: black images of cameras at the origin."""

@@ -10,14 +10,10 @@ import torch
 from mmengine.dataset import pseudo_collate
 from torch.utils.data import Dataset
 
+from gsmap.structures.calibration import OUT_OF_SIGHT
+
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
-
-# A camera 1 km ahead of the vehicle that looks further ahead: everything in range is behind it, and
-# its frustum lies out of range. So both ways of making BEV features get nothing from it.
-_OUT_OF_SIGHT = np.array(
-    [[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, -1000.0], [0, 0, 0, 1.0]]
-)  # cam_from_frame
 
 
 @dataclass(frozen=True)
@@ -84,8 +80,8 @@ def _with_blank_cameras(item: dict[str, Any], wanted: Sequence[str]) -> dict[str
     images = item["inputs"]["img"]  # (V present, 3, H, W)
     stacked = torch.stack([torch.zeros_like(images[0]) if i is None else images[i] for i in order])
     blank = {"cam2img": meta["cam2img"][0], "img_aug_matrix": meta["img_aug_matrix"][0]}
-    blank["lidar2cam"] = _OUT_OF_SIGHT
-    blank["lidar2img"] = blank["img_aug_matrix"] @ blank["cam2img"] @ _OUT_OF_SIGHT
+    blank["lidar2cam"] = OUT_OF_SIGHT
+    blank["lidar2img"] = blank["img_aug_matrix"] @ blank["cam2img"] @ OUT_OF_SIGHT
     changed = {
         key: np.stack([value if i is None else meta[key][i] for i in order])
         for key, value in blank.items()

@@ -145,6 +145,7 @@ class SamplePairs:
         shard: Which part of the ground truth's samples to take.
         allow_other_split: Whether results may be of a model that was trained on another split than
             that of the annotation file; otherwise that is an error, after the last pair.
+        gaussians: Whether to read the Gaussians of results.
     """
 
     def __init__(
@@ -155,9 +156,10 @@ class SamplePairs:
         allow_mismatch: bool = False,
         shard: Shard = WHOLE,
         allow_other_split: bool = False,
+        gaussians: bool = False,
     ) -> None:
         self._allow_other_split = allow_other_split
-        self._results = SampleFile(results_path, RESULTS_KEY, classes)
+        self._results = SampleFile(results_path, RESULTS_KEY, classes, gaussians)
         self._truth = open_ground_truth(truth_path, classes, shard)
         self._allow_mismatch = allow_mismatch
         self._elsewhere: set[str] = set()  # what belongs to other shards is theirs

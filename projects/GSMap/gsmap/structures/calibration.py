@@ -9,6 +9,12 @@ from numpy.typing import NDArray
 NUM_CAN_BUS = 18
 OF_ONE_FRAME = slice(3, 17)  # of ``can_bus``; the rest are changes since an earlier frame
 
+# A camera 1 km ahead of the vehicle that looks further ahead: everything in range is behind it, and
+# its frustum lies out of range. So both ways of making BEV features get nothing from it.
+OUT_OF_SIGHT = np.array(
+    [[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, -1000.0], [0, 0, 0, 1.0]]
+)  # cam_from_frame
+
 
 def without_history(can_bus: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
     """Return vehicle signals as MapTR has them of a single frame: `OF_ONE_FRAME`, zeros around it.

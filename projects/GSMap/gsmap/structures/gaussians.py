@@ -14,6 +14,7 @@ from gsmap.structures.tensors import at_least_float32
 ACTIVATIONS = ("sigmoid", "softplus", "exp")
 _ROUND = 1e-6  # relative difference of both variances, below which a Gaussian has no direction
 _MARGIN = 1e-4  # of the range of sigma, kept off its ends where no number stands for it
+_TINY = 1e-12  # square metres; a shorter segment has no direction
 AT_FLOOR = 1.1  # a Gaussian is at its floor if both sigmas are below this multiple of it
 
 
@@ -252,10 +253,10 @@ def gaussians_along(points: Tensor, across_m: float) -> Gaussians:
     apart = torch.cat([steps[..., :1], (steps[..., 1:] + steps[..., :-1]) / 2, steps[..., -1:]], -1)
     along = (apart / 2).clamp(min=across_m)
     scales = torch.stack([along, torch.full_like(along, across_m)], -1)
-    return Gaussians(points, scales, _angles_of_line(points))
+    return Gaussians(points, scales, angles_of_line(points))
 
 
-def _angles_of_line(points: Tensor) -> Tensor:
+def angles_of_line(points: Tensor) -> Tensor:
     """Return the line's direction at each point, in radians from +x. (..., P, 2) -> (..., P)"""
     padded = torch.cat([points[..., :1, :], points, points[..., -1:, :]], -2)
     along = padded[..., 2:, :] - padded[..., :-2, :]
@@ -274,7 +275,63 @@ def extents_along_line(gaussians: Gaussians) -> Tensor:
     :math:`\sqrt{d^T \Sigma d}` in metres; the line's direction d at a centre joins its neighbours,
     or at an end the end and its neighbour. Two or more Gaussians each. (..., P) -> (..., P, 2)
     """
-    angles = _angles_of_line(gaussians.means) - gaussians.rotations
+    angles = angles_of_line(gaussians.means) - gaussians.rotations
     cos, sin = angles.cos().square(), angles.sin().square()
     first, second = gaussians.scales.square().unbind(-1)
     return torch.stack([first * cos + second * sin, first * sin + second * cos], -1).sqrt()
+
+
+def stretched(gaussians: Gaussians, factors: Tensor) -> Gaussians:
+    r"""Multiply each Gaussian's extents along and across the line of its centres.
+
+    :math:`\Sigma' = M \Sigma M^T` with M diagonal in the directions of `extents_along_line`.
+
+    Args:
+        gaussians: Two or more for each line. (..., P)
+        factors: Of the standard deviations along and across, > 0. (..., P, 2), or broadcast to it
+
+    Returns:
+        The Gaussians, the longer axis first. (..., P)
+    """
+    angles = angles_of_line(gaussians.means)
+    cos, sin = (gaussians.rotations - angles).cos(), (gaussians.rotations - angles).sin()
+    first, second = gaussians.scales.square().unbind(-1)
+    both = factors.prod(-1) * (first - second) * sin * cos
+    along = factors[..., 0].square() * (first * cos.square() + second * sin.square())
+    across = factors[..., 1].square() * (first * sin.square() + second * cos.square())
+    spread = ((along - across).square() / 4 + both.square()).sqrt()
+    longer = ((along + across) / 2 + spread).sqrt()
+    shorter = gaussians.scales.prod(-1) * factors.prod(-1) / longer  # the area is known
+    turn = torch.atan2(2 * both, along - across) / 2
+    return Gaussians(gaussians.means, torch.stack([longer, shorter], -1), angles + turn)
+
+
+def line_errors(points: Tensor, targets: Tensor, lines: Tensor | None = None) -> Tensor:
+    """Return how far points of predicted lines are off, along and across, in metres.
+
+    Along: the distance from the point's own target, in the direction of the predicted line (as in
+    `extents_along_line`). Across: the distance from the true line, whose ends go on straight, so
+    that a line that is too long is not off to the side.
+
+    Args:
+        points: Predicted points in metres. (..., P, 2)
+        targets: True points in their order, in metres. (..., P, 2)
+        lines: The true lines at full resolution, or None for the targets. (..., S, 2)
+
+    Returns:
+        Both errors, >= 0. (..., P, 2)
+    """
+    angles = angles_of_line(points)
+    direction = torch.stack([angles.cos(), angles.sin()], -1)
+    along = ((points - targets) * direction).sum(-1).abs()
+    lines = targets if lines is None else lines
+    steps = lines.diff(dim=-2)[..., None, :, :]  # (..., 1, S - 1, 2)
+    offsets = points[..., None, :] - lines[..., None, :-1, :]  # (..., P, S - 1, 2)
+    lengths = steps.square().sum(-1)
+    place = (offsets * steps).sum(-1) / lengths.clamp(min=_TINY)
+    closed = (lines[..., :1, :] == lines[..., -1:, :]).all(-1, keepdim=True)  # (..., 1, 1)
+    beyond = torch.where(closed, 0.0, torch.inf)
+    inner = torch.zeros_like(lengths[..., 1:])
+    low, high = torch.cat([-beyond, inner], -1), torch.cat([inner, beyond], -1) + 1
+    apart = (offsets - place.clamp(low, high)[..., None] * steps).square().sum(-1)
+    return torch.stack([along, apart.amin(-1).clamp(min=_TINY).sqrt()], -1)

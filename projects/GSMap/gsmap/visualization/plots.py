@@ -8,9 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gsmap.evaluation.average_precision import precision_recall, reliability
+from gsmap.evaluation.calibration import AXES, LEVELS, Vertices, sparsification
+from gsmap.evaluation.calibration import reliability as coverage
 from gsmap.evaluation.report import MetricReport
 from gsmap.visualization.style import MapStyle
 
+_LINE: dict[str, Any] = {"linewidth": 1.3, "markersize": 3}
 WIDTH_IN = 7.5  # so that text of 7.5 points stays legible where a plot is shown 800 px wide
 
 
@@ -82,4 +85,44 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
             score, share, _ = reliability(found.scores, found.hits[:, loosest])
             row[-1].plot(score, share, "o-", markersize=3, color=style.colour(label))
         finish_shares(row[-1], "calibration", "score", "share of hits")
+    return figure
+
+
+def plot_uncertainty(vertices: Vertices, classes: Sequence[str]) -> Figure:
+    """Draw a row for errors along and across: coverage of intervals, and sparsification.
+
+    Sparsification shows the mean error in metres of what is left when the vertices of the largest
+    sigma are taken away, and below it, pale, of the largest errors.
+    """
+    style = MapStyle(tuple(classes))
+    figure, axes = panel_grid(len(AXES), 2)
+    for axis, (name, (left, right)) in enumerate(zip(AXES, axes, strict=True)):
+        left.plot([0, 1], [0, 1], color=style.grid, linewidth=1)
+        for label, title in enumerate(classes):
+            own = vertices.of(vertices.labels == label)
+            if not len(own.labels):
+                continue
+            errors, sigmas = own.errors[:, axis], own.sigmas[:, axis]
+            line = {"color": style.colour(label), "linewidth": 1.3}
+            left.plot(LEVELS, coverage(errors, sigmas), label=title, **line)
+            taken = 1 - np.arange(1, len(errors) + 1) / len(errors)
+            right.plot(taken, sparsification(errors, errors), alpha=0.3, **line)
+            right.plot(taken, sparsification(errors, sigmas), **line)
+        finish_shares(left, f"reliability {name}", "interval", "share of errors")
+        right.set(xlim=(0, 1), ylim=(0, None))
+        finish_panel(right, f"sparsification {name}", "share taken away", "mean error (m)")
+    return figure
+
+
+def plot_severities(
+    values: Mapping[str, Sequence[float]], clean: float, severities: Sequence[int]
+) -> Figure:
+    """Draw the AP in percent over the severity of each corruption, from that without any."""
+    figure, axes = panel_grid(1, 1)
+    ax = axes[0, 0]
+    for number, (kind, aps) in enumerate(values.items()):
+        ax.plot([0, *severities], [clean, *aps], "o-", color=f"C{number}", label=kind, **_LINE)
+    ax.set_ylim(0, None)
+    legend = {"loc": "center left", "bbox_to_anchor": (1, 0.5)}
+    finish_panel(ax, "corruptions", "severity", "AP_chamfer (%)", legend=legend)
     return figure

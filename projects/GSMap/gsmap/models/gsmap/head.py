@@ -11,12 +11,14 @@ from gsmap.models.gsmap.layer import guided
 from gsmap.models.gsmap.losses import MaskLoss, RasterLoss
 from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.statistics import gaussian_statistics
+from gsmap.models.maptr.coder import Detections
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.losses import PointsLoss
 from gsmap.models.maptr.masks import ElementMasks
 from gsmap.models.maptr.matching import OrderedPointsCost
 from gsmap.models.maptr.pairs import MatchedPairs
 from gsmap.models.maptr.parts import DEFAULTS, PARTS, WEIGHT, brought, with_points_weight
+from gsmap.structures.gaussians import Gaussians, stretched
 from gsmap.structures.grid import BEVGrid
 
 
@@ -39,6 +41,11 @@ class GSMapHead(MapHead):
         masks: Settings of `ElementMasks`.
         reference: Settings of `GaussianReference`; its smallest sigma is half a pixel of the masks
             by default.
+        temperatures: Factors, > 0, of the sigmas of detections, along and across the line, of each
+            class (`tools/calibrate.py` fits them), or None. C x (2,)
+
+    Raises:
+        ValueError: If there are not two temperatures for each class.
     """
 
     def __init__(
@@ -52,6 +59,7 @@ class GSMapHead(MapHead):
         points_weight: WEIGHT | None = None,
         masks: PARTS | None = None,
         reference: PARTS | None = None,
+        temperatures: Sequence[Sequence[float]] | None = None,
         **kwargs: Any,
     ) -> None:
         drawing = ElementMasks(grid, **(masks or {}))
@@ -76,6 +84,24 @@ class GSMapHead(MapHead):
             reference={**gaussian, **(reference or {})},
             **kwargs,
         )
+        if temperatures is not None:
+            fits = [len(pair) == 2 and min(pair) > 0 for pair in temperatures]
+            if fits != [True] * len(self.classes):
+                raise ValueError(
+                    f"temperatures must be two numbers > 0 for each of the {len(self.classes)} "
+                    f"classes, got {temperatures}."
+                )
+        self.temperatures = temperatures
+
+    def detected(self, fields: dict[str, Tensor], best: Detections) -> dict[str, Tensor]:
+        """Return what the reference decoded of the detections, sigmas at their temperatures."""
+        found = super().detected(fields, best)
+        if self.temperatures is None:
+            return found
+        factors = found["scales"].new_tensor(self.temperatures)[best.labels][:, None]  # (M, 1, 2)
+        means, scales, rotations = found["pts"][..., :2], found["scales"], found["rotations"]
+        _, scales, rotations = stretched(Gaussians(means, scales, rotations), factors)
+        return {**found, "scales": scales, "rotations": rotations}
 
     def statistics(self, pairs: MatchedPairs) -> dict[str, Tensor]:
         """Return what says whether the Gaussians live (see `gaussian_statistics`)."""

@@ -12,7 +12,7 @@ from gsmap.models.maptr import layers
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.references import PointReference
 from gsmap.ops.gaussian_raster import render_gaussians
-from gsmap.structures.gaussians import GaussianSpace
+from gsmap.structures.gaussians import Gaussians, GaussianSpace
 from gsmap.structures.grid import BEVGrid
 
 
@@ -84,9 +84,13 @@ class GaussianReference(PointReference):
         turn = turn.view(-1, *[1] * (moved.dim() - 1)).expand_as(moved[..., :1])
         return torch.cat([moved[..., :-1], moved[..., -1:] + turn], -1)
 
+    def errors(self, references: Tensor) -> Gaussians:
+        """Return the Gaussians that stand for the points' errors. (..., P, D) -> (..., P)"""
+        return self.space.decode(references)
+
     def decode(self, references: Tensor) -> dict[str, Tensor]:
         """Add the Gaussians' ``scales`` (N, P, 2) in metres and ``rotations`` (N, P) in radians."""
-        gaussians = self.space.decode(references)
+        gaussians = self.errors(references)
         shapes = {"scales": gaussians.scales, "rotations": gaussians.rotations}
         return super().decode(references) | shapes
 

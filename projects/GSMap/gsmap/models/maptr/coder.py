@@ -101,7 +101,11 @@ class DetectionHead(BaseModule):
         for scores, references in zip(outputs[-1].scores, outputs[-1].references, strict=True):
             fields = self.reference.decode(references)
             best = self.coder.decode(scores, fields["pts"])
-            chosen = {name: value[best.query_inds] for name, value in fields.items()}
+            chosen = self.detected(fields, best)
             chosen.update(scores_3d=best.scores, labels_3d=best.labels)
             results.append(InstanceData(metainfo=dict(self.reference.metainfo), **chosen))
         return results
+
+    def detected(self, fields: Tensors, best: Detections) -> Tensors:
+        """Return what the reference decoded, (N, ...), of the detections. (M, ...)"""
+        return {name: value[best.query_inds] for name, value in fields.items()}

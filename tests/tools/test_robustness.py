@@ -1,0 +1,50 @@
+"""The command that measures corruptions: its pipelines, its table, one run."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def tool():
+    spec = importlib.util.spec_from_file_location("robustness", REPO / "tools/robustness.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_corruptions_come_right_after_the_images_and_delays_before(tool):
+    load, scale = {"type": "LoadCameraImages"}, {"type": "ScaleImages"}
+    settings = {"ann_file": "a.arrow", "data_root": "d", "pipeline": [load, scale]}
+    fog = tool.corrupted(settings, "fog", 3, 7)["pipeline"]
+    assert fog == [load, {"type": "CorruptImages", "kind": "fog", "severity": 3, "seed": 7}, scale]
+    late = tool.corrupted(settings, "camera_delayed", 2, 7)["pipeline"]
+    files = {"ann_file": "a.arrow", "data_root": "d"}
+    assert late == [{"type": "DelayCameras", **files, "severity": 2, "seed": 7}, load, scale]
+    assert tool.corrupted(settings, "none", 1, 7) == settings
+
+
+def test_every_kind_is_registered_and_in_the_table(tool):
+    from gsmap.datasets.transforms.corruptions import KINDS, SEVERITIES
+
+    assert set(tool.KINDS) == {*KINDS, "camera_delayed"}
+    assert tool.SEVERITIES == SEVERITIES
+    found = {"none": [{"mean": 40.0}], "fog": [{"mean": v} for v in (40.0, 30.0, 20.0, 10.0, 0.0)]}
+    assert "| fog | 40.0 | 30.0 | 20.0 | 10.0 | 0.0 | 50 % |" in tool.table(found)
+
+
+def test_a_run_writes_table_figures_and_plot(tool, minicity_root, tmp_path, monkeypatch):
+    words = ["gsmap_r18_minicity", "--data-root", str(minicity_root), "--samples", "1"]
+    options = ["--kinds", "camera_lost", "camera_delayed", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["robustness.py", *words, *options])
+    said = tool.main()
+    found = json.loads((tmp_path / "robustness.json").read_text())
+    assert {kind: len(figures) for kind, figures in found.items()} == {
+        "none": 1, "camera_lost": 5, "camera_delayed": 5,
+    }  # fmt: skip
+    assert (tmp_path / "robustness.md").read_text() in said
+    assert (tmp_path / "robustness.png").stat().st_size > 1000

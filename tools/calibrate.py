@@ -1,0 +1,76 @@
+#!/usr/bin/env python
+r"""Fit the sigmas of a model's Gaussians to its errors, and write a checkpoint that has them.
+
+RESULTS are the model's predictions of samples that it was not trained on. Each class gets a factor
+for sigma along and one for sigma across the line: 68.3 % of the errors then lie within one sigma.
+
+Example:
+    python tools/test.py gsmap_r18_minicity --eval --out half.json \
+        --cfg-options test_dataloader.dataset.indices=200
+    python tools/calibrate.py gsmap_r18_minicity gsmap_r18_minicity half.json \
+        gsmap_minicity_val.arrow calibrated.pth
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from gsmap.evaluation.calibration import fitted_factors, matched_vertices
+from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.file_evaluation import SamplePairs
+from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.files import atomic_write
+
+
+def parse_args() -> argparse.Namespace:
+    parser = CommandParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("config", help="config, by file or name, or the name of a trained model")
+    parser.add_argument("checkpoint", help="checkpoint of the model, by file or name")
+    parser.add_argument("results", type=Path, help="its predictions (tools/test.py --out)")
+    parser.add_argument(
+        "ground_truth", type=Path, help="annotation file (*.arrow), or JSON with a list of GTs"
+    )
+    parser.add_argument("target", type=Path, help="checkpoint to write; must not exist")
+    return parser.parse_args()
+
+
+def main() -> str:
+    args = parse_args()
+    if args.target.exists():
+        raise FileExistsError(f"{args.target} exists already: choose another name or remove it.")
+    import torch
+    from mmdet3d.registry import MODELS
+
+    from gsmap.checkpoints.building import building
+    from gsmap.checkpoints.reading import adopt_settings, read_checked
+    from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
+    from gsmap.engine.launch import read_config
+
+    cfg, source = read_config(args.config), read_checked(args.checkpoint)
+    with building(cfg):
+        adopt_settings(cfg, args.checkpoint, None)
+        if cfg.model.map_head.get("temperatures"):
+            raise ValueError(
+                f"{args.checkpoint} is calibrated already: give the checkpoint that it was made of."
+            )
+        classes = tuple(cfg.model.classes)
+        pairs = SamplePairs(args.results, args.ground_truth, classes, True, gaussians=True)
+        factors = fitted_factors(matched_vertices(pairs, ChamferConfig(classes)), classes)
+        cfg.model.map_head.temperatures = factors.round(4).tolist()
+        MODELS.build(cfg.model)  # refuses heads without Gaussians
+    meta = {MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())), SIGNALS: source.can_bus}
+    if source.image_size:
+        meta[IMAGE_SIZE] = source.image_size
+    with atomic_write(args.target, "wb") as file:
+        torch.save({"state_dict": source.state, "meta": meta}, file)
+    rows = (
+        f"{name}: sigma {along:.2f} times along, {across:.2f} times across"
+        for name, (along, across) in zip(classes, factors, strict=True)
+    )
+    return "\n".join([*rows, str(args.target)])
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,133 @@
+#!/usr/bin/env python
+r"""Measure what a model loses when cameras fail: AP_chamfer over five severities of corruptions.
+
+Writes ``robustness.md``, ``robustness.json`` and ``robustness.png``. Resilience is the mean of AP
+over the severities, as a share of that without corruption.
+
+Example:
+    python tools/robustness.py gsmap_r18_minicity --data-root data/minicity --samples 50 --out r
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmap.checkpoints.named_models import checkpoint_for
+from gsmap.engine.arguments import add_config_options
+from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.files import write_text
+from gsmap.utils.progress import Progress
+
+KINDS = (
+    "camera_lost", "camera_delayed", "rotation", "translation",
+    "fog", "rain", "night", "motion_blur", "jpeg",
+)  # fmt: skip
+SEVERITIES = (1, 2, 3, 4, 5)
+CLEAN = "none"
+_DELAYED = "camera_delayed"
+
+
+def parse_args() -> argparse.Namespace:
+    parser = CommandParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("config", help="config, by file or name, or the name of a trained model")
+    parser.add_argument("checkpoint", nargs="?", help="not needed with the name of a model")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--samples", type=int, help="that many, evenly spread; default: all")
+    parser.add_argument("--seed", type=int, default=0, help="of what the corruptions draw")
+    parser.add_argument("--out", type=Path, required=True, help="folder of table and plot")
+    add_config_options(parser)
+    return parser.parse_args()
+
+
+def corrupted(settings: Any, kind: str, severity: int, seed: int) -> dict[str, Any]:
+    """Return a data set's settings with a corruption in the pipeline, where its images are read."""
+    if kind == CLEAN:
+        return {**settings}
+    steps = list(settings["pipeline"])
+    (load,) = (i for i, step in enumerate(steps) if step["type"] == "LoadCameraImages")
+    step = {"severity": severity, "seed": seed}
+    if kind == _DELAYED:
+        files = {key: settings[key] for key in ("ann_file", "data_root")}
+        steps.insert(load, {"type": "DelayCameras", **files, **step})
+    else:
+        steps.insert(load + 1, {"type": "CorruptImages", "kind": kind, **step})
+    return {**settings, "pipeline": steps}
+
+
+def average_precisions(model: Any, settings: Any, samples: int | None) -> dict[str, float]:
+    """Return AP_chamfer of each class and their mean, in percent."""
+    from mmdet3d.registry import DATASETS, METRICS
+    from mmengine.dataset import pseudo_collate
+
+    dataset = DATASETS.build(settings)
+    metric = METRICS.build({"type": "MapMetric", "eval": ["chamfer"]})
+    metric.dataset_meta = dataset.metainfo
+    count = min(samples or len(dataset), len(dataset))
+    for index in np.linspace(0, len(dataset) - 1, count).round().astype(int).tolist():
+        found = model.test_step(pseudo_collate([dataset[index]]))
+        metric.process(None, [sample.to_dict() for sample in found])
+    figures = metric.evaluate(count)
+    keys = {name: f"chamfer/{name}/AP" for name in dataset.metainfo["classes"]}
+    return {n: 100 * figures[key] for n, key in {**keys, "mean": "chamfer/mAP"}.items()}
+
+
+def table(found: dict[str, list[dict[str, float]]]) -> str:
+    """Return the table of all corruptions: the mean AP at each severity, and the resilience."""
+    rows = [
+        f"AP_chamfer without corruption: {found[CLEAN][0]['mean']:.1f}\n",
+        f"| corruption | {' | '.join(map(str, SEVERITIES))} | resilience |",
+        "| --- " * (len(SEVERITIES) + 2) + "|",
+    ]
+    for kind, figures in found.items():
+        if kind != CLEAN:
+            aps = [of["mean"] for of in figures]
+            cells = [f"{value:.1f}" for value in aps] + [f"{resilience(found, kind):.0f} %"]
+            rows.append(f"| {kind} | {' | '.join(cells)} |")
+    return "\n".join(rows) + "\n"
+
+
+def resilience(found: dict[str, list[dict[str, float]]], kind: str) -> float:
+    """Return the mean AP over the severities as a share of that without corruption, in percent."""
+    clean = found[CLEAN][0]["mean"]
+    return 100 * float(np.mean([of["mean"] for of in found[kind]])) / max(clean, 1e-9)
+
+
+def main() -> str:
+    args = parse_args()
+    import torch
+    from mmengine.logging import MMLogger
+
+    from gsmap.apis.loading import load_model
+    from gsmap.visualization.figure import save_figure
+    from gsmap.visualization.plots import plot_severities
+
+    if args.samples is not None and args.samples < 1:
+        raise ValueError(f"--samples must be >= 1, got {args.samples}.")
+    checkpoint = checkpoint_for(args.config, args.checkpoint)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    model = load_model(args.config, checkpoint, device, args.cfg_options)
+    MMLogger.get_instance("robustness", log_level="ERROR")  # one table for each run is too much
+    cases = [(CLEAN, 1), *((kind, severity) for kind in args.kinds for severity in SEVERITIES)]
+    found: dict[str, list[dict[str, float]]] = {}
+    with Progress(total=len(cases), unit="corruptions") as bar, torch.no_grad():
+        for kind, severity in cases:
+            settings = corrupted(model.cfg.test_dataloader.dataset, kind, severity, args.seed)
+            figures = average_precisions(model, settings, args.samples)
+            found.setdefault(kind, []).append(figures)
+            bar.update(1)
+    text = table(found)
+    write_text(args.out / "robustness.json", json.dumps(found, indent=1) + "\n")
+    write_text(args.out / "robustness.md", text)
+    means = {kind: [of["mean"] for of in figures] for kind, figures in found.items()}
+    clean = means.pop(CLEAN)[0]
+    save_figure(plot_severities(means, clean, SEVERITIES), args.out / "robustness.png")
+    return f"{text}\nfiles: {args.out}"
+
+
+if __name__ == "__main__":
+    run_command(main)
