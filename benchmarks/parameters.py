@@ -1,4 +1,4 @@
-"""Parameters of a config's model by module; papers count the trainable ones."""
+"""Parameters of a config's model by module; papers count all, the trainable, or all entries."""
 
 import argparse
 
@@ -21,15 +21,18 @@ def run(args: argparse.Namespace) -> None:
     with building(cfg):
         counts = count_parameters(MODELS.build(cfg.model), args.depth)
     width = max(map(len, counts))
-    print(f"{'module'.ljust(width)}  {'all':>12}  {'trainable':>12}")
-    for name, (total, trainable) in counts.items():
-        print(f"{(name or 'model').ljust(width)}  {total:>12,}  {trainable:>12,}")
+    print(f"{'module'.ljust(width)}  {'all':>12}  {'trainable':>12}  {'entries':>12}")
+    for name, numbers in counts.items():
+        print("  ".join([(name or "model").ljust(width), *(f"{n:>12,}" for n in numbers)]))
+    print("all and trainable: parameters; entries: numbers in a checkpoint, with buffers")
 
 
-def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, int]]:
-    """Count the parameters of a model (named "") and of its modules, all and trainable ones.
+def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, int, int]]:
+    """Count the numbers of a model (named "") and of its modules.
 
-    Modules are listed to ``depth`` levels; those that hold no parameter are left out.
+    They are all parameters, the trainable ones, and the entries of a checkpoint: buffers such as
+    the statistics of batch norms count, and what has two names counts twice. Modules are listed to
+    ``depth`` levels; those that hold no parameter are left out.
 
     Raises:
         ValueError: If ``depth`` is negative.
@@ -41,7 +44,7 @@ def count_parameters(model: nn.Module, depth: int = 2) -> dict[str, tuple[int, i
         if name and name.count(".") >= depth:
             continue
         sizes = [(p.numel(), p.requires_grad) for p in module.parameters()]
-        total = sum(size for size, _ in sizes)
-        if total:
-            counts[name] = total, sum(size for size, grad in sizes if grad)
+        if total := sum(size for size, _ in sizes):
+            trainable = sum(size for size, grad in sizes if grad)
+            counts[name] = total, trainable, sum(v.numel() for v in module.state_dict().values())
     return counts

@@ -22,24 +22,16 @@ from gsmap.models.mgmap.refinement import (
 
 @dataclass(eq=False)
 class MaskedDecoded(Decoded):
-    """What a decoder layer returns, with the masks that activated the queries.
+    """What a decoder layer returns, with the masks that activated the queries."""
 
-    Args:
-        mask_logits: Masks of the instances, the same in all layers. (B, N, H, W)
-    """
-
-    mask_logits: Tensor
+    mask_logits: Tensor  # of the instances, the same in all layers (B, N, H, W)
 
 
 @dataclass(eq=False)
 class RefinedDecoded(Decoded):
-    """What a stage of the refinement returns.
+    """What a stage of the refinement returns."""
 
-    Args:
-        segmentation: Logits of elements and of background, of all instances. (B, 2, H, W)
-    """
-
-    segmentation: Tensor
+    segmentation: Tensor  # logits of elements and of background, of all instances (B, 2, H, W)
 
     def of_queries(self, queries: slice) -> Decoded:
         """Return what belongs to some of the instance queries; the segmentation to all."""

@@ -52,9 +52,7 @@ def enlarged(feats: Tensor, shape: torch.Size) -> Tensor:
 class EnhancedNeck(nn.Module):
     """Three stages of gated blocks on the BEV features, which are then put together (MGMap).
 
-    Args:
-        embed_dims: Channels C of the features and of what is returned; the stages have a quarter,
-            a half and all of them.
+    The stages have a quarter, a half and all of the C channels.
     """
 
     num_levels = 4

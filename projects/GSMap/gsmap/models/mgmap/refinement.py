@@ -66,15 +66,7 @@ class _HalfAttention(nn.TransformerDecoderLayer):
 
 
 class PatchRefinement(BaseModule):
-    """One stage of the refinement (MGMap).
-
-    Args:
-        embed_dims: Channels C.
-        state_dims: Channels of the states that it starts from.
-        num_heads: Heads of both attentions.
-        ffn_dims: Hidden channels of its feed-forward network.
-        dropout: Dropout of its layer.
-    """
+    """One stage of the refinement (MGMap), which starts from states of ``state_dims`` channels."""
 
     def __init__(
         self, embed_dims: int, state_dims: int, num_heads: int, ffn_dims: int, dropout: float
@@ -108,15 +100,10 @@ class PatchRefinement(BaseModule):
     def forward(
         self, states: Tensor, patches: Tensor, mask: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return corrected states, and what they saw.
+        """Return corrected states, and what they saw. (B, Q, state_dims) -> 2 x (B, Q, C)
 
-        Args:
-            states: States of points. (B, Q, state_dims)
-            patches: Patches around them, or one for all (1, 1, C, 5, 5). (B, Q, C, 5, 5)
-            mask: True where a point may not attend to another. (Q, Q)
-
-        Returns:
-            2 x (B, Q, C).
+        Patches are around the points (B, Q, C, 5, 5), or one for all (1, 1, C, 5, 5); the mask is
+        True where a point may not attend to another (Q, Q).
         """
         seen = self.patch_net(patches.flatten(0, 1)).unflatten(0, patches.shape[:2])
         seen = seen.expand(*states.shape[:2], -1)

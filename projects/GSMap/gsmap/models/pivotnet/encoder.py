@@ -19,14 +19,7 @@ Shapes = Sequence[tuple[int, int]]
 
 
 class DeformableLayer(nn.Module):
-    """Attentions to maps, one after another, and a feed-forward network, post-norm.
-
-    Args:
-        levels: Maps of each attention.
-        ffn_dims: Hidden channels of the feed-forward network.
-        dropout: Dropout of every sublayer.
-        sizes: ``embed_dims``, ``num_heads`` and ``num_points`` of the attentions.
-    """
+    """Attentions to maps, one after another, and a feed-forward network, post-norm."""
 
     def __init__(self, levels: Sequence[int], ffn_dims: int, dropout: float, **sizes: int) -> None:
         super().__init__()

@@ -1,8 +1,7 @@
 """PivotNet's head: points of lines, of which those that are pivots make the map."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -43,7 +42,7 @@ class PivotReference:
     grid: BEVGrid
     outputs = ("pts", "num_pts")
     space = None
-    metainfo: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    metainfo: ClassVar[dict[str, Any]] = {}
 
     def decode(self, references: Tensor) -> Tensors:
         """Keep the pivots of every line, those of positive logit, in order.

@@ -53,31 +53,18 @@ class Pairs(NamedTuple):
 
 @dataclass(frozen=True)
 class PivotLosses:
-    """Weights of losses and of matching costs; the defaults are the released ones.
+    """Weights of losses and of matching costs; the defaults are the released ones."""
 
-    Args:
-        cls: Weight of the class, of matching too.
-        mask: Weight of the lines' masks, of matching too.
-        pivots: Weight of matched pivots, of the matching of sequences too.
-        collinear: Weight of the points between.
-        point_cls: Weight of the kind of each point.
-        semantic: Weight of the masks of whole classes.
-        end_weight: What the ends of a line weigh more than its other pivots, of matching too.
-        none_weight: Weight of predictions of no line in ``cls``.
-        between_weight: Weight of points between pivots in ``point_cls``.
-        point_cls_per_line: Divide the mean of ``point_cls`` by the number of lines, as released.
-    """
-
-    cls: float = 2.0
-    mask: float = 5.0
-    pivots: float = 30.0
-    collinear: float = 10.0
-    point_cls: float = 2.0
-    semantic: float = 3.0
-    end_weight: float = 5.0
-    none_weight: float = 0.5
-    between_weight: float = 0.2
-    point_cls_per_line: bool = True
+    cls: float = 2.0  # class, of matching too
+    mask: float = 5.0  # masks of lines, of matching too
+    pivots: float = 30.0  # matched pivots, of the matching of sequences too
+    collinear: float = 10.0  # points between pivots
+    point_cls: float = 2.0  # kind of each point
+    semantic: float = 3.0  # masks of whole classes
+    end_weight: float = 5.0  # what ends weigh more than other pivots, of matching too
+    none_weight: float = 0.5  # predictions of no line in ``cls``
+    between_weight: float = 0.2  # points between pivots in ``point_cls``
+    point_cls_per_line: bool = True  # divide ``point_cls`` by the number of lines, as released
 
     @torch.no_grad()
     def match(self, cases: Sequence[Case]) -> list[Pairs]:
@@ -93,10 +80,7 @@ class PivotLosses:
         return [self.pairs(*case) for case in matched]
 
     def costs(self, case: Case) -> tuple[Tensor, ...]:
-        """Return what a case is matched by: two costs, differences of points, the pivots.
-
-        (2, n, K), |du| + |dv| (n, K, m, p), (K, m, 2), numbers (K,)
-        """
+        """Return two costs (2, n, K), |du| + |dv| (n, K, m, p), pivots (K, m, 2), numbers (K,)."""
         score = case.lines.logits.softmax(-1)[:, LINE, None].expand_as(case.apart)
         plain = torch.stack([-self.cls * score, self.mask * case.apart])
         pivots = case.truth.pivots
