@@ -7,7 +7,7 @@ import torch
 from mmengine.registry import init_default_scope
 from torch import Tensor, nn
 
-from gsmap.checkpoints.key_map import KeyMap
+from gsmap.checkpoints.key_rules import KeyMap
 from reference.golden import Golden
 from reference.report import Row, largest_difference
 
