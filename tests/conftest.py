@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import ctypes
 import os
 from pathlib import Path
 
@@ -9,6 +10,11 @@ import torch
 import gsmap  # noqa: F401 - before mmcv.ops, which may need its stand-in
 
 REPO = Path(__file__).resolve().parents[1]
+
+# glibc keeps freed blocks of up to 32 MB: gigabytes after a step of a large model. From here on
+# those of 1 MB and more go back to the system at once.
+if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
+    mallopt(-3, 1 << 20)  # M_MMAP_THRESHOLD
 
 
 @pytest.fixture(scope="session")

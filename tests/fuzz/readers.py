@@ -38,7 +38,6 @@ from gsmap.datasets.annotations.record import AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
-from gsmap.datasets.source import Source
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points
 from gsmap.engine.launch import check_config, read_config
 from gsmap.evaluation.match_files import SHARD_KIND as MATCHES
@@ -192,7 +191,7 @@ class Files:
 
         return Reader(path, read, (mutations.damaged_pickle,))
 
-    def recorded(self, read: Callable[[Path], Source]) -> Pictures:
+    def recorded(self, read: Callable[[Path], Any]) -> Pictures:
         """Read a recording and look at the images that it makes."""
         frames = self.out / "frames"
         shutil.rmtree(frames, ignore_errors=True)
@@ -220,9 +219,8 @@ class Files:
         return Reader(times if poses else path, read, damages)
 
     def image_of_folder(self) -> Reader:
-        path = self.put(
-            "calibration.yaml", yaml.safe_dump(contents.own_calibration(self.sample)).encode()
-        )
+        values = yaml.safe_dump(contents.own_calibration(self.sample))
+        path = self.put("calibration.yaml", values.encode())
         read = partial(self.recorded, partial(read_image_folder, path))
         image = self.work / self.sample.cameras[0].path
         return Reader(image, read, (mutations.damaged_bytes,))

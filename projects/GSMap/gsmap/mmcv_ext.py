@@ -60,36 +60,17 @@ def hard_voxelize_forward(
     voxel_num.fill_(len(found[0]))
 
 
-def modulated_deform_conv_forward(
-    images: Tensor,
-    weight: Tensor,
-    bias: Tensor,
-    _ones: Tensor,
-    offset: Tensor,
-    mask: Tensor,
-    output: Tensor,
-    _columns: Tensor,
-    **geometry: Any,
-) -> None:
+def modulated_deform_conv_forward(*tensors: Tensor, **geometry: Any) -> None:
     """Fill mmcv's output tensor."""
+    images, weight, bias, _ones, offset, mask, output, _columns = tensors
     output.copy_(_deform_conv((images, weight, bias, offset, mask), geometry))
 
 
-def modulated_deform_conv_backward(
-    images: Tensor,
-    weight: Tensor,
-    bias: Tensor,
-    _ones: Tensor,
-    offset: Tensor,
-    mask: Tensor,
-    _columns: Tensor,
-    *grads_and_grad_output: Tensor,
-    **geometry: Any,
-) -> None:
+def modulated_deform_conv_backward(*tensors: Tensor, **geometry: Any) -> None:
     """Fill mmcv's gradients of images, weight, bias, offset and mask."""
     import torch
 
-    *grads, grad_output = grads_and_grad_output
+    images, weight, bias, _ones, offset, mask, _columns, *grads, grad_output = tensors
     inputs = [t.detach().requires_grad_() for t in (images, weight, bias, offset, mask)]
     with torch.enable_grad():
         out = _deform_conv(inputs, geometry)

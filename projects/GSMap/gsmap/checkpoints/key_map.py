@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from gsmap.checkpoints.key_rules import KeyMap, pattern, rules_under, zeros_under
+from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
 
 _HEAD = "pts_bbox_head."
 _TRANSFORMER = "pts_bbox_head.transformer."
@@ -17,12 +17,12 @@ _OUR_ENCODER_LAYER = "bev_encoder.layers.{i}."
 _LAYER = "map_head.decoder.layers.{i}."
 
 _COMMON_RULES = (
-    *rules_under("", "", "img_backbone. img_neck."),
-    *rules_under(_HEAD, "map_head.", "instance_embedding. pts_embedding. cls_branches."),
-    *rules_under(_HEAD, "map_head.reference.", "reg_branches.=branches."),
-    *rules_under(_TRANSFORMER, "map_head.reference.", "reference_points.=initial."),
+    *rules_of("", "", "img_backbone. img_neck."),
+    *rules_of(_HEAD, "map_head.", "instance_embedding. pts_embedding. cls_branches."),
+    *rules_of(_HEAD, "map_head.reference.", "reg_branches.=branches."),
+    *rules_of(_TRANSFORMER, "map_head.reference.", "reference_points.=initial."),
 )
-_DECODER_RULES = rules_under(
+_DECODER_RULES = rules_of(
     _DECODER_LAYER,
     _LAYER,
     "attentions.0.attn.=self_attn. attentions.1.=cross_attn. ffns.0.=ffn. norms.",
@@ -30,13 +30,11 @@ _DECODER_RULES = rules_under(
 _BEV_QUERY_RULES = (
     *_COMMON_RULES,
     *_DECODER_RULES,
-    *rules_under(_HEAD, "bev_encoder.", "bev_embedding. positional_encoding."),
-    *rules_under(_TRANSFORMER, "bev_encoder.", "level_embeds cams_embeds can_bus_mlp."),
-    *rules_under(
-        _ENCODER_LAYER,
-        _OUR_ENCODER_LAYER,
-        "attentions.0.=self_attn. attentions.1.output_proj.=cross_attn.output_proj. ffns.0.=ffn. "
-        "norms.",
+    *rules_of(_HEAD, "bev_encoder.", "bev_embedding. positional_encoding."),
+    *rules_of(_TRANSFORMER, "bev_encoder.", "level_embeds cams_embeds can_bus_mlp."),
+    *rules_of(_ENCODER_LAYER, _OUR_ENCODER_LAYER, "attentions.0.=self_attn. ffns.0.=ffn. norms."),
+    *rules_of(
+        _ENCODER_LAYER, _OUR_ENCODER_LAYER, "attentions.1.output_proj.=cross_attn.output_proj."
     ),
 )
 _CODE_WEIGHTS = {_HEAD + "code_weights": torch.ones(4)}  # of box coordinates: a loss of weight 0
@@ -51,7 +49,7 @@ MAPTR_BEVFORMER = KeyMap(
     markers=((_DEFORMABLE, _OUR_ENCODER_LAYER + "cross_attn.sampling_offsets."),),
 )
 
-_MASK_RULES = rules_under(_HEAD, "map_head.aux_heads.", "seg_head.=seg. pv_seg_head.=pv_seg.")
+_MASK_RULES = rules_of(_HEAD, "map_head.aux_heads.", "seg_head.=seg. pv_seg_head.=pv_seg.")
 # the weight of the foreground in a mask loss, which the config says
 _MASK_WEIGHTS = {
     _HEAD + "loss_seg.loss_fn.pos_weight": torch.tensor((4.0,)),
@@ -83,7 +81,7 @@ MGMAP = KeyMap(
         _ACTIVATION,
         (_TRANSFORMER + "decoder.linear1.", "map_head.decoder.activation."),
         (_HEAD + "pts_embedding_.", "map_head.pts_embedding."),
-        *rules_under(
+        *rules_of(
             _ENHANCED,
             _NECK,
             "conv1.=stem.0. bn1.=stem.1. conv_1.conv.=fusion.0. conv_1.bn.=fusion.1. "
@@ -92,10 +90,10 @@ MGMAP = KeyMap(
         *(
             rule
             for block in _BLOCKS
-            for rule in rules_under(*block, "ca.fc.=gates.channel. sa.conv1.=gates.space.")
+            for rule in rules_of(*block, "ca.fc.=gates.channel. sa.conv1.=gates.space.")
         ),
         *_BLOCKS,
-        *rules_under(
+        *rules_of(
             _HEAD,
             "map_head.decoder.",
             "conv_2.conv.=segmentation.0. conv_2.bn.=segmentation.1. "
@@ -103,7 +101,7 @@ MGMAP = KeyMap(
             "change_channels.conv_basicblock.=mask_feature.block. "
             "process_net.conv_reduce.=mask_feature.reduce. ",
         ),
-        *rules_under(
+        *rules_of(
             _HEAD,
             "map_head.decoder.refinements.{i}.",
             "rcnn_net_{i}.=patch_net. rego_hs_linear_{i}.=memory.0. "
@@ -123,12 +121,12 @@ MGMAP = KeyMap(
 _LIFTED_RULES = (
     *_COMMON_RULES,
     *_MASK_RULES,
-    *rules_under(_ENCODER, "bev_encoder.", "depth_net. downsample."),
+    *rules_of(_ENCODER, "bev_encoder.", "depth_net. downsample."),
 )
 _LIFTED_UNUSED: dict[str, Tensor | None] = {
     **_CODE_WEIGHTS,
     # parts of the encoder with learned BEV queries, which depth lifting does not run
-    **zeros_under(
+    **zeros(
         _HEAD,
         {
             "positional_encoding.row_embed.weight": (200, 128),
@@ -155,7 +153,7 @@ MAPTRV2 = KeyMap(
     "maptrv2",
     (
         *_LIFTED_RULES,
-        *rules_under(
+        *rules_of(
             _DECODER_LAYER,
             _LAYER,
             "attentions.0.attn.=self_attn.instance_attn. attentions.1.attn.=self_attn.point_attn. "
@@ -169,7 +167,7 @@ MAPTRV2 = KeyMap(
 
 # The names are those of upstream since 2023-12-12. Before, upstream called the attention among
 # instances "intra" and the one within each "inter", and no key tells the two apart.
-_GEOMETRY_RULES = rules_under(
+_GEOMETRY_RULES = rules_of(
     _DECODER_LAYER + "attentions.0.", _LAYER + "self_attn.", "inter_=inter. intra_=intra."
 )
 GEMAP = KeyMap(
@@ -204,20 +202,20 @@ MGMAPNET = KeyMap(
         *_LIFTED_RULES,
         (_HEAD + "ins_seg_head.", "map_head.losses.ins_seg.embedding."),
         _DOWN_SAMPLING,
-        *rules_under(
+        *rules_of(
             _DECODER_LAYER + "attentions.1.p2p_attention.", _LAYER + "cross_attn.p2p.", _INTERACTION
         ),
-        *rules_under(
+        *rules_of(
             _DECODER_LAYER + "attentions.1.p2i_attention.", _LAYER + "cross_attn.p2i.", _INTERACTION
         ),
-        *rules_under(
+        *rules_of(
             _DECODER_LAYER + "attentions.1.",
             _LAYER + "cross_attn.",
             "point_pos.=point_code. instance_pos.=instance_code. output_proj_point.=output_proj. "
             "point2ins_proj.=instance_mlp.",
         ),
         *_DECODER_RULES,
-        *rules_under(
+        *rules_of(
             _DECODER,
             _LAYER,
             "point_ffn.{i}.=point_ffn. point_norm.{i}.=point_norm. "
@@ -227,7 +225,7 @@ MGMAPNET = KeyMap(
     {
         **_LIFTED_UNUSED,
         _HEAD + "loss_seg.loss_fn.pos_weight": None,  # a loss that MGMapNet has not
-        **zeros_under(
+        **zeros(
             _HEAD,
             {
                 # the embedding of the points, which MGMapNet's queries do not use
@@ -240,7 +238,7 @@ MGMAPNET = KeyMap(
                 "bev_pv_seg_head.6.bias": (3,),
             },
         ),
-        **zeros_under(
+        **zeros(
             _DECODER,
             {
                 # the code of the first layer's reference, which adds the learned position instead
@@ -265,25 +263,25 @@ PIVOTNET = KeyMap(
     "pivotnet",
     (
         ("im_backbone.bkb.", "img_backbone."),
-        *rules_under(
+        *rules_of(
             _BEV + "encoder.layers.{i}.",
             "bev_encoder.source_layers.{i}.",
             f"self_attn.=attns.0. norm1.=norms.0. {_SAMPLING} norm2.=norms.1.",
         ),
-        *rules_under(
+        *rules_of(
             _BEV + "decoder.layers.{i}.",
             "bev_encoder.bev_layers.{i}.",
             f"self_attn.=attns.0. norm2.=norms.0. cross_attn.=attns.1. norm1.=norms.1. {_SAMPLING} "
             "norm3.=norms.2.",
         ),
-        *rules_under(
+        *rules_of(
             _BEV,
             "bev_encoder.",
             "input_proj. t2s_reference_points.=unseen_reference. "
             "src_pos_embed.{i}.pos_embed.=source_pos.{i}. "
             "tgt_pos_embed.pos_embed.=bev_pos. tgt_embed.pos_embed.=bev_embedding.",
         ),
-        *rules_under(
+        *rules_of(
             _POINTS + "transformer_",
             _LAYER,
             "cross_attention_layers.{i}.multihead_attn.=cross_attn. "
@@ -293,7 +291,7 @@ PIVOTNET = KeyMap(
             "ffn_layers.{i}.linear1.=ffn.layers.0.0. ffn_layers.{i}.linear2.=ffn.layers.1. "
             "ffn_layers.{i}.norm.=norms.2.",
         ),
-        *rules_under(
+        *rules_of(
             _POINTS,
             "map_head.decoder.",
             "query_feat=query.weight query_embed=query_pos.weight level_embed.=level. "
@@ -330,20 +328,20 @@ _Y, _X = torch.meshgrid(
 STREAMMAPNET = KeyMap(
     "streammapnet",
     (
-        *rules_under(_BACKBONE, "", "img_backbone. img_neck."),
-        *rules_under(_BACKBONE, "bev_encoder.", "bev_embedding. positional_encoding."),
-        *rules_under(_BACKBONE + "transformer.", "bev_encoder.", "level_embeds cams_embeds"),
-        *rules_under(
+        *rules_of(_BACKBONE, "", "img_backbone. img_neck."),
+        *rules_of(_BACKBONE, "bev_encoder.", "bev_embedding. positional_encoding."),
+        *rules_of(_BACKBONE + "transformer.", "bev_encoder.", "level_embeds cams_embeds"),
+        *rules_of(
             _STREAM_ENCODER,
             _OUR_ENCODER_LAYER,
             "attentions.0.=self_attn. attentions.1.output_proj.=cross_attn.output_proj. "
             "attentions.1.deformable_attention.=cross_attn. ffns.0.=ffn. norms.",
         ),
-        *rules_under("head.", "map_head.", "query_embedding.=instance_embedding. cls_branches."),
-        *rules_under("head.", "map_head.reference.", "reference_points_embed.=initial."),
-        *rules_under("head.", "map_head.reference.", "reg_branches.=branches."),
+        *rules_of("head.", "map_head.", "query_embedding.=instance_embedding. cls_branches."),
+        *rules_of("head.", "map_head.reference.", "reference_points_embed.=initial."),
+        *rules_of("head.", "map_head.reference.", "reg_branches.=branches."),
         (_STREAM_INPUT, "map_head.decoder.input_proj."),
-        *rules_under(
+        *rules_of(
             _STREAM_DECODER,
             _LAYER,
             "attentions.0.attn.=self_attn. attentions.1.=cross_attn. ffns.0.=ffn. norms.",
@@ -374,9 +372,8 @@ def is_upstream(keys: Iterable[str]) -> bool:
 def find_key_map(keys: Iterable[str]) -> KeyMap:
     """Return the map of the architecture that state keys, upstream's or ours, belong to."""
     keys = list(keys)
-    side = 0 if is_upstream(keys) else 1
+    upstream = is_upstream(keys)
     for key_map in KEY_MAPS:
-        patterns = [pattern(pair[side]) for pair in key_map.markers]
-        if all(any(pattern.match(key) for key in keys) for pattern in patterns):
+        if key_map.is_marked(keys, upstream):
             return key_map
     raise ValueError("the checkpoint holds no weights.")

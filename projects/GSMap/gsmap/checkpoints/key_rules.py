@@ -1,7 +1,7 @@
-"""How the state keys of an earlier system and ours correspond, read in both directions."""
+"""Rules between the state keys of an earlier system and ours, read in both directions."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -33,6 +33,11 @@ class KeyMap:
     markers: Rules = (("", ""),)
     idle: str = "(?!)"
 
+    def is_marked(self, keys: Collection[str], upstream: bool) -> bool:
+        """Return whether keys, upstream's or ours, tell this architecture."""
+        patterns = [_pattern(pair[0 if upstream else 1]) for pair in self.markers]
+        return all(any(pattern.match(key) for key in keys) for pattern in patterns)
+
     def is_unused(self, key: str) -> bool:
         """Return whether an upstream key has no counterpart."""
         return key in self.unused or re.match(self.idle, key) is not None
@@ -46,7 +51,7 @@ class KeyMap:
         return _rename(key, tuple((ours, upstream) for upstream, ours in self.rules))
 
 
-def pattern(template: str) -> re.Pattern[str]:
+def _pattern(template: str) -> re.Pattern[str]:
     """Compile a key prefix in which ``{i}`` stands for a number."""
     return re.compile(r"(\d+)".join(re.escape(part) for part in template.split(_NUMBER)))
 
@@ -54,19 +59,25 @@ def pattern(template: str) -> re.Pattern[str]:
 def _rename(key: str, rules: Rules) -> str | None:
     """Replace the prefix of ``key`` by the first rule that fits."""
     for source, target in rules:
-        if match := pattern(source).match(key):
+        if match := _pattern(source).match(key):
             for number in match.groups():
                 target = target.replace(_NUMBER, number, 1)
             return target + key[match.end() :]
     return None
 
 
-def rules_under(upstream: str, ours: str, names: str) -> Rules:
-    """Return rules for names under a prefix on either side: ``theirs=ours``, or one for both."""
+def rules_of(upstream: str, ours: str, names: str) -> Rules:
+    """Return rules for several names.
+
+    Args:
+        upstream: What upstream's keys begin with.
+        ours: What our keys begin with.
+        names: What follows, with blanks between: ``theirs=ours``, or one for both.
+    """
     pairs = (name.partition("=") for name in names.split())
     return tuple((upstream + theirs, ours + (own or theirs)) for theirs, _, own in pairs)
 
 
-def zeros_under(prefix: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
+def zeros(prefix: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
     """Return zeros for parameters without effect on any output; they take no memory."""
     return {prefix + key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}

@@ -174,14 +174,13 @@ class MapHead(DetectionHead):
                     f"query group {group.name!r} names losses {unknown}; there are {names}."
                 )
         check_classes("masks.filled_classes", self.masks.filled_classes, self.classes)
-        for part in (*self.losses.values(), *self.assigner.match_costs):
-            if isinstance(part, (MapLoss, MapCost)):
-                part.check(self)
-        for part in self.losses.values():
-            check_weight(part, cast(MapLoss, part).loss_weight, self.classes)
-        for part in self.assigner.match_costs:
-            if isinstance(part, MapCost):
-                check_weight(part, part.weight, self.classes)
+        for loss in cast(Any, self.losses.values()):
+            loss.check(self)
+            check_weight(loss, loss.loss_weight, self.classes)
+        for cost in self.assigner.match_costs:
+            if isinstance(cost, MapCost):
+                cost.check(self)
+                check_weight(cost, cost.weight, self.classes)
 
     def init_weights(self) -> None:
         """Initialise the decoder's matrices (Xavier) and let every class start improbable."""
@@ -330,17 +329,14 @@ class MapHead(DetectionHead):
         return GroundTruth(samples)
 
     def match(
-        self,
-        predictions: Predictions,
-        truths: GroundTruth,
-        metas: Metas,
-        repeats: int = 1,
+        self, predictions: Predictions, truths: GroundTruth, metas: Metas, repeats: int = 1
     ) -> MatchedPairs:
         """Match every sample's predictions of one layer with its ground truth."""
-        matches = []
-        for index, (truth, meta) in enumerate(zip(truths.samples, metas, strict=True)):
-            sample = SamplePredictions(predictions, index)
-            matches.append(self.assigner.assign(sample, truth, meta, repeats))
+        samples = zip(truths.samples, metas, strict=True)
+        matches = [
+            self.assigner.assign(SamplePredictions(predictions, index), truth, meta, repeats)
+            for index, (truth, meta) in enumerate(samples)
+        ]
         return MatchedPairs(predictions, truths, matches)
 
     def layer_losses(self, group: QueryGroup, pairs: MatchedPairs, is_last: bool) -> Tensors:
