@@ -21,6 +21,7 @@ COMMANDS = {
     "raster": "raster",
     "shape": "shape",
     "step": "step",
+    "stream": "stream",
 }
 
 

@@ -20,8 +20,8 @@ from gsmap.models.maptr.pairs import SamplePredictions
 from gsmap.models.streammapnet.attention import LinePointAttention
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.memory import StreamMemory
-from gsmap.models.streams.past import Past
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.past import Past
 from gsmap.structures.rigid import rigid
 from gsmap.structures.streams import Frame
 from reference.golden import Golden

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from gsmap.models.gsmap.memory import COVARIANCES, GaussianMemory
 from gsmap.models.streams.memory import StreamMemory
-from gsmap.models.streams.past import Past
 from gsmap.structures.gaussians import covariances
+from gsmap.structures.past import Past
 from gsmap.structures.rigid import invert_rigid, rigid
 
 FUSED = {"type": "GaussianMemory", "num": 2}

@@ -12,7 +12,7 @@ from model_cases import build_small, make_images, make_samples, straight_element
 
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.memory import StreamMemory, recalled
-from gsmap.models.streams.past import Past
+from gsmap.structures.past import Past
 from gsmap.structures.rigid import rigid
 from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamState
 
@@ -168,6 +168,36 @@ def test_a_standing_vehicle_keeps_its_memory_and_a_driving_one_moves_it():
     assert moved[:, :, -1].abs().max() < 1e-5  # nothing was seen there
     released = BEVMemory(ALONG_Y, embed_dims=16, end_points=True)
     assert (released.warp(feats, still) - feats).abs().max() > 0.1
+
+
+def test_channels_that_are_not_kept_are_those_of_now():
+    """The vehicle stands, so the memory lies where it was."""
+    memory = BEVMemory(ALONG_Y, embed_dims=16, kept_dims=4)
+    before, now = features(0), features(1)
+    kept = memory.kept(before)
+    torch.testing.assert_close(kept, before[:, :4])
+    still = torch.eye(4, dtype=torch.float64)[None], torch.ones(1), torch.ones(1, dtype=torch.bool)
+    found = memory(now, Past({"bev_feats": kept}, *still))
+    memory.kept_dims = None
+    joined = torch.cat([kept, now[:, 4:]], 1)
+    expected = memory(now, Past({"bev_feats": joined}, *still))
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    assert not torch.allclose(found, memory(now, Past({"bev_feats": before}, *still)))
+
+
+def test_half_a_state_keeps_the_places_exact():
+    head, memory = with_memory()
+    whole = [step(head, memory, meta(n), feats=features(n)) for n in range(2)]
+    values = memory.streams.states["a"].values
+    assert {name: value.dtype for name, value in values.items()} == dict.fromkeys(
+        ("bev_feats", "queries_0", "queries_1", "references"), torch.float32
+    )
+    memory.eval().half = True
+    halved = [step(head, memory, meta(n), feats=features(n)) for n in range(2)]
+    assert torch.equal(halved[0], whole[0])
+    assert 0 < (halved[1] - whole[1]).abs().max() < 1e-3  # of the map's sides
+    kinds = [value.dtype for value in memory.streams.states["a"].values.values()]
+    assert kinds == [torch.float16] * 3 + [torch.float32]
 
 
 def test_references_move_with_the_vehicle():

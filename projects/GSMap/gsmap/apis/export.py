@@ -11,9 +11,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from gsmap.apis.onnx_inferencer import CAN_BUS_RULE, FORMAT, METADATA_KEY, OnnxInferencer
+from gsmap.apis.onnx_inferencer import (
+    CAN_BUS_RULE,
+    FORMAT,
+    MEMORY,
+    METADATA_KEY,
+    OF_STREAM,
+    OnnxInferencer,
+)
 from gsmap.structures.calibration import NUM_CAN_BUS, OF_ONE_FRAME
 from gsmap.structures.elements import MapElements
+from gsmap.structures.past import Past
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import write_bytes
 
@@ -23,8 +31,11 @@ OPSET = 18
 class ExportedDetector(nn.Module):
     """A `MapDetector` of cameras as a function of tensors alone, for one sample.
 
+    With memory it is one step of a stream: what the frame before has left is further inputs, and
+    what this one leaves further outputs.
+
     Raises:
-        ValueError: If the model reads LiDAR or has memory.
+        ValueError: If the model reads LiDAR.
     """
 
     def __init__(self, model: Any) -> None:
@@ -34,49 +45,80 @@ class ExportedDetector(nn.Module):
                 "only models of cameras can be exported: voxels of LiDAR have no ONNX operator. "
                 "Give a config without lidar_encoder."
             )
-        if model.temporal is not None:
-            raise ValueError(
-                "models with memory cannot be exported: the file would forget each frame. Give a "
-                "config without temporal, and a checkpoint trained so."
-            )
         self.model = model
-        self.input_names = ("images", *model.bev_encoder.calibration)
+        of_stream = () if model.temporal is None else OF_STREAM
+        self.input_names = ("images", *model.bev_encoder.calibration, *of_stream)
         self.output_names = ("scores", "labels", "points", *model.map_head.reference.outputs[1:])
+        self.memory: tuple[str, ...] = ()  # names of what is remembered, after `example_inputs`
 
-    def forward(self, images: Tensor, *calibration: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, images: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Find the best map elements, wherever they lie.
 
         Args:
             images: Pixel values as the data pipeline leaves them: 0 to 255, not normalised, not
                 padded. (V, 3, H, W)
-            calibration: What the BEV encoder reads, ``input_names[1:]``. (V, 4, 4) or (18,)
+            inputs: ``input_names[1:]``: what the BEV encoder reads, (V, 4, 4) or (18,). With
+                memory also the motion since the frame before (4, 4), which takes metres then to
+                metres now, its seconds (1,), whether the stream continues, 1 or 0 (1,), and what
+                that frame has left.
 
         Returns:
             Scores (M,), labels (M,), points in metres (M, P, 2 or 3), and with Gaussians scales in
             metres (M, P, 2) and rotations in radians (M, P), with PivotNet the number of points
-            that count (M,); best first.
+            that count (M,); best first. With memory also what this frame leaves.
         """
+        elements, left = self.step(images, dict(zip(self.input_names[1:], inputs, strict=True)))
+        return (*elements, *left.values())
+
+    def step(
+        self, images: Tensor, given: dict[str, Tensor]
+    ) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
+        """Return the map elements of a frame, and what it leaves, by name."""
         # a tensor of four axes is normalised and padded image by image
         images = self.model.data_preprocessor({"inputs": {"img": images}})["inputs"]["imgs"]
         feats = self.model.bev_encoder.levels(self.model.extract_img_feats(images[None]))
-        given = dict(zip(self.input_names[1:], calibration, strict=True))
         if "can_bus" in given:  # `without_history`
             given["can_bus"] = nn.functional.pad(given["can_bus"][OF_ONE_FRAME], (3, 1))
         named = {name: value[None] for name, value in given.items()}
-        head = self.model.map_head
-        outputs = head(self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:])))
-        best = head.coder.best(outputs[-1].scores[0])
-        fields = head.detected(head.reference.decode(outputs[-1].references[0]), best)
-        names = ("pts", *self.output_names[3:])
-        return (best.scores, best.labels, *(fields[name] for name in names))
+        head, temporal = self.model.map_head, self.model.temporal
+        outputs = self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:]))
+        if temporal is not None:
+            memory = {name: named[f"{MEMORY}{name}"] for name in self.memory}
+            motion, seconds, continues = (named[name] for name in OF_STREAM)
+            outputs = temporal.enter(outputs, Past(memory, motion, seconds[0], continues[0] > 0.5))
+        predictions = head(outputs)
+        best = head.coder.best(predictions[-1].scores[0])
+        fields = head.detected(head.reference.decode(predictions[-1].references[0]), best)
+        names = ("pts", *head.reference.outputs[1:])
+        elements = (best.scores, best.labels, *(fields[name] for name in names))
+        left = {} if temporal is None else temporal.left(outputs)
+        return elements, {name: value[0] for name, value in left.items()}
 
+    @torch.no_grad()
     def example_inputs(self, num_cams: int, image_size: tuple[int, int]) -> tuple[Tensor, ...]:
-        """Return inputs of the right shapes: black images of cameras at the origin."""
-        calibration = (  # a tensor of its own for each: torch takes one tensor for one input
-            torch.zeros(NUM_CAN_BUS) if name == "can_bus" else torch.eye(4).repeat(num_cams, 1, 1)
+        """Return inputs of the right shapes: black images of cameras at the origin.
+
+        With memory, a first frame says what it is, which sets ``memory`` and all names.
+        """
+        special = {
+            "can_bus": torch.zeros(NUM_CAN_BUS),
+            "now_from_then": torch.eye(4),
+            "seconds": torch.zeros(1),
+            "continues": torch.zeros(1),
+        }
+        given = {  # a tensor of its own for each: torch takes one tensor for one input
+            name: special.get(name, torch.eye(4).repeat(num_cams, 1, 1))
             for name in self.input_names[1:]
-        )
-        return torch.zeros(num_cams, 3, *image_size), *calibration
+            if not name.startswith(MEMORY)
+        }
+        images = torch.zeros(num_cams, 3, *image_size)
+        if self.model.temporal is not None and not self.memory:
+            _, left = self.step(images, dict(given))
+            self.memory = tuple(left)
+            given |= {f"{MEMORY}{name}": torch.zeros_like(value) for name, value in left.items()}
+            self.input_names = ("images", *given)
+            self.output_names += tuple(f"new_{MEMORY}{name}" for name in left)
+        return images, *given.values()
 
 
 def export_onnx(
@@ -97,8 +139,8 @@ def export_onnx(
 
     Raises:
         RuntimeError: If the packages of the extra ``onnx`` are not installed.
-        ValueError: If the model reads LiDAR or has memory, has another number of cameras, or does
-            something for which ONNX has no operator.
+        ValueError: If the model reads LiDAR, has another number of cameras, or does something for
+            which ONNX has no operator.
     """
     onnx = import_extra("onnx", "onnx")
     import_extra("onnxscript", "onnx")  # what torch's exporter is written with
@@ -136,6 +178,8 @@ def export_onnx(
     }
     if "can_bus" in exported.input_names:
         metadata["can_bus"] = CAN_BUS_RULE
+    if model.temporal is not None:
+        metadata["max_gap_s"] = model.temporal.max_gap_s
     onnx.helper.set_model_props(proto, {METADATA_KEY: json.dumps(metadata)})
     onnx.checker.check_model(proto)
     write_bytes(out, proto.SerializeToString())
@@ -218,14 +262,20 @@ def graph_inputs(
         dataset: Data set with the test pipeline.
         indices: Samples of the data set.
 
+    With memory the samples of a scene continue each other, in their order.
+
     Raises:
         ValueError: If images or matrices are not those of the file's cameras.
     """
+    streams = inferencer.new_scenes() if inferencer.has_memory else None
     for index in indices:
         packed = dataset[index]
         images = packed["inputs"]["img"].permute(0, 2, 3, 1).numpy()  # (V, H, W, 3)
         meta = packed["data_samples"].metainfo
-        yield meta["token"], inferencer.prepare(images, meta)
+        inputs = inferencer.prepare(images, meta, streams)
+        yield meta["token"], inputs
+        if streams is not None:
+            inferencer.remember(streams, meta, inferencer.run(inputs))
 
 
 def largest_differences(found: MapElements, expected: MapElements) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.elements import MapElements
+from gsmap.structures.streams import Frame, MapStream, Scenes, StreamState
 from gsmap.utils.extras import import_extra
 
 METADATA_KEY = "gsmap"
@@ -18,6 +19,9 @@ FORMAT = 1
 CAN_BUS_RULE = (
     "the 18 values of a sample's record; the graph itself sets entries 0 to 2 and 17 to zero"
 )
+OF_STREAM = ("now_from_then", "seconds", "continues")  # inputs of a model with memory
+MEMORY = "memory_"  # how its further inputs start; what replaces them has new_ besides
+_PRECISIONS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _OUTPUTS = {"scores", "labels", "points"}
 
 
@@ -70,10 +74,16 @@ class OnnxInferencer:
                 raise ValueError("another format")
             _check_metadata(self.metadata)
             self._outputs = [value.name for value in self.session.get_outputs()]
-            images, *calibration = self.session.get_inputs()
+            images, *others = self.session.get_inputs()
             shape = [len(self.metadata["cameras"]), 3, *self.metadata["image_size"]]
             if images.shape != shape or not set(self._outputs) >= _OUTPUTS:
                 raise ValueError("its graph is not the one that its metadata tell of")
+            memory = [value for value in others if value.name.startswith(MEMORY)]
+            self._empty = {
+                value.name: np.zeros(value.shape, _PRECISIONS[value.type]) for value in memory
+            }
+            if self.has_memory != bool(memory):
+                raise ValueError("its graph and its metadata do not agree on a memory")
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(
                 f"{path} does not say that tools/export.py of this version wrote it ({error!r}): "
@@ -82,10 +92,32 @@ class OnnxInferencer:
         self.classes: tuple[str, ...] = tuple(self.metadata["classes"])
         self.cameras: tuple[str, ...] = tuple(self.metadata["cameras"])
         self.image_size: tuple[int, int] = tuple(self.metadata["image_size"])
-        self._calibration = [value.name for value in calibration]
+        names = [value.name for value in others]
+        self._calibration = [n for n in names if n not in (*self._empty, *OF_STREAM)]
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the model remembers the frames before."""
+        return "max_gap_s" in self.metadata
+
+    def new_stream(self) -> MapStream:
+        """Return the empty memory of one drive, for calls; ValueError if the file has no memory."""
+        if not self.has_memory:
+            raise ValueError(f"{self.path.name} has no memory: leave the stream out.")
+        return MapStream(self.metadata["max_gap_s"])
+
+    def new_scenes(self) -> Scenes:
+        """Return empty memories of several scenes, as `new_stream`."""
+        return Scenes(self.new_stream().max_gap_s)
 
     def __call__(
-        self, images: Sequence[NDArray[Any]] | NDArray[Any], meta: Mapping[str, Any]
+        self,
+        images: Sequence[NDArray[Any]] | NDArray[Any],
+        meta: Mapping[str, Any],
+        stream: Scenes | None = None,
     ) -> MapElements:
         """Find the map elements of one sample.
 
@@ -97,18 +129,28 @@ class OnnxInferencer:
                 ``cam2img`` of the original images, ``img_aug_matrix`` (V, 4, 4) from those to
                 these, and ``lidar2ego`` (4, 4). GKT and BEVFormer read
                 ``can_bus`` (18,), as a record has it; zeros if the model was trained without it.
+                With memory also ``scene``, ``timestamp_ns`` and ``lidar2global`` (4, 4), from the
+                annotation frame to the world.
+            stream: With memory, that of the drive (`new_stream`); it is brought forward.
 
         Returns:
             The elements, best first, with their scores and, if the model has them, Gaussians.
 
         Raises:
             ValueError: If images or matrices are not those of the file's cameras, or a matrix is
-                missing.
+                missing; with memory, if there is no stream, or the frame does not follow its last.
         """
-        return self.elements(self.run(self.prepare(images, meta)))
+        outputs = self.run(self.prepare(images, meta, stream))
+        elements = self.elements(outputs)
+        if stream is not None:
+            self.remember(stream, meta, outputs)
+        return elements
 
     def prepare(
-        self, images: Sequence[NDArray[Any]] | NDArray[Any], meta: Mapping[str, Any]
+        self,
+        images: Sequence[NDArray[Any]] | NDArray[Any],
+        meta: Mapping[str, Any],
+        stream: Scenes | None = None,
     ) -> dict[str, NDArray[np.float32]]:
         """Return the inputs of the graph; arguments and errors as of a call."""
         self._check_images(images)
@@ -127,7 +169,37 @@ class OnnxInferencer:
                 )
         stacked = np.stack([np.asarray(image) for image in images])
         pixels = np.ascontiguousarray(stacked.transpose(0, 3, 1, 2), dtype=np.float32)
+        if self.has_memory or stream is not None:
+            inputs |= self._of_stream(meta, stream)
         return {"images": pixels, **inputs}
+
+    def _of_stream(self, meta: Mapping[str, Any], stream: Scenes | None) -> dict[str, Any]:
+        """Return what the frame before has left, and the motion since."""
+        if stream is None or not self.has_memory:
+            self.new_stream()  # says so if there is no memory
+            raise ValueError(
+                f"{self.path.name} remembers the frames of a drive: give the call its stream, "
+                "which new_stream() starts."
+            )
+        stream.claim(self)
+        frame = Frame.of(meta)
+        (before,) = stream.previous([frame])
+        if before is None:
+            before = StreamState(frame, self._empty)
+        of_stream = (
+            frame.motion_from(before.frame),
+            [frame.seconds_after(before.frame)],
+            [float(before.values is not self._empty)],
+        )
+        arrays = (np.asarray(values, np.float32) for values in of_stream)
+        return {**dict(zip(OF_STREAM, arrays, strict=True)), **before.values}
+
+    def remember(
+        self, stream: Scenes, meta: Mapping[str, Any], outputs: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """Bring a stream forward by a frame whose outputs `run` has returned."""
+        left = {name: outputs[f"new_{name}"] for name in self._empty}
+        stream.keep([StreamState(Frame.of(meta), left)])
 
     def _check_images(self, images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
         """Raise if the images are not those of the file's cameras."""
@@ -184,7 +256,11 @@ class OnnxInferencer:
             keep = ((points >= low - margin) & (points <= high + margin)).all((1, 2))
         if threshold is not None:
             keep &= outputs["scores"] > threshold
-        kept = {name: values[keep] for name, values in outputs.items()}
+        kept = {
+            name: values[keep]
+            for name, values in outputs.items()
+            if not name.startswith(f"new_{MEMORY}")
+        }
         if not np.isin(kept["labels"], range(len(self.classes))).all():
             raise ValueError(f"a label is none of the {len(self.classes)} classes")
         points, numbers = kept.pop("points"), kept.pop("num_pts", None)
@@ -212,3 +288,5 @@ def _check_metadata(metadata: Mapping[str, Any]) -> None:
     for name in ("margin_m", "score_threshold"):
         if metadata[name] is not None and not np.isfinite(metadata[name]):
             raise ValueError(f"{name} must be a number, got {metadata[name]!r:.80}")
+    if not 0 < metadata.get("max_gap_s", 1.0) < np.inf:
+        raise ValueError(f"max_gap_s must be seconds > 0, got {metadata['max_gap_s']!r:.80}")

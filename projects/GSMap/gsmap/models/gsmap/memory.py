@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.models.maptr.head import MapHead
-from gsmap.models.streams.past import Past
 from gsmap.models.streams.query_memory import QueryMemory
 from gsmap.structures.gaussians import fused_gaussians, moved_gaussians
+from gsmap.structures.past import Past
 
 COVARIANCES = ("points", "moved", "fused")
 

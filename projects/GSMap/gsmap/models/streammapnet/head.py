@@ -21,8 +21,8 @@ class BestClassCoder(MapCoder):
     def best(self, scores: Tensor) -> Detections:
         """Return the best class of each query, best query first. (N, classes)"""
         best, labels = scores.float().sigmoid().max(-1)
-        order = best.argsort(descending=True, stable=True)[: self.max_num]
-        return Detections(best[order], labels[order], order)
+        first, order = best.topk(min(self.max_num, len(best)))
+        return Detections(first, labels[order], order)
 
 
 @MODELS.register_module()

@@ -5,8 +5,8 @@ import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.streams.past import Past
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.past import Past
 
 
 @MODELS.register_module()

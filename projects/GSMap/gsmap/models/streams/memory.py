@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.streams.bev_memory import BEVMemory
-from gsmap.models.streams.past import Past
 from gsmap.models.streams.query_memory import Propagation, QueryMemory
+from gsmap.structures.past import Past
 from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamState
 
 _EXACT = ("references", "targets")  # half precision would move a point by centimetres

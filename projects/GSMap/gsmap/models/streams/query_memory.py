@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from gsmap.models.maptr.decoder import Queries
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.pairs import MatchedPairs
-from gsmap.models.streams.past import Past
+from gsmap.structures.past import Past
 
 _POSE = 12  # the first three rows of a motion
 
