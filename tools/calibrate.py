@@ -47,6 +47,7 @@ def main() -> str:
     from gsmap.checkpoints.reading import adopt_settings, read_checked
     from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
     from gsmap.engine.launch import read_config
+    from gsmap.models.gsmap.head import GSMapHead
 
     cfg, source = read_config(args.config), read_checked(args.checkpoint)
     with building(cfg):
@@ -56,10 +57,12 @@ def main() -> str:
                 f"{args.checkpoint} is calibrated already: give the checkpoint that it was made of."
             )
         classes = tuple(cfg.model.classes)
+        model = MODELS.build(cfg.model)
+        if not isinstance(model.map_head, GSMapHead):
+            raise ValueError(f"{args.config} has no Gaussians: its head is no GSMapHead.")
         pairs = SamplePairs(args.results, args.ground_truth, classes, True, gaussians=True)
         factors = fitted_factors(matched_vertices(pairs, ChamferConfig(classes)), classes)
         cfg.model.map_head.temperatures = factors.round(4).tolist()
-        MODELS.build(cfg.model)  # refuses heads without Gaussians
     meta = {MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())), SIGNALS: source.can_bus}
     if source.image_size:
         meta[IMAGE_SIZE] = source.image_size

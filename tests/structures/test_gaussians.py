@@ -7,9 +7,9 @@ from gsmap.structures.gaussians import (
     Gaussians,
     GaussianSpace,
     extents_along_line,
+    gaussians_along,
     line_errors,
     stretched,
-    gaussians_along,
 )
 from gsmap.structures.grid import BEVGrid
 

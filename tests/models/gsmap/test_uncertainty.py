@@ -57,8 +57,9 @@ def test_a_pair_that_is_no_detection_does_not_count():
 
 def test_learning_the_errors_changes_no_point_and_no_rendered_gaussian():
     """One step with the loss and one without: all weights but those of the errors are equal."""
-    with_loss, without = build_head(GSMAP, **ERRORS), build_head(
-        GSMAP, **{**ERRORS, "losses": HEAD["losses"]}
+    with_loss, without = (
+        build_head(GSMAP, **ERRORS),
+        build_head(GSMAP, **{**ERRORS, "losses": HEAD["losses"]}),
     )
     without.load_state_dict(with_loss.state_dict())
     losses = train_a_step(with_loss, LANES)

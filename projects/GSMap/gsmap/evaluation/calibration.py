@@ -4,6 +4,7 @@ Errors and sigmas are taken along and across the line (`gsmap.structures.gaussia
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -89,7 +90,7 @@ def _of_sample(
 
 
 def reliability(errors: FloatArray, sigmas: FloatArray) -> FloatArray:
-    """Return the share of errors in the central interval of each of ``LEVELS``. 2 x (n,) -> (19,)"""
+    """Return the share of errors in the interval of each of ``LEVELS``. 2 x (n,) -> (19,)"""
     widths = stats.norm.ppf((1 + LEVELS) / 2)
     return np.searchsorted(np.sort(errors / sigmas), widths, side="right") / len(errors)
 
@@ -149,11 +150,9 @@ def uncertainty_report(
     for name, labels in groups.items():
         own = vertices.of(np.isin(vertices.labels, labels))
         parts = {name: own}
-        for low, high in zip(DISTANCES_M, DISTANCES_M[1:], strict=False):
-            rows = (low <= own.distances) & (own.distances < high)
-            parts[f"{name}/{low:g}m+" if high == np.inf else f"{name}/{low:g}-{high:g}m"] = own.of(
-                rows
-            )
+        for low, high in pairwise(DISTANCES_M):
+            title = f"{low:g}m+" if high == np.inf else f"{low:g}-{high:g}m"
+            parts[f"{name}/{title}"] = own.of((low <= own.distances) & (own.distances < high))
         for part, chosen in parts.items():
             figures = uncertainty_figures(chosen) if len(chosen.labels) else {}
             metrics |= {f"uncertainty/{part}/{key}": value for key, value in figures.items()}
@@ -166,12 +165,15 @@ def format_uncertainty(metrics: Mapping[str, float]) -> str:
     names = [key.removesuffix(end) for key in metrics if key.endswith(end)]
     wide = max((len(name) for name in names), default=0) + 1 - len("uncertainty/")
     titles = "".join(title.rjust(9) for _, title in _COLUMNS)
-    rows = [f"{'Gaussians of matched vertices':<{wide + 8}}{titles} vertices"]
+    first = f"{'Gaussians of matched vertices':<{wide + 8}}"
+    rows = [f"{first}{titles} vertices"]
     for name in names:
         for axis in AXES:
             cells = "".join(f"{metrics[f'{name}/{axis}/{key}']:9.3f}" for key, _ in _COLUMNS)
             label = f"{name.removeprefix('uncertainty/'):<{wide}} {axis:<7}"
-            rows.append(f"{label:<{len(rows[0]) - len(titles) - 9}}{cells} {metrics[name + end]:8.0f}")
+            rows.append(
+                f"{label:<{len(rows[0]) - len(titles) - 9}}{cells} {metrics[name + end]:8.0f}"
+            )
     return "\n".join(rows)
 
 

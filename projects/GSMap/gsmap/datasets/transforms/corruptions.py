@@ -7,6 +7,7 @@ seed and token alone, and a severer one is the same one, stronger.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -196,8 +197,7 @@ class DelayCameras(BaseTransform):
         file = self._file
         columns = (file.column(name) for name in ("scene", "timestamp_ns", "token"))
         order = sorted((*entry, row) for row, entry in enumerate(zip(*columns, strict=True)))
-        pairs = zip(order, order[1:], strict=False)
-        return {late[2]: early[3] for early, late in pairs if early[0] == late[0]}
+        return {late[2]: early[3] for early, late in pairwise(order) if early[0] == late[0]}
 
     @cached_property
     def _file(self) -> AnnotationFile:

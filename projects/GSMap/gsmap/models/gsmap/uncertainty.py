@@ -1,4 +1,4 @@
-"""How far off a predicted vertex may be: Gaussians of its error, and the loss that they learn by."""
+"""How far off a predicted vertex may be: Gaussians of its error, and their loss."""
 
 from typing import Any, cast
 
