@@ -37,7 +37,7 @@ def test_a_line_beside_the_true_one_by_hand():
     y = np.linspace(-10, 10, 5)
     line = np.column_stack([np.full(5, 4.0), y])
     found = MapElements.from_polylines(
-        [line + (0.3, 0.0), line + (5.0, 0.0)],
+        [np.add(line, [0.3, 0.0]), np.add(line, [5.0, 0.0])],
         [0, 0],
         [0.9, 0.8],
         [np.tile([0.5, 0.2], (5, 1))] * 2,
