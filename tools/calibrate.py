@@ -47,7 +47,6 @@ def main() -> str:
     from gsmap.checkpoints.reading import adopt_settings, read_checked
     from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
     from gsmap.engine.launch import read_config
-    from gsmap.models.gsmap.head import GSMapHead
 
     cfg, source = read_config(args.config), read_checked(args.checkpoint)
     with building(cfg):
@@ -58,8 +57,8 @@ def main() -> str:
             )
         classes = tuple(cfg.model.classes)
         model = MODELS.build(cfg.model)
-        if not isinstance(model.map_head, GSMapHead):
-            raise ValueError(f"{args.config} has no Gaussians: its head is no GSMapHead.")
+        if "scales" not in model.map_head.reference.outputs:
+            raise ValueError(f"{args.config} has no Gaussians: give a config of GSMap.")
         pairs = SamplePairs(args.results, args.ground_truth, classes, True, gaussians=True)
         factors = fitted_factors(matched_vertices(pairs, ChamferConfig(classes)), classes)
         cfg.model.map_head.temperatures = factors.round(4).tolist()
