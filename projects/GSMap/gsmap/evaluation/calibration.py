@@ -13,7 +13,7 @@ from scipy import stats
 from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.evaluation.evaluator import Sample
 from gsmap.evaluation.report import MetricReport
-from gsmap.structures.elements import FloatArray, IntArray, MapElements
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import equivalent_orders
 
 AXES = ("along", "across")
@@ -39,9 +39,10 @@ class Vertices(NamedTuple):
     sigmas: FloatArray
     distances: FloatArray
 
-    def of(self, rows: FloatArray | IntArray) -> "Vertices":
+    def of(self, rows: IntArray | BoolArray) -> "Vertices":
         """Return some of the vertices, by their places or a mask."""
-        return Vertices(*(values[rows] for values in self))
+        labels, errors, sigmas, distances = self
+        return Vertices(labels[rows], errors[rows], sigmas[rows], distances[rows])
 
 
 def matched_vertices(samples: Iterable[Sample], config: ChamferConfig) -> Vertices:
@@ -57,14 +58,17 @@ def matched_vertices(samples: Iterable[Sample], config: ChamferConfig) -> Vertic
     parts = [part for sample in samples for part in _of_sample(*sample, config)]
     if not parts:
         raise ValueError("no prediction matches: there is no vertex to measure.")
-    return Vertices(*map(np.concatenate, zip(*parts, strict=True)))
+    labels, errors, sigmas, distances = map(np.concatenate, zip(*parts, strict=True))
+    return Vertices(labels, errors, sigmas, distances)
 
 
 def _of_sample(
     token: str, found: MapElements, truth: MapElements, config: ChamferConfig
 ) -> Iterator[Vertices]:
     """Yield the vertices of each prediction that matches."""
-    if len(found) and not found.has_gaussians:
+    if not len(found):
+        return
+    if found.scales is None or found.rotations is None:
         raise ValueError(
             f"sample {token!r} has predictions without Gaussians: predict with a model that has "
             "them, such as GSMap."
@@ -115,7 +119,7 @@ def uncertainty_figures(vertices: Vertices) -> dict[str, float]:
     ``sparsification_error``: how much larger than with the true order the mean error is while the
     vertices of the largest sigmas are taken away, as a share of the mean error of all.
     """
-    figures = {}
+    figures: dict[str, float] = {}
     for axis, name in enumerate(AXES):
         errors, sigmas = vertices.errors[:, axis], vertices.sigmas[:, axis]
         apart = sparsification(errors, sigmas) - sparsification(errors, errors)
@@ -146,7 +150,7 @@ def uncertainty_report(
     """
     lines = [label for label, name in enumerate(classes) if name not in areas]
     groups = {name: [label] for label, name in enumerate(classes)} | {"line": lines}
-    metrics = {}
+    metrics: dict[str, float] = {}
     for name, labels in groups.items():
         own = vertices.of(np.isin(vertices.labels, labels))
         parts = {name: own}
