@@ -56,10 +56,12 @@ def main() -> str:
                 f"{args.checkpoint} is calibrated already: give the checkpoint that it was made of."
             )
         classes = tuple(cfg.model.classes)
+        model = MODELS.build(cfg.model)
+        if "scales" not in model.map_head.reference.outputs:
+            raise ValueError(f"{args.config} has no Gaussians: give a config of GSMap.")
         pairs = SamplePairs(args.results, args.ground_truth, classes, True, gaussians=True)
         factors = fitted_factors(matched_vertices(pairs, ChamferConfig(classes)), classes)
         cfg.model.map_head.temperatures = factors.round(4).tolist()
-        MODELS.build(cfg.model)  # refuses heads without Gaussians
     meta = {MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())), SIGNALS: source.can_bus}
     if source.image_size:
         meta[IMAGE_SIZE] = source.image_size

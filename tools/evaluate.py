@@ -248,8 +248,8 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         from gsmap.visualization.figure import save_figure  # matplotlib takes a second
         from gsmap.visualization.plots import plot_result
 
-        figure = plot_result([found for found in reports if found.detections])
-        print(f"curves: {save_figure(figure, args.pr_curves)}")
+        drawn = [found for found in reports if found.detections]
+        print(f"curves: {save_figure(plot_result(drawn), args.pr_curves)}")
 
 
 def topology_reports(args: argparse.Namespace, evaluator: MapEvaluator) -> list[MetricReport]:

@@ -37,7 +37,7 @@ def test_a_line_beside_the_true_one_by_hand():
     y = np.linspace(-10, 10, 5)
     line = np.column_stack([np.full(5, 4.0), y])
     found = MapElements.from_polylines(
-        [line + [0.3, 0.0], line + [5.0, 0.0]],
+        [np.add(line, [0.3, 0.0]), np.add(line, [5.0, 0.0])],
         [0, 0],
         [0.9, 0.8],
         [np.tile([0.5, 0.2], (5, 1))] * 2,
@@ -93,9 +93,8 @@ def test_a_report_has_classes_lines_and_distances():
     metrics = uncertainty_report(joined, CLASSES, ["ped_crossing"]).metrics
     assert metrics["uncertainty/divider/num_vertices"] == 200
     assert metrics["uncertainty/line/num_vertices"] == 400
-    by_distance = [
-        metrics[f"uncertainty/line/{d}/num_vertices"] for d in ("0-10m", "10-20m", "20m+")
-    ]
+    distances = ("0-10m", "10-20m", "20m+")
+    by_distance = [metrics[f"uncertainty/line/{part}/num_vertices"] for part in distances]
     assert sum(by_distance) == 400
     text = format_uncertainty(metrics)
     assert len(text.splitlines()) == 1 + 2 * 4 * 4

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
+
+FILE = "gsmap_minicity_val.arrow"
 REPO = Path(__file__).resolve().parents[2]
 
 
@@ -38,8 +41,11 @@ def test_every_kind_is_registered_and_in_the_table(tool):
 
 
 def test_a_run_writes_table_figures_and_plot(tool, minicity_root, tmp_path, monkeypatch):
+    options = {"dataset": "minicity", "out_dir": tmp_path}
+    convert_nuscenes(NuScenesOptions(minicity_root, "v1.0-trainval", **options))
     words = ["gsmap_r18_minicity", "--data-root", str(minicity_root), "--samples", "1"]
     options = ["--kinds", "camera_lost", "camera_delayed", "--out", str(tmp_path)]
+    options += ["--cfg-options", f"test_dataloader.dataset.ann_file={tmp_path}/{FILE}"]
     monkeypatch.setattr("sys.argv", ["robustness.py", *words, *options])
     said = tool.main()
     found = json.loads((tmp_path / "robustness.json").read_text())

@@ -1,9 +1,10 @@
 # The small MapTR whose points have a Laplace distribution: nothing is rendered, no layer guided.
-_base_ = './gsmap_maptr_r18_minicity.py'
+_base_ = '../../../configs/maptr/maptr_r18_minicity.py'
 
 _losses = [*_base_.model.map_head.losses, dict(type='GaussianNLLLoss', laplace=True, detach_points=False)]
 model = dict(
     map_head=dict(
+        type='GSMapHead',
         loss_raster=None,
         iou_cost=None,
         decoder=dict(layer=dict(type='MapDecoderLayer')),

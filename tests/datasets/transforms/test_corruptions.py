@@ -1,6 +1,7 @@
 """Corruptions of cameras: what is drawn, how strong it is, and which matrices change."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -88,7 +89,7 @@ def test_lost_cameras_are_black_look_nowhere_and_add_up():
             np.testing.assert_array_equal(found["lidar2cam"][view], expected)
             np.testing.assert_allclose(found["lidar2img"][view], INNER @ expected)
         lost.append(black)
-    assert all(fewer < more for fewer, more in zip(lost, lost[1:], strict=False))
+    assert all(fewer < more for fewer, more in pairwise(lost))
     pair = CorruptImages("camera_lost", 5).transform(results(2))
     assert sum(image.any() for image in pair["img"]) == 1
 
@@ -121,7 +122,7 @@ def test_fog_leaves_five_percent_of_the_contrast_at_the_end_of_sight():
 
 @pytest.mark.parametrize(("kind", "severity"), [("snow", 1), ("fog", 0), ("fog", 6)])
 def test_unknown_corruptions_are_refused(kind, severity):
-    with pytest.raises(ValueError, match="kind must be one of .* got"):
+    with pytest.raises(ValueError, match="kind must be one of"):
         CorruptImages(kind, severity)
 
 

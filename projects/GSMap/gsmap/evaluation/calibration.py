@@ -4,6 +4,7 @@ Errors and sigmas are taken along and across the line (`gsmap.structures.gaussia
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy import stats
 from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.evaluation.evaluator import Sample
 from gsmap.evaluation.report import MetricReport
-from gsmap.structures.elements import FloatArray, IntArray, MapElements
+from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import equivalent_orders
 
 AXES = ("along", "across")
@@ -38,9 +39,10 @@ class Vertices(NamedTuple):
     sigmas: FloatArray
     distances: FloatArray
 
-    def of(self, rows: FloatArray | IntArray) -> "Vertices":
+    def of(self, rows: IntArray | BoolArray) -> "Vertices":
         """Return some of the vertices, by their places or a mask."""
-        return Vertices(*(values[rows] for values in self))
+        labels, errors, sigmas, distances = self
+        return Vertices(labels[rows], errors[rows], sigmas[rows], distances[rows])
 
 
 def matched_vertices(samples: Iterable[Sample], config: ChamferConfig) -> Vertices:
@@ -56,14 +58,17 @@ def matched_vertices(samples: Iterable[Sample], config: ChamferConfig) -> Vertic
     parts = [part for sample in samples for part in _of_sample(*sample, config)]
     if not parts:
         raise ValueError("no prediction matches: there is no vertex to measure.")
-    return Vertices(*map(np.concatenate, zip(*parts, strict=True)))
+    labels, errors, sigmas, distances = map(np.concatenate, zip(*parts, strict=True))
+    return Vertices(labels, errors, sigmas, distances)
 
 
 def _of_sample(
     token: str, found: MapElements, truth: MapElements, config: ChamferConfig
 ) -> Iterator[Vertices]:
     """Yield the vertices of each prediction that matches."""
-    if len(found) and not found.has_gaussians:
+    if not len(found):
+        return
+    if found.scales is None or found.rotations is None:
         raise ValueError(
             f"sample {token!r} has predictions without Gaussians: predict with a model that has "
             "them, such as GSMap."
@@ -89,7 +94,7 @@ def _of_sample(
 
 
 def reliability(errors: FloatArray, sigmas: FloatArray) -> FloatArray:
-    """Return the share of errors in the central interval of each of ``LEVELS``. 2 x (n,) -> (19,)"""
+    """Return the share of errors in the interval of each of ``LEVELS``. 2 x (n,) -> (19,)"""
     widths = stats.norm.ppf((1 + LEVELS) / 2)
     return np.searchsorted(np.sort(errors / sigmas), widths, side="right") / len(errors)
 
@@ -114,7 +119,7 @@ def uncertainty_figures(vertices: Vertices) -> dict[str, float]:
     ``sparsification_error``: how much larger than with the true order the mean error is while the
     vertices of the largest sigmas are taken away, as a share of the mean error of all.
     """
-    figures = {}
+    figures: dict[str, float] = {}
     for axis, name in enumerate(AXES):
         errors, sigmas = vertices.errors[:, axis], vertices.sigmas[:, axis]
         apart = sparsification(errors, sigmas) - sparsification(errors, errors)
@@ -145,15 +150,13 @@ def uncertainty_report(
     """
     lines = [label for label, name in enumerate(classes) if name not in areas]
     groups = {name: [label] for label, name in enumerate(classes)} | {"line": lines}
-    metrics = {}
+    metrics: dict[str, float] = {}
     for name, labels in groups.items():
         own = vertices.of(np.isin(vertices.labels, labels))
         parts = {name: own}
-        for low, high in zip(DISTANCES_M, DISTANCES_M[1:], strict=False):
-            rows = (low <= own.distances) & (own.distances < high)
-            parts[f"{name}/{low:g}m+" if high == np.inf else f"{name}/{low:g}-{high:g}m"] = own.of(
-                rows
-            )
+        for low, high in pairwise(DISTANCES_M):
+            title = f"{low:g}m+" if high == np.inf else f"{low:g}-{high:g}m"
+            parts[f"{name}/{title}"] = own.of((low <= own.distances) & (own.distances < high))
         for part, chosen in parts.items():
             figures = uncertainty_figures(chosen) if len(chosen.labels) else {}
             metrics |= {f"uncertainty/{part}/{key}": value for key, value in figures.items()}
@@ -166,7 +169,8 @@ def format_uncertainty(metrics: Mapping[str, float]) -> str:
     names = [key.removesuffix(end) for key in metrics if key.endswith(end)]
     wide = max((len(name) for name in names), default=0) + 1 - len("uncertainty/")
     titles = "".join(title.rjust(9) for _, title in _COLUMNS)
-    rows = [f"{'Gaussians of matched vertices':<{wide + 8}}{titles} vertices"]
+    first = f"{'Gaussians of matched vertices':<{wide + 8}}"
+    rows = [f"{first}{titles} vertices"]
     for name in names:
         for axis in AXES:
             cells = "".join(f"{metrics[f'{name}/{axis}/{key}']:9.3f}" for key, _ in _COLUMNS)

@@ -7,6 +7,7 @@ seed and token alone, and a severer one is the same one, stronger.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -134,7 +135,7 @@ def rain(image: Image, level: int, rng: np.random.Generator) -> Image:
     drops = (rng.random((height, width)) < _DROPS[level]).astype(np.float32)
     length = max(3, round(0.06 * height))
     streak = np.zeros((length, length), np.float32)
-    cv2.line(streak, (length * 2 // 5, 0), (length * 3 // 5, length - 1), 1.0)  # nearly upright
+    cv2.line(streak, (length * 2 // 5, 0), (length * 3 // 5, length - 1), (1.0,))  # nearly upright
     veil = np.clip(cv2.filter2D(drops, -1, streak), 0, 1)[..., None] * 0.4
     grey = 0.04 * (level + 1)
     return _grey_levels((image * (1 - grey) + 128 * grey) * (1 - veil) + 210 * veil)
@@ -150,13 +151,13 @@ def night(image: Image, level: int, rng: np.random.Generator) -> Image:
 def motion_blur(image: Image, level: int, rng: np.random.Generator) -> Image:
     """Return an image blurred along its rows, as of a vehicle that turns. (H, W, 3)"""
     length = 2 * round(_BLURS[level] * image.shape[1] / 2) + 1  # odd: nothing is shifted
-    return cv2.blur(image, (length, 1))
+    return np.asarray(cv2.blur(image, (length, 1)), np.uint8)
 
 
 def jpeg(image: Image, level: int, rng: np.random.Generator) -> Image:
     """Return an image after compression. (H, W, 3)"""
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITIES[level]])
-    return cv2.imdecode(data, cv2.IMREAD_COLOR)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
 
 
 _CALIBRATIONS: dict[str, Callable[[NDArray[np.float64], int], NDArray[np.float64]]] = {
@@ -196,8 +197,7 @@ class DelayCameras(BaseTransform):
         file = self._file
         columns = (file.column(name) for name in ("scene", "timestamp_ns", "token"))
         order = sorted((*entry, row) for row, entry in enumerate(zip(*columns, strict=True)))
-        pairs = zip(order, order[1:], strict=False)
-        return {late[2]: early[3] for early, late in pairs if early[0] == late[0]}
+        return {late[2]: early[3] for early, late in pairwise(order) if early[0] == late[0]}
 
     @cached_property
     def _file(self) -> AnnotationFile:

@@ -30,7 +30,7 @@ class GaussianReference(PointReference):
     """
 
     space: GaussianSpace
-    neutral_keys = ("gaussian_init.", "gaussian_branches.")
+    neutral_keys: tuple[str, ...] = ("gaussian_init.", "gaussian_branches.")
 
     outputs = ("pts", "scales", "rotations")
 

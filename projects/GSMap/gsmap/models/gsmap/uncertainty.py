@@ -1,4 +1,4 @@
-"""How far off a predicted vertex may be: Gaussians of its error, and the loss that they learn by."""
+"""How far off a predicted vertex may be: Gaussians of its error, and their loss."""
 
 from typing import Any, cast
 
@@ -119,7 +119,8 @@ class GaussianNLLLoss(MapLoss):
 
     def values(self, pairs: MatchedPairs) -> Tensor:
         """Return the values along and across the line. (M, 2)"""
-        gaussians = pairs.predictions.reference.errors(pairs.pred_references)
+        reference = cast(GaussianReference, pairs.predictions.reference)
+        gaussians = reference.errors(pairs.pred_references)
         points = gaussians.means.detach() if self.detach_points else gaussians.means
         sigma = extents_along_line(gaussians._replace(means=points))  # (M, P, 2)
         errors = line_errors(points, pairs.gt_pts_m[..., :2])

@@ -1,0 +1,95 @@
+"""Sigmas of a result file: scored, drawn, fitted, and kept in a checkpoint."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsmap.apis.loading import load_model
+from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.structures.elements import MapElements
+from tools.calibrate import main as calibrate
+from tools.evaluate import main as evaluate
+
+CLASSES = ("divider", "ped_crossing", "boundary")
+NAME = "gsmap_r18_minicity"
+
+
+@pytest.fixture
+def files(tmp_path) -> tuple[Path, Path]:
+    """40 samples with a line of each class, along y, whose points err by three sigmas across."""
+    rng = np.random.default_rng(0)
+    y = np.linspace(-20, 20, 20)
+    found, truth = [], []
+    for number in range(40):
+        lines = [np.column_stack([np.full(20, x), y]) for x in (-5.0, 0.0, 5.0)]
+        sigmas = rng.uniform(0.05, 0.15, (3, 20))
+        moved = [
+            line + np.column_stack([3 * rng.normal(size=20) * sigma, np.zeros(20)])
+            for line, sigma in zip(lines, sigmas, strict=True)
+        ]
+        scales = [np.column_stack([np.full(20, 0.5), sigma]) for sigma in sigmas]
+        angles = np.full((3, 20), np.pi / 2)
+        elements = MapElements.from_polylines(moved, range(3), [0.9] * 3, scales, angles)
+        found.append((f"t{number}", vectors_of(elements, CLASSES)))
+        truth.append(
+            (f"t{number}", vectors_of(MapElements.from_polylines(lines, range(3)), CLASSES))
+        )
+    write_results(tmp_path / "results.json", found)
+    write_results(tmp_path / "truth.json", truth, key="GTs")
+    return tmp_path / "results.json", tmp_path / "truth.json"
+
+
+def test_a_checkpoint_keeps_what_is_fitted_and_its_model_has_it(files, tmp_path, monkeypatch):
+    target = tmp_path / "calibrated.pth"
+    words = ["calibrate.py", NAME, NAME, *map(str, files), str(target)]
+    monkeypatch.setattr("sys.argv", words)
+    assert "divider: sigma" in calibrate()
+    temperatures = load_model(NAME, target).map_head.temperatures
+    np.testing.assert_allclose([across for _, across in temperatures], 3.0, rtol=0.2)
+    plain, fitted = load_model(NAME), load_model(NAME, target)
+    assert plain.map_head.temperatures is None
+    for name, value in plain.state_dict().items():
+        assert value.equal(fitted.state_dict()[name])
+    with pytest.raises(FileExistsError, match="exists already"):
+        calibrate()
+    monkeypatch.setattr(
+        "sys.argv", [*words[:2], str(target), *words[3:-1], str(tmp_path / "again.pth")]
+    )
+    with pytest.raises(ValueError, match="is calibrated already: give the checkpoint that it"):
+        calibrate()
+
+
+def test_a_model_without_gaussians_is_not_calibrated(files, tmp_path, monkeypatch):
+    name, target = "maptr_r18_minicity", tmp_path / "calibrated.pth"
+    monkeypatch.setattr("sys.argv", ["calibrate.py", name, name, *map(str, files), str(target)])
+    with pytest.raises(ValueError, match="maptr_r18_minicity has no Gaussians"):
+        calibrate()
+    assert not target.exists()
+
+
+def test_the_command_scores_and_draws_sigmas(files, tmp_path, capsys):
+    out, curves = tmp_path / "figures.json", tmp_path / "curves.png"
+    words = [*map(str, files), "--eval", "chamfer", "--out", str(out), "--uncertainty"]
+    evaluate([*words, "--reliability", str(curves), "--pr-curves", str(tmp_path / "pr.png")])
+    figures = json.loads(out.read_text())
+    assert figures["uncertainty/divider/num_vertices"] == 800
+    third = 0.2611  # of a normal distribution within a third of its sigma
+    assert figures["uncertainty/line/across/coverage@1"] == pytest.approx(third, abs=0.03)
+    assert "chamfer/mAP" in figures
+    assert curves.stat().st_size > 1000
+    assert "Gaussians of matched vertices" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--reliability", "a.png"], "--reliability needs --uncertainty"),
+        (["--uncertainty", "--shard", "0/2", "--out", "a.json"], "--uncertainty needs the results"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(files, words, message, capsys):
+    with pytest.raises(SystemExit):
+        evaluate([*map(str, files), *words])
+    assert message in capsys.readouterr().err
