@@ -179,24 +179,25 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error(f"{args.results} holds ground truth: name the result file before it")
     if (args.results is None) == (args.prior is None):
         parser.error("name either a result file or --prior")
-    if args.hard and args.thresholds:
-        parser.error("--hard and --thresholds exclude each other")
-    if args.consistency and (args.prior or args.shard.count):
-        parser.error("--consistency needs the results of whole drives: leave out --prior, --shard")
-    if args.tracks and not args.consistency:
-        parser.error("--tracks needs --consistency")
-    if args.topology and (args.prior or args.shard.count):
-        parser.error("--topology needs a result file as a whole: leave out --prior and --shard")
-    if args.against and args.prior:
-        parser.error("--against compares two result files: leave out --prior")
-    if args.shard.count and (args.bootstrap is not None or args.against):
-        parser.error("--bootstrap and --against need all samples: leave out --shard")
-    if args.uncertainty and (args.prior or args.shard.count):
-        parser.error("--uncertainty needs the results of a model: leave out --prior, --shard")
-    if args.reliability and not args.uncertainty:
-        parser.error("--reliability needs --uncertainty")
-    if args.shard.count and (not args.out or args.prior or args.pr_curves):
-        parser.error("--shard needs --out, and can neither fit a --prior nor draw --pr-curves")
+    for refused, why in (
+        (args.hard and args.thresholds, "--hard and --thresholds exclude each other"),
+        (args.tracks and not args.consistency, "--tracks needs --consistency"),
+        (args.reliability and not args.uncertainty, "--reliability needs --uncertainty"),
+        (args.against and args.prior, "--against compares two result files: leave out --prior"),
+        (
+            args.shard.count and (not args.out or args.prior or args.pr_curves),
+            "--shard needs --out, and can neither fit a --prior nor draw --pr-curves",
+        ),
+        (
+            args.shard.count and (args.bootstrap is not None or args.against),
+            "--bootstrap and --against need all samples: leave out --shard",
+        ),
+    ):
+        if refused:
+            parser.error(why)
+    for name in ("consistency", "topology", "uncertainty"):
+        if getattr(args, name) and (args.prior or args.shard.count):
+            parser.error(f"--{name} needs a result file as a whole: leave out --prior and --shard")
     return args
 
 
