@@ -207,8 +207,13 @@ def ap_differences(
 ) -> dict[str, Interval]:
     """Return what the first result has more than the second, in every AP, with its interval.
 
-    Both are of the same samples. Each resample has the same scenes for both, so what makes scenes
-    hard or easy for both takes no part.
+    Each resample has the same scenes for both, so what makes scenes hard or easy for both takes no
+    part.
+
+    Args:
+        first: A result's figures, a metric each.
+        second: Another result's figures, of the same samples.
+        resamples: The scenes of every resample.
 
     Raises:
         ValueError: If they are of other metrics or samples.
@@ -226,7 +231,13 @@ def ap_differences(
 
 
 def format_intervals(intervals: Mapping[str, Interval], title: str, signed: bool = False) -> str:
-    """Return a table: a row per figure, with its interval."""
+    """Return a table: a row per figure, with its interval.
+
+    Args:
+        intervals: Value and interval of every figure, by its key.
+        title: What the columns are of.
+        signed: Whether values above 0 have a plus: of differences.
+    """
     width, sign = max(map(len, intervals), default=0), "+" if signed else ""
     rows = [
         f"{key:<{width}}  {i.value:{sign}.4f}  {i.low:{sign}.4f} to {i.high:{sign}.4f}"

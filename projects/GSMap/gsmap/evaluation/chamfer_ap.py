@@ -98,6 +98,12 @@ def nearest_by_chamfer(
 ) -> tuple[IntArray, FloatArray]:
     """Find the nearest ground truth of each prediction among those whose strips touch its own.
 
+    Args:
+        predictions: N elements.
+        ground_truth: Elements they may be.
+        config: How lines are resampled and whether heights count.
+        max_distance: Chamfer distance beyond which there is none, in metres.
+
     Returns:
         Its index, or -1 if none is within ``max_distance`` metres, and its Chamfer distance in
         metres, or infinity. 2 x (N,)
@@ -129,8 +135,12 @@ def match_chamfer(
 ) -> FrameMatches:
     """Match the predictions of one sample with its ground truth.
 
-    Predictions with fewer than two points are dropped. Ground truth of zero length, or of fewer
-    than two points, counts as a ground truth that nobody can match. ``token`` names the sample.
+    Args:
+        predictions: Elements with scores; those of fewer than two points are dropped.
+        ground_truth: Elements; one of zero length, or of fewer than two points, counts as one that
+            nobody can match.
+        config: The metric's settings.
+        token: The sample's name.
 
     Raises:
         ValueError: If heights count, and a side has none; or as of `check_pair`.

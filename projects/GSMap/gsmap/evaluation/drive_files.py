@@ -104,6 +104,12 @@ def evaluate_drives(
 ) -> dict[str, float]:
     """Return the figures of `consistency` of a result file; write its tracks if that is asked for.
 
+    Args:
+        results: Result file of all samples.
+        annotations: Ground truth with poses.
+        config: The metric's settings.
+        tracks_file: Where the results are written again, each element with its ``track_id``.
+
     Raises:
         FileNotFoundError: If the result file does not exist.
         ValueError: If it is malformed, lacks a sample, or the annotations have no ground truth.

@@ -110,8 +110,13 @@ def read_ground_truth(
 def mismatch_notes(results: Collection[str], truth: Collection[str], allowed: bool) -> list[str]:
     """Say which tokens of samples have no results or no ground truth.
 
+    Args:
+        results: Tokens of samples with results.
+        truth: Tokens of samples with ground truth.
+        allowed: Whether they may differ.
+
     Raises:
-        ValueError: If the tokens differ and that is not ``allowed``.
+        ValueError: If they differ and may not.
     """
     notes = []
     for these, others, what, lack, treatment in (
@@ -266,7 +271,13 @@ def evaluate_files(
 def match_samples(
     pairs: Iterable[Sample], evaluator: MapEvaluator, num_workers: int = 1
 ) -> Iterator[SampleMatches]:
-    """Match the samples in their order."""
+    """Match the samples in their order.
+
+    Args:
+        pairs: Token, predictions and ground truth of each.
+        evaluator: The metrics.
+        num_workers: Processes.
+    """
     stream = iter(pairs)
     tasks = iter(lambda: list(islice(stream, CHUNK)), [])
     with Progress(unit="samples") as bar:

@@ -88,7 +88,14 @@ def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:
 def check_pair(
     predictions: MapElements, ground_truth: MapElements, classes: Sequence[str], token: str
 ) -> None:
-    """Raise ValueError unless predictions have scores and all labels are -1 (no class) or known."""
+    """Raise ValueError unless predictions have scores and all labels are -1 (no class) or known.
+
+    Args:
+        predictions: Elements of a sample.
+        ground_truth: Elements of the same sample.
+        classes: Names that labels count.
+        token: The sample's name, for the error.
+    """
     for what, elements in (("prediction", predictions), ("ground truth", ground_truth)):
         beyond = (elements.labels < -1) | (elements.labels >= len(classes))
         if beyond.any():
@@ -109,7 +116,11 @@ def ranked_predictions(
 ) -> IntArray:
     """Return which predictions count, in descending order of score, at most N of each class. (n,)
 
-    They are lines of known classes with ``min_score`` or more.
+    Args:
+        predictions: Elements with scores; lines of known classes count.
+        num_classes: How many classes are known.
+        min_score: The least score that counts.
+        max_num: N; all by default.
     """
     scores = predictions.confidence
     rows = np.flatnonzero((predictions.num_points >= 2) & (scores >= min_score))

@@ -146,9 +146,13 @@ def evaluate_prior(
     evaluator: MapEvaluator,
     max_elements: int = 50,
 ) -> Evaluation:
-    """Fit a prior of ``max_elements`` on one file of ground truth and score it on another.
+    """Fit a prior on one file of ground truth and score it on another.
 
-    Both are annotation files, or MapTR's JSON.
+    Args:
+        train_path: Annotation file or MapTR's JSON, to fit on.
+        truth_path: Annotation file or MapTR's JSON, to score on.
+        evaluator: The metrics.
+        max_elements: Elements of the prior.
     """
     chamfer = evaluator.chamfer or ChamferConfig(evaluator.classes)
     everything, _ = read_ground_truth(train_path, evaluator.classes)

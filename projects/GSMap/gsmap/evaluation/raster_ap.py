@@ -120,7 +120,14 @@ def match_raster(
 ) -> FrameMatches:
     """Match the predictions of one sample with its ground truth by the IoU of their masks.
 
-    Ground truth is at full resolution; ``token`` names the sample; errors as in `check_pair`.
+    Args:
+        predictions: Elements with scores.
+        ground_truth: Elements at full resolution.
+        config: The metric's settings.
+        token: The sample's name.
+
+    Raises:
+        ValueError: As of `check_pair`.
     """
     check_pair(predictions, ground_truth, config.classes, token)
     num_classes, gt_labels = len(config.classes), ground_truth.labels

@@ -55,8 +55,10 @@ def class_figures(
 ) -> dict[str, float]:
     """Return the figures of one class that both metrics have, by the last part of their key.
 
-    ``average_precision`` turns hits (N,) and the number of ground truths into an AP; ``absent`` is
-    the recall of a class without ground truth.
+    Args:
+        found: Detections of the class.
+        average_precision: Takes hits (N,) and the number of ground truths.
+        absent: Recall of a class without ground truth.
     """
     figures: dict[str, float] = {}
     for threshold, hits in zip(found.thresholds, found.hits.T, strict=True):

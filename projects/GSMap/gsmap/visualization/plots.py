@@ -117,7 +117,13 @@ def plot_uncertainty(vertices: Vertices, classes: Sequence[str]) -> Figure:
 def plot_severities(
     values: Mapping[str, Sequence[float]], clean: float, severities: Sequence[int]
 ) -> Figure:
-    """Draw the AP in percent over the severity of each corruption, from that without any."""
+    """Draw the AP over the severity of each corruption.
+
+    Args:
+        values: APs of each corruption, in percent.
+        clean: AP without any, in percent.
+        severities: Of the columns of ``values``.
+    """
     figure, axes = panel_grid(1, 1)
     ax = axes[0, 0]
     for number, (kind, aps) in enumerate(values.items()):

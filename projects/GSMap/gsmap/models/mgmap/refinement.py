@@ -113,7 +113,13 @@ class PatchRefinement(BaseModule):
 
 
 def mask_network(embed_dims: int, masks: int, activation: nn.Module) -> nn.Sequential:
-    """Return a 3x3 convolution with BatchNorm and a 1x1. (B, C, H, W) -> (B, masks, H, W)"""
+    """Return a 3x3 convolution with BatchNorm and a 1x1. (B, C, H, W) -> (B, masks, H, W)
+
+    Args:
+        embed_dims: C.
+        masks: Number of masks.
+        activation: What stands between the two.
+    """
     hidden = embed_dims // 2
     return nn.Sequential(
         nn.Conv2d(embed_dims, hidden, 3, padding=1, bias=False),

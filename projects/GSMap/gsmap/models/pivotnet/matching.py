@@ -21,9 +21,12 @@ def path_costs(costs: Floats) -> Floats:
 
 
 def sequence_costs(costs: Floats, lengths: NDArray[np.integer], end_weight: float) -> Floats:
-    """Return the mean cost of lines, whose ends have ``end_weight`` more. (N, K)
+    """Return the mean cost of lines. (N, K)
 
-    The last pivot has the last point. Differences (N, K, m, p), numbers of pivots (K,).
+    Args:
+        costs: Differences of points and pivots; the last pivot has the last point. (N, K, m, p)
+        lengths: Numbers of pivots. (K,)
+        end_weight: What the ends of a line count more.
     """
     last, number = lengths - 1, np.arange(len(lengths))
     total = path_costs(costs)[:, number, last, -1]
