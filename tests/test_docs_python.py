@@ -20,6 +20,7 @@ import pytest
 import shapely
 from mmdet3d import registry as of_mmdet3d
 from mmengine import registry
+from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from report_case import write_case
 
 import gsmap.registered  # noqa: F401 - the configs name its classes
@@ -80,6 +81,20 @@ def with_exported_model(folder: Path, minicity: Path) -> dict[str, Any]:
     return {"my_cameras": cameras, "my_can_bus": np.zeros(18)}
 
 
+def deployment(folder: Path, minicity: Path) -> dict[str, Any]:
+    """What a reader of docs/deployment.md has: two files, one with memory, and a drive."""
+    from gsmap.apis.export import export_onnx
+
+    model = build_small(temporal={"bev": {}, "queries": {"num": 3}, "embed_dims": 16}).eval()
+    cameras = [f"CAM_{number}" for number in range(NUM_CAMS)]
+    export_onnx(model, folder / "stream.onnx", cameras, IMAGE_SHAPE)
+    images = [np.zeros((*IMAGE_SHAPE, 3), np.uint8)] * NUM_CAMS
+    meta = {"scene": "a", "lidar2global": np.eye(4), "can_bus": np.zeros(18)}
+    meta["lidar2img"] = np.stack([np.eye(4)] * NUM_CAMS)
+    drive = [(images, {**meta, "timestamp_ns": time}) for time in (0, 500_000_000)]
+    return {**with_exported_model(folder, minicity), "my_drive": drive}
+
+
 def tutorial(folder: Path, minicity: Path) -> dict[str, Any]:
     """Export a model to where the tutorial does."""
     out = folder / "work_dirs/tutorial"
@@ -134,7 +149,7 @@ GIVEN: Mapping[str, Callable[[Path, Path], dict[str, Any]]] = {
     "docs/evaluation.md": lambda *_: {"frames": [(line(scores=[0.9]), line())]},
     "docs/inference.md": towns,
     "docs/visualization.md": samples,
-    "docs/deployment.md": with_exported_model,
+    "docs/deployment.md": deployment,
     "docs/tutorial.md": tutorial,
     "projects/MiniCity/README.md": town,
 }

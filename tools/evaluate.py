@@ -233,11 +233,11 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     for found in reports:
         if found.name == "intervals":  # printed
             continue
-        if not found.groups:
+        if found.name == "uncertainty":
+            print(format_uncertainty(found.metrics) + "\n")
+        elif not found.groups:
             lines = (f"{key:<44} {value:.4f}" for key, value in found.metrics.items())
             print("\n".join(lines) + "\n")
-        elif found.name == "uncertainty":
-            print(format_uncertainty(found.metrics) + "\n")
         else:
             print(format_table(found) + "\n")
     for note in notes:
@@ -296,9 +296,8 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
 def report_of_gaussians(args: argparse.Namespace, evaluator: MapEvaluator) -> MetricReport:
     """Score the Gaussians of a result file, and draw their curves if that is asked for."""
     classes = evaluator.classes
-    pairs = SamplePairs(
-        args.results, args.ground_truth, classes, args.allow_mismatch, gaussians=True
-    )
+    inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard
+    pairs = SamplePairs(*inputs, args.allow_other_split, gaussians=True)
     vertices = matched_vertices(pairs, evaluator.chamfer or ChamferConfig(classes))
     if args.reliability:
         from gsmap.visualization.figure import save_figure

@@ -24,6 +24,8 @@ from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.structures.elements import MapElements
+from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
+from minicity.generate import generate
 
 for _package in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(_package, reason=f"{_package} is not installed: pip install -e .[onnx]")
@@ -399,12 +401,21 @@ STREAMS = {
 }
 
 
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    """Annotations of two scenes of two samples."""
+    root = tmp_path_factory.mktemp("drives") / "root"
+    generate(root, 3, 0, (400, 225), samples_per_scene=2, val_scenes=2, workers=1)
+    convert_nuscenes(NuScenesOptions(root, "v1.0-trainval", dataset="minicity"))
+    return root / "gsmap_minicity_val.arrow"
+
+
 @pytest.mark.parametrize("case", STREAMS)
-def test_a_stream_runs_step_by_step_as_in_torch(case, annotations, tmp_path):
+def test_a_stream_runs_step_by_step_as_in_torch(case, drives, tmp_path):
     """Two frames of a scene and two of another: with the memory of each, none of the other."""
     config, overrides = STREAMS[case]
     inferencer = MapInferencer(REPO / config, None, "cpu", {**SMALL, **overrides})
-    dataset = inferencer.dataset(annotations, annotations.parent)
+    dataset = inferencer.dataset(drives, drives.parent)
     shake(inferencer.model)
     exported = export(inferencer, dataset, tmp_path / "model.onnx")
     first, second = (scene[:2] for scene in dataset.scenes()[:2])

@@ -44,7 +44,7 @@ def test_each_place_changes_alone_and_types_and_messages_do_not():
 def test_tests_of_a_module_are_those_of_its_room_that_import_it():
     tests = mutations.tests_of("gsmap.structures.rigid", "structures")
     names = [Path(path).name for path in tests]
-    assert names == ["test_rigid.py", "test_vehicle_signals.py"]
+    assert {"test_rigid.py", "test_vehicle_signals.py"} <= set(names)
     modules = mutations.modules_of("structures")
     assert modules["gsmap.structures.rigid"].name == "rigid.py"
     assert "gsmap.ops.raster_loss.numba" not in mutations.modules_of("ops")

@@ -125,6 +125,7 @@ def ready(name: str, out: Path) -> bool:
 
 def main() -> None:
     """Try all commands with all ends, and print the table."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it, and children inherit that
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, nargs=2, metavar=("MINICITY", "CONFIG"), required=True)
     parser.add_argument("--command", nargs="+", choices=PROCESSES, default=list(PROCESSES))

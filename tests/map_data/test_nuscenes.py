@@ -27,7 +27,7 @@ REPO = Path(__file__).resolve().parents[2]
 def reference_root(golden_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     target = tmp_path_factory.mktemp("reference")
     with tarfile.open(golden_dir / "data/E6_mini_root_A.tar.gz") as archive:
-        archive.extractall(target, filter="data")
+        archive.extractall(target)
     return target / "root_A"
 
 

@@ -86,7 +86,10 @@ def test_the_command_scores_and_draws_sigmas(files, tmp_path, capsys):
     ("words", "message"),
     [
         (["--reliability", "a.png"], "--reliability needs --uncertainty"),
-        (["--uncertainty", "--shard", "0/2", "--out", "a.json"], "--uncertainty needs the results"),
+        (
+            ["--uncertainty", "--shard", "0/2", "--out", "a.json"],
+            "--uncertainty needs a result file",
+        ),
     ],
 )
 def test_options_that_do_not_fit_are_refused(files, words, message, capsys):

@@ -115,4 +115,4 @@ def test_the_command_lists_and_names_what_there_is():
     assert "model.map_head.decoder.num_layers=12" in run.stdout
     bad = run_python(*words, "X")
     assert bad.returncode == 2
-    assert "no table is named 'X'; there are: GSMap Table 1" in bad.stderr
+    assert "no table is named 'X': compare.py --list names all" in bad.stderr

@@ -30,11 +30,13 @@ def read_assignments(path: str | Path) -> dict[str, Any]:
         ValueError: If the file holds anything else; the message names the line.
     """
     names = _Names()
+    source = read_text(path)
     try:
-        source = read_text(path)
         tree = ast.parse(source)
     except SyntaxError as error:
         raise ValueError(f"{path}, line {error.lineno}: {error.msg}.") from None
+    except ValueError as error:  # a zero byte, before Python 3.12
+        raise ValueError(f"{path}: {error}.") from None
     except (RecursionError, MemoryError):
         raise ValueError(f"{path} cannot be read: it is nested too deep.") from None
     for node in tree.body:
