@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 from processes import run_python
 
+from gsmap.utils import parallel
 from gsmap.utils.parallel import ordered_map
 
 
@@ -122,3 +124,25 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path):
         started = time.monotonic()
         parent.stdout.read()
     assert time.monotonic() - started < 30
+
+
+def test_a_signal_that_another_thread_is_given_waits_until_processes_have_started():
+    done = threading.Event()
+    other = threading.Thread(target=done.wait)  # it takes what the main thread blocks
+    other.start()
+    steps = []
+
+    def start():
+        with parallel._signals_later():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.2)
+            steps.append("started")
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            start()
+    finally:
+        done.set()
+        other.join()
+    assert steps == ["started"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, TimeoutError
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -133,18 +134,39 @@ def ordered_map(
             pool.shutdown(cancel_futures=True)
 
 
+@contextmanager
+def _signals_later() -> Iterator[None]:
+    """Hold signals back while processes start: a half-started one answers with a traceback.
+
+    The mask is for this thread and the new processes. Another thread may be given the signal, whose
+    Python handler the main thread then runs at once: so that one waits, too.
+    """
+    came: list[int] = []
+    handlers = {}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if (handler := signal.getsignal(number)) not in (None, signal.SIG_IGN):
+                    handlers[number] = handler
+                    signal.signal(number, lambda number, _frame: came.append(number))
+        yield
+    finally:  # what this process was sent meanwhile reaches it here
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for late in came:
+            signal.raise_signal(late)
+
+
 def _in_order(
     pool: ProcessPoolExecutor, tasks: Iterable[Any], limit: int, timeout_s: float | None
 ) -> Iterator[Any]:
     """Keep at most ``limit`` tasks in the pool and yield the oldest one's result."""
     pending: deque[Future[Any]] = deque()
     for task in tasks:
-        # A starting process would answer Ctrl-C, which a terminal sends to all, with a traceback.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-        try:
+        with _signals_later():
             pending.append(pool.submit(_work, task))
-        finally:  # what this process was sent meanwhile reaches it here
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         if len(pending) == limit:
             yield pending.popleft().result(timeout_s)
     while pending:
