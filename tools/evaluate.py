@@ -20,22 +20,9 @@ from pathlib import Path
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, RANGES
-from gsmap.evaluation.bootstrap import (
-    Resamples,
-    ap_differences,
-    ap_intervals,
-    format_intervals,
-)
-from gsmap.evaluation.calibration import (
-    format_uncertainty,
-    matched_vertices,
-    uncertainty_report,
-)
-from gsmap.evaluation.chamfer_ap import (
-    CHAMFER_THRESHOLDS,
-    HARD_CHAMFER_THRESHOLDS,
-    ChamferConfig,
-)
+from gsmap.evaluation.bootstrap import Resamples, ap_differences, ap_intervals, format_intervals
+from gsmap.evaluation.calibration import format_uncertainty, matched_vertices, uncertainty_report
+from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, HARD_CHAMFER_THRESHOLDS, ChamferConfig
 from gsmap.evaluation.evaluator import HARD_NAME, METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.file_evaluation import (
     Evaluation,
@@ -44,6 +31,7 @@ from gsmap.evaluation.file_evaluation import (
     match_samples,
     scenes_of,
 )
+from gsmap.evaluation.groups import group_report, group_table, read_groups
 from gsmap.evaluation.match_files import write_matches
 from gsmap.evaluation.prior import evaluate_prior
 from gsmap.evaluation.raster_ap import RasterConfig
@@ -54,7 +42,7 @@ from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.faults import nearest
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest, digest_of_common, read_shard
-from gsmap.utils.words import counted
+from gsmap.utils.words import counted, markdown_table
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
@@ -157,6 +145,12 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the resamples")
     parser.add_argument(
+        "--by",
+        metavar="map|scene|FILE",
+        help="AP of each map or scene alone, or of scenes by night and weather (FILE: scene.json "
+        "of nuScenes' tables, or JSON with a word for each scene)",
+    )
+    parser.add_argument(
         "--against",
         type=Path,
         metavar="OTHER",
@@ -189,8 +183,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
             "--shard needs --out, and can neither fit a --prior nor draw --pr-curves",
         ),
         (
-            args.shard.count and (args.bootstrap is not None or args.against),
-            "--bootstrap and --against need all samples: leave out --shard",
+            args.shard.count and (args.bootstrap is not None or args.against or args.by),
+            "--bootstrap, --against and --by need all samples: leave out --shard",
         ),
     ):
         if refused:
@@ -231,7 +225,7 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
 def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     reports, notes = outcome
     for found in reports:
-        if found.name == "intervals":  # printed
+        if found.name in ("intervals", "by"):  # printed
             continue
         if found.name == "uncertainty":
             print(format_uncertainty(found.metrics) + "\n")
@@ -373,6 +367,7 @@ def main(argv: list[str] | None = None) -> str:
     evaluator = evaluator_from(args)
     if args.shard.count:
         return match_shard(args, evaluator)
+    groups = read_groups(args.ground_truth, args.by) if args.by else None
     resamples = None
     if args.bootstrap is not None or args.against:
         count = 1000 if args.bootstrap is None else args.bootstrap
@@ -383,6 +378,9 @@ def main(argv: list[str] | None = None) -> str:
         outcome = evaluate(args.results, args, evaluator)
     if resamples is not None:
         outcome[0].append(interval_report(outcome, resamples, args, evaluator))
+    if groups is not None:
+        print(markdown_table(*group_table(outcome[0], groups)) + "\n")
+        outcome[0].append(group_report(outcome[0], groups))
     if args.topology:
         outcome[0].extend(topology_reports(args, evaluator))
     if args.consistency:

@@ -43,6 +43,9 @@ def parse_args() -> argparse.Namespace:
         action="store_true",
         help="samples without results count as empty, results without ground truth are left out",
     )
+    parser.add_argument(
+        "--by", metavar="map|scene|FILE", help="a table of AP by parts, as of tools/evaluate.py"
+    )
     return parser.parse_args()
 
 
@@ -58,6 +61,7 @@ def main() -> str:
         args.score_thr,
         0 if args.no_images else args.image_width,
         args.allow_mismatch,
+        args.by,
     )
     data = page_data(args.ann, dict(zip(names, paths, strict=True)), options)
     return write_page(args.out, data)

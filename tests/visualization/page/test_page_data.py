@@ -90,6 +90,30 @@ def test_curves_end_at_the_recall_that_is_reached(data):
     assert poor == []
 
 
+def test_gaussians_have_curves_of_reliability_and_results_without_them_none(data):
+    panels = data["reliability"]
+    assert [panel["class"] for panel in panels] == [0, 2]  # the crossing is never found
+    for panel in panels:
+        assert [line["label"][:6] for line in panel["lines"]] == ["along,", "across"]
+        for line in panel["lines"]:
+            levels, shares = np.transpose(line["points"][0])
+            assert levels[0] == 0.05
+            assert levels[-1] == 0.95
+            assert (np.diff(shares) >= 0).all()
+            assert line["points"][1] == []
+            assert line["ap"][1] == "\N{EN DASH}"
+    assert panels[1]["lines"][1]["ap"][0] == "100.0"  # boundaries are perfect
+
+
+def test_parts_of_the_samples_have_a_table(case, tmp_path):
+    path, results = case
+    options = PageOptions(image_width=0, by="map")
+    (table,) = (
+        t for t in page_data(path, results, options)["tables"] if "by map, good" in t["caption"]
+    )
+    assert table["rows"][0][:3] == ["town", str(FRAMES), "50.0"]
+
+
 def test_frames_are_spread_evenly_and_the_worst_are_added(case):
     class Result:
         def f1(self, token, score_thr):

@@ -104,7 +104,7 @@ def test_figures_and_strangers_texts_are_shown_as_text_and_nothing_is_fetched(op
     assert len(shown(opened, "table")) == 1  # the means; the others are folded away
     opened.find_element(By.CSS_SELECTOR, "#figures summary").click()
     assert len(shown(opened, "table")) == 5  # and where two results differ
-    assert len(shown(opened, "#curves figure")) == 6
+    assert len(shown(opened, "#curves figure")) == 8  # two of Gaussians
     assert len(shown(opened, ".card svg")) == FRAMES
     assert opened.find_elements(By.CSS_SELECTOR, "main img") == []
     fetched = opened.execute_script(

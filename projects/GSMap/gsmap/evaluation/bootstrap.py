@@ -7,6 +7,7 @@ there: here the copies of each prediction stand in a row.)
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -33,6 +34,13 @@ class Interval:
     value: float
     low: float
     high: float
+
+
+class Weights(Protocol):
+    """Says how often each of some parts of the samples counts."""
+
+    def draw(self, tokens: Sequence[str]) -> tuple[IntArray, FloatArray]:
+        """Return the part of each sample (S,), and how often each part counts. (B, parts)"""
 
 
 @dataclass(frozen=True)
@@ -148,7 +156,7 @@ def resampled_aps(
     return _aps(rows, ends, scene, drawn, gts, interpolated)
 
 
-def resampled_figures(report: MetricReport, resamples: Resamples) -> dict[str, FloatArray]:
+def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, FloatArray]:
     """Return every AP of a metric in each resample, by its flat key; NaN where there is none. (B,)
 
     A report without ranked predictions has none.

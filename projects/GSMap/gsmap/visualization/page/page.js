@@ -36,10 +36,10 @@ function table({ caption, head, rows }) {
       make("tbody", {}, ...rows.map((row) => make("tr", {}, ...cells(row, "td"))))));
 }
 
-function curvePanel(panel) {
+function curvePanel(panel, across, up) {
   const of = data.classes[panel.class];
   const name = `${panel.metric}, ${of.title}`;
-  const plot = make("svg:svg", { viewBox: "-36 -8 246 246", role: "img", "aria-label": `${name}: precision over recall` });
+  const plot = make("svg:svg", { viewBox: "-36 -8 246 246", role: "img", "aria-label": `${name}: ${up} over ${across}` });
   for (const at of [0, 50, 100]) {
     plot.append(
       make("svg:path", { class: "axis", d: `M0 ${200 - 2 * at}H200M${2 * at} 0V200` }),
@@ -47,8 +47,8 @@ function curvePanel(panel) {
       make("svg:text", { x: 2 * at, y: 214, "text-anchor": "middle" }, String(at)));
   }
   plot.append(
-    make("svg:text", { x: 100, y: 230, "text-anchor": "middle" }, "recall (%)"),
-    make("svg:text", { transform: "translate(-26 100) rotate(-90)", "text-anchor": "middle" }, "precision (%)"));
+    make("svg:text", { x: 100, y: 230, "text-anchor": "middle" }, `${across} (%)`),
+    make("svg:text", { transform: "translate(-26 100) rotate(-90)", "text-anchor": "middle" }, `${up} (%)`));
   const legend = make("ul", {});
   panel.lines.forEach((line, i) => {
     const opacity = 0.3 + (0.7 * (i + 1)) / panel.lines.length;
@@ -543,7 +543,13 @@ function start() {
   const [means, ...tables] = data.tables.map(table);
   if (means) byId("means").append(means);
   byId("tables").append(...tables);
-  byId("curves").append(...data.curves.map(curvePanel));
+  byId("curves").append(
+    ...data.curves.map((panel) => curvePanel(panel, "recall", "precision")),
+    ...data.reliability.map((panel) => {
+      const figure = curvePanel(panel, "interval of the Gaussian", "errors within");
+      figure.querySelector("svg").append(make("svg:path", { class: "axis", d: "M0 200L200 0" }));
+      return figure;
+    }));
   byId("shown").append(...data.results.map((name, r) => make("option", { value: r }, name)));
   const orders = { time: "as recorded", worst: "worst first", best: "best first" };
   if (pair) Object.assign(orders, { gain: `${data.results[0]} ahead first`, loss: `${data.results[1]} ahead first` });

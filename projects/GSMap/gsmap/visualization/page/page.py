@@ -14,6 +14,7 @@ from typing import Any
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.bootstrap import Resamples
 from gsmap.evaluation.file_evaluation import read_ground_truth
+from gsmap.evaluation.groups import read_groups
 from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.grid import BEVGrid
@@ -27,6 +28,8 @@ from gsmap.visualization.page.tables import (
     class_tables,
     curves,
     difference_table,
+    group_tables,
+    reliability_curves,
     summary_table,
 )
 from gsmap.visualization.style import MATCH_COLOURS, MapStyle
@@ -44,6 +47,7 @@ class PageOptions:
             drawn large; 0 leaves them out.
         allow_mismatch: Samples without results count as without predictions, results without
             ground truth are left out; otherwise both are errors.
+        by: Parts of the samples that have their AP in a table, as `read_groups` takes them.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -54,6 +58,7 @@ class PageOptions:
     score_thr: float = 0.4
     image_width: int = 320
     allow_mismatch: bool = False
+    by: str | None = None
 
     def __post_init__(self) -> None:
         if self.max_frames < 1 or self.image_width < 0 or not 0 <= self.score_thr <= 1:
@@ -131,8 +136,9 @@ def page_data(
         "min_score": MIN_SCORE,
         "score": options.score_thr,
         "results": [result.name for result in scored],
-        "tables": _tables(scored, style, file, options.score_thr) if scored else [],
+        "tables": _tables(scored, style, file, options) if scored else [],
         "curves": curves(scored, style) if scored else [],
+        "reliability": reliability_curves(scored, truth, style),
         "frames": frames,
     }
 
@@ -143,16 +149,19 @@ def _title(scene: str, seconds: float) -> str:
 
 
 def _tables(
-    scored: Sequence[ScoredResult], style: MapStyle, file: AnnotationFile, score_thr: float
+    scored: Sequence[ScoredResult], style: MapStyle, file: AnnotationFile, options: PageOptions
 ) -> list[Table]:
     """Return the tables of one or two results, with intervals where there are several scenes."""
     scene_of = dict(zip(file.column("token"), file.column("scene"), strict=True))
     resamples = Resamples(scene_of) if len(set(scene_of.values())) > 1 else None
     tables = [summary_table(scored, resamples), *class_tables(scored, style)]
+    if options.by:
+        groups = read_groups(file.path, options.by)
+        tables += group_tables(scored, groups, Path(options.by).name)
     if len(scored) == 2:
         pairs = zip(scene_of.items(), file.seconds_into_scene, strict=True)
         titles = {token: _title(scene, seconds) for (token, scene), seconds in pairs}
-        tables.append(difference_table(scored, titles, score_thr))
+        tables.append(difference_table(scored, titles, options.score_thr))
     return tables
 
 

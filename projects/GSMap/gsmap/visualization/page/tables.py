@@ -7,9 +7,12 @@ import numpy as np
 
 from gsmap.evaluation.average_precision import precision_recall
 from gsmap.evaluation.bootstrap import Interval, Resamples, ap_differences, ap_intervals
-from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS
+from gsmap.evaluation.calibration import AXES, LEVELS, Vertices, matched_vertices, reliability
+from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.groups import Groups, group_table
 from gsmap.evaluation.matches import ClassDetections
 from gsmap.evaluation.report import UNDEFINED, MetricReport, flat_metrics
+from gsmap.structures.elements import MapElements
 from gsmap.visualization.page.scores import ScoredResult
 from gsmap.visualization.style import MapStyle
 
@@ -150,6 +153,67 @@ def curves(results: Sequence[ScoredResult], style: MapStyle) -> list[dict[str, A
             panel = {"metric": f"AP_{report.name}", "class": style.classes.index(name)}
             panels.append(panel | {"lines": lines})
     return panels
+
+
+def reliability_curves(
+    results: Sequence[ScoredResult], truth: Mapping[str, MapElements], style: MapStyle
+) -> list[dict[str, Any]]:
+    """Return a panel per class: the share of errors within intervals of the Gaussians.
+
+    Args:
+        results: One result or two; those without Gaussians have no curve.
+        truth: Ground truth of each sample, by token.
+        style: Names of the classes.
+    """
+    found = [_vertices(result, truth, style) for result in results]
+    panels = []
+    for label in range(len(style.classes)):
+        own = [each.of(each.labels == label) if each else None for each in found]
+        lines = []
+        for axis, name in enumerate(AXES):
+            shares: list[float] = []
+            points: list[list[list[float]]] = []
+            for each in own:
+                if each is None or not len(each.labels):
+                    shares.append(UNDEFINED)
+                    points.append([])
+                    continue
+                errors, sigmas = each.errors[:, axis], each.sigmas[:, axis]
+                shares.append(float((errors <= sigmas).mean()))
+                points.append(np.stack([LEVELS, reliability(errors, sigmas)], 1).round(3).tolist())
+            label_ap = {"label": f"{name}, within 1 sigma", "ap": [_figure(s) for s in shares]}
+            lines.append(label_ap | {"points": points})
+        if any(map(any, (line["points"] for line in lines))):
+            panels.append({"metric": "Gaussians", "class": label, "lines": lines})
+    return panels
+
+
+def _vertices(
+    result: ScoredResult, truth: Mapping[str, MapElements], style: MapStyle
+) -> Vertices | None:
+    """Return the vertices of matched predictions, or None without Gaussians or matches."""
+    some = [elements for elements in result.predictions.values() if len(elements)]
+    matched = any((matches.matched_gt >= 0).any() for matches in result.matches.values())
+    if not matched or any(elements.scales is None for elements in some):
+        return None
+    pairs = ((t, result.predictions[t], gt) for t, gt in truth.items() if t in result.predictions)
+    return matched_vertices(pairs, ChamferConfig(tuple(style.classes)))
+
+
+def group_tables(results: Sequence[ScoredResult], groups: Groups, by: str) -> list[Table]:
+    """Return a table per result: AP in percent of each group of samples.
+
+    Args:
+        results: One result or two.
+        groups: Of the samples.
+        by: What they are, for the caption.
+    """
+    tables = []
+    for result in results:
+        head, rows = group_table(result.reports, groups)
+        what = f", {result.name}" if len(results) > 1 else ""
+        tables.append({"caption": f"AP (%) by {by}{what}", "head": head, "rows": rows})
+    return tables
 
 
 def _thinned(found: ClassDetections, column: int) -> list[list[float]]:
