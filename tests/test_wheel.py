@@ -94,6 +94,8 @@ def test_the_wheel_holds_the_models_that_ship_and_scripts_that_run(site):
     assert shipped == {"registry.json", "README.md", *weights}
     assert not (site / "gsmap/gone.py").exists()
     assert os.access(site / "gsmap/.mim/tools/dist_train.sh", os.X_OK)
+    lists = {path.name for path in (REPO / "projects/MapData/mapdata/split_lists").iterdir()}
+    assert {path.name for path in (site / "mapdata/split_lists").iterdir()} == lists != set()
 
 
 def imported() -> set[str]:
