@@ -8,6 +8,7 @@ from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.statistics import gaussian_statistics
 from gsmap.models.maptr.masks import ElementMasks
 from gsmap.models.maptr.references import PointReference, refine_reference
+from gsmap.models.streammapnet.reference import LineReference
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import Gaussians
 
@@ -33,6 +34,21 @@ def test_refinement_at_the_border_stays_finite_and_has_a_gradient():
 def test_refinement_is_float32_under_mixed_precision():
     refined = refine_reference(torch.rand(1, 2), torch.rand(1, 2, dtype=torch.bfloat16))
     assert refined.dtype == torch.float32
+
+
+@pytest.mark.parametrize("reference", [PointReference, GaussianReference, LineReference])
+def test_neighbouring_points_stay_apart_in_bfloat16(reference):
+    """Rounded onto each other, their edges have no direction, and gradients of thousands."""
+    torch.manual_seed(0)
+    reference = reference(ALONG_Y, 8, 1)
+    reference.eval()
+    states = (5 * torch.randn(1, 8) + torch.linspace(0, 1e-3, 20)[:, None])[None]
+    start = reference.start(states)
+    expected = reference.refine(0, states, start)[..., :2]
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(reference.start(states)[..., :2], start[..., :2])
+        assert torch.equal(reference.refine(0, states, start)[..., :2], expected)
+    assert len(expected.flatten(0, 1).unique(dim=0)) > 10
 
 
 def test_refinement_refuses_other_shapes():

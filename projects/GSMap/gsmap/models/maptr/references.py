@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from gsmap.models.maptr.layers import init_matrices, mlp
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.tensors import at_least_float32, check_same_shape
+from gsmap.structures.tensors import at_least_float32, check_same_shape, in_float32
 
 
 def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Tensor:
@@ -94,11 +94,11 @@ class PointReference(nn.Module):
 
     def start(self, query_pos: Tensor) -> Tensor:
         """Return the reference that the first layer starts from. (..., Q, C) -> (..., Q * n, D)"""
-        return self.by_point(self.initial(query_pos)).sigmoid()
+        return self.by_point(in_float32(self.initial, query_pos)).sigmoid()
 
     def offsets(self, layer: int, point_states: Tensor) -> Tensor:
         """Return a layer's change of the reference. (..., Q, C) -> (..., Q * n, D)"""
-        return self.by_point(self.branches[layer](point_states))
+        return self.by_point(in_float32(self.branches[layer], point_states))
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
         """Return the reference after a layer. (..., Q, C), (..., Q * n, D) -> (..., Q * n, D)"""

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from gsmap.models.maptr.references import PointReference
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.tensors import at_least_float32
+from gsmap.structures.tensors import in_float32
 
 
 @MODELS.register_module()
@@ -50,5 +50,5 @@ class LineReference(PointReference):
 
     def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
         """Return the lines after a layer. (B, N, C), (B, N * P, D) -> (B, N * P, D)"""
-        lines = at_least_float32(self.branches[layer](point_states)).sigmoid()
+        lines = in_float32(self.branches[layer], point_states).sigmoid()
         return lines.unflatten(-1, (-1, self.coords)).flatten(1, 2)
