@@ -130,7 +130,7 @@ def test_a_signal_that_another_thread_is_given_waits_until_processes_have_starte
     done = threading.Event()
     other = threading.Thread(target=done.wait)  # it takes what the main thread blocks
     other.start()
-    steps = []
+    steps, before = [], signal.signal(signal.SIGINT, signal.default_int_handler)  # or ignored
 
     def start():
         with parallel._signals_later():
@@ -141,8 +141,9 @@ def test_a_signal_that_another_thread_is_given_waits_until_processes_have_starte
     try:
         with pytest.raises(KeyboardInterrupt):
             start()
+        assert steps == ["started"]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
+        signal.signal(signal.SIGINT, before)
         done.set()
         other.join()
-    assert steps == ["started"]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
