@@ -2,6 +2,7 @@
 
 A setting that no number is known of is not here.
 """
+# Over 400 lines: one table of all papers is easier to check against them than parts of it.
 
 from collections.abc import Iterator
 from pathlib import Path

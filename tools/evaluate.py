@@ -31,7 +31,7 @@ from gsmap.evaluation.file_evaluation import (
     match_samples,
     scenes_of,
 )
-from gsmap.evaluation.groups import group_report, group_table, read_groups
+from gsmap.evaluation.groups import ap_by_group, group_report, group_table, read_groups
 from gsmap.evaluation.match_files import write_matches
 from gsmap.evaluation.prior import evaluate_prior
 from gsmap.evaluation.raster_ap import RasterConfig
@@ -379,8 +379,9 @@ def main(argv: list[str] | None = None) -> str:
     if resamples is not None:
         outcome[0].append(interval_report(outcome, resamples, args, evaluator))
     if groups is not None:
-        print(markdown_table(*group_table(outcome[0], groups)) + "\n")
-        outcome[0].append(group_report(outcome[0], groups))
+        aps = ap_by_group(outcome[0], groups)
+        print(markdown_table(*group_table(outcome[0], groups, aps)) + "\n")
+        outcome[0].append(group_report(aps))
     if args.topology:
         outcome[0].extend(topology_reports(args, evaluator))
     if args.consistency:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from export_cases import POINTS_M, SCORES, SMALL, compare, export, shake
 from fuzz.contents import exported_model
 from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from processes import run_python
@@ -22,10 +23,7 @@ from gsmap.apis.export import (
 )
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.apis.onnx_inferencer import OnnxInferencer
-from gsmap.datasets.elements import elements_of_predictions
 from gsmap.structures.elements import MapElements
-from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
-from minicity.generate import generate
 
 for _package in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(_package, reason=f"{_package} is not installed: pip install -e .[onnx]")
@@ -62,53 +60,16 @@ CASES = {
     ),
     "GSMap on MGMapNet": ("projects/GSMap/configs/gsmap_mgmapnet_r18_minicity.py", {}),
 }
-SMALL = {  # of ResNet-18, whose whole is exported with the shipped weights, the first stage
-    "model.img_backbone.num_stages": 1,
-    "model.img_backbone.strides": (1,),
-    "model.img_backbone.dilations": (1,),
-    "model.img_backbone.out_indices": (0,),
-    "model.img_neck.in_channels": [24],
-    "model.img_neck.out_channels": [128],
-    "model.img_neck.upsample_strides": [0.5],
-    "model.map_head.coder.margin_m": None,  # every query and class is found
-    "model.map_head.coder.max_num": 200,
-}
 # its encoder reads the last stages without a neck; every line is found
 SMALL_PIVOTNET = {
     "model.map_head.queries": ((20, 10), (25, 2), (15, 16)),
     "model.map_head.score_threshold": None,
 }
-POINTS_M, SCORES = 1e-3, 1e-4  # float32 sums in another order
 
 
 @pytest.fixture(scope="module")
 def annotations(minicity_annotations):
     return minicity_annotations["val"]
-
-
-def export(inferencer, dataset, path):
-    cameras = inferencer.cfg.test_dataloader.dataset.cameras
-    size = tuple(dataset[0]["inputs"]["img"].shape[-2:])
-    export_onnx(inferencer.model, path, cameras, size)
-    return OnnxInferencer(path, num_threads=1)
-
-
-def compare(inferencer, dataset, exported, indices=(0, 1)):
-    """Return the largest differences of scores and metres, and the elements of the last sample."""
-    in_torch = inferencer.predict(dataset, indices)
-    differences = []
-    for sample, (_, inputs) in zip(in_torch, graph_inputs(exported, dataset, indices), strict=True):
-        expected = elements_of_predictions(sample.pred_instances_3d)
-        found = exported.elements(exported.run(inputs))
-        differences.append(largest_differences(found, expected))
-    return np.max(differences, 0), found, expected
-
-
-def shake(model, seed=0):
-    """Let no weight be neutral: random ones say more."""
-    generator = torch.Generator().manual_seed(seed)
-    for parameter in model.parameters():
-        parameter.data += 0.03 * torch.randn(parameter.shape, generator=generator)
 
 
 @pytest.fixture(scope="module")
@@ -389,101 +350,6 @@ def test_differences_are_of_the_nearest_element_of_a_class():
     b = elements([5.25, 0, 9], [0, 0, 1], [0.5, 0.5, 0.375])
     assert largest_differences(a, b) == pytest.approx((0.025, 0.25))
     assert largest_differences(a, elements([0], [0], [0.5])) == (np.inf, np.inf)
-
-
-STREAMS = {
-    "StreamMapNet": ("configs/streammapnet/streammapnet_r18_minicity.py", {}),
-    "GSMap": ("projects/GSMap/configs/gsmap_stream_r18_minicity.py", {}),
-    "GSMap, small state": (
-        "projects/GSMap/configs/gsmap_stream_r18_minicity.py",
-        {"model.temporal.half": True, "model.temporal.bev.kept_dims": 32},
-    ),
-}
-
-
-@pytest.fixture(scope="module")
-def drives(tmp_path_factory):
-    """Annotations of two scenes of two samples."""
-    root = tmp_path_factory.mktemp("drives") / "root"
-    generate(root, 3, 0, (400, 225), samples_per_scene=2, val_scenes=2, workers=1)
-    convert_nuscenes(NuScenesOptions(root, "v1.0-trainval", dataset="minicity"))
-    return root / "gsmap_minicity_val.arrow"
-
-
-@pytest.mark.parametrize("case", STREAMS)
-def test_a_stream_runs_step_by_step_as_in_torch(case, drives, tmp_path):
-    """Two frames of a scene and two of another: with the memory of each, none of the other."""
-    config, overrides = STREAMS[case]
-    inferencer = MapInferencer(REPO / config, None, "cpu", {**SMALL, **overrides})
-    dataset = inferencer.dataset(drives, drives.parent)
-    shake(inferencer.model)
-    exported = export(inferencer, dataset, tmp_path / "model.onnx")
-    first, second = (scene[:2] for scene in dataset.scenes()[:2])
-    (scores, metres), found, expected = compare(inferencer, dataset, exported, [*first, *second])
-    half = 0.05 if "small" in case else 1.0  # float16 can round the other way
-    assert len(found) == len(expected) > 10
-    assert scores * half < SCORES
-    assert metres * half < POINTS_M
-    alone = next(inferencer.predict(dataset, [second[1]]))
-    forgetful = elements_of_predictions(alone.pred_instances_3d)
-    assert largest_differences(found, forgetful)[1] > 10 * POINTS_M  # the memory counts
-
-
-@pytest.fixture(scope="module")
-def with_memory(tmp_path_factory):
-    """A small model with memory and its file."""
-    model = build_small(temporal={"bev": {}, "queries": {"num": 3}, "embed_dims": 16}).eval()
-    path = tmp_path_factory.mktemp("memory") / "model.onnx"
-    export_onnx(model, path, [f"CAM_{number}" for number in range(NUM_CAMS)], IMAGE_SHAPE)
-    return OnnxInferencer(path, num_threads=1)
-
-
-def frame_of(number: int, scene: str = "a", **changes) -> dict:
-    """Return the calibration and the place of a sample, 2 m after the one before."""
-    pose = np.eye(4)
-    pose[1, 3] = 2.0 * number
-    at = {"scene": scene, "timestamp_ns": number * 500_000_000, "lidar2global": pose}
-    matrices = np.stack([np.eye(4)] * NUM_CAMS)
-    return {
-        "token": f"{scene}{number}",
-        "lidar2img": matrices,
-        "can_bus": np.zeros(18),
-        **at,
-        **changes,
-    }
-
-
-def test_the_state_is_one_flat_set_of_inputs_and_outputs(with_memory):
-    inputs, outputs = (
-        {value.name: (value.shape, value.type) for value in values}
-        for values in (with_memory.session.get_inputs(), with_memory.session.get_outputs())
-    )
-    names = ["bev_feats", "queries_0", "queries_1", "references"]
-    assert [n.removeprefix("memory_") for n in inputs if n.startswith("memory_")] == names
-    for name in names:
-        assert inputs[f"memory_{name}"] == outputs[f"new_memory_{name}"]
-    assert with_memory.metadata["max_gap_s"] == 2.0
-
-
-def test_a_stream_of_a_file_follows_the_rules_of_streams(with_memory):
-    images = np.zeros((NUM_CAMS, *IMAGE_SHAPE, 3), np.uint8)
-    stream = with_memory.new_stream()
-    first = with_memory(images, frame_of(0), stream)
-    second = with_memory(images, frame_of(1), stream)
-    assert not np.allclose(first.scores, second.scores, atol=1e-6)
-    after_a_gap = with_memory(images, frame_of(9), stream)
-    np.testing.assert_array_equal(after_a_gap.scores, first.scores)
-    with pytest.raises(ValueError, match=r"'a9' .* comes twice: its stream is at 'a9'"):
-        with_memory(images, frame_of(9), stream)
-    with pytest.raises(ValueError, match=r"'b10' .* another scene than 'a9'"):
-        with_memory(images, frame_of(10, "b"), stream)
-    with pytest.raises(ValueError, match=r"model\.onnx remembers .* new_stream\(\) starts"):
-        with_memory(images, frame_of(10))
-    with pytest.raises(ValueError, match=r"has no \['scene'\] in its metainfo"):
-        with_memory(images, frame_of(10, scene=None), stream)
-    other = OnnxInferencer(with_memory.path)
-    with pytest.raises(ValueError, match=r"is of .*model\.onnx, and .* start a new stream"):
-        other(images, frame_of(10), stream)
 
 
 def test_a_file_without_memory_takes_no_stream(small):

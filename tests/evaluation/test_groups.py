@@ -31,7 +31,7 @@ def test_the_ap_of_a_group_is_that_of_its_samples_alone():
         for key, value in figures.items():
             assert value == pytest.approx(wanted[key], abs=1e-12), (name, key)
     assert {"chamfer/mAP", "chamfer_hard/mAP", "raster/line/AP@0.5"} <= set(found["0"])
-    head, rows = group_table(reports, groups)
+    head, rows = group_table(reports, groups, found)
     assert head[:4] == ["", "samples", "chamfer mAP", "chamfer divider"]
     assert [row[:2] for row in rows] == [["0", "4"], ["1", "4"], ["2", "4"], ["3", "3"]]
     assert rows[1][2] == f"{100 * found['1']['chamfer/mAP']:.1f}"

@@ -108,23 +108,31 @@ def ap_by_group(reports: Sequence[MetricReport], groups: Groups) -> dict[str, di
     return found
 
 
-def group_report(reports: Sequence[MetricReport], groups: Groups) -> MetricReport:
-    """Return the APs of groups as one report, with keys such as ``by/night/chamfer/mAP``."""
-    metrics: dict[str, float] = {}
-    for name, figures in ap_by_group(reports, groups).items():
-        metrics |= {f"by/{name}/{key}": value for key, value in figures.items()}
-    return MetricReport("by", {}, metrics, {})
+def group_report(found: Mapping[str, Mapping[str, float]]) -> MetricReport:
+    """Return what `ap_by_group` does as one report, with keys such as ``by/night/chamfer/mAP``."""
+    return MetricReport(
+        "by",
+        {},
+        {f"by/{name}/{key}": v for name, aps in found.items() for key, v in aps.items()},
+        {},
+    )
 
 
 def group_table(
-    reports: Sequence[MetricReport], groups: Groups
+    reports: Sequence[MetricReport], groups: Groups, found: Mapping[str, Mapping[str, float]]
 ) -> tuple[list[str], list[list[str]]]:
-    """Return head and rows of a table: samples, means and classes of each group, in percent."""
+    """Return head and rows of a table: samples, means and classes of each group, in percent.
+
+    Args:
+        reports: Of all samples.
+        groups: Their groups.
+        found: From `ap_by_group`.
+    """
     ranked = [report for report in reports if report.detections]
     parts = [(r.name, part) for r in ranked for part in ("mAP", *(f"{n}/AP" for n in r.detections))]
     numbers = np.bincount(groups.draw(reports[0].tokens)[0], minlength=len(groups.names))
     rows = []
-    for (name, figures), number in zip(ap_by_group(reports, groups).items(), numbers, strict=True):
+    for (name, figures), number in zip(found.items(), numbers, strict=True):
         values = (figures[f"{metric}/{part}"] for metric, part in parts)
         cells = ("-" if value == UNDEFINED else f"{100 * value:.1f}" for value in values)
         rows.append([name, str(number), *cells])

@@ -9,7 +9,7 @@ from gsmap.evaluation.average_precision import precision_recall
 from gsmap.evaluation.bootstrap import Interval, Resamples, ap_differences, ap_intervals
 from gsmap.evaluation.calibration import AXES, LEVELS, Vertices, matched_vertices, reliability
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.groups import Groups, group_table
+from gsmap.evaluation.groups import Groups, ap_by_group, group_table
 from gsmap.evaluation.matches import ClassDetections
 from gsmap.evaluation.report import UNDEFINED, MetricReport, flat_metrics
 from gsmap.structures.elements import MapElements
@@ -210,7 +210,7 @@ def group_tables(results: Sequence[ScoredResult], groups: Groups, by: str) -> li
     """
     tables = []
     for result in results:
-        head, rows = group_table(result.reports, groups)
+        head, rows = group_table(result.reports, groups, ap_by_group(result.reports, groups))
         what = f", {result.name}" if len(results) > 1 else ""
         tables.append({"caption": f"AP (%) by {by}{what}", "head": head, "rows": rows})
     return tables

@@ -1,0 +1,46 @@
+"""Models in torch beside their exported files."""
+
+import numpy as np
+import torch
+
+from gsmap.apis.export import export_onnx, graph_inputs, largest_differences
+from gsmap.apis.onnx_inferencer import OnnxInferencer
+from gsmap.datasets.elements import elements_of_predictions
+
+SMALL = {  # of ResNet-18, whose whole is exported with the shipped weights, the first stage
+    "model.img_backbone.num_stages": 1,
+    "model.img_backbone.strides": (1,),
+    "model.img_backbone.dilations": (1,),
+    "model.img_backbone.out_indices": (0,),
+    "model.img_neck.in_channels": [24],
+    "model.img_neck.out_channels": [128],
+    "model.img_neck.upsample_strides": [0.5],
+    "model.map_head.coder.margin_m": None,  # every query and class is found
+    "model.map_head.coder.max_num": 200,
+}
+POINTS_M, SCORES = 1e-3, 1e-4  # float32 sums in another order
+
+
+def export(inferencer, dataset, path):
+    cameras = inferencer.cfg.test_dataloader.dataset.cameras
+    size = tuple(dataset[0]["inputs"]["img"].shape[-2:])
+    export_onnx(inferencer.model, path, cameras, size)
+    return OnnxInferencer(path, num_threads=1)
+
+
+def compare(inferencer, dataset, exported, indices=(0, 1)):
+    """Return the largest differences of scores and metres, and the elements of the last sample."""
+    in_torch = inferencer.predict(dataset, indices)
+    differences = []
+    for sample, (_, inputs) in zip(in_torch, graph_inputs(exported, dataset, indices), strict=True):
+        expected = elements_of_predictions(sample.pred_instances_3d)
+        found = exported.elements(exported.run(inputs))
+        differences.append(largest_differences(found, expected))
+    return np.max(differences, 0), found, expected
+
+
+def shake(model, seed=0):
+    """Let no weight be neutral: random ones say more."""
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in model.parameters():
+        parameter.data += 0.03 * torch.randn(parameter.shape, generator=generator)
