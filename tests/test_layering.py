@@ -49,6 +49,7 @@ MODELS = {
     "mapvr": {"maptr", "encoders"},
     "gemap": {"maptr", "encoders"},
     "mgmapnet": {"maptr", "encoders", "maptrv2"},  # its mask heads are MapTRv2's
+    "hdmapnet": set(),
     "mapqr": {"maptr", "encoders"},
     "mgmap": {"maptr", "encoders"},
     "pivotnet": {"maptr", "encoders"},
@@ -57,7 +58,8 @@ MODELS = {
 }
 # what the others are built on stays
 METHODS = (
-    "maptrv2", "mapvr", "gemap", "mgmapnet", "mapqr", "mgmap", "pivotnet", "streammapnet", "gsmap",
+    "maptrv2", "mapvr", "gemap", "mgmapnet", "mapqr", "mgmap", "hdmapnet", "pivotnet",
+    "streammapnet", "gsmap",
 )  # fmt: skip
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 

@@ -16,6 +16,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -23,6 +24,7 @@ from gsmap.datasets.annotations.record import CLASSES, RANGES
 from gsmap.evaluation.bootstrap import Resamples, ap_differences, ap_intervals, format_intervals
 from gsmap.evaluation.calibration import format_uncertainty, matched_vertices, uncertainty_report
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, HARD_CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.distances import DISTANCE, cut_by_distance, distance_groups
 from gsmap.evaluation.evaluator import HARD_NAME, METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.file_evaluation import (
     Evaluation,
@@ -31,7 +33,13 @@ from gsmap.evaluation.file_evaluation import (
     match_samples,
     scenes_of,
 )
-from gsmap.evaluation.groups import ap_by_group, group_report, group_table, read_groups
+from gsmap.evaluation.groups import (
+    Groups,
+    ap_by_group,
+    group_report,
+    group_table,
+    read_groups,
+)
 from gsmap.evaluation.match_files import write_matches
 from gsmap.evaluation.prior import evaluate_prior
 from gsmap.evaluation.raster_ap import RasterConfig
@@ -146,9 +154,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="of the resamples")
     parser.add_argument(
         "--by",
-        metavar="map|scene|FILE",
-        help="AP of each map or scene alone, or of scenes by night and weather (FILE: scene.json "
-        "of nuScenes' tables, or JSON with a word for each scene)",
+        metavar="map|scene|distance|FILE",
+        help="AP of each map or scene alone, of the map cut at 10 and 20 m from the vehicle, or "
+        "of scenes by night and weather (FILE: scene.json of nuScenes' tables, or JSON with a word "
+        "for each scene)",
     )
     parser.add_argument(
         "--against",
@@ -178,6 +187,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         (args.tracks and not args.consistency, "--tracks needs --consistency"),
         (args.reliability and not args.uncertainty, "--reliability needs --uncertainty"),
         (args.against and args.prior, "--against compares two result files: leave out --prior"),
+        (args.by == DISTANCE and args.prior, "--by distance cuts a result file: leave out --prior"),
+        (args.by == DISTANCE and args.dim == 3, "--by distance is in the plane: leave out --dim 3"),
         (
             args.shard.count and (not args.out or args.prior or args.pr_curves),
             "--shard needs --out, and can neither fit a --prior nor draw --pr-curves",
@@ -359,6 +370,28 @@ def interval_report(
     return MetricReport("intervals", {}, flat, {})
 
 
+def groups_from(args: argparse.Namespace) -> Groups | None:
+    """Read the groups of samples before anything is scored; None: bands of distances, or none."""
+    return None if args.by in (None, DISTANCE) else read_groups(args.ground_truth, args.by)
+
+
+def report_of_parts(
+    reports: Sequence[MetricReport], groups: Groups | None, args: argparse.Namespace
+) -> MetricReport:
+    """Print the AP of each group of samples; without groups, of the map in bands of distances."""
+    if groups is None:
+        evaluator = evaluator_from(args)
+        classes = evaluator.classes
+        inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard, True
+        areas = [label for label, name in enumerate(classes) if name in args.polygon_classes]
+        pieces = cut_by_distance(SamplePairs(*inputs), areas)
+        reports = evaluator.reports(match_samples(pieces, evaluator, args.workers))
+        groups = distance_groups(reports[0].tokens)
+    aps = ap_by_group(reports, groups)
+    print(markdown_table(*group_table(reports, groups, aps)) + "\n")
+    return group_report(aps)
+
+
 def main(argv: list[str] | None = None) -> str:
     args = parse_args(argv)
     if args.executor:
@@ -367,7 +400,7 @@ def main(argv: list[str] | None = None) -> str:
     evaluator = evaluator_from(args)
     if args.shard.count:
         return match_shard(args, evaluator)
-    groups = read_groups(args.ground_truth, args.by) if args.by else None
+    groups = groups_from(args)
     resamples = None
     if args.bootstrap is not None or args.against:
         count = 1000 if args.bootstrap is None else args.bootstrap
@@ -378,10 +411,8 @@ def main(argv: list[str] | None = None) -> str:
         outcome = evaluate(args.results, args, evaluator)
     if resamples is not None:
         outcome[0].append(interval_report(outcome, resamples, args, evaluator))
-    if groups is not None:
-        aps = ap_by_group(outcome[0], groups)
-        print(markdown_table(*group_table(outcome[0], groups, aps)) + "\n")
-        outcome[0].append(group_report(aps))
+    if args.by:
+        outcome[0].append(report_of_parts(outcome[0], groups, args))
     if args.topology:
         outcome[0].extend(topology_reports(args, evaluator))
     if args.consistency:

@@ -44,7 +44,9 @@ def parse_args() -> argparse.Namespace:
         help="samples without results count as empty, results without ground truth are left out",
     )
     parser.add_argument(
-        "--by", metavar="map|scene|FILE", help="a table of AP by parts, as of tools/evaluate.py"
+        "--by",
+        metavar="map|scene|distance|FILE",
+        help="a table of AP by parts, as of tools/evaluate.py",
     )
     return parser.parse_args()
 

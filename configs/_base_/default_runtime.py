@@ -22,7 +22,7 @@ custom_hooks = [dict(type='RunSummaryHook'), dict(type='RigFitHook'), dict(type=
 val_evaluator = dict(type='MapMetric', eval=['chamfer'])
 test_evaluator = dict(type='MapMetric', eval=['chamfer', 'raster'])
 vis_backends = [dict(type='LocalVisBackend'), dict(type='TensorboardVisBackend')]
-visualizer = dict(type='MapVisualizer', name='visualizer', vis_backends=vis_backends)
+visualizer = dict(type='MapVisualizer', vis_backends=vis_backends)
 log_processor = dict(type='MapLogProcessor', window_size=50, by_epoch=True)
 log_level = 'INFO'
 load_from = None

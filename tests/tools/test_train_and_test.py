@@ -184,7 +184,9 @@ def test_two_processes_learn_what_one_learns_from_the_same_batch(tiny_config, tm
         torch.testing.assert_close(weights[1][name], value, rtol=0, atol=1e-6, msg=name)
 
 
-def test_a_cpu_trains_in_bfloat16(tiny_config, trained, tmp_path, monkeypatch):
+def test_a_cpu_trains_in_bfloat16_and_each_run_of_a_process_writes_its_own_curves(
+    tiny_config, tmp_path, monkeypatch
+):
     types = set()
     forward = torch.nn.Linear.forward
 
@@ -194,18 +196,20 @@ def test_a_cpu_trains_in_bfloat16(tiny_config, trained, tmp_path, monkeypatch):
         return result
 
     monkeypatch.setattr(torch.nn.Linear, "forward", noted)
-    args = ["train.py", str(tiny_config), "--work-dir", str(tmp_path), "--amp"]
-    monkeypatch.setattr("sys.argv", [*args, "--cfg-options", "train_cfg.max_epochs=1"])
-    train()
-    assert torch.bfloat16 in types
-    half, full = (
-        json.loads(min(path.glob("*/vis_data/scalars.json")).read_text().splitlines()[0])
-        for path in (tmp_path, trained)
-    )
+    logs = []
+    for work, amp, used in (("full", [], torch.float32), ("half", ["--amp"], torch.bfloat16)):
+        types.clear()
+        args = ["train.py", str(tiny_config), "--work-dir", str(tmp_path / work), *amp]
+        monkeypatch.setattr("sys.argv", [*args, "--cfg-options", "train_cfg.max_epochs=1"])
+        train()
+        assert used in types
+        (curves,) = (tmp_path / work).glob("*/vis_data/scalars.json")
+        logs.append(json.loads(curves.read_text().splitlines()[0]))
+    full, half = logs
     assert half["step"] == full["step"] == 1
     assert half["loss"] == pytest.approx(full["loss"], rel=0.01)
     assert half["loss"] != full["loss"]
-    saved = read_checked(tmp_path / "epoch_1.pth").state
+    saved = read_checked(tmp_path / "half/epoch_1.pth").state
     assert torch.bfloat16 not in {weight.dtype for weight in saved.values()}
 
 

@@ -26,6 +26,7 @@ FOLDERS = (  # every module of these is imported; a method comes and goes with i
     "gsmap.models.mapvr",
     "gsmap.models.gemap",
     "gsmap.models.mgmapnet",
+    "gsmap.models.hdmapnet",
     "gsmap.models.mapqr",
     "gsmap.models.mgmap",
     "gsmap.models.pivotnet",

@@ -119,6 +119,8 @@ def test_a_backbone_with_deformable_convolutions_is_not_folded_nor_fed_channels_
             nn.init.normal_(parameter, std=0.3)
     assert not can_be_folded(backbone)
     model = build_small(img_backbone=config, img_neck=None).eval()
+    assert build_small().channels_last
+    assert not model.channels_last
     model.img_backbone.load_state_dict(backbone.state_dict())
     (feats,) = model.extract_img_feats(IMAGES[None])
     assert_same((feats[0],), backbone(IMAGES))

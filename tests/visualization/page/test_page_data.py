@@ -11,6 +11,11 @@ from processes import run_python
 from report_case import CLASSES, FRAMES, STRANGE, write_case
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
+from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.distances import cut_by_distance, distance_groups
+from gsmap.evaluation.evaluator import MapEvaluator
+from gsmap.evaluation.file_evaluation import SamplePairs
+from gsmap.evaluation.groups import ap_by_group, group_table
 from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.visualization.page.frames import cameras_of, choose_frames
@@ -112,6 +117,20 @@ def test_parts_of_the_samples_have_a_table(case, tmp_path):
         t for t in page_data(path, results, options)["tables"] if "by map, good" in t["caption"]
     )
     assert table["rows"][0][:3] == ["town", str(FRAMES), "50.0"]
+
+
+def test_the_map_near_and_far_has_a_table_that_equals_the_commands(case):
+    path, results = case
+    tables = page_data(path, results, replace(NO_IMAGES, by="distance"))["tables"]
+    (table,) = (t for t in tables if "by distance, good" in t["caption"])
+    classes = AnnotationFile(path).meta.classes
+    evaluator = MapEvaluator(ChamferConfig(classes), None)
+    pieces = cut_by_distance(SamplePairs(results["good"], path, classes), areas=[1])
+    reports = evaluator.reports(evaluator.match(*sample) for sample in pieces)
+    groups = distance_groups(reports[0].tokens)
+    head, rows = group_table(reports, groups, ap_by_group(reports, groups))
+    assert [row[: len(head)] for row in table["rows"]] == rows
+    assert [row[0] for row in rows] == ["0-10 m", "10-20 m", "beyond 20 m"]
 
 
 def test_frames_are_spread_evenly_and_the_worst_are_added(case):

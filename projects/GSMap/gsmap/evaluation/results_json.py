@@ -12,12 +12,14 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from gsmap.structures.bezier import curve_points
 from gsmap.structures.elements import MapElements
 from gsmap.utils.files import atomic_write
 from gsmap.utils.json_items import Place, items_of
 from gsmap.utils.shards import ShardFile
 
 RESULTS_KEY, GROUND_TRUTH_KEY = "results", "GTs"
+BEZIER = "bezier"  # in place of "pts": {"degree", "pts"}, as `gsmap.evaluation.compact` writes it
 THREE_D = "3D"
 SHARD_KIND = "results"
 _LAST_LINE = "]}\n"
@@ -68,7 +70,12 @@ class SampleFile:
         self.about: dict[str, Any] = {}
 
     def __iter__(self) -> Iterator[tuple[str, MapElements, Place]]:
-        """Yield token, elements and place of each sample.
+        """Yield token, elements and place of each sample; errors are those of `raw`."""
+        for _, token, elements, place in self.raw():
+            yield token, elements, place
+
+    def raw(self) -> Iterator[tuple[dict[str, Any], str, MapElements, Place]]:
+        """Yield what stands in the file, token, elements and place of each sample.
 
         Raises:
             FileNotFoundError: If the file does not exist.
@@ -82,7 +89,7 @@ class SampleFile:
             if token in seen:
                 raise ValueError(f"{self.path} holds sample {token!r} more than once.")
             seen.add(token)
-            yield token, elements, place
+            yield item, token, elements, place
         self.about = beside["meta"] if isinstance(beside["meta"], dict) else {}
 
     def tokens(self) -> list[str]:
@@ -120,7 +127,8 @@ class SampleFile:
         if not all(isinstance(v["cls_name"], str) for v in vectors):
             raise TypeError("cls_name is no text")
         ignored.update(v["cls_name"] for v in vectors if v["cls_name"] not in label_of)
-        if any(len(point) == 3 for v in vectors for point in v["pts"][:1]):
+        polylines = [_points_of(vector) for vector in vectors]
+        if any(len(point) == 3 for points in polylines for point in points[:1]):
             ignored[THREE_D] += 1
         extra = {
             name: [v[f"gaussian_{name}"] for v in vectors]
@@ -128,11 +136,21 @@ class SampleFile:
             if self._gaussians and vectors and all(f"gaussian_{name}" in v for v in vectors)
         }
         return MapElements.from_polylines(
-            [v["pts"] for v in vectors],
+            polylines,
             [label_of.get(v["cls_name"], -1) for v in vectors],
             [v["confidence_level"] for v in vectors] if self._key == RESULTS_KEY else None,
             **extra,
         )
+
+
+def _points_of(vector: Mapping[str, Any]) -> Any:
+    """Return the points of a vector, or those of its Bezier curve."""
+    if "pts" in vector or BEZIER not in vector:
+        return vector["pts"]
+    curve = vector[BEZIER]
+    if not isinstance(curve["degree"], int):
+        raise TypeError(f"the degree {curve['degree']!r:.20} is no whole number")
+    return curve_points(curve["pts"], curve["degree"]).tolist()
 
 
 def read_samples(

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from mmcv.ops import ModulatedDeformConv2d
 from mmdet3d.models.detectors import Base3DDetector
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
@@ -72,6 +73,10 @@ class MapDetector(Base3DDetector):
         super().__init__(data_preprocessor=data_preprocessor, init_cfg=init_cfg)
         self.img_backbone = MODELS.build(img_backbone) if img_backbone else None
         self.folded_backbone = FoldedBackbone() if fold_batch_norms else None
+        # channels last is what CPU and tensor-core convolutions are fastest with; mmcv's deformable
+        # convolution takes them for channels first and is silently wrong
+        parts = () if self.img_backbone is None else self.img_backbone.modules()
+        self.channels_last = not any(isinstance(part, ModulatedDeformConv2d) for part in parts)
         self.strict_loading = strict_loading
         self.allow_untrained = allow_untrained
         self.img_neck = MODELS.build(img_neck) if img_neck else None
@@ -96,9 +101,7 @@ class MapDetector(Base3DDetector):
         if self.training and self.img_augment is not None:
             images = self.img_augment(images)
         folded, backbone = self.folded_backbone, self.img_backbone
-        # channels last is what CPU and tensor-core convolutions are fastest with; mmcv's deformable
-        # convolution takes them for channels first and is silently wrong
-        if not getattr(backbone, "dcn", None):
+        if self.channels_last:
             images = images.contiguous(memory_format=torch.channels_last)
         feats = backbone(images) if folded is None else folded(backbone, images)
         if self.img_neck is not None:

@@ -13,16 +13,18 @@ from typing import Any
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.bootstrap import Resamples
+from gsmap.evaluation.distances import DISTANCE, distance_groups
 from gsmap.evaluation.file_evaluation import read_ground_truth
 from gsmap.evaluation.groups import read_groups
 from gsmap.evaluation.raster_ap import MIN_SCORE
+from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 from gsmap.visualization.bev_view import display_extent
 from gsmap.visualization.page.frames import cameras_of, choose_frames, found_of, truth_of
-from gsmap.visualization.page.scores import MATCH_M, ScoredResult, score_result
+from gsmap.visualization.page.scores import MATCH_M, ScoredResult, score_result, scored_by_distance
 from gsmap.visualization.page.tables import (
     Table,
     class_tables,
@@ -136,7 +138,7 @@ def page_data(
         "min_score": MIN_SCORE,
         "score": options.score_thr,
         "results": [result.name for result in scored],
-        "tables": _tables(scored, style, file, options) if scored else [],
+        "tables": _tables(scored, truth, style, file, options) if scored else [],
         "curves": curves(scored, style) if scored else [],
         "reliability": reliability_curves(scored, truth, style),
         "frames": frames,
@@ -149,13 +151,21 @@ def _title(scene: str, seconds: float) -> str:
 
 
 def _tables(
-    scored: Sequence[ScoredResult], style: MapStyle, file: AnnotationFile, options: PageOptions
+    scored: Sequence[ScoredResult],
+    truth: Mapping[str, MapElements],
+    style: MapStyle,
+    file: AnnotationFile,
+    options: PageOptions,
 ) -> list[Table]:
     """Return the tables of one or two results, with intervals where there are several scenes."""
     scene_of = dict(zip(file.column("token"), file.column("scene"), strict=True))
     resamples = Resamples(scene_of) if len(set(scene_of.values())) > 1 else None
     tables = [summary_table(scored, resamples), *class_tables(scored, style)]
-    if options.by:
+    if options.by == DISTANCE:
+        near_and_far = [scored_by_distance(result, truth, file.meta) for result in scored]
+        groups = distance_groups(near_and_far[0].reports[0].tokens)
+        tables += group_tables(near_and_far, groups, DISTANCE)
+    elif options.by:
         groups = read_groups(file.path, options.by)
         tables += group_tables(scored, groups, Path(options.by).name)
     if len(scored) == 2:

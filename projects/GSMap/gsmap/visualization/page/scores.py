@@ -1,17 +1,19 @@
 """A result file scored for the page, with the matches of each sample."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.distances import cut_by_distance
 from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.file_evaluation import mismatch_notes
 from gsmap.evaluation.matches import FrameMatches
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import MetricReport
 from gsmap.evaluation.results_json import RESULTS_KEY, THREE_D, read_samples
+from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
 
@@ -78,9 +80,30 @@ def score_result(
     if others.pop(THREE_D, 0):
         notes.append("some predictions have heights, which no figure here counts")
     notes += [f"{n} predictions of class {c!r} are not scored" for c, n in sorted(others.items())]
-    grid = BEVGrid(meta.x_range, meta.y_range)
-    evaluator = MapEvaluator(ChamferConfig(meta.classes), RasterConfig(meta.classes, grid))
-    nothing = MapElements.from_polylines()
+    evaluator, nothing = _evaluator(meta), MapElements.from_polylines()
     found = [evaluator.match(t, predictions.get(t, nothing), gt) for t, gt in truth.items()]
     matches = {sample["chamfer"].token: sample["chamfer"] for sample in found}
     return ScoredResult(name, predictions, matches, evaluator.reports(found), notes)
+
+
+def scored_by_distance(
+    result: ScoredResult, truth: Mapping[str, MapElements], meta: AnnotationMeta
+) -> ScoredResult:
+    """Return a result whose reports are of the map in bands of distances from the vehicle.
+
+    Args:
+        result: A scored result file.
+        truth: Ground truth of each sample, by token.
+        meta: Classes and range.
+    """
+    evaluator, nothing = _evaluator(meta), MapElements.from_polylines()
+    samples = ((token, result.predictions.get(token, nothing), gt) for token, gt in truth.items())
+    areas = [label for label, name in enumerate(meta.classes) if name in AREA_CLASSES]
+    found = (evaluator.match(*pieces) for pieces in cut_by_distance(samples, areas))
+    return replace(result, reports=evaluator.reports(found))
+
+
+def _evaluator(meta: AnnotationMeta) -> MapEvaluator:
+    """Return the metrics of the page."""
+    grid = BEVGrid(meta.x_range, meta.y_range)
+    return MapEvaluator(ChamferConfig(meta.classes), RasterConfig(meta.classes, grid))

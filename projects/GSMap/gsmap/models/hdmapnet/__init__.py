@@ -1,0 +1,1 @@
+"""HDMapNet: lines from maps of classes, instances and directions."""

@@ -1,0 +1,40 @@
+#!/usr/bin/env python
+"""Write a result file with Bezier curves in place of points, within an error in metres.
+
+Every command here reads the new file like the old one:
+    python tools/compact_results.py results.json compact.json --max-error 0.1
+    python tools/evaluate.py compact.json gsmap_nuscenes_val.arrow
+"""
+
+import argparse
+from pathlib import Path
+
+from gsmap.evaluation.compact import compact_results
+from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.utils.words import counted
+
+
+def main(argv: list[str] | None = None) -> str:
+    parser = CommandParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("results", type=Path, help="results in MapTR's JSON form")
+    parser.add_argument("out", type=output_file, help="file to write")
+    parser.add_argument("--degree", type=int, default=3, help="of the curves, 1 to 5")
+    parser.add_argument(
+        "--max-error", type=float, default=0.1, help="of a curve from its line, in metres"
+    )
+    args = parser.parse_args(argv)
+    if args.out.resolve() == args.results.resolve():
+        parser.error("the new file would replace the results: give another name")
+    found = compact_results(args.results, args.out, args.degree, args.max_error)
+    sizes = [path.stat().st_size / 1e6 for path in (args.results, args.out)]
+    return (
+        f"{counted(found.elements, 'element')}, {found.vertices} points as {found.controls} "
+        f"control points, at most {found.largest_m:.3f} m off: {args.out} "
+        f"({sizes[1]:.1f} MB instead of {sizes[0]:.1f})"
+    )
+
+
+if __name__ == "__main__":
+    run_command(main)
