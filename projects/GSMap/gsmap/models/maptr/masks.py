@@ -30,6 +30,7 @@ class ElementMasks:
             points in the matched order (in matching, in the annotated one); ``"gaussians"``: as
             ``"points"``, by Gaussians along them (GSMap Eq. 6), whose mask has the line's width in
             mass, so that a prediction can equal it.
+        held_classes: Classes whose masks move no point: their losses reach sigma and theta alone.
 
     Raises:
         ValueError: If ``source`` is unknown, or the pixels do not divide the map.
@@ -43,6 +44,7 @@ class ElementMasks:
         line_width_m: float = 0.75,
         filled_classes: Sequence[int] = (),
         source: str = "full",
+        held_classes: Sequence[int] = (),
     ) -> None:
         if source not in SOURCES:
             raise ValueError(f"source must be one of {SOURCES}, got {source!r}.")
@@ -52,6 +54,7 @@ class ElementMasks:
         self.line_width_m = line_width_m
         self.filled_classes = tuple(filled_classes)
         self.source = source
+        self.held_classes = tuple(held_classes)
 
     @classmethod
     def of(cls, grid: BEVGrid, masks: "ElementMasks | dict[str, Any] | None") -> "ElementMasks":
@@ -77,6 +80,20 @@ class ElementMasks:
         if self.filled_classes:
             filled = torch.isin(labels, labels.new_tensor(self.filled_classes))
         return draw_polylines(polylines[..., :2].float(), grid, self.line_width_m, filled)
+
+    def held(self, references: Tensor, labels: Tensor, coords: int) -> Tensor:
+        """Return references whose points get no gradient if their class is held.
+
+        Args:
+            references: What the decoder refines, ``coords`` coordinates first. (M, P, D)
+            labels: Class indices. (M,)
+            coords: Number of coordinates of a point.
+        """
+        if not self.held_classes:
+            return references
+        held = torch.isin(labels, labels.new_tensor(self.held_classes))[:, None, None]
+        points = references[..., :coords]
+        return torch.cat([torch.where(held, points.detach(), points), references[..., coords:]], -1)
 
     def draw_sample(self, gt_instances: InstanceData, grid: BEVGrid) -> Tensor:
         """Draw a sample's ground truth, before its matching is known. (K, H, W)"""

@@ -205,7 +205,9 @@ class MatchedPairs:
     @cached_property
     def pred_masks(self) -> Tensor:
         """Masks rendered from the predicted Gaussians. (M, H, W)"""
-        return self.predictions.reference.render(self.pred_references, self.predictions.masks.grid)
+        reference, masks = self.predictions.reference, self.predictions.masks
+        references = masks.held(self.pred_references, self.gt_labels, reference.coords)
+        return reference.render(references, masks.grid)
 
     @cached_property
     def pred_instance_states(self) -> Tensor:
