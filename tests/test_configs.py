@@ -199,6 +199,8 @@ SETTINGS = {  # every line of the table in GSMap's README, with another value th
     "masks.source": "points",
     "masks.line_width_m": 1.0,
     "masks.filled_classes": [1],
+    "masks.held_classes": [1],
+    "coder.unfold_classes": [0, 2],
     "masks.pixel_m": 0.6,
     "masks.cost_pixel_m": 1.2,
     "loss_raster.alpha": 1.0,

@@ -58,6 +58,7 @@ CASES = {
         GSMAP,
         {"model.map_head.reference": {"coords": 3, "z_range": (-5.0, 3.0)}},
     ),
+    "GSMap, unfolded": (GSMAP, {"model.map_head.coder.unfold_classes": [0, 2]}),
     "GSMap on MGMapNet": ("projects/GSMap/configs/gsmap_mgmapnet_r18_minicity.py", {}),
 }
 # its encoder reads the last stages without a neck; every line is found

@@ -1,5 +1,6 @@
 """Polylines: values worked by hand, and MapTR's training targets."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from gsmap.structures.polylines import (
     is_closed,
     resample,
     resample_all,
+    shortest_orders,
 )
 
 SQUARE = np.array([[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]], float)
@@ -175,3 +177,48 @@ def test_the_orders_of_a_long_ring_are_spread_evenly_over_it():
     starts = equivalent_orders(ring, 5)[:, 0]
     quarters = [[1, 0], [0, -1], [-1, 0], [0, 1]]  # order k starts at vertex -k
     np.testing.assert_allclose(starts, quarters, atol=1e-12)
+
+
+def way_m(line):
+    return np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+
+
+def test_a_line_that_runs_back_and_forth_is_put_straight():
+    """Points of a line along x whose middle part was walked backwards, and one that needs nothing."""
+    straight = np.stack([np.arange(8.0), np.zeros(8)], -1)
+    folded = straight[[0, 1, 5, 4, 3, 2, 6, 7]]
+    orders = shortest_orders(np.stack([folded, straight]))
+    np.testing.assert_array_equal(folded[orders[0]], straight)
+    assert orders[1].tolist() == list(range(8))
+
+
+def test_ends_may_change_but_those_of_a_ring():
+    line = np.array([[2, 0], [1, 0], [0, 0], [3, 0], [4, 0]], float)
+    assert shortest_orders(line[None]).tolist() == [[2, 1, 0, 3, 4]]
+    angles = np.linspace(0, 2 * np.pi, 9)
+    ring = np.stack([np.cos(angles), np.sin(angles)], -1)
+    ring[-1] += 1e-4  # nearly closed: without the rule it would open where its step is longest
+    assert shortest_orders(ring[None]).tolist() == [list(range(9))]
+
+
+def test_orders_are_permutations_that_no_reversal_shortens():
+    rng = np.random.default_rng(0)
+    lines = rng.normal(size=(40, 7, 3)) * [1, 5, 100]  # heights do not count
+    orders = shortest_orders(lines)
+    assert (np.sort(orders, 1) == np.arange(7)).all()
+    for line, order in zip(lines[..., :2], orders, strict=True):
+        found = way_m(line[order])
+        ring = np.linalg.norm(line[0] - line[-1]) < way_m(line) / 6
+        assert found <= way_m(line)
+        for first, last in itertools.combinations(range(7), 2):
+            if ring and (first == 0 or last == 6):
+                continue
+            other = [*order[:first], *order[first : last + 1][::-1], *order[last + 1 :]]
+            assert found <= way_m(line[other]) + 1e-3
+
+
+def test_lines_of_no_or_one_point_and_no_lines_have_an_order():
+    assert shortest_orders(np.zeros((0, 20, 2))).shape == (0, 20)
+    assert shortest_orders(np.zeros((3, 1, 2))).tolist() == [[0]] * 3
+    assert shortest_orders(np.zeros((1, 2, 2))).tolist() == [[0, 1]]
+    assert shortest_orders(np.zeros((1, 4, 2))).tolist() == [[0, 1, 2, 3]]

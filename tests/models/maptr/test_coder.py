@@ -37,6 +37,17 @@ def test_low_scores_can_be_dropped():
     assert best.query_inds.tolist() == [1]
 
 
+def test_points_of_lines_are_unfolded_with_all_that_belongs_to_them():
+    folded = torch.tensor([[0.0, 0], [0, 2], [0, 1], [0, 3]])
+    fields = {"pts": folded.repeat(2, 1, 1), "scales": torch.arange(16.0).view(2, 4, 2)}
+    coder = MapCoder(GRID, unfold_classes=[2])
+    found = coder.unfolded(fields, torch.tensor([2, 1]))
+    assert found["pts"][:, :, 1].tolist() == [[0, 1, 2, 3], [0, 2, 1, 3]]
+    assert found["scales"][0].tolist() == [[0, 1], [4, 5], [2, 3], [6, 7]]
+    torch.testing.assert_close(found["scales"][1], fields["scales"][1])
+    assert MapCoder(GRID).unfolded(fields, torch.tensor([2, 2])) is fields
+
+
 def test_wrong_settings_are_refused():
     with pytest.raises(ValueError, match="max_num must be >= 1, got 0"):
         MapCoder(GRID, max_num=0)

@@ -132,3 +132,15 @@ def test_the_mask_of_another_order_would_pull_centres_off_their_points(crossing)
     masks = ElementMasks(ALONG_Y)
     first = masks.draw(gt.pts, gt.labels_3d, masks.grid)
     assert fit(matched, first, masks) > 0.5
+
+
+def test_masks_of_held_classes_move_no_point():
+    masks = ElementMasks(ALONG_Y, held_classes=[1])
+    references = torch.rand(3, 4, 5, requires_grad=True)
+    held = masks.held(references, torch.tensor([0, 1, 2]), coords=2)
+    torch.testing.assert_close(held, references)
+    held.sum().backward()
+    expected = torch.ones(3, 4, 5)
+    expected[1, :, :2] = 0
+    torch.testing.assert_close(references.grad, expected)
+    assert ElementMasks(ALONG_Y).held(references, torch.tensor([0, 1, 2]), coords=2) is references

@@ -175,6 +175,7 @@ def export_onnx(
         "cameras": list(cameras),
         "margin_m": head.coder.margin_m,
         "score_threshold": head.coder.score_threshold,
+        "unfold_classes": list(head.coder.unfold_classes),
     }
     if "can_bus" in exported.input_names:
         metadata["can_bus"] = CAN_BUS_RULE

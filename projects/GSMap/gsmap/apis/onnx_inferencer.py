@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.elements import MapElements
+from gsmap.structures.polylines import shortest_orders
 from gsmap.structures.streams import Frame, MapStream, Scenes, StreamState
 from gsmap.utils.extras import import_extra
 
@@ -263,6 +264,11 @@ class OnnxInferencer:
         }
         if not np.isin(kept["labels"], range(len(self.classes))).all():
             raise ValueError(f"a label is none of the {len(self.classes)} classes")
+        lines = np.isin(kept["labels"], self.metadata.get("unfold_classes", []))
+        if lines.any():
+            orders = shortest_orders(kept["points"][lines])
+            for name in kept.keys() - {"scores", "labels"}:
+                kept[name][lines] = kept[name][lines][np.arange(len(orders))[:, None], orders]
         points, numbers = kept.pop("points"), kept.pop("num_pts", None)
         if numbers is not None:
             lines = [line[:number] for line, number in zip(points, numbers, strict=True)]
@@ -288,5 +294,8 @@ def _check_metadata(metadata: Mapping[str, Any]) -> None:
     for name in ("margin_m", "score_threshold"):
         if metadata[name] is not None and not np.isfinite(metadata[name]):
             raise ValueError(f"{name} must be a number, got {metadata[name]!r:.80}")
+    unfold = metadata.get("unfold_classes", [])
+    if not (isinstance(unfold, list) and all(type(label) is int for label in unfold)):
+        raise ValueError(f"unfold_classes must be class indices, got {unfold!r:.80}")
     if not 0 < metadata.get("max_gap_s", 1.0) < np.inf:
         raise ValueError(f"max_gap_s must be seconds > 0, got {metadata['max_gap_s']!r:.80}")

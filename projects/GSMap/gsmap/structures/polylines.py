@@ -132,6 +132,46 @@ def sampled_orders(points: Points, closed: bool) -> NDArray[np.float64]:
     return orders
 
 
+def shortest_orders(lines: Points, least_gain_m: float = 1e-3) -> NDArray[np.int64]:
+    """Return orders of the points of lines in which the way through them is short.
+
+    The part of a line whose reversal shortens it most is reversed, until none does (2-opt, Croes
+    1958), so a line that runs back and forth runs straight. A line that ends where it begins, by
+    less than its mean step, keeps its ends.
+
+    Args:
+        lines: Points of each line in metres; the way is one in the plane. (M, P, 2 or 3)
+        least_gain_m: Metres that a reversal must save.
+
+    Returns:
+        Numbers of the points of each line in their new order. (M, P)
+    """
+    lines = np.asarray(lines, np.float64)[..., :2]
+    count, size = lines.shape[:2]
+    apart = np.linalg.norm(lines[:, :, None] - lines[:, None], axis=-1)  # (M, P, P)
+    steps = np.linalg.norm(np.diff(lines, axis=1), axis=-1)
+    ring = apart[:, 0, -1] < steps.mean(1) if size > 1 else np.zeros(count, bool)
+    orders, places = np.tile(np.arange(size), (count, 1)), np.arange(size)
+    left = np.arange(count if size > 2 else 0)
+    while len(left):
+        rows = orders[left]
+        ways = apart[left[:, None, None], rows[:, :, None], rows[:, None]]
+        ways = np.pad(ways, ((0, 0), (1, 1), (1, 1)))  # beyond its ends a line goes nowhere
+        step = ways.diagonal(1, 1, 2)  # to each point from the one before it, (m, P + 1)
+        # [i, j]: the steps into and out of points i to j, as they are and with these reversed
+        gain = step[:, :-1, None] + step[:, None, 1:] - ways[:, :-2, 1:-1] - ways[:, 1:-1, 2:]
+        gain[ring[left], 0], gain[ring[left], :, -1] = 0.0, 0.0
+        gain = np.triu(gain, 1).reshape(len(left), -1)
+        best = gain.argmax(1)
+        better = gain[np.arange(len(left)), best] > least_gain_m
+        left = left[better]
+        first, last = (ends[better, None] for ends in np.divmod(best, size))
+        inside = (places >= first) & (places <= last)
+        turned = np.where(inside, first + last - places, places)
+        orders[left] = np.take_along_axis(orders[left], turned, 1)
+    return orders
+
+
 def bounding_boxes(points: Points) -> Points:
     """Return axis-aligned boxes (xmin, ymin, xmax, ymax) in metres. (..., P, D) -> (..., 4)."""
     xy = np.asarray(points)[..., :2]

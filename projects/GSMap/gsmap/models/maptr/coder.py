@@ -10,6 +10,7 @@ from mmengine.structures import InstanceData
 from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.polylines import shortest_orders
 
 Tensors = dict[str, Tensor]
 Samples = Sequence[Det3DDataSample]
@@ -32,6 +33,8 @@ class MapCoder:
         max_num: Largest number of detections per sample; ValueError if it is not positive.
         margin_m: How far beyond the map a point may lie, in metres, > 0; None keeps all.
         score_threshold: Smallest score to keep; None keeps all.
+        unfold_classes: Class indices of lines whose points are put in the order of a short way
+            through them (`shortest_orders`), for masks do not see when a line runs back and forth.
     """
 
     def __init__(
@@ -40,6 +43,7 @@ class MapCoder:
         max_num: int = 50,
         margin_m: float | None = 5.0,
         score_threshold: float | None = None,
+        unfold_classes: Sequence[int] = (),
     ) -> None:
         if max_num < 1:
             raise ValueError(f"max_num must be >= 1, got {max_num}.")
@@ -47,6 +51,7 @@ class MapCoder:
             raise ValueError(f"margin_m must be > 0, got {margin_m}.")
         self.grid, self.max_num = grid, max_num
         self.margin_m, self.score_threshold = margin_m, score_threshold
+        self.unfold_classes = tuple(unfold_classes)
 
     def decode(self, scores: Tensor, pts: Tensor) -> Detections:
         """Select at most ``max_num`` detections; index ``pts`` with their ``query_inds``.
@@ -70,6 +75,22 @@ class MapCoder:
         best, index = flat.topk(min(self.max_num, len(flat)))
         query = torch.div(index, scores.shape[-1], rounding_mode="floor")
         return Detections(best, index % scores.shape[-1], query)
+
+    def unfolded(self, fields: Tensors, labels: Tensor) -> Tensors:
+        """Put what belongs to points in the order of a short way through them.
+
+        Args:
+            fields: ``pts`` in metres (M, P, 2 or 3), and what else points have. (M, P, ...)
+            labels: Class indices; of those not in ``unfold_classes``, points stay. (M,)
+        """
+        if not self.unfold_classes:
+            return fields
+        points = fields["pts"]
+        lines = torch.isin(labels, labels.new_tensor(self.unfold_classes))
+        orders = torch.arange(points.shape[1], device=points.device).repeat(len(points), 1)
+        orders[lines] = torch.from_numpy(shortest_orders(points[lines].cpu().numpy())).to(orders)
+        rows = torch.arange(len(points), device=points.device)[:, None]
+        return {name: values[rows, orders] for name, values in fields.items()}
 
 
 class DetectionHead(BaseModule):
@@ -101,7 +122,7 @@ class DetectionHead(BaseModule):
         for scores, references in zip(outputs[-1].scores, outputs[-1].references, strict=True):
             fields = self.reference.decode(references)
             best = self.coder.decode(scores, fields["pts"])
-            chosen = self.detected(fields, best)
+            chosen = self.coder.unfolded(self.detected(fields, best), best.labels)
             chosen.update(scores_3d=best.scores, labels_3d=best.labels)
             results.append(InstanceData(metainfo=dict(self.reference.metainfo), **chosen))
         return results

@@ -173,7 +173,12 @@ class MapHead(DetectionHead):
                 raise ValueError(
                     f"query group {group.name!r} names losses {unknown}; there are {names}."
                 )
-        check_classes("masks.filled_classes", self.masks.filled_classes, self.classes)
+        for name, given in (
+            ("masks.filled_classes", self.masks.filled_classes),
+            ("masks.held_classes", self.masks.held_classes),
+            ("coder.unfold_classes", self.coder.unfold_classes),
+        ):
+            check_classes(name, given, self.classes)
         for loss in cast(Any, self.losses.values()):
             loss.check(self)
             check_weight(loss, loss.loss_weight, self.classes)
