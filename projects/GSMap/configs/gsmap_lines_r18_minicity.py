@@ -9,4 +9,5 @@ model = dict(
         loss_raster=dict(loss_weight=15.0),
         iou_cost=dict(weight=[10.0, 0.0, 10.0]),
         masks=dict(line_width_m=1.5, held_classes=[1]),
+        coder=dict(unfold_classes=[0, 2]),
         reference=dict(min_scale_m=60 / 128)))
