@@ -162,7 +162,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         metavar="map|scene|distance|FILE",
         help="AP of each map or scene alone, of the map cut at 10 and 20 m from the vehicle, or "
         "of scenes by night and weather (FILE: scene.json of nuScenes' tables, or JSON with a word "
-        "for each scene)",
+        "for each scene or each sample)",
     )
     parser.add_argument(
         "--against",
