@@ -18,6 +18,10 @@ LINE = np.array([[0.0, 0.0], [0.0, 3.0]])  # 7 points
 SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [0.0, 0.0]])  # 16 points
 
 
+def aside(metres: float) -> np.ndarray:
+    return LINE + np.array([metres, 0])
+
+
 def of_lines(first: np.ndarray, second: np.ndarray, cutoff_m: float = 1.0) -> tuple:
     return tuple(sospa(spaced(first), spaced(second), (cutoff_m,))[0])
 
@@ -40,14 +44,14 @@ def test_points_stand_every_half_metre_and_at_the_end():
 
 def test_a_shifted_line_costs_its_shift_at_every_point():
     # C = 7 * 0.2, G = 0.5 * 14: 2 * 1.4 / 8.4, all of it between paired points
-    assert of_lines(LINE + [0.2, 0], LINE) == pytest.approx((1 / 3, 1 / 3), abs=1e-12)
+    assert of_lines(aside(0.2), LINE) == pytest.approx((1 / 3, 1 / 3), abs=1e-12)
     assert of_lines(LINE[::-1], LINE) == (0, 0)
-    assert of_lines(LINE + [1.0, 0], LINE) == (1, 0)  # no two points are within the cut-off
+    assert of_lines(aside(1.0), LINE) == (1, 0)  # no two points are within the cut-off
 
 
 def test_a_line_that_is_too_short_costs_half_a_cutoff_for_each_point_missing():
     # 5 of 7 points: C = 2 * 0.5, G = 0.5 * 12
-    assert of_lines(LINE[:1] + [[0, 0], [0, 2]], LINE) == pytest.approx((2 / 7, 0), abs=1e-12)
+    assert of_lines(LINE * [[1, 2 / 3]], LINE) == pytest.approx((2 / 7, 0), abs=1e-12)
 
 
 def test_order_counts_where_the_chamfer_distance_is_zero():
@@ -61,8 +65,8 @@ def test_rings_may_start_anywhere_and_run_either_way():
     turned = np.concatenate([SQUARE[2:-1], SQUARE[:3]])
     assert of_lines(turned, SQUARE) == (0, 0)
     assert of_lines(turned[::-1], SQUARE) == (0, 0)
-    nearly = SQUARE[2:].tolist() + [[2.0, 0.0], [2.0, 1.95]]  # ends 5 cm apart
-    assert of_lines(np.array(nearly), SQUARE)[0] < 0.01
+    nearly = np.concatenate([SQUARE[2:], [[2.0, 0.0], [2.0, 1.95]]])  # ends 5 cm apart
+    assert of_lines(nearly, SQUARE)[0] < 0.01
     open_ended = np.array([[2.0, 2.0], [0.0, 2.0], [0.0, 0.0], [2.0, 0.0]])  # 13 of 16 points
     # in the ring's order from there on; C = 3 * 0.5, G = 0.5 * 29
     assert of_lines(open_ended, SQUARE)[0] == pytest.approx(3 / 16, abs=1e-12)
@@ -108,8 +112,8 @@ def test_sospa_is_a_metric_of_open_lines(seed):
 
 def test_pld_of_a_sample_by_hand():
     """One line is found 0.2 m aside (s = 1/3, score 0.9), one is missed, one of 0.4 is false."""
-    far = LINE + [10.0, 0]
-    found = figures([LINE + [0.2, 0], LINE - [10.0, 0]], [0.9, 0.4], [LINE, far])
+    far = aside(10.0)
+    found = figures([aside(0.2), aside(-10.0)], [0.9, 0.4], [LINE, far])
     # D = 0.9 / 3 + 0.1 / 2 + 0.4 / 2 + 1 / 2, M = (1.3 + 2) / 2
     assert found["divider/PLD@1.0"] == pytest.approx(2 * 1.05 / (1.65 + 1.05), abs=1e-12)
     assert found["divider/localisation"] == pytest.approx(2 * 0.3 / 2.7, abs=1e-12)
@@ -121,7 +125,7 @@ def test_pld_of_a_sample_by_hand():
 
 def test_pld_has_its_ends_at_equal_maps_and_at_maps_without_a_pair():
     assert figures([LINE, SQUARE], [1, 1], [SQUARE, LINE])["divider/PLD"] == 0
-    assert figures([LINE + [5.0, 0]], [0.3], [LINE])["divider/PLD"] == 1
+    assert figures([aside(5.0)], [0.3], [LINE])["divider/PLD"] == 1
     assert figures([], [], [LINE])["divider/PLD"] == 1
     assert figures([LINE], [0.3], [])["divider/PLD"] == 1
     assert figures([], [], [])["divider/PLD"] == 0
@@ -130,11 +134,9 @@ def test_pld_has_its_ends_at_equal_maps_and_at_maps_without_a_pair():
 
 
 def test_samples_count_by_their_elements_and_classes_apart():
-    other = elements([LINE], [2]), elements([LINE], [2], [1.0])
-    found = pld_figures(
-        [("a", elements([LINE], scores=[1.0]), elements([LINE])), ("b", other[1], elements([LINE]))],
-        CONFIG,
-    )
+    other = elements([LINE], [2], [1.0])
+    first = "a", elements([LINE], scores=[1.0]), elements([LINE])
+    found = pld_figures([first, ("b", other, elements([LINE]))], CONFIG)
     # dividers: one found, one missed: D = 1/2, M = 3/2; boundaries: one that is not there
     assert found["divider/PLD"] == pytest.approx(0.5)
     assert found["boundary/PLD"] == 1
@@ -158,8 +160,8 @@ def test_pld_takes_the_best_of_all_ways_to_pair_lines(seed):
 
 def test_looser_cutoffs_are_averaged():
     config = ChamferConfig(CLASSES, (0.5, 1.0))
-    found = figures([LINE + [0.2, 0]], [1.0], [LINE], config)
-    at = [of_lines(LINE + [0.2, 0], LINE, cutoff)[0] for cutoff in (0.5, 1.0)]
+    found = figures([aside(0.2)], [1.0], [LINE], config)
+    at = [of_lines(aside(0.2), LINE, cutoff)[0] for cutoff in (0.5, 1.0)]
     # one pair, score 1: D = s, M = 1
     expected = [2 * s / (1 + s) for s in at]
     assert [found["divider/PLD@0.5"], found["divider/PLD@1.0"]] == pytest.approx(expected)

@@ -68,7 +68,8 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
     groups = file.column(_COLUMNS.get(by, "scene"))
     if by not in _COLUMNS:
         group_of = _groups_in(by)
-        kind, names = ("sample", tokens) if group_of.keys() & set(tokens) else ("scene", groups)
+        of_samples = not group_of.keys().isdisjoint(tokens)
+        kind, names = ("sample", tokens) if of_samples else ("scene", groups)
         if missing := next((name for name in names if name not in group_of), None):
             raise ValueError(f"{by} has no {kind} {missing!r}, which {annotations} has.")
         groups = [group_of[name] for name in names]
@@ -85,8 +86,8 @@ def _groups_in(path: str) -> dict[str, str]:
         for text in content.values()
     ):
         raise ValueError(
-            f"{path} is neither an object with the group of each scene or sample, in at most {_LONGEST} "
-            "characters, nor a scene.json of nuScenes."
+            f"{path} is neither an object with the group of each scene or sample, in at most "
+            f"{_LONGEST} characters, nor a scene.json of nuScenes."
         )
     return content
 
