@@ -2,7 +2,8 @@
 r"""Fit the sigmas of a model's Gaussians to its errors, and write a checkpoint that has them.
 
 RESULTS are the model's predictions of samples that it was not trained on. Each class gets a factor
-for sigma along and one for sigma across the line: 68.3 % of the errors then lie within one sigma.
+for sigma along and one for sigma across the line: 68.3 % of the errors then lie within one sigma,
+or with ``--sigmas 2`` 95.4 % within two.
 
 Example:
     python tools/test.py gsmap_r18_minicity --eval --out half.json \
@@ -33,6 +34,12 @@ def parse_args() -> argparse.Namespace:
         "ground_truth", type=Path, help="annotation file (*.arrow), or JSON with a list of GTs"
     )
     parser.add_argument("target", type=Path, help="checkpoint to write; must not exist")
+    parser.add_argument(
+        "--sigmas",
+        type=float,
+        default=1.0,
+        help="interval that gets its coverage: 1 for 68.3 %% of the errors, 2 for 95.4 %%",
+    )
     return parser.parse_args()
 
 
@@ -60,7 +67,8 @@ def main() -> str:
         if "scales" not in model.map_head.reference.outputs:
             raise ValueError(f"{args.config} has no Gaussians: give a config of GSMap.")
         pairs = SamplePairs(args.results, args.ground_truth, classes, True, gaussians=True)
-        factors = fitted_factors(matched_vertices(pairs, ChamferConfig(classes)), classes)
+        vertices = matched_vertices(pairs, ChamferConfig(classes))
+        factors = fitted_factors(vertices, classes, args.sigmas)
         cfg.model.map_head.temperatures = factors.round(4).tolist()
     meta = {MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())), SIGNALS: source.can_bus}
     if source.image_size:

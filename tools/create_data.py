@@ -25,6 +25,7 @@ COMMANDS = {
     "infos": ("mapdata.infos.convert", "convert an info file of MapTR or MapTRv2"),
     "split": ("mapdata.splitter", "split scenes by place, at a distance from each other"),
     "overlap": ("mapdata.overlap", "say which validation samples lie near training"),
+    "occlusion": ("mapdata.nuscenes.occlusion", "group samples by how much boxes hide of the map"),
     "check": ("mapdata.check", "check annotation files completely"),
     "export": ("mapdata.vectors_json", "write an annotation file's vectors as JSON"),
 }

@@ -136,6 +136,11 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "also measure heights",
     )
     parser.add_argument(
+        "--pld",
+        action="store_true",
+        help="PLD: distance of whole maps, in which the order of points and all scores count",
+    )
+    parser.add_argument(
         "--min-score", type=float, default=0.4, help="of predictions that --topology counts"
     )
     parser.add_argument(
@@ -157,7 +162,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         metavar="map|scene|distance|FILE",
         help="AP of each map or scene alone, of the map cut at 10 and 20 m from the vehicle, or "
         "of scenes by night and weather (FILE: scene.json of nuScenes' tables, or JSON with a word "
-        "for each scene)",
+        "for each scene or each sample)",
     )
     parser.add_argument(
         "--against",
@@ -200,7 +205,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     ):
         if refused:
             parser.error(why)
-    for name in ("consistency", "topology", "uncertainty"):
+    for name in ("consistency", "pld", "topology", "uncertainty"):
         if getattr(args, name) and (args.prior or args.shard.count):
             parser.error(f"--{name} needs a result file as a whole: leave out --prior and --shard")
     return args
@@ -258,16 +263,22 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         print(f"curves: {save_figure(plot_result(drawn), args.pr_curves)}")
 
 
-def topology_reports(args: argparse.Namespace, evaluator: MapEvaluator) -> list[MetricReport]:
-    """Count breaks, false joints and folds, and measure heights if they count."""
+def reports_of_pairs(args: argparse.Namespace, evaluator: MapEvaluator) -> list[MetricReport]:
+    """Compute PLD, count breaks, false joints and folds, and measure heights if they count."""
+    from gsmap.evaluation.pld import pld_figures
     from gsmap.evaluation.topology import TopologyConfig, height_figures, topology_figures
 
     classes = evaluator.classes
     areas = tuple(label for label, name in enumerate(classes) if name in args.polygon_classes)
     config = TopologyConfig(classes, areas, args.min_score)
     inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard, True
-    found = {"topology": topology_figures(SamplePairs(*inputs), config)}
-    if evaluator.chamfer is not None and evaluator.counts_heights:
+    found = {}
+    if args.pld:
+        rules = evaluator.chamfer or ChamferConfig(classes)
+        found["pld"] = pld_figures(SamplePairs(*inputs), rules)
+    if args.topology:
+        found["topology"] = topology_figures(SamplePairs(*inputs), config)
+    if args.topology and evaluator.chamfer is not None and evaluator.counts_heights:
         found["heights"] = height_figures(SamplePairs(*inputs), evaluator.chamfer)
     return [
         MetricReport(name, {}, {f"{name}/{key}": value for key, value in figures.items()}, {})
@@ -413,8 +424,8 @@ def main(argv: list[str] | None = None) -> str:
         outcome[0].append(interval_report(outcome, resamples, args, evaluator))
     if args.by:
         outcome[0].append(report_of_parts(outcome[0], groups, args))
-    if args.topology:
-        outcome[0].extend(topology_reports(args, evaluator))
+    if args.pld or args.topology:
+        outcome[0].extend(reports_of_pairs(args, evaluator))
     if args.consistency:
         outcome[0].append(consistency_report(args))
     if args.uncertainty:

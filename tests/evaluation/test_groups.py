@@ -48,12 +48,16 @@ def test_groups_are_scenes_maps_or_what_a_file_says(tmp_path):
     own = {f"s{i}": "odd" if i % 2 else "even" for i in range(5)}
     (tmp_path / "own.json").write_text(json.dumps(own))
     assert read_groups(truth, str(tmp_path / "own.json")).group_of["t8"] == "odd"
+    each = {f"t{i}": "first" if i < 3 else "other" for i in range(10)}
+    (tmp_path / "each.json").write_text(json.dumps(each))
+    assert read_groups(truth, str(tmp_path / "each.json")).group_of == each
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ({"s0": "a"}, "has no scene 's1'"),
+        ({"t0": "a", "t1": "b"}, "has no sample 't2'"),
         ({f"s{i}": 3 for i in range(5)}, "is neither an object with the group of each scene"),
         ({f"s{i}": "a\x1b[2J" for i in range(5)}, "is neither"),
         ({f"s{i}": "a" * 81 for i in range(5)}, "in at most 80 characters"),

@@ -48,6 +48,12 @@ def test_a_checkpoint_keeps_what_is_fitted_and_its_model_has_it(files, tmp_path,
     assert "divider: sigma" in calibrate()
     temperatures = load_model(NAME, target).map_head.temperatures
     np.testing.assert_allclose([across for _, across in temperatures], 3.0, rtol=0.2)
+    monkeypatch.setattr("sys.argv", [*words[:-1], str(tmp_path / "two.pth"), "--sigmas", "2"])
+    calibrate()
+    two = load_model(NAME, tmp_path / "two.pth").map_head.temperatures
+    np.testing.assert_allclose([across for _, across in two], 3.0, rtol=0.2)
+    assert two != temperatures
+    monkeypatch.setattr("sys.argv", words)
     plain, fitted = load_model(NAME), load_model(NAME, target)
     assert plain.map_head.temperatures is None
     for name, value in plain.state_dict().items():

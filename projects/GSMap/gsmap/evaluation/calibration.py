@@ -19,7 +19,6 @@ from gsmap.structures.polylines import equivalent_orders
 AXES = ("along", "across")
 DISTANCES_M = (0.0, 10.0, 20.0, np.inf)  # from the vehicle
 LEVELS = np.linspace(0.05, 0.95, 19)  # of central intervals
-_ONE_SIGMA = 2 * stats.norm.cdf(1) - 1
 _FEWEST = 100  # vertices of a class whose sigmas are fitted
 _COLUMNS = (
     ("nll", "NLL"), ("coverage@1", "1 sigma"), ("coverage@2", "2 sigma"), ("sigma_m", "sigma m"),
@@ -181,12 +180,23 @@ def format_uncertainty(metrics: Mapping[str, float]) -> str:
     return "\n".join(rows)
 
 
-def fitted_factors(vertices: Vertices, classes: Sequence[str]) -> FloatArray:
-    """Return factors of sigma after which one sigma covers 68.3 % of each class's errors. (C, 2)
+def fitted_factors(
+    vertices: Vertices, classes: Sequence[str], num_sigmas: float = 1.0
+) -> FloatArray:
+    """Return factors of sigma that give an interval of each class's errors its coverage. (C, 2)
+
+    Args:
+        vertices: Matched vertices.
+        classes: Names of the classes.
+        num_sigmas: The interval: one sigma is to cover 68.3 % of the errors, two 95.4 %, as of a
+            normal distribution. Errors with longer tails fit one of both only.
 
     Raises:
-        ValueError: If a class has too few vertices for that.
+        ValueError: If a class has too few vertices for that, or ``num_sigmas`` is not in (0, 3].
     """
+    if not 0 < num_sigmas <= 3:
+        raise ValueError(f"num_sigmas must be in (0, 3], got {num_sigmas}.")
+    covered = 2 * stats.norm.cdf(num_sigmas) - 1
     factors = np.empty((len(classes), len(AXES)))
     for label, name in enumerate(classes):
         own = vertices.of(vertices.labels == label)
@@ -195,5 +205,5 @@ def fitted_factors(vertices: Vertices, classes: Sequence[str]) -> FloatArray:
                 f"class {name!r} has {len(own.labels)} matched vertices, {_FEWEST} are needed: "
                 "give results of more samples."
             )
-        factors[label] = np.quantile(own.errors / own.sigmas, _ONE_SIGMA, axis=0)
+        factors[label] = np.quantile(own.errors / own.sigmas, covered, axis=0) / num_sigmas
     return factors

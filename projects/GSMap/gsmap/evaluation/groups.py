@@ -50,12 +50,12 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
 
     Args:
         annotations: The annotation file.
-        by: ``scene``, ``map``, or a JSON file with the group of each scene; or the ``scene.json``
-            of nuScenes' tables, whose descriptions name weather and night.
+        by: ``scene``, ``map``, or a JSON file with the group of each scene or of each sample; or
+            the ``scene.json`` of nuScenes' tables, whose descriptions name weather and night.
 
     Raises:
         FileNotFoundError: If a file does not exist.
-        ValueError: If there are no groups in it, or a scene is not in the JSON file.
+        ValueError: If there are no groups in it, or a scene or sample is not in the JSON file.
     """
     if Path(annotations).suffix.lower() == ".json":
         raise ValueError(f"{annotations} knows no scenes: give the annotation file (.arrow).")
@@ -64,17 +64,20 @@ def read_groups(annotations: str | Path, by: str) -> Groups:
             f"--by takes {', '.join(_COLUMNS)} or a JSON file, and there is no file {by!r}."
         )
     file = AnnotationFile(annotations)
+    tokens = file.column("token")
     groups = file.column(_COLUMNS.get(by, "scene"))
     if by not in _COLUMNS:
-        group_of = _groups_of_scenes(by)
-        if missing := next((scene for scene in groups if scene not in group_of), None):
-            raise ValueError(f"{by} has no scene {missing!r}, which {annotations} has.")
-        groups = [group_of[scene] for scene in groups]
-    return Groups(dict(zip(file.column("token"), groups, strict=True)))
+        group_of = _groups_in(by)
+        of_samples = not group_of.keys().isdisjoint(tokens)
+        kind, names = ("sample", tokens) if of_samples else ("scene", groups)
+        if missing := next((name for name in names if name not in group_of), None):
+            raise ValueError(f"{by} has no {kind} {missing!r}, which {annotations} has.")
+        groups = [group_of[name] for name in names]
+    return Groups(dict(zip(tokens, groups, strict=True)))
 
 
-def _groups_of_scenes(path: str) -> dict[str, str]:
-    """Read the group of each scene."""
+def _groups_in(path: str) -> dict[str, str]:
+    """Read the group of each scene or sample."""
     content = read_json(path)
     if isinstance(content, list) and all(isinstance(row, dict) for row in content):
         content = {row.get("name"): _conditions(row.get("description")) for row in content}
@@ -83,8 +86,8 @@ def _groups_of_scenes(path: str) -> dict[str, str]:
         for text in content.values()
     ):
         raise ValueError(
-            f"{path} is neither an object with the group of each scene, in at most {_LONGEST} "
-            "characters, nor a scene.json of nuScenes."
+            f"{path} is neither an object with the group of each scene or sample, in at most "
+            f"{_LONGEST} characters, nor a scene.json of nuScenes."
         )
     return content
 

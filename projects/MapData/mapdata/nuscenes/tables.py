@@ -33,6 +33,7 @@ _FIELDS: dict[str, dict[str, type | int]] = {
         "timestamp": int, "filename": str, "is_key_frame": bool, "prev": str, "width": int,
         "height": int,
     },
+    "sample_annotation": {"sample_token": str, "size": 3, **_POSE},
 }  # fmt: skip
 _LINKS = {
     "calibrated_sensor": {"sensor_token": "sensor"},
@@ -71,6 +72,36 @@ def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
     return rigid(rotation, np.asarray(record[f"{prefix}translation"], np.float64).reshape(3))
 
 
+def _damaged(folder: Path, table: str, wrong: str) -> ValueError:
+    return ValueError(f"{folder}/{table}.json{wrong}; download the tables again.")
+
+
+def read_table(folder: Path, table: str) -> Iterator[dict[str, Any]]:
+    """Yield a table's records, what is read of each checked.
+
+    Args:
+        folder: Folder of the tables.
+        table: Its name, one of those with fields that maps need.
+
+    Raises:
+        FileNotFoundError: If it is missing.
+        ValueError: If it is damaged; maybe only after some records.
+    """
+    path = folder / f"{table}.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"no table at {path}: download the tables again.")
+    fields: dict[str, type | int] = {"token": str, **_FIELDS[table]}
+    for record, _ in items_of(path, None, "download it again"):
+        values = record if isinstance(record, dict) else {}
+        for name, kind in fields.items():
+            if not _is_right(value := values.get(name), kind):
+                numbers = f"{kind} finite numbers"
+                wanted = f"a {kind.__name__}" if isinstance(kind, type) else numbers
+                wrong = f", record {values.get('token')!r}: {name} must be {wanted}"
+                raise _damaged(folder, table, f"{wrong}, got {value!r}")
+        yield record
+
+
 class NuScenesTables:
     """The tables with the key frames of cameras and LiDAR, and LiDAR sweeps if asked for.
 
@@ -89,10 +120,12 @@ class NuScenesTables:
         self._messages = lru_cache(maxsize=1)(partial(read_messages, dataroot))
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
         for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
-            self._keep(table, self._read(table))
+            self._keep(table, read_table(self._folder, table))
         data = list(self._wanted_sample_data())
         wanted = {record["ego_pose_token"] for record in data}
-        self._keep("ego_pose", (r for r in self._read("ego_pose") if r["token"] in wanted))
+        self._keep(
+            "ego_pose", (r for r in read_table(self._folder, "ego_pose") if r["token"] in wanted)
+        )
         self._keep("sample_data", data)
         for sample in self._records["sample"].values():
             sample["data"] = {}
@@ -102,9 +135,6 @@ class NuScenesTables:
                 keys[self._channel_of(record)] = record
         self.scene = list(self._records["scene"].values())
 
-    def _damaged(self, table: str, wrong: str) -> ValueError:
-        return ValueError(f"{self._folder}/{table}.json{wrong}; download the tables again.")
-
     def _keep(self, table: str, records: Iterable[dict[str, Any]]) -> None:
         """Keep a table's records by token; those that they link to are there already."""
         kept = self._records[table] = {}
@@ -112,28 +142,12 @@ class NuScenesTables:
             for link in _LINKS.get(table, ()):
                 self._check_link(table, record, link)
             if kept.setdefault(record["token"], record) is not record:
-                raise self._damaged(table, f" has record {record['token']!r} twice")
+                raise _damaged(self._folder, table, f" has record {record['token']!r} twice")
 
     def _check_link(self, table: str, record: dict[str, Any], name: str) -> None:
         if record[name] not in self._records[_LINKS[table][name]]:
             wrong = f", record {record['token']!r}: {name} {record[name]!r} leads nowhere"
-            raise self._damaged(table, wrong)
-
-    def _read(self, table: str) -> Iterator[dict[str, Any]]:
-        """Yield a table's records, what is read of each checked."""
-        path = self._folder / f"{table}.json"
-        if not path.is_file():
-            raise FileNotFoundError(f"no table at {path}: download the tables again.")
-        fields: dict[str, type | int] = {"token": str, **_FIELDS[table]}
-        for record, _ in items_of(path, None, "download it again"):
-            values = record if isinstance(record, dict) else {}
-            for name, kind in fields.items():
-                if not _is_right(value := values.get(name), kind):
-                    numbers = f"{kind} finite numbers"
-                    wanted = f"a {kind.__name__}" if isinstance(kind, type) else numbers
-                    wrong = f", record {values.get('token')!r}: {name} must be {wanted}"
-                    raise self._damaged(table, f"{wrong}, got {value!r}")
-            yield record
+            raise _damaged(self._folder, table, wrong)
 
     def _channel_of(self, record: dict[str, Any]) -> str:
         """Return the sensor channel of a ``sample_data`` record."""
@@ -141,7 +155,7 @@ class NuScenesTables:
         return self._records["sensor"][sensor["sensor_token"]]["channel"]
 
     def _wanted_sample_data(self) -> Iterator[dict[str, Any]]:
-        for record in self._read("sample_data"):
+        for record in read_table(self._folder, "sample_data"):
             self._check_link("sample_data", record, "calibrated_sensor_token")
             channel = self._channel_of(record)
             is_sweep = channel == LIDAR and self._max_sweeps > 0
@@ -160,10 +174,12 @@ class NuScenesTables:
         while token:
             if token not in known:
                 origin = record["token"]
-                raise self._damaged(table, f" has no record {token!r}, to which {origin!r} leads")
+                raise _damaged(
+                    self._folder, table, f" has no record {token!r}, to which {origin!r} leads"
+                )
             if token in seen:
                 wrong = f", record {record['token']!r}: {step} leads back to {token!r}"
-                raise self._damaged(table, wrong)
+                raise _damaged(self._folder, table, wrong)
             seen.add(token)
             record = known[token]
             yield record

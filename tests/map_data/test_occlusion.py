@@ -1,0 +1,112 @@
+"""What boxes hide of a map, by lines of sight that are worked by hand.
+
+A camera 1.5 m above the ground looks along x at a line 10 m ahead, from y = -5 to 5. Half way, a
+box 1.5 m high stands between y = 1 and 3, from x = 4.5 to 5.5: it hides what lies from y = 1.9 on.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from processes import run_python
+from scipy.spatial.transform import Rotation
+
+from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import CameraRecord, MapInstance, MapSample
+from gsmap.evaluation.groups import read_groups
+from gsmap.structures.rigid import invert_rigid, rigid
+from mapdata.nuscenes.occlusion import cuts_sight, hidden_share, read_boxes, word_for
+
+HEIGHT_M = 1.8  # of the annotation frame above the ground
+GLOBAL_FROM_FRAME = rigid(Rotation.from_euler("z", 30, degrees=True).as_matrix(), [100, 50, 1.8])
+FORWARD = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # frame from camera: z looks along x
+
+
+def camera(y: float) -> CameraRecord:
+    frame_from_cam = rigid(FORWARD, [0.0, y, 1.5 - HEIGHT_M])
+    intrinsics = np.array([[100.0, 0, 200], [0, 100, 200], [0, 0, 1]])
+    return CameraRecord("C", "", 400, 400, intrinsics, invert_rigid(frame_from_cam))
+
+
+def sample(*cameras: CameraRecord, x: float = 10.0) -> MapSample:
+    line = MapInstance(0, np.array([[x, -5.0], [x, 5.0]]))
+    above_ground = rigid(np.eye(3), [0, 0, HEIGHT_M])
+    views = list(cameras)
+    return MapSample(
+        "s", "scene", "", 0, views, GLOBAL_FROM_FRAME, None, None, [line], above_ground
+    )
+
+
+def tables(folder: Path, height_m: float = 1.5, **wrong: object) -> Path:
+    """Write the box, which stands across: its length of 2 m along the frame's y."""
+    centre = GLOBAL_FROM_FRAME @ [5.0, 2.0, height_m / 2 - HEIGHT_M, 1]
+    x, y, z, w = Rotation.from_euler("z", 30 + 90, degrees=True).as_quat()
+    box = {
+        "token": "b", "sample_token": "s", "translation": centre[:3].tolist(),
+        "rotation": [w, x, y, z], "size": [1.0, 2.0, height_m],
+    }  # fmt: skip
+    other = {**box, "token": "c", "sample_token": "another sample"}
+    (folder / "sample_annotation.json").write_text(json.dumps([other, {**box, **wrong}]))
+    return folder
+
+
+def test_a_box_hides_what_lies_behind_it(tmp_path):
+    boxes = read_boxes(tables(tmp_path), ["s"])["s"]
+    assert len(boxes.halves_m) == 1
+    assert hidden_share(sample(camera(0)), boxes) == pytest.approx(4 / 11)  # y = 2, 3, 4, 5
+    assert hidden_share(sample(camera(0), x=4.0), boxes) == 0  # before the box
+    low = read_boxes(tables(tmp_path, height_m=0.5), ["s"])["s"]
+    assert hidden_share(sample(camera(0)), low) == 0  # one looks over it
+
+
+def test_what_another_camera_sees_is_not_hidden_and_what_none_holds_does_not_count(tmp_path):
+    boxes = read_boxes(tables(tmp_path), ["s"])["s"]
+    assert hidden_share(sample(camera(0), camera(-5)), boxes) == 0
+    narrow = camera(0)
+    narrow.width = 205  # up to y = -0.5: six points are left, four of them hidden
+    assert hidden_share(sample(narrow), boxes) == pytest.approx(4 / 6)
+
+
+def test_sight_is_cut_between_the_eye_and_the_point_alone(tmp_path):
+    boxes = read_boxes(tables(tmp_path), ["s"])["s"]
+    ahead, behind, short = ([10.0, 4.0, -HEIGHT_M], [-10.0, -4.0, -2.1], [4.0, 1.6, -1.0])
+    points = np.array([ahead, behind, short]) @ GLOBAL_FROM_FRAME[:3, :3].T
+    points += GLOBAL_FROM_FRAME[:3, 3]
+    eye = (GLOBAL_FROM_FRAME @ [0, 0, 1.5 - HEIGHT_M, 1])[:3]
+    np.testing.assert_array_equal(cuts_sight(eye, points, boxes)[:, 0], [True, False, False])
+
+
+def test_a_sample_without_boxes_or_map_has_nothing_hidden(tmp_path):
+    found = read_boxes(tables(tmp_path), ["s", "empty"])
+    assert hidden_share(sample(camera(0)), found["empty"]) == 0
+    nothing = sample(camera(0))
+    nothing.instances = None
+    assert hidden_share(nothing, found["s"]) == 0
+
+
+def test_shares_have_words_that_sort():
+    words = [word_for(share, (5, 20)) for share in (0, 0.049, 0.05, 0.2, 1.0)]
+    assert words == ["00-05 % hidden"] * 2 + ["05-20 % hidden"] + ["20-100 % hidden"] * 2
+
+
+def test_damaged_and_foreign_tables_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no table at"):
+        read_boxes(tmp_path, ["s"])
+    with pytest.raises(ValueError, match="has no box of these samples"):
+        read_boxes(tables(tmp_path), ["x"])
+    with pytest.raises(ValueError, match="record 'b': size must be 3 finite numbers"):
+        read_boxes(tables(tmp_path, size=[1, 2]), ["s"])
+
+
+def test_the_command_writes_a_group_for_each_sample(
+    minicity_root: Path, minicity_annotations: dict[str, Path], tmp_path: Path
+):
+    tool, truth = ("tools/create_data.py", "occlusion"), minicity_annotations["val"]
+    words = *tool, truth, minicity_root / "v1.0-trainval", tmp_path / "o.json"
+    done = run_python(*words, "--limits", 1, 50)
+    assert "% hidden: " in done.stdout
+    groups = read_groups(truth, str(tmp_path / "o.json")).group_of
+    assert set(groups) == set(AnnotationFile(truth).column("token"))
+    refused = run_python(*words, "--limits", 50, 1)
+    assert refused.stderr.startswith("error: --limits must rise")
