@@ -16,6 +16,7 @@ model = dict(
     map_head=dict(
         detector=dict(num_queries=40, in_channels=_width * 4, embed_dims=_dim, decoder=_layer, coder=dict(max_num=20)),
         generator=dict(
-            in_channels=_width * 4, embed_dims=_dim, dropout=0.0, max_points=24, redraw=False, box_noise_by_x=False, **_layer)))
+            in_channels=_width * 4, embed_dims=_dim, dropout=0.0, max_points=24, redraw=False, box_noise_by_x=False,
+            **_layer)))
 _steps = [_base_._load, _base_._scale, dict(type='FormatPolylineTargets', edge_classes=(2,)), _base_._pack]
 train_dataloader = dict(batch_size=2, dataset=dict(pipeline=_steps))

@@ -38,7 +38,10 @@ def check_generator(golden: Golden, name: str) -> Iterator[Row]:
     bev = parts.normal("vm_gen_bev", (2, 128, 5, 10)).requires_grad_()
     tokens = torch.from_numpy(data["polylines"]).long()
     boxes, labels = (torch.from_numpy(data[key]).long() for key in ("bbox_flat", "lines_cls"))
-    of_image, valid = torch.from_numpy(data["lines_bs_idx"]), torch.from_numpy(data["polyline_masks"])
+    of_image, valid = (
+        torch.from_numpy(data["lines_bs_idx"]),
+        torch.from_numpy(data["polyline_masks"]),
+    )
     weights = torch.from_numpy(data["polyline_weights"])
     total, rows = torch.zeros(()), {"condition": [], "inputs": [], "layers": [], "law": []}
     with torch.no_grad():
@@ -54,7 +57,12 @@ def check_generator(golden: Golden, name: str) -> Iterator[Row]:
             rows["law"].append(generator.log_probs(feats, elements, given))
             if i == 0:
                 raw = generator.logits(states[-1][0, 4:])[valid[0]]
-                yield Row(name, "raw_logits_line0", largest_difference(raw, data["raw_logits_line0"]), 3e-4)
+                yield Row(
+                    name,
+                    "raw_logits_line0",
+                    largest_difference(raw, data["raw_logits_line0"]),
+                    3e-4,
+                )
         cells = torch.stack([generator.context(feats[None])[0] for feats in bev])[of_image]
     found = {key: torch.cat(value, 2 if key == "layers" else 0) for key, value in rows.items()}
     law = found["law"]
@@ -138,13 +146,19 @@ def check_decoding(golden: Golden, name: str) -> Iterator[Row]:
         yield Row(name, f"topp_{key}", off, 1e-6)
     generator = generator_of(parts)
     bev = parts.normal("vm_gen_bev", (2, 128, 5, 10))
-    for share, redraw, tag in ((0.0, True, "released"), (0.0, False, "cached"), (0.9, False, "0.9")):
+    for share, redraw, tag in (
+        (0.0, True, "released"),
+        (0.0, False, "cached"),
+        (0.9, False, "0.9"),
+    ):
         generator.top_p, generator.redraw = share, redraw
         tokens = decoded(generator, bev, data, lambda laws: laws.argmax(-1))
         off = largest_difference(tokens, data["greedy_polylines"])
         yield Row(name, f"greedy_polylines, {tag}", off, 0)
         ends = (tokens == 0).any(1)
-        yield Row(name, f"greedy_completed, {tag}", largest_difference(ends, data["greedy_completed"]), 0)
+        yield Row(
+            name, f"greedy_completed, {tag}", largest_difference(ends, data["greedy_completed"]), 0
+        )
         kept = torch.arange(tokens.shape[1]) <= (tokens > 0).sum(1, keepdim=True)
         yield Row(name, f"greedy_masks, {tag}", largest_difference(kept, data["greedy_masks"]), 0)
     generator.top_p, generator.redraw = 0.9, True
@@ -190,7 +204,9 @@ def decoded_together(
             "g_polylines": given.drawn[own].numpy(),
         }
         each = Given(part, "g")
-        elements = Elements(*(torch.from_numpy(data[k][own]).long() for k in ("cond_cls", "cond_bbox")))
+        elements = Elements(
+            *(torch.from_numpy(data[k][own]).long() for k in ("cond_cls", "cond_bbox"))
+        )
         tokens.append(generator.generate(feats, elements, each, MAX_POINTS))
         laws.append(each.laws)
     given.laws = [torch.cat([part[step] for part in laws if step < len(part)]) for step in range(5)]

@@ -42,8 +42,9 @@ VECTORMAPNET = KeyMap(
         *rules_of(
             LINES,
             "map_head.generator.",
-            "_project_to_logits.=logits. input_proj.=context.project. img_coord_embed.=context.code. "
-            "label_embed.=label. coord_embed.=axis. pos_embeddings.=position. "
+            "_project_to_logits.=logits. input_proj.=context.project. "
+            "img_coord_embed.=context.code. label_embed.=label. coord_embed.=axis. "
+            "pos_embeddings.=position. "
             "bbox_context_embed.=corner. vertex_embed.=vertex.",
         ),
     ),
@@ -57,9 +58,7 @@ VECTORMAPNET = KeyMap(
         "head.augmentation.scaling_size": None,
         # trained without effect: a table that is never read, codes of the one level and of labels
         "backbone.masked_embeds.weight": torch.zeros(()).expand(4, 128),
-        **zeros(
-            _ELEMENTS, {"transformer.level_embeds": (1, 256), "label_embed.weight": (3, 256)}
-        ),
+        **zeros(_ELEMENTS, {"transformer.level_embeds": (1, 256), "label_embed.weight": (3, 256)}),
     },
     markers=((LINES, "map_head.generator."),),
     idle=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",  # further names of the branch of index 0

@@ -195,7 +195,9 @@ class KeyPointHead(DetectionHead):
         off = []
         for i, ((rows, cols), truth) in enumerate(zip(pairs, truths, strict=True)):
             labels[i, rows] = truth.labels_3d[cols]
-            off.append(F.smooth_l1_loss(boxes[i, rows], truth.keypoints[cols], beta=0.5, reduction="sum"))
+            off.append(
+                F.smooth_l1_loss(boxes[i, rows], truth.keypoints[cols], beta=0.5, reduction="sum")
+            )
         number = max(sum(len(rows) for rows, _ in pairs), 1)
         cls = self.loss_cls(scores.flatten(0, 1), labels.flatten(), avg_factor=number)
         return cls, self.box_weight * torch.stack(off).sum() / (2 * _CORNERS * number)
@@ -230,6 +232,7 @@ def targets_of(sample: Det3DDataSample, canvas: Canvas) -> InstanceData:
     if tuple(instances.metainfo["canvas"]) != canvas.settings:
         raise ValueError(
             f"FormatPolylineTargets has the canvas {tuple(instances.metainfo['canvas'])} (pixel_m, "
-            f"margin_m, ranges), the head {canvas.settings}: give both the same pixel_m and margin_m."
+            f"margin_m, ranges), the head {canvas.settings}: give both the same pixel_m and "
+            "margin_m."
         )
     return instances

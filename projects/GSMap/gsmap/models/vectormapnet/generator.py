@@ -163,8 +163,8 @@ class PolylineGenerator(BaseModule):
         if tokens.shape[1] > 2 * self.position.num_embeddings + 1:
             raise ValueError(
                 f"an annotated line has {tokens.shape[1] // 2} points, and num_positions of "
-                f"PolylineGenerator is {self.position.num_embeddings}: set it higher, or tolerance_m "
-                "of FormatPolylineTargets."
+                f"PolylineGenerator is {self.position.num_embeddings}: set it higher, or "
+                "tolerance_m of FormatPolylineTargets."
             )
         given, boxes = tokens[:, :-1], elements.boxes
         if self.training and self.noise_share:

@@ -59,10 +59,13 @@ class VectorMapNetHead(DetectionHead):
         if first["type"] == "KeyPointHead":
             first = {"canvas": canvas, **first}
         self.detector: DetectionHead = MODELS.build(first)
-        if isinstance(self.detector, KeyPointHead) and self.detector.reference.canvas != self.canvas:
+        own = self.canvas
+        if isinstance(self.detector, KeyPointHead):
+            own = self.detector.reference.canvas
+        if own != self.canvas:
             raise ValueError(
-                f"the detector's canvas {self.detector.reference.canvas.settings} is not the "
-                f"generator's {self.canvas.settings}: give canvas to VectorMapNetHead alone."
+                f"the detector's canvas {own.settings} is not the generator's "
+                f"{self.canvas.settings}: give canvas to VectorMapNetHead alone."
             )
         second = {"canvas": self.canvas, "num_classes": len(classes), **(generator or {})}
         self.generator = PolylineGenerator(**second)
