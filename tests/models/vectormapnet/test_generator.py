@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases import GRID, bev, generator
+from vectormapnet_cases import GRID, bev, generator
 
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.generator import Elements, PolylineGenerator, causal_mask

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from cases import GRID, transformed
+from vectormapnet_cases import GRID, transformed
 
 from gsmap.datasets.transforms.map_targets import FormatMapTargets
 from gsmap.models.vectormapnet.canvas import Canvas, tokens_of

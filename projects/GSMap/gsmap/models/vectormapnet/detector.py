@@ -127,8 +127,9 @@ class KeyPointHead(DetectionHead):
         super().__init__(init_cfg)
         self.grid, self.classes = grid, tuple(classes)
         self.reference = KeyPointReference(Canvas(grid, **(canvas or {})))
-        self.coder = MapCoder(grid, **{"max_num": 35, "margin_m": None, **(coder or {})})
-        settings = {"num_layers": 6, "num_heads": 8, "ffn_dims": 512, "dropout": 0.1}
+        choice: PARTS = {"max_num": 35, "margin_m": None, **(coder or {})}
+        self.coder = MapCoder(grid, **choice)
+        settings: PARTS = {"num_layers": 6, "num_heads": 8, "ffn_dims": 512, "dropout": 0.1}
         settings |= decoder or {}
         num_layers = settings.pop("num_layers")
         self.context = CodedMap(in_channels, embed_dims)

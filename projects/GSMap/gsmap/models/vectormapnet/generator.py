@@ -81,7 +81,9 @@ class PolylineGenerator(BaseModule):
         self.canvas, self.top_p, self.max_points, self.redraw = canvas, top_p, max_points, redraw
         self.noise_share, self.noise_px = noise_share, noise_px
         self.box_noise_by_x = box_noise_by_x
-        self.metres = (canvas.grid if shrunk_results else canvas).metres_from_norm
+        self.metres: Callable[[Tensor], Tensor] = (
+            canvas.grid.metres_from_norm if shrunk_results else canvas.metres_from_norm
+        )
         self.context = CodedMap(in_channels, embed_dims)
         self.label = nn.Embedding(num_classes, embed_dims)
         self.vertex = nn.Embedding(canvas.num_tokens, embed_dims)

@@ -55,19 +55,24 @@ class VectorMapNetHead(DetectionHead):
         super().__init__(init_cfg)
         self.grid, self.classes, self.loss_weight = grid, tuple(classes), loss_weight
         self.canvas = Canvas(grid, **(canvas or {}))
-        first = {"type": "KeyPointHead", "grid": grid, "classes": classes, **(detector or {})}
+        first: PARTS = {
+            "type": "KeyPointHead",
+            "grid": grid,
+            "classes": classes,
+            **(detector or {}),
+        }
         if first["type"] == "KeyPointHead":
             first = {"canvas": canvas, **first}
         self.detector: DetectionHead = MODELS.build(first)
-        own = self.canvas
+        other = self.canvas
         if isinstance(self.detector, KeyPointHead):
-            own = self.detector.reference.canvas
-        if own != self.canvas:
+            other = self.detector.reference.canvas
+        if other != self.canvas:
             raise ValueError(
-                f"the detector's canvas {own.settings} is not the generator's "
+                f"the detector's canvas {other.settings} is not the generator's "
                 f"{self.canvas.settings}: give canvas to VectorMapNetHead alone."
             )
-        second = {"canvas": self.canvas, "num_classes": len(classes), **(generator or {})}
+        second: PARTS = {"canvas": self.canvas, "num_classes": len(classes), **(generator or {})}
         self.generator = PolylineGenerator(**second)
         self.reference, self.coder = self.detector.reference, self.detector.coder
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import shapely
@@ -120,10 +120,12 @@ class FormatPolylineTargets(BaseTransform):
         return shapely.get_coordinates(shapely.LineString(points).simplify(self.tolerance_m))
 
 
-def filled(rows: Sequence[NDArray[Any]], mode: str = "constant") -> torch.Tensor:
+def filled(
+    rows: Sequence[NDArray[Any]], mode: Literal["constant", "edge"] = "constant"
+) -> torch.Tensor:
     """Stack arrays (n, D), the shorter ones filled up. (K, longest, D)"""
     longest = max(map(len, rows), default=2)
-    padded = [np.pad(row, ((0, longest - len(row)), (0, 0)), mode) for row in rows]  # type: ignore[call-overload]
+    padded = [np.pad(row, ((0, longest - len(row)), (0, 0)), mode) for row in rows]
     dims = rows[0].shape[1] if rows else 2
     return torch.from_numpy(np.array(padded).reshape(-1, longest, dims))
 
