@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
@@ -25,7 +24,6 @@ class Elements(NamedTuple):
     boxes: Tensor  # x0, y0, x1, y1 in whole pixels of the canvas (n, 4)
 
 
-@MODELS.register_module()
 class PolylineGenerator(BaseModule):
     """Generate polylines of any number of points within boxes.
 
@@ -168,6 +166,8 @@ class PolylineGenerator(BaseModule):
                 f"PolylineGenerator is {self.position.num_embeddings}: set it higher, or "
                 "tolerance_m of FormatPolylineTargets."
             )
+        if not len(tokens):
+            return torch.stack([parameter.sum() for parameter in self.parameters()]).sum() * 0
         given, boxes = tokens[:, :-1], elements.boxes
         if self.training and self.noise_share:
             given = self.noisy(given).where(given > 0, 0)

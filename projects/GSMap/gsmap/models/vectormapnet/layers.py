@@ -62,7 +62,7 @@ class GatedLayer(nn.Module):
         shape = states.shape
         shared = self.self_attn(self.norms[0](states), own, mask)
         states = states + self.gates[0] * self.dropout(shared)
-        query = self.norms[1](states).reshape(1, -1, shape[-1])  # all lines see one map
+        query = self.norms[1](states).flatten(0, 1)[None]  # all lines see one map
         seen = self.cross_attn(query, memory).view(shape)
         states = states + self.gates[1] * self.dropout(seen)
         return states + self.gates[2] * self.dropout(self.ffn(self.norms[2](states)))

@@ -60,7 +60,8 @@ class FormatPolylineTargets(BaseTransform):
     ``pts`` (K, P, 2) in metres, the last point repeated, and ``num_pts`` (K,).
 
     Args:
-        pixel_m, margin_m: As in `Canvas`, those of the head.
+        pixel_m: As in `Canvas`, that of the head.
+        margin_m: As in `Canvas`, that of the head.
         tolerance_m: How far a simplified line may be from the annotated one.
         smallest_box: Shorter side of a box at least, as a share of the canvas.
         border_px: Least distance of corners from the border of the canvas, in pixels.
