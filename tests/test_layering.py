@@ -54,12 +54,13 @@ MODELS = {
     "mgmap": {"maptr", "encoders"},
     "pivotnet": {"maptr", "encoders"},
     "streammapnet": {"maptr", "encoders"},
+    "vectormapnet": {"maptr", "encoders"},
     "gsmap": {"maptr", "encoders", "streams"},
 }
 # what the others are built on stays
 METHODS = (
     "maptrv2", "mapvr", "gemap", "mgmapnet", "mapqr", "mgmap", "hdmapnet", "pivotnet",
-    "streammapnet", "gsmap",
+    "streammapnet", "vectormapnet", "gsmap",
 )  # fmt: skip
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 

@@ -21,6 +21,7 @@ from gsmap.models.pivotnet.head import LEVEL_WEIGHTS
 from gsmap.models.pivotnet.losses import PivotLosses
 from gsmap.models.pivotnet.targets import FormatPivotTargets
 from gsmap.models.streams.memory import StreamMemory
+from gsmap.models.vectormapnet.targets import FormatPolylineTargets
 from gsmap.structures.grid import BEVGrid
 
 REPO = Path(__file__).resolve().parents[1]
@@ -152,6 +153,27 @@ CONFIGS: dict[str, dict[str, Any]] = {
     "pivotnet/pivotnet_r50_110e.py": {
         "train_cfg.max_epochs": 110,
         "param_scheduler.0.milestones": [77, 99],
+    },
+    "vectormapnet/vectormapnet_r50_130e.py": {
+        "grid.x_range": (-30.0, 30.0),  # the vehicle's frame
+        "grid.y_range": (-15.0, 15.0),
+        "classes": ["ped_crossing", "divider", "boundary"],
+        "optim_wrapper.optimizer": {"type": "AdamW", "lr": 1e-3, "weight_decay": 0.01},
+        "optim_wrapper.paramwise_cfg.custom_keys.img_backbone.lr_mult": 0.1,
+        "optim_wrapper.clip_grad.max_norm": 0.5,
+        "param_scheduler.0.start_factor": 0.1,
+        "param_scheduler.0.end": 400,
+        "param_scheduler.1.milestones": [100, 120],
+        "train_cfg.max_epochs": 130,
+        "train_dataloader.batch_size": 5,
+        "train_dataloader.dataset.pipeline.1.size": (455, 256),
+        "train_dataloader.dataset.pipeline.2.type": "StretchToPadding",
+        "model.data_preprocessor.mean": [103.53, 116.28, 123.675],
+        "model.data_preprocessor.std": [1.0, 1.0, 1.0],
+        "model.data_preprocessor.bgr_to_rgb": False,
+        "model.img_backbone.stage_with_dcn": (False, False, True, True),
+        "model.bev_encoder.heights_m": (-1.1, 0.0, 0.5, 1.1),
+        "model.map_head.generator.redraw": True,
     },
     "streammapnet/streammapnet_r50_24e.py": {
         **STREAMMAPNET,
@@ -386,6 +408,29 @@ def test_pivotnet_weighs_as_released():
     assert (targets.step_m, targets.min_area_m2) == (1.0, 2.0)
     assert not targets.keep_end
     assert not targets.sort_rings
+
+
+def test_vectormapnet_weighs_and_draws_as_released():
+    head = head_of("vectormapnet/vectormapnet_r50_130e.py")
+    detector, generator, targets = head.detector, head.generator, FormatPolylineTargets()
+    assert (detector.box_weight, detector.giou_weight, head.loss_weight) == (0.1, 1.0, 1.0)
+    assert (detector.loss_cls.loss_weight, detector.cost_cls.weight) == (2.0, 2.0)
+    assert (detector.elements.num_embeddings, detector.coder.max_num) == (120, 35)
+    assert (detector.coder.margin_m, detector.coder.score_threshold) == (None, None)
+    assert len(detector.layers) == len(generator.layers) == 6
+    layers = detector.layers[0], generator.layers[0]
+    assert [layer.self_attn.num_heads for layer in layers] == [8, 8]
+    assert [layer.self_attn.dropout for layer in layers] == [0.1, 0.2]
+    assert layers[0].ffn.feedforward_channels == layers[1].ffn[0].out_features == 512
+    assert (layers[0].cross_attn.num_heads, layers[0].cross_attn.num_points) == (8, 4)
+    assert (generator.top_p, generator.max_points, generator.redraw) == (0.9, 64, True)
+    noise = generator.noise_share, generator.noise_px, generator.box_noise_by_x
+    assert noise == (0.3, (2.0, 1.0), True)
+    canvas = head.canvas
+    assert (canvas.size, canvas.num_tokens, canvas.margin_m) == ((200, 100), 201, 2.0)
+    assert (targets.pixel_m, targets.margin_m, targets.tolerance_m) == (0.3, 2.0, 0.2)
+    assert (targets.smallest_box, targets.border_px) == (0.02, 0.1)
+    assert targets.edge_classes == (2,)
 
 
 def test_detections_are_chosen_as_by_maptr():

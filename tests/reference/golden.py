@@ -20,9 +20,13 @@ from torch import Tensor
 
 from gsmap import registered  # noqa: F401
 from gsmap.checkpoints.key_map import PIVOTNET
+from gsmap.checkpoints.vectormapnet_keys import VECTORMAPNET
 
 NUM_CAMS = 6
-OWN_RECIPES = ("mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet")  # of another scale
+OWN_RECIPES = (  # of another scale
+    "mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet", "vectormapnet",
+)  # fmt: skip
+TENSOR_BY_TENSOR = {"pivotnet": PIVOTNET, "vectormapnet": VECTORMAPNET}  # recipes without a state
 
 
 @dataclass(eq=False)
@@ -104,13 +108,13 @@ class Golden:
         """Return the upstream state that the recipe makes for a state list."""
         method = name.split("_")[0]
         recipe = self.recipe(method) if method in OWN_RECIPES else self.weights
-        if method == "pivotnet":
-            shapes = self.state_shapes(name)
-            made = {key: recipe.tensor(key, shape, self.seed) for key, shape in shapes.items()}
-            return {
-                key: PIVOTNET.unused[key] if value is None else torch.from_numpy(value)
-                for key, value in made.items()
-            }
+        if method in TENSOR_BY_TENSOR:
+            state, settings = {}, TENSOR_BY_TENSOR[method].unused
+            for key, shape in self.state_shapes(name).items():
+                value = recipe.tensor(key, shape, self.seed)
+                made = settings[key] if value is None else torch.from_numpy(np.asarray(value))
+                state[key] = torch.zeros(shape) if made is None else made  # a setting of its own
+            return state
         arrays = recipe.state(self.state_shapes(name), self.seed)
         return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}
 

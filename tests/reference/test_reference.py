@@ -75,6 +75,10 @@ FILES = [
     "pivotnet_projection_*.npz",
     "pivotnet_forward_reduced_*.npz",
     "pivotnet_state.json",
+    "vectormapnet_state.json",
+    *(f"vectormapnet_{part}_*.npz" for part in ("targets", "detector", "generator", "decoding")),
+    "vectormapnet_losses_*.npz",
+    "vectormapnet_forward_reduced_*.npz",
 ]
 
 

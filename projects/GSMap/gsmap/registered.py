@@ -31,6 +31,7 @@ FOLDERS = (  # every module of these is imported; a method comes and goes with i
     "gsmap.models.mgmap",
     "gsmap.models.pivotnet",
     "gsmap.models.streammapnet",
+    "gsmap.models.vectormapnet",
     "gsmap.models.gsmap",
 )
 

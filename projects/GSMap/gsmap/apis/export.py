@@ -35,7 +35,7 @@ class ExportedDetector(nn.Module):
     what this one leaves further outputs.
 
     Raises:
-        ValueError: If the model reads LiDAR.
+        ValueError: If the model reads LiDAR, or its head cannot be exported.
     """
 
     def __init__(self, model: Any) -> None:
@@ -44,6 +44,11 @@ class ExportedDetector(nn.Module):
             raise ValueError(
                 "only models of cameras can be exported: voxels of LiDAR have no ONNX operator. "
                 "Give a config without lidar_encoder."
+            )
+        if model.map_head.not_exported:
+            raise ValueError(
+                f"a {type(model.map_head).__name__} cannot be exported: "
+                f"{model.map_head.not_exported}"
             )
         self.model = model
         of_stream = () if model.temporal is None else OF_STREAM

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
+from gsmap.checkpoints.vectormapnet_keys import LINES, VECTORMAPNET
 
 _HEAD = "pts_bbox_head."
 _TRANSFORMER = "pts_bbox_head.transformer."
@@ -358,7 +359,7 @@ STREAMMAPNET = KeyMap(
 )
 
 KEY_MAPS: list[KeyMap] = [
-    STREAMMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MGMAP,
+    VECTORMAPNET, STREAMMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MGMAP,
     MAPTRV2, MAPTR_BEVFORMER, MAPTR,
 ]  # fmt: skip
 """Known architectures, the most special first; the last needs no marker."""
@@ -366,7 +367,7 @@ KEY_MAPS: list[KeyMap] = [
 
 def is_upstream(keys: Iterable[str]) -> bool:
     """Return whether state keys are in the format of the earlier systems."""
-    return any(key.startswith((_HEAD, _POINTS, _STREAM_INPUT)) for key in keys)
+    return any(key.startswith((_HEAD, _POINTS, _STREAM_INPUT, LINES)) for key in keys)
 
 
 def find_key_map(keys: Iterable[str]) -> KeyMap:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -263,8 +264,9 @@ def needed_targets(cfg: Config) -> dict[str, Any]:
         Names of transforms (``transforms`` of the classes), each with the type that needs it.
     """
     head = (cfg.get("model") or {}).get("map_head") or {}
-    losses = head.get("losses")
-    kinds = [part.get("type") for part in (head, *(losses if isinstance(losses, list) else ()))]
+    heads = [head, head["detector"]] if head.get("detector") else [head]  # of two stages
+    losses = [own["losses"] for own in heads if isinstance(own.get("losses"), list)]
+    kinds = [part.get("type") for part in (*heads, *chain.from_iterable(losses))]
     classes = [(kind, MODELS.get(kind) if isinstance(kind, str) else kind) for kind in kinds]
     return {name: kind for kind, part in classes for name in getattr(part, "transforms", ())}
 

@@ -1,0 +1,33 @@
+# VectorMapNet with ResNet-50 as published: 36.73 M trainable parameters. detectron2's weights of ResNet-50 (caffe) are
+# fetched; without a network set model.img_backbone.init_cfg to None or to a local copy.
+model = dict(
+    type='MapDetector',
+    data_preprocessor=dict(
+        type='Det3DDataPreprocessor',
+        mean=[103.53, 116.28, 123.675],
+        std=[1.0, 1.0, 1.0],
+        bgr_to_rgb=False,
+        pad_size_divisor=32),
+    img_backbone=dict(
+        type='mmdet.ResNet',
+        depth=50,
+        num_stages=4,
+        out_indices=(0, 1, 2, 3),
+        frozen_stages=-1,
+        norm_cfg=dict(type='BN', requires_grad=True),
+        norm_eval=True,
+        style='caffe',
+        dcn=dict(type='DCNv2', deform_groups=1, fallback_on_stride=False),
+        stage_with_dcn=(False, False, True, True),
+        init_cfg=dict(type='Pretrained', checkpoint='open-mmlab://detectron2/resnet50_caffe')),
+    img_neck=dict(
+        type='mmdet.FPN',
+        in_channels=[256, 512, 1024, 2048],
+        out_channels=128,
+        num_outs=4,
+        norm_cfg=dict(type='BN')),
+    bev_encoder=dict(type='HeightPlanesEncoder', heights_m=(-1.1, 0.0, 0.5, 1.1), bev_pixel_m=0.3),
+    map_head=dict(
+        type='VectorMapNetHead',
+        detector=dict(type='KeyPointHead', num_queries=120, decoder=dict(num_layers=6), coder=dict(max_num=35)),
+        generator=dict(num_layers=6, top_p=0.9, max_points=64, redraw=True)))

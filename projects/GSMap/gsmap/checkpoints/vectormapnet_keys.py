@@ -1,0 +1,65 @@
+"""The table between VectorMapNet's state keys and ours."""
+
+import torch
+
+from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
+
+_ELEMENTS = "head.det_net."
+_ELEMENT_LAYER = "head.det_net.transformer.decoder.layers.{i}."
+LINES = "head.gen_net."
+_PLANES = torch.meshgrid(
+    torch.tensor((-1.1, 0.0, 0.5, 1.1)),
+    torch.linspace(-15.0, 15.0, 100),
+    torch.linspace(-30.0, 30.0, 200),
+    indexing="ij",
+)
+VECTORMAPNET = KeyMap(
+    "vectormapnet",
+    (
+        *rules_of("backbone.", "", "img_backbone. img_neck."),
+        *((f"backbone.upsample.fscale.{n + 1}.", f"bev_encoder.upsampling.{n}.") for n in range(3)),
+        ("backbone.outconvs.", "bev_encoder.reduction."),
+        ("neck.", "bev_encoder.neck."),
+        *rules_of(
+            _ELEMENT_LAYER,
+            "map_head.detector.layers.{i}.",
+            "attentions.0.attn.=self_attn. attentions.1.=cross_attn. ffns.0.=ffn. norms.",
+        ),
+        *rules_of(
+            _ELEMENTS,
+            "map_head.detector.",
+            "transformer.reference_points_embed.=initial. input_proj.=context.project. "
+            "img_coord_embed.=context.code. query_embedding.=elements. bbox_embedding.=corners. "
+            "pre_branches.cls.0.=cls_branch. pre_branches.reg.0.=corner_branch.",
+        ),
+        *rules_of(
+            LINES + "decoder.layers.{i}.",
+            "map_head.generator.layers.{i}.",
+            "self_attn. multihead_attn.=cross_attn. linear1.=ffn.0. linear2.=ffn.3. "
+            "norm1.=norms.0. norm2.=norms.1. norm3.=norms.2. "
+            "res_weight1=gates.0 res_weight2=gates.1 res_weight3=gates.2",
+        ),
+        *rules_of(
+            LINES,
+            "map_head.generator.",
+            "_project_to_logits.=logits. input_proj.=context.project. "
+            "img_coord_embed.=context.code. label_embed.=label. coord_embed.=axis. "
+            "pos_embeddings.=position. "
+            "bbox_context_embed.=corner. vertex_embed.=vertex.",
+        ),
+    ),
+    {
+        # settings: points of the planes, pixels of the canvas, and two of the noise in training
+        "backbone.bev_planes": torch.stack((_PLANES[2], _PLANES[1], _PLANES[0]), -1),
+        _ELEMENTS + "canvas_size": torch.tensor((200, 100)),
+        LINES + "canvas_size": torch.tensor((200, 100)),
+        "head.augmentation.canvas_size": torch.tensor((200, 100)),
+        "head.augmentation.shift_scale": None,
+        "head.augmentation.scaling_size": None,
+        # trained without effect: a table that is never read, codes of the one level and of labels
+        "backbone.masked_embeds.weight": torch.zeros(()).expand(4, 128),
+        **zeros(_ELEMENTS, {"transformer.level_embeds": (1, 256), "label_embed.weight": (3, 256)}),
+    },
+    markers=((LINES, "map_head.generator."),),
+    idle=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",  # further names of the branch of index 0
+)

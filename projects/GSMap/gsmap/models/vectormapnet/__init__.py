@@ -1,0 +1,1 @@
+"""VectorMapNet (Liu et al., ICML 2023)."""
