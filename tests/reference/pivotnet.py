@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from gsmap.checkpoints.key_map import PIVOTNET
 from gsmap.models.pivotnet.encoder import PivotBEVEncoder
+from gsmap.models.pivotnet.front import turned
 from gsmap.models.pivotnet.head import PivotHead, PivotPredictions
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import BEVGrid
@@ -166,7 +167,9 @@ def check_head(golden: Golden, name: str) -> Iterator[Row]:
             scalar = scalar + (value * weight).sum()
     levels = [parts.normal(f"pv_bev_level{i}", (B, C, *BEV)) for i in range(3)]
     with torch.no_grad():
-        masks = torch.stack([head.class_masks(head.grid.turned(level)) for level in (*levels, bev)])
+        masks = torch.stack(
+            [head.class_masks(turned(level, head.grid)) for level in (*levels, bev)]
+        )
     for label, kind in enumerate(CLASSES):
         off = largest_difference(
             masks[:, :, label, ::5, ::5], data[f"sem_mask_{kind}_sub"][:, :, 1]
@@ -224,7 +227,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     memory = [level.flatten(2) for level in encoder.sources(feats)]
     subsets["memory_sub"] = torch.cat(memory, 2)[0, ::8, ::20].T
     bev = encoder.encode(feats, {"img_from_ground": ground_matrices(golden, size)}, size)
-    levels = [head.grid.turned(level) for level in bev["bev_levels"]]
+    levels = [turned(level, head.grid) for level in bev["bev_levels"]]
     subsets["bev_sub"] = torch.cat(levels)[:, ::8, ::8, ::8]
     for key, value in subsets.items():
         yield Row(name, key, largest_difference(value, data[key]), 1e-4)

@@ -107,15 +107,6 @@ class BEVGrid:
         return self.metres_from_norm(_affine(points, scale, shift)[..., order])
 
     @property
-    def front_size(self) -> tuple[int, int]:
-        """Number of pixels along the direction of travel and across it."""
-        return (self.height, self.width) if self.forward == "y" else (self.width, self.height)
-
-    def turned(self, raster: "Tensor") -> "Tensor":
-        """Turn a raster so that row 0 is the front and column 0 the left, or back. (..., H, W)"""
-        return raster.flip(-2) if self.forward == "y" else raster.transpose(-1, -2).flip(-2, -1)
-
-    @property
     def _front(self) -> tuple[list[int], tuple[float, float], tuple[float, float]]:
         """Return how [0, 1] over the map is turned to the front and back: order, scale, shift."""
         along_x = self.forward == "x"

@@ -12,6 +12,7 @@ from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import project_pillars
 from gsmap.models.maptr.attention import MultiLevelAttention
 from gsmap.models.maptr.layers import feed_forward, init_matrices
+from gsmap.models.pivotnet.front import centres, front_size, turned
 from gsmap.structures.grid import BEVGrid
 
 Shapes = Sequence[tuple[int, int]]
@@ -20,20 +21,13 @@ Shapes = Sequence[tuple[int, int]]
 class DeformableLayer(nn.Module):
     """Attentions to maps, one after another, and a feed-forward network, post-norm."""
 
-    def __init__(
-        self,
-        levels: Sequence[int],
-        embed_dims: int,
-        num_heads: int = 8,
-        num_points: int = 8,
-        ffn_dims: int = 1024,
-        dropout: float = 0.1,
-    ) -> None:
+    def __init__(self, levels: Sequence[int], ffn_dims: int, dropout: float, **sizes: int) -> None:
         super().__init__()
-        sizes = {"embed_dims": embed_dims, "num_heads": num_heads, "dropout": dropout}
-        self.attns = nn.ModuleList(MultiLevelAttention(n, num_points, **sizes) for n in levels)
-        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
-        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in (*levels, "ffn"))
+        self.attns = nn.ModuleList(
+            MultiLevelAttention(number, dropout=dropout, **sizes) for number in levels
+        )
+        self.ffn = feed_forward(sizes["embed_dims"], ffn_dims, dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(sizes["embed_dims"]) for _ in (*levels, "ffn"))
 
     def forward(
         self, tokens: Tensor, position: Tensor, *views: tuple[Sequence[Tensor], Tensor]
@@ -99,10 +93,11 @@ class PivotBEVEncoder(CameraEncoder):
         self.source_pos = nn.ModuleList(
             nn.Embedding(height * width, embed_dims) for height, width in self.shapes
         )
-        settings, levels = {"embed_dims": embed_dims, **(layer_cfg or {})}, len(strides)
+        defaults = {"num_heads": 8, "num_points": 8, "ffn_dims": 1024, "dropout": 0.1}
+        settings = {"embed_dims": embed_dims, **defaults, **(layer_cfg or {})}
         self.source_layers, self.bev_layers = (
-            nn.ModuleList(DeformableLayer(maps, **settings) for _ in range(number))
-            for maps, number in zip(((levels,), (1, levels)), num_layers, strict=True)
+            nn.ModuleList(DeformableLayer(levels, **settings) for _ in range(number))
+            for levels, number in zip(((len(strides),), (1, len(strides))), num_layers, strict=True)
         )
         cells = self.grid.height * self.grid.width
         self.bev_embedding = nn.Embedding(cells, embed_dims)
@@ -132,12 +127,12 @@ class PivotBEVEncoder(CameraEncoder):
         sources, position = self.sources(feats), self.bev_pos.weight
         uv, seen = self.project(calibration["img_from_ground"], img_shape)
         reference = torch.where(seen[..., None], uv, self.unseen_reference(position).sigmoid())
-        shapes = [self.grid.front_size]
+        shapes = [front_size(self.grid)]
         own = centres(shapes, position.device).expand_as(reference)
         cells, bev = self.bev_embedding.weight.expand(len(uv), -1, -1), []
         for layer in self.bev_layers:
             cells = layer(cells, position, (maps_of(cells, shapes), own), (sources, reference))
-            bev.append(self.grid.turned(maps_of(cells, shapes)[0]))
+            bev.append(turned(maps_of(cells, shapes)[0], self.grid))
         return {"bev_feats": bev[-1], "bev_levels": bev}
 
     def sources(self, feats: Sequence[Tensor]) -> list[Tensor]:
@@ -164,7 +159,7 @@ class PivotBEVEncoder(CameraEncoder):
         (B, H * W, 2), (B, H * W)
         """
         matrices = img_from_ground.float()
-        places = centres([self.grid.front_size], matrices.device).flip(-1)
+        places = centres([front_size(self.grid)], matrices.device).flip(-1)
         points = F.pad(self.grid.metres_from_front(places), (0, 1))  # on the ground
         points = F.pad(points, (0, 1), value=1.0)  # (Q, 4)
         uv, visible = project_pillars(points[:, None], matrices, img_shape)
@@ -176,12 +171,6 @@ class PivotBEVEncoder(CameraEncoder):
         u, v = (part.gather(1, camera)[:, 0] for part in uv[..., 0, :].unbind(-1))
         u = (u + camera[:, 0]) / matrices.shape[1]
         return torch.stack([u, v], -1), visible.gather(1, camera)[:, 0]
-
-
-def centres(shapes: Shapes, device: torch.device) -> Tensor:
-    """Return the centres (x, y) of maps' cells, [0, 1] over each, row by row. (all cells, 2)"""
-    grids = [BEVGrid((0.0, 1.0), (0.0, 1.0), *shape) for shape in shapes]
-    return torch.cat([grid.pixel_centres(device).flatten(0, 1) for grid in grids])
 
 
 def maps_of(tokens: Tensor, shapes: Shapes) -> list[Tensor]:

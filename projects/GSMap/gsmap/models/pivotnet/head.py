@@ -16,9 +16,11 @@ from gsmap.models.maptr.coder import DetectionHead, MapCoder, Samples, Tensors
 from gsmap.models.maptr.layers import mlp
 from gsmap.models.maptr.parts import PARTS
 from gsmap.models.pivotnet.decoder import ClassLines, PointLineDecoder
+from gsmap.models.pivotnet.front import front_size, turned
 from gsmap.models.pivotnet.losses import (
     LINE,
     PIVOT,
+    Case,
     Lines,
     Pairs,
     PivotLosses,
@@ -73,7 +75,8 @@ def packed(lines: list[Lines]) -> PivotPredictions:
         score = own.logits[..., LINE, None] - own.logits[..., 1 - LINE, None]
         scores.append(F.pad(score, (label, len(lines) - 1 - label), value=-torch.inf))
         pivot = own.point_logits[..., PIVOT, None] - own.point_logits[..., 1 - PIVOT, None]
-        pivot = F.pad(pivot[:, :, 1:-1], (0, 0, 1, 1), value=1.0)
+        ends = torch.ones_like(pivot[:, :, :1])
+        pivot = torch.cat([ends, pivot[:, :, 1:-1], ends], 2)
         both = torch.cat([own.points, pivot], -1)
         references.append(F.pad(both, (0, 0, 0, longest - both.shape[2]), value=-1.0))
     return PivotPredictions(torch.cat(scores, 1), torch.cat(references, 1), lines)
@@ -119,7 +122,7 @@ class PivotHead(DetectionHead):
                 f"{list(classes)}, got {list(queries)}."
             )
         self.grid, self.classes, self.losses = grid, tuple(classes), PivotLosses(**(losses or {}))
-        self.mask_size = grid.rasterized(mask_pixel_m).front_size
+        self.mask_size = front_size(grid.rasterized(mask_pixel_m))
         own = {"type": "PointLineDecoder", "queries": queries, "embed_dims": embed_dims}
         self.decoder: PointLineDecoder = MODELS.build({**own, **(decoder or {})})
         num_layers = len(self.decoder.layers)
@@ -161,7 +164,7 @@ class PivotHead(DetectionHead):
 
     def forward(self, bev_outputs: Tensors) -> list[PivotPredictions]:
         """Predict the lines after every decoder layer, from ``bev_feats`` (B, C, H, W)."""
-        layers = self.decoder(self.grid.turned(bev_outputs["bev_feats"]))[1:]
+        layers = self.decoder(turned(bev_outputs["bev_feats"], self.grid))[1:]
         mean = self.coordinate_feature()
         return [self.predictions(layer, mean) for layer in layers]
 
@@ -195,14 +198,13 @@ class PivotHead(DetectionHead):
                 f"sample {sample.metainfo.get('token')!r} has no pivots: put FormatPivotTargets in "
                 "place of FormatMapTargets into the training pipeline."
             )
-        labels, masks = instances.labels_3d.cpu().numpy(), instances.masks
+        labels, numbers, masks = instances.labels_3d, instances.num_pts, instances.masks
         if tuple(masks.shape[1:]) != self.mask_size:
             raise ValueError(
                 f"masks of FormatPivotTargets are {tuple(masks.shape[1:])}, the head's "
                 f"{self.mask_size}: set pixel_m there to the head's mask_pixel_m."
             )
-        pivots = self.grid.front_from_metres(instances.pts.double()).cpu().numpy()
-        numbers, found = instances.num_pts.cpu().numpy(), []
+        pivots, found = self.grid.front_from_metres(instances.pts.float()), []
         for label, (_, most) in enumerate(self.decoder.queries):
             own = labels == label
             if (numbers[own] > most).any():
@@ -211,8 +213,7 @@ class PivotHead(DetectionHead):
                     f"has {most} points: set num_points of FormatPivotTargets to those of its "
                     "queries."
                 )
-            shown = masks[torch.from_numpy(own)].float()
-            found.append(TrueLines(pivots[own, :most], numbers[own], shown))
+            found.append(TrueLines(pivots[own, :most], numbers[own], masks[own].float()))
         return found
 
     def line_losses(
@@ -222,21 +223,31 @@ class PivotHead(DetectionHead):
         tokens: Sequence[str],
     ) -> tuple[Tensors, list[list[Pairs]]]:
         """Return the losses of all layers and classes, and the pairs of each and every sample."""
+        groups = [
+            self.cases(lines, [truth[label] for truth in truths], tokens)
+            for layer in outputs
+            for label, lines in enumerate(layer.lines)
+        ]
+        pairs = iter(self.losses.match([case for group in groups for case in group]))
+        matches = [[next(pairs) for _ in group] for group in groups]
         totals: Tensors = {}
-        matches = []
-        for weight, layer in zip(self.layer_weights, outputs, strict=True):
-            share = weight / (len(outputs) * len(self.classes))
-            for label, lines in enumerate(layer.lines):
-                own = lines._replace(masks=self.enlarged(lines.masks))
-                losses, pairs = self.losses(own, [truth[label] for truth in truths], tokens)
-                matches.append(pairs)
-                for name, value in losses.items():
-                    totals[name] = totals.get(name, 0) + share * value
+        weights = [w / len(groups) for w in self.layer_weights for _ in self.classes]
+        for weight, group, matched in zip(weights, groups, matches, strict=True):
+            for name, value in self.losses(group, matched).items():
+                totals[name] = totals.get(name, 0) + weight * value
         return totals, matches
+
+    def cases(self, lines: Lines, truths: Sequence[TrueLines], tokens: Sequence[str]) -> list[Case]:
+        """Return a layer's lines of a class by sample, with what is annotated."""
+        samples = zip(*lines[:3], self.enlarged(lines.masks), truths, tokens, strict=True)
+        return [
+            Case(Lines(*own), truth, mask_distances(own[3], truth.masks), token)
+            for *own, truth, token in samples
+        ]
 
     def class_masks(self, bev_feats: Tensor) -> Tensor:
         """Return the logits of the classes' masks. (B, C, H, W) -> (B, classes, rows, columns)"""
-        front = self.grid.turned(bev_feats)
+        front = turned(bev_feats, self.grid)
         # of the two channels of each class, the release trains the second alone
         return self.enlarged(torch.cat([conv(front)[:, 1:] for conv in self.semantic_branches], 1))
 

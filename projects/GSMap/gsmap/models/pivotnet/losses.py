@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
@@ -29,13 +28,22 @@ class Lines(NamedTuple):
 class TrueLines(NamedTuple):
     """Annotated lines of one class in one sample."""
 
-    pivots: Floats  # [0, 1] from the front and from the left; beyond their number unused (K, P, 2)
-    numbers: NDArray[np.int64]  # of pivots (K,)
+    pivots: Tensor  # [0, 1] from the front and from the left; beyond their number unused (K, P, 2)
+    numbers: Tensor  # of pivots (K,)
     masks: Tensor  # 0 and 1, float (K, H, W)
 
 
+class Case(NamedTuple):
+    """Lines of one class in one sample."""
+
+    lines: Lines
+    truth: TrueLines
+    apart: Tensor  # distances of their masks (n, K)
+    token: str
+
+
 class Pairs(NamedTuple):
-    """Matched lines of one class in one sample."""
+    """Matched lines of a case."""
 
     rows: Tensor  # numbers of the predicted ones (M,)
     cols: Tensor  # and of the annotated ones (M,)
@@ -59,45 +67,60 @@ class PivotLosses:
     point_cls_per_line: bool = True  # divide ``point_cls`` by the number of lines, as released
 
     @torch.no_grad()
-    def match(self, lines: Lines, truth: TrueLines, token: str) -> Pairs:
-        """Match the lines of a sample; FloatingPointError if a cost is not a number."""
-        masks = mask_distances(lines.masks, truth.masks)
-        scores = lines.logits.softmax(-1)[:, LINE, None].expand_as(masks)
-        points = lines.points.double().cpu().numpy()
-        differences = np.abs(truth.pivots[:, :, None] - points[:, None, None]).sum(-1)
-        sequences = torch.from_numpy(sequence_costs(differences, truth.numbers, self.end_weight))
-        parts = -self.cls * scores.cpu(), self.mask * masks.cpu(), self.pivots * sequences
-        costs = torch.stack([part.double() for part in parts])  # (3, n, K)
-        check_finite(costs, ["class scores", "masks", "pivots"], {"token": token})
-        rows, cols = linear_sum_assignment(costs.sum(0).numpy())
-        index = np.arange(points.shape[1])
-        is_pivot = np.zeros((len(rows), len(index)), bool)
-        expected = np.zeros((len(rows), len(index), 2), np.float32)
-        for pair, (row, col) in enumerate(zip(rows, cols, strict=True)):
-            line = truth.pivots[col, : truth.numbers[col]]
-            path = match_pivots(differences[row, col, : len(line)])
-            is_pivot[pair, path] = True
-            expected[pair] = np.stack([np.interp(index, path, axis) for axis in line.T], -1)
-        found = rows, cols, is_pivot, expected
-        return Pairs(*(torch.from_numpy(part).to(masks.device) for part in found))
-
-    def __call__(
-        self, lines: Lines, truths: Sequence[TrueLines], tokens: Sequence[str]
-    ) -> tuple[dict[str, Tensor], list[Pairs]]:
-        """Return the weighted losses of a layer's lines of a class, and the pairs of each sample.
-
-        The masks of lines (B, n, H, W) are as large as the annotated ones.
-        """
-        samples = zip(map(Lines, *lines), truths, tokens, strict=True)
-        pairs = [self.match(*sample) for sample in samples]
-        chosen = [
-            torch.cat([own[found.rows] for own, found in zip(part, pairs, strict=True)])
-            for part in lines
+    def match(self, cases: Sequence[Case]) -> list[Pairs]:
+        """Match the lines of each case; FloatingPointError if a cost is not a number."""
+        parts = [part for case in cases for part in self.costs(case)]
+        # all in one copy from the device
+        values = torch.cat([part.flatten() for part in parts]).cpu().double()
+        arrays = [
+            own.view(part.shape).numpy()
+            for own, part in zip(values.split([p.numel() for p in parts]), parts, strict=True)
         ]
-        _, points, kinds, masks = chosen  # of matched lines (M, ...)
-        drawn = torch.cat([own.masks[p.cols] for own, p in zip(truths, pairs, strict=True)])
-        is_pivot = torch.cat([found.is_pivot for found in pairs])
-        offsets = (points - torch.cat([found.expected for found in pairs])).abs().sum(-1)
+        matched = zip(cases, arrays[::4], arrays[1::4], arrays[2::4], arrays[3::4], strict=True)
+        return [self.pairs(*case) for case in matched]
+
+    def costs(self, case: Case) -> tuple[Tensor, ...]:
+        """Return two costs (2, n, K), |du| + |dv| (n, K, m, p), pivots (K, m, 2), numbers (K,)."""
+        score = case.lines.logits.softmax(-1)[:, LINE, None].expand_as(case.apart)
+        plain = torch.stack([-self.cls * score, self.mask * case.apart])
+        pivots = case.truth.pivots
+        apart = pivots[None, :, :, None] - case.lines.points[:, None, None]
+        return plain, apart.abs().sum(-1), pivots, case.truth.numbers
+
+    def pairs(
+        self, case: Case, plain: Floats, differences: Floats, pivots: Floats, numbers: Floats
+    ) -> Pairs:
+        """Match a case by what `costs` says."""
+        counts = numbers.astype(int)
+        sequences = self.pivots * sequence_costs(differences, counts, self.end_weight)
+        costs = torch.from_numpy(np.concatenate([plain, sequences[None]]))
+        check_finite(costs, ["class scores", "masks", "pivots"], {"token": case.token})
+        rows, cols = linear_sum_assignment(costs.sum(0).numpy())
+        points = np.arange(differences.shape[-1])
+        is_pivot, expected = (
+            np.zeros((len(rows), len(points))),
+            np.zeros((len(rows), len(points), 2)),
+        )
+        for pair, (row, col) in enumerate(zip(rows, cols, strict=True)):
+            line = pivots[col, : counts[col]]
+            path = match_pivots(differences[row, col, : len(line)])
+            is_pivot[pair, path] = 1
+            expected[pair] = np.stack([np.interp(points, path, axis) for axis in line.T], -1)
+        found = rows, cols, is_pivot.astype(bool), expected.astype(np.float32)
+        return Pairs(*(torch.from_numpy(part).to(case.apart.device) for part in found))
+
+    def __call__(self, cases: Sequence[Case], matches: Sequence[Pairs]) -> dict[str, Tensor]:
+        """Return the weighted losses of a layer and class, from the cases of all samples."""
+        number = max(sum(len(case.truth.numbers) for case in cases), 1)
+        labels = [torch.full_like(case.lines.logits[:, 0], 1 - LINE).long() for case in cases]
+        for label, pairs in zip(labels, matches, strict=True):
+            label[pairs.rows] = LINE
+        both = list(zip(cases, matches, strict=True))
+        masks = torch.cat([case.apart[pairs.rows, pairs.cols] for case, pairs in both])
+        points = torch.cat([case.lines.points[pairs.rows] for case, pairs in both])
+        kinds = torch.cat([case.lines.point_logits[pairs.rows] for case, pairs in both])
+        is_pivot = torch.cat([pairs.is_pivot for pairs in matches])
+        offsets = (points - torch.cat([pairs.expected for pairs in matches])).abs().sum(-1)
         weight = is_pivot.float()
         weight[:, [0, -1]] += self.end_weight
         between = (~is_pivot).float()
@@ -106,20 +129,15 @@ class PivotLosses:
         if len(kinds):
             classes = kinds.new_tensor([self.between_weight, 1.0])
             point_cls = F.cross_entropy(kinds.flatten(0, 1), is_pivot.flatten().long(), classes)
-        labels = torch.full_like(lines.logits[..., 0], 1 - LINE).long()
-        for own, found in zip(labels, pairs, strict=True):
-            own[found.rows] = LINE
-        classes = lines.logits.new_tensor([1.0, self.none_weight])
-        cls = F.cross_entropy(lines.logits.flatten(0, 1), labels.flatten(), classes)
-        number = max(sum(len(own.numbers) for own in truths), 1)
-        losses = {
-            "mask": self.mask * mask_distances(masks, drawn).diagonal().sum() / number,
+        logits = torch.cat([case.lines.logits for case in cases])
+        cls = F.cross_entropy(logits, torch.cat(labels), logits.new_tensor([1.0, self.none_weight]))
+        return {
+            "mask": self.mask * masks.sum() / number,
             "pivots": self.pivots * ((offsets * weight).sum(1) / weight.sum(1)).sum() / number,
             "collinear": self.collinear * collinear.sum() / number,
             "cls": self.cls * cls,
             "point_cls": self.point_cls * point_cls / (number if self.point_cls_per_line else 1),
         }
-        return losses, pairs
 
 
 def mask_distances(logits: Tensor, masks: Tensor) -> Tensor:

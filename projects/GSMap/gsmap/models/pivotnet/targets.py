@@ -13,6 +13,7 @@ from mmdet3d.registry import TRANSFORMS
 from mmengine.structures import InstanceData
 from numpy.typing import NDArray
 
+from gsmap.models.pivotnet.front import front_size
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import arc_lengths, is_closed
 
@@ -139,7 +140,7 @@ class FormatPivotTargets(BaseTransform):
             labels_3d=torch.tensor([label for label, _ in parts], dtype=torch.int64),
             pts=torch.from_numpy(points_m.astype(np.float32)),
             num_pts=torch.tensor([len(line) for line in pivots], dtype=torch.int64),
-            masks=torch.from_numpy(self.masks(parts, pivots, grid.front_size)),
+            masks=torch.from_numpy(self.masks(parts, pivots, front_size(grid))),
         )
         return results
 
@@ -167,7 +168,7 @@ class FormatPivotTargets(BaseTransform):
 
     def pivots(self, line: Points, label: int, grid: BEVGrid) -> Points:
         """Return the pivots of a line, [0, 1] from the front and the left. (m, 2)"""
-        size_m, most = np.array(grid.front_size) * self.pixel_m, self.num_points[label]
+        size_m, most = np.array(front_size(grid)) * self.pixel_m, self.num_points[label]
         line_m = directed(line * size_m, 1.0, self.sort_rings)
         areas = significances(line_m)
         chosen = np.flatnonzero(areas >= self.min_area_m2)
