@@ -71,7 +71,7 @@ class Mesh:
         self.disc_groups.append(len(self.anchors) - 1)
 
     def freeze(self) -> "FrozenMesh":
-        """The same as arrays."""
+        """Return the faces and discs so far as arrays."""
         return FrozenMesh(
             np.array(self.quads, float).reshape(-1, 4, 3),
             np.array(self.colors, float).reshape(-1, 3),

@@ -168,7 +168,7 @@ def _blend(target: Image, paint: tuple[int, int, int], alpha: Image) -> None:
 
 
 def darken(texture: GroundTexture, outlines: list[Array], strength: float) -> GroundTexture:
-    """The same ground under shadows with soft edges.
+    """Return the ground under shadows with soft edges.
 
     Args:
         texture: The ground.

@@ -17,6 +17,7 @@ from gsmap.checkpoints.key_map import is_upstream
 from gsmap.checkpoints.named_models import named_models
 from gsmap.checkpoints.settings import plain
 from gsmap.datasets.annotations.record import MapSample
+from gsmap.engine.run_log import innermost
 from gsmap.structures.frames import FRAME_VIEWS, viewing_azimuth
 from gsmap.utils.shipped import shipped
 
@@ -200,9 +201,7 @@ class RigFitHook(Hook):
         """Change the weights before the model takes them."""
         if runner._resume or isinstance(runner._train_loop, dict | None):
             return
-        dataset = runner.train_dataloader.dataset
-        while hasattr(dataset, "dataset"):  # a wrapper, such as RepeatDataset
-            dataset = dataset.dataset
+        dataset = innermost(runner.train_dataloader.dataset)
         state = checkpoint.get("state_dict", checkpoint)
         fitted = {key.removeprefix("module."): value for key, value in state.items()}
         if is_upstream(fitted):

@@ -43,10 +43,9 @@ class MapDetector(Base3DDetector):
         temporal: Settings of `StreamMemory`, for a model that remembers earlier frames.
         fold_batch_norms: Whether the image backbone runs without gradients as a copy whose batch
             norms are folded into its convolutions (faster, for a second copy of its weights).
-        strict_loading: Whether a checkpoint must hold every weight, by our names or upstream's, and
-            nothing else; otherwise it is loaded as torch does, by our names.
-        allow_untrained: Whether it may lack the parts that start without effect, as MapTR's lack
-            GSMap's Gaussians: so a training may start, and nothing else does unless it is asked.
+        allow_untrained: Whether a checkpoint may lack the parts that start without effect, as
+            MapTR's lack GSMap's Gaussians: so a training may start, and nothing else does unless it
+            is asked. Other weights must all be there, by our names or upstream's, and no further.
 
     Raises:
         ValueError: If there is neither camera nor LiDAR, or both but no fusion.
@@ -65,7 +64,6 @@ class MapDetector(Base3DDetector):
         bev_fuser: dict | None = None,
         temporal: dict | None = None,
         fold_batch_norms: bool = True,
-        strict_loading: bool = True,
         allow_untrained: bool = True,
         data_preprocessor: dict | None = None,
         init_cfg: dict | None = None,
@@ -77,7 +75,6 @@ class MapDetector(Base3DDetector):
         # convolution takes them for channels first and is silently wrong
         parts = () if self.img_backbone is None else self.img_backbone.modules()
         self.channels_last = not any(isinstance(part, ModulatedDeformConv2d) for part in parts)
-        self.strict_loading = strict_loading
         self.allow_untrained = allow_untrained
         self.img_neck = MODELS.build(img_neck) if img_neck else None
         self.img_augment = MODELS.build(img_augment) if img_augment else None
@@ -170,9 +167,8 @@ class MapDetector(Base3DDetector):
     def _load_from_state_dict(
         self, state_dict: dict[str, Tensor], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        """Accept upstream's names; with ``strict_loading`` ValueError if a key does not match."""
-        if self.strict_loading:
-            own, neutral = self.state_dict(prefix=prefix), neutral_keys(self, prefix)
-            fit = partial(self.map_head.fit_state, prefix=f"{prefix}map_head.")
-            adapt_state(state_dict, own, prefix, neutral, fit, self.allow_untrained)
+        """Accept upstream's names too; ValueError if a key is missing or matches none."""
+        own, neutral = self.state_dict(prefix=prefix), neutral_keys(self, prefix)
+        fit = partial(self.map_head.fit_state, prefix=f"{prefix}map_head.")
+        adapt_state(state_dict, own, prefix, neutral, fit, self.allow_untrained)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

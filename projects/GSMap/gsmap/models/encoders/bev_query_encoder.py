@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import PillarProjection, pillar_points, project_pillars
-from gsmap.models.maptr.attention import BEVDeformableAttention, directional_offsets
+from gsmap.models.maptr.attention import BEVDeformableAttention
 from gsmap.models.maptr.layers import feed_forward, init_matrices
 from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.structures.grid import BEVGrid
@@ -24,25 +24,16 @@ class BEVSelfAttention(BEVDeformableAttention):
     are the samples per head and queue entry.
     """
 
-    num_queue = 2
-
     def __init__(
         self, embed_dims: int = 256, num_heads: int = 8, num_points: int = 4, dropout: float = 0.1
     ) -> None:
-        super().__init__(
-            embed_dims, num_heads, self.num_queue * num_points, 2 * embed_dims, dropout
-        )
-
-    def initial_offsets(self) -> Tensor:
-        """Return the offsets, in cells, the same for each queue entry. (heads, S, 2)"""
-        one = directional_offsets(self.num_heads, self.num_points // self.num_queue)
-        return one.repeat(1, self.num_queue, 1)
+        super().__init__(embed_dims, num_heads, num_points, 2 * embed_dims, dropout, num_parts=2)
 
     def weights(self, query: Tensor) -> Tensor:
         """Return a softmax per queue entry, averaged over the queue. (B, Q, heads, S)"""
         logits = self.attention_weights(query).float()
-        logits = logits.unflatten(-1, (self.num_heads, self.num_queue, -1))
-        return logits.softmax(-1).flatten(-2) / self.num_queue
+        logits = logits.unflatten(-1, (self.num_heads, self.num_parts, -1))
+        return logits.softmax(-1).flatten(-2) / self.num_parts
 
 
 class BEVEncoderLayer(nn.Module):

@@ -8,7 +8,7 @@ from mmdet3d.registry import MODELS
 from torch import Tensor
 
 from gsmap.models.encoders.projection import PillarProjection
-from gsmap.models.maptr.attention import SamplingAttention, directional_offsets, sample_map
+from gsmap.models.maptr.attention import SamplingAttention, sample_map
 
 
 @MODELS.register_module()
@@ -38,13 +38,8 @@ class SpatialCrossAttention(SamplingAttention):
             raise ValueError(
                 f"num_points must be a multiple of num_heights, got {num_points} and {num_heights}."
             )
-        self.num_levels, self.num_heights = num_levels, num_heights
-        super().__init__(embed_dims, num_heads, num_levels * num_points, dropout=0.0)
-
-    def initial_offsets(self) -> Tensor:
-        """Return the same offsets for every level. (heads, levels * S, 2)"""
-        one = directional_offsets(self.num_heads, self.num_points // self.num_levels)
-        return one.repeat(1, self.num_levels, 1)
+        super().__init__(embed_dims, num_heads, num_points, dropout=0.0, num_parts=num_levels)
+        self.num_heights = num_heights
 
     def forward(
         self, query: Tensor, img_feats: Tensor | Sequence[Tensor], projection: PillarProjection
@@ -55,9 +50,9 @@ class SpatialCrossAttention(SamplingAttention):
         ``num_heights`` points. (B, Q, C) -> (B, Q, C)
         """
         levels = [img_feats] if isinstance(img_feats, Tensor) else list(img_feats)
-        offsets = self.offsets_in_cells(query).chunk(self.num_levels, 3)  # (B, Q, heads, S, 2)
-        weights = self.weights(query).chunk(self.num_levels, 3)
-        repeats = self.num_points // (self.num_levels * self.num_heights)
+        offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)  # (B, Q, heads, S, 2)
+        weights = self.weights(query).chunk(self.num_parts, 3)
+        repeats = self.num_points // (self.num_parts * self.num_heights)
         summed = query.new_zeros(query.shape, dtype=torch.float32)
         for feats, offset, weight in zip(levels, offsets, weights, strict=True):
             height, width = feats.shape[-2:]

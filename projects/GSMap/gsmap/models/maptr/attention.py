@@ -71,9 +71,13 @@ class SamplingAttention(nn.Module):
     Args:
         embed_dims: Channels C of map and output; ValueError if ``num_heads`` does not divide them.
         num_heads: Number of heads.
-        num_points: Samples per head and query, S.
+        num_points: Samples per head and query, in each part.
         query_dims: Channels of the query; None means ``embed_dims``.
         dropout: Dropout on the output.
+        num_parts: Parts of the samples, such as levels, which start with the same offsets.
+
+    Attributes:
+        num_points: Samples per head and query, of all parts, S.
     """
 
     def __init__(
@@ -83,6 +87,7 @@ class SamplingAttention(nn.Module):
         num_points: int = 4,
         query_dims: int | None = None,
         dropout: float = 0.1,
+        num_parts: int = 1,
     ) -> None:
         super().__init__()
         if embed_dims % num_heads:
@@ -90,9 +95,10 @@ class SamplingAttention(nn.Module):
                 f"embed_dims must be divisible by num_heads, got {embed_dims} and {num_heads}."
             )
         query_dims = query_dims or embed_dims
-        self.num_heads, self.num_points = num_heads, num_points
-        self.sampling_offsets = nn.Linear(query_dims, num_heads * num_points * 2)
-        self.attention_weights = nn.Linear(query_dims, num_heads * num_points)
+        self.num_heads, self.num_parts = num_heads, num_parts
+        self.num_points = num_parts * num_points
+        self.sampling_offsets = nn.Linear(query_dims, num_heads * self.num_points * 2)
+        self.attention_weights = nn.Linear(query_dims, num_heads * self.num_points)
         self.value_proj = nn.Linear(embed_dims, embed_dims)
         self.output_proj: nn.Module = nn.Linear(embed_dims, embed_dims)
         self.dropout = nn.Dropout(dropout)
@@ -101,14 +107,11 @@ class SamplingAttention(nn.Module):
     def init_weights(self) -> None:
         """Let each head look in its own direction, with equal weights."""
         constant_init(self.sampling_offsets, 0.0)
-        self.sampling_offsets.bias.data = self.initial_offsets().flatten()
+        offsets = directional_offsets(self.num_heads, self.num_points // self.num_parts)
+        self.sampling_offsets.bias.data = offsets.repeat(1, self.num_parts, 1).flatten()
         constant_init(self.attention_weights, 0.0)
         xavier_init(self.value_proj, distribution="uniform")
         xavier_init(self.output_proj, distribution="uniform")
-
-    def initial_offsets(self) -> Tensor:
-        """Return the offsets, in cells, that every query starts with. (heads, S, 2)"""
-        return directional_offsets(self.num_heads, self.num_points)
 
     def offsets_in_cells(self, query: Tensor) -> Tensor:
         """Return the learned offsets (x, y) in cells. (B, Q, heads, S, 2)"""
@@ -182,13 +185,7 @@ class MultiLevelAttention(SamplingAttention):
     """
 
     def __init__(self, num_levels: int = 4, num_points: int = 4, **kwargs: Any) -> None:
-        self.num_levels = num_levels
-        super().__init__(num_points=num_levels * num_points, **kwargs)
-
-    def initial_offsets(self) -> Tensor:
-        """Return the same offsets for every map. (heads, levels * S, 2)"""
-        one = super().initial_offsets()[:, : self.num_points // self.num_levels]
-        return one.repeat(1, self.num_levels, 1)
+        super().__init__(num_points=num_points, num_parts=num_levels, **kwargs)
 
     def forward(
         self,
@@ -201,8 +198,8 @@ class MultiLevelAttention(SamplingAttention):
 
         References and frames are as in `place_samples`.
         """
-        offsets = self.offsets_in_cells(query).chunk(self.num_levels, 3)
-        weights = self.weights(query).chunk(self.num_levels, 3)
+        offsets = self.offsets_in_cells(query).chunk(self.num_parts, 3)
+        weights = self.weights(query).chunk(self.num_parts, 3)
         seen = torch.zeros_like(query)
         for level, own, weight in zip(feats, offsets, weights, strict=True):
             shape = (level.shape[-2], level.shape[-1])

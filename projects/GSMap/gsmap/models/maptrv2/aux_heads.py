@@ -85,7 +85,7 @@ class BEVMaskHead(nn.Sequential):
 
 @MODELS.register_module()
 class PVMaskHead(BEVMaskHead):
-    """The same in the view of each camera, on the encoder's image features."""
+    """Elements drawn in the view of each camera; learned from the encoder's image features."""
 
     feats, target = "img_feats", "gt_pv_seg"  # (B, V, C, h, w) and (B, V, classes or 1, h, w)
 

@@ -8,7 +8,7 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.maptr.attention import SamplingAttention, directional_offsets, place_samples
+from gsmap.models.maptr.attention import SamplingAttention, place_samples
 from gsmap.models.maptr.layers import feed_forward, mlp
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.structures.tensors import at_least_float32
@@ -45,7 +45,7 @@ class PerPointSampling(SamplingAttention):
         self, num_points: int = 20, num_samples: int = 8, num_levels: int = 2, **kwargs: Any
     ) -> None:
         self.layout = (num_levels, num_points, num_samples)
-        super().__init__(num_points=num_levels * num_points * num_samples, **kwargs)
+        super().__init__(num_points=num_samples, num_parts=num_levels * num_points, **kwargs)
 
     def forward(
         self,
@@ -71,11 +71,6 @@ class PerPointSampling(SamplingAttention):
     ) -> Granularities:
         """Return the queries, updated by what the samples see."""
         raise NotImplementedError
-
-    def initial_offsets(self) -> Tensor:
-        """Return the same offsets for every level and point. (heads, levels * P * K, 2)"""
-        levels, points, samples = self.layout
-        return directional_offsets(self.num_heads, samples).repeat(1, levels * points, 1)
 
     def look(
         self,

@@ -26,26 +26,24 @@ def significances(points: Points) -> NDArray[np.float64]:
     Visvalingam and Whyatt: the point of the smallest triangle with its neighbours goes first. A
     point counts at least as much as those removed before it.
     """
-    areas = np.full(len(points), np.inf)
-    for i in range(1, len(points) - 1):
-        areas[i] = _triangle(*points[i - 1 : i + 2])
-    result, left, next_up = areas.copy(), list(range(len(points))), 0
+    areas, left, next_up = np.full(len(points), np.inf), list(range(len(points))), 0
+    areas[1:-1] = _triangles(points[:-2], points[1:-1], points[2:])
     while len(left) > 2:
         at = next_up or int(np.argmin(areas[left]))
         smallest = areas[left.pop(at)]
         next_up = 0
         for near in (at, at - 1):  # what was on its right and on its left
             if 0 < near < len(left) - 1:
-                area = _triangle(*points[left[near - 1 : near + 2]])
-                if area <= smallest:
-                    area, next_up = smallest, near
-                areas[left[near]] = result[left[near]] = area
-    return result
+                areas[left[near]] = _triangles(*points[left[near - 1 : near + 2]])
+                if areas[left[near]] <= smallest:
+                    areas[left[near]], next_up = smallest, near
+    return areas
 
 
-def _triangle(a: Points, b: Points, c: Points) -> float:
-    """Return the area of a triangle."""
-    return abs(a[0] * (b[1] - c[1]) + b[0] * (c[1] - a[1]) + c[0] * (a[1] - b[1])) / 2
+def _triangles(a: Points, b: Points, c: Points) -> NDArray[np.float64]:
+    """Return the areas of triangles. 3 x (..., 2) -> (...)"""
+    (ax, ay), (bx, by), (cx, cy) = a.T, b.T, c.T
+    return np.abs(ax * (by - cy) + bx * (cy - ay) + cx * (ay - by)) / 2
 
 
 def directed(line: Points, tolerance: float, sort_rings: bool = False) -> Points:
