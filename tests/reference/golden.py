@@ -19,7 +19,7 @@ from mmengine.registry import init_default_scope
 from torch import Tensor
 
 from gsmap import registered  # noqa: F401
-from gsmap.checkpoints.key_map import PIVOTNET
+from gsmap.checkpoints.line_keys import PIVOTNET
 
 NUM_CAMS = 6
 OWN_RECIPES = ("mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet")  # of another scale

@@ -9,7 +9,7 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from torch import Tensor, nn
 
-from gsmap.checkpoints.key_map import PIVOTNET
+from gsmap.checkpoints.line_keys import PIVOTNET
 from gsmap.models.pivotnet.encoder import PivotBEVEncoder
 from gsmap.models.pivotnet.front import turned
 from gsmap.models.pivotnet.head import PivotHead, PivotPredictions
