@@ -19,10 +19,10 @@ from mmengine.registry import init_default_scope
 from torch import Tensor
 
 from gsmap import registered  # noqa: F401
-from gsmap.checkpoints.line_keys import PIVOTNET
+from gsmap.checkpoints.line_keys import BEMAPNET, PIVOTNET
 
 NUM_CAMS = 6
-OWN_RECIPES = ("mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet")  # of another scale
+OWN_RECIPES = ("bemapnet", "mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet")  # of another scale
 
 
 @dataclass(eq=False)
@@ -104,11 +104,11 @@ class Golden:
         """Return the upstream state that the recipe makes for a state list."""
         method = name.split("_")[0]
         recipe = self.recipe(method) if method in OWN_RECIPES else self.weights
-        if method == "pivotnet":
+        if method in ("bemapnet", "pivotnet"):  # their recipes make what they are asked for
             shapes = self.state_shapes(name)
             made = {key: recipe.tensor(key, shape, self.seed) for key, shape in shapes.items()}
             return {
-                key: PIVOTNET.unused[key] if value is None else torch.from_numpy(value)
+                key: {**BEMAPNET.unused, **PIVOTNET.unused}[key] if value is None else torch.from_numpy(value)
                 for key, value in made.items()
             }
         arrays = recipe.state(self.state_shapes(name), self.seed)
