@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from mmdet3d.registry import MODELS
-from mmengine.config import Config
 from torch import Tensor, nn
 
 from gsmap.checkpoints.line_keys import BEMAPNET
@@ -27,8 +25,9 @@ from reference.report import Row, largest_difference, largest_relative, relative
 CONFIG = "bemapnet/bemapnet_r50_30e.py"
 STATE = "bemapnet_state.json"
 GRID = BEVGrid((-30.0, 30.0), (-15.0, 15.0))
+IMAGE = np.diag([0.16, 0.19, 1.0, 1.0])  # from the pixels of full images to those of small ones
+IMAGE[1, 2] = -43
 SHARED = "bev_decoder.bev_encoder.tgt_pos_embed_layer."  # listed twice, one module
-NAMES = ("joints", "inner", "pieces")
 KEYS = ("im", "ex", "end")  # theirs of the same
 
 
@@ -41,18 +40,9 @@ class BezierParts(GoldenParts):
         self.recipe: Any = SimpleNamespace(
             tensor=self.recipe.tensor,
             normal=inputs.normal,
+            images=inputs.images,
             in_rng=inputs.rng_for,
         )
-
-    def model(self) -> nn.Module:
-        """Return the released model; its map lies in the frame of the vehicle."""
-        path = self.golden.configs / CONFIG
-        cfg = Config.fromfile(path, import_custom_modules=False).model
-        cfg.img_backbone.init_cfg = None
-        cfg.img_neck.size = (7, 14)
-        cfg.bev_encoder.position_size = None
-        cfg.grid = {"x_range": GRID.x_range, "y_range": GRID.y_range}
-        return self.load(MODELS.build(cfg), "")
 
 
 @check(STATE)
@@ -113,9 +103,7 @@ def check_encoder(golden: Golden, name: str) -> Iterator[Row]:
     built.grid = GRID.resized(6, 8)
     built.bev_embedding = nn.Embedding(48, 64)
     encoder = parts.load(built, "bev_encoder.")
-    image = np.diag([0.16, 0.19, 1.0, 1.0])
-    image[1, 2] = -43
-    matrices = ground_matrices(golden, image).expand(2, -1, -1, -1)
+    matrices = ground_matrices(golden, IMAGE).expand(2, -1, -1, -1)
     points, seen = encoder.ground_points(matrices[:1], (5, 7), (171, 256))
     valid = data["ipm_valid"][..., 0]
     found = seen.view(valid.shape)
