@@ -22,7 +22,14 @@ from gsmap import registered  # noqa: F401
 from gsmap.checkpoints.line_keys import BEMAPNET, PIVOTNET
 
 NUM_CAMS = 6
-OWN_RECIPES = ("bemapnet", "mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet")  # of another scale
+OWN_RECIPES = (
+    "bemapnet",
+    "mapqr",
+    "mgmap",
+    "mgmapnet",
+    "pivotnet",
+    "streammapnet",
+)  # of another scale
 
 
 @dataclass(eq=False)
@@ -108,7 +115,9 @@ class Golden:
             shapes = self.state_shapes(name)
             made = {key: recipe.tensor(key, shape, self.seed) for key, shape in shapes.items()}
             return {
-                key: {**BEMAPNET.unused, **PIVOTNET.unused}[key] if value is None else torch.from_numpy(value)
+                key: {**BEMAPNET.unused, **PIVOTNET.unused}[key]
+                if value is None
+                else torch.from_numpy(value)
                 for key, value in made.items()
             }
         arrays = recipe.state(self.state_shapes(name), self.seed)

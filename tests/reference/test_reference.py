@@ -75,6 +75,9 @@ FILES = [
     "pivotnet_projection_*.npz",
     "pivotnet_forward_reduced_*.npz",
     "pivotnet_state.json",
+    *(f"bemapnet_{part}_*.npz" for part in ("bifpn", "bevdecoder", "insdecoder", "head")),
+    *(f"bemapnet_{part}_*.npz" for part in ("bezier", "targets", "losses", "forward_reduced")),
+    "bemapnet_state.json",
 ]
 
 

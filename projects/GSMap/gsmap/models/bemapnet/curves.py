@@ -49,7 +49,7 @@ class Curve(nn.Module):
         self.degree = degree
 
     def forward(self, controls: Tensor, pieces: Tensor) -> Tensor:
-        """Return points of curves (..., P, 2) of numbers of pieces, less one (...,). (..., 100, 2)"""
+        """Return points of curves (..., P, 2) of ``pieces + 1`` pieces (...,). (..., 100, 2)"""
         return self.weights[pieces] @ controls
 
     def used(self, pieces: Tensor) -> Tensor:

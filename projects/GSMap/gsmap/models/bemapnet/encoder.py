@@ -8,8 +8,8 @@ from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.encoders.camera_encoder import CameraEncoder
-from gsmap.models.maptr.layers import feed_forward, init_matrices
 from gsmap.models.encoders.projection import pixel_rays
+from gsmap.models.maptr.layers import feed_forward, init_matrices
 from gsmap.models.pivotnet.front import ahead, centres, front_size, turned
 from gsmap.structures.grid import BEVGrid
 

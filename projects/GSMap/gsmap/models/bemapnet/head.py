@@ -161,9 +161,7 @@ class BezierHead(LineHead):
     ) -> BezierLines:
         """Return lines of a class from what `raw` says."""
         controls, curve, last = control_points(joints, inner), self.curves[label], pieces.argmax(-1)
-        return BezierLines(
-            logits, controls, curve.used(last), pieces, curve(controls, last), masks
-        )
+        return BezierLines(logits, controls, curve.used(last), pieces, curve(controls, last), masks)
 
     def truth(self, sample: Det3DDataSample) -> list[TrueCurves]:
         """Return a sample's annotated lines, by class; ValueError if they are not of this head."""

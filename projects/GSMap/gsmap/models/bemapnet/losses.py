@@ -73,9 +73,7 @@ class BezierLosses:
             raise ValueError(f"mask_points must be >= 10 or None, got {self.mask_points}.")
 
     @torch.no_grad()
-    def distances(
-        self, masks: Sequence[Tensor], truths: Sequence[Tensor]
-    ) -> list[Tensor]:
+    def distances(self, masks: Sequence[Tensor], truths: Sequence[Tensor]) -> list[Tensor]:
         """Return distances of all masks of each sample, at the same points. (n, K) each"""
         if self.mask_points is None:
             return [mask_distances(*pair) for pair in zip(masks, truths, strict=True)]
@@ -144,11 +142,15 @@ class BezierLosses:
         both = list(zip(cases, matches, strict=True))
         _, controls, used, piece_logits, curves, masks = (
             torch.cat(part)
-            for part in zip(*([p[rows] for p in case.lines] for case, (rows, _) in both), strict=True)
+            for part in zip(
+                *([p[rows] for p in case.lines] for case, (rows, _) in both), strict=True
+            )
         )
         true_controls, pieces, true_curves, true_masks = (
             torch.cat(part)
-            for part in zip(*([p[cols] for p in case.truth] for case, (_, cols) in both), strict=True)
+            for part in zip(
+                *([p[cols] for p in case.truth] for case, (_, cols) in both), strict=True
+            )
         )
         around_px = around(curves, true_masks.shape[-2:])
         values = sampled(true_masks[:, None], around_px)[:, 0] if len(curves) else curves[..., 0]

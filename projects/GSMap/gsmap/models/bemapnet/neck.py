@@ -1,7 +1,6 @@
 """BeMapNet's neck: rounds of BiFPN (EfficientDet), whose levels become one map."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import torch
 import torch.nn.functional as F

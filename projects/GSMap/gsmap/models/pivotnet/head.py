@@ -2,19 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
-from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
 from gsmap.models.maptr.coder import Tensors
 from gsmap.models.maptr.layers import mlp
 from gsmap.models.maptr.parts import PARTS
-from gsmap.models.pivotnet.decoder import ClassLines, PointLineDecoder
+from gsmap.models.pivotnet.decoder import ClassLines
 from gsmap.models.pivotnet.lines import LineHead, LinePredictions, class_scores
 from gsmap.models.pivotnet.losses import (
     PIVOT,
