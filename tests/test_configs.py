@@ -28,7 +28,7 @@ CONFIGS = sorted(
     path for folder in (BASELINES, REPO / "projects/GSMap/configs") for path in folder.rglob("*.py")
 )
 LEAVES = [path for path in CONFIGS if "_base_" not in path.parts]
-ANY_NUMBER = ("pivotnet", "vectormapnet")  # their lines have no equal numbers of points
+ANY_NUMBER = ("pivotnet", "bemapnet", "vectormapnet")  # lines of no equal numbers of points
 SWAPPABLE = [
     path for path in LEAVES if path.is_relative_to(BASELINES) and path.parent.name not in ANY_NUMBER
 ]
@@ -143,6 +143,8 @@ def small(cfg: Config) -> Config:
                 width, height = step.size = tuple(side // 2 for side in step.size)
                 if cfg.model.bev_encoder.type == "PivotBEVEncoder":
                     cfg.model.bev_encoder.image_size = (height, width)
+            if step.type == "CropImages":
+                step.top //= 2
     return cfg
 
 

@@ -53,13 +53,14 @@ MODELS = {
     "mapqr": {"maptr", "encoders"},
     "mgmap": {"maptr", "encoders"},
     "pivotnet": {"maptr", "encoders"},
+    "bemapnet": {"maptr", "encoders", "pivotnet"},  # of the same authors, built alike
     "streammapnet": {"maptr", "encoders"},
     "vectormapnet": {"maptr", "encoders"},
     "gsmap": {"maptr", "encoders", "streams"},
 }
 # what the others are built on stays
 METHODS = (
-    "maptrv2", "mapvr", "gemap", "mgmapnet", "mapqr", "mgmap", "hdmapnet", "pivotnet",
+    "maptrv2", "mapvr", "gemap", "mgmapnet", "mapqr", "mgmap", "hdmapnet", "pivotnet", "bemapnet",
     "streammapnet", "vectormapnet", "gsmap",
 )  # fmt: skip
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")

@@ -17,6 +17,9 @@ from torch import nn
 import gsmap.registered  # noqa: F401
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.raster_ap import MIN_SCORE, RasterConfig
+from gsmap.models.bemapnet.head import LEVEL_WEIGHTS as BEMAPNET_LEVELS
+from gsmap.models.bemapnet.losses import BezierLosses
+from gsmap.models.bemapnet.targets import FormatBezierTargets
 from gsmap.models.pivotnet.head import LEVEL_WEIGHTS
 from gsmap.models.pivotnet.losses import PivotLosses
 from gsmap.models.pivotnet.targets import FormatPivotTargets
@@ -174,6 +177,22 @@ CONFIGS: dict[str, dict[str, Any]] = {
         "model.img_backbone.stage_with_dcn": (False, False, True, True),
         "model.bev_encoder.heights_m": (-1.1, 0.0, 0.5, 1.1),
         "model.map_head.generator.redraw": True,
+    },
+    "bemapnet/bemapnet_r50_30e.py": {
+        **NUSCENES,
+        "optim_wrapper.optimizer": {"type": "AdamW", "lr": 2e-4, "weight_decay": 0.01},
+        "optim_wrapper.paramwise_cfg.custom_keys.img_backbone.lr_mult": 0.25,
+        "param_scheduler.0.milestones": [21, 27],
+        "param_scheduler.0.gamma": 1 / 3,
+        "train_cfg.max_epochs": 30,
+        "train_dataloader.batch_size": 1,
+        "auto_scale_lr.base_batch_size": 8,
+        "model.data_preprocessor.bgr_to_rgb": False,
+        "model.img_backbone.frozen_stages": 1,
+    },
+    "bemapnet/bemapnet_r50_110e.py": {
+        "train_cfg.max_epochs": 110,
+        "param_scheduler.0.milestones": [77, 99],
     },
     "streammapnet/streammapnet_r50_24e.py": {
         **STREAMMAPNET,
@@ -431,6 +450,21 @@ def test_vectormapnet_weighs_and_draws_as_released():
     assert (targets.pixel_m, targets.margin_m, targets.tolerance_m) == (0.3, 2.0, 0.2)
     assert (targets.smallest_box, targets.border_px) == (0.02, 0.1)
     assert targets.edge_classes == (2,)
+
+
+def test_bemapnet_weighs_as_released():
+    head = head_of("bemapnet/bemapnet_r50_30e.py")
+    assert head.losses == BezierLosses(2.0, 5.0, 5.0, 2.0, 10.0, 1.0, 0.5, 0.5, 20000, True)
+    assert head.layer_weights == (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
+    assert BEMAPNET_LEVELS == (0.5, 0.8, 1.2, 1.8)
+    assert (head.mask_size, head.bev_size) == ((400, 200), (200, 100))
+    assert tuple(head.queries) == (20, 25, 15)
+    assert [curve.weights.shape[-1] for curve in head.curves] == [7, 2, 22]
+    targets = FormatBezierTargets()
+    assert (targets.degrees, targets.pieces) == ((2, 1, 3), (3, 1, 7))
+    assert (targets.edge_classes, targets.max_error_m) == ((1,), 0.1)
+    assert (targets.pixel_m, targets.thickness_px, targets.step_m) == (0.15, 8, 1.0)
+    assert not targets.sort_rings
 
 
 def test_detections_are_chosen_as_by_maptr():

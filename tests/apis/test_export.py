@@ -54,6 +54,7 @@ CASES = {
     "MapQR": ("configs/mapqr/mapqr_r18_minicity.py", {}),
     "MGMap": ("configs/mgmap/mgmap_r18_minicity.py", {}),
     "PivotNet": ("configs/pivotnet/pivotnet_r18_minicity.py", {}),
+    "BeMapNet": ("configs/bemapnet/bemapnet_r18_minicity.py", {}),
     "GSMap, heights": (
         GSMAP,
         {"model.map_head.reference": {"coords": 3, "z_range": (-5.0, 3.0)}},

@@ -19,14 +19,19 @@ from mmengine.registry import init_default_scope
 from torch import Tensor
 
 from gsmap import registered  # noqa: F401
-from gsmap.checkpoints.key_map import PIVOTNET
+from gsmap.checkpoints.line_keys import BEMAPNET, PIVOTNET
 from gsmap.checkpoints.vectormapnet_keys import VECTORMAPNET
 
 NUM_CAMS = 6
 OWN_RECIPES = (  # of another scale
-    "mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet", "vectormapnet",
+    "bemapnet", "mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet", "vectormapnet",
 )  # fmt: skip
-TENSOR_BY_TENSOR = {"pivotnet": PIVOTNET, "vectormapnet": VECTORMAPNET}  # recipes without a state
+# recipes without a state, which make what they are asked for, and values of what they do not make
+TENSOR_BY_TENSOR = {
+    "bemapnet": {**BEMAPNET.unused, **PIVOTNET.unused},
+    "pivotnet": PIVOTNET.unused,
+    "vectormapnet": VECTORMAPNET.unused,
+}
 
 
 @dataclass(eq=False)
@@ -109,7 +114,7 @@ class Golden:
         method = name.split("_")[0]
         recipe = self.recipe(method) if method in OWN_RECIPES else self.weights
         if method in TENSOR_BY_TENSOR:
-            state, settings = {}, TENSOR_BY_TENSOR[method].unused
+            state, settings = {}, TENSOR_BY_TENSOR[method]
             for key, shape in self.state_shapes(name).items():
                 value = recipe.tensor(key, shape, self.seed)
                 made = settings[key] if value is None else torch.from_numpy(np.asarray(value))

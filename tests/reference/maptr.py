@@ -33,8 +33,11 @@ SAMPLES = {
 }
 
 
-def state_rows(golden: Golden, name: str, config: str) -> Iterator[Row]:
-    """Compare keys, shapes, counts and the round trip of an upstream state list with a model."""
+def state_rows(golden: Golden, name: str, config: str, shared: str = "-") -> Iterator[Row]:
+    """Compare keys, shapes, counts and the round trip of an upstream state list with a model.
+
+    Keys that begin with ``shared`` are further names of parameters.
+    """
     listed = golden.read_json(name)
     model = golden.model(config, name)
     shapes = golden.state_shapes(name)
@@ -45,6 +48,7 @@ def state_rows(golden: Golden, name: str, config: str) -> Iterator[Row]:
     key_map = find_key_map(shapes)
     trainable = sum(p.numel() for p in model.parameters() if p.requires_grad)
     twice = {name for name, _ in listed.get("shared_storage", [])}
+    twice |= {key for key in shapes if key.startswith(shared)}
     unused = {key for key in shapes if key_map.is_unused(key)}
     for key in unused - twice:  # upstream trains them too, without effect
         if listed["state"][key].get("requires_grad"):

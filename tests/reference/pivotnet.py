@@ -9,10 +9,11 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from torch import Tensor, nn
 
-from gsmap.checkpoints.key_map import PIVOTNET
+from gsmap.checkpoints.line_keys import PIVOTNET
 from gsmap.models.pivotnet.encoder import PivotBEVEncoder
 from gsmap.models.pivotnet.front import turned
-from gsmap.models.pivotnet.head import PivotHead, PivotPredictions
+from gsmap.models.pivotnet.head import PivotHead
+from gsmap.models.pivotnet.lines import LinePredictions
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
@@ -186,7 +187,7 @@ def check_head(golden: Golden, name: str) -> Iterator[Row]:
 def decoded_rows(
     name: str,
     head: PivotHead,
-    output: PivotPredictions,
+    output: LinePredictions,
     data: Mapping[str, np.ndarray],
     tag: str,
     size: tuple[int, int],

@@ -10,7 +10,8 @@ from mmdet3d.structures import Det3DDataSample
 from scipy.ndimage import binary_dilation
 
 from gsmap.datasets.annotations.record import MapInstance
-from gsmap.models.pivotnet.head import PivotHead, PivotPredictions, packed
+from gsmap.models.pivotnet.head import PivotHead, packed
+from gsmap.models.pivotnet.lines import LinePredictions
 from gsmap.models.pivotnet.losses import Lines
 from gsmap.models.pivotnet.matching import match_pivots, path_costs, sequence_costs
 from gsmap.models.pivotnet.targets import FormatPivotTargets
@@ -199,7 +200,7 @@ def loss_rows(
         part.requires_grad_()
     truth = head.truth(truth_of(parts.golden, tag))
     nothing = torch.empty(0)
-    outputs = [PivotPredictions(nothing, nothing, lines) for lines in given.layers]
+    outputs = [LinePredictions(nothing, nothing, lines) for lines in given.layers]
     losses, matches = head.line_losses(outputs, [truth], [tag])
     class_masks = [torch.cat([part[:, 1:] for part in level], 1) for level in semantic]
     losses["semantic"] = head.semantic_loss(class_masks, [truth])

@@ -79,6 +79,9 @@ FILES = [
     *(f"vectormapnet_{part}_*.npz" for part in ("targets", "detector", "generator", "decoding")),
     "vectormapnet_losses_*.npz",
     "vectormapnet_forward_reduced_*.npz",
+    *(f"bemapnet_{part}_*.npz" for part in ("bifpn", "bevdecoder", "insdecoder", "head")),
+    *(f"bemapnet_{part}_*.npz" for part in ("bezier", "targets", "losses", "forward_reduced")),
+    "bemapnet_state.json",
 ]
 
 

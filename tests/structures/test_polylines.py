@@ -184,7 +184,7 @@ def way_m(line):
 
 
 def test_a_line_that_runs_back_and_forth_is_put_straight():
-    """Points of a line along x whose middle part was walked backwards, and one that needs nothing."""
+    """Points along x whose middle part was walked backwards, and a line that needs nothing."""
     straight = np.stack([np.arange(8.0), np.zeros(8)], -1)
     folded = straight[[0, 1, 5, 4, 3, 2, 6, 7]]
     orders = shortest_orders(np.stack([folded, straight]))

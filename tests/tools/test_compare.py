@@ -21,7 +21,7 @@ ROWS = [
     for row in table["rows"]
     if row["config"]
 ]
-TARGETS = {"FormatMapTargets", "FormatPivotTargets"}
+TARGETS = {"FormatBezierTargets", "FormatMapTargets", "FormatPivotTargets"}
 EXTENDED = "configs/maptr/maptr_r50_extended_24e.py"
 
 
@@ -62,6 +62,11 @@ def test_a_rows_config_is_changed_by_its_overrides_and_builds(row):
     head = model.map_head
     if "vectormapnet" in row["config"]:  # targets as long as the annotated lines
         assert not steps
+        return
+    if "bemapnet" in row["config"]:
+        (targets,) = map(TRANSFORMS.build, steps)
+        shapes = zip(targets.degrees, targets.pieces, strict=True)
+        assert [d * k + 1 for d, k in shapes] == [c.weights.shape[-1] for c in head.curves]
         return
     own = tuple(p for _, p in head.decoder.queries) if "pivotnet" in row["config"] else None
     assert [TRANSFORMS.build(step).num_points for step in steps] == [own or head.num_points]

@@ -30,6 +30,7 @@ FOLDERS = (  # every module of these is imported; a method comes and goes with i
     "gsmap.models.mapqr",
     "gsmap.models.mgmap",
     "gsmap.models.pivotnet",
+    "gsmap.models.bemapnet",
     "gsmap.models.streammapnet",
     "gsmap.models.vectormapnet",
     "gsmap.models.gsmap",

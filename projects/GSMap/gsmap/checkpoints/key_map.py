@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
+from gsmap.checkpoints.line_keys import BEMAPNET, LINE_DECODER, PIVOTNET
 from gsmap.checkpoints.vectormapnet_keys import LINES, VECTORMAPNET
 
 _HEAD = "pts_bbox_head."
@@ -256,69 +257,6 @@ MGMAPNET = KeyMap(
     markers=(_DOWN_SAMPLING,),
 )
 
-_POINTS = "ins_decoder.bev_decoder."
-_BEV = "bev_decoder.bev_encoder."
-_SAMPLING = "linear1.=ffn.layers.0.0. linear2.=ffn.layers.1. "
-_MLP = ((0, 0), (1, 2), (2, 4))  # matrices of an MLP, theirs and ours
-PIVOTNET = KeyMap(
-    "pivotnet",
-    (
-        ("im_backbone.bkb.", "img_backbone."),
-        *rules_of(
-            _BEV + "encoder.layers.{i}.",
-            "bev_encoder.source_layers.{i}.",
-            f"self_attn.=attns.0. norm1.=norms.0. {_SAMPLING} norm2.=norms.1.",
-        ),
-        *rules_of(
-            _BEV + "decoder.layers.{i}.",
-            "bev_encoder.bev_layers.{i}.",
-            f"self_attn.=attns.0. norm2.=norms.0. cross_attn.=attns.1. norm1.=norms.1. {_SAMPLING} "
-            "norm3.=norms.2.",
-        ),
-        *rules_of(
-            _BEV,
-            "bev_encoder.",
-            "input_proj. t2s_reference_points.=unseen_reference. "
-            "src_pos_embed.{i}.pos_embed.=source_pos.{i}. "
-            "tgt_pos_embed.pos_embed.=bev_pos. tgt_embed.pos_embed.=bev_embedding.",
-        ),
-        *rules_of(
-            _POINTS + "transformer_",
-            _LAYER,
-            "cross_attention_layers.{i}.multihead_attn.=cross_attn. "
-            "cross_attention_layers.{i}.norm.=norms.0. "
-            "self_attention_layers.{i}.self_attn.=self_attn. "
-            "self_attention_layers.{i}.norm.=norms.1. "
-            "ffn_layers.{i}.linear1.=ffn.layers.0.0. ffn_layers.{i}.linear2.=ffn.layers.1. "
-            "ffn_layers.{i}.norm.=norms.2.",
-        ),
-        *rules_of(
-            _POINTS,
-            "map_head.decoder.",
-            "query_feat=query.weight query_embed=query_pos.weight level_embed.=level. "
-            "decoder_norm.=norm. class_embed.=cls_branches.",
-        ),
-        *(
-            (f"{theirs}.{{i}}.layers.{old}.", f"map_head.{ours}.{{i}}.{new}.")
-            for theirs, ours in (
-                (_POINTS + "mask_embed", "decoder.mask_branches"),
-                ("output_head.im_ctr_heads", "point_branches"),
-                ("output_head.pts_cls_heads", "kind_branches"),
-            )
-            for old, new in _MLP
-        ),
-        *((f"output_head.coords_head.layers.{o}.", f"map_head.coordinates.{n}.") for o, n in _MLP),
-        ("output_head.semantic_heads.{i}.0.", "map_head.semantic_branches.{i}."),
-    ),
-    {
-        # settings: where each camera stands in the joined image, class weights of two losses
-        _BEV + "image_order": torch.arange(6),
-        "post_processor.criterion.empty_weight": torch.tensor((1.0, 0.5)),
-        "post_processor.criterion.collinear_pt_weight": torch.tensor((0.2, 1.0)),
-    },
-    markers=((_POINTS + "query_feat", "map_head.decoder.query.weight"),),
-)
-
 _BACKBONE = "backbone."
 _STREAM_INPUT = "head.input_proj."
 _STREAM_ENCODER = "backbone.transformer.encoder.layers.{i}."
@@ -359,7 +297,7 @@ STREAMMAPNET = KeyMap(
 )
 
 KEY_MAPS: list[KeyMap] = [
-    VECTORMAPNET, STREAMMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MGMAP,
+    VECTORMAPNET, STREAMMAPNET, BEMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MGMAP,
     MAPTRV2, MAPTR_BEVFORMER, MAPTR,
 ]  # fmt: skip
 """Known architectures, the most special first; the last needs no marker."""
@@ -367,7 +305,7 @@ KEY_MAPS: list[KeyMap] = [
 
 def is_upstream(keys: Iterable[str]) -> bool:
     """Return whether state keys are in the format of the earlier systems."""
-    return any(key.startswith((_HEAD, _POINTS, _STREAM_INPUT, LINES)) for key in keys)
+    return any(key.startswith((_HEAD, LINE_DECODER, _STREAM_INPUT, LINES)) for key in keys)
 
 
 def find_key_map(keys: Iterable[str]) -> KeyMap:

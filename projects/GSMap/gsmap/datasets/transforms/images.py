@@ -121,6 +121,36 @@ class ScaleImages(BaseTransform):
         return _times((width, height), cast(float, self.scale))
 
 
+@TRANSFORMS.register_module()
+@dataclass(eq=False)
+class CropImages(BaseTransform):
+    """Cut rows off the top of all images, the sky, and update the matrices.
+
+    Args:
+        top: Rows, > 0; ValueError if not, or if an image has no more.
+    """
+
+    top: int
+
+    def __post_init__(self) -> None:
+        if self.top < 1:
+            raise ValueError(f"top must be >= 1 row, got {self.top}.")
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Crop ``results['img']``."""
+        height, width = results["img"][0].shape[:2]
+        if height <= self.top:
+            raise ValueError(f"top={self.top} leaves nothing of images of {height} rows.")
+        matrix = np.eye(4)
+        matrix[1, 2] = -self.top
+        results["img"] = [img[self.top :] for img in results["img"]]
+        for key in ("lidar2img", "img_aug_matrix"):
+            results[key] = [matrix @ m for m in results[key]]
+        results["raw_shapes"] = [(rows - self.top, cols) for rows, cols in results["raw_shapes"]]
+        results["img_shape"] = results["pad_shape"] = (height - self.top, width)
+        return results
+
+
 def _times(size: tuple[int, int], scale: float) -> tuple[int, int]:
     """Return width and height of a scaled image, in pixels."""
     # 1e-6: a factor such as 0.58 * 100 must not round down to 57

@@ -71,6 +71,21 @@ def visible_points(projected: Tensor, img_shape: tuple[int, int]) -> PillarProje
     return PillarProjection(uv, inside.any(-1))
 
 
+def pixel_rays(
+    frame_from_img: Tensor, image_size: tuple[int, int], feature_size: tuple[int, int]
+) -> Tensor:
+    """Return what every feature pixel looks along, of depth 1; arguments as of `frustum_points`.
+
+    (..., h, w, 3)
+    """
+    device, dtype = frame_from_img.device, frame_from_img.dtype
+    u = torch.linspace(0, image_size[1] - 1, feature_size[1], device=device, dtype=dtype)
+    v = torch.linspace(0, image_size[0] - 1, feature_size[0], device=device, dtype=dtype)
+    u, v = torch.meshgrid(u, v, indexing="xy")  # (h, w)
+    pixels = torch.stack([u, v, torch.ones_like(u)], -1)
+    return torch.einsum("...ij,hwj->...hwi", frame_from_img[..., :3, :3], pixels)
+
+
 def frustum_points(
     frame_from_img: Tensor,
     image_size: tuple[int, int],
@@ -95,11 +110,6 @@ def frustum_points(
         raise ValueError(
             f"frame_from_img must hold 4 x 4 matrices, got shape {tuple(frame_from_img.shape)}."
         )
-    device, dtype = frame_from_img.device, frame_from_img.dtype
-    u = torch.linspace(0, image_size[1] - 1, feature_size[1], device=device, dtype=dtype)
-    v = torch.linspace(0, image_size[0] - 1, feature_size[0], device=device, dtype=dtype)
-    u, v = torch.meshgrid(u, v, indexing="xy")  # (h, w)
-    pixels = torch.stack([u, v, torch.ones_like(u)], -1)
-    rays = torch.einsum("...ij,hwj->...hwi", frame_from_img[..., :3, :3], pixels)
+    rays = pixel_rays(frame_from_img, image_size, feature_size)
     origins = frame_from_img[..., None, None, None, :3, 3]  # (..., 1, 1, 1, 3)
-    return rays.unsqueeze(-4) * depths_m.to(device, dtype).view(-1, 1, 1, 1) + origins
+    return rays.unsqueeze(-4) * depths_m.to(rays).view(-1, 1, 1, 1) + origins

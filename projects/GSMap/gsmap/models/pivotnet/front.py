@@ -22,3 +22,9 @@ def centres(shapes: Sequence[tuple[int, int]], device: torch.device) -> Tensor:
     """Return the centres (x, y) of maps' cells, [0, 1] over each, row-major. (all cells, 2)"""
     grids = [BEVGrid((0.0, 1.0), (0.0, 1.0), *shape) for shape in shapes]
     return torch.cat([grid.pixel_centres(device).flatten(0, 1) for grid in grids])
+
+
+def ahead(points: Tensor, grid: BEVGrid) -> Tensor:
+    """Return points (x, y) in metres as (ahead, to the left). (..., 2)"""
+    x, y = points.unbind(-1)
+    return torch.stack([y, -x] if grid.forward == "y" else [x, y], -1)

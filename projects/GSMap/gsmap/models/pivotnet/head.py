@@ -2,27 +2,23 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
-from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
-from gsmap.models.encoders.folded_backbone import tensor_versions
-from gsmap.models.maptr.coder import DetectionHead, MapCoder, Samples, Tensors
+from gsmap.models.maptr.coder import Tensors
 from gsmap.models.maptr.layers import mlp
 from gsmap.models.maptr.parts import PARTS
-from gsmap.models.pivotnet.decoder import ClassLines, PointLineDecoder
-from gsmap.models.pivotnet.front import front_size, turned
+from gsmap.models.pivotnet.decoder import ClassLines
+from gsmap.models.pivotnet.lines import LineHead, LinePredictions, class_scores
 from gsmap.models.pivotnet.losses import (
-    LINE,
     PIVOT,
     Case,
     Lines,
-    Pairs,
     PivotLosses,
     TrueLines,
     mask_distances,
@@ -30,8 +26,7 @@ from gsmap.models.pivotnet.losses import (
 from gsmap.structures.grid import BEVGrid
 
 _POINT_DIMS = 64  # channels of each coordinate of a point
-# of the losses of decoder layers, and of the class masks of BEV levels; of fewer, the last ones
-LAYER_WEIGHTS = (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
+# of the losses of the class masks of BEV levels; of fewer, the last ones
 LEVEL_WEIGHTS = (0.4, 0.8, 1.6, 2.4)
 
 
@@ -59,31 +54,22 @@ class PivotReference:
         return {"pts": self.grid.metres_from_front(points), "num_pts": number}
 
 
-class PivotPredictions(NamedTuple):
-    """What the head says after a layer."""
-
-    scores: Tensor  # logits, -inf but for a query's own class (B, N, classes)
-    references: Tensor  # (u, v, logit of a pivot) of each point (B, N, P, 3)
-    lines: list[Lines]  # by class, (B, n, ...) each, masks as large as the BEV features
-
-
-def packed(lines: list[Lines]) -> PivotPredictions:
+def packed(lines: list[Lines]) -> LinePredictions:
     """Join what a layer says of the lines of each class; ends are pivots whatever it says."""
-    scores, references = [], []
+    references = []
     longest = max(own.points.shape[2] for own in lines)
-    for label, own in enumerate(lines):
-        score = own.logits[..., LINE, None] - own.logits[..., 1 - LINE, None]
-        scores.append(F.pad(score, (label, len(lines) - 1 - label), value=-torch.inf))
+    for own in lines:
         pivot = own.point_logits[..., PIVOT, None] - own.point_logits[..., 1 - PIVOT, None]
         ends = torch.ones_like(pivot[:, :, :1])
         pivot = torch.cat([ends, pivot[:, :, 1:-1], ends], 2)
         both = torch.cat([own.points, pivot], -1)
         references.append(F.pad(both, (0, 0, 0, longest - both.shape[2]), value=-1.0))
-    return PivotPredictions(torch.cat(scores, 1), torch.cat(references, 1), lines)
+    scores = class_scores([own.logits for own in lines])
+    return LinePredictions(scores, torch.cat(references, 1), lines)
 
 
 @MODELS.register_module()
-class PivotHead(DetectionHead):
+class PivotHead(LineHead):
     """Predict lines of classes that have queries and numbers of points of their own (PivotNet).
 
     Args:
@@ -102,6 +88,7 @@ class PivotHead(DetectionHead):
     """
 
     transforms = ("FormatPivotTargets",)
+    targets = "pivots"
 
     def __init__(
         self,
@@ -115,60 +102,36 @@ class PivotHead(DetectionHead):
         embed_dims: int = 256,
         init_cfg: dict | None = None,
     ) -> None:
-        super().__init__(init_cfg)
         if len(queries) != len(classes) or any(n < 1 or p < 2 for n, p in queries):
             raise ValueError(
                 "queries must be lines (>= 1) and their points (>= 2) for each of "
                 f"{list(classes)}, got {list(queries)}."
             )
-        self.grid, self.classes, self.losses = grid, tuple(classes), PivotLosses(**(losses or {}))
-        self.mask_size = front_size(grid.rasterized(mask_pixel_m))
         own = {"type": "PointLineDecoder", "queries": queries, "embed_dims": embed_dims}
-        self.decoder: PointLineDecoder = MODELS.build({**own, **(decoder or {})})
-        num_layers = len(self.decoder.layers)
-        if not 0 < num_layers <= len(LAYER_WEIGHTS):
-            raise ValueError(
-                f"decoder.num_layers must be 1 to {len(LAYER_WEIGHTS)}, which have weights in the "
-                f"losses, got {num_layers}."
-            )
-        self.layer_weights = LAYER_WEIGHTS[-num_layers:]
+        super().__init__(
+            grid,
+            classes,
+            MODELS.build({**own, **(decoder or {})}),
+            [n for n, _ in queries],
+            mask_pixel_m,
+            PivotLosses(**(losses or {})),
+            score_threshold,
+            embed_dims,
+            point_dims=_POINT_DIMS,
+            init_cfg=init_cfg,
+        )
         self.reference = PivotReference(grid)
-        self.coder = MapCoder(grid, sum(n for n, _ in queries), None, score_threshold)
         dims, both = [embed_dims] * 3, 2 * _POINT_DIMS
-        self.semantic_branches = nn.ModuleList(nn.Conv2d(embed_dims, 2, 1) for _ in classes)
         self.point_branches = nn.ModuleList(mlp(*dims, both) for _ in classes)
         self.kind_branches = nn.ModuleList(mlp(both, both, both, 2) for _ in classes)
-        convs = [nn.Conv2d(a, b, 1) for a, b in ((2, 256), (256, 256), (256, _POINT_DIMS))]
-        self.coordinates = nn.Sequential(convs[0], nn.ReLU(), convs[1], nn.ReLU(), convs[2])
-        self._kept: tuple[Any, Tensor] | None = None  # state of the weights, their feature
 
-    def coordinate_feature(self) -> Tensor:
-        """Return the mean of the coordinates' features over the map, kept in inference. (64,)
-
-        Differs from the paper, as released: points see the map's coordinates through this mean.
-        """
-        if torch.is_grad_enabled() or torch.compiler.is_compiling():
-            return self._mean_feature()
-        state = tensor_versions(self.coordinates)
-        if self._kept is None or self._kept[0] != state:
-            self._kept = state, self._mean_feature()
-        return self._kept[1]
-
-    def _mean_feature(self) -> Tensor:
-        """Return the mean of the coordinates' features over the map. (64,)"""
-        device = self.decoder.query.weight.device
-        rows, cols = (torch.arange(n, device=device) / n for n in self.mask_size)
-        places = torch.stack(torch.meshgrid(cols, rows, indexing="xy"))  # (2, H, W)
-        hidden = self.coordinates[:-1](places[None]).mean((2, 3), keepdim=True)
-        return self.coordinates[-1](hidden).flatten().float()
-
-    def forward(self, bev_outputs: Tensors) -> list[PivotPredictions]:
+    def forward(self, bev_outputs: Tensors) -> list[LinePredictions]:
         """Predict the lines after every decoder layer, from ``bev_feats`` (B, C, H, W)."""
-        layers = self.decoder(turned(bev_outputs["bev_feats"], self.grid))[1:]
+        layers = self.decoder(self.front(bev_outputs["bev_feats"]))[1:]
         mean = self.coordinate_feature()
         return [self.predictions(layer, mean) for layer in layers]
 
-    def predictions(self, layer: Sequence[ClassLines], mean: Tensor) -> PivotPredictions:
+    def predictions(self, layer: Sequence[ClassLines], mean: Tensor) -> LinePredictions:
         """Return the points, kinds and scores of a layer's lines."""
         lines = []
         parts = zip(layer, self.point_branches, self.kind_branches, strict=True)
@@ -179,31 +142,10 @@ class PivotHead(DetectionHead):
             lines.append(Lines(own.logits.float(), points, kinds, own.masks.float()))
         return packed(lines)
 
-    def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
-        """Run the head and return its losses, sums of all layers."""
-        outputs, feats = self(bev_outputs), bev_outputs["bev_feats"]
-        tokens = [str(sample.metainfo.get("token")) for sample in batch_data_samples]
-        with torch.autocast(feats.device.type, enabled=False):
-            truths = [self.truth(sample) for sample in batch_data_samples]
-            losses, _ = self.line_losses(outputs, truths, tokens)
-            levels = [self.class_masks(level) for level in bev_outputs.get("bev_levels", [feats])]
-            losses["semantic"] = self.semantic_loss(levels, truths)
-        return {f"loss_{name}": value for name, value in losses.items()}
-
     def truth(self, sample: Det3DDataSample) -> list[TrueLines]:
         """Return a sample's annotated lines, by class; ValueError if they are not of this head."""
-        instances = sample.get("gt_instances_3d", InstanceData())
-        if "num_pts" not in instances or "masks" not in instances:
-            raise ValueError(
-                f"sample {sample.metainfo.get('token')!r} has no pivots: put FormatPivotTargets in "
-                "place of FormatMapTargets into the training pipeline."
-            )
+        instances = self.annotated(sample)
         labels, numbers, masks = instances.labels_3d, instances.num_pts, instances.masks
-        if tuple(masks.shape[1:]) != self.mask_size:
-            raise ValueError(
-                f"masks of FormatPivotTargets are {tuple(masks.shape[1:])}, the head's "
-                f"{self.mask_size}: set pixel_m there to the head's mask_pixel_m."
-            )
         pivots, found = self.grid.front_from_metres(instances.pts.float()), []
         for label, (_, most) in enumerate(self.decoder.queries):
             own = labels == label
@@ -216,27 +158,6 @@ class PivotHead(DetectionHead):
             found.append(TrueLines(pivots[own, :most], numbers[own], masks[own].float()))
         return found
 
-    def line_losses(
-        self,
-        outputs: Sequence[PivotPredictions],
-        truths: Sequence[Sequence[TrueLines]],
-        tokens: Sequence[str],
-    ) -> tuple[Tensors, list[list[Pairs]]]:
-        """Return the losses of all layers and classes, and the pairs of each and every sample."""
-        groups = [
-            self.cases(lines, [truth[label] for truth in truths], tokens)
-            for layer in outputs
-            for label, lines in enumerate(layer.lines)
-        ]
-        pairs = iter(self.losses.match([case for group in groups for case in group]))
-        matches = [[next(pairs) for _ in group] for group in groups]
-        totals: Tensors = {}
-        weights = [w / len(groups) for w in self.layer_weights for _ in self.classes]
-        for weight, group, matched in zip(weights, groups, matches, strict=True):
-            for name, value in self.losses(group, matched).items():
-                totals[name] = totals.get(name, 0) + weight * value
-        return totals, matches
-
     def cases(self, lines: Lines, truths: Sequence[TrueLines], tokens: Sequence[str]) -> list[Case]:
         """Return a layer's lines of a class by sample, with what is annotated."""
         samples = zip(*lines[:3], self.enlarged(lines.masks), truths, tokens, strict=True)
@@ -244,12 +165,6 @@ class PivotHead(DetectionHead):
             Case(Lines(*own), truth, mask_distances(own[3], truth.masks), token)
             for *own, truth, token in samples
         ]
-
-    def class_masks(self, bev_feats: Tensor) -> Tensor:
-        """Return the logits of the classes' masks. (B, C, H, W) -> (B, classes, rows, columns)"""
-        front = turned(bev_feats, self.grid)
-        # of the two channels of each class, the release trains the second alone
-        return self.enlarged(torch.cat([conv(front)[:, 1:] for conv in self.semantic_branches], 1))
 
     def semantic_loss(
         self, levels: Sequence[Tensor], truths: Sequence[Sequence[TrueLines]]
@@ -262,7 +177,3 @@ class PivotHead(DetectionHead):
             for masks, own in zip(level, drawn, strict=True)
         ]
         return self.losses.semantic * torch.stack(terms).mean()
-
-    def enlarged(self, masks: Tensor) -> Tensor:
-        """Enlarge masks to the size of the targets. (B, n, h, w) -> (B, n, H, W)"""
-        return F.interpolate(masks.float(), self.mask_size, mode="bilinear", align_corners=True)

@@ -11,9 +11,10 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from gsmap.models.maptr.matching import check_finite
+from gsmap.models.pivotnet.lines import LINE
 from gsmap.models.pivotnet.matching import Floats, match_pivots, sequence_costs
 
-PIVOT, LINE = 1, 0  # the places of their logits; the others are a point between and none
+PIVOT = 1  # the place of its logit; the other one is of a point between
 
 
 class Lines(NamedTuple):

@@ -18,6 +18,7 @@ from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import arc_lengths, is_closed
 
 Points = NDArray[np.float64]
+Part = tuple[int, Points]  # its class, and a line in [0, 1] from the front and the left
 
 
 def significances(points: Points) -> NDArray[np.float64]:
@@ -80,76 +81,68 @@ def drawn(lines: Iterable[Points], size: tuple[int, int], thickness_px: int) -> 
     return np.array(masks).reshape(-1, *size).astype(bool)
 
 
-@TRANSFORMS.register_module()
 @dataclass(eq=False)
-class FormatPivotTargets(BaseTransform):
-    """Add ``gt_instances_3d`` with the pivots of lines, from ``map_instances``.
-
-    It has ``labels_3d`` (K,), ``pts`` (K, P, 2) in metres, the last pivot repeated, ``num_pts``
-    (K,) and ``masks`` (K, H, W), with rows from the front and columns from the left.
+class FormatLineTargets(BaseTransform):
+    """What PivotNet and BeMapNet make targets of: parts of lines, and their masks.
 
     Args:
-        num_points: Most pivots P of a line of each class, as in the head.
         edge_classes: Class indices whose rings become their two longest edges.
         pixel_m: Side of a pixel of the masks in metres.
         thickness_px: Width of lines in them.
         step_m: Lines are sampled at this distance first.
-        min_area_m2: A point is a pivot if its triangle is at least as large.
-        keep_end: Whether a line of too many pivots keeps the most significant ones; by default the
-            first, as released, so that its end is lost.
         sort_rings: Whether rings start at their rearmost vertex and run clockwise; by default they
             stay as they are annotated.
-
-    Raises:
-        ValueError: If a class has less than two points, or ``edge_classes`` names one that is not.
     """
 
-    num_points: Sequence[int] = (10, 2, 30)
     edge_classes: Sequence[int] = (1,)
     pixel_m: float = 0.15
     thickness_px: int = 8
     step_m: float = 1.0
-    min_area_m2: float = 2.0
-    keep_end: bool = False
     sort_rings: bool = False
 
+    def by_class(self) -> tuple[str, Sequence[int]]:
+        """Return the setting with a number for each class, and its value."""
+        raise NotImplementedError
+
     def __post_init__(self) -> None:
-        if min(self.num_points, default=0) < 2:
-            raise ValueError(f"num_points must be >= 2 for each class, got {self.num_points}.")
-        if not set(self.edge_classes) <= set(range(len(self.num_points))):
+        name, numbers = self.by_class()
+        if not set(self.edge_classes) <= set(range(len(numbers))):
             raise ValueError(
-                f"edge_classes must be indices of the {len(self.num_points)} classes of "
-                f"num_points, got {self.edge_classes}."
+                f"edge_classes must be indices of the {len(numbers)} classes of {name}, got "
+                f"{self.edge_classes}."
             )
 
-    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Add the targets; ValueError without ground truth or for a class that has no number."""
+    def annotated(self, results: dict[str, Any]) -> tuple[list[Part], BEVGrid]:
+        """Return all parts of lines by class, and the masks' grid; ValueError without any truth."""
         if results["map_instances"] is None:
+            name = type(self).__name__
             raise ValueError(
-                f"sample {results['token']!r} has no ground truth: leave FormatPivotTargets out of "
-                "this pipeline."
+                f"sample {results['token']!r} has no ground truth: leave {name} out of this "
+                "pipeline."
             )
         grid = BEVGrid(results["x_range"], results["y_range"]).rasterized(self.pixel_m)
         elements = sorted(results["map_instances"], key=lambda element: element.label)
-        parts = [(own.label, line) for own in elements for line in self.lines(own, grid)]
-        pivots = [self.pivots(line, label, grid) for label, line in parts]
-        most = max(self.num_points)
-        points = [np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in pivots]
-        points_m = grid.metres_from_front(np.array(points).reshape(-1, most, 2))
-        results["gt_instances_3d"] = InstanceData(
-            labels_3d=torch.tensor([label for label, _ in parts], dtype=torch.int64),
-            pts=torch.from_numpy(points_m.astype(np.float32)),
-            num_pts=torch.tensor([len(line) for line in pivots], dtype=torch.int64),
-            masks=torch.from_numpy(self.masks(parts, pivots, front_size(grid))),
+        return [(own.label, line) for own in elements for line in self.lines(own, grid)], grid
+
+    def instances(
+        self, labels: Sequence[int], lines_m: Sequence[Points], masks: NDArray[np.bool_], most: int
+    ) -> InstanceData:
+        """Return targets: lines of at most ``most`` points in metres, the last one repeated."""
+        points = [np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in lines_m]
+        return InstanceData(
+            labels_3d=torch.tensor(labels, dtype=torch.int64),
+            pts=torch.from_numpy(np.array(points, np.float32).reshape(-1, most, 2)),
+            num_pts=torch.tensor([len(line) for line in lines_m], dtype=torch.int64),
+            masks=torch.from_numpy(masks),
         )
-        return results
 
     def lines(self, element: Any, grid: BEVGrid) -> list[Points]:
         """Return the parts of an element on the map, [0, 1] from the front and the left."""
-        if not 0 <= element.label < len(self.num_points):
+        name, numbers = self.by_class()
+        if not 0 <= element.label < len(numbers):
             raise ValueError(
-                f"label {element.label} of an element, but num_points of FormatPivotTargets is "
-                f"{self.num_points}: give one for each class."
+                f"label {element.label} of an element, but {name} of {type(self).__name__} is "
+                f"{numbers}: give one for each class."
             )
         box = shapely.box(grid.x_range[0], grid.y_range[0], grid.x_range[1], grid.y_range[1])
         whole = element.points[:, :2].astype(np.float64)
@@ -166,6 +159,64 @@ class FormatPivotTargets(BaseTransform):
                 found += [shapely.get_coordinates(part) for part in parts]
         return [grid.front_from_metres(line) for line in found if len(line) > 1]
 
+    def masks(
+        self, parts: Sequence[Part], pivots: Iterable[Points], size: tuple[int, int]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Draw the lines of each class over each other; by their pivots if one is hidden.
+
+        The masks, and which of them are drawn by pivots. (K, H, W), (K,)
+        """
+        labels = np.array([label for label, _ in parts], int)
+        masks = drawn((line for _, line in parts), size, self.thickness_px)
+        for i in range(len(masks)):
+            masks[:i][labels[:i] == labels[i]] &= ~masks[i]
+        hidden = np.isin(labels, labels[~masks.any((1, 2))])
+        masks[hidden] = drawn(pivots, size, self.thickness_px)[hidden]
+        return masks, hidden
+
+
+@TRANSFORMS.register_module()
+@dataclass(eq=False)
+class FormatPivotTargets(FormatLineTargets):
+    """Add ``gt_instances_3d`` with the pivots of lines, from ``map_instances``.
+
+    It has ``labels_3d`` (K,), ``pts`` (K, P, 2) in metres, the last pivot repeated, ``num_pts``
+    (K,) and ``masks`` (K, H, W), with rows from the front and columns from the left.
+
+    Args:
+        num_points: Most pivots P of a line of each class, as in the head; the other settings are
+            those of `FormatLineTargets`.
+        min_area_m2: A point is a pivot if its triangle is at least as large.
+        keep_end: Whether a line of too many pivots keeps the most significant ones; by default the
+            first, as released, so that its end is lost.
+
+    Raises:
+        ValueError: If a class has less than two points, or ``edge_classes`` names one that is not.
+    """
+
+    num_points: Sequence[int] = (10, 2, 30)
+    min_area_m2: float = 2.0
+    keep_end: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.num_points, default=0) < 2:
+            raise ValueError(f"num_points must be >= 2 for each class, got {self.num_points}.")
+        super().__post_init__()
+
+    def by_class(self) -> tuple[str, Sequence[int]]:
+        """Return the setting with a number for each class, and its value."""
+        return "num_points", self.num_points
+
+    def transform(self, results: dict[str, Any]) -> dict[str, Any]:
+        """Add the targets; ValueError without ground truth or for a class that has no number."""
+        parts, grid = self.annotated(results)
+        pivots = [self.pivots(line, label, grid) for label, line in parts]
+        masks, _ = self.masks(parts, pivots, front_size(grid))
+        labels, lines_m = [label for label, _ in parts], map(grid.metres_from_front, pivots)
+        found = self.instances(labels, list(lines_m), masks, max(self.num_points))
+        results["gt_instances_3d"] = found
+        return results
+
     def pivots(self, line: Points, label: int, grid: BEVGrid) -> Points:
         """Return the pivots of a line, [0, 1] from the front and the left. (m, 2)"""
         size_m, most = np.array(front_size(grid)) * self.pixel_m, self.num_points[label]
@@ -175,18 +226,3 @@ class FormatPivotTargets(BaseTransform):
         if self.keep_end and len(chosen) > most:
             chosen = np.sort(np.argsort(-areas, kind="stable")[:most])
         return line_m[chosen[:most]] / size_m
-
-    def masks(
-        self, parts: Sequence[tuple[int, Points]], pivots: Iterable[Points], size: tuple[int, int]
-    ) -> NDArray[np.bool_]:
-        """Draw the lines of each class over each other; by their pivots if one is hidden.
-
-        (K, H, W)
-        """
-        labels = np.array([label for label, _ in parts], int)
-        masks = drawn((line for _, line in parts), size, self.thickness_px)
-        for i in range(len(masks)):
-            masks[:i][labels[:i] == labels[i]] &= ~masks[i]
-        hidden = np.isin(labels, labels[~masks.any((1, 2))])
-        masks[hidden] = drawn(pivots, size, self.thickness_px)[hidden]
-        return masks

@@ -1,0 +1,22 @@
+# BeMapNet with ResNet-50 as published: 73.75 M trainable parameters.
+model = dict(
+    type='MapDetector',
+    data_preprocessor=dict(
+        type='Det3DDataPreprocessor',
+        mean=[123.675, 116.28, 103.53],
+        std=[58.395, 57.12, 57.375],
+        bgr_to_rgb=False,  # the release swaps the channels of RGB images: BGR with the means of RGB
+        pad_size_divisor=32),
+    img_backbone=dict(
+        type='mmdet.ResNet',
+        depth=50,
+        num_stages=4,
+        out_indices=(1, 2, 3),
+        frozen_stages=1,
+        norm_cfg=dict(type='BN', requires_grad=True),
+        norm_eval=True,
+        style='pytorch',
+        init_cfg=dict(type='Pretrained', checkpoint='torchvision://resnet50')),
+    img_neck=dict(type='BiFPN'),
+    bev_encoder=dict(type='BezierBEVEncoder'),
+    map_head=dict(type='BezierHead', decoder=dict(num_layers=6)))

@@ -1,0 +1,175 @@
+"""BeMapNet's BEV encoder: attention of all cells to all pixels, placed on the ground."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from mmdet3d.registry import MODELS
+from torch import Tensor, nn
+
+from gsmap.models.encoders.camera_encoder import CameraEncoder
+from gsmap.models.encoders.projection import pixel_rays
+from gsmap.models.maptr.layers import feed_forward, init_matrices
+from gsmap.models.pivotnet.front import ahead, centres, front_size, turned
+from gsmap.structures.grid import BEVGrid
+
+
+class GlobalLayer(nn.Module):
+    """Self-attention, attention to a memory if there is one, feed-forward network, post-norm."""
+
+    def __init__(
+        self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float, with_memory: bool
+    ) -> None:
+        super().__init__()
+        sizes = {"dropout": dropout, "batch_first": True}
+        self.self_attn = nn.MultiheadAttention(embed_dims, num_heads, **sizes)
+        if with_memory:
+            self.cross_attn = nn.MultiheadAttention(embed_dims, num_heads, **sizes)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(2 + with_memory))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self,
+        tokens: Tensor,
+        position: Tensor,
+        hidden: Tensor,
+        key: Tensor | None = None,
+        memory: Tensor | None = None,
+    ) -> Tensor:
+        """Update tokens by themselves, and by a memory (B, S, C) with keys of its own.
+
+        Those that are ``hidden`` (B, S), of the memory or else of the tokens, are not looked at.
+        Positions are part of queries and keys. (B, Q, C)
+        """
+        query = tokens + position
+        own = hidden if memory is None else None
+        seen, _ = self.self_attn(query, query, tokens, key_padding_mask=own, need_weights=False)
+        tokens = self.norms[0](tokens + self.dropout(seen))
+        if memory is not None:
+            query = tokens + position
+            seen, _ = self.cross_attn(
+                query, key, memory, key_padding_mask=hidden, need_weights=False
+            )
+            tokens = self.norms[1](tokens + self.dropout(seen))
+        return self.norms[-1](self.ffn(tokens))
+
+
+@MODELS.register_module()
+class BezierBEVEncoder(CameraEncoder):
+    """Mix the cameras side by side, then let BEV cells look at them, all at all (BeMapNet).
+
+    A pixel's position is that of the point on the ground that it shows (IPM-PE); pixels above the
+    horizon are not looked at. Besides ``bev_feats`` there are ``bev_levels``, what each of the BEV
+    layers returns.
+
+    Args:
+        grid: The map's extent.
+        in_channels: Channels of the feature map.
+        bev_pixel_m: Side of a BEV cell in metres.
+        num_layers: Layers over the cameras, and BEV layers.
+        layer_cfg: ``num_heads``, ``ffn_dims``, ``dropout`` of all layers.
+        position_dims: Hidden channels of the positions' network.
+        position_size: Rows and columns of the image over which positions of pixels are spread: as
+            released, of the one that is not cropped yet. None takes the images' own.
+        from_camera: Place points relative to their camera, as released, not to the vehicle.
+    """
+
+    calibration = ("ground_from_img",)
+
+    def __init__(
+        self,
+        grid: BEVGrid,
+        in_channels: int = 600,
+        bev_pixel_m: float = 0.9375,
+        embed_dims: int = 512,
+        num_layers: Sequence[int] = (2, 4),
+        layer_cfg: Mapping[str, Any] | None = None,
+        position_dims: int = 2048,
+        position_size: Sequence[int] | None = (512, 896),
+        from_camera: bool = True,
+        init_cfg: dict | None = None,
+    ) -> None:
+        super().__init__(init_cfg)
+        self.grid, self.from_camera = grid.rasterized(bev_pixel_m), from_camera
+        self.position_size, self.embed_dims = position_size, embed_dims
+        self.input_proj = nn.Conv2d(in_channels, embed_dims, 1)
+        settings = {"num_heads": 8, "ffn_dims": 1024, "dropout": 0.1, **(layer_cfg or {})}
+        self.source_layers, self.bev_layers = (
+            nn.ModuleList(GlobalLayer(embed_dims, **settings, with_memory=m) for _ in range(number))
+            for m, number in zip((False, True), num_layers, strict=True)
+        )
+        self.norm = nn.LayerNorm(embed_dims)
+        self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)
+        self.position = nn.Sequential(
+            nn.Conv2d(embed_dims, position_dims, 1),
+            nn.ReLU(),
+            nn.Conv2d(position_dims, embed_dims, 1),
+        )
+
+    def init_weights(self) -> None:
+        """Initialise the matrices of the layers and the table of cells (Xavier)."""
+        super().init_weights()
+        for part in (self.source_layers, self.bev_layers, self.bev_embedding):
+            init_matrices(part)
+
+    def encode(
+        self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
+    ) -> dict[str, Any]:
+        """Encode features (B, V, C, h, w) with ``ground_from_img`` (B, V, 4, 4)."""
+        points, seen = self.ground_points(
+            calibration["ground_from_img"], feats.shape[-2:], img_shape
+        )
+        sources = self.input_proj(feats.flatten(0, 1)).unflatten(0, feats.shape[:2])
+        sources = sources.permute(0, 1, 3, 4, 2).flatten(1, 3)  # (B, S, C)
+        position = self.positions(points, seen)
+        hidden = ~seen & seen.any(-1, keepdim=True)  # without any ground, all are looked at
+        for layer in self.source_layers:
+            sources = layer(sources, position, hidden)
+        shape = front_size(self.grid)
+        places = self.grid.metres_from_front(centres([shape], feats.device).flip(-1))
+        own = self.positions(ahead(places, self.grid)[None])
+        cells, bev = self.bev_embedding.weight.expand(len(feats), -1, -1), []
+        for layer in self.bev_layers:
+            cells = layer(cells, own, hidden, sources + position, sources)
+            level = self.norm(cells).transpose(1, 2).unflatten(2, shape)
+            bev.append(turned(level, self.grid))
+        return {"bev_feats": bev[-1], "bev_levels": bev}
+
+    def ground_points(
+        self, ground_from_img: Tensor, size: Sequence[int], img_shape: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """Return what point on the ground each pixel of maps of a size shows, and whether it does.
+
+        Points are metres ahead and to the left. (B, S, 2), (B, S)
+        """
+        matrices = ground_from_img.float()
+        image_size = self.position_size or img_shape
+        rays = pixel_rays(matrices, (image_size[0], image_size[1]), (size[0], size[1]))
+        camera = matrices[:, :, None, None, :3, 3]
+        depth = -camera[..., 2:] / rays[..., 2:]
+        points = rays[..., :2] * depth  # differs from the paper, as released
+        if not self.from_camera:
+            points = points + camera[..., :2]
+        return ahead(points, self.grid).flatten(1, 3), (depth[..., 0] > 0).flatten(1)
+
+    def positions(self, points: Tensor, seen: Tensor | None = None) -> Tensor:
+        """Return the positions of points (B, Q, 2); of those that are not seen, that of zeros.
+
+        (B, Q, C)
+        """
+        with torch.autocast(points.device.type, enabled=False):
+            code = position_code(points, self.embed_dims // 2)
+        if seen is not None:
+            code = torch.where(seen[..., None], code, 0.0)
+        return self.position(code.transpose(1, 2)[..., None])[..., 0].transpose(1, 2)
+
+
+def position_code(points: Tensor, num_dims: int) -> Tensor:
+    """Return sines and cosines, in turn, of the second coordinate, then of the first.
+
+    Metres, without a factor. (..., 2) -> (..., 2 * num_dims)
+    """
+    steps = torch.arange(num_dims, device=points.device).div(2, rounding_mode="floor")
+    phases = points.flip(-1)[..., None] / 10000 ** (2 * steps / num_dims)
+    return torch.stack([phases[..., ::2].sin(), phases[..., 1::2].cos()], -1).flatten(-3)
