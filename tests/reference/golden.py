@@ -22,7 +22,14 @@ from gsmap import registered  # noqa: F401
 from gsmap.checkpoints.key_map import PIVOTNET
 
 NUM_CAMS = 6
-OWN_RECIPES = ("mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet")  # of another scale
+OWN_RECIPES = (
+    "hdmapnet",
+    "mapqr",
+    "mgmap",
+    "mgmapnet",
+    "pivotnet",
+    "streammapnet",
+)  # of another scale
 
 
 @dataclass(eq=False)
@@ -104,7 +111,7 @@ class Golden:
         """Return the upstream state that the recipe makes for a state list."""
         method = name.split("_")[0]
         recipe = self.recipe(method) if method in OWN_RECIPES else self.weights
-        if method == "pivotnet":
+        if method in ("hdmapnet", "pivotnet"):
             shapes = self.state_shapes(name)
             made = {key: recipe.tensor(key, shape, self.seed) for key, shape in shapes.items()}
             return {

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from gsmap.checkpoints.hdmapnet_keys import HDMAPNET, VIEWS
 from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
 
 _HEAD = "pts_bbox_head."
@@ -358,7 +359,7 @@ STREAMMAPNET = KeyMap(
 )
 
 KEY_MAPS: list[KeyMap] = [
-    STREAMMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MGMAP,
+    HDMAPNET, STREAMMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MGMAP,
     MAPTRV2, MAPTR_BEVFORMER, MAPTR,
 ]  # fmt: skip
 """Known architectures, the most special first; the last needs no marker."""
@@ -366,7 +367,7 @@ KEY_MAPS: list[KeyMap] = [
 
 def is_upstream(keys: Iterable[str]) -> bool:
     """Return whether state keys are in the format of the earlier systems."""
-    return any(key.startswith((_HEAD, _POINTS, _STREAM_INPUT)) for key in keys)
+    return any(key.startswith((_HEAD, _POINTS, _STREAM_INPUT, VIEWS)) for key in keys)
 
 
 def find_key_map(keys: Iterable[str]) -> KeyMap:

@@ -78,7 +78,10 @@ class DetectionHead(BaseModule):
     Attributes:
         reference: How references of predictions stand for points (`PointReference`).
         coder: The choice of detections.
+        not_exported: Why there is no ONNX file of the head; empty if there is one.
     """
+
+    not_exported: str = ""
 
     reference: Any
     coder: MapCoder
