@@ -82,7 +82,7 @@ class HDMapNetHead(DetectionHead):
         return LineMaps(*(values.float() for values in self.decoder(feats)))
 
     def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
-        """Run the head and return its losses, and the mean error of directions."""
+        """Run the head and return its losses."""
         maps = self(bev_outputs)
         numbers, directions = (
             torch.stack([self.target(sample, name) for sample in batch_data_samples])

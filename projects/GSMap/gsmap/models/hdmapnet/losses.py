@@ -37,7 +37,7 @@ class LineMapLosses:
                 raise ValueError(f"losses.{field.name} must not be negative.")
 
     def __call__(self, maps: LineMaps, numbers: Tensor, directions: Tensor) -> dict[str, Tensor]:
-        """Return the weighted losses, and ``direction_error``, the mean error in degrees.
+        """Return the weighted losses.
 
         Args:
             maps: What the network says, of a batch.
@@ -57,7 +57,6 @@ class LineMapLosses:
             "loss_pull": self.pull * pull,
             "loss_push": self.push * push,
             "loss_direction": self.direction * direction_loss(maps.direction, directions),
-            "direction_error": direction_error(maps.direction.detach(), directions),
         }
 
     def embedding_losses(self, embedding: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
@@ -92,21 +91,3 @@ def direction_loss(logits: Tensor, directions: Tensor) -> Tensor:
     drawn = 1 - target[:, :1]
     each = F.binary_cross_entropy(logits.softmax(1), target, reduction="none")
     return (each * drawn).sum() / (drawn.sum() * classes).clamp(min=1)
-
-
-def direction_error(logits: Tensor, directions: Tensor) -> Tensor:
-    """Return the mean angle on lines between the two best directions and the true ones, in degrees.
-
-    (B, 1 + K, H, W), (B, 2, H, W)
-    """
-    classes = logits.shape[1]
-    first = logits.argmax(1, keepdim=True)
-    beside = (torch.arange(classes, device=logits.device).view(1, -1, 1, 1) - first).abs() <= 2
-    second = logits.masked_fill(beside, -torch.inf).argmax(1, keepdim=True)
-    turn = 360 / (classes - 1)
-    found = torch.cat([first, second], 1)
-    apart = turn * (found[:, :, None] - directions[:, None]).abs().float()
-    apart = torch.minimum(apart, 360 - apart)  # (B, found, true, H, W)
-    best = torch.minimum(apart[:, 0, 0] + apart[:, 1, 1], apart[:, 1, 0] + apart[:, 0, 1]) / 2
-    drawn = (directions > 0).any(1)
-    return (best * drawn).sum() / drawn.sum().clamp(min=1)
