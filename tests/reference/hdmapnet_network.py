@@ -132,7 +132,7 @@ def check_decoders(golden: Golden, name: str) -> Iterator[Row]:
     for key, step in steps.items():
         off = largest_difference(trained[key][:, ::step], data[f"train_{key}"])
         yield Row(name, f"train_{key}", off, 2e-4)
-    norms = {"up1e": decoder.joined[1][4], "up1": decoder.joined[0][4]}
+    norms = {"up1e": decoder.joined[1][1], "up1": decoder.joined[0][1]}
     for key, norm in norms.items():
         for leaf, value in (("mean", norm.running_mean), ("var", norm.running_var)):
             if f"train_{key}_{leaf}" in data:

@@ -65,6 +65,9 @@ class LineMapDecoder(nn.Module):
         self.joined = nn.ModuleList(
             JoinedMaps(_WIDTHS[0] + _WIDTHS[2], _WIDTHS[2]) for _ in range(number)
         )
+        if shared_direction_block:  # the release runs it twice, so its statistics learn faster
+            for norm in (self.joined[1][1], self.joined[1][4]):
+                norm.momentum = 1 - (1 - norm.momentum) ** 2
         outputs = 1 + num_classes, embedding_dims, 1 + num_directions
         self.maps = nn.ModuleList(FineMaps(channels) for channels in outputs)
 
