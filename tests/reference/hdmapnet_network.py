@@ -47,9 +47,9 @@ class HDMapParts(GoldenParts):
         )
 
     def decoder(self, **settings: Any) -> LineMapDecoder:
-        """Return the released BEV network with other settings of the head."""
+        """Return the released BEV network with other settings."""
         cfg = Config.fromfile(self.golden.configs / CONFIG, import_custom_modules=False)
-        head = {**cfg.model.map_head, "grid": GRID, "classes": cfg.classes, **settings}
+        head = {**cfg.model.map_head, "grid": GRID, "classes": cfg.classes, "decoder": settings}
         return self.load(MODELS.build(head).decoder, "map_head.decoder.")
 
     def cam_from_ground(self, moved_m: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Tensor:

@@ -75,6 +75,9 @@ FILES = [
     "pivotnet_projection_*.npz",
     "pivotnet_forward_reduced_*.npz",
     "pivotnet_state.json",
+    *(f"hdmapnet_{part}_*.npz" for part in ("view", "decoders", "targets", "losses", "post")),
+    "hdmapnet_forward_*.npz",
+    "hdmapnet_state.json",
 ]
 
 

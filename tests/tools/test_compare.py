@@ -60,6 +60,9 @@ def test_a_rows_config_is_changed_by_its_overrides_and_builds(row):
     model = build(cfg)
     steps = [s for s in cfg.train_dataloader.dataset.pipeline if s.type in TARGETS]
     head = model.map_head
+    if "hdmapnet" in row["config"]:  # its lines have as many points as they need
+        assert not steps
+        return
     own = tuple(p for _, p in head.decoder.queries) if "pivotnet" in row["config"] else None
     assert [TRANSFORMS.build(step).num_points for step in steps] == [own or head.num_points]
 

@@ -9,8 +9,6 @@ from torch import Tensor, nn
 from gsmap.models.hdmapnet.encoder import JoinedMaps, conv_block
 from gsmap.models.maptr.layers import enlarged
 
-_WIDTHS = 64, 128, 256  # channels of the three stages
-
 
 class LineMaps(NamedTuple):
     """What the network says of each pixel."""
@@ -23,8 +21,9 @@ class LineMaps(NamedTuple):
 class FineMaps(nn.Sequential):
     """Enlarge a map of half the size, and say something of each pixel."""
 
-    def __init__(self, outputs: int) -> None:
-        super().__init__(*conv_block(_WIDTHS[2], _WIDTHS[1]), nn.Conv2d(_WIDTHS[1], outputs, 1))
+    def __init__(self, inputs: int, outputs: int) -> None:
+        hidden = inputs // 2
+        super().__init__(*conv_block(inputs, hidden), nn.Conv2d(hidden, outputs, 1))
 
     def forward(self, feats: Tensor, like: Tensor) -> Tensor:
         """Return a map as large as ``like``. (B, C, h, w), (B, _, H, W) -> (B, outputs, H, W)"""
@@ -41,6 +40,7 @@ class LineMapDecoder(nn.Module):
         num_directions: Directions K.
         shared_direction_block: Whether directions share the first block of the embeddings, as
             released; its own was meant.
+        base_channels: Channels of the first stage; each further one has twice as many.
     """
 
     def __init__(
@@ -50,26 +50,28 @@ class LineMapDecoder(nn.Module):
         embedding_dims: int,
         num_directions: int,
         shared_direction_block: bool = True,
+        base_channels: int = 64,
     ) -> None:
         super().__init__()
+        widths = base_channels, 2 * base_channels, 4 * base_channels
         self.stem = nn.Sequential(
-            nn.Conv2d(embed_dims, _WIDTHS[0], 7, 2, 3, bias=False),
-            nn.BatchNorm2d(_WIDTHS[0]),
+            nn.Conv2d(embed_dims, widths[0], 7, 2, 3, bias=False),
+            nn.BatchNorm2d(widths[0]),
             nn.ReLU(inplace=True),
         )
-        sizes = zip((_WIDTHS[0], *_WIDTHS), _WIDTHS, (1, 2, 2), strict=False)
+        sizes = zip((widths[0], *widths), widths, (1, 2, 2), strict=False)
         self.stages = nn.ModuleList(
             ResLayer(BasicBlock, inputs, outputs, 2, stride) for inputs, outputs, stride in sizes
         )
         number = 2 if shared_direction_block else 3
         self.joined = nn.ModuleList(
-            JoinedMaps(_WIDTHS[0] + _WIDTHS[2], _WIDTHS[2]) for _ in range(number)
+            JoinedMaps(widths[0] + widths[2], widths[2]) for _ in range(number)
         )
         if shared_direction_block:  # the release runs it twice, so its statistics learn faster
             for norm in (self.joined[1][1], self.joined[1][4]):
                 norm.momentum = 1 - (1 - norm.momentum) ** 2
         outputs = 1 + num_classes, embedding_dims, 1 + num_directions
-        self.maps = nn.ModuleList(FineMaps(channels) for channels in outputs)
+        self.maps = nn.ModuleList(FineMaps(widths[2], channels) for channels in outputs)
 
     def init_weights(self) -> None:
         """Initialise the stages as ResNets are; the last normalisation of a block begins at 0."""

@@ -33,7 +33,7 @@ class HDMapNetHead(DetectionHead):
         pixel_m: Side of a pixel in metres, as in `MakeLineMaps`.
         embedding_dims: Channels of the embedding that tells elements apart.
         num_directions: Directions that a line may have, as in `MakeLineMaps`.
-        shared_direction_block: As in `LineMapDecoder`.
+        decoder: Settings of `LineMapDecoder`: ``shared_direction_block``, ``base_channels``.
         losses: Settings of `LineMapLosses`.
         vectorizing: Settings of `VectorizeConfig`.
         random_start: Whether tracing begins at a point taken by chance, as released; by default at
@@ -56,7 +56,7 @@ class HDMapNetHead(DetectionHead):
         pixel_m: float = 0.15,
         embedding_dims: int = 16,
         num_directions: int = 36,
-        shared_direction_block: bool = True,
+        decoder: PARTS | None = None,
         losses: PARTS | None = None,
         vectorizing: PARTS | None = None,
         random_start: bool = False,
@@ -70,9 +70,8 @@ class HDMapNetHead(DetectionHead):
         self.losses = LineMapLosses(**(losses or {}))
         degrees = 360 // num_directions
         self.vectorizing = VectorizeConfig(**{"degrees": degrees, **(vectorizing or {})})
-        self.decoder = LineMapDecoder(
-            embed_dims, len(classes), embedding_dims, num_directions, shared_direction_block
-        )
+        sizes = embed_dims, len(classes), embedding_dims, num_directions
+        self.decoder = LineMapDecoder(*sizes, **(decoder or {}))
 
     def forward(self, bev_outputs: Tensors) -> LineMaps:
         """Return maps of all pixels, from ``bev_feats`` (B, C, H, W)."""
