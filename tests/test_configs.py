@@ -18,6 +18,7 @@ from mmengine.structures import InstanceData
 import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.strict import neutral_keys
 from gsmap.datasets.transforms.map_targets import map_targets
+from gsmap.datasets.transforms.masks import padded_size
 from gsmap.engine.launch import check_config, read_config
 from gsmap.structures.grid import BEVGrid
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
@@ -28,10 +29,12 @@ CONFIGS = sorted(
     path for folder in (BASELINES, REPO / "projects/GSMap/configs") for path in folder.rglob("*.py")
 )
 LEAVES = [path for path in CONFIGS if "_base_" not in path.parts]
-ANY_NUMBER = ("pivotnet", "bemapnet", "vectormapnet")  # lines of no equal numbers of points
+# lines of no equal numbers of points
+ANY_NUMBER = ("pivotnet", "bemapnet", "vectormapnet", "hdmapnet")
 SWAPPABLE = [
     path for path in LEAVES if path.is_relative_to(BASELINES) and path.parent.name not in ANY_NUMBER
 ]
+TIED = ("PivotBEVEncoder", "ViewTransformEncoder")  # to the images' size
 names = pytest.mark.parametrize("path", LEAVES, ids=lambda path: path.stem)
 
 
@@ -134,15 +137,16 @@ def small(cfg: Config) -> Config:
         if part:
             part.init_cfg = None
     head = cfg.model.map_head
-    head.get("detector", head).decoder.num_layers = 2
+    if head.type != "HDMapNetHead":
+        head.get("detector", head).decoder.num_layers = 2
     if "num_cams" in (cfg.model.get("bev_encoder") or {}):
         cfg.model.bev_encoder.num_cams = 6  # MiniCity's
     for part in ("train", "test"):
         for step in cfg[f"{part}_dataloader"].dataset.pipeline:
             if step.type == "ScaleImages" and "size" in step:
                 width, height = step.size = tuple(side // 2 for side in step.size)
-                if cfg.model.bev_encoder.type == "PivotBEVEncoder":
-                    cfg.model.bev_encoder.image_size = (height, width)
+                if cfg.model.bev_encoder.type in TIED:
+                    cfg.model.bev_encoder.image_size = padded_size((height, width), 32)
             if step.type == "CropImages":
                 step.top //= 2
     return cfg
@@ -309,6 +313,8 @@ def test_one_step_of_training_and_testing(path, minicity_root, annotations):
     predicted = samples[0].pred_instances_3d
     most = max(p for _, p in cfg.model.map_head.get("queries", ((1, 20),)))
     most = cfg.model.map_head.get("generator", {"max_points": most})["max_points"]
+    if cfg.model.map_head.type == "HDMapNetHead":  # as many as the longest line has
+        most = max([2, *predicted.num_pts.tolist()])
     assert ("num_pts" in predicted) == (path.parent.name in ANY_NUMBER)
     assert predicted.pts.shape[1:] == (most, coordinates(cfg))
     assert ("scales" in predicted) == ("GSMap" in cfg.model.map_head.type)

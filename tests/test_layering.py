@@ -49,7 +49,7 @@ MODELS = {
     "mapvr": {"maptr", "encoders"},
     "gemap": {"maptr", "encoders"},
     "mgmapnet": {"maptr", "encoders", "maptrv2"},  # its mask heads are MapTRv2's
-    "hdmapnet": set(),
+    "hdmapnet": {"maptr", "encoders"},
     "mapqr": {"maptr", "encoders"},
     "mgmap": {"maptr", "encoders"},
     "pivotnet": {"maptr", "encoders"},

@@ -20,6 +20,9 @@ from gsmap.evaluation.raster_ap import MIN_SCORE, RasterConfig
 from gsmap.models.bemapnet.head import LEVEL_WEIGHTS as BEMAPNET_LEVELS
 from gsmap.models.bemapnet.losses import BezierLosses
 from gsmap.models.bemapnet.targets import FormatBezierTargets
+from gsmap.models.hdmapnet.encoder import ViewTransformEncoder
+from gsmap.models.hdmapnet.losses import LineMapLosses
+from gsmap.models.hdmapnet.targets import MakeLineMaps
 from gsmap.models.pivotnet.head import LEVEL_WEIGHTS
 from gsmap.models.pivotnet.losses import PivotLosses
 from gsmap.models.pivotnet.targets import FormatPivotTargets
@@ -152,6 +155,19 @@ CONFIGS: dict[str, dict[str, Any]] = {
         "auto_scale_lr.base_batch_size": 8,
         "model.data_preprocessor.bgr_to_rgb": False,
         "model.map_head.queries": ((20, 10), (25, 2), (15, 30)),
+    },
+    "hdmapnet/hdmapnet_effb0_30e.py": {
+        "grid.x_range": (-30.0, 30.0),  # the vehicle's frame
+        "grid.y_range": (-15.0, 15.0),
+        "optim_wrapper.optimizer": {"type": "Adam", "lr": 1e-3, "weight_decay": 1e-7},
+        "optim_wrapper.clip_grad.max_norm": 5,
+        "param_scheduler.0.step_size": 10,
+        "param_scheduler.0.gamma": 0.1,
+        "train_cfg.max_epochs": 30,
+        "train_dataloader.batch_size": 4,
+        "model.data_preprocessor.mean": [123.675, 116.28, 103.53],
+        "model.bev_encoder.image_size": (128, 352),
+        "train_dataloader.dataset.pipeline.1.size": (352, 128),
     },
     "pivotnet/pivotnet_r50_110e.py": {
         "train_cfg.max_epochs": 110,
@@ -465,6 +481,17 @@ def test_bemapnet_weighs_as_released():
     assert (targets.edge_classes, targets.max_error_m) == ((1,), 0.1)
     assert (targets.pixel_m, targets.thickness_px, targets.step_m) == (0.15, 8, 1.0)
     assert not targets.sort_rings
+
+
+def test_hdmapnet_weighs_and_draws_as_released():
+    head, targets = head_of("hdmapnet/hdmapnet_effb0_30e.py"), MakeLineMaps()
+    assert head.losses == LineMapLosses(1.0, 1.0, 1.0, 0.2, 2.13, 0.5, 3.0)
+    assert [maps[-1].out_channels for maps in head.decoder.maps] == [4, 16, 37]
+    assert len(head.decoder.joined) == 2  # directions have no block of their own
+    assert head.map_size == (200, 400)
+    assert (targets.pixel_m, targets.thickness_px, targets.gap_px) == (0.15, 5, 9)
+    assert (targets.step_m, targets.num_directions) == (1.0, 36)
+    assert ViewTransformEncoder(head.grid, num_cams=0).released_units
 
 
 def test_detections_are_chosen_as_by_maptr():

@@ -24,11 +24,13 @@ from gsmap.checkpoints.vectormapnet_keys import VECTORMAPNET
 
 NUM_CAMS = 6
 OWN_RECIPES = (  # of another scale
-    "bemapnet", "mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet", "vectormapnet",
+    "bemapnet", "hdmapnet", "mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet",
+    "vectormapnet",
 )  # fmt: skip
 # recipes without a state, which make what they are asked for, and values of what they do not make
-TENSOR_BY_TENSOR = {
+TENSOR_BY_TENSOR: dict[str, dict[str, Tensor | None]] = {
     "bemapnet": {**BEMAPNET.unused, **PIVOTNET.unused},
+    "hdmapnet": {},
     "pivotnet": PIVOTNET.unused,
     "vectormapnet": VECTORMAPNET.unused,
 }

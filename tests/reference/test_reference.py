@@ -82,6 +82,9 @@ FILES = [
     *(f"bemapnet_{part}_*.npz" for part in ("bifpn", "bevdecoder", "insdecoder", "head")),
     *(f"bemapnet_{part}_*.npz" for part in ("bezier", "targets", "losses", "forward_reduced")),
     "bemapnet_state.json",
+    *(f"hdmapnet_{part}_*.npz" for part in ("view", "decoders", "targets", "losses", "post")),
+    "hdmapnet_forward_*.npz",
+    "hdmapnet_state.json",
 ]
 
 

@@ -45,15 +45,16 @@ class ExportedDetector(nn.Module):
                 "only models of cameras can be exported: voxels of LiDAR have no ONNX operator. "
                 "Give a config without lidar_encoder."
             )
-        if model.map_head.not_exported:
+        head = model.map_head
+        if head.not_exported:
             raise ValueError(
-                f"a {type(model.map_head).__name__} cannot be exported: "
-                f"{model.map_head.not_exported}"
+                f"{type(head).__name__} cannot be exported: {head.not_exported}. Run the model "
+                "with tools/infer.py."
             )
         self.model = model
         of_stream = () if model.temporal is None else OF_STREAM
         self.input_names = ("images", *model.bev_encoder.calibration, *of_stream)
-        self.output_names = ("scores", "labels", "points", *model.map_head.reference.outputs[1:])
+        self.output_names = ("scores", "labels", "points", *head.reference.outputs[1:])
         self.memory: tuple[str, ...] = ()  # names of what is remembered, after `example_inputs`
 
     def forward(self, images: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from gsmap.checkpoints.hdmapnet_keys import HDMAPNET, VIEWS
 from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
 from gsmap.checkpoints.line_keys import BEMAPNET, LINE_DECODER, PIVOTNET
 from gsmap.checkpoints.vectormapnet_keys import LINES, VECTORMAPNET
@@ -297,7 +298,8 @@ STREAMMAPNET = KeyMap(
 )
 
 KEY_MAPS: list[KeyMap] = [
-    VECTORMAPNET, STREAMMAPNET, BEMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR, MGMAP,
+    HDMAPNET, VECTORMAPNET, STREAMMAPNET, BEMAPNET, PIVOTNET, MGMAPNET, GEMAP_FULL, GEMAP, MAPQR,
+    MGMAP,
     MAPTRV2, MAPTR_BEVFORMER, MAPTR,
 ]  # fmt: skip
 """Known architectures, the most special first; the last needs no marker."""
@@ -305,7 +307,7 @@ KEY_MAPS: list[KeyMap] = [
 
 def is_upstream(keys: Iterable[str]) -> bool:
     """Return whether state keys are in the format of the earlier systems."""
-    return any(key.startswith((_HEAD, LINE_DECODER, _STREAM_INPUT, LINES)) for key in keys)
+    return any(key.startswith((_HEAD, LINE_DECODER, _STREAM_INPUT, LINES, VIEWS)) for key in keys)
 
 
 def find_key_map(keys: Iterable[str]) -> KeyMap:

@@ -37,8 +37,9 @@ def calibration_arrays(
             given `without_history`; without it the vehicle's motion is zero.
         names: ``img_from_frame`` and ``frame_from_img``, between metres in the annotation frame and
             (u * d, v * d, d, 1) in pixels of the network's image; ``img_from_ground``, the former
-            with z above the plane on which the vehicle stands, and its inverse ``ground_from_img``;
-            ``cam2img``; ``img_aug_matrix``; ``ego_from_cam``; ``can_bus``.
+            with z above the plane on which the vehicle stands, its inverse ``ground_from_img``, and
+            ``cam_from_ground``, to metres of the camera; ``cam2img``; ``img_aug_matrix``;
+            ``ego_from_cam``; ``can_bus``.
 
     Raises:
         ValueError: If the sample lacks a field.
@@ -63,6 +64,7 @@ def calibration_arrays(
         "img_from_frame": lambda: field("lidar2img"),
         "img_from_ground": img_from_ground,
         "ground_from_img": lambda: np.linalg.inv(img_from_ground()),
+        "cam_from_ground": lambda: field("lidar2cam") @ _frame_from_ground(field("lidar2ego")),
         "frame_from_img": lambda: np.linalg.inv(field("lidar2img")),
         "ego_from_cam": lambda: field("lidar2ego") @ np.linalg.inv(field("lidar2cam")),
     }

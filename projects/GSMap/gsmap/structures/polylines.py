@@ -36,6 +36,16 @@ def arc_lengths(points: Points) -> NDArray[np.float64]:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
+def sampled(points: Points, step: float) -> NDArray[np.float64]:
+    """Return a point at every step from the start of a line; the rest at the end is dropped.
+
+    Steps are measured in the plane, in the points' unit. (n, D) -> (m, D)
+    """
+    along = arc_lengths(points)
+    at = np.arange(0.0, along[-1], step)
+    return np.stack([np.interp(at, along, axis) for axis in points.T], -1)
+
+
 def resample(points: Points, num_points: int) -> NDArray[np.float64]:
     """Resample a polyline at equal arc length in the plane, both end points included.
 

@@ -16,7 +16,7 @@ META_KEYS = (
     "lidar2img", "cam2img", "lidar2cam", "img_aug_matrix", "img_shape", "ori_shape",
     "lidar2global", "lidar2ego", "can_bus", "x_range", "y_range", "eval_ann_info",
 )  # fmt: skip
-TARGET_KEYS = ("gt_instances_3d", "gt_depth", "gt_seg", "gt_pv_seg")
+TARGET_KEYS = ("gt_instances_3d", "gt_depth", "gt_seg", "gt_pv_seg", "gt_lines", "gt_directions")
 _MATRIX_KEYS = ("lidar2img", "cam2img", "lidar2cam", "img_aug_matrix")
 
 

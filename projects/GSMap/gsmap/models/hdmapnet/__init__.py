@@ -1,1 +1,1 @@
-"""HDMapNet: lines from maps of classes, instances and directions."""
+"""HDMapNet: maps of classes, instances and directions, and lines from them."""

@@ -14,6 +14,7 @@ from scipy.spatial import distance
 from torch import Tensor, from_numpy
 from torch.nn.functional import avg_pool2d, max_pool2d
 
+from gsmap.models.hdmapnet.clustering import dense_clusters
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
 Float32 = np.float32
@@ -86,12 +87,14 @@ def vectorize(
     probs = semantic.detach().cpu().float().softmax(0).numpy()
     best = probs.argmax(0)
     embeddings = embedding.detach().cpu().float().numpy()
-    directions = top_directions(direction)
+    direction = direction.detach().cpu()
+    directions = np.full((*best.shape, 2), NONE)
     lines = []
     for label in range(1, len(probs)):
         mask = clean_mask(best == label, config.min_area_px)
         clusters = cluster_pixels(mask, embeddings, config)
         ridge = ridge_pixels(np.where(clusters > 0, probs[label], 0), config.ridge_tolerance)
+        directions[ridge] = top_directions(direction[:, from_numpy(ridge)])
         for number in range(1, clusters.max() + 1):
             own = clusters == number
             points = order_by_distance(along_longer_side(own, ridge))
@@ -136,15 +139,16 @@ def top_directions(direction: Tensor) -> IntArray:
     """Return two directions of each pixel: the best, and the best that is not beside it.
 
     Args:
-        direction: Logits of no direction and of K directions. (1 + K, H, W)
+        direction: Logits of no direction and of K directions. (1 + K, ...)
 
     Returns:
         Directions 0 to K - 1, or -1 for none. The two before and after the best are left out for
-        the second, and as in the release K - 1 and 0 do not count as neighbours. (H, W, 2)
+        the second, and as in the release K - 1 and 0 do not count as neighbours. (..., 2)
     """
     probs = direction.detach().cpu().float().softmax(0).numpy()
     first = probs.argmax(0)
-    beside = np.abs(np.arange(len(probs))[:, None, None] - first) <= 2
+    numbers = np.arange(len(probs)).reshape(-1, *[1] * first.ndim)
+    beside = np.abs(numbers - first) <= 2
     second = np.where(beside, 0, probs).argmax(0)
     return np.stack([first, second], axis=-1) - 1
 
@@ -176,8 +180,10 @@ def cluster_pixels(mask: BoolArray, embedding: FloatArray, config: VectorizeConf
     clusters = np.zeros(mask.shape, dtype=np.int64)
     if mask.any():
         scaled = StandardScaler().fit_transform(embedding[:, mask].T)
-        clustering = DBSCAN(eps=config.eps, min_samples=config.min_neighbours)
-        clusters[mask] = clustering.fit_predict(scaled) + 1
+        found = dense_clusters(scaled.astype(np.float64), config.eps, config.min_neighbours)
+        if found is None:
+            found = DBSCAN(eps=config.eps, min_samples=config.min_neighbours).fit_predict(scaled)
+        clusters[mask] = found + 1
     return clusters
 
 

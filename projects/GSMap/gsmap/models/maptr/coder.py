@@ -99,12 +99,13 @@ class DetectionHead(BaseModule):
     Attributes:
         reference: How references of predictions stand for points (`PointReference`).
         coder: The choice of detections.
-        not_exported: Why it has no ONNX file, if it has none.
+        not_exported: Why there is no ONNX file of the head; empty if there is one.
     """
+
+    not_exported: str = ""
 
     reference: Any
     coder: MapCoder
-    not_exported: str | None = None
 
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
         """Fit a checkpoint's state to the model's, in place."""

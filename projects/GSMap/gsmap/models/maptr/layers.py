@@ -1,9 +1,11 @@
-"""The small networks that turn states into predictions, codes and embeddings."""
+"""The small networks that turn states into predictions, codes and embeddings; enlarging maps."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
+import torch.nn.functional as F
 from mmcv.cnn.bricks.transformer import FFN
-from torch import nn
+from torch import Tensor, nn
 
 
 def mlp(*dims: int) -> nn.Sequential:
@@ -35,6 +37,11 @@ def classification_branch(embed_dims: int, num_classes: int) -> nn.Sequential:
     for _ in range(2):
         layers += [nn.Linear(embed_dims, embed_dims), nn.LayerNorm(embed_dims), nn.ReLU(True)]
     return nn.Sequential(*layers, nn.Linear(embed_dims, num_classes))
+
+
+def enlarged(feats: Tensor, shape: Sequence[int]) -> Tensor:
+    """Resize a map, the centres of its corner cells staying where they are. (B, C, *shape)"""
+    return F.interpolate(feats, size=tuple(shape), mode="bilinear", align_corners=True)
 
 
 _SAMPLING = ("sampling_offsets.weight", "attention_weights.weight", "height_offsets.weight")

@@ -3,10 +3,11 @@
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from mmdet.models.backbones.resnet import BasicBlock
 from mmdet.models.layers import ResLayer
 from torch import Tensor, nn
+
+from gsmap.models.maptr.layers import enlarged
 
 
 class Gates(nn.Module):
@@ -42,11 +43,6 @@ class GatedBlock(BasicBlock):
         inner = self.relu(self.norm1(self.conv1(feats)))
         kept = feats if self.downsample is None else self.downsample(feats)
         return self.relu(self.gates(self.norm2(self.conv2(inner))) + kept)
-
-
-def enlarged(feats: Tensor, shape: torch.Size) -> Tensor:
-    """Resize a map, the centres of its corner cells staying where they are. (B, C, *shape)"""
-    return F.interpolate(feats, size=shape, mode="bilinear", align_corners=True)
 
 
 class EnhancedNeck(nn.Module):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gsmap.models.pivotnet.front import front_size
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.polylines import arc_lengths, is_closed
+from gsmap.structures.polylines import is_closed, sampled
 
 Points = NDArray[np.float64]
 Part = tuple[int, Points]  # its class, and a line in [0, 1] from the front and the left
@@ -62,13 +62,6 @@ def directed(line: Points, tolerance: float, sort_rings: bool = False) -> Points
     (u0, v0), (u1, v1) = line[0], line[-1]
     starts_well = u0 > u1 if abs(u0 - u1) > tolerance else v0 >= v1
     return line if starts_well else line[::-1]
-
-
-def sampled(line: Points, step: float) -> Points:
-    """Return a point at every step from the start; the rest at the end is dropped. (n, 2)"""
-    along = arc_lengths(line)
-    at = np.arange(0.0, along[-1], step)
-    return np.stack([np.interp(at, along, axis) for axis in line.T], -1)
 
 
 def drawn(lines: Iterable[Points], size: tuple[int, int], thickness_px: int) -> NDArray[np.bool_]:
