@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from matplotlib.colors import hsv_to_rgb, to_hex
+
 from gsmap.structures.classes import AREA_CLASSES
 
 CLASS_COLOURS = {
@@ -31,6 +33,18 @@ RUN_COLOURS = (
     "#7F1D1D",
     "#000000",
 )
+_HUE_STEP = (5**0.5 - 1) / 2  # golden section: no two of a dozen successive hues are alike
+
+
+def track_colours(tracks: Iterable[int]) -> list[str]:
+    """Return a colour for each track, always the same for a number; grey for -1, no track. (N,)"""
+    values = [0.85, 0.6]
+    return [
+        to_hex(hsv_to_rgb((track * _HUE_STEP % 1, 0.85, values[track // 6 % 2])))
+        if track >= 0
+        else MATCH_COLOURS["found"]
+        for track in tracks
+    ]
 
 
 @dataclass(frozen=True)
