@@ -106,8 +106,8 @@ def model_and_batch(
     cameras, *size = shape
     images = torch.randn(batch, cameras, 3, *size, generator=generator).to(args.device)
     eyes = np.stack([np.eye(4)] * cameras)
-    metainfo = {"token": "random", "lidar2img": ring_of_cameras(*shape), "cam2img": eyes}
-    metainfo |= {"lidar2cam": eyes, "img_aug_matrix": eyes, "lidar2ego": np.eye(4)}
+    metainfo: dict[str, Any] = {"token": "random", "lidar2img": ring_of_cameras(*shape)}
+    metainfo |= {"cam2img": eyes, "lidar2cam": eyes, "img_aug_matrix": eyes, "lidar2ego": np.eye(4)}
     metainfo |= {"timestamp_ns": 0, "lidar2global": np.eye(4)}
     grid = model.map_head.grid
     samples = []
