@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.measure import MIB, Cost, measure
-from benchmarks.model import add_arguments, in_fresh_processes, model_and_batch, report
+from benchmarks.model import add_arguments, drive_on, in_fresh_processes, model_and_batch, report
 
 __all__ = ["add_arguments", "run"]
 
@@ -32,12 +32,13 @@ def run(args: argparse.Namespace) -> None:
 
 
 def frame_cost(path: str, args: argparse.Namespace) -> Cost:
-    """Measure a config's way from images to decoded elements."""
+    """Measure a config's way from images to decoded elements, with memory if it has any."""
     model, inputs, samples = model_and_batch(path, args)
     model.eval()
 
     @torch.no_grad()
     def predict() -> None:
+        drive_on(samples)
         with torch.autocast(args.device, enabled=args.fp16):
             model.predict(inputs, samples)
 

@@ -17,6 +17,7 @@ from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakePVMask
 from gsmap.engine.launch import needed_targets, read_config
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.rigid import rigid
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,23 +98,25 @@ def model_and_batch(
 ) -> tuple[Any, dict[str, torch.Tensor], list[Det3DDataSample]]:
     """Build a config's model as ``build`` does, and random inputs for it.
 
-    They are normalised images of cameras in a ring, and straight elements as ground truth.
+    They are normalised images of cameras in a ring, and straight elements as ground truth, each
+    sample of a scene of its own (`drive_on`).
     """
     model, shape, stride = build(path, args, raster), image_shape(path, args), mask_stride(path)
     generator = torch.Generator().manual_seed(0)
     cameras, *size = shape
     images = torch.randn(batch, cameras, 3, *size, generator=generator).to(args.device)
     eyes = np.stack([np.eye(4)] * cameras)
-    metainfo = {"token": "random", "lidar2img": ring_of_cameras(*shape), "cam2img": eyes}
-    metainfo |= {"lidar2cam": eyes, "img_aug_matrix": eyes, "lidar2ego": np.eye(4)}
+    metainfo: dict[str, Any] = {"token": "random", "lidar2img": ring_of_cameras(*shape)}
+    metainfo |= {"cam2img": eyes, "lidar2cam": eyes, "img_aug_matrix": eyes, "lidar2ego": np.eye(4)}
+    metainfo |= {"timestamp_ns": 0, "lidar2global": np.eye(4)}
     grid = model.map_head.grid
     samples = []
-    for _ in range(batch):
+    for number in range(batch):
         ends = grid.metres_from_norm(torch.rand(num_elements, 2, 2, generator=generator))
         steps = torch.linspace(0, 1, getattr(model.map_head, "num_points", 2))[:, None]
         pts = ends[:, :1] * (1 - steps) + ends[:, 1:] * steps  # (K, P, 2)
         labels = torch.randint(len(model.map_head.classes), (num_elements,), generator=generator)
-        sample = Det3DDataSample(metainfo=metainfo)
+        sample = Det3DDataSample(metainfo={**metainfo, "scene": f"scene {number}"})
         sample.gt_instances_3d = InstanceData(
             labels_3d=labels,
             pts=pts,
@@ -124,6 +127,14 @@ def model_and_batch(
         add_own_targets(sample, path, grid)
         samples.append(sample.to(args.device))
     return model, {"imgs": images}, samples
+
+
+def drive_on(samples: Sequence[Det3DDataSample]) -> None:
+    """Take samples half a second and 4 m further, so that a model with memory has one of them."""
+    for sample in samples:
+        moved = sample.lidar2global @ rigid(np.eye(3), [0.0, 4.0, 0.0])
+        later = {"timestamp_ns": sample.timestamp_ns + 500_000_000, "lidar2global": moved}
+        sample.set_metainfo(later)
 
 
 def add_own_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> None:

@@ -47,6 +47,7 @@ def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
     model.train()
 
     def step() -> None:
+        models.drive_on(samples)
         model.zero_grad(set_to_none=True)
         with torch.autocast(args.device, enabled=args.fp16):
             losses = model.loss(inputs, samples)

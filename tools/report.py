@@ -1,15 +1,17 @@
 #!/usr/bin/env python
-"""Write a page about a result file: figures, curves and frames in one HTML file.
+"""Write a page about a result file: figures, curves and frames in one HTML file. Or film a drive.
 
 Examples:
     python tools/report.py results.json --ann gsmap_nuscenes_val.arrow --out report.html
     python tools/report.py gsmap.json --compare maptr.json --names GSMap MapTR --ann val.arrow
+    python tools/report.py results.json --ann val.arrow --scene scene-0003 --out drive.mp4
 """
 
 import argparse
 from pathlib import Path
 
 from gsmap.utils.cli import CommandParser, output_file, run_command
+from gsmap.visualization.film import write_drive_film
 from gsmap.visualization.page.page import PageOptions, page_data, write_page
 
 
@@ -20,7 +22,10 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("results", type=Path, help="results in MapTR's JSON form")
     parser.add_argument("--ann", type=Path, required=True, help="annotation file (*.arrow)")
     parser.add_argument(
-        "--out", type=output_file, default=Path("report.html"), help="page to write"
+        "--out",
+        type=output_file,
+        default=Path("report.html"),
+        help="page to write, or a film (*.mp4) of one drive",
     )
     parser.add_argument(
         "--compare", type=Path, metavar="RESULTS", help="second result file, shown beside the first"
@@ -48,7 +53,14 @@ def parse_args() -> argparse.Namespace:
         metavar="map|scene|distance|FILE",
         help="a table of AP by parts, as of tools/evaluate.py",
     )
-    return parser.parse_args()
+    parser.add_argument("--scene", help="drive of a film; default: the first one of --ann")
+    args = parser.parse_args()
+    film = args.out.suffix.lower() == ".mp4"
+    if film and (args.by or args.allow_mismatch):
+        parser.error("--by and --allow-mismatch are of pages: leave them out for a film")
+    if args.scene and not film:
+        parser.error("--scene is of films: give --out NAME.mp4; a page has a field for the scene")
+    return args
 
 
 def main() -> str:
@@ -57,6 +69,7 @@ def main() -> str:
     names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     if len(names) != len(paths) or len(set(names)) != len(names):
         raise ValueError(f"--names must give {len(paths)} different names, got {names}.")
+    named = dict(zip(names, paths, strict=True))
     options = PageOptions(
         args.data_root,
         args.max_frames,
@@ -65,7 +78,18 @@ def main() -> str:
         args.allow_mismatch,
         args.by,
     )
-    data = page_data(args.ann, dict(zip(names, paths, strict=True)), options)
+    if args.out.suffix.lower() == ".mp4":
+        return write_drive_film(
+            args.out,
+            args.ann,
+            named,
+            args.scene,
+            options.data_root,
+            options.score_thr,
+            not args.no_images,
+            options.max_frames,
+        )
+    data = page_data(args.ann, named, options)
     return write_page(args.out, data)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks import fps, live, profile, step
-from benchmarks.model import image_shape, mask_stride, model_and_batch
+from benchmarks.model import drive_on, image_shape, mask_stride, model_and_batch
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -83,6 +83,23 @@ def test_a_step_is_measured_for_every_raster_of_gsmap(capsys):
     rows = cells(capsys.readouterr().out)
     assert [row[1] for row in rows] == ["64x32", "80x40"]
     assert all(float(row[2]) > 0 for row in rows)
+
+
+def test_a_model_with_memory_continues_its_streams_from_call_to_call():
+    args = argparse.Namespace(threads=torch.get_num_threads(), device="cpu", size=[64, 96])
+    path = str(REPO / "projects/GSMap/configs/gsmap_stream_r18_minicity.py")
+    model, inputs, samples = model_and_batch(path, args, batch=2)
+    shares = []
+    for _ in range(2):
+        drive_on(samples)
+        shares.append(float(model.loss(inputs, samples)["loss_trans"].detach()))
+    assert shares[0] == 0 < shares[1]  # only what continues is told how the vehicle has moved
+    model.eval()
+    with torch.no_grad():
+        for _ in range(2):
+            drive_on(samples)
+            model.predict(inputs, samples)
+    assert list(model.temporal.streams.states) == ["scene 0", "scene 1"]
 
 
 def test_the_parts_of_a_forward_pass_add_up(capsys):

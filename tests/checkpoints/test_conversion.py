@@ -148,6 +148,18 @@ def test_neutral_keys_may_be_missing_together_only():
         adapt_state({**without, "head.extra.weight": torch.ones(2, 2)}, expected, "", neutral)
 
 
+def test_each_part_of_a_model_may_be_missing_alone():
+    """As a trained GSMap's lacks memory, but not its Gaussians."""
+    model = nn.ModuleDict({"head": Extended(), "temporal": Extended()})
+    expected = model.state_dict()
+    state = {key: torch.ones_like(value) for key, value in expected.items()}
+    for name in ("weight", "bias"):
+        del state[f"temporal.extra.{name}"]
+    adapt_state(state, expected, "", neutral_keys(model))
+    assert torch.equal(state["temporal.extra.weight"], model["temporal"].extra.weight)
+    assert torch.equal(state["head.extra.weight"], torch.ones(2, 2))
+
+
 def test_a_file_of_something_else_is_refused(tmp_path):
     path = tmp_path / "other.pth"
     torch.save({"state_dict": {"epoch": 3}}, path)

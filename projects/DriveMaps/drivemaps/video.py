@@ -1,6 +1,5 @@
 """A drive as a film: cameras with predictions, predictions and the growing map from above."""
 
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +8,10 @@ from drivemaps.replay import Moment, Replay
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.grid import BEVGrid
-from gsmap.utils.extras import import_extra
-from gsmap.utils.files import atomic_write
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import camera_views
 from gsmap.visualization.figure import compose_figure, figure_to_rgb
+from gsmap.visualization.film import write_film
 from gsmap.visualization.style import MapStyle
 
 
@@ -29,22 +27,9 @@ def write_video(path: str | Path, replay: Replay, width_px: int = 1280) -> None:
         ValueError: If an image is missing or damaged.
         RuntimeError: If ``av`` (PyAV) is missing.
     """
-    av = import_extra("av", "viz")
     times_ns = [frame.sample.timestamp_ns for frame in replay.drive.frames]
-    period_s = np.median(np.diff(times_ns)) / 1e9 if len(times_ns) > 1 else 0.5
-    rate = Fraction(1 / np.clip(period_s, 1 / 60, 10)).limit_denominator(100)
-    with atomic_write(path, "wb") as file, av.open(file, "w", format="mp4") as film:
-        stream = None
-        for moment in replay.moments():
-            picture = _picture(moment, replay, width_px)
-            if stream is None:
-                stream = film.add_stream("libx264", rate=rate, options={"crf": "20"})
-                stream.pix_fmt = "yuv420p"  # what every player takes, of even sizes
-                stream.height, stream.width = (size // 2 * 2 for size in picture.shape[:2])
-            shown = np.ascontiguousarray(picture[: stream.height, : stream.width])
-            film.mux(stream.encode(av.VideoFrame.from_ndarray(shown, format="rgb24")))
-        if stream is not None:
-            film.mux(stream.encode())
+    pictures = (_picture(moment, replay, width_px) for moment in replay.moments())
+    write_film(path, pictures, times_ns)
 
 
 def _picture(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:

@@ -185,6 +185,36 @@ def test_channels_that_are_not_kept_are_those_of_now():
     assert not torch.allclose(found, memory(now, Past({"bev_feats": before}, *still)))
 
 
+def test_a_memory_that_starts_as_a_mean_leaves_a_first_frame_alone_and_learns():
+    """The vehicle stands: what comes out is the mean, at the start, of present and past."""
+    memory = BEVMemory(ALONG_Y, embed_dims=16, present_share=0.9)
+    before, now = features(0), features(1)
+    still = torch.eye(4, dtype=torch.float64)[None], torch.ones(1)
+    first = Past({}, *still, torch.zeros(1, dtype=torch.bool))
+    torch.testing.assert_close(memory(now, first), now)
+    past = Past({"bev_feats": before}, *still, torch.ones(1, dtype=torch.bool))
+    found = memory(now, past)
+    torch.testing.assert_close(found, 0.9 * now + 0.1 * before, atol=1e-5, rtol=0)
+    found.square().sum().backward()
+    for part in (memory.convz.weight, memory.convz.bias, memory.convq.weight):
+        assert part.grad.abs().max() > 0
+    with pytest.raises(ValueError, match=r"present_share must lie between 0 and 1, got 1"):
+        BEVMemory(ALONG_Y, embed_dims=16, present_share=1)
+
+
+def test_a_model_without_memory_is_a_start_for_one_that_begins_as_a_mean_only():
+    single = build_small().state_dict()
+    settings = {"queries": {"num": 2}, "embed_dims": 16}
+    fresh = build_small(temporal={"bev": {"present_share": 0.9}, **settings})
+    fresh.load_state_dict(single)
+    fresh.allow_untrained = False
+    with pytest.raises(ValueError, match=r"never trained with .*temporal\.bev\.convq"):
+        fresh.load_state_dict(single)
+    published = build_small(temporal={"bev": {}, **settings})
+    with pytest.raises(ValueError, match=r"does not fit the model; missing: temporal\.bev\.conv"):
+        published.load_state_dict(single)
+
+
 def test_half_a_state_keeps_the_places_exact():
     head, memory = with_memory()
     whole = [step(head, memory, meta(n), feats=features(n)) for n in range(2)]

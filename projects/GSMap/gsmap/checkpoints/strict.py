@@ -1,6 +1,7 @@
 """Strict loading: every key is used and every weight is loaded, or an error names it."""
 
 from collections.abc import Callable, Mapping
+from itertools import chain
 
 from torch import Tensor, nn
 
@@ -37,7 +38,8 @@ def adapt_state(
         state: What a checkpoint has, under ``prefix``.
         expected: What the model has, under ``prefix``.
         prefix: What the keys begin with.
-        neutral: Keys that may be missing all together (``neutral_keys``).
+        neutral: Keys that may be missing (``neutral_keys``), those of a part of the model
+            (``map_head``, ``temporal``) all together.
         fit: Changes the renamed state in place before it is compared.
         allow_untrained: Whether the neutral keys may be missing.
 
@@ -53,10 +55,12 @@ def adapt_state(
     missing = {
         key for key in expected if key not in state and not key.endswith("num_batches_tracked")
     }
-    untrained = sorted(neutral) if neutral <= missing else []
-    if untrained:
-        missing -= neutral
-        state.update({key: expected[key] for key in neutral})  # they stay as they are
+    parts: dict[str, set[str]] = {}
+    for key in neutral:
+        parts.setdefault(key.removeprefix(prefix).partition(".")[0], set()).add(key)
+    untrained = sorted(chain.from_iterable(keys for keys in parts.values() if keys <= missing))
+    missing -= set(untrained)
+    state.update({key: expected[key] for key in untrained})  # they stay as they are
     problems = {
         "missing": sorted(missing),
         "left over": [key for key in state if key not in expected],

@@ -43,6 +43,7 @@ class BEVPanel:
         points: Points (x, y) to draw as faint dots, such as a LiDAR sweep. (n, >= 2)
         truth: Ground truth in broad lines under the elements, coloured by whether it is found.
         hits: Index of the ground truth that each element hits, or -1; colours elements by it. (N,)
+        colours: A colour for each element in place of its class's. (N,)
     """
 
     title: str
@@ -57,6 +58,7 @@ class BEVPanel:
     points: np.ndarray | None = None
     truth: MapElements | None = None
     hits: np.ndarray | None = None
+    colours: Sequence[str] = ()
 
     @property
     def fates(self) -> tuple[list[str], list[str]]:
@@ -247,7 +249,8 @@ def draw_bev(ax: Axes, panel: BEVPanel, grid: BEVGrid, view: FrameView, style: M
         note.set(fontsize=7, color=style.muted)
         return
     lines = [view.display_from_frame(line) for line in elements.polylines]
-    colours = [MATCH_COLOURS[fate] for fate in fates] or style.colours(elements.labels)
+    colours = [MATCH_COLOURS[fate] for fate in fates] or list(panel.colours)
+    colours = colours or style.colours(elements.labels)
     if panel.rasters is not None:
         _draw_rasters(ax, raster_picture(panel.rasters, elements.labels, style), view)
     if panel.gaussians and elements.has_gaussians:

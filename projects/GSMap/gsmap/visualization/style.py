@@ -1,7 +1,10 @@
 """Colours and widths that all pictures share."""
 
 from collections.abc import Iterable, Sequence
+from colorsys import hsv_to_rgb
 from dataclasses import dataclass
+
+from matplotlib.colors import to_hex
 
 from gsmap.structures.classes import AREA_CLASSES
 
@@ -31,6 +34,18 @@ RUN_COLOURS = (
     "#7F1D1D",
     "#000000",
 )
+_HUE_STEP = (5**0.5 - 1) / 2  # golden section: no two of a dozen successive hues are alike
+
+
+def track_colours(tracks: Iterable[int]) -> list[str]:
+    """Return a colour for each track, always the same for a number; grey for -1, no track. (N,)"""
+    values = [0.85, 0.6]
+    return [
+        to_hex(hsv_to_rgb(track * _HUE_STEP % 1, 0.85, values[track // 6 % 2]))
+        if track >= 0
+        else MATCH_COLOURS["found"]
+        for track in tracks
+    ]
 
 
 @dataclass(frozen=True)

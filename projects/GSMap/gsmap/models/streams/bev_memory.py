@@ -1,8 +1,11 @@
 """Memory of BEV features: moved by the vehicle's motion, then fused by a convolutional GRU."""
 
+import math
+
 import torch
 import torch.nn.functional as F
 from mmdet3d.registry import MODELS
+from mmengine.model import constant_init
 from torch import Tensor, nn
 
 from gsmap.structures.grid import BEVGrid
@@ -25,9 +28,12 @@ class BEVMemory(nn.Module):
             need it.
         kept_dims: Channels that are kept, the first ones; the others of h are those of x, as in a
             first frame. None keeps all, as published.
+        present_share: Start as a mean of present and past, z everywhere at this share and q = x,
+            without LayerNorm: then a model that was trained without memory still knows its
+            features. None starts from random weights, as published.
 
     Raises:
-        ValueError: If there are not as many channels.
+        ValueError: If there are not as many channels, or a share is not within (0, 1).
     """
 
     def __init__(
@@ -36,6 +42,7 @@ class BEVMemory(nn.Module):
         embed_dims: int = 256,
         end_points: bool = False,
         kept_dims: int | None = None,
+        present_share: float | None = None,
     ) -> None:
         super().__init__()
         if kept_dims is not None and not 0 < kept_dims <= embed_dims:
@@ -43,13 +50,25 @@ class BEVMemory(nn.Module):
                 f"temporal.bev.kept_dims must be 1 to {embed_dims}, the channels of the map's "
                 f"features, got {kept_dims}."
             )
+        if present_share is not None and not 0 < present_share < 1:
+            raise ValueError(
+                f"temporal.bev.present_share must lie between 0 and 1, got {present_share}."
+            )
         self.grid, self.end_points, self.kept_dims = grid, end_points, kept_dims
+        published = present_share is None
+        self.neutral_keys = () if published else ("conv",)  # a checkpoint may lack them
         self.convz, self.convr, self.convq = (
-            nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=False) for _ in range(3)
+            nn.Conv2d(2 * embed_dims, embed_dims, 1, bias=bias)
+            for bias in (not published, False, False)
         )
-        self.ln = nn.LayerNorm(embed_dims)
+        self.ln = nn.LayerNorm(embed_dims) if published else nn.Identity()
         for conv in (self.convz, self.convr, self.convq):
             nn.init.kaiming_normal_(conv.weight, mode="fan_out", nonlinearity="relu")
+        if present_share is not None:
+            constant_init(self.convz, 0.0, math.log(present_share / (1 - present_share)))
+            with torch.no_grad():
+                self.convq.weight.zero_()
+                self.convq.weight[:, embed_dims:, 0, 0].fill_diagonal_(1.0)
 
     def cells(self, height: int, width: int) -> Tensor:
         """Return where the cells lie, in metres, float64. (H, W, 2)"""

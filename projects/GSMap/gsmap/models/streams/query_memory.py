@@ -32,6 +32,8 @@ class QueryMemory(BaseModule):
         beta: Distance, [0, 1] over the map, below which smooth L1 is a parabola.
     """
 
+    neutral_keys = ("fc.",)
+
     def __init__(
         self, embed_dims: int, num: int = 33, loss_weight: float = 5.0, beta: float = 0.01
     ) -> None:

@@ -1,0 +1,70 @@
+"""Films of drives: a frame for each sample, tracks that keep their colour, and what is refused."""
+
+import json
+
+import av
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from report_case import FRAMES, STRANGE, write_case
+
+from gsmap.visualization import film
+from gsmap.visualization.style import track_colours
+
+
+def frames_of(path) -> list[np.ndarray]:
+    with av.open(str(path)) as opened:
+        return [frame.to_ndarray(format="rgb24") for frame in opened.decode(video=0)]
+
+
+def share_of(picture: np.ndarray, colour: str) -> float:
+    """Return the share of pixels that nearly have a colour; compression moves it a little."""
+    wanted = 255 * np.array(to_rgb(colour))
+    return float((np.abs(picture - wanted).max(-1) < 40).mean())
+
+
+def test_a_drive_has_a_frame_for_each_sample_as_fast_as_it_was(tmp_path):
+    annotations, results = write_case(tmp_path)
+    path = tmp_path / "drive.mp4"
+    said = film.write_drive_film(path, annotations, results, width_px=480)
+    assert said == f"{STRANGE}, {FRAMES} frames: {path}"
+    shown = frames_of(path)
+    assert len(shown) == FRAMES
+    assert shown[0].shape[1] == 480
+    with av.open(str(path)) as opened:
+        assert opened.streams.video[0].average_rate == 1  # samples are a second apart
+    film.write_drive_film(path, annotations, results, images=False, max_frames=2, width_px=480)
+    shorter = frames_of(path)
+    assert len(shorter) == 2
+    assert shorter[0].shape[0] < shown[0].shape[0]  # without cameras
+
+
+def test_an_element_keeps_the_colour_of_its_track(tmp_path):
+    annotations, results = write_case(tmp_path)
+    found = json.loads(results["good"].read_text())
+    for number, sample in enumerate(found["results"]):
+        for vector, track in zip(sample["vectors"], (4, 7 + number, -1), strict=True):
+            vector["track_id"] = track
+    results["good"].write_text(json.dumps(found))
+    path = tmp_path / "drive.mp4"
+    one = {"good": results["good"]}
+    film.write_drive_film(path, annotations, one, images=False, width_px=960)
+    stays, first, later = track_colours([4, 7, 7 + FRAMES - 1])
+    start, end = (frames_of(path)[index] for index in (0, -1))
+    assert min(share_of(start, stays), share_of(end, stays)) > 5e-4
+    assert share_of(start, first) > 5e-4 > share_of(end, first)
+    assert share_of(end, later) > 5e-4 > share_of(start, later)
+
+
+def test_tracks_have_colours_of_their_own_always_the_same():
+    colours = track_colours(range(12))
+    assert len(set(colours)) == 12
+    assert track_colours([11, 3]) == [colours[11], colours[3]]
+    assert track_colours([-1])[0] not in colours
+
+
+def test_a_scene_that_does_not_exist_is_named_with_one_that_does(tmp_path):
+    annotations, results = write_case(tmp_path)
+    with pytest.raises(ValueError, match="no scene 'scene-0003': give one of its 1, such as"):
+        film.write_drive_film(tmp_path / "no.mp4", annotations, results, scene="scene-0003")
+    assert not (tmp_path / "no.mp4").exists()
