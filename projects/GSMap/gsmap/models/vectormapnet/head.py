@@ -39,7 +39,7 @@ class VectorMapNetHead(DetectionHead):
     not_exported = (
         "polylines are generated point after point, as many times as the longest one has "
         "coordinates, with random numbers: no graph of fixed steps. Export a model whose map_head "
-        "is the detector alone."
+        "is the detector alone"
     )
 
     def __init__(
