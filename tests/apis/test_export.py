@@ -62,10 +62,16 @@ CASES = {
     "GSMap, unfolded": (GSMAP, {"model.map_head.coder.unfold_classes": [0, 2]}),
     "GSMap on MGMapNet": ("projects/GSMap/configs/gsmap_mgmapnet_r18_minicity.py", {}),
 }
-# its encoder reads the last stages without a neck; every line is found
-SMALL_PIVOTNET = {
-    "model.map_head.queries": ((20, 10), (25, 2), (15, 16)),
-    "model.map_head.score_threshold": None,
+# heads without MapTR's coder, of other necks; every line is found
+OWN_SMALL = {
+    "PivotNet": {
+        "model.map_head.queries": ((20, 10), (25, 2), (15, 16)),
+        "model.map_head.score_threshold": None,
+    },
+    "BeMapNet": {
+        "model.map_head.queries": (20, 25, 15),
+        "model.map_head.score_threshold": None,
+    },
 }
 
 
@@ -87,7 +93,7 @@ def shipped(annotations, tmp_path_factory):
 @pytest.mark.parametrize("case", CASES)
 def test_every_method_and_encoder_predicts_as_in_torch(case, annotations, tmp_path):
     config, overrides = CASES[case]
-    small = SMALL_PIVOTNET if case == "PivotNet" else SMALL
+    small = OWN_SMALL.get(case, SMALL)
     inferencer = MapInferencer(REPO / config, None, "cpu", {**small, **overrides})
     dataset = inferencer.dataset(annotations, annotations.parent)
     shake(inferencer.model)

@@ -1,5 +1,7 @@
 """Piecewise Bezier curves as a head predicts them, and what they see of a mask."""
 
+from collections.abc import Sequence
+
 import torch
 from mmcv.ops import point_sample
 from torch import Tensor, nn
@@ -66,7 +68,7 @@ def sampled(masks: Tensor, points: Tensor) -> Tensor:
     return point_sample(masks, points, align_corners=False)
 
 
-def around(points: Tensor, size: tuple[int, int]) -> Tensor:
+def around(points: Tensor, size: Sequence[int]) -> Tensor:
     """Return points of the map around points of curves, in a raster of a size (H, W).
 
     (..., 100, 2) -> (..., 2500, 2)

@@ -1,8 +1,8 @@
 """BeMapNet's head: lines as Bezier curves of several pieces."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +16,7 @@ from gsmap.models.bemapnet.targets import check_curves
 from gsmap.models.maptr.coder import Tensors
 from gsmap.models.maptr.layers import mlp
 from gsmap.models.maptr.parts import PARTS
+from gsmap.models.pivotnet.decoder import ClassLines
 from gsmap.models.pivotnet.front import front_size
 from gsmap.models.pivotnet.lines import LineHead, LinePredictions, class_scores
 from gsmap.structures.grid import BEVGrid
@@ -122,12 +123,11 @@ class BezierHead(LineHead):
         """Predict the lines after every decoder layer, from ``bev_feats`` (B, C, H, W)."""
         layers = self.decoder(self.front(bev_outputs["bev_feats"]))[1:]
         mean = self.coordinate_feature()
-        return [self.predictions(*own, mean) for (own,) in layers]
+        return [self.predictions(own, mean) for (own,) in layers]
 
-    def predictions(
-        self, states: Tensor, logits: Tensor, masks: Tensor, mean: Tensor
-    ) -> LinePredictions:
-        """Return the curves and scores of a layer's lines: states (B, N, 1, C), logits, masks."""
+    def predictions(self, layer: ClassLines, mean: Tensor) -> LinePredictions:
+        """Return the curves and scores of a layer's lines of all classes."""
+        states, logits, masks = layer
         parts = (part.split(list(self.queries), 1) for part in (states[:, :, 0], logits, masks))
         lines = [
             self.curved(label, *self.raw(label, own, mean), of_line.float(), mask.float())
@@ -141,7 +141,7 @@ class BezierHead(LineHead):
 
         (B, n, k + 1, 2), (B, n, k, d - 1, 2), (B, n, k)
         """
-        curve, coordinates = self.curves[label], (2, self.point_dims)
+        curve, coordinates = cast(Curve, self.curves[label]), (2, self.point_dims)
         joints = self.joint_branches[label](states).float().unflatten(-1, (-1, *coordinates)) @ mean
         pieces = self.piece_branches[label](states).float()
         shape = (pieces.shape[-1], curve.degree - 1)
@@ -160,14 +160,15 @@ class BezierHead(LineHead):
         masks: Tensor,
     ) -> BezierLines:
         """Return lines of a class from what `raw` says."""
-        controls, curve, last = control_points(joints, inner), self.curves[label], pieces.argmax(-1)
+        curve, last = cast(Curve, self.curves[label]), pieces.argmax(-1)
+        controls = control_points(joints, inner)
         return BezierLines(logits, controls, curve.used(last), pieces, curve(controls, last), masks)
 
     def truth(self, sample: Det3DDataSample) -> list[TrueCurves]:
         """Return a sample's annotated lines, by class; ValueError if they are not of this head."""
         instances, found = self.annotated(sample), []
         points = self.grid.front_from_metres(instances.pts.float()).flip(-1)
-        for label, curve in enumerate(self.curves):
+        for label, curve in enumerate(cast(Iterable[Curve], self.curves)):
             own = instances.labels_3d == label
             numbers, most = instances.num_pts[own], curve.weights.shape[-1]
             if ((numbers > most) | ((numbers - 1) % curve.degree != 0)).any():
