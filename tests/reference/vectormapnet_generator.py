@@ -56,7 +56,7 @@ def check_generator(golden: Golden, name: str) -> Iterator[Row]:
             rows["layers"].append(torch.stack(states)[:, :, ::4, ::16].transpose(1, 2))
             rows["law"].append(generator.log_probs(feats, elements, given))
             if i == 0:
-                raw = generator.logits(states[-1][0, 4:])[valid[0]]
+                raw = generator.allowed(generator.logits(states[-1][:1, 4:]))[0, valid[0]]
                 yield Row(
                     name,
                     "raw_logits_line0",
