@@ -270,10 +270,10 @@ class OnnxInferencer:
             for name in kept.keys() - {"scores", "labels"}:
                 kept[name][lines] = kept[name][lines][np.arange(len(orders))[:, None], orders]
         points, numbers = kept.pop("points"), kept.pop("num_pts", None)
-        if numbers is not None:
-            lines = [line[:number] for line, number in zip(points, numbers, strict=True)]
-            return MapElements.from_polylines(lines, **kept)
-        return MapElements.from_polylines(points, **kept)
+        if numbers is None:
+            return MapElements.from_polylines(points, **kept)
+        cut = [line[:number] for line, number in zip(points, numbers, strict=True)]
+        return MapElements.from_polylines(cut, **kept)
 
     def write(self, path: str | Path, samples: Iterable[tuple[str, MapElements]]) -> None:
         """Write each sample's token and elements as ``tools/test.py --out`` does."""

@@ -67,7 +67,8 @@ def dense_clusters(points: Points, eps: float, min_neighbours: int) -> NDArray[n
 
 def _balls(points: Points, eps: float) -> tuple[NDArray[np.int64] | None, list[Points]]:
     """Return the ball of each point, and all points' squared distances from the balls' leaders."""
-    balls, to_leaders = np.full(len(points), -1), []
+    balls = np.full(len(points), -1)
+    to_leaders: list[Points] = []
     inside = (eps / 2) ** 2 * (1 - 1e-9)
     while (left := balls < 0).any():
         if len(to_leaders) == _MOST_BALLS:

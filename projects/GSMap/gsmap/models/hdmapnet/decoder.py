@@ -25,7 +25,7 @@ class FineMaps(nn.Sequential):
         hidden = inputs // 2
         super().__init__(*conv_block(inputs, hidden), nn.Conv2d(hidden, outputs, 1))
 
-    def forward(self, feats: Tensor, like: Tensor) -> Tensor:
+    def forward(self, feats: Tensor, like: Tensor) -> Tensor:  # type: ignore[override]
         """Return a map as large as ``like``. (B, C, h, w), (B, _, H, W) -> (B, outputs, H, W)"""
         return super().forward(enlarged(feats, like.shape[-2:]))
 
@@ -64,11 +64,12 @@ class LineMapDecoder(nn.Module):
             ResLayer(BasicBlock, inputs, outputs, 2, stride) for inputs, outputs, stride in sizes
         )
         number = 2 if shared_direction_block else 3
-        self.joined = nn.ModuleList(
-            JoinedMaps(widths[0] + widths[2], widths[2]) for _ in range(number)
-        )
+        blocks = [JoinedMaps(widths[0] + widths[2], widths[2]) for _ in range(number)]
+        self.joined = nn.ModuleList(blocks)
         if shared_direction_block:  # the release runs it twice, so its statistics learn faster
-            for norm in (self.joined[1][1], self.joined[1][4]):
+            for norm in blocks[1].modules():
+                if not isinstance(norm, nn.BatchNorm2d) or norm.momentum is None:
+                    continue
                 norm.momentum = 1 - (1 - norm.momentum) ** 2
         outputs = 1 + num_classes, embedding_dims, 1 + num_directions
         self.maps = nn.ModuleList(FineMaps(widths[2], channels) for channels in outputs)

@@ -27,7 +27,7 @@ class JoinedMaps(nn.Sequential):
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(*conv_block(inputs, outputs), *conv_block(outputs, outputs))
 
-    def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
+    def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:  # type: ignore[override]
         """Return a map as large as the fine one. (B, C, H, W), (B, D, h, w) -> (B, E, H, W)"""
         return super().forward(torch.cat([fine, enlarged(coarse, fine.shape[-2:])], 1))
 

@@ -1,7 +1,7 @@
 """VectorMapNet's BEV encoder: image features where planes of several heights are seen."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -84,7 +84,7 @@ class HeightPlanesEncoder(CameraEncoder):
     def joined(self, feats: Sequence[Tensor]) -> Tensor:
         """Return the sum of all levels at the size of the first. (B, V, C, h, w)"""
         total = feats[0].flatten(0, 1)
-        for level, blocks in zip(feats[1:], self.upsampling, strict=True):
+        for level, blocks in zip(feats[1:], cast(Any, self.upsampling), strict=True):
             image = level.flatten(0, 1)
             for block in blocks:
                 image = block(image)

@@ -1,7 +1,7 @@
 """VectorMapNet's polyline generator: the points of an element, token after token."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from mmengine.model import BaseModule
@@ -88,7 +88,7 @@ class PolylineGenerator(BaseModule):
         self.position = nn.Embedding(num_positions, embed_dims)
         self.axis = nn.Embedding(2, embed_dims)
         self.corner = nn.Embedding(3, embed_dims)  # the third has no use, as released
-        self.layers = nn.ModuleList(
+        self.layers: Any = nn.ModuleList(
             GatedLayer(embed_dims, num_heads, ffn_dims, dropout) for _ in range(num_layers)
         )
         self.logits = nn.Linear(embed_dims, canvas.num_tokens)
