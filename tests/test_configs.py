@@ -137,7 +137,10 @@ def small(cfg: Config) -> Config:
         if part:
             part.init_cfg = None
     head = cfg.model.map_head
-    if head.type != "HDMapNetHead":
+    if head.type == "HDMapNetHead":  # before it has learned, every pixel of its maps is a line
+        head.pixel_m, cfg.model.bev_encoder.bev_pixel_m = 0.6, 1.2
+        cfg.train_dataloader.dataset.pipeline[2].pixel_m = 0.6
+    else:
         head.get("detector", head).decoder.num_layers = 2
     if "num_cams" in (cfg.model.get("bev_encoder") or {}):
         cfg.model.bev_encoder.num_cams = 6  # MiniCity's

@@ -1,13 +1,19 @@
 """Clusters of whole balls are those of DBSCAN."""
 
+import tracemalloc
+
 import numpy as np
+import pytest
 from sklearn.cluster import DBSCAN
 
+from gsmap.models.hdmapnet import clustering
 from gsmap.models.hdmapnet.clustering import dense_clusters
 
 
-def test_clusters_are_dbscans_and_numbered_alike():
-    rng, compared = np.random.default_rng(0), 0
+@pytest.mark.parametrize("most_pairs", [clustering._MOST_PAIRS, 3000])
+def test_clusters_are_dbscans_and_numbered_alike(most_pairs, monkeypatch):
+    monkeypatch.setattr(clustering, "_MOST_PAIRS", most_pairs)
+    rng, several = np.random.default_rng(0), 0
     for _ in range(60):
         dims, number = rng.integers(1, 5), rng.integers(1, 9)
         centres = rng.normal(size=(number, dims)) * rng.uniform(0.5, 4)
@@ -15,24 +21,40 @@ def test_clusters_are_dbscans_and_numbered_alike():
         points = centres[rng.integers(0, number, 400)] + spread * rng.normal(size=(400, dims))
         eps, least = rng.uniform(0.3, 1.5), int(rng.integers(2, 40))
         found = dense_clusters(points, eps, least)
-        if found is not None:
-            wanted = DBSCAN(eps=eps, min_samples=least).fit_predict(points)
-            np.testing.assert_array_equal(found, wanted)
-            compared += 1
-    assert compared > 20
+        wanted = DBSCAN(eps=eps, min_samples=least).fit_predict(points)
+        np.testing.assert_array_equal(found, wanted)
+        several += found.max() > 0
+    assert several > 20
 
 
-def test_points_far_from_each_other_are_left_to_dbscan():
-    assert dense_clusters(np.arange(200.0)[:, None], 0.5, 2) is None
-    assert dense_clusters(np.arange(60.0)[:, None], 0.5, 2) is None
+@pytest.mark.parametrize("apart", [0.4, 0.6])
+def test_points_in_more_balls_than_are_made(apart):
+    """A chain of 200 points, and the same points as a cluster for each."""
+    points = apart * np.arange(200.0)[:, None]
+    found = dense_clusters(points, 0.5, 1)
+    assert found.tolist() == ([0] * 200 if apart < 0.5 else list(range(200)))
+    assert dense_clusters(points, 0.5, 4).tolist() == [-1] * 200
+    assert dense_clusters(points[:0], 0.5, 4).tolist() == []
 
 
 def test_a_point_on_the_border_of_two_clusters_belongs_to_the_first():
     """Cores at 0 and 2 of five points each; one point at 1, whose neighbours are too few."""
     points = np.array([2.0] * 5 + [1.0] + [0.0] * 5)[:, None]
-    found = dense_clusters(points, 1.0, 12)
-    assert found is None  # no core at all: nothing is dense
-    points = np.array([2.0] * 9 + [1.0] + [0.0] * 9)[:, None]
-    assert dense_clusters(points, 1.0, 20) is None
-    dense = dense_clusters(np.concatenate([points, [[5.0]]]), 1.0, 9)
-    assert dense.tolist() == [0] * 19 + [-1]  # a core itself, it joins both
+    assert dense_clusters(points, 1.0, 12).tolist() == [-1] * 11  # no core at all
+    assert dense_clusters(points, 0.9, 5).tolist() == [0] * 5 + [-1] + [1] * 5
+    points = np.array([2.0] * 9 + [1.0] + [0.0] * 9 + [5.0])[:, None]
+    assert dense_clusters(points, 1.0, 9).tolist() == [0] * 19 + [-1]  # a core joins both
+    points = np.array([2.0] * 5 + [1.0] + [0.0] * 5 + [2.9] * 8 + [-0.9] * 8)[:, None]
+    found = dense_clusters(points, 1.0, 12)  # 1.0 has 11 neighbours, 2.0 and 0.0 have 14
+    assert found.tolist() == [0] * 6 + [1] * 5 + [0] * 8 + [1] * 8
+
+
+def test_equal_points_need_little_memory():
+    """20,000 points that lie together: the distances of their pairs alone would take 3 GB."""
+    points = np.random.default_rng(0).normal(size=(20_000, 2)) * [1.0, 0.02]
+    tracemalloc.start()
+    found = dense_clusters(points, 1.5, 50)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6
+    assert (found == 0).mean() > 0.99

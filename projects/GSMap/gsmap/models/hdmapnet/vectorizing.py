@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.spatial import distance
 from torch import Tensor, from_numpy
 from torch.nn.functional import avg_pool2d, max_pool2d
 
@@ -174,15 +173,12 @@ def cluster_pixels(mask: BoolArray, embedding: FloatArray, config: VectorizeConf
     Returns:
         Number of each pixel's cluster, from 1 on in the order of rows; 0 for none. (H, W)
     """
-    from sklearn.cluster import DBSCAN  # takes a second
-    from sklearn.preprocessing import StandardScaler
+    from sklearn.preprocessing import StandardScaler  # takes a second
 
     clusters = np.zeros(mask.shape, dtype=np.int64)
     if mask.any():
         scaled = StandardScaler().fit_transform(embedding[:, mask].T)
         found = dense_clusters(scaled.astype(np.float64), config.eps, config.min_neighbours)
-        if found is None:
-            found = DBSCAN(eps=config.eps, min_samples=config.min_neighbours).fit_predict(scaled)
         clusters[mask] = found + 1
     return clusters
 
@@ -226,16 +222,16 @@ def order_by_distance(points: IntArray) -> IntArray:
     """
     if not len(points):
         return points
-    between = distance.cdist(points, points)
     left = np.ones(len(points), dtype=bool)
     left[0], chosen = False, [0]
     for step in range(len(points) - 1):
-        to_left = np.where(left, between[chosen[-1]], np.inf)
-        nearest = int(to_left.argmin())
+        others = np.flatnonzero(left)
+        apart = ((points[others] - points[chosen[-1]]) ** 2).sum(1)
+        nearest, gap = others[apart.argmin()], apart.min()
         left[nearest] = False
-        if to_left[nearest] > 3 and between[nearest][chosen].min() < 5:
+        if gap > 3**2 and ((points[chosen] - points[nearest]) ** 2).sum(1).min() < 5**2:
             continue
-        if to_left[nearest] > 10 and step > 0.9 * len(points):
+        if gap > 10**2 and step > 0.9 * len(points):
             break
         chosen.append(nearest)
     return points[chosen]
