@@ -18,9 +18,8 @@ from mmengine.structures import InstanceData
 import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.strict import neutral_keys
 from gsmap.datasets.transforms.map_targets import map_targets
-from gsmap.datasets.transforms.masks import padded_size
 from gsmap.engine.launch import check_config, read_config
-from gsmap.structures.grid import BEVGrid
+from gsmap.structures.grid import BEVGrid, padded_size
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
 REPO = Path(__file__).resolve().parents[1]
@@ -31,6 +30,7 @@ CONFIGS = sorted(
 LEAVES = [path for path in CONFIGS if "_base_" not in path.parts]
 # lines of no equal numbers of points
 ANY_NUMBER = ("pivotnet", "bemapnet", "vectormapnet", "hdmapnet")
+NUMBERED = ("PivotHead", "VectorMapNetHead", "HDMapNetHead")  # that say how many points count
 SWAPPABLE = [
     path for path in LEAVES if path.is_relative_to(BASELINES) and path.parent.name not in ANY_NUMBER
 ]
@@ -314,12 +314,16 @@ def test_one_step_of_training_and_testing(path, minicity_root, annotations):
     for name in test.classes:  # AP_raster leaves out what the ground truth does not have
         assert 0 <= figures[f"chamfer/{name}/AP"] <= 1
     predicted = samples[0].pred_instances_3d
-    most = max(p for _, p in cfg.model.map_head.get("queries", ((1, 20),)))
-    most = cfg.model.map_head.get("generator", {"max_points": most})["max_points"]
-    if cfg.model.map_head.type == "HDMapNetHead":  # as many as the longest line has
+    head = cfg.model.map_head
+    most = {"BezierHead": 100}.get(head.type, 20)
+    if head.type == "PivotHead":
+        most = max(number for _, number in head.queries)
+    elif head.type == "VectorMapNetHead":
+        most = head.generator.max_points
+    elif head.type == "HDMapNetHead":  # as many as the longest line has
         most = max([2, *predicted.num_pts.tolist()])
-    assert ("num_pts" in predicted) == (path.parent.name in ANY_NUMBER)
     assert predicted.pts.shape[1:] == (most, coordinates(cfg))
+    assert ("num_pts" in predicted) == (head.type in NUMBERED)
     assert ("scales" in predicted) == ("GSMap" in cfg.model.map_head.type)
 
 

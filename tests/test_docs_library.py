@@ -42,7 +42,7 @@ def test_the_loss_moves_gaussians_onto_the_line(ran):
 
 
 def test_a_model_sees_images_in_memory(ran):
-    assert ran["list_models"]()[:2] == ["gsmap_r18_minicity", "maptr_r18_minicity"]
+    assert {"gsmap_r18_minicity", "maptr_r18_minicity"} <= set(ran["list_models"]())
     assert not ran["model"].training
     assert len(ran["elements"]) > 0
     assert ran["elements"].has_gaussians

@@ -20,6 +20,7 @@ import pytest
 import shapely
 from mmdet3d import registry as of_mmdet3d
 from mmengine import registry
+from mmengine.config import Config
 from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from report_case import write_case
 
@@ -30,6 +31,7 @@ PAGES = [REPO / "README.md", *sorted([*(REPO / "docs").rglob("*.md"), *REPO.glob
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 ROS = "import rclpy"  # the node of docs/inference.md: test_docs_library.py runs it without ROS
 WITH_BLOCKS = [page for page in dict.fromkeys(PAGES) if BLOCK.search(page.read_text())]
+BASE = str(REPO / "configs/maptr/maptr_r18_minicity.py")  # what a config reads as _base_
 OWN_TESTS = {
     "docs/library.md": "test_docs_library.py",
     "docs/add_a_method.md": "test_docs_method.py",
@@ -38,6 +40,7 @@ STAND_INS = {
     "'CONFIG', 'CHECKPOINT', device='cuda'": "'gsmap_r18_minicity', device='cpu'",
     "open_input('INPUT')": "open_input('val.arrow')",
     "num_workers=2": "num_workers=0",  # no fork out of a test
+    "_base_ = '../maptr/maptr_r18_minicity.py'": f"_base_ = Config.fromfile({BASE!r})",
 }
 REGISTRIES = [
     each
@@ -178,7 +181,7 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path, monkeypatch, request):
     if name in OWN_TESTS:
         assert (REPO / "tests" / OWN_TESTS[name]).exists()
         return
-    scope: dict[str, Any] = {"__name__": "page"}
+    scope: dict[str, Any] = {"__name__": "page", "Config": Config}
     if name in GIVEN:
         minicity = request.getfixturevalue("minicity_annotations")["val"]
         scope |= GIVEN[name](tmp_path, minicity)

@@ -98,14 +98,14 @@ def check_pivots(golden: Golden, name: str) -> Iterator[Row]:
                 default=0,
             )
             yield Row(name, f"{tag}: pivots {label}", off, 1e-9)
-        masks = thick.masks(parts, pivots, (400, 200))
+        masks, _ = thick.masks(parts, pivots, (400, 200))
         drawn = np.zeros((3, 400, 200), int)
         for number, (mask, label) in enumerate(zip(masks, labels, strict=True)):
             drawn[label][mask] = 2 * number + 2
         off = largest_difference(drawn, data[f"{tag}_mask8"])
         yield Row(name, f"{tag}: masks of width 8", off, 0)
         # no loss reads the masks of width 1, and versions of OpenCV draw such lines differently
-        lines = FormatPivotTargets(thickness_px=1).masks(parts, pivots, (400, 200))
+        lines, _ = FormatPivotTargets(thickness_px=1).masks(parts, pivots, (400, 200))
         thin = np.stack([lines[labels == label].any(0) for label in range(3)])
         far = sum((a & ~wide(b)).sum() for a, b in permutations((thin, data[f"{tag}_mask1"] > 0)))
         yield Row(name, f"{tag}: pixels of width 1 that are more than one off", far, 0)

@@ -236,7 +236,8 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     packed = np.unpackbits(data["cam_mask"]).reshape(visible.shape).astype(bool)
     yield Row(name, "points that a camera sees", (visible ^ packed).mean(), 1e-4)
     shown = visible[:, ::317]
-    off = largest_difference(seen.uv[0, :, ::317, 0].numpy()[shown], data["cam_uv_sub"][shown])
+    places = 2 * seen.uv[0, :, ::317, 0].numpy() - 1
+    off = largest_difference(places[shown], data["cam_uv_sub"][shown])
     yield Row(name, "cam_uv_sub, where seen", off, 1e-3)
     any_seen = np.unpackbits(data["ipm_any"]).astype(bool)
     yield Row(name, "ipm_any", (visible.any(0) ^ any_seen).mean(), 1e-4)

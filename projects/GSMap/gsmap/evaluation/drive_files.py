@@ -28,6 +28,11 @@ def drive_frames(
 
     Tracks are those of the results (``track_id`` of a vector), if they have any.
 
+    Args:
+        results: Result file, in MapTR's JSON form.
+        annotations: Ground truth with poses, which has every scene's samples.
+        classes: Names of the classes, in the order of their indices.
+
     Raises:
         FileNotFoundError: If the result file does not exist.
         ValueError: If it is malformed, lacks a sample, or only some of its vectors have a track.

@@ -5,12 +5,10 @@ A curve of k pieces of degree d has ``k * d + 1`` control points: joint, inner p
 
 from collections.abc import Callable
 from functools import cache
+from math import comb
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
-from scipy.spatial import distance
-from scipy.special import comb
 
 from gsmap.structures.polylines import Points, resample
 
@@ -38,7 +36,8 @@ def bernstein(degree: int, num_points: int = SAMPLES) -> Float:
     if not 1 <= degree <= MAX_DEGREE:
         raise ValueError(f"the degree of a Bezier curve must be 1 to {MAX_DEGREE}, got {degree}.")
     t, k = np.linspace(0, 1, num_points)[:, None], np.arange(degree + 1)
-    return comb(degree, k) * t**k * (1 - t) ** (degree - k)
+    numbers: Float = np.array([comb(degree, each) for each in k.tolist()], np.float64)
+    return numbers * t**k * (1 - t) ** (degree - k)
 
 
 def curve_points(controls: Points, degree: int, num_points: int = SAMPLES) -> Float:
@@ -95,6 +94,8 @@ def mean_deviation(line: Float, curve: Float, ignored_m: float = 0.05) -> float:
         curve: Points of the curve. (m, D)
         ignored_m: Distances up to this count as 0.
     """
+    from scipy.spatial import distance  # reading a result file needs neither scipy nor shapely
+
     between = distance.cdist(resample(line, SAMPLES), curve)
     nearest = between.min(0), between.min(1)
     return float(np.mean([np.where(near <= ignored_m, 0, near).mean() for near in nearest]))
@@ -106,6 +107,8 @@ def largest_deviation(line: Float, curve: Float) -> float:
     Both directions count, in the plane: the given points of the curve, the vertices of the line,
     and 100 equidistant points of it.
     """
+    import shapely
+
     sides = np.concatenate([line, resample(line, SAMPLES)]), curve
     apart = [
         shapely.distance(shapely.points(points[:, :2]), shapely.linestrings(other[:, :2]))

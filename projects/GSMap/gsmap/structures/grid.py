@@ -140,3 +140,8 @@ def _affine(points: Array, scale: tuple[float, float], shift: tuple[float, float
 
     x, y = points[..., 0] * scale[0] + shift[0], points[..., 1] * scale[1] + shift[1]
     return torch.cat([torch.stack([x, y], -1), points[..., 2:]], -1)
+
+
+def padded_size(size: tuple[int, int], divisor: int) -> tuple[int, int]:
+    """Return height and width rounded up to multiples of ``divisor``."""
+    return -(-size[0] // divisor) * divisor, -(-size[1] // divisor) * divisor

@@ -10,6 +10,7 @@ from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
 
 from gsmap.datasets.annotations.record import MapInstance
+from gsmap.structures.grid import padded_size
 from gsmap.structures.polylines import resample
 
 _PV_SAMPLES = 200
@@ -145,8 +146,3 @@ def channel_of(instance: MapInstance, num_classes: int | None) -> int:
     if not 0 <= instance.label < num_classes:
         raise ValueError(f"label {instance.label} of an element, but num_classes={num_classes}.")
     return instance.label
-
-
-def padded_size(size: tuple[int, int], divisor: int) -> tuple[int, int]:
-    """Return height and width rounded up to multiples of ``divisor``."""
-    return -(-size[0] // divisor) * divisor, -(-size[1] // divisor) * divisor

@@ -14,7 +14,7 @@ from mmdet3d.registry import TRANSFORMS
 from pyarrow import feather
 
 from gsmap.datasets.errors import BrokenSampleError
-from gsmap.datasets.transforms.masks import padded_size
+from gsmap.structures.grid import padded_size
 
 # Argoverse 2's columns in the order of their use; the first five mean what nuScenes' values mean.
 FEATHER_COLUMNS = ("x", "y", "z", "intensity", "laser_number", "offset_ns")

@@ -27,8 +27,12 @@ def halved(feats: Tensor) -> Tensor:
     An even number of pixels has one more behind the last, an odd one also before the first, so that
     ``(n + 1) // 2`` remain. (B, C, h, w)
     """
-    odd_rows, odd_columns = (size % 2 for size in feats.shape[-2:])
-    return F.max_pool2d(F.pad(feats, (odd_columns, 1, odd_rows, 1)), 3, 2)
+    # not F.pad: ONNX Runtime (1.31) makes of it the border of a maximum, which is not zero but -inf
+    for axis in (2, 3):
+        line = torch.zeros_like(feats.narrow(axis, 0, 1))
+        before = [line] * (feats.shape[axis] % 2)
+        feats = torch.cat([*before, feats, line], axis)
+    return F.max_pool2d(feats, 3, 2)
 
 
 class FusionConv(nn.Module):

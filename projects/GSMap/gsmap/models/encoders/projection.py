@@ -74,9 +74,15 @@ def visible_points(projected: Tensor, img_shape: tuple[int, int]) -> PillarProje
 def pixel_rays(
     frame_from_img: Tensor, image_size: tuple[int, int], feature_size: tuple[int, int]
 ) -> Tensor:
-    """Return what every feature pixel looks along, of depth 1; arguments as of `frustum_points`.
+    """Return what every feature pixel looks along, of depth 1.
 
-    (..., h, w, 3)
+    Args:
+        frame_from_img: As of `frustum_points`. (..., 3 or 4, 3 or 4)
+        image_size: Height and width of the (padded) image in pixels.
+        feature_size: Height h and width w of the feature map.
+
+    Returns:
+        Vectors in metres, in the frame of the map. (..., h, w, 3)
     """
     device, dtype = frame_from_img.device, frame_from_img.dtype
     u = torch.linspace(0, image_size[1] - 1, feature_size[1], device=device, dtype=dtype)

@@ -50,9 +50,13 @@ def _triangles(a: Points, b: Points, c: Points) -> NDArray[np.float64]:
 def directed(line: Points, tolerance: float, sort_rings: bool = False) -> Points:
     """Let a line start at its rear end or, of ends at one height, at the one farther right.
 
-    Points are (u, v) from the front and from the left, all in one unit; ends whose heights differ
-    by at most ``tolerance`` lie at one height. ``sort_rings`` lets a ring start at its rearmost
-    vertex and run clockwise. (n, 2) -> (n, 2)
+    Args:
+        line: Points (u, v) from the front and from the left, all in one unit. (n, 2)
+        tolerance: Ends whose heights differ by at most that lie at one height.
+        sort_rings: Whether a ring starts at its rearmost vertex and runs clockwise.
+
+    Returns:
+        The points in their order. (n, 2)
     """
     if sort_rings and is_closed(line):
         ring = np.roll(line[:-1], -int(line[:-1, 0].argmax()), 0)

@@ -12,9 +12,8 @@ from mmdet3d.registry import TRANSFORMS
 from mmengine.structures import InstanceData
 from numpy.typing import NDArray
 
-from gsmap.datasets.transforms.masks import padded_size
 from gsmap.models.vectormapnet.canvas import Canvas, tokens_of
-from gsmap.structures.grid import BEVGrid
+from gsmap.structures.grid import BEVGrid, padded_size
 
 Floats = NDArray[np.float64]
 
