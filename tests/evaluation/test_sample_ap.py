@@ -77,7 +77,11 @@ def test_lines_are_drawn_with_their_numbers_and_later_ones_hide_earlier_ones():
     assert np.argwhere(mask == 1).tolist() == [[200, c] for c in range(80, 121)]
     assert (mask == 2).sum() == 0
     thick = draw_numbers(both.select(np.array([0])), 0, RULES["hdmapnet"])
-    assert (thick[200] == 0).nonzero()[0].tolist() == [98, 99, 100, 101, 102]
+    wanted = cv2.polylines(
+        np.zeros((400, 200), np.uint8), [np.array([[100, 66], [100, 333]])], 0, 1, 5
+    )
+    np.testing.assert_array_equal(thick == 0, wanted == 1)
+    assert set(np.nonzero(thick == 0)[1]) == {*range(97, 104)}  # what OpenCV makes of 5
 
 
 @pytest.mark.parametrize(("shift_px", "tens"), [(3, "ooo"), (4, "xoo"), (7, "xxo"), (10, "xxx")])
@@ -225,7 +229,8 @@ def test_figures_equal_a_plain_implementation(seed):
                 aps = [ap for sample in samples if (ap := plain(*sample)) is not None]
                 values.append(metrics[f"{name}/{CLASSES[label]}/AP@{threshold}"])
                 assert values[-1] == pytest.approx(np.mean(aps), abs=1e-12)
-    assert 0 < min(values) < max(values) < 1
+    assert 0 <= min(values) < max(values) < 1
+    assert len(set(values)) > 4
 
 
 @given(seed=st.integers(0, 2**32 - 1), rows=st.integers(1, 40), columns=st.integers(1, 40))
@@ -326,7 +331,7 @@ def test_command_writes_them_under_their_own_names_also_in_shards(tmp_path, caps
     assert written["bemapnet/divider/AP"] == written["hdmapnet/divider/AP"] == 7 / 8
     assert written["vectormapnet/divider/AP"] == 1 > written["chamfer/divider/AP"]
     assert "mAP_bemapnet_hard = 0.6" in capsys.readouterr().out
-    for part in ("1/2", "2/2"):
+    for part in ("0/2", "1/2"):
         command()([*words, "--out", str(parts), "--shard", part])
     merge([str(parts)])
     assert json.loads(parts.read_text()) == written
