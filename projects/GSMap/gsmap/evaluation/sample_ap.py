@@ -127,7 +127,7 @@ class _Pixels:
         indices: What the elements are called outside, by their numbers. (n,)
         rows: Rows of all pixels that belong to one. (M,)
         columns: Their columns. (M,)
-        owners: Numbers of their elements. (M,)
+        owners: Numbers of their elements, ascending. (M,)
     """
 
     mask: MaskArray
@@ -143,7 +143,8 @@ class _Pixels:
         indices, owners = np.unique(mask[rows, columns], return_inverse=True)
         numbered = np.full(mask.shape, -1, np.int32)
         numbered[rows, columns] = owners
-        return cls(numbered, indices.astype(np.int64), rows, columns, owners)
+        order = np.argsort(owners, kind="stable")
+        return cls(numbered, indices.astype(np.int64), rows[order], columns[order], owners[order])
 
     @property
     def count(self) -> int:
@@ -152,10 +153,11 @@ class _Pixels:
 
     def bounds(self, along: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the least and the largest of the rows, or of the columns, of each. 2 x (n,)"""
-        low, high = np.full(self.count, np.inf), np.full(self.count, -np.inf)
-        np.minimum.at(low, self.owners, along)
-        np.maximum.at(high, self.owners, along)
-        return low, high
+        starts = np.searchsorted(self.owners, np.arange(self.count))
+        values = along.astype(np.float64)
+        if not self.count:
+            return values, values
+        return np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
 
 
 @njit(cache=True)
