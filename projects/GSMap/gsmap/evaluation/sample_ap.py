@@ -32,6 +32,7 @@ PIXEL_M = 0.15
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
 _NO_PIXEL = 1e6  # distance in pixels where a column has none, beyond any canvas
 MaskArray = npt.NDArray[np.int32]
+GapArray = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ class _Pixels:
 
 
 @njit(cache=True)
-def _fill_gaps(gap: FloatArray, mask: MaskArray, number: int) -> None:
+def _fill_gaps(gap: GapArray, mask: MaskArray, number: int) -> None:
     """Write the distance in pixels to the nearest one of an element in the same column. (H, W)"""
     height, width = mask.shape
     gap[0] = _NO_PIXEL
@@ -175,7 +176,7 @@ def _fill_gaps(gap: FloatArray, mask: MaskArray, number: int) -> None:
 
 
 @njit(cache=True)
-def _nearest(gaps: FloatArray, column: int) -> float:
+def _nearest(gaps: GapArray, column: int) -> float:
     """Return the distance in pixels to the nearest one of an element, from gaps of a row. (W,)"""
     best, step = gaps[column] ** 2, 1
     while step * step < best and step < len(gaps):
