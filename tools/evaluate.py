@@ -26,7 +26,7 @@ from gsmap.evaluation.bootstrap import Resamples, ap_differences, ap_intervals, 
 from gsmap.evaluation.calibration import format_uncertainty, matched_vertices, uncertainty_report
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, HARD_CHAMFER_THRESHOLDS, ChamferConfig
 from gsmap.evaluation.distances import DISTANCE, cut_by_distance, distance_groups
-from gsmap.evaluation.evaluator import HARD_NAME, METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.evaluator import ALL_NAMES, METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.file_evaluation import (
     Evaluation,
     SamplePairs,
@@ -34,17 +34,12 @@ from gsmap.evaluation.file_evaluation import (
     match_samples,
     scenes_of,
 )
-from gsmap.evaluation.groups import (
-    Groups,
-    ap_by_group,
-    group_report,
-    group_table,
-    read_groups,
-)
+from gsmap.evaluation.groups import Groups, ap_by_group, group_report, group_table, read_groups
 from gsmap.evaluation.match_files import write_matches
 from gsmap.evaluation.prior import evaluate_prior
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import MetricReport, format_table, write_figures
+from gsmap.evaluation.sample_ap import METHODS
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, output_file, run_command
@@ -73,8 +68,9 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "--eval",
         nargs="+",
         default=list(METRIC_NAMES),
-        choices=(*METRIC_NAMES, HARD_NAME),
-        help="metrics; chamfer_hard: besides chamfer also at 0.2, 0.5 and 1.0 m, matched once",
+        choices=ALL_NAMES,
+        help="metrics; chamfer_hard: besides chamfer also at 0.2, 0.5 and 1.0 m, matched once; "
+        "vectormapnet, hdmapnet, bemapnet: of these methods' own evaluators, not comparable",
     )
     parser.add_argument(
         "--thresholds", nargs="+", type=float, help="of AP_chamfer, in metres (0.5 1.0 1.5)"
@@ -142,7 +138,9 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="PLD: distance of whole maps, in which the order of points and all scores count",
     )
     parser.add_argument(
-        "--min-score", type=float, default=0.4, help="of predictions that --topology counts"
+        "--min-score",
+        type=float,
+        help="of predictions that --topology counts (0.4), and hdmapnet and bemapnet (0: all)",
     )
     parser.add_argument(
         "--tracks",
@@ -193,6 +191,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         (args.tracks and not args.consistency, "--tracks needs --consistency"),
         (args.reliability and not args.uncertainty, "--reliability needs --uncertainty"),
         (args.against and args.prior, "--against compares two result files: leave out --prior"),
+        (
+            args.pr_curves and not {*args.eval} - {*METHODS},
+            "--pr-curves draws what counts predictions of all samples: name chamfer or raster",
+        ),
         (args.by == DISTANCE and args.prior, "--by distance cuts a result file: leave out --prior"),
         (args.by == DISTANCE and args.dim == 3, "--by distance is in the plane: leave out --dim 3"),
         (
@@ -223,20 +225,16 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
         raise ValueError(f"--polygon-classes: there is no class {name!r}{nearest(name, classes)}")
     if args.range:
         x_range, y_range = tuple(args.range[::2]), tuple(args.range[1::2])
-    chamfer = raster = None
-    hard = HARD_NAME in args.eval
-    if "chamfer" in args.eval or hard:
-        thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
-        chamfer = ChamferConfig(
-            classes,
-            tuple(thresholds or CHAMFER_THRESHOLDS),
-            resample_predictions=not args.keep_pred_points,
-            resample_ground_truth=not args.keep_gt_points,
-            dim=args.dim,
-        )
-    if "raster" in args.eval:
-        raster = RasterConfig(classes, BEVGrid(x_range, y_range), tuple(args.polygon_classes))
-    return MapEvaluator(chamfer, raster, args.gt_points, hard)
+    thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
+    chamfer = ChamferConfig(
+        classes,
+        tuple(thresholds or CHAMFER_THRESHOLDS),
+        resample_predictions=not args.keep_pred_points,
+        resample_ground_truth=not args.keep_gt_points,
+        dim=args.dim,
+    )
+    raster = RasterConfig(classes, BEVGrid(x_range, y_range), tuple(args.polygon_classes))
+    return MapEvaluator.named(args.eval, chamfer, raster, args.gt_points, args.min_score or 0.0)
 
 
 def report(outcome: Evaluation, args: argparse.Namespace) -> None:
@@ -260,7 +258,7 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         from gsmap.visualization.figure import save_figure  # matplotlib takes a second
         from gsmap.visualization.plots import plot_result
 
-        drawn = [found for found in reports if found.detections]
+        drawn = [found for found in reports if found.detections and not found.sample_aps]
         print(f"curves: {save_figure(plot_result(drawn), args.pr_curves)}")
 
 
@@ -271,7 +269,8 @@ def reports_of_pairs(args: argparse.Namespace, evaluator: MapEvaluator) -> list[
 
     classes = evaluator.classes
     areas = tuple(label for label, name in enumerate(classes) if name in args.polygon_classes)
-    config = TopologyConfig(classes, areas, args.min_score)
+    min_score = 0.4 if args.min_score is None else args.min_score
+    config = TopologyConfig(classes, areas, min_score)
     inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard, True
     found = {}
     if args.pld:

@@ -154,9 +154,10 @@ def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator
     own: dict[str, Any] = {"classes": meta.classes, "grid": BEVGrid(meta.x_range, meta.y_range)}
     own |= {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
     known = [{f.name for f in fields(c)} for c in (ChamferConfig, RasterConfig, MapEvaluator)]
+    known[-1] -= {"chamfer", "raster", "drawn"}  # rules of metrics are no settings
     unknown = own.keys() - set().union(*known)
     if unknown:
-        allowed = sorted(set().union(*known) - set(METRIC_NAMES))
+        allowed = sorted(set().union(*known))
         raise ValueError(f"no metric has the setting {sorted(unknown)}; there are {allowed}.")
     chamfer, raster, both = ({k: v for k, v in own.items() if k in part} for part in known)
     return MapEvaluator(ChamferConfig(**chamfer), RasterConfig(**raster), **both)

@@ -1,4 +1,4 @@
-"""Average precision from ranked hits: the area and the 101-point definitions, and calibration."""
+"""Average precision from ranked hits: the area, 101-point and 10-point definitions, calibration."""
 
 import numpy as np
 
@@ -37,6 +37,19 @@ def interpolated_ap(hits: BoolArray, num_gts: int) -> float:
     precision = found / (np.arange(1, len(found) + 1) + np.spacing(1.0))
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
     at = np.searchsorted(found / num_gts, _RECALL_POINTS, side="left")
+    return float(np.append(envelope, 0.0)[at].mean())
+
+
+def ten_point_ap(hits: BoolArray, num_gts: int) -> float:
+    """Return the mean of the precision envelope at the recalls 0.1, 0.2, ... 1.
+
+    ``hits`` (N,) are in the order in which predictions count; ``num_gts`` is > 0. (HDMapNet's
+    evaluator compares recalls in float32, in which 7 of 10 are less than 0.7; here they are equal.)
+    """
+    _, precision = precision_recall(hits, num_gts)
+    envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    needed = -(-np.arange(1, 11) * num_gts // 10)  # hits, rounded up
+    at = np.searchsorted(np.cumsum(hits), needed, side="left")
     return float(np.append(envelope, 0.0)[at].mean())
 
 

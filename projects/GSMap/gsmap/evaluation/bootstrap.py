@@ -164,14 +164,18 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
     if not report.detections:
         return {}
     scenes, drawn = resamples.draw(report.tokens)
-    by_area = report.by_distance
+    by_area, per_sample = report.by_distance, report.sample_aps
     of_class: dict[str, FloatArray] = {}
     figures: dict[str, FloatArray] = {}
     for name, found in report.detections.items():
-        gts = np.bincount(scenes, found.gts_of_sample, drawn.shape[1]).astype(np.float64)
-        aps = resampled_aps(found.hits, scenes[found.samples], drawn, gts, not by_area)
+        if per_sample:
+            aps = _mean_of_samples(per_sample[name], scenes, drawn)
+        else:
+            gts = np.bincount(scenes, found.gts_of_sample, drawn.shape[1]).astype(np.float64)
+            aps = resampled_aps(found.hits, scenes[found.samples], drawn, gts, not by_area)
         of_class[name] = aps
-        known = np.nan_to_num(aps) if by_area else aps  # as the metric takes an absent class
+        zeros = by_area and not per_sample  # as the metric takes an absent class
+        known = np.nan_to_num(aps) if zeros else aps
         for t, threshold in enumerate(found.thresholds):
             figures[f"{name}/AP@{threshold}"] = known[:, t]
         figures[f"{name}/AP"] = known.mean(axis=1)
@@ -184,6 +188,16 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
             figures[f"{prefix}AP"] = _mean([figures[f"{name}/AP"] for name in names])
     figures["mAP"] = _mean([figures[f"{name}/AP"] for name in report.detections])
     return {f"{report.name}/{key}": values for key, values in figures.items()}
+
+
+def _mean_of_samples(aps: FloatArray, scenes: IntArray, drawn: FloatArray) -> FloatArray:
+    """Return the mean AP of the samples in each resample: aps (S, T), scenes (S,) -> (B, T)"""
+    known = ~np.isnan(aps)
+    sums, counts = np.zeros((2, drawn.shape[1], aps.shape[1]))
+    np.add.at(sums, scenes, np.where(known, aps, 0.0))
+    np.add.at(counts, scenes, known)
+    with np.errstate(invalid="ignore"):  # 0 / 0: NaN, as none of the drawn samples counts
+        return np.asarray((drawn @ sums) / (drawn @ counts))
 
 
 def _mean(values: Sequence[FloatArray]) -> FloatArray:

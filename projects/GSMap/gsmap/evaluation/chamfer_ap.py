@@ -8,7 +8,7 @@ heights, distances are in space, as in MapTRv2's; lines are resampled and strips
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from gsmap.evaluation.matches import (
     checked_classes,
     ranked_predictions,
 )
-from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
+from gsmap.evaluation.report import MetricReport, distance_figures
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
 
@@ -181,18 +181,11 @@ def chamfer_report(
     """
     classes, thresholds = config.classes, tuple(thresholds or config.thresholds)
     detections = matches.detections(dict.fromkeys(classes, config.thresholds))
-    columns = [config.thresholds.index(threshold) for threshold in thresholds]
-    if thresholds != config.thresholds:
-        detections = {
-            of_class: replace(found, thresholds=thresholds, hits=found.hits[:, columns])
-            for of_class, found in detections.items()
-        }
+    detections = {of_class: found.at(thresholds) for of_class, found in detections.items()}
     metrics: dict[str, float] = {}
     for of_class, found in detections.items():
-        figures = class_figures(found, area_ap, absent=0.0)
-        for t, threshold in enumerate(thresholds):
-            errors = found.quality[found.hits[:, t]]
-            figures[f"error_m@{threshold}"] = float(errors.mean()) if len(errors) else UNDEFINED
+        aps = [area_ap(hits, found.num_gts) for hits in found.hits.T]
+        figures = distance_figures(found, aps)
         metrics |= {f"{of_class}/{key}": value for key, value in figures.items()}
     present = [of_class for of_class, found in detections.items() if found.num_gts]
     for threshold in thresholds:

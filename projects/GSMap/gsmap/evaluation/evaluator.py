@@ -1,10 +1,11 @@
-"""Both metrics over a stream of samples: match each sample once, keep only its matches."""
+"""All metrics over a stream of samples: match each sample once, keep only its matches."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 from gsmap.evaluation.chamfer_ap import (
+    CHAMFER_THRESHOLDS,
     HARD_CHAMFER_THRESHOLDS,
     ChamferConfig,
     chamfer_report,
@@ -13,12 +14,21 @@ from gsmap.evaluation.chamfer_ap import (
 from gsmap.evaluation.matches import FrameMatches, MatchTable
 from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
 from gsmap.evaluation.report import MetricReport, flat_metrics
+from gsmap.evaluation.sample_ap import (
+    METHODS,
+    SampleAPConfig,
+    match_sample_ap,
+    sample_ap_reports,
+)
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import resample_all
 
 METRIC_NAMES = ("chamfer", "raster")
 HARD_NAME = "chamfer_hard"
 """AP_chamfer at the hard thresholds besides, of the same matching."""
+TWO_SIDED_NAME = "vectormapnet"
+"""VectorMapNet's own: AP_chamfer without the samples that lack predictions or ground truth."""
+ALL_NAMES = (*METRIC_NAMES, HARD_NAME, TWO_SIDED_NAME, *METHODS)
 Sample = tuple[str, MapElements, MapElements]  # token, predictions, ground truth
 SampleMatches = dict[str, FrameMatches]  # by the name of the metric
 
@@ -36,22 +46,74 @@ class MapEvaluator:
         ground_truth_points: To how many points ground truth is first resampled, such as the 20 of
             the training targets; None keeps its full resolution.
         hard: Whether a second report has AP_chamfer at 0.2, 0.5 and 1.0 m.
+        two_sided: Whether another report, ``vectormapnet``, leaves out samples without predictions
+            or without ground truth; by the rules of AP_chamfer, at 0.5, 1.0 and 1.5 m.
+        drawn: Rules of AP per sample, a method each.
 
     Raises:
-        ValueError: If both are left out, or their classes differ.
+        ValueError: If all are left out, their classes differ, or AP_chamfer has other rules than
+            ``two_sided`` needs.
     """
 
     chamfer: ChamferConfig | None
     raster: RasterConfig | None
     ground_truth_points: int | None = None
     hard: bool = False
+    two_sided: bool = False
+    drawn: tuple[SampleAPConfig, ...] = ()
 
     def __post_init__(self) -> None:
-        classes = {config.classes for config in (self.chamfer, self.raster) if config}
+        classes = {config.classes for config in self._configs}
         if len(classes) != 1:
-            raise ValueError(f"name at least one of {METRIC_NAMES}, with the same classes.")
+            raise ValueError(f"name at least one of {ALL_NAMES}, with the same classes.")
+        if len({config.method for config in self.drawn}) != len(self.drawn):
+            raise ValueError("drawn must have one entry for a method.")
+        plain = self.chamfer and replace(self.chamfer, thresholds=CHAMFER_THRESHOLDS)
+        if self.two_sided and plain != ChamferConfig(next(iter(classes))):
+            raise ValueError(
+                f"{TWO_SIDED_NAME} is AP_chamfer of lines of 100 points in the plane: leave out "
+                "heights (dim 3) and points as they are given."
+            )
         if self.ground_truth_points is not None and self.ground_truth_points < 2:
             raise ValueError(f"ground_truth_points must be >= 2, got {self.ground_truth_points}.")
+
+    @classmethod
+    def named(
+        cls,
+        names: Collection[str],
+        chamfer: ChamferConfig,
+        raster: RasterConfig,
+        ground_truth_points: int | None = None,
+        min_score: float = 0.0,
+    ) -> "MapEvaluator":
+        """Return the evaluator of some metrics.
+
+        Args:
+            names: Of ``ALL_NAMES``. What is made of the matches of AP_chamfer comes besides it.
+            chamfer: Rules of AP_chamfer, if it is named.
+            raster: Rules of AP_raster, if it is named; its canvas is that of all masks.
+            ground_truth_points: As of the class.
+            min_score: Of ``SampleAPConfig``.
+
+        Raises:
+            ValueError: If there is no metric of a name, or as of the class.
+        """
+        if unknown := set(names) - set(ALL_NAMES):
+            raise ValueError(f"there is no metric {sorted(unknown)}; there are {ALL_NAMES}.")
+        beside = HARD_NAME in names, TWO_SIDED_NAME in names
+        methods = [method for method in METHODS if method in names]
+        return cls(
+            chamfer if "chamfer" in names or any(beside) else None,
+            raster if "raster" in names else None,
+            ground_truth_points,
+            *beside,
+            tuple(SampleAPConfig(raster.classes, m, raster.grid, min_score) for m in methods),
+        )
+
+    @property
+    def _configs(self) -> list[ChamferConfig | RasterConfig | SampleAPConfig]:
+        """The rules of all metrics."""
+        return [config for config in (self.chamfer, self.raster, *self.drawn) if config]
 
     @cached_property
     def _matches(self) -> list[SampleMatches]:
@@ -80,17 +142,17 @@ class MapEvaluator:
     @cached_property
     def _chamfer(self) -> ChamferConfig | None:
         """Rules of the matching by distance, at the thresholds of all reports."""
-        if self.chamfer is None or not self.hard:
-            return self.chamfer
-        thresholds = {*self.chamfer.thresholds, *HARD_CHAMFER_THRESHOLDS}
+        if self.chamfer is None:
+            return None
+        thresholds = {*self.chamfer.thresholds}
+        thresholds.update(HARD_CHAMFER_THRESHOLDS if self.hard else ())
+        thresholds.update(CHAMFER_THRESHOLDS if self.two_sided else ())
         return replace(self.chamfer, thresholds=tuple(thresholds))
 
     @property
     def classes(self) -> tuple[str, ...]:
         """Names of the classes."""
-        config = self.chamfer or self.raster
-        assert config is not None
-        return config.classes
+        return self._configs[0].classes
 
     @property
     def counts_heights(self) -> bool:
@@ -118,15 +180,23 @@ class MapEvaluator:
             found["chamfer"] = match_chamfer(predictions, ground_truth, self._chamfer, token)
         if self.raster:
             found["raster"] = match_raster(predictions, ground_truth, self.raster, token)
+        for config in self.drawn:
+            found[config.method] = match_sample_ap(predictions, ground_truth, config, token)
+        return found
+
+    @property
+    def _num_thresholds(self) -> dict[str, int]:
+        """At how many thresholds each metric matches."""
+        found = {config.method: len(METHODS[config.method].thresholds) for config in self.drawn}
+        if self._chamfer:
+            found["chamfer"] = len(self._chamfer.thresholds)
+        if self.raster:
+            found["raster"] = len(next(iter(self.raster.thresholds.values())))
         return found
 
     def require_fitting(self, found: SampleMatches) -> None:
         """Raise ValueError unless matches that come from elsewhere fit the rules."""
-        wanted = {}
-        if self._chamfer:
-            wanted["chamfer"] = len(self._chamfer.thresholds)
-        if self.raster:
-            wanted["raster"] = len(next(iter(self.raster.thresholds.values())))
+        wanted = self._num_thresholds
         for name in wanted.keys() | found.keys():
             shapes = (found[name].matched_gt.shape[1:], found[name].num_gts.shape)
             if shapes != ((wanted[name],), (len(self.classes),)):
@@ -142,19 +212,24 @@ class MapEvaluator:
         Raises:
             ValueError: If there is no sample.
         """
-        chamfer, raster, found = MatchTable(), MatchTable(), []
+        tables = {name: MatchTable() for name in self._num_thresholds}
+        two_sided, found = MatchTable(), []
         for sample in samples:
-            if self.chamfer:
-                chamfer.add(sample["chamfer"])
-            if self.raster:
-                raster.add(sample["raster"])
-        if not (len(chamfer) or len(raster)):
+            for name, table in tables.items():
+                table.add(sample[name])
+            if self.two_sided:
+                two_sided.add(sample["chamfer"].if_two_sided())
+        if not any(map(len, tables.values())):
             raise ValueError("there is no sample to score.")
         if self.chamfer and self._chamfer:
-            found.append(chamfer_report(chamfer, self._chamfer, self.chamfer.thresholds))
+            chamfer, rules = tables["chamfer"], self._chamfer
+            found.append(chamfer_report(chamfer, rules, self.chamfer.thresholds))
             if self.hard:
-                hard = HARD_CHAMFER_THRESHOLDS
-                found.append(chamfer_report(chamfer, self._chamfer, hard, HARD_NAME))
+                found.append(chamfer_report(chamfer, rules, HARD_CHAMFER_THRESHOLDS, HARD_NAME))
+            if self.two_sided:
+                found.append(chamfer_report(two_sided, rules, CHAMFER_THRESHOLDS, TWO_SIDED_NAME))
         if self.raster:
-            found.append(raster_report(raster, self.raster))
+            found.append(raster_report(tables["raster"], self.raster))
+        for config in self.drawn:
+            found += sample_ap_reports(tables[config.method], config)
         return found

@@ -12,7 +12,7 @@ from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_truth
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.evaluator import HARD_NAME, METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.evaluator import ALL_NAMES, METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import flat_metrics, format_table
 from gsmap.evaluation.results_json import vectors_of, write_results
@@ -30,8 +30,9 @@ class MapMetric(BaseMetric):
     (``classes``, ``x_range``, ``y_range``, ``dim``).
 
     Args:
-        eval: Metrics to compute: ``chamfer``, ``raster``, and besides ``chamfer`` also
-            ``chamfer_hard``; may be empty if only ``out_file`` is wanted.
+        eval: Metrics to compute: ``chamfer``, ``raster``, besides ``chamfer`` also
+            ``chamfer_hard`` and ``vectormapnet``, ``hdmapnet`` and ``bemapnet``; may be empty if
+            only ``out_file`` is wanted.
         thresholds: Thresholds of AP_chamfer in metres.
         out_file: Where to write the predictions in MapTR's JSON form, or None.
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
@@ -50,9 +51,8 @@ class MapMetric(BaseMetric):
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
-        names = (*METRIC_NAMES, HARD_NAME)
-        if set(eval) - set(names) or (not eval and out_file is None):
-            raise ValueError(f"eval must name metrics of {names}, got {list(eval)}.")
+        if set(eval) - set(ALL_NAMES) or (not eval and out_file is None):
+            raise ValueError(f"eval must name metrics of {ALL_NAMES}, got {list(eval)}.")
         self.eval = tuple(eval)
         self.thresholds = tuple(thresholds)
         self.out_file = out_file
@@ -69,15 +69,9 @@ class MapMetric(BaseMetric):
         if not self.eval:
             return None
         classes = tuple(self._meta("classes"))
-        chamfer = raster = None
-        hard = HARD_NAME in self.eval
-        if "chamfer" in self.eval or hard:
-            dim = self.dataset_meta.get("dim", 2)
-            chamfer = ChamferConfig(classes, self.thresholds, dim=dim)
-        if "raster" in self.eval:
-            grid = BEVGrid(self._meta("x_range"), self._meta("y_range"))
-            raster = RasterConfig(classes, grid)
-        return MapEvaluator(chamfer, raster, hard=hard)
+        grid = BEVGrid(self._meta("x_range"), self._meta("y_range"))
+        chamfer = ChamferConfig(classes, self.thresholds, dim=self.dataset_meta.get("dim", 2))
+        return MapEvaluator.named(self.eval, chamfer, RasterConfig(classes, grid))
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
         """Match one batch and keep its matches.

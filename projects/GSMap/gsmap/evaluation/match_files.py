@@ -12,6 +12,7 @@ from gsmap.evaluation.evaluator import MapEvaluator, SampleMatches
 from gsmap.evaluation.matches import FrameMatches
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import MetricReport
+from gsmap.evaluation.sample_ap import SampleAPConfig
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import DAMAGED_ZIP, atomic_write
 from gsmap.utils.shards import Shard, ShardFile
@@ -113,20 +114,21 @@ def _records(arrays: dict[str, Any], metric: str) -> Iterator[FrameMatches]:
 def _evaluator(options: dict[str, Any]) -> MapEvaluator:
     """Make the evaluator whose rules a manifest tells."""
 
-    def rules(kind: Any, name: str, **changes: Any) -> Any:
-        values = options[name]
+    def rules(kind: Any, values: Any) -> Any:
         if values is None:
             return None
         lists = {key: tuple(v) for key, v in values.items() if isinstance(v, list)}
         for key in {"classes", "polygon_classes"} & values.keys():
             if not all(isinstance(name, str) for name in lists[key]):
                 raise TypeError(f"{key} must be names")
-        return kind(**(values | lists | changes))
+        canvas = {"grid": BEVGrid(**values["grid"])} if "grid" in values else {}
+        return kind(**(values | lists | canvas))
 
-    grid = options["raster"] and BEVGrid(**options["raster"]["grid"])
     return MapEvaluator(
-        rules(ChamferConfig, "chamfer"),
-        rules(RasterConfig, "raster", **({"grid": grid} if grid else {})),
+        rules(ChamferConfig, options["chamfer"]),
+        rules(RasterConfig, options["raster"]),
         options["ground_truth_points"],
         options["hard"],
+        options["two_sided"],
+        tuple(rules(SampleAPConfig, values) for values in options["drawn"]),
     )

@@ -2,7 +2,7 @@
 
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -49,6 +49,21 @@ class FrameMatches:
     num_gts: IntArray
     class_iou: FloatArray | None = None
 
+    def if_two_sided(self) -> "FrameMatches":
+        """Return this, or the matches of an empty sample if it lacks either side."""
+        if len(self.labels) and self.num_gts.any():
+            return self
+        none = slice(0, 0)
+        return FrameMatches(
+            self.token,
+            self.pred_index[none],
+            self.labels[none],
+            self.scores[none],
+            self.matched_gt[none],
+            self.quality[none],
+            np.zeros_like(self.num_gts),
+        )
+
 
 @dataclass(frozen=True)
 class ClassDetections:
@@ -73,6 +88,11 @@ class ClassDetections:
     num_gts: int
     samples: IntArray
     gts_of_sample: IntArray
+
+    def at(self, thresholds: Sequence[float]) -> "ClassDetections":
+        """Return the same predictions at some of the thresholds."""
+        columns = [list(self.thresholds).index(threshold) for threshold in thresholds]
+        return replace(self, thresholds=tuple(thresholds), hits=self.hits[:, columns])
 
 
 def checked_classes(classes: Iterable[str]) -> tuple[str, ...]:

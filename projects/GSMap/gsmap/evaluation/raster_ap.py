@@ -162,7 +162,8 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
     detections = matches.detections(config.thresholds)
     figures: dict[str, dict[str, float]] = {}
     for c, (name, found) in enumerate(detections.items()):
-        figures[name] = of_class = class_figures(found, interpolated_ap, absent=UNDEFINED)
+        aps = [interpolated_ap(hits, found.num_gts) for hits in found.hits.T]
+        figures[name] = of_class = class_figures(found, aps, absent=UNDEFINED)
         for limit in RECALL_LIMITS:
             hits = found.hits[found.ranks < limit].sum(axis=0)
             of_class[f"AR@{limit}"] = _mean(hits / found.num_gts if found.num_gts else ())

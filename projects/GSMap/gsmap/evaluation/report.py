@@ -1,15 +1,15 @@
 """The outcome of a metric: flat figures, the ranked predictions, and one table to read."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from gsmap.evaluation.average_precision import calibration_error
 from gsmap.evaluation.matches import ClassDetections
-from gsmap.structures.elements import BoolArray
+from gsmap.structures.elements import FloatArray
 from gsmap.utils.files import write_text
 
 UNDEFINED = -1.0  # as in COCO: the figure does not exist (a class without ground truth, no match)
@@ -20,12 +20,14 @@ class MetricReport:
     """Everything that one metric says about a result.
 
     Args:
-        name: ``chamfer`` or ``raster``.
+        name: Of the metric, such as ``chamfer`` or ``raster``.
         groups: Classes that share their thresholds and a mean, by the name of the group.
         metrics: Figures by flat keys such as ``chamfer/divider/AP@0.5``; -1 marks a figure that
             does not exist. The keys are listed in docs/evaluation.md.
         detections: The ranked predictions of each class, from which curves are drawn.
         tokens: The samples, sorted.
+        sample_aps: Of a metric that is the mean over samples: the AP of each class in each sample,
+            NaN where it does not count. C x (S, T)
     """
 
     name: str
@@ -33,6 +35,7 @@ class MetricReport:
     metrics: Mapping[str, float]
     detections: Mapping[str, ClassDetections]
     tokens: Sequence[str] = ()
+    sample_aps: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
     def by_distance(self) -> bool:
@@ -50,25 +53,32 @@ def write_figures(path: Path, reports: Iterable[MetricReport]) -> None:
     write_text(path, json.dumps(flat_metrics(reports), indent=1) + "\n")
 
 
-def class_figures(
-    found: ClassDetections, average_precision: Callable[[BoolArray, int], float], absent: float
-) -> dict[str, float]:
-    """Return the figures of one class that both metrics have, by the last part of their key.
+def class_figures(found: ClassDetections, aps: Sequence[float], absent: float) -> dict[str, float]:
+    """Return the figures of one class that all metrics have, by the last part of their key.
 
     Args:
         found: Detections of the class.
-        average_precision: Takes hits (N,) and the number of ground truths.
+        aps: Its AP at each threshold. (T,)
         absent: Recall of a class without ground truth.
     """
     figures: dict[str, float] = {}
-    for threshold, hits in zip(found.thresholds, found.hits.T, strict=True):
-        figures[f"AP@{threshold}"] = average_precision(hits, found.num_gts)
+    for threshold, hits, ap in zip(found.thresholds, found.hits.T, aps, strict=True):
+        figures[f"AP@{threshold}"] = ap
         figures[f"recall@{threshold}"] = hits.sum() / found.num_gts if found.num_gts else absent
         figures[f"tp@{threshold}"] = float(hits.sum())
         figures[f"calibration_error@{threshold}"] = calibration_error(found.scores, hits)
     figures["AP"] = float(np.mean([figures[f"AP@{threshold}"] for threshold in found.thresholds]))
     figures["num_gts"] = float(found.num_gts)
     figures["num_preds"] = float(len(found.scores))
+    return figures
+
+
+def distance_figures(found: ClassDetections, aps: Sequence[float]) -> dict[str, float]:
+    """Return ``class_figures`` of a metric by distance, and the mean distance of matches."""
+    figures = class_figures(found, aps, absent=0.0)
+    for t, threshold in enumerate(found.thresholds):
+        errors = found.quality[found.hits[:, t]]
+        figures[f"error_m@{threshold}"] = float(errors.mean()) if len(errors) else UNDEFINED
     return figures
 
 
