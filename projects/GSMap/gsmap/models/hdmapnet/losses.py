@@ -1,6 +1,6 @@
 """HDMapNet's losses: of classes, of instance embeddings, and of directions."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -32,9 +32,9 @@ class LineMapLosses:
     push_margin: float = 3.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if getattr(self, field.name) < 0:
-                raise ValueError(f"losses.{field.name} must not be negative.")
+        for name, value in vars(self).items():
+            if value < 0:
+                raise ValueError(f"losses.{name} must not be negative.")
 
     def __call__(self, maps: LineMaps, numbers: Tensor, directions: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses.

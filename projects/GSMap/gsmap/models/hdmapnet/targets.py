@@ -50,9 +50,10 @@ class MakeLineMaps(BaseTransform):
     forward: str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("num_classes", "pixel_m", "thickness_px", "gap_px", "step_m"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be more than 0, got {getattr(self, name)}.")
+        sizes = ("num_classes", "pixel_m", "thickness_px", "gap_px", "step_m")
+        for name, value in vars(self).items():
+            if name in sizes and value <= 0:
+                raise ValueError(f"{name} must be more than 0, got {value}.")
         if self.num_directions < 1 or 360 % self.num_directions:
             raise ValueError(f"num_directions must divide 360, got {self.num_directions}.")
 

@@ -43,9 +43,10 @@ class VectorizeConfig:
     degrees: int = 10
 
     def __post_init__(self) -> None:
-        for name in ("eps", "min_neighbours", "step_px", "jump_px", "degrees"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name} must be more than 0, got {getattr(self, name)}.")
+        sizes = ("eps", "min_neighbours", "step_px", "jump_px", "degrees")
+        for name, value in vars(self).items():
+            if name in sizes and value <= 0:
+                raise ValueError(f"{name} must be more than 0, got {value}.")
 
 
 class TracedLine(NamedTuple):
