@@ -288,9 +288,13 @@ def graph_inputs(
 def largest_differences(found: MapElements, expected: MapElements) -> tuple[float, float]:
     """Compare two predictions of one sample; elements of nearly one score may change places.
 
+    So may points of an element: where two orders are nearly as short, rounding decides which one
+    `unfold_classes` takes.
+
     Returns:
-        The largest difference of a score, and of a coordinate in metres between an element and the
-        nearest one of its class; infinite if there are not as many elements of each class.
+        The largest difference of a score, and of a coordinate in metres between the points of an
+        element and the nearest points of the nearest one of its class; infinite if there are not as
+        many elements of each class.
     """
     if sorted(found.labels) != sorted(expected.labels):
         return float("inf"), float("inf")
@@ -301,7 +305,8 @@ def largest_differences(found: MapElements, expected: MapElements) -> tuple[floa
     for i, ours in enumerate(found.polylines):
         for j, theirs in enumerate(expected.polylines):
             if found.labels[i] == expected.labels[j] and ours.shape == theirs.shape:
-                apart[i, j] = np.abs(ours - theirs).max()
+                between = np.abs(ours[:, None] - theirs).max(-1)
+                apart[i, j] = max(between.min(0).max(), between.min(1).max())
     return float(scores), float(apart.min(1).max())
 
 
