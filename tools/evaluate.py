@@ -192,6 +192,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         (args.reliability and not args.uncertainty, "--reliability needs --uncertainty"),
         (args.against and args.prior, "--against compares two result files: leave out --prior"),
         (
+            args.min_score is not None and not (args.topology or {*args.eval} & {*METHODS}),
+            "--min-score is of --topology, hdmapnet and bemapnet: leave it out",
+        ),
+        (
             args.pr_curves and not {*args.eval} - {*METHODS},
             "--pr-curves draws what counts predictions of all samples: name chamfer or raster",
         ),
@@ -274,7 +278,8 @@ def reports_of_pairs(args: argparse.Namespace, evaluator: MapEvaluator) -> list[
     inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard, True
     found = {}
     if args.pld:
-        rules = evaluator.chamfer or ChamferConfig(classes)
+        thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
+        rules = ChamferConfig(classes, tuple(thresholds or CHAMFER_THRESHOLDS))
         found["pld"] = pld_figures(SamplePairs(*inputs), rules)
     if args.topology:
         found["topology"] = topology_figures(SamplePairs(*inputs), config)

@@ -5,6 +5,7 @@ box 1.5 m high stands between y = 1 and 3, from x = 4.5 to 5.5: it hides what li
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,8 @@ def test_a_box_hides_what_lies_behind_it(tmp_path):
     assert len(boxes.halves_m) == 1
     assert hidden_share(sample(camera(0)), boxes) == pytest.approx(4 / 11)  # y = 2, 3, 4, 5
     assert hidden_share(sample(camera(0), x=4.0), boxes) == 0  # before the box
+    with pytest.raises(ValueError, match="sample 's' has no ground truth"):
+        hidden_share(replace(sample(camera(0)), instances=None), boxes)
     low = read_boxes(tables(tmp_path, height_m=0.5), ["s"])["s"]
     assert hidden_share(sample(camera(0)), low) == 0  # one looks over it
 
@@ -81,7 +84,7 @@ def test_a_sample_without_boxes_or_map_has_nothing_hidden(tmp_path):
     found = read_boxes(tables(tmp_path), ["s", "empty"])
     assert hidden_share(sample(camera(0)), found["empty"]) == 0
     nothing = sample(camera(0))
-    nothing.instances = None
+    nothing.instances = []
     assert hidden_share(nothing, found["s"]) == 0
 
 

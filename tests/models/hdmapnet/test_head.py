@@ -208,6 +208,10 @@ def test_the_border_of_a_map_counts_as_outside():
         (lambda: encoder().from_above(torch.zeros(1, 3, 1, 2, 4)), "built for 2 cameras"),
         (lambda: head().target(Det3DDataSample(), "gt_lines"), "put MakeLineMaps into"),
         (lambda: head(pixel_m=0.6).target(sample([]), "gt_lines"), "the head's maps are"),
+        (
+            lambda: head().target(sample(LINES, num_directions=72), "gt_directions"),
+            "direction 37 of 36",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(build, message):

@@ -46,6 +46,13 @@ def test_a_line_does_not_depend_on_the_others():
         assert torch.equal(alone[0], tokens[i])
 
 
+def test_a_line_may_have_as_many_points_as_there_are_positions():
+    built = generator(top_p=0.0, num_positions=4, max_points=4)
+    tokens = built.generate(feats(), ELEMENTS, lambda laws: laws[..., 1:].argmax(-1) + 1)
+    assert tokens.shape == (3, 9)
+    assert (tokens[:, :8] > 0).all()
+
+
 def test_greedy_lines_are_the_same_whether_earlier_tokens_are_drawn_again():
     once, again = (
         generator(top_p=0.0, redraw=redraw).generate(feats(), ELEMENTS, greedy)

@@ -92,6 +92,9 @@ def test_what_does_not_fit_is_refused():
 
 
 def test_projections_are_stretched_over_the_padding():
-    results = {"img_shape": (256, 455), "lidar2img": [np.eye(4)]}
-    found = StretchToPadding().transform(results)["lidar2img"][0]
-    np.testing.assert_allclose(np.diag(found), [480 / 455, 1, 1, 1])
+    half = np.diag([0.5, 0.5, 1, 1])
+    results = {"img_shape": (256, 455), "lidar2img": [np.eye(4)], "img_aug_matrix": [half]}
+    found = StretchToPadding().transform(results)
+    np.testing.assert_allclose(np.diag(found["lidar2img"][0]), [480 / 455, 1, 1, 1])
+    back = np.linalg.inv(found["img_aug_matrix"][0]) @ found["lidar2img"][0]
+    np.testing.assert_allclose(back, np.diag([2, 2, 1, 1]))  # pictures show the file, as before

@@ -267,7 +267,7 @@ class OnnxInferencer:
         lines = np.isin(kept["labels"], self.metadata.get("unfold_classes", []))
         if lines.any():
             orders = shortest_orders(kept["points"][lines])
-            for name in kept.keys() - {"scores", "labels"}:
+            for name in kept.keys() - {"scores", "labels", "num_pts"}:
                 kept[name][lines] = kept[name][lines][np.arange(len(orders))[:, None], orders]
         points, numbers = kept.pop("points"), kept.pop("num_pts", None)
         if numbers is None:

@@ -82,11 +82,16 @@ def cuts_sight(origin: Array, points: Array, boxes: Boxes) -> NDArray[np.bool_]:
 
 
 def _map_points(sample: MapSample) -> Array:
-    """Return the points of a sample's map, every metre, on the ground if it is flat. (n, 3)"""
+    """Return the points of a sample's map, every metre, on the ground if it is flat. (n, 3)
+
+    ValueError if it has no ground truth.
+    """
+    if sample.instances is None:
+        raise ValueError(f"sample {sample.token!r} has no ground truth, of which parts could hide.")
     height_m = 0.0 if sample.ego_from_frame is None else sample.ego_from_frame[2, 3]
     lines = [
         resample(i.points, max(math.ceil(arc_lengths(i.points)[-1] / _STEP_M), 1) + 1)
-        for i in sample.instances or ()
+        for i in sample.instances
     ]
     flat = [np.column_stack([line, np.full(len(line), -height_m)])[:, :3] for line in lines]
     return np.concatenate([np.empty((0, 3)), *flat])

@@ -68,7 +68,7 @@ class HDMapNetHead(DetectionHead):
         self.grid, self.classes = grid.rasterized(pixel_m), tuple(classes)
         self.map_size, self.random_start = ahead_size(self.grid), random_start
         self.losses = LineMapLosses(**(losses or {}))
-        degrees = 360 // num_directions
+        self.num_directions, degrees = num_directions, 360 // num_directions
         self.vectorizing = VectorizeConfig(**{"degrees": degrees, **(vectorizing or {})})
         sizes = embed_dims, len(classes), embedding_dims, num_directions
         self.decoder = LineMapDecoder(*sizes, **(decoder or {}))
@@ -87,7 +87,7 @@ class HDMapNetHead(DetectionHead):
             torch.stack([self.target(sample, name) for sample in batch_data_samples])
             for name in TARGETS
         )
-        with torch.autocast(numbers.device.type, enabled=False):
+        with torch.autocast(maps.semantic.device.type, enabled=False):
             return self.losses(maps, *(t.to(maps.semantic.device) for t in (numbers, directions)))
 
     def target(self, sample: Det3DDataSample, name: str) -> Tensor:
@@ -102,7 +102,12 @@ class HDMapNetHead(DetectionHead):
         if tuple(target.shape) != wanted:
             raise ValueError(
                 f"{name} is {tuple(target.shape)}, the head's maps are {wanted}: give MakeLineMaps "
-                "the head's pixel_m and number of classes."
+                "the head's pixel_m and number of classes, and the grid's forward."
+            )
+        if name == "gt_directions" and target.max() > self.num_directions:
+            raise ValueError(
+                f"gt_directions has direction {int(target.max())} of {self.num_directions}: give "
+                "MakeLineMaps the head's num_directions."
             )
         return target
 

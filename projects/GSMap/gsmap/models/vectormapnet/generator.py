@@ -217,7 +217,7 @@ class PolylineGenerator(BaseModule):
             drawn = draw(laws)
             tokens[alive, step] = drawn[:, -1]
             going = drawn[:, -1] > 0
-            if not going.any():
+            if not going.any() or step == number - 1:
                 break
             alive, laws, drawn, start = (p[going] for p in (alive, laws, drawn, start))
             kept = [(own[0][going], own[1][going]) for own in kept if own is not None]

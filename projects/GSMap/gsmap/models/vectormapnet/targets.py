@@ -142,9 +142,10 @@ class StretchToPadding(BaseTransform):
     pad_size_divisor: int = 32
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Scale ``lidar2img``."""
+        """Scale ``lidar2img``, and ``img_aug_matrix`` with it, which leads back to the file."""
         height, width = results["img_shape"]
         padded = padded_size((height, width), self.pad_size_divisor)
         stretch = np.diag([padded[1] / width, padded[0] / height, 1.0, 1.0])
-        results["lidar2img"] = [stretch @ matrix for matrix in results["lidar2img"]]
+        for key in results.keys() & {"lidar2img", "img_aug_matrix"}:
+            results[key] = [stretch @ matrix for matrix in results[key]]
         return results
