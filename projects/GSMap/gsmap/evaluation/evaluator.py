@@ -82,7 +82,7 @@ class MapEvaluator:
         cls,
         names: Collection[str],
         chamfer: ChamferConfig,
-        raster: RasterConfig,
+        raster: RasterConfig | None,
         ground_truth_points: int | None = None,
         min_score: float = 0.0,
     ) -> "MapEvaluator":
@@ -91,7 +91,8 @@ class MapEvaluator:
         Args:
             names: Of ``ALL_NAMES``. What is made of the matches of AP_chamfer comes besides it.
             chamfer: Rules of AP_chamfer, if it is named.
-            raster: Rules of AP_raster, if it is named; its canvas is that of all masks.
+            raster: Rules of AP_raster, if it is named; its canvas is that of all masks. None is
+                enough for metrics without masks.
             ground_truth_points: As of the class.
             min_score: Of ``SampleAPConfig``.
 
@@ -102,12 +103,19 @@ class MapEvaluator:
             raise ValueError(f"there is no metric {sorted(unknown)}; there are {ALL_NAMES}.")
         beside = HARD_NAME in names, TWO_SIDED_NAME in names
         methods = [method for method in METHODS if method in names]
+        if raster is None and (methods or "raster" in names):
+            raise ValueError("metrics of masks need the rules of AP_raster.")
+        drawn = [
+            SampleAPConfig(raster.classes, method, raster.grid, min_score)
+            for method in methods
+            if raster
+        ]
         return cls(
             chamfer if "chamfer" in names or any(beside) else None,
             raster if "raster" in names else None,
             ground_truth_points,
             *beside,
-            tuple(SampleAPConfig(raster.classes, m, raster.grid, min_score) for m in methods),
+            tuple(drawn),
         )
 
     @property

@@ -16,6 +16,7 @@ from gsmap.evaluation.evaluator import ALL_NAMES, METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import flat_metrics, format_table
 from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.evaluation.sample_ap import METHODS
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
 
@@ -69,9 +70,12 @@ class MapMetric(BaseMetric):
         if not self.eval:
             return None
         classes = tuple(self._meta("classes"))
-        grid = BEVGrid(self._meta("x_range"), self._meta("y_range"))
         chamfer = ChamferConfig(classes, self.thresholds, dim=self.dataset_meta.get("dim", 2))
-        return MapEvaluator.named(self.eval, chamfer, RasterConfig(classes, grid))
+        raster = None
+        if {"raster", *METHODS} & set(self.eval):
+            grid = BEVGrid(self._meta("x_range"), self._meta("y_range"))
+            raster = RasterConfig(classes, grid)
+        return MapEvaluator.named(self.eval, chamfer, raster)
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
         """Match one batch and keep its matches.
