@@ -35,7 +35,8 @@ def compare(inferencer, dataset, exported, indices=(0, 1)):
     for sample, (_, inputs) in zip(in_torch, graph_inputs(exported, dataset, indices), strict=True):
         expected = elements_of_predictions(sample.pred_instances_3d)
         found = exported.elements(exported.run(inputs))
-        differences.append(largest_differences(found, expected))
+        unfolded = exported.metadata.get("unfold_classes", [])
+        differences.append(largest_differences(found, expected, unfolded))
     return np.max(differences, 0), found, expected
 
 

@@ -139,7 +139,8 @@ def check(inferencer: MapInferencer, exported: OnnxInferencer, args: argparse.Na
     for expected, (token, inputs) in zip(in_torch, samples, strict=True):
         found = exported.elements(exported.run(inputs))
         truth = elements_of_predictions(expected.pred_instances_3d)
-        differences.append(largest_differences(found, truth))
+        unfolded = exported.metadata.get("unfold_classes", [])
+        differences.append(largest_differences(found, truth, unfolded))
         predictions.append((token, found))
     if args.results:
         exported.write(args.results, predictions)

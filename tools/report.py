@@ -35,12 +35,16 @@ def parse_args() -> argparse.Namespace:
         "--data-root", type=Path, help="root of the image paths; default: folder of --ann"
     )
     parser.add_argument("--max-frames", type=int, default=200, help="largest number of frames")
-    parser.add_argument("--score-thr", type=float, default=0.4, help="initial score of the slider")
+    parser.add_argument(
+        "--score-thr",
+        type=float,
+        default=0.4,
+        help="initial score of the slider; of a film, the least score",
+    )
     parser.add_argument(
         "--image-width",
         type=int,
-        default=320,
-        help="largest width of images in pixels; of the camera ahead twice that",
+        help="largest width of a page's images in pixels (320); of the camera ahead twice that",
     )
     parser.add_argument("--no-images", action="store_true", help="leave the camera images out")
     parser.add_argument(
@@ -56,8 +60,8 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--scene", help="drive of a film; default: the first one of --ann")
     args = parser.parse_args()
     film = args.out.suffix.lower() == ".mp4"
-    if film and (args.by or args.allow_mismatch):
-        parser.error("--by and --allow-mismatch are of pages: leave them out for a film")
+    if film and (args.by or args.allow_mismatch or args.image_width is not None):
+        parser.error("--by, --allow-mismatch and --image-width are of pages: leave them out")
     if args.scene and not film:
         parser.error("--scene is of films: give --out NAME.mp4; a page has a field for the scene")
     return args
@@ -74,7 +78,7 @@ def main() -> str:
         args.data_root,
         args.max_frames,
         args.score_thr,
-        0 if args.no_images else args.image_width,
+        0 if args.no_images else 320 if args.image_width is None else args.image_width,
         args.allow_mismatch,
         args.by,
     )

@@ -361,6 +361,12 @@ def test_differences_are_of_the_nearest_element_of_a_class():
     b = elements([5.25, 0, 9], [0, 0, 1], [0.5, 0.5, 0.375])
     assert largest_differences(a, b) == pytest.approx((0.025, 0.25))
     assert largest_differences(a, elements([0], [0], [0.5])) == (np.inf, np.inf)
+    turned = MapElements.from_polylines(
+        [line[::-1] for line in a.polylines], a.labels, a.confidence
+    )
+    assert largest_differences(a, turned) == (0, 1)
+    assert largest_differences(a, turned, unfolded=[0]) == (0, 1)  # that of class 1
+    assert largest_differences(a, turned, unfolded=[0, 1]) == (0, 0)
 
 
 def test_a_file_without_memory_takes_no_stream(small):

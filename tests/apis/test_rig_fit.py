@@ -114,6 +114,16 @@ def test_a_start_is_fitted_to_cameras_cells_and_classes():
     ]
 
 
+def test_classes_of_a_head_of_another_form_are_said_to_stay():
+    model = another_rig()
+    state = {key: v for key, v in model.state_dict().items() if ".cls_branches." not in key}
+    origin = METAINFO | {"classes": ("kerb", "divider", "boundary"), "cameras": Drive.cameras}
+    (line,) = fit_start(state, model, Drive(), origin)
+    assert line.startswith(
+        "classes were kerb, divider, boundary, are boundary, divider, kerb: this"
+    )
+
+
 def test_a_start_that_fits_stays_as_it_is():
     model = another_rig()
     state = dict(model.state_dict())

@@ -285,16 +285,20 @@ def graph_inputs(
             inferencer.remember(streams, meta, inferencer.run(inputs))
 
 
-def largest_differences(found: MapElements, expected: MapElements) -> tuple[float, float]:
+def largest_differences(
+    found: MapElements, expected: MapElements, unfolded: Sequence[int] = ()
+) -> tuple[float, float]:
     """Compare two predictions of one sample; elements of nearly one score may change places.
 
-    So may points of an element: where two orders are nearly as short, rounding decides which one
-    `unfold_classes` takes.
+    Args:
+        found: Elements of one way.
+        expected: Elements of the other.
+        unfolded: Class indices whose points may change places, too: where two orders are nearly as
+            short, rounding decides which one ``unfold_classes`` takes.
 
     Returns:
-        The largest difference of a score, and of a coordinate in metres between the points of an
-        element and the nearest points of the nearest one of its class; infinite if there are not as
-        many elements of each class.
+        The largest difference of a score, and of a coordinate in metres between an element and the
+        nearest one of its class; infinite if there are not as many elements of each class.
     """
     if sorted(found.labels) != sorted(expected.labels):
         return float("inf"), float("inf")
@@ -305,8 +309,10 @@ def largest_differences(found: MapElements, expected: MapElements) -> tuple[floa
     for i, ours in enumerate(found.polylines):
         for j, theirs in enumerate(expected.polylines):
             if found.labels[i] == expected.labels[j] and ours.shape == theirs.shape:
-                between = np.abs(ours[:, None] - theirs).max(-1)
-                apart[i, j] = max(between.min(0).max(), between.min(1).max())
+                apart[i, j] = np.abs(ours - theirs).max()
+                if found.labels[i] in unfolded:
+                    between = np.abs(ours[:, None] - theirs).max(-1)
+                    apart[i, j] = max(between.min(0).max(), between.min(1).max())
     return float(scores), float(apart.min(1).max())
 
 

@@ -177,15 +177,21 @@ def _fit_classes(
     if trained is None or list(trained) == list(names):
         return []
     kept = {name: list(trained).index(name) for name in names if name in trained}
+    fitted = False
     for key, new in own.items():
         old = state.get(key)
         if old is None or not key.startswith("map_head.cls_branches."):
             continue
         if len(old) == len(trained) and len(new) == len(names):
-            state[key] = new.detach().clone().to(old)
+            fitted, state[key] = True, new.detach().clone().to(old)
             for row, name in enumerate(names):
                 if name in kept:
                     state[key][row] = old[kept[name]]
+    if not fitted:
+        return [
+            f"classes were {', '.join(trained)}, are {', '.join(names)}: this head's weights of "
+            "classes are taken as they are, where their sizes fit."
+        ]
     fresh = [name for name in names if name not in kept]
     return [f"classes keep their weights: {listed(list(kept))}; begin as new: {listed(fresh)}."]
 
