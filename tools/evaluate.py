@@ -23,7 +23,12 @@ from pathlib import Path
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, RANGES
 from gsmap.evaluation.bootstrap import Resamples, ap_differences, ap_intervals, format_intervals
-from gsmap.evaluation.calibration import format_uncertainty, matched_vertices, uncertainty_report
+from gsmap.evaluation.calibration import (
+    LAWS,
+    format_uncertainty,
+    matched_vertices,
+    uncertainty_report,
+)
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, HARD_CHAMFER_THRESHOLDS, ChamferConfig
 from gsmap.evaluation.distances import DISTANCE, cut_by_distance, distance_groups
 from gsmap.evaluation.evaluator import ALL_NAMES, METRIC_NAMES, MapEvaluator
@@ -175,6 +180,9 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="whether Gaussians say how far off matched vertices are: likelihood, coverage, ranks",
     )
     parser.add_argument(
+        "--law", choices=LAWS, help="with --uncertainty: distribution of the errors (normal)"
+    )
+    parser.add_argument(
         "--reliability", type=output_file, help="with --uncertainty: draw its curves"
     )
     parser.add_argument("--workers", type=int, default=1, help="number of processes")
@@ -190,6 +198,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         (args.hard and args.thresholds, "--hard and --thresholds exclude each other"),
         (args.tracks and not args.consistency, "--tracks needs --consistency"),
         (args.reliability and not args.uncertainty, "--reliability needs --uncertainty"),
+        (args.law and not args.uncertainty, "--law needs --uncertainty"),
         (args.against and args.prior, "--against compares two result files: leave out --prior"),
         (
             args.min_score is not None and not (args.topology or {*args.eval} & {*METHODS}),
@@ -316,7 +325,7 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
 
 def report_of_gaussians(args: argparse.Namespace, evaluator: MapEvaluator) -> MetricReport:
     """Score the Gaussians of a result file, and draw their curves if that is asked for."""
-    classes = evaluator.classes
+    classes, law = evaluator.classes, args.law or "normal"
     inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard
     pairs = SamplePairs(*inputs, args.allow_other_split, gaussians=True)
     vertices = matched_vertices(pairs, evaluator.chamfer or ChamferConfig(classes))
@@ -324,9 +333,9 @@ def report_of_gaussians(args: argparse.Namespace, evaluator: MapEvaluator) -> Me
         from gsmap.visualization.figure import save_figure
         from gsmap.visualization.plots import plot_uncertainty
 
-        figure = plot_uncertainty(vertices, classes)
+        figure = plot_uncertainty(vertices, classes, law)
         print(f"reliability: {save_figure(figure, args.reliability)}")
-    return uncertainty_report(vertices, classes, args.polygon_classes)
+    return uncertainty_report(vertices, classes, args.polygon_classes, law)
 
 
 def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:

@@ -123,6 +123,31 @@ def test_long_tails_get_the_coverage_of_the_interval_that_is_fitted():
         fitted_factors(tailed, CLASSES[:1], 0)
 
 
+def test_the_law_of_the_errors_decides_intervals_and_likelihood():
+    """Errors of a Laplace distribution: within its intervals as often as they say, by their sigma.
+
+    Its sigma is sqrt(2) times its scale, and its intervals of 68.3 and 95.4 % are 0.812 and 2.185
+    sigma wide.
+    """
+    rng = np.random.default_rng(0)
+    sigmas = np.exp(rng.normal(size=(50000, 2)))
+    errors = rng.exponential(size=(50000, 2)) * sigmas / np.sqrt(2)
+    tailed = Vertices(np.zeros(50000, int), errors, sigmas, np.ones(50000))
+    normal, laplace = (uncertainty_figures(tailed, law) for law in ("normal", "laplace"))
+    assert laplace["across/coverage@1"] == pytest.approx(0.683, abs=0.005)
+    assert laplace["across/coverage@2"] == pytest.approx(0.954, abs=0.005)
+    assert laplace["across/reliability_error"] < 0.005
+    assert normal["across/coverage@1"] == pytest.approx(1 - np.exp(-np.sqrt(2)), abs=0.005)
+    expected = -stats.laplace.logpdf(errors[:, 1], scale=sigmas[:, 1] / np.sqrt(2)).mean()
+    assert laplace["across/nll"] == pytest.approx(expected)
+    assert laplace["across/nll"] < normal["across/nll"]
+    for key in ("sigma_m", "rank_correlation", "sparsification_error"):
+        assert laplace[f"across/{key}"] == normal[f"across/{key}"]
+    for num_sigmas in (1, 2):  # both intervals fit one sigma
+        found = fitted_factors(tailed, CLASSES[:1], num_sigmas, "laplace")
+        np.testing.assert_allclose(found, [[1.0, 1.0]], rtol=0.02)
+
+
 def test_results_without_gaussians_are_refused():
     line = np.array([[0.0, -5.0], [0.0, 5.0]])
     found, truth = (MapElements.from_polylines([line], [0], s) for s in ([0.9], None))

@@ -53,6 +53,12 @@ def test_a_checkpoint_keeps_what_is_fitted_and_its_model_has_it(files, tmp_path,
     two = load_model(NAME, tmp_path / "two.pth").map_head.temperatures
     np.testing.assert_allclose([across for _, across in two], 3.0, rtol=0.2)
     assert two != temperatures
+    monkeypatch.setattr(
+        "sys.argv", [*words[:-1], str(tmp_path / "tails.pth"), "--law", "laplace"]
+    )
+    calibrate()
+    tails = load_model(NAME, tmp_path / "tails.pth").map_head.temperatures
+    np.testing.assert_allclose(np.divide(tails, temperatures)[:, 1], 1 / 0.8117, rtol=1e-3)
     monkeypatch.setattr("sys.argv", words)
     plain, fitted = load_model(NAME), load_model(NAME, target)
     assert plain.map_head.temperatures is None
@@ -84,6 +90,10 @@ def test_the_command_scores_and_draws_sigmas(files, tmp_path, capsys):
     third = 0.2611  # of a normal distribution within a third of its sigma
     assert figures["uncertainty/line/across/coverage@1"] == pytest.approx(third, abs=0.03)
     assert "chamfer/mAP" in figures
+    evaluate([*words, "--law", "laplace", "--reliability", str(tmp_path / "laplace.png")])
+    tails = json.loads(out.read_text())["uncertainty/line/across/coverage@1"]
+    assert tails == pytest.approx(0.2133, abs=0.03)  # within 0.8117 / 3 sigma
+    assert (tmp_path / "laplace.png").read_bytes() != curves.read_bytes()
     assert curves.stat().st_size > 1000
     assert "Gaussians of matched vertices" in capsys.readouterr().out
 
@@ -92,6 +102,7 @@ def test_the_command_scores_and_draws_sigmas(files, tmp_path, capsys):
     ("words", "message"),
     [
         (["--reliability", "a.png"], "--reliability needs --uncertainty"),
+        (["--law", "laplace"], "--law needs --uncertainty"),
         (
             ["--uncertainty", "--shard", "0/2", "--out", "a.json"],
             "--uncertainty needs a result file",

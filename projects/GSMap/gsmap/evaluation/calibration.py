@@ -19,9 +19,11 @@ from gsmap.structures.polylines import equivalent_orders
 AXES = ("along", "across")
 DISTANCES_M = (0.0, 10.0, 20.0, np.inf)  # from the vehicle
 LEVELS = np.linspace(0.05, 0.95, 19)  # of central intervals
+LAWS = {"normal": stats.norm(), "laplace": stats.laplace(scale=0.5**0.5)}  # of variance 1
+COVERED = (2 * stats.norm.cdf([1.0, 2.0]) - 1).tolist()  # by one and two sigma of a normal law
 _FEWEST = 100  # vertices of a class whose sigmas are fitted
 _COLUMNS = (
-    ("nll", "NLL"), ("coverage@1", "1 sigma"), ("coverage@2", "2 sigma"), ("sigma_m", "sigma m"),
+    ("nll", "NLL"), ("coverage@1", "68.3 %"), ("coverage@2", "95.4 %"), ("sigma_m", "sigma m"),
     ("error_m", "error m"), ("reliability_error", "reliab."), ("sparsification_error", "spars."),
     ("rank_correlation", "rank"), ("distance_rank_correlation", "by dist."),
 )  # fmt: skip
@@ -92,10 +94,20 @@ def _of_sample(
         yield Vertices(labels, errors, sigmas, np.linalg.norm(points, axis=1))
 
 
-def reliability(errors: FloatArray, sigmas: FloatArray) -> FloatArray:
+def half_widths(law: str, levels: Sequence[float] | FloatArray) -> FloatArray:
+    """Return half the widths of a law's central intervals, in sigma. (n,)
+
+    Args:
+        law: ``normal``, or ``laplace`` for longer tails with the same variance.
+        levels: Shares of the errors that the intervals are to cover (n,).
+    """
+    return LAWS[law].ppf((1 + np.asarray(levels)) / 2)
+
+
+def reliability(errors: FloatArray, sigmas: FloatArray, law: str = "normal") -> FloatArray:
     """Return the share of errors in the interval of each of ``LEVELS``. 2 x (n,) -> (19,)"""
-    widths = stats.norm.ppf((1 + LEVELS) / 2)
-    return np.searchsorted(np.sort(errors / sigmas), widths, side="right") / len(errors)
+    ratios = np.sort(errors / sigmas)
+    return np.searchsorted(ratios, half_widths(law, LEVELS), side="right") / len(errors)
 
 
 def sparsification(errors: FloatArray, order: FloatArray) -> FloatArray:
@@ -111,24 +123,27 @@ def rank_correlation(first: FloatArray, second: FloatArray) -> float:
     return float(stats.spearmanr(first, second).statistic)
 
 
-def uncertainty_figures(vertices: Vertices) -> dict[str, float]:
+def uncertainty_figures(vertices: Vertices, law: str = "normal") -> dict[str, float]:
     """Return the scores of at least one vertex, by ``along/NAME`` and ``across/NAME``.
 
-    The negative log-likelihood and the coverage are of a normal distribution around the vertex.
+    The negative log-likelihood and the coverage are of a distribution around the vertex, one of
+    ``LAWS``: ``coverage@1`` and ``coverage@2`` of its central intervals of 68.3 and 95.4 %, which
+    are one and two sigma of the normal one (0.81 and 2.18 of Laplace's).
     ``sparsification_error``: how much larger than with the true order the mean error is while the
     vertices of the largest sigmas are taken away, as a share of the mean error of all.
     """
     figures: dict[str, float] = {}
+    one, two = half_widths(law, COVERED)
     for axis, name in enumerate(AXES):
         errors, sigmas = vertices.errors[:, axis], vertices.sigmas[:, axis]
         apart = sparsification(errors, sigmas) - sparsification(errors, errors)
         values = {
-            "nll": -stats.norm.logpdf(errors, scale=sigmas).mean(),
-            "coverage@1": (errors <= sigmas).mean(),
-            "coverage@2": (errors <= 2 * sigmas).mean(),
+            "nll": (np.log(sigmas) - LAWS[law].logpdf(errors / sigmas)).mean(),
+            "coverage@1": (errors <= one * sigmas).mean(),
+            "coverage@2": (errors <= two * sigmas).mean(),
             "sigma_m": sigmas.mean(),
             "error_m": errors.mean(),
-            "reliability_error": np.abs(reliability(errors, sigmas) - LEVELS).mean(),
+            "reliability_error": np.abs(reliability(errors, sigmas, law) - LEVELS).mean(),
             "sparsification_error": apart.mean() / max(errors.mean(), np.finfo(float).tiny),
             "rank_correlation": rank_correlation(sigmas, errors),
             "distance_rank_correlation": rank_correlation(vertices.distances, errors),
@@ -138,7 +153,7 @@ def uncertainty_figures(vertices: Vertices) -> dict[str, float]:
 
 
 def uncertainty_report(
-    vertices: Vertices, classes: Sequence[str], areas: Sequence[str]
+    vertices: Vertices, classes: Sequence[str], areas: Sequence[str], law: str = "normal"
 ) -> MetricReport:
     """Score each class, all ``line`` classes together, and each at distances from the vehicle.
 
@@ -146,6 +161,7 @@ def uncertainty_report(
         vertices: Matched vertices.
         classes: Names of the classes.
         areas: Those of them that are no lines.
+        law: What the errors are distributed by, one of ``LAWS``.
     """
     lines = [label for label, name in enumerate(classes) if name not in areas]
     groups = {name: [label] for label, name in enumerate(classes)} | {"line": lines}
@@ -157,7 +173,7 @@ def uncertainty_report(
             title = f"{low:g}m+" if high == np.inf else f"{low:g}-{high:g}m"
             parts[f"{name}/{title}"] = own.of((low <= own.distances) & (own.distances < high))
         for part, chosen in parts.items():
-            figures = uncertainty_figures(chosen) if len(chosen.labels) else {}
+            figures = uncertainty_figures(chosen, law) if len(chosen.labels) else {}
             metrics |= {f"uncertainty/{part}/{key}": value for key, value in figures.items()}
     return MetricReport("uncertainty", {}, metrics, {})
 
@@ -181,15 +197,17 @@ def format_uncertainty(metrics: Mapping[str, float]) -> str:
 
 
 def fitted_factors(
-    vertices: Vertices, classes: Sequence[str], num_sigmas: float = 1.0
+    vertices: Vertices, classes: Sequence[str], num_sigmas: float = 1.0, law: str = "normal"
 ) -> FloatArray:
     """Return factors of sigma that give an interval of each class's errors its coverage. (C, 2)
 
     Args:
         vertices: Matched vertices.
         classes: Names of the classes.
-        num_sigmas: The interval: one sigma is to cover 68.3 % of the errors, two 95.4 %, as of a
-            normal distribution. Errors with longer tails fit one of both only.
+        num_sigmas: The interval, by what a normal distribution has within so many sigma: 1 for
+            68.3 % of the errors, 2 for 95.4 %. Errors with other tails than the law's fit one of
+            both only.
+        law: What the errors are distributed by, one of ``LAWS``.
 
     Raises:
         ValueError: If a class has too few vertices for that, or ``num_sigmas`` is not in (0, 3].
@@ -197,6 +215,7 @@ def fitted_factors(
     if not 0 < num_sigmas <= 3:
         raise ValueError(f"num_sigmas must be in (0, 3], got {num_sigmas}.")
     covered = 2 * stats.norm.cdf(num_sigmas) - 1
+    width = half_widths(law, covered)
     factors = np.empty((len(classes), len(AXES)))
     for label, name in enumerate(classes):
         own = vertices.of(vertices.labels == label)
@@ -205,5 +224,5 @@ def fitted_factors(
                 f"class {name!r} has {len(own.labels)} matched vertices, {_FEWEST} are needed: "
                 "give results of more samples."
             )
-        factors[label] = np.quantile(own.errors / own.sigmas, covered, axis=0) / num_sigmas
+        factors[label] = np.quantile(own.errors / own.sigmas, covered, axis=0) / width
     return factors

@@ -88,7 +88,9 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
     return figure
 
 
-def plot_uncertainty(vertices: Vertices, classes: Sequence[str]) -> Figure:
+def plot_uncertainty(
+    vertices: Vertices, classes: Sequence[str], law: str = "normal"
+) -> Figure:
     """Draw a row for errors along and across: coverage of intervals, and sparsification.
 
     Sparsification shows the mean error in metres of what is left when the vertices of the largest
@@ -104,7 +106,7 @@ def plot_uncertainty(vertices: Vertices, classes: Sequence[str]) -> Figure:
                 continue
             errors, sigmas = own.errors[:, axis], own.sigmas[:, axis]
             line = {"color": style.colour(label), "linewidth": 1.3}
-            left.plot(LEVELS, coverage(errors, sigmas), label=title, **line)
+            left.plot(LEVELS, coverage(errors, sigmas, law), label=title, **line)
             taken = 1 - np.arange(1, len(errors) + 1) / len(errors)
             right.plot(taken, sparsification(errors, errors), alpha=0.3, **line)
             right.plot(taken, sparsification(errors, sigmas), **line)
