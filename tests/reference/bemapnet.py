@@ -12,8 +12,8 @@ from gsmap.checkpoints.line_keys import BEMAPNET
 from gsmap.models.bemapnet.encoder import BezierBEVEncoder, position_code
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.neck import BiFPN
-from gsmap.models.pivotnet.decoder import PointLineDecoder
-from gsmap.models.pivotnet.front import turned
+from gsmap.models.lines.decoder import PointLineDecoder
+from gsmap.models.lines.front import turned
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
 from reference.maptr import state_rows

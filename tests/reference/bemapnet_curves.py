@@ -13,7 +13,7 @@ from mmengine.structures import InstanceData
 from gsmap.models.bemapnet.curves import Curve, around, control_points, missed, sampled
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.targets import FormatBezierTargets
-from gsmap.models.pivotnet.targets import Part, drawn
+from gsmap.models.lines.targets import Part, drawn
 from gsmap.structures.bezier import bernstein, curve_points, fit_piece, fit_pieces, mean_deviation
 from gsmap.structures.grid import BEVGrid
 from reference.bemapnet import small_head
@@ -139,7 +139,7 @@ def fitted_rows(
     ends = np.cumsum(data[f"{tag}_ctr_count"])[:-1]
     off = 0.0
     for (label, line), wanted in zip(parts, np.split(data[f"{tag}_ctr_f64"], ends), strict=True):
-        controls_m = whole.controls(line, label, grid)[:, ::-1] * (30, 60)
+        controls_m = whole.points(line, label, grid)[:, ::-1] * (30, 60)
         off = max(off, largest_difference(controls_m, wanted))
     yield Row(name, f"{tag}: control points (metres)", off, 1e-6)
 
