@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from mmcv.ops import point_sample
 from mmdet3d.structures import Det3DDataSample
 from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
 
-from gsmap.models.bemapnet.curves import Curve, around, control_points, missed, sampled
+from gsmap.models.bemapnet.curves import Curve, around, control_points, missed
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.targets import FormatBezierTargets
 from gsmap.models.lines.targets import Part, drawn
@@ -86,7 +87,7 @@ def check_curves(golden: Golden, name: str) -> Iterator[Row]:
     points.requires_grad_()
     steps = -around(torch.zeros(1, 2) + 0.5, (40, 20)) + 0.5
     yield Row(name, "rec_kernel", largest_difference(steps, data["rec_kernel"][0, 0]), 1e-6)
-    losses = missed(sampled(masks[:, None], around(points, (40, 20)))[:, 0])
+    losses = missed(point_sample(masks[:, None], around(points, (40, 20)))[:, 0])
     losses.sum().backward()
     yield Row(name, "rec_loss", largest_difference(losses.detach(), data["rec_loss"]), 1e-5)
     yield Row(name, "rec_grad", largest_difference(points.grad, data["rec_grad"]), 1e-5)

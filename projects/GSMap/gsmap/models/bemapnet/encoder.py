@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from mmdet.models.layers import coordinate_to_encoding
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
@@ -121,17 +122,7 @@ class BezierBEVEncoder(CameraEncoder):
         (B, Q, C)
         """
         with torch.autocast(points.device.type, enabled=False):
-            code = position_code(points, self.embed_dims // 2)
+            code = coordinate_to_encoding(points, self.embed_dims // 2, scale=1.0)  # of metres
         if seen is not None:
             code = torch.where(seen[..., None], code, 0.0)
         return self.position(code.transpose(1, 2)[..., None])[..., 0].transpose(1, 2)
-
-
-def position_code(points: Tensor, num_dims: int) -> Tensor:
-    """Return sines and cosines, in turn, of the second coordinate, then of the first.
-
-    Metres, without a factor. (..., 2) -> (..., 2 * num_dims)
-    """
-    steps = torch.arange(num_dims, device=points.device).div(2, rounding_mode="floor")
-    phases = points.flip(-1)[..., None] / 10000 ** (2 * steps / num_dims)
-    return torch.stack([phases[..., ::2].sin(), phases[..., 1::2].cos()], -1).flatten(-3)

@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
+from mmcv.ops import point_sample
 from mmdet.models.utils import get_uncertain_point_coords_with_randomness
 from torch import Tensor
 
-from gsmap.models.bemapnet.curves import around, missed, sampled
+from gsmap.models.bemapnet.curves import around, missed
 from gsmap.models.lines.losses import Case, LineLosses
 from gsmap.models.maptr.matching import assigned
 
@@ -65,7 +66,7 @@ class BezierLosses(LineLosses):
         if self.mask_points is not None:
             points = torch.rand(1, self.mask_points, 2, device=masks[0].device)
             masks, truths = (
-                [sampled(own[None], points)[0] for own in part] for part in (masks, truths)
+                [point_sample(own[None], points)[0] for own in part] for part in (masks, truths)
             )
         return super().distances(masks, truths)
 
@@ -77,14 +78,14 @@ class BezierLosses(LineLosses):
                 points = get_uncertain_point_coords_with_randomness(
                     masks, masks, self.mask_points, OVERSAMPLING, UNCERTAIN
                 )
-            masks, truths = (sampled(part, points)[:, 0] for part in (masks, truths))
+            masks, truths = (point_sample(part, points)[:, 0] for part in (masks, truths))
         return super().mask_losses(masks, truths)
 
     def costs(self, case: Case) -> tuple[Tensor, ...]:
         """Return the weighted costs of all pairs of a case. (6, n, K)"""
         lines, truth = case.lines, case.truth
         points, size = around(lines.curves, truth.masks.shape[-2:]), lines.curves.shape[0]
-        values = sampled(truth.masks[None], points.flatten(0, 1)[None])[0]  # (K, n * 2500)
+        values = point_sample(truth.masks[None], points.flatten(0, 1)[None])[0]  # (K, n * 2500)
         own = [
             self.controls * _mean_apart(lines.controls[:, None], truth.controls),
             -self.pieces * lines.piece_logits.softmax(-1)[:, truth.pieces],
@@ -108,7 +109,7 @@ class BezierLosses(LineLosses):
         truth: TrueCurves = _chosen([case.truth for case in cases], cols)
         around_px, values = around(lines.curves, truth.masks.shape[-2:]), lines.curves[..., 0]
         if len(values):
-            values = sampled(truth.masks[:, None], around_px)[:, 0]
+            values = point_sample(truth.masks[:, None], around_px)[:, 0]
         controls = lines.controls * lines.used[..., None]
         pieces = F.cross_entropy(lines.piece_logits, truth.pieces, reduction="none")
         sums = {

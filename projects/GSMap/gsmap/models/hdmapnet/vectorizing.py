@@ -259,11 +259,7 @@ def trace(points: IntArray, directions: IntArray, start: int, config: VectorizeC
 
 
 def _walk(
-    last: IntArray,
-    points: IntArray,
-    directions: IntArray,
-    used: BoolArray,
-    config: VectorizeConfig,
+    last: IntArray, points: IntArray, directions: IntArray, used: BoolArray, config: VectorizeConfig
 ) -> Iterator[IntArray]:
     """Yield the points after the last one; marks the directions that are used."""
     while True:

@@ -1,4 +1,4 @@
-"""PivotNet's line-aware point decoder: points look at the cells of their line's mask."""
+"""PivotNet's and BeMapNet's line-aware decoder: points look at the cells of their line's mask."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -61,12 +61,10 @@ class AttentionLayer(nn.Module):
         *norms, last = self.norms
         for name, norm in zip(self.attentions, norms, strict=True):
             query = tokens + position
-            seen = (query, tokens) if name == "self_attn" else (key, memory)
+            pair = (query, tokens) if name == "self_attn" else (key, memory)
             hidden = masks if memory is None or name == "cross_attn" else {}
-            attn = getattr(self, name)
-            tokens = norm(
-                tokens + self.dropout(attn(query, *seen, need_weights=False, **hidden)[0])
-            )
+            seen, _ = getattr(self, name)(query, *pair, need_weights=False, **hidden)
+            tokens = norm(tokens + self.dropout(seen))
         return last(self.ffn(tokens))
 
 

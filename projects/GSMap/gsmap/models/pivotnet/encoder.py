@@ -112,10 +112,7 @@ class PivotBEVEncoder(CameraEncoder):
             init_matrices(part)
 
     def encode(
-        self,
-        feats: Sequence[Tensor],
-        calibration: Mapping[str, Tensor],
-        img_shape: tuple[int, int],
+        self, feats: Sequence[Tensor], calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
         """Encode feature maps, each (B, V, C, h, w), with ``img_from_ground`` (B, V, 4, 4).
 

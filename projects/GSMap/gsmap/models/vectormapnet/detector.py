@@ -182,10 +182,7 @@ class KeyPointHead(DetectionHead):
         return {"loss_cls": cls, "loss_box": box}
 
     def layer_losses(
-        self,
-        output: KeyPointPredictions,
-        truths: Sequence[InstanceData],
-        tokens: Sequence[str],
+        self, output: KeyPointPredictions, truths: Sequence[InstanceData], tokens: Sequence[str]
     ) -> tuple[Tensor, Tensor]:
         """Return the losses of classes and of corners of a layer."""
         scores, boxes = output.scores.float(), output.references.float().flatten(2)

@@ -66,10 +66,7 @@ class HeightPlanesEncoder(CameraEncoder):
         return list(mlvl_feats[: self.num_levels])
 
     def encode(
-        self,
-        feats: Sequence[Tensor],
-        calibration: Mapping[str, Tensor],
-        img_shape: tuple[int, int],
+        self, feats: Sequence[Tensor], calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
         """Encode feature maps, each (B, V, C, h, w), with ``img_from_ground`` (B, V, 4, 4)."""
         seen = self.project(calibration["img_from_ground"], img_shape)
