@@ -59,6 +59,7 @@ class BezierHead(LineHead):
     transforms = ("FormatBezierTargets",)
     targets = "control points"
     level_weights = (0.5, 0.8, 1.2, 1.8)
+    losses: BezierLosses
 
     def __init__(
         self,

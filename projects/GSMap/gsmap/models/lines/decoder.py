@@ -37,7 +37,7 @@ class AttentionLayer(nn.Module):
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        self.attentions, self.num_heads = tuple(attentions), num_heads
+        self.attentions = tuple(attentions)
         for name in attentions:
             attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
             self.add_module(name, attn)
@@ -89,6 +89,7 @@ class PointLineDecoder(BaseModule):
     ) -> None:
         super().__init__()
         self.queries, self.line_masks = [(int(n), int(p)) for n, p in queries], line_masks
+        self.num_heads = num_heads
         total = sum(n * p for n, p in self.queries)
         self.query = nn.Embedding(total, embed_dims)
         self.query_pos = nn.Embedding(total, embed_dims)
@@ -118,7 +119,7 @@ class PointLineDecoder(BaseModule):
         for layer in self.layers:
             blocked = None
             if self.line_masks:
-                blocked = self.blocked(outputs[-1]).repeat_interleave(layer.num_heads, 0)
+                blocked = self.blocked(outputs[-1]).repeat_interleave(self.num_heads, 0)
             states = layer(states, self.query_pos.weight, key, memory, attn_mask=blocked)
             outputs.append(self.lines(states, bev))
         return outputs

@@ -54,6 +54,10 @@ class LineLosses:
         """Match a case by its `costs`, on the CPU."""
         raise NotImplementedError
 
+    def __call__(self, cases: Sequence[Case], matches: Sequence[Any]) -> dict[str, Tensor]:
+        """Return the weighted losses of a layer and class, from the cases of all samples."""
+        raise NotImplementedError
+
     def line_costs(self, case: Case) -> Tensor:
         """Return the weighted costs of class and masks. (2, n, K)"""
         score = case.lines.logits.softmax(-1)[:, LINE, None].expand_as(case.apart)
