@@ -44,6 +44,7 @@ MODELS = {
     "maptr": set(),
     "encoders": {"maptr"},
     "streams": {"maptr"},
+    "lines": {"maptr", "encoders"},
     "": {"encoders", "streams"},
     "maptrv2": {"maptr", "encoders"},
     "mapvr": {"maptr", "encoders"},
@@ -52,8 +53,8 @@ MODELS = {
     "hdmapnet": {"maptr", "encoders"},
     "mapqr": {"maptr", "encoders"},
     "mgmap": {"maptr", "encoders"},
-    "pivotnet": {"maptr", "encoders"},
-    "bemapnet": {"maptr", "encoders", "pivotnet"},  # of the same authors, built alike
+    "pivotnet": {"maptr", "encoders", "lines"},
+    "bemapnet": {"maptr", "encoders", "lines"},
     "streammapnet": {"maptr", "encoders"},
     "vectormapnet": {"maptr", "encoders"},
     "gsmap": {"maptr", "encoders", "streams"},

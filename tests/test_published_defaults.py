@@ -17,13 +17,13 @@ from torch import nn
 import gsmap.registered  # noqa: F401
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.raster_ap import MIN_SCORE, RasterConfig
-from gsmap.models.bemapnet.head import LEVEL_WEIGHTS as BEMAPNET_LEVELS
+from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.losses import BezierLosses
 from gsmap.models.bemapnet.targets import FormatBezierTargets
 from gsmap.models.hdmapnet.encoder import ViewTransformEncoder
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.targets import MakeLineMaps
-from gsmap.models.pivotnet.head import LEVEL_WEIGHTS
+from gsmap.models.pivotnet.head import PivotHead
 from gsmap.models.pivotnet.losses import PivotLosses
 from gsmap.models.pivotnet.targets import FormatPivotTargets
 from gsmap.models.streams.memory import StreamMemory
@@ -433,9 +433,12 @@ def test_mapvr_renders_as_released():
 
 def test_pivotnet_weighs_as_released():
     head = head_of("pivotnet/pivotnet_r50_30e.py")
-    assert head.losses == PivotLosses(2.0, 5.0, 30.0, 10.0, 2.0, 3.0, 5.0, 0.5, 0.2, True)
+    assert head.losses == PivotLosses(
+        cls=2.0, mask=5.0, pivots=30.0, collinear=10.0, point_cls=2.0, semantic=3.0, end_weight=5.0,
+        none_weight=0.5, between_weight=0.2, point_cls_per_line=True,
+    )  # fmt: skip
     assert head.layer_weights == (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
-    assert LEVEL_WEIGHTS == (0.4, 0.8, 1.6, 2.4)
+    assert PivotHead.level_weights == (0.4, 0.8, 1.6, 2.4)
     assert head.mask_size == (400, 200)
     targets = FormatPivotTargets()
     assert (targets.num_points, targets.edge_classes) == ((10, 2, 30), (1,))
@@ -470,9 +473,12 @@ def test_vectormapnet_weighs_and_draws_as_released():
 
 def test_bemapnet_weighs_as_released():
     head = head_of("bemapnet/bemapnet_r50_30e.py")
-    assert head.losses == BezierLosses(2.0, 5.0, 5.0, 2.0, 10.0, 1.0, 0.5, 0.5, 20000, True)
+    assert head.losses == BezierLosses(
+        cls=2.0, mask=5.0, controls=5.0, pieces=2.0, curve=10.0, recovery=1.0, semantic=0.5,
+        none_weight=0.5, mask_points=20000, redrawn_in_px=True,
+    )  # fmt: skip
     assert head.layer_weights == (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
-    assert BEMAPNET_LEVELS == (0.5, 0.8, 1.2, 1.8)
+    assert BezierHead.level_weights == (0.5, 0.8, 1.2, 1.8)
     assert (head.mask_size, head.bev_size) == ((400, 200), (200, 100))
     assert tuple(head.queries) == (20, 25, 15)
     assert [curve.weights.shape[-1] for curve in head.curves] == [7, 2, 22]

@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from mmdet.models.layers import coordinate_to_encoding
 from torch import Tensor, nn
 
 from gsmap.checkpoints.line_keys import BEMAPNET
-from gsmap.models.bemapnet.encoder import BezierBEVEncoder, position_code
+from gsmap.models.bemapnet.encoder import BezierBEVEncoder
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.neck import BiFPN
-from gsmap.models.pivotnet.decoder import PointLineDecoder
-from gsmap.models.pivotnet.front import turned
+from gsmap.models.lines.decoder import PointLineDecoder
+from gsmap.models.lines.front import turned
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden
 from reference.maptr import state_rows
@@ -113,7 +114,8 @@ def check_encoder(golden: Golden, name: str) -> Iterator[Row]:
     yield Row(name, "points on the ground", off, 1e-3)
     for key, sign in (("ipm_code", 1), ("ipm_code_flip", -1)):
         turned_points = places * torch.tensor([1, sign])
-        code = torch.where(found[..., None], position_code(turned_points, 32), 0.0)
+        code = coordinate_to_encoding(turned_points.flatten(0, 1), 32, scale=1.0)
+        code = torch.where(found[..., None], code.view(*found.shape, -1), 0.0)
         code = code.permute(3, 1, 0, 2).flatten(2)  # side by side
         off = largest_difference(code[:: 64 // len(data[key])], data[key])
         yield Row(name, key, off, 1e-4)

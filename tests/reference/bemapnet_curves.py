@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from mmcv.ops import point_sample
 from mmdet3d.structures import Det3DDataSample
 from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
 
-from gsmap.models.bemapnet.curves import Curve, around, control_points, missed, sampled
+from gsmap.models.bemapnet.curves import Curve, around, control_points, missed
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.targets import FormatBezierTargets
-from gsmap.models.pivotnet.targets import Part, drawn
+from gsmap.models.lines.targets import Part, drawn
 from gsmap.structures.bezier import bernstein, curve_points, fit_piece, fit_pieces, mean_deviation
 from gsmap.structures.grid import BEVGrid
 from reference.bemapnet import small_head
@@ -86,7 +87,7 @@ def check_curves(golden: Golden, name: str) -> Iterator[Row]:
     points.requires_grad_()
     steps = -around(torch.zeros(1, 2) + 0.5, (40, 20)) + 0.5
     yield Row(name, "rec_kernel", largest_difference(steps, data["rec_kernel"][0, 0]), 1e-6)
-    losses = missed(sampled(masks[:, None], around(points, (40, 20)))[:, 0])
+    losses = missed(point_sample(masks[:, None], around(points, (40, 20)))[:, 0])
     losses.sum().backward()
     yield Row(name, "rec_loss", largest_difference(losses.detach(), data["rec_loss"]), 1e-5)
     yield Row(name, "rec_grad", largest_difference(points.grad, data["rec_grad"]), 1e-5)
@@ -139,7 +140,7 @@ def fitted_rows(
     ends = np.cumsum(data[f"{tag}_ctr_count"])[:-1]
     off = 0.0
     for (label, line), wanted in zip(parts, np.split(data[f"{tag}_ctr_f64"], ends), strict=True):
-        controls_m = whole.controls(line, label, grid)[:, ::-1] * (30, 60)
+        controls_m = whole.points(line, label, grid)[:, ::-1] * (30, 60)
         off = max(off, largest_difference(controls_m, wanted))
     yield Row(name, f"{tag}: control points (metres)", off, 1e-6)
 

@@ -10,8 +10,8 @@ from scipy.ndimage import binary_dilation
 from torch import nn
 
 from gsmap.models.bemapnet.head import BezierHead
-from gsmap.models.pivotnet.lines import LinePredictions
-from gsmap.models.pivotnet.targets import drawn
+from gsmap.models.lines.head import LinePredictions
+from gsmap.models.lines.targets import drawn
 from reference.bemapnet import CONFIG, GRID, IMAGE, KEYS, BezierParts, ground_matrices
 from reference.golden import Golden
 from reference.registry import check
@@ -61,7 +61,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
         yield Row(name, key, largest_difference(value, data[key]), tolerance)
     mean = head.coordinate_feature()
     by_class = [states[i][0].states[:, :, 0].split(list(head.queries), 1) for i in ENDS]
-    last = head.predictions(states[-1][0], mean)
+    last = head.predictions(states[-1], mean)
     for label, lines in enumerate(last.lines):
         raw = [head.raw(label, own[label], mean) for own in by_class]
         for key, values in zip(KEYS, zip(*raw, strict=True), strict=True):

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmap.models.bemapnet import head as head_module
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.losses import TrueCurves
-from gsmap.models.pivotnet.lines import LinePredictions
+from gsmap.models.lines.head import LinePredictions
 from reference.bemapnet import KEYS, BezierParts, small_head
 from reference.golden import Golden
 from reference.registry import check
@@ -40,7 +39,7 @@ def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     data, parts = golden.read_arrays(name), BezierParts(golden)
     for tag, points in (("points", 1000), ("dense", None)):
         head = small_head(QUERIES, 0.6, losses={"mask_points": points})
-        head.layer_weights = LAYER_WEIGHTS
+        head.layer_weights, head.level_weights = LAYER_WEIGHTS, LEVEL_WEIGHTS
         yield from loss_rows(parts, name, head, tag, data)
 
 
@@ -105,10 +104,7 @@ def loss_rows(
         outputs.append(LinePredictions(nothing, nothing, lines))
         levels.append(torch.cat([leaf["sem"][:, 1:] for leaf in own], 1))
     draws = Draws(parts.golden)
-    with (
-        patch.object(torch, "rand", draws),
-        patch.object(head_module, "LEVEL_WEIGHTS", LEVEL_WEIGHTS),
-    ):
+    with patch.object(torch, "rand", draws):
         losses, matches = head.line_losses(outputs, truths, ["first", "second"])
         losses["semantic"] = head.semantic_loss(levels, truths)
     off = largest_difference(np.reshape(draws.shapes, (-1, 3)), data[f"{tag}_rand_shapes"])

@@ -10,10 +10,10 @@ from mmengine.config import Config
 from torch import Tensor, nn
 
 from gsmap.checkpoints.line_keys import PIVOTNET
+from gsmap.models.lines.front import turned
+from gsmap.models.lines.head import LinePredictions
 from gsmap.models.pivotnet.encoder import PivotBEVEncoder
-from gsmap.models.pivotnet.front import turned
 from gsmap.models.pivotnet.head import PivotHead
-from gsmap.models.pivotnet.lines import LinePredictions
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import BEVGrid
 from reference.golden import Golden

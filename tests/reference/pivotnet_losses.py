@@ -10,8 +10,8 @@ from mmdet3d.structures import Det3DDataSample
 from scipy.ndimage import binary_dilation
 
 from gsmap.datasets.annotations.record import MapInstance
+from gsmap.models.lines.head import LinePredictions
 from gsmap.models.pivotnet.head import PivotHead, packed
-from gsmap.models.pivotnet.lines import LinePredictions
 from gsmap.models.pivotnet.losses import Lines
 from gsmap.models.pivotnet.matching import match_pivots, path_costs, sequence_costs
 from gsmap.models.pivotnet.targets import FormatPivotTargets
@@ -79,7 +79,7 @@ def check_pivots(golden: Golden, name: str) -> Iterator[Row]:
             largest_difference(p, data[f"{tag}_map_pivot_input{i}"]) for i, p in enumerate(pixels)
         )
         yield Row(name, f"{tag}: lines (pixels)", off, 1e-4)
-        pivots = [thick.pivots(line, label, grid) for label, line in parts]
+        pivots = [thick.points(line, label, grid) for label, line in parts]
         for label in range(3):
             own = [line for line, kind in zip(pivots, labels, strict=True) if kind == label]
             numbers = [len(line) for line in own]

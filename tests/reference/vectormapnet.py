@@ -269,7 +269,8 @@ def line_rows(
     number = len(data["tokens"])
     boxes = torch.from_numpy(data["post_bbox_flat"][:number]).long()
     elements = Elements(torch.from_numpy(data["post_labels"][:number]), boxes)
-    tokens = head.generator.generate(bev, elements, lambda laws: laws.argmax(-1), 24)
+    head.generator.max_points = 24
+    tokens = head.generator.generate(bev, elements, lambda laws: laws.argmax(-1))
     off = largest_difference(tokens * data["token_masks"], data["tokens"] * data["token_masks"])
     yield Row(name, "tokens", off, 0)
     points, count = head.generator.lines(tokens)

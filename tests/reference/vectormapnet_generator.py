@@ -21,7 +21,7 @@ MAX_POINTS = 24
 def generator_of(parts: VectorParts) -> PolylineGenerator:
     """Return the released generator, as it decodes."""
     generator = deepcopy(parts.head().generator)
-    generator.redraw = True
+    generator.redraw, generator.max_points = True, MAX_POINTS
     return generator
 
 
@@ -184,9 +184,7 @@ def decoded(
     boxes, labels = (torch.from_numpy(data[k]).long() for k in ("cond_bbox", "cond_cls"))
     of_image = torch.from_numpy(data["cond_bs"])
     parts = [
-        generator.generate(
-            feats, Elements(labels[of_image == i], boxes[of_image == i]), draw, MAX_POINTS
-        )
+        generator.generate(feats, Elements(labels[of_image == i], boxes[of_image == i]), draw)
         for i, feats in enumerate(bev)
     ]
     return torch.cat(parts)
@@ -207,7 +205,7 @@ def decoded_together(
         elements = Elements(
             *(torch.from_numpy(data[k][own]).long() for k in ("cond_cls", "cond_bbox"))
         )
-        tokens.append(generator.generate(feats, elements, each, MAX_POINTS))
+        tokens.append(generator.generate(feats, elements, each))
         laws.append(each.laws)
     given.laws = [torch.cat([part[step] for part in laws if step < len(part)]) for step in range(5)]
     return torch.cat(tokens)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gsmap.structures.elements import MapElements
+from gsmap.structures.elements import MapElements, annotated
 
 LINE, RING = [[0.0, 1.0], [2.0, 3.0]], [[4.0, 4.0], [5.0, 4.0], [5.0, 5.0], [4.0, 4.0]]
 
@@ -83,3 +83,9 @@ def test_ground_truth_has_full_confidence_and_a_sample_may_be_empty():
 def test_bad_elements_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         MapElements.from_polylines(*values)
+
+
+def test_a_sample_without_ground_truth_is_refused_by_the_name_of_the_transform():
+    assert annotated({"map_instances": []}, object()) == []
+    with pytest.raises(ValueError, match="'a' has no ground truth: leave Exception out of this"):
+        annotated({"map_instances": None, "token": "a"}, Exception())

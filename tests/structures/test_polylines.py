@@ -16,6 +16,8 @@ from gsmap.structures.polylines import (
     clip_to_box,
     equivalent_orders,
     is_closed,
+    padded,
+    parts_inside,
     resample,
     resample_all,
     shortest_orders,
@@ -28,6 +30,27 @@ def test_resampling_keeps_both_ends_and_spaces_by_arc_length():
     corner = np.array([[0, 0], [3, 0], [3, 1]], float)
     np.testing.assert_allclose(arc_lengths(corner), [0, 3, 4])
     np.testing.assert_allclose(resample(corner, 5), [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]])
+
+
+def test_lines_of_any_length_are_stacked():
+    lines = [np.array([[1.0, 2], [3, 4]]), np.array([[5.0, 6]])]
+    assert padded(lines).tolist() == [[[1, 2], [3, 4]], [[5, 6], [5, 6]]]
+    assert padded(lines, 3, "constant")[1].tolist() == [[5, 6], [0, 0], [0, 0]]
+    assert (padded([]).shape, padded([], 7).shape) == ((0, 2, 2), (0, 7, 2))
+
+
+def test_a_line_that_crosses_itself_or_the_border_has_several_parts():
+    """A loop from the left to the right through (1, 0); only its upper half is in the rectangle."""
+    loop = np.array([[0, 0], [2, 0], [2, 2], [1, 2], [1, -1]], float)
+    parts = parts_inside(loop, (-9, 9), (-9, 9))
+    assert [part.tolist() for part in parts] == [
+        [[0, 0], [1, 0]], [[1, 0], [2, 0], [2, 2], [1, 2], [1, 0]], [[1, 0], [1, -1]]
+    ]  # fmt: skip
+    assert [part.tolist() for part in parts_inside(loop[:3], (1, 3), (-1, 1))] == [
+        [[1, 0], [2, 0], [2, 1]]
+    ]
+    assert parts_inside(loop[:1], (-9, 9), (-9, 9)) == []
+    assert parts_inside(loop[:2], (-9, 0), (-9, 9)) == []  # a point
 
 
 def test_resampling_interpolates_height_and_survives_repeated_points():

@@ -22,6 +22,7 @@ FOLDERS = (  # every module of these is imported; a method comes and goes with i
     "gsmap.models.encoders",
     "gsmap.models.maptr",
     "gsmap.models.streams",
+    "gsmap.models.lines",
     "gsmap.models.maptrv2",
     "gsmap.models.mapvr",
     "gsmap.models.gemap",

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from mmcv.ops import point_sample
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.config import Config
@@ -12,7 +13,7 @@ from mmengine.structures import InstanceData
 import gsmap.registered  # noqa: F401
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.images import CropImages
-from gsmap.models.bemapnet.curves import Curve, around, control_points, missed, sampled
+from gsmap.models.bemapnet.curves import Curve, around, control_points, missed
 from gsmap.models.bemapnet.encoder import BezierBEVEncoder
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.neck import BiFPN, halved
@@ -86,7 +87,7 @@ def test_a_curve_on_its_mask_misses_nothing_and_far_off_all():
     mask[..., 10:30, 5:15] = 1
     points = torch.tensor([[[0.5, 0.5]]]).expand(1, 100, 2)
     inside, outside = (
-        missed(sampled(mask, around(p, (40, 20)))[:, 0]) for p in (points, points * 0.1)
+        missed(point_sample(mask, around(p, (40, 20)))[:, 0]) for p in (points, points * 0.1)
     )
     assert inside.item() == pytest.approx(0, abs=1e-6)
     assert outside.item() == pytest.approx(1 - 1 / 2501, abs=1e-6)

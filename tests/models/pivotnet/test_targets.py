@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from gsmap.datasets.annotations.record import MapInstance
+from gsmap.models.lines.targets import directed
 from gsmap.models.pivotnet.matching import match_pivots, path_costs
-from gsmap.models.pivotnet.targets import FormatPivotTargets, directed, significances
+from gsmap.models.pivotnet.targets import FormatPivotTargets, significances
 from gsmap.structures.grid import BEVGrid
 
 

@@ -1,6 +1,6 @@
 """The map of one sample, predicted or annotated: all its polylines and rings in flat arrays."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from typing import Any
@@ -12,6 +12,20 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 PerElement = Sequence[Any] | npt.NDArray[Any]
+
+
+def annotated(results: Mapping[str, Any], transform: object) -> Sequence[Any]:
+    """Return the elements of a sample in a pipeline, ``map_instances``.
+
+    ValueError if there is no ground truth, so that the transform should be left out.
+    """
+    elements: Sequence[Any] | None = results["map_instances"]
+    if elements is None:
+        raise ValueError(
+            f"sample {results['token']!r} has no ground truth: leave {type(transform).__name__} "
+            "out of this pipeline."
+        )
+    return elements
 
 
 @dataclass(frozen=True, eq=False)

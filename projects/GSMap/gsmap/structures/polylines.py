@@ -1,7 +1,8 @@
 """Polylines as numpy arrays: resampling, equivalent point orders, boxes and clipping."""
 
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,47 @@ def sampled(points: Points, step: float) -> NDArray[np.float64]:
     along = arc_lengths(points)
     at = np.arange(0.0, along[-1], step)
     return np.stack([np.interp(at, along, axis) for axis in points.T], -1)
+
+
+def padded(
+    lines: Sequence[NDArray[Any]],
+    length: int | None = None,
+    mode: Literal["constant", "edge"] = "edge",
+) -> NDArray[Any]:
+    """Stack lines, the last point of the shorter ones repeated. (K, P, D)
+
+    Args:
+        lines: Points of each line, one or more. (n, D) each
+        length: Number P of points; None means those of the longest line, or 2 without any.
+        mode: ``"constant"`` fills lines with zeros instead.
+    """
+    length = length or max(map(len, lines), default=2)
+    rows = [np.pad(line, ((0, length - len(line)), (0, 0)), mode) for line in lines]
+    return np.array(rows) if rows else np.zeros((0, length, 2))
+
+
+def parts_inside(
+    points: Points, x_range: tuple[float, float], y_range: tuple[float, float]
+) -> list[NDArray[np.float64]]:
+    """Return the parts of a line in a rectangle, as shapely cuts it.
+
+    Unlike in `clip_to_box`, a line that crosses itself becomes several.
+
+    Args:
+        points: Vertices in metres; fewer than two have no part. (n, 2)
+        x_range: Smallest and largest x of the rectangle, in metres.
+        y_range: Smallest and largest y, likewise.
+
+    Returns:
+        The parts. each (m >= 2, 2)
+    """
+    import shapely  # reading a result file needs neither scipy nor shapely
+
+    if len(points) < 2:
+        return []
+    box = shapely.box(x_range[0], y_range[0], x_range[1], y_range[1])
+    parts = shapely.get_parts(shapely.LineString(points).intersection(box))
+    return [part for part in map(shapely.get_coordinates, parts) if len(part) > 1]
 
 
 def resample(points: Points, num_points: int) -> NDArray[np.float64]:

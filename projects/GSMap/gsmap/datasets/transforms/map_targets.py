@@ -11,6 +11,7 @@ from mmdet3d.registry import TRANSFORMS
 from mmengine.structures import InstanceData
 
 from gsmap.datasets.annotations.record import MapInstance
+from gsmap.structures.elements import annotated
 from gsmap.structures.polylines import (
     PADDING,
     bounding_boxes,
@@ -116,15 +117,11 @@ class FormatMapTargets(BaseTransform):
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets; ValueError if the sample has no ground truth."""
-        if results["map_instances"] is None:
-            raise ValueError(
-                f"sample {results['token']!r} has no ground truth: leave FormatMapTargets out of "
-                "this pipeline."
-            )
+        elements = annotated(results, self)
         # seeded from the generator that mmengine seeds in each worker
         rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
         results["gt_instances_3d"] = map_targets(
-            results["map_instances"],
+            elements,
             self.num_points,
             results["x_range"],
             results["y_range"],

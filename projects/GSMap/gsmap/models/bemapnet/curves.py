@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import torch
-from mmcv.ops import point_sample
 from torch import Tensor, nn
 
 from gsmap.structures.bezier import SAMPLES, bernstein
@@ -58,14 +57,6 @@ class Curve(nn.Module):
         """Return which control points curves of numbers of pieces, less one, have. (..., P)"""
         order = torch.arange(self.weights.shape[-1], device=pieces.device)
         return order <= (pieces[..., None] + 1) * self.degree
-
-
-def sampled(masks: Tensor, points: Tensor) -> Tensor:
-    """Return masks' values at points (from the left, from the front) in [0, 1], bilinearly.
-
-    (N, C, H, W), (N, P, 2) -> (N, C, P)
-    """
-    return point_sample(masks, points, align_corners=False)
 
 
 def around(points: Tensor, size: Sequence[int]) -> Tensor:

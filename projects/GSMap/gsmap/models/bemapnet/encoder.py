@@ -4,55 +4,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from mmdet.models.layers import coordinate_to_encoding
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import pixel_rays
-from gsmap.models.maptr.layers import feed_forward, init_matrices
-from gsmap.models.pivotnet.front import ahead, centres, front_size, turned
+from gsmap.models.lines.decoder import AttentionLayer
+from gsmap.models.lines.front import ahead, centres, front_size, turned
+from gsmap.models.maptr.layers import init_matrices
 from gsmap.structures.grid import BEVGrid
 
-
-class GlobalLayer(nn.Module):
-    """Self-attention, attention to a memory if there is one, feed-forward network, post-norm."""
-
-    def __init__(
-        self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float, with_memory: bool
-    ) -> None:
-        super().__init__()
-        sizes = {"dropout": dropout, "batch_first": True}
-        self.self_attn = nn.MultiheadAttention(embed_dims, num_heads, **sizes)
-        if with_memory:
-            self.cross_attn = nn.MultiheadAttention(embed_dims, num_heads, **sizes)
-        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
-        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(2 + with_memory))
-        self.dropout = nn.Dropout(dropout)
-
-    def forward(
-        self,
-        tokens: Tensor,
-        position: Tensor,
-        hidden: Tensor,
-        key: Tensor | None = None,
-        memory: Tensor | None = None,
-    ) -> Tensor:
-        """Update tokens by themselves, and by a memory (B, S, C) with keys of its own.
-
-        Those that are ``hidden`` (B, S), of the memory or else of the tokens, are not looked at.
-        Positions are part of queries and keys. (B, Q, C)
-        """
-        query = tokens + position
-        own = hidden if memory is None else None
-        seen, _ = self.self_attn(query, query, tokens, key_padding_mask=own, need_weights=False)
-        tokens = self.norms[0](tokens + self.dropout(seen))
-        if memory is not None:
-            query = tokens + position
-            seen, _ = self.cross_attn(
-                query, key, memory, key_padding_mask=hidden, need_weights=False
-            )
-            tokens = self.norms[1](tokens + self.dropout(seen))
-        return self.norms[-1](self.ffn(tokens))
+ATTENTIONS = ("self_attn", "cross_attn")
 
 
 @MODELS.register_module()
@@ -96,8 +59,8 @@ class BezierBEVEncoder(CameraEncoder):
         self.input_proj = nn.Conv2d(in_channels, embed_dims, 1)
         settings = {"num_heads": 8, "ffn_dims": 1024, "dropout": 0.1, **(layer_cfg or {})}
         self.source_layers, self.bev_layers = (
-            nn.ModuleList(GlobalLayer(embed_dims, **settings, with_memory=m) for _ in range(number))
-            for m, number in zip((False, True), num_layers, strict=True)
+            nn.ModuleList(AttentionLayer(names, embed_dims, **settings) for _ in range(number))
+            for names, number in zip((ATTENTIONS[:1], ATTENTIONS), num_layers, strict=True)
         )
         self.norm = nn.LayerNorm(embed_dims)
         self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)
@@ -125,13 +88,13 @@ class BezierBEVEncoder(CameraEncoder):
         position = self.positions(points, seen)
         hidden = ~seen & seen.any(-1, keepdim=True)  # without any ground, all are looked at
         for layer in self.source_layers:
-            sources = layer(sources, position, hidden)
+            sources = layer(sources, position, key_padding_mask=hidden)
         shape = front_size(self.grid)
         places = self.grid.metres_from_front(centres([shape], feats.device).flip(-1))
         own = self.positions(ahead(places, self.grid)[None])
         cells, bev = self.bev_embedding.weight.expand(len(feats), -1, -1), []
         for layer in self.bev_layers:
-            cells = layer(cells, own, hidden, sources + position, sources)
+            cells = layer(cells, own, sources + position, sources, key_padding_mask=hidden)
             level = self.norm(cells).transpose(1, 2).unflatten(2, shape)
             bev.append(turned(level, self.grid))
         return {"bev_feats": bev[-1], "bev_levels": bev}
@@ -159,17 +122,7 @@ class BezierBEVEncoder(CameraEncoder):
         (B, Q, C)
         """
         with torch.autocast(points.device.type, enabled=False):
-            code = position_code(points, self.embed_dims // 2)
+            code = coordinate_to_encoding(points, self.embed_dims // 2, scale=1.0)  # of metres
         if seen is not None:
             code = torch.where(seen[..., None], code, 0.0)
         return self.position(code.transpose(1, 2)[..., None])[..., 0].transpose(1, 2)
-
-
-def position_code(points: Tensor, num_dims: int) -> Tensor:
-    """Return sines and cosines, in turn, of the second coordinate, then of the first.
-
-    Metres, without a factor. (..., 2) -> (..., 2 * num_dims)
-    """
-    steps = torch.arange(num_dims, device=points.device).div(2, rounding_mode="floor")
-    phases = points.flip(-1)[..., None] / 10000 ** (2 * steps / num_dims)
-    return torch.stack([phases[..., ::2].sin(), phases[..., 1::2].cos()], -1).flatten(-3)

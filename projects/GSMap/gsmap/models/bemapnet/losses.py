@@ -2,18 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
+from mmcv.ops import point_sample
 from mmdet.models.utils import get_uncertain_point_coords_with_randomness
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from gsmap.models.bemapnet.curves import around, missed, sampled
-from gsmap.models.maptr.matching import check_finite
-from gsmap.models.pivotnet.lines import LINE
-from gsmap.models.pivotnet.losses import mask_distances
+from gsmap.models.bemapnet.curves import around, missed
+from gsmap.models.lines.losses import Case, LineLosses
+from gsmap.models.maptr.matching import assigned
 
 COSTS = ("class scores", "masks", "control points", "pieces", "curves", "recovery")
 OVERSAMPLING, UNCERTAIN = 3.0, 0.9  # of a mask's points: drawn per taken one, share of the taken
@@ -39,32 +38,21 @@ class TrueCurves(NamedTuple):
     masks: Tensor  # 0 and 1, float (K, H, W)
 
 
-class Case(NamedTuple):
-    """Lines of one class in one sample."""
-
-    lines: BezierLines
-    truth: TrueCurves
-    apart: Tensor  # distances of their masks, in matching (n, K)
-    token: str
-
-
 @dataclass(frozen=True)
-class BezierLosses:
+class BezierLosses(LineLosses):
     """Weights of losses and of matching costs; the defaults are the released ones.
 
     Masks are compared at ``mask_points`` points each, in matching at random ones, in losses mostly
     at those where the prediction is least certain; None compares all pixels. With
     ``redrawn_in_px``, as released, curves of lines whose masks were drawn by them are in pixels.
+    Further weights are ``cls``, ``mask`` and ``none_weight`` of `LineLosses`.
     """
 
-    cls: float = 2.0  # class, of matching too
-    mask: float = 5.0  # masks of lines, of matching too
+    semantic: float = 0.5  # masks of whole classes
     controls: float = 5.0  # control points, of matching too
     pieces: float = 2.0  # numbers of pieces, of matching too
     curve: float = 10.0  # points of curves, of matching too
     recovery: float = 1.0  # what curves miss of the masks, of matching too
-    semantic: float = 0.5  # masks of whole classes
-    none_weight: float = 0.5  # predictions of no line in ``cls``
     mask_points: int | None = 20000
     redrawn_in_px: bool = True
 
@@ -75,98 +63,70 @@ class BezierLosses:
     @torch.no_grad()
     def distances(self, masks: Sequence[Tensor], truths: Sequence[Tensor]) -> list[Tensor]:
         """Return distances of all masks of each sample, at the same points. (n, K) each"""
-        if self.mask_points is None:
-            return [mask_distances(*pair) for pair in zip(masks, truths, strict=True)]
-        points = torch.rand(1, self.mask_points, 2, device=masks[0].device)
-        return [
-            mask_distances(*(sampled(part[None], points)[0] for part in pair))
-            for pair in zip(masks, truths, strict=True)
-        ]
+        if self.mask_points is not None:
+            points = torch.rand(1, self.mask_points, 2, device=masks[0].device)
+            masks, truths = (
+                [point_sample(own[None], points)[0] for own in part] for part in (masks, truths)
+            )
+        return super().distances(masks, truths)
 
     def mask_losses(self, masks: Tensor, truths: Tensor) -> Tensor:
-        """Return cross-entropy + dice of masks and what they should be. (M, H, W) each -> (M,)"""
-        if not len(masks):
-            return masks.sum((1, 2))
-        if self.mask_points is None:
-            return mask_distances(masks, truths).diagonal()
-        masks, truths = masks[:, None], truths[:, None]
-        with torch.no_grad():
-            points = get_uncertain_point_coords_with_randomness(
-                masks, masks, self.mask_points, OVERSAMPLING, UNCERTAIN
-            )
-        pair = (sampled(part, points)[:, 0] for part in (masks, truths))
-        return mask_distances(*pair).diagonal()
+        """Return the distances of masks from what they should be. (M, H, W) each -> (M,)"""
+        if self.mask_points is not None and len(masks):
+            masks, truths = masks[:, None], truths[:, None]
+            with torch.no_grad():
+                points = get_uncertain_point_coords_with_randomness(
+                    masks, masks, self.mask_points, OVERSAMPLING, UNCERTAIN
+                )
+            masks, truths = (point_sample(part, points)[:, 0] for part in (masks, truths))
+        return super().mask_losses(masks, truths)
 
-    @torch.no_grad()
-    def match(self, cases: Sequence[Case]) -> list[tuple[Tensor, Tensor]]:
-        """Return matched predictions and annotations (M,) of each case.
-
-        FloatingPointError if a cost is not a number.
-        """
-        costs = [self.costs(case) for case in cases]
-        values = torch.cat([own.flatten() for own in costs]).cpu()  # one copy from the device
-        arrays, pairs = values.split([own.numel() for own in costs]), []
-        for case, own, array in zip(cases, costs, arrays, strict=True):
-            cost = array.view(own.shape)
-            check_finite(cost, COSTS, {"token": case.token})
-            found = linear_sum_assignment(cost.sum(0).numpy())
-            rows, cols = (torch.from_numpy(part).to(own.device) for part in found)
-            pairs.append((rows, cols))
-        return pairs
-
-    def costs(self, case: Case) -> Tensor:
+    def costs(self, case: Case) -> tuple[Tensor, ...]:
         """Return the weighted costs of all pairs of a case. (6, n, K)"""
         lines, truth = case.lines, case.truth
-        score = lines.logits.softmax(-1)[:, LINE, None].expand_as(case.apart)
         points, size = around(lines.curves, truth.masks.shape[-2:]), lines.curves.shape[0]
-        values = sampled(truth.masks[None], points.flatten(0, 1)[None])[0]  # (K, n * 2500)
-        return torch.stack(
-            [
-                -self.cls * score,
-                self.mask * case.apart,
-                self.controls * _mean_apart(lines.controls[:, None], truth.controls),
-                -self.pieces * lines.piece_logits.softmax(-1)[:, truth.pieces],
-                self.curve * _mean_apart(lines.curves[:, None], truth.curves),
-                self.recovery * missed(values.unflatten(1, (size, points.shape[1]))).T,
-            ]
-        )
+        values = point_sample(truth.masks[None], points.flatten(0, 1)[None])[0]  # (K, n * 2500)
+        own = [
+            self.controls * _mean_apart(lines.controls[:, None], truth.controls),
+            -self.pieces * lines.piece_logits.softmax(-1)[:, truth.pieces],
+            self.curve * _mean_apart(lines.curves[:, None], truth.curves),
+            self.recovery * missed(values.unflatten(1, (size, points.shape[1]))).T,
+        ]
+        return (torch.cat([self.line_costs(case), torch.stack(own)]),)
+
+    def pairs(self, case: Case, costs: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return matched predictions and annotations by the `costs` on the CPU. (M,)"""
+        rows, cols = assigned(costs[0], COSTS, {"token": case.token})
+        return rows.to(case.apart.device), cols.to(case.apart.device)
 
     def __call__(
         self, cases: Sequence[Case], matches: Sequence[tuple[Tensor, Tensor]]
     ) -> dict[str, Tensor]:
         """Return the weighted losses of a layer and class, from the cases of all samples."""
         number = max(sum(len(case.truth.pieces) for case in cases), 1)
-        labels = [torch.full_like(case.lines.logits[:, 0], 1 - LINE).long() for case in cases]
-        for label, (rows, _) in zip(labels, matches, strict=True):
-            label[rows] = LINE
-        both = list(zip(cases, matches, strict=True))
-        _, controls, used, piece_logits, curves, masks = (
-            torch.cat(part)
-            for part in zip(
-                *([p[rows] for p in case.lines] for case, (rows, _) in both), strict=True
-            )
-        )
-        true_controls, pieces, true_curves, true_masks = (
-            torch.cat(part)
-            for part in zip(
-                *([p[cols] for p in case.truth] for case, (_, cols) in both), strict=True
-            )
-        )
-        around_px = around(curves, true_masks.shape[-2:])
-        values = sampled(true_masks[:, None], around_px)[:, 0] if len(curves) else curves[..., 0]
-        logits = torch.cat([case.lines.logits for case in cases])
-        classes = logits.new_tensor([1.0, self.none_weight])
+        rows, cols = zip(*matches, strict=True)
+        lines: BezierLines = _chosen([case.lines for case in cases], rows)
+        truth: TrueCurves = _chosen([case.truth for case in cases], cols)
+        around_px, values = around(lines.curves, truth.masks.shape[-2:]), lines.curves[..., 0]
+        if len(values):
+            values = point_sample(truth.masks[:, None], around_px)[:, 0]
+        controls = lines.controls * lines.used[..., None]
+        pieces = F.cross_entropy(lines.piece_logits, truth.pieces, reduction="none")
         sums = {
-            "mask": self.mask * self.mask_losses(masks, true_masks),
-            "controls": self.controls * _mean_apart(controls * used[..., None], true_controls),
-            "pieces": self.pieces * F.cross_entropy(piece_logits, pieces, reduction="none"),
-            "curve": self.curve * _mean_apart(curves, true_curves),
+            "mask": self.mask * self.mask_losses(lines.masks, truth.masks),
+            "controls": self.controls * _mean_apart(controls, truth.controls),
+            "pieces": self.pieces * pieces,
+            "curve": self.curve * _mean_apart(lines.curves, truth.curves),
             "recovery": self.recovery * missed(values),
         }
-        return {
-            **{name: value.sum() / number for name, value in sums.items()},
-            "cls": self.cls * F.cross_entropy(logits, torch.cat(labels), classes),
-        }
+        losses = {name: value.sum() / number for name, value in sums.items()}
+        return {**losses, "cls": self.class_loss(cases, rows)}
+
+
+def _chosen(lines: Sequence[Any], indices: Sequence[Tensor]) -> Any:
+    """Return the chosen lines of all samples as one tuple of them. (M, ...)"""
+    picked = ([part[i] for part in own] for own, i in zip(lines, indices, strict=True))
+    return type(lines[0])(*map(torch.cat, zip(*picked, strict=True)))
 
 
 def _mean_apart(points: Tensor, others: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ class CameraEncoder(BaseModule):
     """A BEV encoder of camera features."""
 
     calibration: tuple[str, ...]  # what it reads of a sample, names of `calibration_arrays`
-    num_levels: int = 1  # of the image features, the finest first
+    num_levels: int | None = 1  # of the image features, the finest first; None takes all
 
     def forward(
         self, mlvl_feats: Sequence[Tensor], img_metas: Sequence[dict[str, Any]]

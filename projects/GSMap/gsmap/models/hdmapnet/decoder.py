@@ -1,13 +1,12 @@
 """HDMapNet's BEV network: maps of classes, instance embeddings and directions."""
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from mmdet.models.backbones.resnet import BasicBlock
-from mmdet.models.layers import ResLayer
 from torch import Tensor, nn
 
 from gsmap.models.hdmapnet.encoder import JoinedMaps, conv_block
-from gsmap.models.maptr.layers import enlarged
+from gsmap.models.maptr.layers import enlarged, resnet_stages
 
 
 class LineMaps(NamedTuple):
@@ -54,23 +53,14 @@ class LineMapDecoder(nn.Module):
     ) -> None:
         super().__init__()
         widths = base_channels, 2 * base_channels, 4 * base_channels
-        self.stem = nn.Sequential(
-            nn.Conv2d(embed_dims, widths[0], 7, 2, 3, bias=False),
-            nn.BatchNorm2d(widths[0]),
-            nn.ReLU(inplace=True),
-        )
-        sizes = zip((widths[0], *widths), widths, (1, 2, 2), strict=False)
-        self.stages = nn.ModuleList(
-            ResLayer(BasicBlock, inputs, outputs, 2, stride) for inputs, outputs, stride in sizes
-        )
+        self.stem, self.stages = resnet_stages(BasicBlock, embed_dims, widths)
         number = 2 if shared_direction_block else 3
         blocks = [JoinedMaps(widths[0] + widths[2], widths[2]) for _ in range(number)]
         self.joined = nn.ModuleList(blocks)
         if shared_direction_block:  # the release runs it twice, so its statistics learn faster
-            for norm in blocks[1].modules():
-                if not isinstance(norm, nn.BatchNorm2d) or norm.momentum is None:
-                    continue
-                norm.momentum = 1 - (1 - norm.momentum) ** 2
+            for part in blocks[1]:
+                if isinstance(part, nn.BatchNorm2d):
+                    part.momentum = 1 - (1 - cast(float, part.momentum)) ** 2
         outputs = 1 + num_classes, embedding_dims, 1 + num_directions
         self.maps = nn.ModuleList(FineMaps(widths[2], channels) for channels in outputs)
 

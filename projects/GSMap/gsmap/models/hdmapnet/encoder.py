@@ -110,8 +110,9 @@ class ViewTransformEncoder(CameraEncoder):
         self, feats: Tensor, calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
         """Encode features (B, V, C, h, w), with ``cam_from_ground`` (B, V, 4, 4)."""
-        places = self.places(calibration["cam_from_ground"])
-        return {"bev_feats": self.laid_out(self.from_above(feats), places)}
+        views, places = self.from_above(feats), self.places(calibration["cam_from_ground"])
+        laid_out = sampled(views.flatten(0, 1), places.flatten(0, 1)).unflatten(0, views.shape[:2])
+        return {"bev_feats": laid_out.amax(1)}  # the largest of any camera; 0 where none has one
 
     def from_above(self, feats: Tensor) -> Tensor:
         """Return each camera's map, rows from its left, columns from near to far. (B, V, C, h, w)
@@ -146,20 +147,12 @@ class ViewTransformEncoder(CameraEncoder):
 
         As released, the centres of the outer cells lie on the border of the map.
         """
-        unit, axes = self.view_pixel_m, []
-        sides = (self.grid.x_range, self.grid.width), (self.grid.y_range, self.grid.height)
-        for (low, high), number in sides:
-            axes.append(torch.linspace(low / unit, high / unit, number, device=device))
-        return torch.stack(torch.meshgrid(*axes, indexing="xy"), -1)
-
-    def laid_out(self, views: Tensor, places: Tensor) -> Tensor:
-        """Return the largest value of any camera's map at each cell; 0 where none has one.
-
-        (B, V, C, h, w), (B, V, H, W, 2) -> (B, C, H, W)
-        """
-        return (
-            sampled(views.flatten(0, 1), places.flatten(0, 1)).unflatten(0, views.shape[:2]).amax(1)
+        grid, unit = self.grid, self.view_pixel_m
+        axes = (
+            torch.linspace(low / unit, high / unit, number, device=device)
+            for (low, high), number in ((grid.x_range, grid.width), (grid.y_range, grid.height))
         )
+        return torch.stack(torch.meshgrid(*axes, indexing="xy"), -1)
 
 
 def sampled(maps: Tensor, places: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from gsmap.models.maptr.coder import DetectionHead, Samples, Tensors
 from gsmap.models.maptr.layers import enlarged
 from gsmap.models.maptr.parts import PARTS
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.polylines import padded
 
 TARGETS = ("gt_lines", "gt_directions")
 
@@ -124,15 +125,11 @@ class HDMapNetHead(DetectionHead):
         found = vectorize(*maps, self.vectorizing, choose_start)
         found = [line for line in found if len(line.pixels) > 1]
         found.sort(key=lambda line: -line.score)
-        most = max((len(line.pixels) for line in found), default=2)
-        pts = torch.zeros(len(found), most, 2)
-        for own, line in zip(pts, found, strict=True):
-            points = torch.from_numpy(metres_from_pixels(line.pixels + 0.5, self.grid))
-            own[: len(points)], own[len(points) :] = points, points[-1]
-        device = maps.semantic.device
-        return InstanceData(
-            scores_3d=torch.tensor([line.score for line in found], device=device),
-            labels_3d=torch.tensor([n.label for n in found], dtype=torch.long, device=device),
-            pts=pts.to(device),
-            num_pts=torch.tensor([len(n.pixels) for n in found], dtype=torch.long, device=device),
+        pts = padded([metres_from_pixels(line.pixels + 0.5, self.grid) for line in found])
+        lines = InstanceData(
+            scores_3d=torch.tensor([line.score for line in found]),
+            labels_3d=torch.tensor([line.label for line in found], dtype=torch.long),
+            pts=torch.from_numpy(pts).float(),
+            num_pts=torch.tensor([len(line.pixels) for line in found], dtype=torch.long),
         )
+        return lines.to(maps.semantic.device)

@@ -6,15 +6,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-import shapely
 import torch
 from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
 from numpy.typing import NDArray
 
 from gsmap.models.hdmapnet.layout import ahead_size, pixels_from_metres
+from gsmap.structures.elements import annotated
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.polylines import sampled
+from gsmap.structures.polylines import parts_inside, sampled
 
 Pixels = NDArray[np.int32]
 
@@ -59,14 +59,10 @@ class MakeLineMaps(BaseTransform):
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets; ValueError without ground truth or for an unknown class."""
-        if results["map_instances"] is None:
-            raise ValueError(
-                f"sample {results['token']!r} has no ground truth: leave MakeLineMaps out of this "
-                "pipeline."
-            )
+        elements = annotated(results, self)
         grid = BEVGrid(results["x_range"], results["y_range"], forward=self.forward)
         grid = grid.rasterized(self.pixel_m)
-        numbers, directions = self.drawn(results["map_instances"], grid)
+        numbers, directions = self.drawn(elements, grid)
         results["gt_lines"] = torch.from_numpy(numbers)
         results["gt_directions"] = torch.from_numpy(directions)
         return results
@@ -97,7 +93,6 @@ class MakeLineMaps(BaseTransform):
 
     def lines(self, instances: Any, grid: BEVGrid) -> Iterator[tuple[int, Pixels]]:
         """Yield class and pixels (column, row) of each part of an element on the map, by class."""
-        box = shapely.box(grid.x_range[0], grid.y_range[0], grid.x_range[1], grid.y_range[1])
         for element in sorted(instances, key=lambda element: element.label):
             if not 0 <= element.label < self.num_classes:
                 raise ValueError(
@@ -106,8 +101,5 @@ class MakeLineMaps(BaseTransform):
                 )
             # as released without its end, and so nothing of a line below one step
             points = sampled(element.points[:, :2].astype(np.float64), self.step_m)
-            if len(points) > 1:
-                parts = shapely.get_parts(shapely.LineString(points).intersection(box))
-                for part in map(shapely.get_coordinates, parts):
-                    if len(part) > 1:
-                        yield element.label, pixels_from_metres(part, grid).astype(np.int32)
+            for part in parts_inside(points, grid.x_range, grid.y_range):
+                yield element.label, pixels_from_metres(part, grid).astype(np.int32)

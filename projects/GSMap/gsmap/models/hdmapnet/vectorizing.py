@@ -259,11 +259,7 @@ def trace(points: IntArray, directions: IntArray, start: int, config: VectorizeC
 
 
 def _walk(
-    last: IntArray,
-    points: IntArray,
-    directions: IntArray,
-    used: BoolArray,
-    config: VectorizeConfig,
+    last: IntArray, points: IntArray, directions: IntArray, used: BoolArray, config: VectorizeConfig
 ) -> Iterator[IntArray]:
     """Yield the points after the last one; marks the directions that are used."""
     while True:
@@ -278,24 +274,15 @@ def _walk(
         points = points[np.hypot(*(points - last).T) > config.step_px - 1]
         if not len(points):
             return
-        distances = np.hypot(*(points - (last + _step(taken, config))).T)
+        angle = np.deg2rad(Float32(config.degrees * taken))  # float32 decides between equal pixels
+        step = Float32(config.step_px) * np.array([np.cos(angle), np.sin(angle)])
+        distances = np.hypot(*(points - (last + step)).T)
         nearest = distances.argmin()
         if distances[nearest] > config.jump_px:
             continue
         last, back = points[nearest], last - points[nearest]
         column, row = last
-        used[row, column, _turn(directions[row, column], back, config.degrees).argmin()] = True
+        angle = np.rad2deg(np.arctan2(back[1], back[0])) % 360
+        turn = np.abs(config.degrees * directions[row, column] - angle)
+        used[row, column, np.minimum(turn, 360 - turn).argmin()] = True  # the way back
         yield last
-
-
-def _step(taken: int, config: VectorizeConfig) -> FloatArray:
-    """Return a step along a direction. Its rounding in float32 decides between equal pixels."""
-    angle = np.deg2rad(Float32(config.degrees * taken))
-    return Float32(config.step_px) * np.array([np.cos(angle), np.sin(angle)])
-
-
-def _turn(directions: IntArray, towards: IntArray, degrees: int) -> FloatArray:
-    """Return the angles between directions and a vector, in degrees. (2,)"""
-    angle = np.rad2deg(np.arctan2(towards[1], towards[0])) % 360
-    apart = np.abs(degrees * directions - angle)
-    return np.minimum(apart, 360 - apart)

@@ -1,6 +1,7 @@
 """From class scores and points of all queries to the best detections."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
@@ -23,6 +24,22 @@ class Detections(NamedTuple):
     scores: Tensor  # confidence in [0, 1]
     labels: Tensor  # class index
     query_inds: Tensor  # the query of each; one may appear with several classes
+
+
+class Reference:
+    """How references of predictions stand for points.
+
+    Attributes:
+        outputs: What `decode` returns.
+        metainfo: What is said of all predictions.
+    """
+
+    outputs: tuple[str, ...] = ("pts",)
+    metainfo: Mapping[str, Any] = MappingProxyType({})
+
+    def decode(self, references: Tensor) -> Tensors:
+        """Return ``pts`` in metres (N, P, 2 or 3), and what else `outputs` names. (N, ...)"""
+        raise NotImplementedError
 
 
 class MapCoder:
@@ -97,7 +114,7 @@ class DetectionHead(BaseModule):
     """What every head shares: detections of its last layer.
 
     Attributes:
-        reference: How references of predictions stand for points (`PointReference`).
+        reference: How references of predictions stand for points (`Reference`, `PointReference`).
         coder: The choice of detections.
         not_exported: Why there is no ONNX file of the head; empty if there is one.
     """

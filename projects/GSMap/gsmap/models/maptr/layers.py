@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import torch.nn.functional as F
 from mmcv.cnn.bricks.transformer import FFN
+from mmdet.models.layers import ResLayer
 from torch import Tensor, nn
 
 
@@ -37,6 +38,24 @@ def classification_branch(embed_dims: int, num_classes: int) -> nn.Sequential:
     for _ in range(2):
         layers += [nn.Linear(embed_dims, embed_dims), nn.LayerNorm(embed_dims), nn.ReLU(True)]
     return nn.Sequential(*layers, nn.Linear(embed_dims, num_classes))
+
+
+def resnet_stages(
+    block: type[nn.Module], inputs: int, widths: Sequence[int]
+) -> tuple[nn.Sequential, nn.ModuleList]:
+    """Return a ResNet's stem without pooling, and stages of two blocks; each further one halves.
+
+    Args:
+        block: Class of the blocks.
+        inputs: Channels of the map.
+        widths: Channels of each stage.
+    """
+    stem = nn.Sequential(
+        nn.Conv2d(inputs, widths[0], 7, 2, 3, bias=False), nn.BatchNorm2d(widths[0]), nn.ReLU(True)
+    )
+    sizes = zip((widths[0], *widths), widths, strict=False)
+    stages = [ResLayer(block, *size, 2, stride=1 + (i > 0)) for i, size in enumerate(sizes)]
+    return stem, nn.ModuleList(stages)
 
 
 def enlarged(feats: Tensor, shape: Sequence[int]) -> Tensor:

@@ -70,13 +70,29 @@ class MapAssigner:
             return MapMatch(*torch.empty(3, 0, dtype=torch.long, device=device))
         sample = pred_instances, gt_instances, img_meta
         total = torch.stack([cost(*sample).float() for cost in self.match_costs]).cpu()
-        check_finite(total, self.names, img_meta)
-        rows, cols = linear_sum_assignment(np.tile(total.sum(0).numpy(), repeats))
-        queries = torch.from_numpy(rows).to(device)
-        gts = torch.from_numpy(cols % num_gts).to(device)
+        queries, gts = (part.to(device) for part in assigned(total, self.names, img_meta, repeats))
         orders = gt_instances.pts_shifts[gts]  # (M, S, P, 2)
         distances = self.between_points(pred_instances.pts[queries, None].expand_as(orders), orders)
         return MapMatch(queries, gts, distances.sum((-1, -2)).argmin(-1))
+
+
+def assigned(
+    costs: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None, repeats: int = 1
+) -> tuple[Tensor, Tensor]:
+    """Return the pairs of least summed cost: predictions in order, and the ground truth of each.
+
+    Args:
+        costs: Costs of N predictions with K ground truths, on the CPU. (n, N, K)
+        names: What each cost is, for the message. (n,)
+        img_meta: Has the token of the sample, likewise.
+        repeats: How often each ground truth may be matched.
+
+    Raises:
+        FloatingPointError: If a cost is not finite.
+    """
+    check_finite(costs, names, img_meta)
+    rows, cols = linear_sum_assignment(np.tile(costs.sum(0).numpy(), repeats))
+    return torch.from_numpy(rows), torch.from_numpy(cols % max(costs.shape[2], 1))
 
 
 def check_finite(values: Tensor, names: Sequence[str], img_meta: dict[str, Any] | None) -> None:

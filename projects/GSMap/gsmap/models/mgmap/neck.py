@@ -4,10 +4,9 @@ from typing import Any
 
 import torch
 from mmdet.models.backbones.resnet import BasicBlock
-from mmdet.models.layers import ResLayer
 from torch import Tensor, nn
 
-from gsmap.models.maptr.layers import enlarged
+from gsmap.models.maptr.layers import enlarged, resnet_stages
 
 
 class Gates(nn.Module):
@@ -56,15 +55,7 @@ class EnhancedNeck(nn.Module):
     def __init__(self, embed_dims: int = 256) -> None:
         super().__init__()
         widths = embed_dims // 4, embed_dims // 2, embed_dims
-        self.stem = nn.Sequential(
-            nn.Conv2d(embed_dims, widths[0], 7, 2, 3, bias=False),
-            nn.BatchNorm2d(widths[0]),
-            nn.ReLU(),
-        )
-        sizes = zip((widths[0], *widths), widths, (1, 2, 2), strict=False)
-        self.stages = nn.ModuleList(
-            ResLayer(GatedBlock, inputs, outputs, 2, stride) for inputs, outputs, stride in sizes
-        )
+        self.stem, self.stages = resnet_stages(GatedBlock, embed_dims, widths)
         self.fusion = nn.Sequential(
             nn.Conv2d(sum(widths), embed_dims, 3, padding=1, bias=False),
             nn.BatchNorm2d(embed_dims),

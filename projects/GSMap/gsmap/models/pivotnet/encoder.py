@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import project_pillars
+from gsmap.models.lines.front import centres, front_size, turned
 from gsmap.models.maptr.attention import MultiLevelAttention
 from gsmap.models.maptr.layers import feed_forward, init_matrices
-from gsmap.models.pivotnet.front import centres, front_size, turned
 from gsmap.structures.grid import BEVGrid
 
 Shapes = Sequence[tuple[int, int]]
@@ -64,6 +64,7 @@ class PivotBEVEncoder(CameraEncoder):
     """
 
     calibration = ("img_from_ground",)
+    num_levels = None
 
     def __init__(
         self,
@@ -110,15 +111,8 @@ class PivotBEVEncoder(CameraEncoder):
         for part in (self.source_layers, self.bev_layers, self.unseen_reference):
             init_matrices(part)
 
-    def levels(self, mlvl_feats: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Return all feature maps."""
-        return mlvl_feats
-
     def encode(
-        self,
-        feats: Sequence[Tensor],
-        calibration: Mapping[str, Tensor],
-        img_shape: tuple[int, int],
+        self, feats: Sequence[Tensor], calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
         """Encode feature maps, each (B, V, C, h, w), with ``img_from_ground`` (B, V, 4, 4).
 

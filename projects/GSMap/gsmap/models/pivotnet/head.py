@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -10,34 +10,21 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from torch import Tensor, nn
 
-from gsmap.models.maptr.coder import Tensors
+from gsmap.models.lines.decoder import ClassLines
+from gsmap.models.lines.head import LineHead, LinePredictions, class_scores
+from gsmap.models.maptr.coder import Reference, Tensors
 from gsmap.models.maptr.layers import mlp
 from gsmap.models.maptr.parts import PARTS
-from gsmap.models.pivotnet.decoder import ClassLines
-from gsmap.models.pivotnet.lines import LineHead, LinePredictions, class_scores
-from gsmap.models.pivotnet.losses import (
-    PIVOT,
-    Case,
-    Lines,
-    PivotLosses,
-    TrueLines,
-    mask_distances,
-)
+from gsmap.models.pivotnet.losses import PIVOT, Lines, PivotLosses, TrueLines
 from gsmap.structures.grid import BEVGrid
-
-_POINT_DIMS = 64  # channels of each coordinate of a point
-# of the losses of the class masks of BEV levels; of fewer, the last ones
-LEVEL_WEIGHTS = (0.4, 0.8, 1.6, 2.4)
 
 
 @dataclass(frozen=True)
-class PivotReference:
+class PivotReference(Reference):
     """What points are: (u, v, logit of a pivot), and the lines that pivots make."""
 
     grid: BEVGrid
     outputs = ("pts", "num_pts")
-    space = None
-    metainfo: ClassVar[dict[str, Any]] = {}
 
     def decode(self, references: Tensor) -> Tensors:
         """Keep the pivots of every line, those of positive logit, in order.
@@ -77,11 +64,9 @@ class PivotHead(LineHead):
         classes: Names of the classes.
         queries: Lines of each class, and points of each line.
         decoder: Settings of `PointLineDecoder`.
-        mask_pixel_m: Side of a pixel of the losses' masks in metres, as in `FormatPivotTargets`.
         losses: Settings of `PivotLosses`.
-        score_threshold: Lines of at most this score are dropped: 0.5 as long as there are just
-            lines and none.
         embed_dims: Channels C.
+        kwargs: Further arguments of `LineHead`.
 
     Raises:
         ValueError: If queries do not fit the classes, or there are more layers than weights.
@@ -89,6 +74,7 @@ class PivotHead(LineHead):
 
     transforms = ("FormatPivotTargets",)
     targets = "pivots"
+    level_weights = (0.4, 0.8, 1.6, 2.4)
 
     def __init__(
         self,
@@ -96,40 +82,22 @@ class PivotHead(LineHead):
         classes: Sequence[str],
         queries: Sequence[tuple[int, int]] = ((20, 10), (25, 2), (15, 30)),
         decoder: PARTS | None = None,
-        mask_pixel_m: float = 0.15,
         losses: PARTS | None = None,
-        score_threshold: float = 0.5,
         embed_dims: int = 256,
-        init_cfg: dict | None = None,
+        **kwargs: Any,
     ) -> None:
         if len(queries) != len(classes) or any(n < 1 or p < 2 for n, p in queries):
             raise ValueError(
                 "queries must be lines (>= 1) and their points (>= 2) for each of "
                 f"{list(classes)}, got {list(queries)}."
             )
-        own = {"type": "PointLineDecoder", "queries": queries, "embed_dims": embed_dims}
-        super().__init__(
-            grid,
-            classes,
-            MODELS.build({**own, **(decoder or {})}),
-            [n for n, _ in queries],
-            mask_pixel_m,
-            PivotLosses(**(losses or {})),
-            score_threshold,
-            embed_dims,
-            point_dims=_POINT_DIMS,
-            init_cfg=init_cfg,
-        )
+        own = {"queries": queries, **(decoder or {})}, PivotLosses(**(losses or {}))
+        numbers = [n for n, _ in queries]
+        super().__init__(grid, classes, numbers, *own, embed_dims=embed_dims, **kwargs)
         self.reference = PivotReference(grid)
-        dims, both = [embed_dims] * 3, 2 * _POINT_DIMS
+        dims, both = [embed_dims] * 3, 2 * self.point_dims
         self.point_branches = nn.ModuleList(mlp(*dims, both) for _ in classes)
         self.kind_branches = nn.ModuleList(mlp(both, both, both, 2) for _ in classes)
-
-    def forward(self, bev_outputs: Tensors) -> list[LinePredictions]:
-        """Predict the lines after every decoder layer, from ``bev_feats`` (B, C, H, W)."""
-        layers = self.decoder(self.front(bev_outputs["bev_feats"]))[1:]
-        mean = self.coordinate_feature()
-        return [self.predictions(layer, mean) for layer in layers]
 
     def predictions(self, layer: Sequence[ClassLines], mean: Tensor) -> LinePredictions:
         """Return the points, kinds and scores of a layer's lines."""
@@ -137,7 +105,7 @@ class PivotHead(LineHead):
         parts = zip(layer, self.point_branches, self.kind_branches, strict=True)
         for own, point_branch, kind_branch in parts:
             feature = point_branch(own.states).float()
-            points = (feature.unflatten(-1, (2, _POINT_DIMS)) @ mean).sigmoid()  # (B, n, p, 2)
+            points = (feature.unflatten(-1, (2, -1)) @ mean).sigmoid()  # (B, n, p, 2)
             kinds = kind_branch(feature).float()
             lines.append(Lines(own.logits.float(), points, kinds, own.masks.float()))
         return packed(lines)
@@ -158,22 +126,6 @@ class PivotHead(LineHead):
             found.append(TrueLines(pivots[own, :most], numbers[own], masks[own].float()))
         return found
 
-    def cases(self, lines: Lines, truths: Sequence[TrueLines], tokens: Sequence[str]) -> list[Case]:
-        """Return a layer's lines of a class by sample, with what is annotated."""
-        samples = zip(*lines[:3], self.enlarged(lines.masks), truths, tokens, strict=True)
-        return [
-            Case(Lines(*own), truth, mask_distances(own[3], truth.masks), token)
-            for *own, truth, token in samples
-        ]
-
-    def semantic_loss(
-        self, levels: Sequence[Tensor], truths: Sequence[Sequence[TrueLines]]
-    ) -> Tensor:
-        """Return the loss of the class masks of all BEV levels (B, classes, H, W)."""
-        drawn = [torch.stack([own.masks.sum(0).clamp(max=1) for own in truth]) for truth in truths]
-        terms = [
-            weight * mask_distances(masks, own).diagonal().mean()
-            for weight, level in zip(LEVEL_WEIGHTS[-len(levels) :], levels, strict=True)
-            for masks, own in zip(level, drawn, strict=True)
-        ]
-        return self.losses.semantic * torch.stack(terms).mean()
+    def semantic_loss(self, levels: Sequence[Tensor], truths: Sequence[Any]) -> Tensor:
+        """Return the loss of the class masks, a mean over the classes. (B, classes, H, W) each"""
+        return super().semantic_loss(levels, truths) / len(self.classes)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -11,13 +11,12 @@ from mmdet3d.registry import MODELS, TASK_UTILS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.model import bias_init_with_prob
 from mmengine.structures import InstanceData
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
 from gsmap.models.maptr.attention import BEVDeformableAttention
-from gsmap.models.maptr.coder import DetectionHead, MapCoder, Samples, Tensors
+from gsmap.models.maptr.coder import DetectionHead, MapCoder, Reference, Samples, Tensors
 from gsmap.models.maptr.layers import classification_branch, feed_forward, init_matrices
-from gsmap.models.maptr.matching import check_finite
+from gsmap.models.maptr.matching import assigned
 from gsmap.models.maptr.parts import PARTS
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.structures.grid import BEVGrid
@@ -62,13 +61,10 @@ class KeyPointLayer(nn.Module):
 
 
 @dataclass(frozen=True)
-class KeyPointReference:
+class KeyPointReference(Reference):
     """What key points are: corners of boxes on the canvas, in pixels."""
 
     canvas: Canvas
-    outputs = ("pts",)
-    space = None
-    metainfo: ClassVar[dict[str, Any]] = {}
 
     def decode(self, references: Tensor) -> Tensors:
         """Return ``pts``, both corners in metres. (N, 2, 2)"""
@@ -186,10 +182,7 @@ class KeyPointHead(DetectionHead):
         return {"loss_cls": cls, "loss_box": box}
 
     def layer_losses(
-        self,
-        output: KeyPointPredictions,
-        truths: Sequence[InstanceData],
-        tokens: Sequence[str],
+        self, output: KeyPointPredictions, truths: Sequence[InstanceData], tokens: Sequence[str]
     ) -> tuple[Tensor, Tensor]:
         """Return the losses of classes and of corners of a layer."""
         scores, boxes = output.scores.float(), output.references.float().flatten(2)
@@ -211,9 +204,8 @@ class KeyPointHead(DetectionHead):
     ) -> tuple[Tensor, Tensor]:
         """Match a sample's boxes in pixels; FloatingPointError if a cost is not finite."""
         costs = self.costs(scores, boxes, truth).cpu()
-        check_finite(costs, ["class scores", "corners", "overlaps"], {"token": token})
-        rows, cols = linear_sum_assignment(costs.sum(0).numpy())
-        return torch.from_numpy(rows).to(boxes.device), torch.from_numpy(cols).to(boxes.device)
+        rows, cols = assigned(costs, ["class scores", "corners", "overlaps"], {"token": token})
+        return rows.to(boxes.device), cols.to(boxes.device)
 
     def costs(self, scores: Tensor, boxes: Tensor, truth: InstanceData) -> Tensor:
         """Return the costs of classes, corners and overlaps. (3, N, K)"""

@@ -7,12 +7,12 @@ import torch
 import torch.nn.functional as F
 from mmcv.cnn import ConvModule
 from mmdet.models.backbones.resnet import BasicBlock
-from mmdet.models.layers import ResLayer
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import PillarProjection, project_pillars
+from gsmap.models.maptr.layers import resnet_stages
 from gsmap.structures.grid import BEVGrid
 
 
@@ -52,14 +52,9 @@ class HeightPlanesEncoder(CameraEncoder):
             for level in range(1, num_levels)
         )
         self.reduction = nn.Conv2d(len(heights_m) * (embed_dims + 3), embed_dims, 3, padding=1)
-        self.neck = nn.Sequential(
-            nn.Conv2d(embed_dims, neck_dims, 7, 2, 3, bias=False),
-            nn.BatchNorm2d(neck_dims),
-            nn.ReLU(),
-            nn.MaxPool2d(3, 2, 1),
-            ResLayer(BasicBlock, neck_dims, neck_dims, 2),
-            nn.Conv2d(neck_dims, embed_dims, 1, bias=False),
-        )
+        stem, stages = resnet_stages(BasicBlock, embed_dims, [neck_dims])
+        last = nn.Conv2d(neck_dims, embed_dims, 1, bias=False)
+        self.neck = nn.Sequential(*stem, nn.MaxPool2d(3, 2, 1), *stages, last)
         axes = zip((grid.y_range, grid.x_range), (self.grid.height, self.grid.width), strict=True)
         y, x = (torch.linspace(*ends, number) for ends, number in axes)
         z, y, x = torch.meshgrid(torch.tensor(heights_m), y, x, indexing="ij")
@@ -71,10 +66,7 @@ class HeightPlanesEncoder(CameraEncoder):
         return list(mlvl_feats[: self.num_levels])
 
     def encode(
-        self,
-        feats: Sequence[Tensor],
-        calibration: Mapping[str, Tensor],
-        img_shape: tuple[int, int],
+        self, feats: Sequence[Tensor], calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
         """Encode feature maps, each (B, V, C, h, w), with ``img_from_ground`` (B, V, 4, 4)."""
         seen = self.project(calibration["img_from_ground"], img_shape)

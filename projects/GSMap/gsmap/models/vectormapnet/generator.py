@@ -190,19 +190,16 @@ class PolylineGenerator(BaseModule):
         return moved.clamp(min=1).minimum(tokens.new_tensor(self.canvas.size)[number % 2])
 
     @torch.no_grad()
-    def generate(
-        self, bev_feats: Tensor, elements: Elements, draw: Draw, max_points: int | None = None
-    ) -> Tensor:
+    def generate(self, bev_feats: Tensor, elements: Elements, draw: Draw) -> Tensor:
         """Return the tokens of a sample's lines, 0 behind their end. (n, T)
 
         Args:
             bev_feats: BEV features of the sample. (C', H, W)
             elements: Classes and boxes of the lines.
             draw: Draws tokens (n, t) from laws (n, t, tokens).
-            max_points: Points of a line at most; None means the setting.
         """
         memory, states = self.memory(bev_feats), self.condition(elements)
-        start, number = states, 2 * (max_points or self.max_points) + 1
+        start, number = states, 2 * self.max_points + 1
         tokens = elements.labels.new_zeros(len(states), number)
         alive = torch.arange(len(states), device=states.device)
         kept: list[Cache | None] = [None] * len(self.layers)

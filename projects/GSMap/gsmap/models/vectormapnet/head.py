@@ -55,12 +55,8 @@ class VectorMapNetHead(DetectionHead):
         super().__init__(init_cfg)
         self.grid, self.classes, self.loss_weight = grid, tuple(classes), loss_weight
         self.canvas = Canvas(grid, **(canvas or {}))
-        first: PARTS = {
-            "type": "KeyPointHead",
-            "grid": grid,
-            "classes": classes,
-            **(detector or {}),
-        }
+        first: PARTS = {"type": "KeyPointHead", "grid": grid, "classes": classes}
+        first |= detector or {}
         if first["type"] == "KeyPointHead":
             first = {"canvas": canvas, **first}
         self.detector: DetectionHead = MODELS.build(first)

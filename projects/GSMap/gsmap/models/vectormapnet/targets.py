@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import shapely
@@ -13,7 +13,9 @@ from mmengine.structures import InstanceData
 from numpy.typing import NDArray
 
 from gsmap.models.vectormapnet.canvas import Canvas, tokens_of
+from gsmap.structures.elements import annotated
 from gsmap.structures.grid import BEVGrid, padded_size
+from gsmap.structures.polylines import padded
 
 Floats = NDArray[np.float64]
 
@@ -83,12 +85,7 @@ class FormatPolylineTargets(BaseTransform):
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Add the targets; ValueError if the sample has no ground truth."""
-        elements = results["map_instances"]
-        if elements is None:
-            raise ValueError(
-                f"sample {results['token']!r} has no ground truth: leave FormatPolylineTargets out "
-                "of this pipeline."
-            )
+        elements = annotated(results, self)
         grid = BEVGrid(results["x_range"], results["y_range"])
         canvas = Canvas(grid, self.pixel_m, self.margin_m)
         low, high = np.transpose([grid.x_range, grid.y_range])
@@ -104,13 +101,13 @@ class FormatPolylineTargets(BaseTransform):
         instances = results.get("gt_instances_3d", InstanceData())
         if "pts" not in instances:
             instances.labels_3d = torch.tensor([e.label for e in elements], dtype=torch.int64)
-            instances.pts = filled(lines_m, "edge").float()
+            instances.pts = torch.from_numpy(padded(lines_m)).float()
             instances.num_pts = torch.tensor([len(line) for line in lines], dtype=torch.int64)
         instances.keypoints = torch.from_numpy((boxes * canvas.size).reshape(-1, 4)).float()
         instances.keypoint_tokens = torch.from_numpy(boxes * canvas.steps).long().flatten(1)
-        tokens = [tokens_of(line, canvas.steps)[:, None] for line in lines]
-        instances.tokens = filled(tokens)[..., 0].long()
-        instances.token_weights = filled([w[:, None] for w in weights])[..., 0].float()
+        tokens = [tokens_of(line, canvas.steps) for line in lines]
+        instances.tokens = filled(tokens).long()
+        instances.token_weights = filled(weights).float()
         instances.set_metainfo({"canvas": canvas.settings})
         results["gt_instances_3d"] = instances
         return results
@@ -120,14 +117,9 @@ class FormatPolylineTargets(BaseTransform):
         return shapely.get_coordinates(shapely.LineString(points).simplify(self.tolerance_m))
 
 
-def filled(
-    rows: Sequence[NDArray[Any]], mode: Literal["constant", "edge"] = "constant"
-) -> torch.Tensor:
-    """Stack arrays (n, D), the shorter ones filled up. (K, longest, D)"""
-    longest = max(map(len, rows), default=2)
-    padded = [np.pad(row, ((0, longest - len(row)), (0, 0)), mode) for row in rows]
-    dims = rows[0].shape[1] if rows else 2
-    return torch.from_numpy(np.array(padded).reshape(-1, longest, dims))
+def filled(rows: Sequence[NDArray[Any]]) -> torch.Tensor:
+    """Stack arrays (n,), the shorter ones filled with zeros. (K, longest)"""
+    return torch.from_numpy(padded([row[:, None] for row in rows], mode="constant")[..., 0])
 
 
 @TRANSFORMS.register_module()

@@ -1,21 +1,23 @@
-"""What heads of lines share whose classes have queries of their own: scores, masks, losses."""
+"""A head of lines whose classes have queries of their own: scores, masks, losses."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
+from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
 from gsmap.models.encoders.folded_backbone import tensor_versions
+from gsmap.models.lines.front import front_size, turned
+from gsmap.models.lines.losses import LINE, Case, LineLosses
 from gsmap.models.maptr.coder import DetectionHead, MapCoder, Samples, Tensors
-from gsmap.models.pivotnet.decoder import PointLineDecoder
-from gsmap.models.pivotnet.front import front_size, turned
+from gsmap.models.maptr.layers import enlarged
+from gsmap.models.maptr.parts import PARTS
 from gsmap.structures.grid import BEVGrid
 
-LINE = 0  # the place of a line's logit; the other one is of none
 # of the losses of decoder layers; of fewer, the last ones
 LAYER_WEIGHTS = (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)
 
@@ -25,7 +27,7 @@ class LinePredictions(NamedTuple):
 
     scores: Tensor  # logits, -inf but for a query's own class (B, N, classes)
     references: Tensor  # points of each line (B, N, P, D)
-    lines: list[Any]  # by class, (B, n, ...) each
+    lines: list[Any]  # by class, a tuple of (B, n, ...), among them ``logits`` and ``masks``
 
 
 def class_scores(logits: Sequence[Tensor]) -> Tensor:
@@ -50,48 +52,62 @@ class LineHead(DetectionHead):
     Args:
         grid: The map's extent.
         classes: Names of the classes.
-        decoder: The decoder; ValueError if it has more layers than there are weights.
-        queries: Lines of each class.
+        numbers: Lines of each class.
+        decoder: Settings of `PointLineDecoder`; ValueError if there are more layers than weights.
+        losses: The losses of one class.
         mask_pixel_m: Side of a pixel of the losses' masks in metres, as in the targets.
-        losses: The losses of one class: ``match(cases)`` and what they are called with.
-        score_threshold: Lines of at most this score are dropped.
+        score_threshold: Lines of at most this score are dropped: 0.5 as long as there are just
+            lines and none.
         embed_dims: Channels C.
         hidden_dims: Hidden channels of the map's coordinates.
         point_dims: Channels of each coordinate of a point.
     """
 
     targets: str  # what the transform adds, in words
+    level_weights: Sequence[float]  # of the class masks of BEV levels; of fewer, the last ones
 
     def __init__(
         self,
         grid: BEVGrid,
         classes: Sequence[str],
-        decoder: PointLineDecoder,
-        queries: Sequence[int],
-        mask_pixel_m: float,
-        losses: Any,
-        score_threshold: float,
-        embed_dims: int,
+        numbers: Sequence[int],
+        decoder: PARTS,
+        losses: LineLosses,
+        mask_pixel_m: float = 0.15,
+        score_threshold: float = 0.5,
+        embed_dims: int = 256,
         hidden_dims: int = 256,
         point_dims: int = 64,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
         self.grid, self.classes, self.losses = grid, tuple(classes), losses
-        self.mask_size = front_size(grid.rasterized(mask_pixel_m))
-        self.decoder, num_layers = decoder, len(decoder.layers)
+        self.mask_size, self.point_dims = front_size(grid.rasterized(mask_pixel_m)), point_dims
+        settings = {"type": "PointLineDecoder", "embed_dims": embed_dims}
+        self.decoder = MODELS.build(settings | decoder)
+        num_layers = len(self.decoder.layers)
         if not 0 < num_layers <= len(LAYER_WEIGHTS):
             raise ValueError(
                 f"decoder.num_layers must be 1 to {len(LAYER_WEIGHTS)}, which have weights in the "
                 f"losses, got {num_layers}."
             )
         self.layer_weights = LAYER_WEIGHTS[-num_layers:]
-        self.coder = MapCoder(grid, sum(queries), None, score_threshold)
+        self.coder = MapCoder(grid, sum(numbers), None, score_threshold)
         self.semantic_branches = nn.ModuleList(nn.Conv2d(embed_dims, 2, 1) for _ in classes)
         dims = (2, hidden_dims), (hidden_dims, hidden_dims), (hidden_dims, point_dims)
         convs = [nn.Conv2d(*pair, 1) for pair in dims]
         self.coordinates = nn.Sequential(convs[0], nn.ReLU(), convs[1], nn.ReLU(), convs[2])
         self._kept: tuple[Any, Tensor] | None = None  # state of the weights, their feature
+
+    def forward(self, bev_outputs: Tensors) -> list[LinePredictions]:
+        """Predict the lines after every decoder layer, from ``bev_feats`` (B, C, H, W)."""
+        layers = self.decoder(self.front(bev_outputs["bev_feats"]))[1:]
+        mean = self.coordinate_feature()
+        return [self.predictions(layer, mean) for layer in layers]
+
+    def predictions(self, layer: Sequence[Any], mean: Tensor) -> LinePredictions:
+        """Return the lines and scores of what the decoder says after a layer."""
+        raise NotImplementedError
 
     def coordinate_feature(self) -> Tensor:
         """Return the mean of the coordinates' features over the map, kept in inference. (D,)
@@ -144,13 +160,23 @@ class LineHead(DetectionHead):
         """Return a sample's annotated lines, by class; ValueError if they are not of this head."""
         raise NotImplementedError
 
-    def cases(self, lines: Any, truths: Sequence[Any], tokens: Sequence[str]) -> list[Any]:
-        """Return a layer's lines of a class by sample, with what is annotated."""
-        raise NotImplementedError
+    def cases(self, lines: Any, truths: Sequence[Any], tokens: Sequence[str]) -> Iterator[Case]:
+        """Yield a layer's lines of a class by sample, with what is annotated."""
+        lines = lines._replace(masks=self.enlarged(lines.masks))
+        apart = self.losses.distances(lines.masks, [truth.masks for truth in truths])
+        for own, *further in zip(zip(*lines, strict=True), truths, apart, tokens, strict=True):
+            yield Case(type(lines)(*own), *further)
 
     def semantic_loss(self, levels: Sequence[Tensor], truths: Sequence[Sequence[Any]]) -> Tensor:
         """Return the loss of the class masks of all BEV levels (B, classes, H, W)."""
-        raise NotImplementedError
+        drawn = [torch.stack([own.masks.sum(0).clamp(max=1) for own in truth]) for truth in truths]
+        by_class = torch.stack(drawn, 1)  # (classes, B, H, W)
+        terms = [
+            weight * self.losses.mask_losses(masks, own).mean()
+            for weight, level in zip(self.level_weights[-len(levels) :], levels, strict=True)
+            for masks, own in zip(level.transpose(0, 1), by_class, strict=True)
+        ]
+        return self.losses.semantic * torch.stack(terms).sum() / len(levels)
 
     def line_losses(
         self,
@@ -160,7 +186,7 @@ class LineHead(DetectionHead):
     ) -> tuple[Tensors, list[list[Any]]]:
         """Return the losses of all layers and classes, and the pairs of each and every sample."""
         groups = [
-            self.cases(lines, [truth[label] for truth in truths], tokens)
+            list(self.cases(lines, [truth[label] for truth in truths], tokens))
             for layer in outputs
             for label, lines in enumerate(layer.lines)
         ]
@@ -185,4 +211,4 @@ class LineHead(DetectionHead):
 
     def enlarged(self, masks: Tensor) -> Tensor:
         """Enlarge masks to the size of the targets. (B, n, h, w) -> (B, n, H, W)"""
-        return F.interpolate(masks.float(), self.mask_size, mode="bilinear", align_corners=True)
+        return enlarged(masks.float(), self.mask_size)

@@ -1,4 +1,4 @@
-"""PivotNet's line-aware point decoder: points look at the cells of their line's mask."""
+"""PivotNet's and BeMapNet's line-aware decoder: points look at the cells of their line's mask."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,28 +20,52 @@ class ClassLines(NamedTuple):
     masks: Tensor  # logits (B, n, H, W)
 
 
-class PointLayer(nn.Module):
-    """Masked cross-attention, self-attention of all points, feed-forward network, post-norm."""
+class AttentionLayer(nn.Module):
+    """Attentions, one after another, and a feed-forward network; post-norm.
 
-    def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int) -> None:
+    Args:
+        attentions: Their names: ``self_attn`` of the tokens, ``cross_attn`` to a memory.
+        embed_dims: Channels C; ``num_heads``, ``ffn_dims`` and ``dropout`` as everywhere.
+    """
+
+    def __init__(
+        self,
+        attentions: Sequence[str],
+        embed_dims: int,
+        num_heads: int,
+        ffn_dims: int,
+        dropout: float = 0.0,
+    ) -> None:
         super().__init__()
-        self.cross_attn, self.self_attn = (
-            nn.MultiheadAttention(embed_dims, num_heads, batch_first=True) for _ in range(2)
-        )
-        self.ffn = feed_forward(embed_dims, ffn_dims, dropout=0.0)
-        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
+        self.attentions = tuple(attentions)
+        for name in attentions:
+            attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+            self.add_module(name, attn)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in (*attentions, "ffn"))
+        self.dropout = nn.Dropout(dropout)
 
     def forward(
-        self, states: Tensor, pos: Tensor, key: Tensor, memory: Tensor, blocked: Tensor | None
+        self,
+        tokens: Tensor,
+        position: Tensor,
+        key: Tensor | None = None,
+        memory: Tensor | None = None,
+        **masks: Tensor | None,
     ) -> Tensor:
-        """Update points by the cells (B, S, C) that are not blocked (B, Q, S). (B, Q, C)"""
-        if blocked is not None:
-            blocked = blocked.repeat_interleave(self.cross_attn.num_heads, 0)
-        seen, _ = self.cross_attn(states + pos, key, memory, attn_mask=blocked, need_weights=False)
-        states = self.norms[0](states + seen)
-        query = states + pos
-        shared, _ = self.self_attn(query, query, states, need_weights=False)
-        return self.norms[2](self.ffn(self.norms[1](states + shared)))
+        """Update tokens by themselves, and by a memory (B, S, C) with keys of its own. (B, Q, C)
+
+        Positions are part of queries and keys. ``masks``, as `nn.MultiheadAttention` has them, are
+        of the memory, without one of the tokens.
+        """
+        *norms, last = self.norms
+        for name, norm in zip(self.attentions, norms, strict=True):
+            query = tokens + position
+            pair = (query, tokens) if name == "self_attn" else (key, memory)
+            hidden = masks if memory is None or name == "cross_attn" else {}
+            seen, _ = getattr(self, name)(query, *pair, need_weights=False, **hidden)
+            tokens = norm(tokens + self.dropout(seen))
+        return last(self.ffn(tokens))
 
 
 @MODELS.register_module()
@@ -65,13 +89,15 @@ class PointLineDecoder(BaseModule):
     ) -> None:
         super().__init__()
         self.queries, self.line_masks = [(int(n), int(p)) for n, p in queries], line_masks
+        self.num_heads = num_heads
         total = sum(n * p for n, p in self.queries)
         self.query = nn.Embedding(total, embed_dims)
         self.query_pos = nn.Embedding(total, embed_dims)
         self.level = nn.Embedding(1, embed_dims)
         self.position = SinePositionalEncoding(embed_dims // 2, normalize=True)
         self.layers = nn.ModuleList(
-            PointLayer(embed_dims, num_heads, ffn_dims) for _ in range(num_layers)
+            AttentionLayer(("cross_attn", "self_attn"), embed_dims, num_heads, ffn_dims)
+            for _ in range(num_layers)
         )
         self.norm = nn.LayerNorm(embed_dims)
         joined, dims = [p * embed_dims for _, p in self.queries], [embed_dims] * 3
@@ -91,8 +117,10 @@ class PointLineDecoder(BaseModule):
         states = self.query.weight.expand(len(bev), -1, -1)
         outputs = [self.lines(states, bev)]
         for layer in self.layers:
-            blocked = self.blocked(outputs[-1]) if self.line_masks else None
-            states = layer(states, self.query_pos.weight, key, memory, blocked)
+            blocked = None
+            if self.line_masks:
+                blocked = self.blocked(outputs[-1]).repeat_interleave(self.num_heads, 0)
+            states = layer(states, self.query_pos.weight, key, memory, attn_mask=blocked)
             outputs.append(self.lines(states, bev))
         return outputs
 
