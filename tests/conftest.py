@@ -11,10 +11,27 @@ import gsmap  # noqa: F401 - before mmcv.ops, which may need its stand-in
 
 REPO = Path(__file__).resolve().parents[1]
 
-# glibc keeps freed blocks of up to 32 MB: gigabytes after a step of a large model. From here on
-# those of 1 MB and more go back to the system at once.
-if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
-    mallopt(-3, 1 << 20)  # M_MMAP_THRESHOLD
+TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
+STATM = Path("/proc/self/statm")
+PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+resident = {"bytes": 0}  # after the last trim
+
+
+def pytest_runtest_logfinish() -> None:
+    """Give memory that a test has freed back to the system.
+
+    glibc keeps freed blocks of up to 32 MB: gigabytes after a step of a large model. To keep none
+    at all (``M_MMAP_THRESHOLD``) costs a third of such a step.
+    """
+    if TRIM is None or not STATM.exists():
+        return
+    if _resident_bytes() > resident["bytes"] + (1 << 28):
+        TRIM(0)
+        resident["bytes"] = _resident_bytes()
+
+
+def _resident_bytes() -> int:
+    return int(STATM.read_text().split()[1]) * PAGE_BYTES
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,13 @@
 """Programs that tests run in processes of their own."""
 
 import os
+import runpy
 import subprocess
 import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from io import FileIO, TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -16,3 +21,46 @@ def run_python(*words: object, env: Any = None, **options: Any) -> subprocess.Co
         **{"cwd": REPO, "capture_output": True, "text": True, "check": False, **options},
         env={**os.environ, **(env or {})},
     )
+
+
+def run_tool(*words: object) -> subprocess.CompletedProcess:
+    """Run a tool as `run_python` does, in a fork, which does not import torch and the rest anew.
+
+    For tests of what a command does. How it starts, and how its process ends, wants a new one.
+    """
+    argv = [str(word) for word in words]
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        pid = os.fork()
+        if pid == 0:
+            for file, stream in ((out, 1), (err, 2)):
+                os.dup2(file.fileno(), stream)
+            os._exit(_exit_code_of(lambda: runpy.run_path(argv[0], run_name="__main__"), argv))
+        _, status = os.waitpid(pid, 0)
+        texts = []
+        for file in (out, err):
+            file.seek(0)
+            texts.append(file.read().decode())
+    return subprocess.CompletedProcess(argv, os.waitstatus_to_exitcode(status), *texts)
+
+
+def _exit_code_of(work: Callable[[], object], argv: list[str]) -> int:
+    """Do a forked process's work with streams of its own; return what it exits with."""
+    sys.argv = argv
+    sys.stdout, sys.stderr = (TextIOWrapper(FileIO(n, "w", closefd=False)) for n in (1, 2))
+    os.chdir(REPO)
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(1)  # a fork has none of the threads of before
+    code: Any = 1
+    try:
+        work()
+        code = 0
+    except SystemExit as end:
+        code = end.code or 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    return code if isinstance(code, int) else 1

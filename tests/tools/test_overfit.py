@@ -2,7 +2,7 @@
 
 import json
 
-from processes import run_python
+from processes import run_tool
 
 ITERATIONS = 150
 
@@ -23,7 +23,7 @@ def test_the_demos_model_learns_one_sample_by_heart(
         *(f"train_cfg.max_epochs={ITERATIONS}", f"train_cfg.val_interval={ITERATIONS // 3}"),
         "default_hooks.checkpoint.interval=1000",
     ]
-    done = run_python(*words, env={"OMP_NUM_THREADS": "1"})
+    done = run_tool(*words)
     assert done.returncode == 0, done.stderr[-3000:]
     (scalars,) = tmp_path.glob("*/vis_data/scalars.json")
     records = [json.loads(line) for line in scalars.read_text().splitlines()]

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from processes import run_python
+from processes import run_tool
 
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from minicity.generate import generate
@@ -28,7 +28,7 @@ def test_a_shipped_model_scores_its_figures(name, towns, tmp_path):
     """Measured once, of the same seed; floats of another machine may tip a pair or two."""
     metrics = tmp_path / "metrics.json"
     words = "--work-dir", tmp_path, "--metrics-out", metrics, "--data-root", towns
-    done = run_python("tools/test.py", name, *words, env={"OMP_NUM_THREADS": "1"})
+    done = run_tool("tools/test.py", name, *words)
     assert done.returncode == 0, done.stderr[-3000:]
     figures = json.loads(metrics.read_text())
     found = (figures["chamfer/mAP"], figures["raster/mAP"])

@@ -12,13 +12,14 @@ from pathlib import Path
 import pytest
 import torch
 from mmengine.runner import FlexibleRunner
-from processes import run_python
+from processes import run_tool
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gsmap.checkpoints.reading import read_checked
 from tools.train import main as train
 
 REPO = Path(__file__).resolve().parents[2]
+DIST_TRAIN = "tools/dist_train.sh"
 
 
 def environment() -> dict[str, str]:
@@ -32,6 +33,13 @@ def run(*command: object) -> str:
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-3000:]
+    return done.stdout
+
+
+def use(*words: object) -> str:
+    """Run a tool in a fork of this process to its end and return what it printed."""
+    done = run_tool(*words)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout
 
 
@@ -56,7 +64,7 @@ def trained(tiny_config, tmp_path_factory) -> Path:
         training.send_signal(signal.SIGKILL)
     assert training.returncode == -signal.SIGKILL, "the run ended before it could be killed"
     (work / "killed_after").write_text(Path(last.read_text()).name)
-    (work / "resumed.log").write_text(run(*command))
+    (work / "resumed.log").write_text(use(*command[1:]))
     return work
 
 
@@ -104,8 +112,8 @@ def test_one_and_two_processes_score_and_write_the_same(tiny_config, trained, tm
     one, two = tmp_path / "one", tmp_path / "two"
     for folder in (one, two):
         folder.mkdir()
-    run(
-        sys.executable, "tools/test.py", tiny_config, trained / "epoch_3.pth", *metrics, *options,
+    use(
+        "tools/test.py", tiny_config, trained / "epoch_3.pth", *metrics, *options,
         "--metrics-out", one / "metrics.json", "--out", one / "results.json",
         "--show-dir", one / "pictures",
     )  # fmt: skip
@@ -126,12 +134,12 @@ def test_the_data_set_and_what_a_model_finds_are_drawn(
     tiny_config, trained, minicity_root, tmp_path
 ):
     browsed, found = tmp_path / "browsed", tmp_path / "found"
-    run(
-        sys.executable, "tools/browse_dataset.py", tiny_config, "--num", "1", "--show-dir", browsed,
+    use(
+        "tools/browse_dataset.py", tiny_config, "--num", "1", "--show-dir", browsed,
         "--format", "png",
     )  # fmt: skip
-    run(
-        sys.executable, "tools/infer.py", minicity_root / "gsmap_minicity_val.arrow", "--model",
+    use(
+        "tools/infer.py", minicity_root / "gsmap_minicity_val.arrow", "--model",
         tiny_config, trained / "epoch_3.pth", "--max-samples", "1", "--order",
         "--show-dir", found, "--out", tmp_path / "map.json",
         "--cfg-options", "visualizer.width_px=400",
@@ -147,10 +155,9 @@ def test_the_data_set_and_what_a_model_finds_are_drawn(
 
 def test_a_data_set_is_browsed_as_a_page(tiny_config, tmp_path):
     page = tmp_path / "page.html"
-    done = run(
-        sys.executable, "tools/browse_dataset.py", tiny_config, "--num", "1", "--split", "val",
-        "--web", page,
-    )  # fmt: skip
+    done = use(
+        "tools/browse_dataset.py", tiny_config, "--num", "1", "--split", "val", "--web", page
+    )
     assert done.splitlines()[-1].startswith("1 frame, ")
     assert "<title>minicity val: ground truth</title>" in page.read_text()
 
@@ -173,7 +180,8 @@ def test_two_processes_learn_what_one_learns_from_the_same_batch(tiny_config, tm
         work = tmp_path / str(ranks)
         leaf = tmp_path / f"ranks_{ranks}.py"
         leaf.write_text(WITHOUT_CHANCE.format(config=tiny_config, batch_size=2 // ranks))
-        log = run("tools/dist_train.sh", leaf, ranks, "--work-dir", work)
+        words = leaf, "--work-dir", work
+        log = use("tools/train.py", *words) if ranks == 1 else run(DIST_TRAIN, leaf, 2, *words[1:])
         assert ("1 sample x 2 processes each", "2 samples x 1 process each")[ranks == 1] in log
         assert "[2][1/1]" in log.replace(" ", "")  # both samples in one iteration
         weights.append(torch.load(work / "epoch_2.pth", weights_only=False)["state_dict"])
@@ -223,7 +231,7 @@ def test_the_config_chooses_the_runner(tiny_config, tmp_path, monkeypatch):
 
 
 def test_a_missing_checkpoint_is_named(tiny_config):
-    done = run_python("tools/test.py", tiny_config, "nowhere.pth", env=environment())
+    done = run_tool("tools/test.py", tiny_config, "nowhere.pth")
     assert done.returncode == 2
     assert done.stderr == (
         "error: There is no checkpoint nowhere.pth, and no model of that name (gsmap_r18_minicity, "
@@ -259,7 +267,7 @@ def test_ranks_validate_with_the_same_batch_norms(synchronized, tiny_config, tmp
         f"train_cfg = dict(max_epochs=1)\n{without * (not synchronized)}"
     )
     code, lines = end(
-        "tools/dist_train.sh", tmp_path / "leaf.py", 2, "--work-dir", tmp_path / "work",
+        DIST_TRAIN, tmp_path / "leaf.py", 2, "--work-dir", tmp_path / "work",
         path=tmp_path,
     )  # fmt: skip
     assert code == 0, lines
@@ -311,7 +319,7 @@ def test_a_rank_that_is_killed_ends_the_training(tiny_config, tmp_path):
         "custom_imports = dict(imports=['gsmap.registered', 'dies'], allow_failed_imports=False)\n"
     )
     code, lines = end(
-        "tools/dist_train.sh", tmp_path / "leaf.py", 2, "--work-dir", tmp_path / "work",
+        DIST_TRAIN, tmp_path / "leaf.py", 2, "--work-dir", tmp_path / "work",
         path=tmp_path,
     )  # fmt: skip
     assert code == 128 + signal.SIGKILL
