@@ -73,6 +73,7 @@ def words_of(block: str) -> list[list[str]]:
     return [[word for word in words if word != "..."] for words in commands]
 
 
+@cache
 def commands(page: Path) -> list[list[str]]:
     return words_of(script(page))
 

@@ -5,6 +5,7 @@ A setting that no number is known of is not here.
 # Over 400 lines: one table of all papers is easier to check against them than parts of it.
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -295,11 +296,15 @@ HEADS: dict[str, dict[str, Any]] = {
 }
 
 
+@cache
 def load(name: str) -> Config:
+    """Return a config that all tests share; none changes it."""
     return Config.fromfile(REPO / "configs" / name, import_custom_modules=False)
 
 
+@cache
 def head_of(name: str) -> nn.Module:
+    """Return a config's head, which all tests share; none changes it."""
     init_default_scope("mmdet3d")
     cfg = load(name)
     shared = {"grid": BEVGrid(**cfg.grid), "classes": cfg.classes}
