@@ -1,10 +1,11 @@
 #!/usr/bin/env python
 r"""Fit the sigmas of a model's Gaussians to its errors, and write a checkpoint that has them.
 
-RESULTS are the model's predictions of samples that it was not trained on. Each class gets a factor
-for sigma along and one for sigma across the line: 68.3 % of the errors then lie within one sigma,
-or with ``--sigmas 2`` 95.4 % within two. With ``--law laplace`` they lie within as large intervals
-of a Laplace distribution with this sigma (0.81 and 2.18 sigma), whose tails are longer.
+RESULTS are this checkpoint's predictions of samples that it was not trained on. Each class gets a
+factor for sigma along and one for sigma across the line: 68.3 % of the errors then lie within one
+sigma, or with ``--sigmas 2`` 95.4 % within two. With ``--law laplace`` they lie within as large
+intervals of a Laplace distribution with this sigma (0.81 and 2.18 sigma to each side), whose tails
+are longer. The checkpoint's meta says both under ``calibration``.
 
 Example:
     python tools/test.py gsmap_r18_minicity --eval --out half.json \
@@ -42,7 +43,10 @@ def parse_args() -> argparse.Namespace:
         help="interval that gets its coverage: 1 for 68.3 %% of the errors, 2 for 95.4 %%",
     )
     parser.add_argument("--law", choices=LAWS, default="normal", help="distribution of the errors")
-    return parser.parse_args()
+    args = parser.parse_args()
+    if not 0 < args.sigmas <= 3:
+        parser.error(f"--sigmas must be more than 0 and at most 3, got {args.sigmas:g}")
+    return args
 
 
 def main() -> str:
@@ -72,7 +76,13 @@ def main() -> str:
         vertices = matched_vertices(pairs, ChamferConfig(classes))
         factors = fitted_factors(vertices, classes, args.sigmas, args.law)
         cfg.model.map_head.temperatures = factors.round(4).tolist()
-    meta = {MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())), SIGNALS: source.can_bus}
+    meta = {
+        MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())),
+        SIGNALS: source.can_bus,
+        "calibration": {"law": args.law, "sigmas": args.sigmas},
+    }
+    if source.dataset_meta:  # with the split, which no other may be tested on
+        meta["dataset_meta"] = dict(source.dataset_meta)
     if source.image_size:
         meta[IMAGE_SIZE] = source.image_size
     with atomic_write(args.target, "wb") as file:
@@ -81,7 +91,7 @@ def main() -> str:
         f"{name}: sigma {along:.2f} times along, {across:.2f} times across"
         for name, (along, across) in zip(classes, factors, strict=True)
     )
-    return "\n".join([*rows, str(args.target)])
+    return "\n".join([*rows, f"by the {args.law} law, {args.sigmas:g} sigma: {args.target}"])
 
 
 if __name__ == "__main__":

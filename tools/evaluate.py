@@ -256,7 +256,7 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         if found.name in ("intervals", "by"):  # printed
             continue
         if found.name == "uncertainty":
-            print(format_uncertainty(found.metrics) + "\n")
+            print(format_uncertainty(found.metrics, args.law or "normal") + "\n")
         elif not found.groups:
             lines = (f"{key:<44} {value:.4f}" for key, value in found.metrics.items())
             print("\n".join(lines) + "\n")

@@ -41,7 +41,10 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="of what the corruptions draw")
     parser.add_argument("--out", type=Path, required=True, help="folder of table and plot")
     add_config_options(parser)
-    return parser.parse_args()
+    args = parser.parse_args()
+    if args.samples is not None and args.samples < 1:
+        parser.error(f"--samples must be >= 1, got {args.samples}")
+    return args
 
 
 def corrupted(settings: Any, kind: str, severity: int, seed: int) -> dict[str, Any]:
@@ -106,8 +109,6 @@ def main() -> str:
     from gsmap.visualization.figure import save_figure
     from gsmap.visualization.plots import plot_severities
 
-    if args.samples is not None and args.samples < 1:
-        raise ValueError(f"--samples must be >= 1, got {args.samples}.")
     checkpoint = checkpoint_for(args.config, args.checkpoint)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = load_model(args.config, checkpoint, device, args.cfg_options)

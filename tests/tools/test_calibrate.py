@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from gsmap.apis.loading import load_model
+from gsmap.checkpoints.reading import read_checked
 from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.structures.elements import MapElements
 from tools.calibrate import main as calibrate
@@ -53,9 +55,7 @@ def test_a_checkpoint_keeps_what_is_fitted_and_its_model_has_it(files, tmp_path,
     two = load_model(NAME, tmp_path / "two.pth").map_head.temperatures
     np.testing.assert_allclose([across for _, across in two], 3.0, rtol=0.2)
     assert two != temperatures
-    monkeypatch.setattr(
-        "sys.argv", [*words[:-1], str(tmp_path / "tails.pth"), "--law", "laplace"]
-    )
+    monkeypatch.setattr("sys.argv", [*words[:-1], str(tmp_path / "tails.pth"), "--law", "laplace"])
     calibrate()
     tails = load_model(NAME, tmp_path / "tails.pth").map_head.temperatures
     np.testing.assert_allclose(np.divide(tails, temperatures)[:, 1], 1 / 0.8117, rtol=1e-3)
@@ -71,6 +71,28 @@ def test_a_checkpoint_keeps_what_is_fitted_and_its_model_has_it(files, tmp_path,
     )
     with pytest.raises(ValueError, match="is calibrated already: give the checkpoint that it"):
         calibrate()
+
+
+def test_the_split_that_a_model_was_trained_on_and_the_law_are_kept(files, tmp_path, monkeypatch):
+    source, target = tmp_path / "trained.pth", tmp_path / "calibrated.pth"
+    trained = {"dataset": "minicity", "split_list": f"near@{'0' * 16}", "cameras": ["CAM_FRONT"]}
+    torch.save({"state_dict": read_checked(NAME).state, "meta": {"dataset_meta": trained}}, source)
+    words = [NAME, str(source), *map(str, files), str(target), "--law", "laplace"]
+    monkeypatch.setattr("sys.argv", ["calibrate.py", *words])
+    assert calibrate().endswith(f"by the laplace law, 1 sigma: {target}")
+    found = read_checked(target)
+    assert found.trained_on == read_checked(source).trained_on == ("minicity", f"near@{'0' * 16}")
+    assert found.dataset_meta == trained
+    meta = torch.load(target, weights_only=True)["meta"]
+    assert meta["calibration"] == {"law": "laplace", "sigmas": 1.0}
+
+
+@pytest.mark.parametrize("sigmas", ["0", "-1", "3.1", "nan"])
+def test_an_interval_of_no_or_too_many_sigmas_is_refused_at_once(sigmas, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["calibrate.py", *"abcde", "--sigmas", sigmas])
+    with pytest.raises(SystemExit):
+        calibrate()
+    assert "--sigmas must be more than 0 and at most 3" in capsys.readouterr().err
 
 
 def test_a_model_without_gaussians_is_not_calibrated(files, tmp_path, monkeypatch):
@@ -95,7 +117,9 @@ def test_the_command_scores_and_draws_sigmas(files, tmp_path, capsys):
     assert tails == pytest.approx(0.2133, abs=0.03)  # within 0.8117 / 3 sigma
     assert (tmp_path / "laplace.png").read_bytes() != curves.read_bytes()
     assert curves.stat().st_size > 1000
-    assert "Gaussians of matched vertices" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "matched vertices, normal law" in printed
+    assert "matched vertices, laplace law" in printed
 
 
 @pytest.mark.parametrize(

@@ -54,3 +54,10 @@ def test_a_run_writes_table_figures_and_plot(tool, minicity_root, tmp_path, monk
     }  # fmt: skip
     assert (tmp_path / "robustness.md").read_text() in said
     assert (tmp_path / "robustness.png").stat().st_size > 1000
+
+
+def test_no_samples_are_refused_at_once(tool, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["robustness.py", "a", "--samples", "0", "--out", "b"])
+    with pytest.raises(SystemExit):
+        tool.main()
+    assert "--samples must be >= 1, got 0" in capsys.readouterr().err

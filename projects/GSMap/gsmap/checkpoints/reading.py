@@ -5,7 +5,7 @@ import pickle
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ class Checkpoint:
         image_size: Width and height that images were scaled to in training, or None.
         can_bus: Whether the training samples had vehicle signals, as far as it says.
         trained_on: The training's data set and its list of scenes, empty where it does not say.
+        dataset_meta: What it says of the training's data set, not checked.
     """
 
     state: dict[str, Tensor]
@@ -58,6 +59,7 @@ class Checkpoint:
     image_size: tuple[int, int] | None
     can_bus: bool
     trained_on: tuple[str, str] = ("", "")
+    dataset_meta: Mapping[str, Any] = field(default_factory=dict)
 
 
 @contextmanager
@@ -114,7 +116,7 @@ def read_checked(path: str | Path) -> Checkpoint:
             "had failed; use an earlier epoch's."
         )
     state = {key.removeprefix("module."): value for key, value in state.items()}
-    return Checkpoint(state, settings, size, signals, trained_on)
+    return Checkpoint(state, settings, size, signals, trained_on, said)
 
 
 def _checked_size(size: Any) -> tuple[int, int] | None:

@@ -178,13 +178,13 @@ def uncertainty_report(
     return MetricReport("uncertainty", {}, metrics, {})
 
 
-def format_uncertainty(metrics: Mapping[str, float]) -> str:
-    """Return the table of ``uncertainty_report``: a row for each class, distance and axis."""
+def format_uncertainty(metrics: Mapping[str, float], law: str = "normal") -> str:
+    """Return the table of an ``uncertainty_report``: a row for each class, distance and axis."""
     end = "/num_vertices"
     names = [key.removesuffix(end) for key in metrics if key.endswith(end)]
     wide = max((len(name) for name in names), default=0) + 1 - len("uncertainty/")
     titles = "".join(title.rjust(9) for _, title in _COLUMNS)
-    first = f"{'Gaussians of matched vertices':<{wide + 8}}"
+    first = f"{f'matched vertices, {law} law':<{wide + 8}}"
     rows = [f"{first}{titles} vertices"]
     for name in names:
         for axis in AXES:

@@ -88,9 +88,7 @@ def plot_result(reports: Sequence[MetricReport]) -> Figure:
     return figure
 
 
-def plot_uncertainty(
-    vertices: Vertices, classes: Sequence[str], law: str = "normal"
-) -> Figure:
+def plot_uncertainty(vertices: Vertices, classes: Sequence[str], law: str = "normal") -> Figure:
     """Draw a row for errors along and across: coverage of intervals, and sparsification.
 
     Sparsification shows the mean error in metres of what is left when the vertices of the largest
@@ -110,7 +108,7 @@ def plot_uncertainty(
             taken = 1 - np.arange(1, len(errors) + 1) / len(errors)
             right.plot(taken, sparsification(errors, errors), alpha=0.3, **line)
             right.plot(taken, sparsification(errors, sigmas), **line)
-        finish_shares(left, f"reliability {name}", "interval", "share of errors")
+        finish_shares(left, f"reliability {name}, {law} law", "interval", "share of errors")
         right.set(xlim=(0, 1), ylim=(0, None))
         finish_panel(right, f"sparsification {name}", "share taken away", "mean error (m)")
     return figure
