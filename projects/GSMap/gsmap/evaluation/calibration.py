@@ -105,7 +105,13 @@ def half_widths(law: str, levels: Sequence[float] | FloatArray) -> FloatArray:
 
 
 def reliability(errors: FloatArray, sigmas: FloatArray, law: str = "normal") -> FloatArray:
-    """Return the share of errors in the interval of each of ``LEVELS``. 2 x (n,) -> (19,)"""
+    """Return the share of errors in the interval of each of ``LEVELS``. (19,)
+
+    Args:
+        errors: In metres, >= 0. (n,)
+        sigmas: In metres. (n,)
+        law: What the errors are distributed by, one of ``LAWS``.
+    """
     ratios = np.sort(errors / sigmas)
     return np.searchsorted(ratios, half_widths(law, LEVELS), side="right") / len(errors)
 

@@ -93,6 +93,11 @@ def plot_uncertainty(vertices: Vertices, classes: Sequence[str], law: str = "nor
 
     Sparsification shows the mean error in metres of what is left when the vertices of the largest
     sigma are taken away, and below it, pale, of the largest errors.
+
+    Args:
+        vertices: Matched vertices.
+        classes: Names of the classes.
+        law: What the errors are distributed by, ``normal`` or ``laplace``.
     """
     style = MapStyle(tuple(classes))
     figure, axes = panel_grid(len(AXES), 2)
