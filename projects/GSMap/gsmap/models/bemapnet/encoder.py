@@ -15,8 +15,6 @@ from gsmap.models.lines.front import ahead, centres, front_size, turned
 from gsmap.models.maptr.layers import init_matrices
 from gsmap.structures.grid import BEVGrid
 
-ATTENTIONS = ("self_attn", "cross_attn")
-
 
 @MODELS.register_module()
 class BezierBEVEncoder(CameraEncoder):
@@ -59,8 +57,10 @@ class BezierBEVEncoder(CameraEncoder):
         self.input_proj = nn.Conv2d(in_channels, embed_dims, 1)
         settings = {"num_heads": 8, "ffn_dims": 1024, "dropout": 0.1, **(layer_cfg or {})}
         self.source_layers, self.bev_layers = (
-            nn.ModuleList(AttentionLayer(names, embed_dims, **settings) for _ in range(number))
-            for names, number in zip((ATTENTIONS[:1], ATTENTIONS), num_layers, strict=True)
+            nn.ModuleList(
+                AttentionLayer(embed_dims, **settings, to_memory=memory) for _ in range(number)
+            )
+            for memory, number in zip((False, True), num_layers, strict=True)
         )
         self.norm = nn.LayerNorm(embed_dims)
         self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)

@@ -31,11 +31,13 @@ class FormatBezierTargets(FormatLineTargets):
     pieces: Sequence[int] = (3, 1, 7)
     max_error_m: float = 0.1
 
-    by_class = "degrees"
-
     def __post_init__(self) -> None:
         check_curves(self.degrees, self.pieces)
         super().__post_init__()
+
+    def by_class(self) -> tuple[str, Sequence[int]]:
+        """Return the setting that has a number for each class: its name and the numbers."""
+        return "degrees", self.degrees
 
     def most(self) -> int:
         """Return the largest number P of control points of a line."""

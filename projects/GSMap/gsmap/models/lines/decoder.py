@@ -24,25 +24,30 @@ class AttentionLayer(nn.Module):
     """Attentions, one after another, and a feed-forward network; post-norm.
 
     Args:
-        attentions: Their names: ``self_attn`` of the tokens, ``cross_attn`` to a memory.
         embed_dims: Channels C; ``num_heads``, ``ffn_dims`` and ``dropout`` as everywhere.
+        to_memory: Whether there is attention to a memory beside that of the tokens.
+        memory_first: Whether it comes before.
     """
 
     def __init__(
         self,
-        attentions: Sequence[str],
         embed_dims: int,
         num_heads: int,
         ffn_dims: int,
         dropout: float = 0.0,
+        to_memory: bool = True,
+        memory_first: bool = False,
     ) -> None:
         super().__init__()
-        self.attentions = tuple(attentions)
-        for name in attentions:
+        self.crosses = sorted((False, True)[: 1 + to_memory], reverse=memory_first)
+        for cross in self.crosses:
             attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
-            self.add_module(name, attn)
+            if cross:
+                self.cross_attn = attn
+            else:
+                self.self_attn = attn
         self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
-        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in (*attentions, "ffn"))
+        self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in (*self.crosses, "ffn"))
         self.dropout = nn.Dropout(dropout)
 
     def forward(
@@ -58,12 +63,14 @@ class AttentionLayer(nn.Module):
         Positions are part of queries and keys. ``masks``, as `nn.MultiheadAttention` has them, are
         of the memory, without one of the tokens.
         """
+        own = masks if memory is None else {}
         *norms, last = self.norms
-        for name, norm in zip(self.attentions, norms, strict=True):
+        for cross, norm in zip(self.crosses, norms, strict=True):
             query = tokens + position
-            pair = (query, tokens) if name == "self_attn" else (key, memory)
-            hidden = masks if memory is None or name == "cross_attn" else {}
-            seen, _ = getattr(self, name)(query, *pair, need_weights=False, **hidden)
+            if cross:
+                seen, _ = self.cross_attn(query, key, memory, need_weights=False, **masks)
+            else:
+                seen, _ = self.self_attn(query, query, tokens, need_weights=False, **own)
             tokens = norm(tokens + self.dropout(seen))
         return last(self.ffn(tokens))
 
@@ -96,7 +103,7 @@ class PointLineDecoder(BaseModule):
         self.level = nn.Embedding(1, embed_dims)
         self.position = SinePositionalEncoding(embed_dims // 2, normalize=True)
         self.layers = nn.ModuleList(
-            AttentionLayer(("cross_attn", "self_attn"), embed_dims, num_heads, ffn_dims)
+            AttentionLayer(embed_dims, num_heads, ffn_dims, memory_first=True)
             for _ in range(num_layers)
         )
         self.norm = nn.LayerNorm(embed_dims)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -75,15 +75,17 @@ class FormatLineTargets(BaseTransform):
     step_m: float = 1.0
     sort_rings: bool = False
 
-    by_class: ClassVar[str]  # the setting that has a number for each class
-
     def __post_init__(self) -> None:
-        number = len(getattr(self, self.by_class))
-        if not set(self.edge_classes) <= set(range(number)):
+        name, numbers = self.by_class()
+        if not set(self.edge_classes) <= set(range(len(numbers))):
             raise ValueError(
-                f"edge_classes must be indices of the {number} classes of {self.by_class}, got "
+                f"edge_classes must be indices of the {len(numbers)} classes of {name}, got "
                 f"{self.edge_classes}."
             )
+
+    def by_class(self) -> tuple[str, Sequence[int]]:
+        """Return the setting that has a number for each class: its name and the numbers."""
+        raise NotImplementedError
 
     def most(self) -> int:
         """Return the largest number P of points of a line."""
@@ -121,10 +123,10 @@ class FormatLineTargets(BaseTransform):
 
     def lines(self, element: Any, grid: BEVGrid) -> list[Points]:
         """Return the parts of an element on the map, [0, 1] from the front and the left."""
-        numbers = getattr(self, self.by_class)
+        name, numbers = self.by_class()
         if not 0 <= element.label < len(numbers):
             raise ValueError(
-                f"label {element.label} of an element, but {self.by_class} of "
+                f"label {element.label} of an element, but {name} of "
                 f"{type(self).__name__} is {numbers}: give one for each class."
             )
         whole = element.points[:, :2].astype(np.float64)

@@ -58,12 +58,14 @@ class FormatPivotTargets(FormatLineTargets):
     min_area_m2: float = 2.0
     keep_end: bool = False
 
-    by_class = "num_points"
-
     def __post_init__(self) -> None:
         if min(self.num_points, default=0) < 2:
             raise ValueError(f"num_points must be >= 2 for each class, got {self.num_points}.")
         super().__post_init__()
+
+    def by_class(self) -> tuple[str, Sequence[int]]:
+        """Return the setting that has a number for each class: its name and the numbers."""
+        return "num_points", self.num_points
 
     def most(self) -> int:
         """Return the largest number P of pivots of a line."""
