@@ -127,4 +127,20 @@ class Shortened(torch.utils.data.Dataset):
 
 def test_a_bus_error_of_a_worker_is_no_want_of_memory():
     text = said(lambda: next(iter(DataLoader(Shortened(), num_workers=1))))
-    assert text.startswith("bus error of a data loader's worker: a data file was shortened while")
+    assert not text.startswith("out of memory")  # torch misses the signal now and then
+    assert "a data file was shortened while" in text
+
+
+@pytest.mark.parametrize(
+    ("cause", "text"),
+    [
+        ("pid 7) is killed by signal: Bus error.", "bus error of a data loader's worker: a data"),
+        ("pid 7) is killed by signal: Killed.", "out of memory (DataLoader worker (pid(s) 7) exi"),
+        ("", "DataLoader worker (pid(s) 7) exited unexpectedly, by a signal unknown: out of"),
+    ],
+)
+def test_the_signal_of_a_worker_says_what_was_missing(cause, text):
+    def end():
+        raise RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly") from OSError(cause)
+
+    assert said(end).startswith(text)

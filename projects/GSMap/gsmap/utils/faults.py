@@ -8,6 +8,14 @@ from difflib import get_close_matches
 from typing import Any
 
 _FULL = "free some space there, or write elsewhere"
+_LESS = (
+    "take a smaller batch (train_dataloader.batch_size=1), fewer processes (num_workers, "
+    "--workers) or smaller images"
+)
+_SHORTENED = (
+    "a data file was shortened while it was read (end what writes there, make it again), or "
+    "/dev/shm is full (take fewer num_workers)"
+)
 _REMEDIES = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
@@ -93,17 +101,18 @@ def _raised_in(error: BaseException) -> tuple[dict[str, Any], str]:
 def _of_the_machine(error: BaseException, text: str) -> str | None:
     """Speak of memory that does not suffice, and of devices and processes that are not there."""
     reason = text.strip().splitlines()[0].rstrip(".") if text.strip() else type(error).__name__
-    if isinstance(error, RuntimeError) and "signal: Bus error" in f"{text} {error.__cause__}":
-        return (
-            "bus error of a data loader's worker: a data file was shortened while it was read (end "
-            "what writes there, make it again), or /dev/shm is full (take fewer num_workers)."
-        )
+    signals = f"{text} {error.__cause__}"
+    if isinstance(error, RuntimeError) and "signal: Bus error" in signals:
+        return f"bus error of a data loader's worker: {_SHORTENED}."
+    if (
+        isinstance(error, RuntimeError)
+        and "exited unexpectedly" in text
+        and "signal:" not in signals
+    ):
+        return f"{reason}, by a signal unknown: out of memory ({_LESS}), or {_SHORTENED}."
     speaks = isinstance(error, (RuntimeError, OSError)) and _NO_MEMORY.search(text)
     if isinstance(error, MemoryError) or speaks:
-        return (
-            f"out of memory ({reason}): take a smaller batch (train_dataloader.batch_size=1), "
-            "fewer processes (num_workers, --workers) or smaller images."
-        )
+        return f"out of memory ({reason}): {_LESS}."
     if isinstance(error, RuntimeError) and _NO_PEER.search(text):
         return "another rank has ended; its own words say why."
     if isinstance(error, (RuntimeError, AssertionError)) and _NO_DEVICE.search(text):
