@@ -17,9 +17,10 @@ setup:
 setup-dev:
 	@GSMAP_DEV=1 tools/setup_env.sh $(VENV)
 
-# One process of one thread per core: threads that wait for each other cost more than they give. A file stays in one process.
+# One process of one thread per core: threads that wait for each other cost more than they give. A file stays in one process,
+# in the order of the folders: by numbers of tests, as pytest-xdist has it, files of one long test would come last.
 test: setup-dev
-	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest -n auto --dist loadfile $(ARGS)
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: setup-dev
 	$(PY) -m ruff check .
