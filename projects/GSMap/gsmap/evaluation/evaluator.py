@@ -200,10 +200,9 @@ class MapEvaluator:
         if self.raster:
             found["raster"] = match_raster(predictions, ground_truth, self.raster, token)
         if self.shrunk:
-            both = (
-                _in_shrunk_units(elements, self.shrunk) for elements in (predictions, ground_truth)
-            )
-            matches = match_chamfer(*both, ChamferConfig(self.classes), token)
+            found_there = _in_shrunk_units(predictions, self.shrunk)
+            true_there = _in_shrunk_units(ground_truth, self.shrunk)
+            matches = match_chamfer(found_there, true_there, ChamferConfig(self.classes), token)
             found[SHRUNK_NAME] = matches.if_two_sided()
         for config in self.drawn:
             found[config.method] = match_sample_ap(predictions, ground_truth, config, token)
