@@ -75,7 +75,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         default=list(METRIC_NAMES),
         choices=ALL_NAMES,
         help="metrics; chamfer_hard: besides chamfer also at 0.2, 0.5 and 1.0 m, matched once; "
-        "vectormapnet, hdmapnet, bemapnet: of these methods' own evaluators, not comparable",
+        "vectormapnet, vectormapnet_shrunk, hdmapnet, bemapnet: of these methods' own evaluators, "
+        "not comparable",
     )
     parser.add_argument(
         "--thresholds", nargs="+", type=float, help="of AP_chamfer, in metres (0.5 1.0 1.5)"

@@ -1,15 +1,19 @@
 """Which of a model's cameras looks as one of another rig does."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from mmdet3d.registry import MODELS
+from mmengine.registry import init_default_scope
 from model_cases import build_small, small_config
 
 from gsmap.apis.rig_fit import RigFitHook, _origin, fit_start, similar_cameras
 from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.datasets.annotations.record import CameraRecord, MapSample
+from gsmap.structures.grid import BEVGrid
 
 NUSCENES = (
     "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
@@ -112,6 +116,53 @@ def test_a_start_is_fitted_to_cameras_cells_and_classes():
         "y_range was [-30.0, 30.0], is (-15.0, 15.0)",
         "frame was lidar, is ego",
     ]
+
+
+def two_stages(detector: str) -> dict[str, Any]:
+    return {"type": "VectorMapNetHead", "detector": {"type": detector}}
+
+
+@pytest.mark.parametrize(
+    ("head", "keys"),
+    [
+        (
+            two_stages("KeyPointHead"),
+            {
+                "detector.cls_branch.weight": 0,
+                "detector.cls_branch.bias": 0,
+                "generator.label.weight": 0,
+            },
+        ),
+        ({"type": "KeyPointHead"}, {"cls_branch.weight": 0, "cls_branch.bias": 0}),
+        (
+            {"type": "HDMapNetHead", "decoder": {"base_channels": 4}},
+            {"decoder.maps.0.3.weight": 1, "decoder.maps.0.3.bias": 1},
+        ),
+        (two_stages("BezierHead"), {}),  # its classes have modules of their own
+    ],
+)
+def test_rows_of_classes_of_other_heads_are_found_by_name(head, keys):
+    init_default_scope("mmdet3d")
+    grid = BEVGrid((-30.0, 30.0), (-15.0, 15.0))
+    model = torch.nn.Module()
+    model.map_head = MODELS.build({**head, "grid": grid, "classes": METAINFO["classes"]})
+    for value in model.state_dict().values():
+        value.fill_(-1)
+    state = {key: value.clone() for key, value in model.state_dict().items()}
+    for name, first in keys.items():
+        rows = state[f"map_head.{name}"]
+        assert len(rows) == first + 3
+        rows += torch.arange(1.0, 1 + len(rows)).view(-1, *[1] * (rows.dim() - 1))  # 0, 1, 2, ..
+    before = {key: value.clone() for key, value in state.items()}
+    (line,) = fit_start(state, model, Drive(), METAINFO | {"classes": ORIGIN["classes"]})
+    for name, first in keys.items():
+        found = state.pop(f"map_head.{name}")
+        found = found.reshape(len(found), -1)
+        # what is no class, boundary, divider, and kerb, which is new
+        wanted = torch.tensor([*range(first), first + 2.0, first, -1.0])
+        torch.testing.assert_close(found, wanted[:, None].expand_as(found))
+    assert all(torch.equal(value, before[key]) for key, value in state.items())
+    assert line.startswith("classes keep their weights" if keys else "classes were divider")
 
 
 def test_classes_of_a_head_of_another_form_are_said_to_stay():

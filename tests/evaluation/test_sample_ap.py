@@ -16,7 +16,7 @@ from test_files import annotated, command, results_of, truth_of
 from gsmap.evaluation.average_precision import ten_point_ap
 from gsmap.evaluation.bootstrap import Resamples, resampled_figures
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.evaluator import ALL_NAMES, TWO_SIDED_NAME, MapEvaluator
+from gsmap.evaluation.evaluator import ALL_NAMES, SHRUNK_NAME, TWO_SIDED_NAME, MapEvaluator
 from gsmap.evaluation.groups import Groups, ap_by_group
 from gsmap.evaluation.map_metric import MapMetric
 from gsmap.evaluation.raster_ap import NUSCENES_GRID, RasterConfig
@@ -318,18 +318,48 @@ def test_vectormapnets_rule_leaves_out_samples_without_either_side():
     assert figures(*samples, evaluator=loose)["vectormapnet/mAP"] == metrics["vectormapnet/mAP"]
 
 
+def test_vectormapnets_units_shrink_a_map_as_much_as_its_canvas_is_larger():
+    """0.52 m across a map of 30 m are 0.4875 m there, 0.52 m along one of 60 m 0.503 m."""
+    both = replace(TWO_SIDED, shrunk=NUSCENES_GRID)
+    along = elements([UPRIGHT[:, ::-1]])
+    samples = [
+        (elements(aside(0.52), [0.9]), TRUTH),
+        (
+            elements([UPRIGHT[:, ::-1] + [0.0, 0.52]], [0.8], 1),
+            replace(along, labels=along.labels + 1),
+        ),
+        (NOTHING, TRUTH),  # left out
+    ]
+    metrics = figures(*samples, evaluator=both)
+    names = CLASSES[:2]
+    assert [metrics[f"{SHRUNK_NAME}/{name}/AP@0.5"] for name in names] == [1, 0]
+    assert [metrics[f"{SHRUNK_NAME}/{name}/AP@1.0"] for name in names] == [1, 1]
+    assert [metrics[f"{TWO_SIDED_NAME}/{name}/AP@0.5"] for name in names] == [0, 0]
+    rest = {key: value for key, value in metrics.items() if not key.startswith(SHRUNK_NAME)}
+    assert rest == figures(*samples, evaluator=TWO_SIDED)
+    samples = [sample[1:] for sample in sample_set()]
+    factors = np.array([30 / 32, 60 / 62])
+    scaled = [[replace(e, points=e.points * factors) for e in sample] for sample in samples]
+    found, wanted = figures(*samples, evaluator=both), figures(*scaled, evaluator=TWO_SIDED)
+    keys = [key for key in found if key.startswith(f"{SHRUNK_NAME}/")]
+    for key in keys:
+        assert found[key] == wanted[key.replace(SHRUNK_NAME, TWO_SIDED_NAME)], key
+    assert len(keys) > 10
+
+
 def test_command_writes_them_under_their_own_names_also_in_shards(tmp_path, capsys):
     results, truth = tmp_path / "results.json", annotated(tmp_path / "val.arrow", 8, scenes=4)
     write_results(results, [*results_of(7), ("t7", [])])
     out, parts = tmp_path / "all.json", tmp_path / "parts.json"
-    words = [str(results), str(truth), "--eval", "vectormapnet", *METHODS]
+    words = [str(results), str(truth), "--eval", "vectormapnet", SHRUNK_NAME, *METHODS]
     assert command()([*words, "--out", str(out)]).startswith("8 samples")
     written = json.loads(out.read_text())
     assert {key.split("/")[0] for key in written} == {
-        "chamfer", "vectormapnet", "hdmapnet", "bemapnet", "bemapnet_hard",
+        "chamfer", "vectormapnet", SHRUNK_NAME, "hdmapnet", "bemapnet", "bemapnet_hard",
     }  # fmt: skip
     assert written["bemapnet/divider/AP"] == written["hdmapnet/divider/AP"] == 7 / 8
     assert written["vectormapnet/divider/AP"] == 1 > written["chamfer/divider/AP"]
+    assert written[f"{SHRUNK_NAME}/divider/AP"] == 1
     assert "mAP_bemapnet_hard = 0.6" in capsys.readouterr().out
     for part in ("0/2", "1/2"):
         command()([*words, "--out", str(parts), "--shard", part])
@@ -352,6 +382,8 @@ def test_bad_settings_are_refused(tmp_path, capsys):
     for rules in (None, ChamferConfig(CLASSES, dim=3)):
         with pytest.raises(ValueError, match="vectormapnet is AP_chamfer of lines of 100 points"):
             replace(BOTH, chamfer=rules)
+        with pytest.raises(ValueError, match="vectormapnet is AP_chamfer of lines of 100 points"):
+            replace(DRAWN, chamfer=rules, shrunk=NUSCENES_GRID)
     with pytest.raises(ValueError, match=r"there is no metric .*'image'"):
         MapEvaluator.named(["image"], ChamferConfig(CLASSES), RasterConfig(CLASSES))
     with pytest.raises(ValueError, match="predictions need scores"):
@@ -371,3 +403,6 @@ def test_any_canvas_and_the_metric_of_a_config():
     metric.dataset_meta = {"classes": CLASSES, "x_range": (-15, 15), "y_range": (-30, 30)}
     assert metric.evaluator == MapEvaluator(None, None, drawn=(RULES["bemapnet"],))
     assert set(ALL_NAMES) >= {"chamfer", "raster", *METHODS}
+    metric = MapMetric(eval=[SHRUNK_NAME])
+    metric.dataset_meta = {"classes": CLASSES, "x_range": (-15, 15), "y_range": (-30, 30)}
+    assert metric.evaluator == replace(PLAIN, shrunk=BEVGrid((-15, 15), (-30, 30)))

@@ -22,6 +22,7 @@ ROWS = [
     if row["config"]
 ]
 TARGETS = {"FormatBezierTargets", "FormatMapTargets", "FormatPivotTargets"}
+METRICS = ("chamfer", "raster", "vectormapnet_shrunk", "bemapnet")
 EXTENDED = "configs/maptr/maptr_r50_extended_24e.py"
 
 
@@ -82,7 +83,7 @@ def test_every_figure_has_a_metric_and_no_row_stands_twice():
     columns = {column for table in read_tables() for column in table["columns"]}
     assert columns <= {
         f"{metric}/{name}"
-        for metric in ("chamfer", "raster")
+        for metric in METRICS
         for name in ("mAP", *(f"{c}/AP" for c in base(EXTENDED).classes))
     } | {"fps", "params_M", "memory_MB", "seconds_per_step"}
 
@@ -97,7 +98,7 @@ def test_the_means_of_the_papers_are_means():
             if not row["paper"] or not row["config"]:
                 continue
             values = dict(zip(table["columns"], row["paper"], strict=True))
-            for metric in ("chamfer", "raster"):
+            for metric in METRICS:
                 classes = [v for k, v in values.items() if k.startswith(metric) and "/AP" in k]
                 mean = values.get(f"{metric}/mAP")
                 if mean is not None and len(classes) > 1:

@@ -206,6 +206,24 @@ def test_a_pixel_stands_for_the_ground_that_it_shows(from_camera, expected):
     assert points[0, 2].tolist() == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("size", [(9, 20), (12, 17)])
+def test_positions_of_other_images_are_refused(size):
+    built = encoder(position_size=(9, 17))
+    with pytest.raises(
+        ValueError, match=rf"\(9, 17\), but images have {size[0]} rows and {size[1]}"
+    ):
+        built.ground_points(ground_from_img(), (2, 2), size)
+    built.ground_points(ground_from_img(), (2, 2), (7, 17))  # two rows are cut off
+    with pytest.raises(ValueError, match="num_layers must be those over the cameras"):
+        encoder(num_layers=(1, 0))
+
+
+def test_more_levels_than_weights_are_refused():
+    levels = [torch.randn(1, 16, 8, 4)] * 5
+    with pytest.raises(ValueError, match="returns 5 levels, but BezierHead has weights"):
+        head().loss({"bev_feats": levels[-1], "bev_levels": levels}, [sample(*LINES)])
+
+
 def test_a_batch_gives_what_its_samples_give_alone():
     built, feats = encoder(position_size=None), torch.randn(2, 1, 4, 3, 3)
     matrices = ground_from_img().repeat(2, 1, 1, 1)

@@ -199,6 +199,10 @@ def test_the_border_of_a_map_counts_as_outside():
     ("build", "message"),
     [
         (lambda: head(num_directions=7), "num_directions must divide 360"),
+        (
+            lambda: head(num_directions=72, vectorizing={"degrees": 10}),
+            "degrees is 10, but 72 directions are 5 degrees apart",
+        ),
         (lambda: head(losses={"push": -1.0}), "losses.push must not be negative"),
         (lambda: encoder(image_size=(8, 8)), "neither may be empty"),
         (lambda: MakeLineMaps(step_m=0), "step_m must be more than 0"),

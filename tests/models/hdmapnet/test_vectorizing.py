@@ -133,6 +133,27 @@ def test_points_of_a_place_that_has_been_passed_are_left_out():
     assert order_by_distance(np.zeros((0, 2), int)).shape == (0, 2)
 
 
+def test_points_are_ordered_from_nearest_to_nearest_as_by_hand():
+    """Every pixel of wide lines, as of saturated maps; a plain loop over the rules."""
+    rng = np.random.default_rng(0)
+    for wide in (1, 3, 6):
+        image = np.zeros((40, 60), np.uint8)
+        for a, b in rng.integers(0, 40, (4, 2, 2)):
+            cv2.line(image, a.tolist(), b.tolist(), 1, wide)
+        points = np.stack(np.nonzero(image)[::-1], 1)
+        left, chosen = list(range(1, len(points))), [0]
+        for step in range(len(points) - 1):
+            apart = np.hypot(*(points[left] - points[chosen[-1]]).T)
+            nearest = left.pop(int(apart.argmin()))
+            passed = np.hypot(*(points[chosen] - points[nearest]).T).min() < 5
+            if apart.min() > 3 and passed:
+                continue
+            if apart.min() > 10 and step > 0.9 * len(points):
+                break
+            chosen.append(nearest)
+        np.testing.assert_array_equal(order_by_distance(points), points[chosen])
+
+
 def test_directions_beside_the_best_are_not_the_second():
     logits = torch.zeros(37, 1, 1)
     logits[10], logits[12], logits[13], logits[11] = 5.0, 4.0, 3.0, 4.5
@@ -167,6 +188,8 @@ def test_lines_in_metres_are_elements():
         (lambda s, e, d: (s[0], e, d), "must be .channels, H, W. of one size"),
         (lambda s, e, d: (s[:1], e, d), "at least one class"),
         (lambda s, e, d: (s, e, d[:20]), "no circle in steps of 10 degrees"),
+        (lambda s, e, d: (s / 0, e, d), "^semantic have values that are not finite"),
+        (lambda s, e, d: (s, e * np.nan, d / 0), "^embedding and direction have values"),
     ],
 )
 def test_maps_that_do_not_fit_are_refused(change, message):
@@ -174,10 +197,15 @@ def test_maps_that_do_not_fit_are_refused(change, message):
         vectorize(*change(*maps()))
 
 
-@pytest.mark.parametrize("name", ["eps", "min_neighbours", "step_px", "jump_px", "degrees"])
-def test_settings_are_checked(name):
+@pytest.mark.parametrize(
+    "name", ["eps", "min_neighbours", "ridge_tolerance", "step_px", "jump_px", "degrees"]
+)
+@pytest.mark.parametrize("value", [0, np.nan])
+def test_settings_are_checked(name, value):
     with pytest.raises(ValueError, match=f"{name} must be more than 0"):
-        VectorizeConfig(**{name: 0})
+        VectorizeConfig(**{name: value})
+    with pytest.raises(ValueError, match="min_area_px must not be negative, got -1"):
+        VectorizeConfig(min_area_px=-1)
     release = VectorizeConfig()
     values = release.min_area_px, release.eps, release.min_neighbours, release.ridge_tolerance
     assert (*values, release.step_px, release.jump_px, release.degrees) == (

@@ -113,6 +113,41 @@ def test_any_detector_gives_boxes():
     assert box.tolist() == [round(200 * low[0]), round(100 * low[1]), round(200 * high[0]), 75]
 
 
+def test_a_detector_by_segmentation_gives_boxes_too():
+    """HDMapNet's lines, whose head has neither references nor queries."""
+    built = head({"type": "HDMapNetHead", "embed_dims": 8, "decoder": {"base_channels": 4}}).eval()
+    built.detector.lines = lambda maps: InstanceData(
+        pts=torch.tensor([[[0.0, 0.0], [9.0, 3.0], [9.0, 3.0]]]),
+        labels_3d=torch.tensor([1]),
+        scores_3d=torch.tensor([0.7]),
+        num_pts=torch.tensor([2]),
+    )
+    (found,) = built.predict(bev(), [sample()])
+    assert found.scores_3d.tolist() == pytest.approx([0.7] * len(found))
+    assert found.pts.shape[1:] == (6, 2)
+    box = built.boxes(built.detector.lines(None))[0]
+    assert box.tolist() == [round(200 * 30 / 62), round(100 * 15 / 32), round(200 * 39 / 62), 56]
+
+
+def test_levels_of_odd_sizes_are_added_and_all_are_needed():
+    torch.manual_seed(0)
+    encoder = HeightPlanesEncoder(GRID, (0.0,), 7.5, embed_dims=4, num_levels=3, neck_dims=4)
+    feats = [torch.randn(1, 2, 4, *size) for size in ((9, 15), (5, 8), (3, 4))]
+    assert encoder.joined(feats).shape == (1, 2, 4, 9, 15)
+    even = [torch.randn(1, 1, 4, 12 >> i, 20 >> i) for i in range(3)]
+    whole = even[0].flatten(0, 1)
+    for level, blocks in zip(even[1:], encoder.upsampling, strict=True):
+        image = level.flatten(0, 1)
+        for block in blocks:  # twice the size, as released
+            image = torch.nn.functional.interpolate(
+                block(image), scale_factor=2.0, mode="bilinear", align_corners=True
+            )
+        whole = whole + image
+    torch.testing.assert_close(encoder.joined(even)[0], whole, rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="built for 3 levels of image features, got 2"):
+        encoder.joined(feats[:2])
+
+
 def test_the_graph_of_two_stages_is_refused_with_the_reason():
     model = SimpleNamespace(lidar_encoder=None, map_head=head())
     with pytest.raises(ValueError, match="VectorMapNetHead cannot be exported: polylines are"):

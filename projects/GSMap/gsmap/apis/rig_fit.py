@@ -35,6 +35,13 @@ AZIMUTHS_DEG = {
 }  # fmt: skip
 
 
+_GENERATED = "map_head.generator.label."  # VectorMapNet's, which fits its detector or none
+# Weights with a row for each class, and how many rows are before these.
+_CLASS_ROWS = {
+    "map_head.cls_branches.": 0, "map_head.cls_branch.": 0, "map_head.detector.cls_branches.": 0,
+    "map_head.detector.cls_branch.": 0, _GENERATED: 0,
+    "map_head.decoder.maps.0.3.": 1,  # HDMapNet's: the background
+}  # fmt: skip
 _LOOK_AT = 100  # samples among which one with all cameras is looked for
 
 
@@ -176,22 +183,24 @@ def _fit_classes(
     """Let classes of the same name keep their weights; others begin as new."""
     if trained is None or list(trained) == list(names):
         return []
-    kept = {name: list(trained).index(name) for name in names if name in trained}
-    fitted = False
-    for key, new in own.items():
-        old = state.get(key)
-        if old is None or not key.startswith("map_head.cls_branches."):
-            continue
-        if len(old) == len(trained) and len(new) == len(names):
-            fitted, state[key] = True, new.detach().clone().to(old)
-            for row, name in enumerate(names):
-                if name in kept:
-                    state[key][row] = old[kept[name]]
-    if not fitted:
+    found = {}  # key -> rows before those of the classes
+    for prefix, first in _CLASS_ROWS.items():
+        sizes = first + len(trained), first + len(names)
+        for key in own.keys() & state.keys():
+            if key.startswith(prefix) and (len(state[key]), len(own[key])) == sizes:
+                found[key] = first
+    if all(key.startswith(_GENERATED) for key in found):
         return [
             f"classes were {', '.join(trained)}, are {', '.join(names)}: this head's weights of "
             "classes are taken as they are, where their sizes fit."
         ]
+    kept = {name: list(trained).index(name) for name in names if name in trained}
+    for key, first in found.items():
+        old, state[key] = state[key], own[key].detach().clone().to(state[key])
+        state[key][:first] = old[:first]
+        for row, name in enumerate(names, first):
+            if name in kept:
+                state[key][row] = old[first + kept[name]]
     fresh = [name for name in names if name not in kept]
     return [f"classes keep their weights: {listed(list(kept))}; begin as new: {listed(fresh)}."]
 

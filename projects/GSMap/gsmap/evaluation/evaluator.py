@@ -1,8 +1,10 @@
 """All metrics over a stream of samples: match each sample once, keep only its matches."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+
+import numpy as np
 
 from gsmap.evaluation.chamfer_ap import (
     CHAMFER_THRESHOLDS,
@@ -21,6 +23,7 @@ from gsmap.evaluation.sample_ap import (
     sample_ap_reports,
 )
 from gsmap.structures.elements import MapElements
+from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import resample_all
 
 METRIC_NAMES = ("chamfer", "raster")
@@ -28,7 +31,10 @@ HARD_NAME = "chamfer_hard"
 """AP_chamfer at the hard thresholds besides, of the same matching."""
 TWO_SIDED_NAME = "vectormapnet"
 """VectorMapNet's own: AP_chamfer without the samples that lack predictions or ground truth."""
-ALL_NAMES = (*METRIC_NAMES, HARD_NAME, TWO_SIDED_NAME, *METHODS)
+SHRUNK_NAME = "vectormapnet_shrunk"
+"""The same in the units of its release, where a map is as much smaller as its canvas is larger."""
+SHRUNK_MARGIN_M = 2.0
+ALL_NAMES = (*METRIC_NAMES, HARD_NAME, TWO_SIDED_NAME, SHRUNK_NAME, *METHODS)
 Sample = tuple[str, MapElements, MapElements]  # token, predictions, ground truth
 SampleMatches = dict[str, FrameMatches]  # by the name of the metric
 
@@ -49,10 +55,12 @@ class MapEvaluator:
         two_sided: Whether another report, ``vectormapnet``, leaves out samples without predictions
             or without ground truth; by the rules of AP_chamfer, at 0.5, 1.0 and 1.5 m.
         drawn: Rules of AP per sample, a method each.
+        shrunk: The map's extent, by which another report, ``vectormapnet_shrunk``, scales both
+            sides before it does as ``two_sided``; None leaves it out.
 
     Raises:
         ValueError: If all are left out, their classes differ, or AP_chamfer has other rules than
-            ``two_sided`` needs.
+            ``two_sided`` and ``shrunk`` need.
     """
 
     chamfer: ChamferConfig | None
@@ -61,6 +69,7 @@ class MapEvaluator:
     hard: bool = False
     two_sided: bool = False
     drawn: tuple[SampleAPConfig, ...] = ()
+    shrunk: BEVGrid | None = None
 
     def __post_init__(self) -> None:
         classes = {config.classes for config in self._configs}
@@ -69,7 +78,7 @@ class MapEvaluator:
         if len({config.method for config in self.drawn}) != len(self.drawn):
             raise ValueError("drawn must have one entry for a method.")
         plain = self.chamfer and replace(self.chamfer, thresholds=CHAMFER_THRESHOLDS)
-        if self.two_sided and plain != ChamferConfig(next(iter(classes))):
+        if (self.two_sided or self.shrunk) and plain != ChamferConfig(next(iter(classes))):
             raise ValueError(
                 f"{TWO_SIDED_NAME} is AP_chamfer of lines of 100 points in the plane: leave out "
                 "heights (dim 3) and points as they are given."
@@ -103,19 +112,21 @@ class MapEvaluator:
             raise ValueError(f"there is no metric {sorted(unknown)}; there are {ALL_NAMES}.")
         beside = HARD_NAME in names, TWO_SIDED_NAME in names
         methods = [method for method in METHODS if method in names]
-        if raster is None and (methods or "raster" in names):
-            raise ValueError("metrics of masks need the rules of AP_raster.")
+        if raster is None and (methods or {"raster", SHRUNK_NAME} & set(names)):
+            raise ValueError("metrics of masks or of shrunk maps need the rules of AP_raster.")
         drawn = [
             SampleAPConfig(raster.classes, method, raster.grid, min_score)
             for method in methods
             if raster
         ]
+        shrunk = raster.grid if raster and SHRUNK_NAME in names else None
         return cls(
-            chamfer if "chamfer" in names or any(beside) else None,
+            chamfer if "chamfer" in names or any(beside) or shrunk else None,
             raster if "raster" in names else None,
             ground_truth_points,
             *beside,
             tuple(drawn),
+            shrunk,
         )
 
     @property
@@ -188,6 +199,11 @@ class MapEvaluator:
             found["chamfer"] = match_chamfer(predictions, ground_truth, self._chamfer, token)
         if self.raster:
             found["raster"] = match_raster(predictions, ground_truth, self.raster, token)
+        if self.shrunk:
+            found_there = _in_shrunk_units(predictions, self.shrunk)
+            true_there = _in_shrunk_units(ground_truth, self.shrunk)
+            matches = match_chamfer(found_there, true_there, ChamferConfig(self.classes), token)
+            found[SHRUNK_NAME] = matches.if_two_sided()
         for config in self.drawn:
             found[config.method] = match_sample_ap(predictions, ground_truth, config, token)
         return found
@@ -200,6 +216,8 @@ class MapEvaluator:
             found["chamfer"] = len(self._chamfer.thresholds)
         if self.raster:
             found["raster"] = len(next(iter(self.raster.thresholds.values())))
+        if self.shrunk:
+            found[SHRUNK_NAME] = len(CHAMFER_THRESHOLDS)
         return found
 
     def require_fitting(self, found: SampleMatches) -> None:
@@ -229,6 +247,18 @@ class MapEvaluator:
                 two_sided.add(sample["chamfer"].if_two_sided())
         if not any(map(len, tables.values())):
             raise ValueError("there is no sample to score.")
+        found += self._distance_reports(tables, two_sided)
+        if self.raster:
+            found.append(raster_report(tables["raster"], self.raster))
+        for config in self.drawn:
+            found += sample_ap_reports(tables[config.method], config)
+        return found
+
+    def _distance_reports(
+        self, tables: Mapping[str, MatchTable], two_sided: MatchTable
+    ) -> list[MetricReport]:
+        """Compute AP_chamfer, and what else is made of distances."""
+        found = []
         if self.chamfer and self._chamfer:
             chamfer, rules = tables["chamfer"], self._chamfer
             found.append(chamfer_report(chamfer, rules, self.chamfer.thresholds))
@@ -236,8 +266,18 @@ class MapEvaluator:
                 found.append(chamfer_report(chamfer, rules, HARD_CHAMFER_THRESHOLDS, HARD_NAME))
             if self.two_sided:
                 found.append(chamfer_report(two_sided, rules, CHAMFER_THRESHOLDS, TWO_SIDED_NAME))
-        if self.raster:
-            found.append(raster_report(tables["raster"], self.raster))
-        for config in self.drawn:
-            found += sample_ap_reports(tables[config.method], config)
+        if self.shrunk:
+            rules = ChamferConfig(self.classes)
+            found.append(chamfer_report(tables[SHRUNK_NAME], rules, name=SHRUNK_NAME))
         return found
+
+
+def _in_shrunk_units(elements: MapElements, grid: BEVGrid) -> MapElements:
+    """Return elements of a map in the units of VectorMapNet's release.
+
+    There coordinates are a share of the map and 2 m more, and come back as that share of the map
+    alone. It matters to distances that they are scaled so, not from which corner.
+    """
+    size = np.array(grid.extent_m)
+    points = elements.with_coordinates(2).points * (size / (size + SHRUNK_MARGIN_M))
+    return replace(elements, points=points)

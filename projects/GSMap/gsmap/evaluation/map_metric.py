@@ -12,7 +12,7 @@ from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_truth
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.evaluator import ALL_NAMES, METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.evaluator import ALL_NAMES, METRIC_NAMES, SHRUNK_NAME, MapEvaluator
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import flat_metrics, format_table
 from gsmap.evaluation.results_json import vectors_of, write_results
@@ -32,8 +32,8 @@ class MapMetric(BaseMetric):
 
     Args:
         eval: Metrics to compute: ``chamfer``, ``raster``, besides ``chamfer`` also
-            ``chamfer_hard`` and ``vectormapnet``, ``hdmapnet`` and ``bemapnet``; may be empty if
-            only ``out_file`` is wanted.
+            ``chamfer_hard``, ``vectormapnet`` and ``vectormapnet_shrunk``, ``hdmapnet`` and
+            ``bemapnet``; may be empty if only ``out_file`` is wanted.
         thresholds: Thresholds of AP_chamfer in metres.
         out_file: Where to write the predictions in MapTR's JSON form, or None.
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
@@ -72,7 +72,7 @@ class MapMetric(BaseMetric):
         classes = tuple(self._meta("classes"))
         chamfer = ChamferConfig(classes, self.thresholds, dim=self.dataset_meta.get("dim", 2))
         raster = None
-        if {"raster", *METHODS} & set(self.eval):
+        if {"raster", SHRUNK_NAME, *METHODS} & set(self.eval):
             grid = BEVGrid(self._meta("x_range"), self._meta("y_range"))
             raster = RasterConfig(classes, grid)
         return MapEvaluator.named(self.eval, chamfer, raster)

@@ -124,6 +124,7 @@ def _evaluator(options: dict[str, Any]) -> MapEvaluator:
         canvas = {"grid": BEVGrid(**values["grid"])} if "grid" in values else {}
         return kind(**(values | lists | canvas))
 
+    shrunk = options["shrunk"]
     return MapEvaluator(
         rules(ChamferConfig, options["chamfer"]),
         rules(RasterConfig, options["raster"]),
@@ -131,4 +132,5 @@ def _evaluator(options: dict[str, Any]) -> MapEvaluator:
         options["hard"],
         options["two_sided"],
         tuple(rules(SampleAPConfig, values) for values in options["drawn"]),
+        shrunk and BEVGrid(**shrunk),
     )

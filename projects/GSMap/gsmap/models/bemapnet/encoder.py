@@ -34,6 +34,9 @@ class BezierBEVEncoder(CameraEncoder):
         position_size: Rows and columns of the image over which positions of pixels are spread: as
             released, of the one that is not cropped yet. None takes the images' own.
         from_camera: Place points relative to their camera, as released, not to the vehicle.
+
+    Raises:
+        ValueError: If ``num_layers`` are not two numbers, of which the second is 1 or more.
     """
 
     calibration = ("ground_from_img",)
@@ -52,6 +55,11 @@ class BezierBEVEncoder(CameraEncoder):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
+        if len(num_layers) != 2 or num_layers[1] < 1:
+            raise ValueError(
+                "num_layers must be those over the cameras and those of the BEV cells, of which at "
+                f"least 1, got {tuple(num_layers)}."
+            )
         self.grid, self.from_camera = grid.rasterized(bev_pixel_m), from_camera
         self.position_size, self.embed_dims = position_size, embed_dims
         self.input_proj = nn.Conv2d(in_channels, embed_dims, 1)
@@ -105,9 +113,17 @@ class BezierBEVEncoder(CameraEncoder):
         """Return what point on the ground each pixel of maps of a size shows, and whether it does.
 
         Points are metres ahead and to the left. (B, S, 2), (B, S)
+
+        ValueError if ``position_size`` is not that of these images before rows were cut off.
         """
         matrices = ground_from_img.float()
         image_size = self.position_size or img_shape
+        if image_size[0] < img_shape[0] or image_size[1] != img_shape[1]:
+            raise ValueError(
+                f"position_size of BezierBEVEncoder is {tuple(image_size)}, but images have "
+                f"{img_shape[0]} rows and {img_shape[1]} columns: set it to their size before rows "
+                "are cut off, or to None."
+            )
         rays = pixel_rays(matrices, (image_size[0], image_size[1]), (size[0], size[1]))
         camera = matrices[:, :, None, None, :3, 3]
         depth = -camera[..., 2:] / rays[..., 2:]

@@ -71,6 +71,11 @@ class HDMapNetHead(DetectionHead):
         self.losses = LineMapLosses(**(losses or {}))
         self.num_directions, degrees = num_directions, 360 // num_directions
         self.vectorizing = VectorizeConfig(**{"degrees": degrees, **(vectorizing or {})})
+        if self.vectorizing.degrees != degrees:
+            raise ValueError(
+                f"vectorizing.degrees is {self.vectorizing.degrees}, but {num_directions} "
+                f"directions are {degrees} degrees apart: leave it out, num_directions decides it."
+            )
         sizes = embed_dims, len(classes), embedding_dims, num_directions
         self.decoder = LineMapDecoder(*sizes, **(decoder or {}))
 

@@ -10,9 +10,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numba import njit
 from torch import Tensor, from_numpy
 from torch.nn.functional import avg_pool2d, max_pool2d
 
+import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.models.hdmapnet.clustering import dense_clusters
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 
@@ -43,9 +45,10 @@ class VectorizeConfig:
     degrees: int = 10
 
     def __post_init__(self) -> None:
-        sizes = ("eps", "min_neighbours", "step_px", "jump_px", "degrees")
         for name, value in vars(self).items():
-            if name in sizes and value <= 0:
+            if name == "min_area_px" and not value >= 0:
+                raise ValueError(f"min_area_px must not be negative, got {value}.")
+            if name != "min_area_px" and not value > 0:
                 raise ValueError(f"{name} must be more than 0, got {value}.")
 
 
@@ -80,7 +83,8 @@ def vectorize(
         The lines, class after class; labels are 0 to C - 1.
 
     Raises:
-        ValueError: If the maps have other sizes, or there is no class beside the background.
+        ValueError: If the maps have other sizes or values that are not finite, or there is no class
+            beside the background.
     """
     config = config or VectorizeConfig()
     _check(semantic, embedding, direction, config)
@@ -133,6 +137,10 @@ def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: Vecto
             f"{len(direction)} channels of direction are none and {len(direction) - 1} directions, "
             f"which make no circle in steps of {config.degrees} degrees."
         )
+    named = {"semantic": semantic, "embedding": embedding, "direction": direction}
+    broken = [name for name, values in named.items() if not bool(values.isfinite().all())]
+    if broken:
+        raise ValueError(f"{' and '.join(broken)} have values that are not finite.")
 
 
 def top_directions(direction: Tensor) -> IntArray:
@@ -221,21 +229,39 @@ def order_by_distance(points: IntArray) -> IntArray:
     Returns:
         The points that are kept, in order. (m, 2)
     """
-    if not len(points):
-        return points
-    left = np.ones(len(points), dtype=bool)
-    left[0], chosen = False, [0]
+    return points[_order(points)] if len(points) else points
+
+
+@njit(cache=True)
+def _order(points: IntArray) -> IntArray:
+    """Return which points are kept, in order: saturated maps have thousands. (n, 2) -> (m,)"""
+    left, chosen, kept = np.ones(len(points), np.bool_), np.zeros(len(points), np.int64), 1
+    left[0] = False
     for step in range(len(points) - 1):
-        others = np.flatnonzero(left)
-        apart = ((points[others] - points[chosen[-1]]) ** 2).sum(1)
-        nearest, gap = others[apart.argmin()], apart.min()
+        nearest, gap = -1, 0
+        for i in range(len(points)):
+            if left[i]:
+                apart = _squared_distance(points[i], points[chosen[kept - 1]])
+                if nearest < 0 or apart < gap:
+                    nearest, gap = i, apart
         left[nearest] = False
-        if gap > 3**2 and ((points[chosen] - points[nearest]) ** 2).sum(1).min() < 5**2:
+        passed = False
+        if gap > 3**2:
+            for i in chosen[:kept]:
+                passed |= _squared_distance(points[i], points[nearest]) < 5**2
+        if passed:
             continue
         if gap > 10**2 and step > 0.9 * len(points):
             break
-        chosen.append(nearest)
-    return points[chosen]
+        chosen[kept] = nearest
+        kept += 1
+    return chosen[:kept]
+
+
+@njit(cache=True)
+def _squared_distance(point: IntArray, other: IntArray) -> int:
+    """Return the squared distance of two pixels. (2,) each"""
+    return int((point[0] - other[0]) ** 2 + (point[1] - other[1]) ** 2)
 
 
 def trace(points: IntArray, directions: IntArray, start: int, config: VectorizeConfig) -> IntArray:

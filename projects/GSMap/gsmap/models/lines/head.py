@@ -168,7 +168,16 @@ class LineHead(DetectionHead):
             yield Case(type(lines)(*own), *further)
 
     def semantic_loss(self, levels: Sequence[Tensor], truths: Sequence[Sequence[Any]]) -> Tensor:
-        """Return the loss of the class masks of all BEV levels (B, classes, H, W)."""
+        """Return the loss of the class masks of all BEV levels (B, classes, H, W).
+
+        ValueError if there are more levels than weights.
+        """
+        if len(levels) > len(self.level_weights):
+            raise ValueError(
+                f"the BEV encoder returns {len(levels)} levels, but {type(self).__name__} has "
+                f"weights for the class masks of {len(self.level_weights)}: give the encoder fewer "
+                "layers."
+            )
         drawn = [torch.stack([own.masks.sum(0).clamp(max=1) for own in truth]) for truth in truths]
         by_class = torch.stack(drawn, 1)  # (classes, B, H, W)
         terms = [

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import PillarProjection, project_pillars
-from gsmap.models.maptr.layers import resnet_stages
+from gsmap.models.maptr.layers import enlarged, resnet_stages
 from gsmap.structures.grid import BEVGrid
 
 
@@ -74,13 +74,23 @@ class HeightPlanesEncoder(CameraEncoder):
         return {"bev_feats": self.neck(self.flattened(planes))}
 
     def joined(self, feats: Sequence[Tensor]) -> Tensor:
-        """Return the sum of all levels at the size of the first. (B, V, C, h, w)"""
+        """Return the sum of all levels at the size of the first. (B, V, C, h, w)
+
+        Each level is enlarged to that of the next finer one, and so on. ValueError if there are
+        fewer levels than the encoder is built for.
+        """
+        if len(feats) != self.num_levels:
+            raise ValueError(
+                f"HeightPlanesEncoder is built for {self.num_levels} levels of image features, got "
+                f"{len(feats)}: set its num_levels, or out_indices and num_outs of backbone and "
+                "neck."
+            )
+        sizes = [level.shape[-2:] for level in feats]
         total = feats[0].flatten(0, 1)
-        for level, blocks in zip(feats[1:], cast(Any, self.upsampling), strict=True):
-            image = level.flatten(0, 1)
-            for block in blocks:
-                image = block(image)
-                image = F.interpolate(image, scale_factor=2.0, mode="bilinear", align_corners=True)
+        for number, blocks in enumerate(cast(Any, self.upsampling), 1):
+            image = feats[number].flatten(0, 1)
+            for block, size in zip(blocks, reversed(sizes[:number]), strict=True):
+                image = enlarged(block(image), size)
             total = total + image
         return total.unflatten(0, feats[0].shape[:2])
 

@@ -70,7 +70,6 @@ class VectorMapNetHead(DetectionHead):
             )
         second: PARTS = {"canvas": self.canvas, "num_classes": len(classes), **(generator or {})}
         self.generator = PolylineGenerator(**second)
-        self.reference, self.coder = self.detector.reference, self.detector.coder
 
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
         """Fit a checkpoint's state to the detector's, in place."""
