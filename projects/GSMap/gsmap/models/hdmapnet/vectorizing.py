@@ -15,6 +15,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gsmap.models.hdmapnet.clustering import dense_clusters
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+from gsmap.utils.settings import check_positive
 
 Float32 = np.float32
 NONE = -1  # no direction
@@ -44,9 +45,7 @@ class VectorizeConfig:
 
     def __post_init__(self) -> None:
         sizes = ("eps", "min_neighbours", "step_px", "jump_px", "degrees")
-        for name, value in vars(self).items():
-            if name in sizes and value <= 0:
-                raise ValueError(f"{name} must be more than 0, got {value}.")
+        check_positive(**{name: getattr(self, name) for name in sizes})
 
 
 class TracedLine(NamedTuple):
