@@ -289,6 +289,30 @@ def _check_targets(cfg: Config) -> None:
                     f"{cfg.filename}: {kind} needs the targets of {name}: add it to the pipeline "
                     "of train_dataloader.dataset."
                 )
+        _check_shared(cfg, steps)
+
+
+def _check_shared(cfg: Config, steps: list[Any]) -> None:
+    """Refuse a transform that has another value of a setting than the head (its ``shared``)."""
+    head = (cfg.get("model") or {}).get("map_head") or {}
+    kind = _class(head.get("type"))
+    shared, made = getattr(kind, "shared", ()), getattr(kind, "transforms", ())
+    for step in steps if shared else ():
+        transform = _class(step.get("type"), TRANSFORMS)
+        if getattr(transform, "__name__", None) not in made:
+            continue
+        for name in shared:
+            own, other = _setting(kind, head, name), _setting(transform, step, name)
+            if own != other:
+                raise ValueError(
+                    f"{cfg.filename}: {name} of {head['type']} is {own}, that of {step['type']} "
+                    f"{other}: set both to one value."
+                )
+
+
+def _setting(kind: Any, part: dict[str, Any], name: str) -> Any:
+    """Return a setting of a part, or the default of its class."""
+    return part.get(name, inspect.signature(kind).parameters[name].default)
 
 
 def _pipelines(dataset: dict[str, Any]) -> list[list[Any]]:
