@@ -13,6 +13,7 @@ from gsmap.engine.launch import (
     newest_checkpoint,
     read_config,
 )
+from gsmap.models.pivotnet.targets import FormatPivotTargets
 
 SPLITS = ("train", "val", "test")
 
@@ -105,6 +106,53 @@ def test_a_cosine_schedule_of_another_length_is_refused():
         check_config(Config(cfg))
     cfg["param_scheduler"][0]["T_max"] = 110
     check_config(Config(cfg))
+
+
+@pytest.mark.parametrize(
+    ("config", "transform", "kind"),
+    [
+        ("mapqr/mapqr_r18_minicity.py", "MakeBEVMask", "BEVMaskHead"),
+        ("mapqr/mapqr_r18_minicity.py", "MakePVMask", "PVMaskHead"),
+        ("maptrv2/maptrv2_r50_24e.py", "MakeDepthMap", "DepthSupervision"),
+        ("mgmap/mgmap_r18_minicity.py", "FormatMapTargets", "MapHead"),
+    ],
+)
+def test_a_pipeline_without_a_target_of_a_head_or_its_parts_is_refused(config, transform, kind):
+    cfg = read_config(f"configs/{config}")
+    check_config(cfg)
+    dataset = cfg.train_dataloader.dataset
+    dataset.pipeline = [step for step in dataset.pipeline if step.type != transform]
+    with pytest.raises(ValueError, match=f"{kind} needs the targets of {transform}: add it"):
+        check_config(cfg)
+
+
+def test_targets_are_found_in_wrapped_data_sets_and_steps_and_by_their_base_class():
+    class Own(FormatPivotTargets):
+        pass
+
+    cfg = read_config("configs/pivotnet/pivotnet_r18_minicity.py")
+    plain = cfg.train_dataloader.dataset.to_dict()
+    bare = {**plain, "pipeline": [s for s in plain["pipeline"] if "Pivot" not in s["type"]]}
+    repeated = {"type": "RepeatDataset", "times": 2, "dataset": plain}
+    inner = {"type": "RandomApply", "transforms": [{"type": Own}]}
+    own = {**plain, "pipeline": [inner]}
+    cfg.train_dataloader.dataset = {"type": "ConcatDataset", "datasets": [repeated, own]}
+    check_config(cfg)
+    cfg.train_dataloader.dataset = {"type": "ConcatDataset", "datasets": [repeated, bare]}
+    with pytest.raises(ValueError, match="PivotHead needs the targets of FormatPivotTargets"):
+        check_config(cfg)
+
+
+@pytest.mark.parametrize("side", ["head", "transform"])
+def test_a_setting_that_head_and_transform_share_has_one_value(side):
+    cfg = read_config("configs/hdmapnet/hdmapnet_r18_minicity.py")
+    steps = cfg.train_dataloader.dataset.pipeline
+    (step,) = [step for step in steps if step.type == "MakeLineMaps"]
+    (cfg.model.map_head if side == "head" else step).num_directions = 72
+    with pytest.raises(ValueError, match=r"num_directions of HDMapNetHead is .*: set both to one"):
+        check_config(cfg)
+    cfg.model.map_head.num_directions = step.num_directions = 72
+    check_config(cfg)
 
 
 STREAMS = {"type": "StreamTrainSampler", "slots": 2}

@@ -1,11 +1,12 @@
 """MakeInstanceMasks: which element has a cell, by hand."""
 
 import numpy as np
+import pytest
 import torch
 from mmengine.structures import InstanceData
 
 from gsmap.datasets.annotations.record import MapInstance
-from gsmap.datasets.transforms.masks import MakeInstanceMasks
+from gsmap.datasets.transforms.masks import MakeBEVMask, MakeInstanceMasks, MakePVMask
 
 
 def masks(*elements, **settings):
@@ -41,3 +42,29 @@ def test_the_later_one_of_a_class_has_the_cells_of_both():
 def test_near_a_later_class_all_give_way():
     assert masks((2, 4), (0, 2), (0, 7)) == [[4], [], [7]]
     assert masks((0, 4), (0, 4), (1, 5)) == [[], [], [5]]
+
+
+@pytest.mark.parametrize(
+    ("transform", "settings", "message"),
+    [
+        (MakeInstanceMasks, {"gap_px": -1}, "gap_px must be more than 0, got -1"),
+        (MakeInstanceMasks, {"size": (0, 9)}, "rows must be more than 0"),
+        (MakeBEVMask, {"size": (6, -9)}, "columns must be more than 0"),
+        (MakeBEVMask, {"num_classes": -1}, "num_classes must be more than 0"),
+        (MakePVMask, {"stride": 0}, "stride must be more than 0"),
+        (MakePVMask, {"thickness_px": 0}, "thickness_px must be more than 0"),
+    ],
+)
+def test_numbers_that_are_not_positive_are_refused_when_it_is_built(transform, settings, message):
+    with pytest.raises(ValueError, match=message):
+        transform(**settings)
+
+
+def test_a_sample_without_ground_truth_or_targets_is_named():
+    sample = {"token": "a", "map_instances": [], "x_range": (0.0, 9.0), "y_range": (0.0, 6.0)}
+    with pytest.raises(ValueError, match="'a' has no targets yet: put MakeInstanceMasks behind"):
+        MakeInstanceMasks().transform(sample)
+    bare = {**sample, "map_instances": None, "img_shape": (64, 64), "lidar2img": np.eye(4)[None]}
+    for transform in (MakeInstanceMasks, MakeBEVMask, MakePVMask):
+        with pytest.raises(ValueError, match=f"leave {transform.__name__} out of this pipeline"):
+            transform().transform(bare)

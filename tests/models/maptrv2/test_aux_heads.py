@@ -94,12 +94,16 @@ def test_depth_loss_by_hand():
 
 
 @pytest.mark.parametrize(
-    ("head", "target"),
-    [(BEVMaskHead(16), "gt_seg"), (PVMaskHead(16), "gt_pv_seg"), (DepthSupervision(), "gt_depth")],
+    ("head", "target", "transform"),
+    [
+        (BEVMaskHead(16), "gt_seg", "MakeBEVMask"),
+        (PVMaskHead(16), "gt_pv_seg", "MakePVMask"),
+        (DepthSupervision(), "gt_depth", "MakeDepthMap"),
+    ],
 )
-def test_missing_target_is_named(head, target):
+def test_missing_target_is_named(head, target, transform):
     outputs = {**bev(), "depth": torch.rand(1, 2, 6, 3, 4), "depth_range": (1.0, 7.0, 1.0)}
-    with pytest.raises(ValueError, match=rf"sample 'b' has no {target}: add its transform"):
+    with pytest.raises(ValueError, match=rf"'b' has no {target}: add its transform {transform} to"):
         head.loss(outputs, [Det3DDataSample(metainfo={"token": "b"})])
 
 

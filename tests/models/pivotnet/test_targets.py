@@ -60,6 +60,9 @@ def test_no_element_and_elements_that_cannot_be():
         FormatPivotTargets(num_points=(10, 1))
     with pytest.raises(ValueError, match="edge_classes must be indices of the 3 classes"):
         FormatPivotTargets(edge_classes=(3,))
+    for name in ("pixel_m", "step_m", "thickness_px"):
+        with pytest.raises(ValueError, match=f"{name} must be more than 0, got 0"):
+            FormatPivotTargets(**{name: 0})
     with pytest.raises(ValueError, match="leave FormatPivotTargets out"):
         FormatPivotTargets().transform({"map_instances": None, "token": "a"})
 

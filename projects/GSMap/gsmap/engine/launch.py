@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from mmdet3d.registry import DATA_SAMPLERS, MODELS, OPTIMIZERS, RUNNERS
+from mmdet3d.registry import DATA_SAMPLERS, MODELS, OPTIMIZERS, RUNNERS, TRANSFORMS
 from mmengine.config import Config
 from mmengine.logging import print_log
-from mmengine.registry import init_default_scope
+from mmengine.registry import Registry, init_default_scope
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.checkpoints.named_models import find_config
@@ -258,30 +258,78 @@ def _check_keys(cfg: Config) -> None:
 
 
 def needed_targets(cfg: Config) -> dict[str, Any]:
-    """Return which transforms make the targets of a config's head and of its losses.
+    """Return which transforms make the targets of a config's head and of its parts.
 
     Returns:
         Names of transforms (``transforms`` of the classes), each with the type that needs it.
     """
     head = (cfg.get("model") or {}).get("map_head") or {}
     heads = [head, head["detector"]] if head.get("detector") else [head]  # of two stages
-    losses = [own["losses"] for own in heads if isinstance(own.get("losses"), list)]
-    kinds = [part.get("type") for part in (*heads, *chain.from_iterable(losses))]
-    classes = [(kind, MODELS.get(kind) if isinstance(kind, str) else kind) for kind in kinds]
-    return {name: kind for kind, part in classes for name in getattr(part, "transforms", ())}
+    lists = [own.get(name) for own in heads for name in ("losses", "aux_heads")]
+    parts = chain(heads, *(part for part in lists if isinstance(part, list)))
+    kinds = [part.get("type") for part in parts if isinstance(part, dict)]
+    return {name: kind for kind in kinds for name in getattr(_class(kind), "transforms", ())}
+
+
+def _class(kind: Any, registry: Registry = MODELS) -> type | None:
+    """Return the class of a type, itself or its name; None if it names none."""
+    found = registry.get(kind) if isinstance(kind, str) else kind
+    return found if isinstance(found, type) else None
 
 
 def _check_targets(cfg: Config) -> None:
     """Refuse a training pipeline without the transforms that `needed_targets` names."""
     dataset = (cfg.get("train_dataloader") or {}).get("dataset") or {}
-    made = {step.get("type") for step in dataset.get("pipeline") or ()}
-    missing = [(name, kind) for name, kind in needed_targets(cfg).items() if name not in made]
-    if missing and dataset:
-        name, kind = missing[0]
-        raise ValueError(
-            f"{cfg.filename}: {kind} needs the targets of {name}: add it to the pipeline of "
-            "train_dataloader.dataset."
-        )
+    for steps in _pipelines(dataset):
+        made = [_class(kind, TRANSFORMS) for kind in _step_types(steps)]
+        bases = {base.__name__ for kind in made for base in inspect.getmro(kind or object)}
+        for name, kind in needed_targets(cfg).items():
+            if name not in bases:
+                raise ValueError(
+                    f"{cfg.filename}: {kind} needs the targets of {name}: add it to the pipeline "
+                    "of train_dataloader.dataset."
+                )
+        _check_shared(cfg, steps)
+
+
+def _check_shared(cfg: Config, steps: list[Any]) -> None:
+    """Refuse a transform that has another value of a setting than the head (its ``shared``)."""
+    head = (cfg.get("model") or {}).get("map_head") or {}
+    kind = _class(head.get("type"))
+    shared, made = getattr(kind, "shared", ()), getattr(kind, "transforms", ())
+    for step in steps if shared else ():
+        transform = _class(step.get("type"), TRANSFORMS)
+        if getattr(transform, "__name__", None) not in made:
+            continue
+        for name in shared:
+            own, other = _setting(kind, head, name), _setting(transform, step, name)
+            if own != other:
+                raise ValueError(
+                    f"{cfg.filename}: {name} of {head['type']} is {own}, that of {step['type']} "
+                    f"{other}: set both to one value."
+                )
+
+
+def _setting(kind: Any, part: dict[str, Any], name: str) -> Any:
+    """Return a setting of a part, or the default of its class."""
+    return part.get(name, inspect.signature(kind).parameters[name].default)
+
+
+def _pipelines(dataset: dict[str, Any]) -> list[list[Any]]:
+    """Return the steps of a data set, or of each one that it wraps; none without a data set."""
+    own = list(dataset.get("pipeline") or ())
+    wrapped = [dataset["dataset"]] if dataset.get("dataset") else dataset.get("datasets") or []
+    if wrapped:
+        return [[*steps, *own] for part in wrapped for steps in _pipelines(part)]
+    return [own] if dataset else []
+
+
+def _step_types(steps: Any) -> Iterator[Any]:
+    """Yield the types of a pipeline's steps, and of those that they wrap."""
+    for step in steps:
+        if isinstance(step, dict):
+            yield step.get("type")
+            yield from _step_types(step.get("transforms") or ())
 
 
 def _check_streams(cfg: Config) -> None:
@@ -293,7 +341,7 @@ def _check_streams(cfg: Config) -> None:
         loader = cfg.get(f"{part}_dataloader") or {}
         sampler = loader.get("sampler") or {}
         kind = sampler.get("type")
-        found = DATA_SAMPLERS.get(kind) if isinstance(kind, str) else kind
+        found = _class(kind, DATA_SAMPLERS)
         if loader and wanted not in [base.__name__ for base in inspect.getmro(found or object)]:
             raise ValueError(
                 f"{cfg.filename}: {part}_dataloader.sampler is {kind!r}, which tears scenes apart "

@@ -10,8 +10,10 @@ from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
 
 from gsmap.datasets.annotations.record import MapInstance
+from gsmap.structures.elements import annotated
 from gsmap.structures.grid import padded_size
 from gsmap.structures.polylines import resample
+from gsmap.utils.settings import check_positive
 
 _PV_SAMPLES = 200
 _MIN_DEPTH = 1e-7
@@ -35,16 +37,23 @@ class MakeBEVMask(BaseTransform):
         size: Rows H and columns W over the ground truth's range.
         thickness_px: Width of the lines.
         num_classes: Number of channels; None draws all elements in one.
+
+    Raises:
+        ValueError: If a number is not positive.
     """
 
     size: tuple[int, int] = (200, 100)
     thickness_px: int = 3
     num_classes: int | None = None
 
+    def __post_init__(self) -> None:
+        numbers = {"thickness_px": self.thickness_px, "num_classes": self.num_classes or 1}
+        check_positive(rows=self.size[0], columns=self.size[1], **numbers)
+
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Draw the mask."""
+        """Draw the mask; ValueError if the sample has no ground truth."""
         masks = np.zeros((self.num_classes or 1, *self.size), np.uint8)
-        for instance in results["map_instances"]:
+        for instance in annotated(results, self):
             pixels = cells_of(instance, results, self.size)
             channel = channel_of(instance, self.num_classes)
             cv2.polylines(masks[channel], [pixels], False, (1,), self.thickness_px)
@@ -65,6 +74,9 @@ class MakeInstanceMasks(BaseTransform):
         thickness_px: Width of the lines.
         gap_px: Width around elements of later classes.
         mirrored: Mirror the masks left to right, as released; they then fit no BEV features.
+
+    Raises:
+        ValueError: If a number is not positive.
     """
 
     size: tuple[int, int] = (200, 100)
@@ -72,9 +84,18 @@ class MakeInstanceMasks(BaseTransform):
     gap_px: int = 7
     mirrored: bool = True
 
+    def __post_init__(self) -> None:
+        widths = {"thickness_px": self.thickness_px, "gap_px": self.gap_px}
+        check_positive(rows=self.size[0], columns=self.size[1], **widths)
+
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Draw the masks."""
-        instances = results["map_instances"]
+        """Draw the masks; ValueError if the sample has no ground truth, or no targets yet."""
+        instances = annotated(results, self)
+        if "gt_instances_3d" not in results:
+            raise ValueError(
+                f"sample {results['token']!r} has no targets yet: put MakeInstanceMasks behind "
+                "FormatMapTargets in the pipeline."
+            )
         masks, gaps = np.zeros((2, len(instances), *self.size), np.uint8)
         for number, instance in enumerate(instances):
             cells = cells_of(instance, results, self.size)
@@ -102,6 +123,9 @@ class MakePVMask(BaseTransform):
         ground_z_m: Height of the ground in the annotation frame, in metres.
         thickness_px: Width of the lines in feature pixels.
         num_classes: Number of channels; None draws all elements in one.
+
+    Raises:
+        ValueError: If a number is not positive.
     """
 
     stride: int = 32
@@ -110,6 +134,11 @@ class MakePVMask(BaseTransform):
     thickness_px: int = 1
     num_classes: int | None = None
 
+    def __post_init__(self) -> None:
+        names = "stride", "pad_size_divisor", "thickness_px"
+        numbers = {name: getattr(self, name) for name in names}
+        check_positive(**numbers, num_classes=self.num_classes or 1)
+
     def _points(self, points: np.ndarray) -> np.ndarray:
         """Return an element as homogeneous points along it. (200, 4)."""
         line = resample(points, _PV_SAMPLES)
@@ -117,14 +146,14 @@ class MakePVMask(BaseTransform):
         return np.concatenate([line[:, :2], height, np.ones((len(line), 1))], -1)
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Draw the masks."""
+        """Draw the masks; ValueError if the sample has no ground truth."""
         height, width = padded_size(results["img_shape"], self.pad_size_divisor)
         size = height // self.stride, width // self.stride
         views = results["lidar2img"]
         masks = np.zeros((len(views), self.num_classes or 1, *size), np.uint8)
         lines = [
             (channel_of(instance, self.num_classes), self._points(instance.points))
-            for instance in results["map_instances"]
+            for instance in annotated(results, self)
         ]
         shrink = np.diag([1 / self.stride, 1 / self.stride, 1.0, 1.0])
         for view, lidar2img in zip(masks, views, strict=True):

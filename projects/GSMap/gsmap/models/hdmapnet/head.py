@@ -45,6 +45,7 @@ class HDMapNetHead(DetectionHead):
     """
 
     transforms = ("MakeLineMaps",)
+    shared = ("pixel_m", "num_directions")  # settings that have one value there and here
     not_exported = (
         "its lines are clustered and traced pixel by pixel, which ONNX has no operator for"
     )

@@ -15,6 +15,7 @@ from gsmap.models.hdmapnet.layout import ahead_size, pixels_from_metres
 from gsmap.structures.elements import annotated
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import parts_inside, sampled
+from gsmap.utils.settings import check_positive
 
 Pixels = NDArray[np.int32]
 
@@ -51,9 +52,7 @@ class MakeLineMaps(BaseTransform):
 
     def __post_init__(self) -> None:
         sizes = ("num_classes", "pixel_m", "thickness_px", "gap_px", "step_m")
-        for name, value in vars(self).items():
-            if name in sizes and value <= 0:
-                raise ValueError(f"{name} must be more than 0, got {value}.")
+        check_positive(**{name: getattr(self, name) for name in sizes})
         if self.num_directions < 1 or 360 % self.num_directions:
             raise ValueError(f"num_directions must divide 360, got {self.num_directions}.")
 

@@ -17,6 +17,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.models.hdmapnet.clustering import dense_clusters
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
+from gsmap.utils.settings import check_positive
 
 Float32 = np.float32
 NONE = -1  # no direction
@@ -45,11 +46,11 @@ class VectorizeConfig:
     degrees: int = 10
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name == "min_area_px" and not value >= 0:
-                raise ValueError(f"min_area_px must not be negative, got {value}.")
-            if name != "min_area_px" and not value > 0:
-                raise ValueError(f"{name} must be more than 0, got {value}.")
+        check_positive(
+            **{name: value for name, value in vars(self).items() if name != "min_area_px"}
+        )
+        if not self.min_area_px >= 0:
+            raise ValueError(f"min_area_px must not be negative, got {self.min_area_px}.")
 
 
 class TracedLine(NamedTuple):

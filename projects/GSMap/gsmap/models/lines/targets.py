@@ -15,6 +15,7 @@ from gsmap.models.lines.front import front_size
 from gsmap.structures.elements import annotated
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import is_closed, padded, parts_inside, sampled
+from gsmap.utils.settings import check_positive
 
 Points = NDArray[np.float64]
 Part = tuple[int, Points]  # its class, and a line in [0, 1] from the front and the left
@@ -67,6 +68,9 @@ class FormatLineTargets(BaseTransform):
         step_m: Lines are sampled at this distance first.
         sort_rings: Whether rings start at their rearmost vertex and run clockwise; by default they
             stay as they are annotated.
+
+    Raises:
+        ValueError: If a size is not positive, or ``edge_classes`` names a class that is not.
     """
 
     edge_classes: Sequence[int] = (1,)
@@ -76,6 +80,7 @@ class FormatLineTargets(BaseTransform):
     sort_rings: bool = False
 
     def __post_init__(self) -> None:
+        check_positive(pixel_m=self.pixel_m, thickness_px=self.thickness_px, step_m=self.step_m)
         name, numbers = self.by_class()
         if not set(self.edge_classes) <= set(range(len(numbers))):
             raise ValueError(

@@ -103,6 +103,8 @@ class MapHead(DetectionHead):
             there is not, or two parts have one name.
     """
 
+    transforms = ("FormatMapTargets",)
+
     def __init__(
         self,
         grid: BEVGrid,

@@ -1,6 +1,7 @@
 """Auxiliary heads: masks in bird's-eye and camera view, depth. They only help training.
 
-Each has a ``name`` and ``loss(bev_outputs, samples)``; predictions do not run them.
+Each has a ``name``, the ``transforms`` that make its target, and ``loss(bev_outputs, samples)``;
+predictions do not run them.
 """
 
 from collections.abc import Sequence
@@ -19,13 +20,13 @@ from gsmap.structures.tensors import check_same_shape
 Samples = Sequence[Det3DDataSample]
 
 
-def _stack_targets(samples: Samples, name: str, device: torch.device) -> Tensor:
+def _stack_targets(head: Any, samples: Samples, name: str, device: torch.device) -> Tensor:
     """Stack a training target of all samples, which must have it. (B, ...)"""
     for sample in samples:
         if name not in sample:
             raise ValueError(
-                f"sample {sample.metainfo.get('token')!r} has no {name}: add its transform to the "
-                "training pipeline, or remove its loss from the model."
+                f"sample {sample.metainfo.get('token')!r} has no {name}: add its transform "
+                f"{head.transforms[0]} to the training pipeline, or remove its loss from the model."
             )
     return torch.stack([torch.as_tensor(sample.get(name)) for sample in samples]).to(device)
 
@@ -43,6 +44,7 @@ class BEVMaskHead(nn.Sequential):
     """
 
     feats, target = "bev_feats", "gt_seg"  # (B, C, H, W) and (B, classes or 1, H, W)
+    transforms = ("MakeBEVMask",)
 
     def __init__(
         self,
@@ -69,7 +71,7 @@ class BEVMaskHead(nn.Sequential):
     def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> Tensor:
         """Return the weighted loss on the encoder's features."""
         feats = bev_outputs[self.feats]
-        target = _stack_targets(batch_data_samples, self.target, feats.device)
+        target = _stack_targets(self, batch_data_samples, self.target, feats.device)
         target = target.reshape(-1, *target.shape[-3:])
         if self.num_masks == 1:
             target = target.amax(1, keepdim=True)
@@ -88,6 +90,7 @@ class PVMaskHead(BEVMaskHead):
     """Elements drawn in the view of each camera; learned from the encoder's image features."""
 
     feats, target = "img_feats", "gt_pv_seg"  # (B, V, C, h, w) and (B, V, classes or 1, h, w)
+    transforms = ("MakePVMask",)
 
     def __init__(
         self,
@@ -107,6 +110,8 @@ class DepthSupervision(nn.Module):
     What other auxiliary heads take, ``kwargs``, is not used.
     """
 
+    transforms = ("MakeDepthMap",)
+
     def __init__(self, loss_weight: float = 3.0, name: str = "depth", **kwargs: Any) -> None:
         super().__init__()
         self.loss_weight, self.name = loss_weight, name
@@ -114,7 +119,7 @@ class DepthSupervision(nn.Module):
     def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> Tensor:
         """Return the loss on ``depth`` (B, V, D, h, w), probabilities of ``depth_range``'s bins."""
         probs, depth_range = bev_outputs["depth"], bev_outputs["depth_range"]
-        target = _stack_targets(batch_data_samples, "gt_depth", probs.device)
+        target = _stack_targets(self, batch_data_samples, "gt_depth", probs.device)
         bins = depth_bins(target, target.shape[-1] // probs.shape[-1], depth_range)
         return self.loss_weight * depth_loss(probs, bins)
 

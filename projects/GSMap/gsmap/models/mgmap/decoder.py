@@ -54,7 +54,7 @@ class MGMapDecoder(MapDecoder):
         kwargs: Further arguments of `MapDecoder`.
 
     Raises:
-        ValueError: If there are more refinements than layers.
+        ValueError: If there are less than no refinements, or more than layers.
     """
 
     def __init__(
@@ -71,9 +71,9 @@ class MGMapDecoder(MapDecoder):
         levels = {"type": MultiLevelAttention, "num_levels": EnhancedNeck.num_levels}
         layer = {**layer, "cross_attn": {**levels, **layer.get("cross_attn", {})}}
         super().__init__(layer, embed_dims=embed_dims, **kwargs)
-        if refinements > len(self.layers):
+        if not 0 <= refinements <= len(self.layers):
             raise ValueError(
-                f"refinements use the branches of layers, got {refinements} and "
+                f"refinements use the branches of layers, each one, got {refinements} and "
                 f"{len(self.layers)} layers."
             )
         self.branches = [*self.branches, *self.branches[len(self.layers) - refinements :]]
