@@ -431,7 +431,8 @@ def main(argv: list[str] | None = None) -> str:
         count = 1000 if args.bootstrap is None else args.bootstrap
         resamples = Resamples(scenes_of(args.ground_truth), count, args.seed)
     if args.prior:
-        outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, args.prior_elements)
+        how = args.prior_elements, args.allow_other_split
+        outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, *how)
     else:
         outcome = evaluate(args.results, args, evaluator)
     if resamples is not None:

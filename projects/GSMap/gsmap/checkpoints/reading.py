@@ -61,6 +61,11 @@ class Checkpoint:
     trained_on: tuple[str, str] = ("", "")
     dataset_meta: Mapping[str, Any] = field(default_factory=dict)
 
+    def list_of(self, dataset: object) -> str:
+        """Return the list of scenes it was trained on; nothing if that is of another data set."""
+        own, identity = self.trained_on
+        return identity if own == dataset else ""
+
 
 @contextmanager
 def refusing(path: object) -> Iterator[None]:
