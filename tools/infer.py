@@ -182,7 +182,7 @@ def about_results(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, A
     path = checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
     checkpoint = read_checked(path)
     about = {"classes": list(data["classes"]), CHECKPOINT: digest(path)}
-    known = {CALIBRATION: checkpoint.calibration}
+    known: dict[str, Any] = {CALIBRATION: checkpoint.calibration}
     if identity := data.get(SPLIT_LIST):
         known |= {SPLIT_LIST: identity, TRAINED_ON: checkpoint.list_of(data["dataset"])}
     return about | {key: said for key, said in known.items() if said}

@@ -54,6 +54,14 @@ def _metainfo(loader: Any) -> dict[str, Any]:
     return getattr(loader.dataset, "metainfo", {})
 
 
+def _tell_results(loop: Any, path: Path, meta: dict[str, Any]) -> None:
+    """Tell what writes results which checkpoint they are of, and how that was calibrated."""
+    facts: dict[str, Any] = {CALIBRATION: calibration_of(meta)}
+    if path.is_file():  # not an address
+        facts[CHECKPOINT] = digest(path)
+    loop.evaluator.dataset_meta = {**(loop.evaluator.dataset_meta or {}), **facts}
+
+
 @HOOKS.register_module()
 class AtomicCheckpointHook(CheckpointHook):
     """mmengine's hook, for runs that may be killed and for checkpoints from strangers.
@@ -91,11 +99,7 @@ class AtomicCheckpointHook(CheckpointHook):
             if isinstance(loop, BaseLoop) and isinstance(trained, dict):
                 self._check_split(trained, loop)
         if isinstance(runner._test_loop, BaseLoop):
-            evaluator, path = runner._test_loop.evaluator, Path(str(runner._load_from))
-            facts = {CALIBRATION: calibration_of(meta)}
-            if path.is_file():
-                facts[CHECKPOINT] = digest(path)
-            evaluator.dataset_meta = {**(evaluator.dataset_meta or {}), **facts}
+            _tell_results(runner._test_loop, Path(str(runner._load_from)), meta)
 
     def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
         """Note the model's settings, the size of the scaled images, and if there are signals.

@@ -165,8 +165,9 @@ def evaluate_prior(
     paths = [path for path in (train_path, truth_path) if Path(path).suffix.lower() != ".json"]
     metas = [AnnotationFile(path).meta for path in paths]
     if len({meta.dataset for meta in metas}) < len(metas) and not allow_other_split:
-        lists = (meta.split_list for meta in metas)
-        require_same_list(*lists, f"the prior of {train_path}", "--allow-other-split")
+        train_list, truth_list = (meta.split_list for meta in metas)
+        subject = f"the prior of {train_path}"
+        require_same_list(train_list, truth_list, subject, "--allow-other-split")
     chamfer = evaluator.chamfer or ChamferConfig(evaluator.classes)
     everything, _ = read_ground_truth(train_path, evaluator.classes)
     step = max(1, -(-len(everything) // _MAX_TRAINING_SAMPLES))

@@ -20,7 +20,8 @@ def calibration_of(meta: Mapping[str, Any]) -> dict[str, Any]:
     said = meta.get(CALIBRATION)
     if said is None:
         return {}
-    law, sigmas = (said.get(k) for k in ("law", "sigmas")) if isinstance(said, Mapping) else (0, 0)
+    words: Mapping[str, Any] = said if isinstance(said, Mapping) else {}
+    law, sigmas = words.get("law"), words.get("sigmas")
     if law not in LAW_NAMES or not isinstance(sigmas, int | float) or not 0 < sigmas <= 3:
         raise ValueError(
             f"{CALIBRATION} must name a law of {LAW_NAMES} and sigmas in (0, 3], got {said!r:.60}."
