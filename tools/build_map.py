@@ -32,11 +32,12 @@ from drivemaps.truth import true_map
 from drivemaps.video import write_video
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
+from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_name, write_text
+from gsmap.utils.split_lists import require_results_of
 from gsmap.utils.words import counted
 from gsmap.visualization.bev_view import draw_lines
 from gsmap.visualization.figure import save_figure
@@ -83,6 +84,11 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         metavar=("LAT", "LON"),
         help="latitude and longitude of the global frame's origin (x east, y north), in degrees; "
         "nuScenes' and Argoverse 2's are known",
+    )
+    parser.add_argument(
+        "--allow-other-split",
+        action="store_true",
+        help="score maps of a model that was trained on another split, whose places it may share",
     )
     parser.add_argument(
         "--data-root", type=Path, help="folder of the images for rrd, mcap and mp4: that of --ann"
@@ -195,7 +201,10 @@ def main(argv: list[str] | None = None) -> str:
     args = parse_args(argv)
     ann = AnnotationFile(args.ann)
     check_formats(args, ann)
-    results, _ = read_samples(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
+    file = SampleFile(args.results, RESULTS_KEY, ann.meta.classes, gaussians=True)
+    results = {token: elements for token, elements, _ in file}
+    if has_truth(ann) and not args.allow_other_split:  # maps are scored
+        require_results_of(ann.meta.split_list, file.about, args.results)
     config = MergeConfig(
         gaussians=not args.no_gaussians,
         min_confidence=args.min_confidence,

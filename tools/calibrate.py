@@ -5,7 +5,9 @@ RESULTS are this checkpoint's predictions of samples that it was not trained on.
 factor for sigma along and one for sigma across the line: 68.3 % of the errors then lie within one
 sigma, or with ``--sigmas 2`` 95.4 % within two. With ``--law laplace`` they lie within as large
 intervals of a Laplace distribution with this sigma (0.81 and 2.18 sigma to each side), whose tails
-are longer. The checkpoint's meta says both under ``calibration``.
+are longer. The checkpoint's meta and its results say both under ``calibration``.
+
+Results that say that another checkpoint made them are refused, and samples of the training's split.
 
 Example:
     python tools/test.py gsmap_r18_minicity --eval --out half.json \
@@ -16,13 +18,18 @@ Example:
 
 import argparse
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.calibration import LAWS, fitted_factors, matched_vertices
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.file_evaluation import SamplePairs
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import atomic_write
+from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
+from gsmap.utils.shards import digest
 
 
 def parse_args() -> argparse.Namespace:
@@ -49,6 +56,17 @@ def parse_args() -> argparse.Namespace:
     return args
 
 
+def require_held_out(trained: Mapping[str, Any], ground_truth: Path) -> None:
+    """Refuse samples of the split that a model was trained on, where both are known."""
+    if ground_truth.suffix.lower() != ".json":
+        meta = AnnotationFile(ground_truth).meta
+        if (trained.get("dataset"), trained.get("split")) == (meta.dataset, meta.split):
+            raise ValueError(
+                f"{ground_truth} holds the split {meta.split!r}, which the model was trained on: "
+                "its errors there are smaller than elsewhere; give results of another split."
+            )
+
+
 def main() -> str:
     args = parse_args()
     if args.target.exists():
@@ -57,11 +75,13 @@ def main() -> str:
     from mmdet3d.registry import MODELS
 
     from gsmap.checkpoints.building import building
+    from gsmap.checkpoints.named_models import find_checkpoint
     from gsmap.checkpoints.reading import adopt_settings, read_checked
     from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
     from gsmap.engine.launch import read_config
 
     cfg, source = read_config(args.config), read_checked(args.checkpoint)
+    require_held_out(source.dataset_meta, args.ground_truth)
     with building(cfg):
         adopt_settings(cfg, args.checkpoint, None)
         if cfg.model.map_head.get("temperatures"):
@@ -74,12 +94,18 @@ def main() -> str:
             raise ValueError(f"{args.config} has no Gaussians: give a config of GSMap.")
         pairs = SamplePairs(args.results, args.ground_truth, classes, True, gaussians=True)
         vertices = matched_vertices(pairs, ChamferConfig(classes))
+        made_by = pairs.about.get(CHECKPOINT)  # nothing in earlier files
+        if made_by not in (None, digest(find_checkpoint(args.checkpoint))):
+            raise ValueError(
+                f"{args.results} was made with another checkpoint than {args.checkpoint}: give "
+                "this one's predictions (tools/test.py --out)."
+            )
         factors = fitted_factors(vertices, classes, args.sigmas, args.law)
         cfg.model.map_head.temperatures = factors.round(4).tolist()
     meta = {
         MODEL_SETTINGS: json.dumps(plain(cfg.model.to_dict())),
         SIGNALS: source.can_bus,
-        "calibration": {"law": args.law, "sigmas": args.sigmas},
+        CALIBRATION: {"law": args.law, "sigmas": args.sigmas},
     }
     if source.dataset_meta:  # with the split, which no other may be tested on
         meta["dataset_meta"] = dict(source.dataset_meta)

@@ -49,6 +49,7 @@ from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.faults import nearest
+from gsmap.utils.model_facts import law_of
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest, digest_of_common, read_shard
 from gsmap.utils.words import counted, markdown_table
@@ -181,7 +182,10 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="whether Gaussians say how far off matched vertices are: likelihood, coverage, ranks",
     )
     parser.add_argument(
-        "--law", choices=LAWS, help="with --uncertainty: distribution of the errors (normal)"
+        "--law",
+        choices=LAWS,
+        help="with --uncertainty: distribution of the errors (that of the model's calibration, as "
+        "the results say, or normal)",
     )
     parser.add_argument(
         "--reliability", type=output_file, help="with --uncertainty: draw its curves"
@@ -254,11 +258,9 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
 def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     reports, notes = outcome
     for found in reports:
-        if found.name in ("intervals", "by"):  # printed
+        if found.name in ("intervals", "by", "uncertainty"):  # printed
             continue
-        if found.name == "uncertainty":
-            print(format_uncertainty(found.metrics, args.law or "normal") + "\n")
-        elif not found.groups:
+        if not found.groups:
             lines = (f"{key:<44} {value:.4f}" for key, value in found.metrics.items())
             print("\n".join(lines) + "\n")
         else:
@@ -325,18 +327,21 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
 
 
 def report_of_gaussians(args: argparse.Namespace, evaluator: MapEvaluator) -> MetricReport:
-    """Score the Gaussians of a result file, and draw their curves if that is asked for."""
-    classes, law = evaluator.classes, args.law or "normal"
+    """Print the scores of a result file's Gaussians; draw their curves if that is asked for."""
+    classes = evaluator.classes
     inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard
     pairs = SamplePairs(*inputs, args.allow_other_split, gaussians=True)
     vertices = matched_vertices(pairs, evaluator.chamfer or ChamferConfig(classes))
+    law = args.law or law_of(pairs.about)
     if args.reliability:
         from gsmap.visualization.figure import save_figure
         from gsmap.visualization.plots import plot_uncertainty
 
         figure = plot_uncertainty(vertices, classes, law)
         print(f"reliability: {save_figure(figure, args.reliability)}")
-    return uncertainty_report(vertices, classes, args.polygon_classes, law)
+    found = uncertainty_report(vertices, classes, args.polygon_classes, law)
+    print(format_uncertainty(found.metrics, law) + "\n")
+    return found
 
 
 def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
@@ -432,7 +437,8 @@ def main(argv: list[str] | None = None) -> str:
         count = 1000 if args.bootstrap is None else args.bootstrap
         resamples = Resamples(scenes_of(args.ground_truth), count, args.seed)
     if args.prior:
-        outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, args.prior_elements)
+        how = args.prior_elements, args.allow_other_split
+        outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, *how)
     else:
         outcome = evaluate(args.results, args, evaluator)
     if resamples is not None:

@@ -22,6 +22,7 @@ from gsmap.engine.arguments import add_config_options
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_bytes
+from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest
@@ -175,17 +176,16 @@ def open_model(args: argparse.Namespace) -> "MapInferencer":
 
 
 def about_results(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, Any]:
-    """Return what a result file says of itself: classes, and lists of scenes where known."""
+    """Return what a result file says of itself: classes, model, lists of scenes where known."""
     from gsmap.checkpoints.reading import read_checked
 
-    about = {"classes": list(data["classes"])}
+    path = checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
+    checkpoint = read_checked(path)
+    about = {"classes": list(data["classes"]), CHECKPOINT: digest(path)}
+    known: dict[str, Any] = {CALIBRATION: checkpoint.calibration}
     if identity := data.get(SPLIT_LIST):
-        about[SPLIT_LIST] = identity
-        checkpoint = checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
-        dataset, trained_on = read_checked(checkpoint).trained_on
-        if trained_on and dataset == data["dataset"]:
-            about[TRAINED_ON] = trained_on
-    return about
+        known |= {SPLIT_LIST: identity, TRAINED_ON: checkpoint.list_of(data["dataset"])}
+    return about | {key: said for key, said in known.items() if said}
 
 
 def run_settings(args: argparse.Namespace) -> dict[str, str]:

@@ -10,6 +10,7 @@ Examples:
 import argparse
 from pathlib import Path
 
+from gsmap.evaluation.calibration import LAWS
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.visualization.film import write_drive_film
 from gsmap.visualization.page.page import PageOptions, page_data, write_page
@@ -57,11 +58,24 @@ def parse_args() -> argparse.Namespace:
         metavar="map|scene|distance|FILE",
         help="a table of AP by parts, as of tools/evaluate.py",
     )
+    parser.add_argument(
+        "--allow-other-split",
+        action="store_true",
+        help="models may be trained on another split, which may hold places of this one",
+    )
+    parser.add_argument(
+        "--law",
+        choices=LAWS,
+        help="distribution of the errors (that of the model's calibration, as the results say, or "
+        "normal)",
+    )
     parser.add_argument("--scene", help="drive of a film; default: the first one of --ann")
     args = parser.parse_args()
     film = args.out.suffix.lower() == ".mp4"
     if film and (args.by or args.allow_mismatch or args.image_width is not None):
         parser.error("--by, --allow-mismatch and --image-width are of pages: leave them out")
+    if film and (args.allow_other_split or args.law):
+        parser.error("--allow-other-split and --law are of pages: leave them out")
     if args.scene and not film:
         parser.error("--scene is of films: give --out NAME.mp4; a page has a field for the scene")
     return args
@@ -81,6 +95,8 @@ def main() -> str:
         0 if args.no_images else 320 if args.image_width is None else args.image_width,
         args.allow_mismatch,
         args.by,
+        args.allow_other_split,
+        args.law,
     )
     if args.out.suffix.lower() == ".mp4":
         return write_drive_film(

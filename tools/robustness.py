@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 
 from gsmap.checkpoints.named_models import checkpoint_for
+from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.arguments import add_config_options
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import write_text
 from gsmap.utils.progress import Progress
+from gsmap.utils.split_lists import require_same_list
 
 KINDS = (
     "camera_lost", "camera_delayed", "rotation", "translation",
@@ -40,6 +42,11 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--samples", type=int, help="that many, evenly spread; default: all")
     parser.add_argument("--seed", type=int, default=0, help="of what the corruptions draw")
     parser.add_argument("--out", type=Path, required=True, help="folder of table and plot")
+    parser.add_argument(
+        "--allow-other-split",
+        action="store_true",
+        help="score data of another split than that of the training, whose places it may share",
+    )
     add_config_options(parser)
     args = parser.parse_args()
     if args.samples is not None and args.samples < 1:
@@ -100,6 +107,15 @@ def resilience(found: dict[str, list[dict[str, float]]], kind: str) -> float:
     return 100 * float(np.mean([of["mean"] for of in found[kind]])) / max(clean, 1e-9)
 
 
+def require_own_split(checkpoint: Path, settings: Any) -> None:
+    """Refuse a data set of another split than that of the model's training."""
+    from gsmap.checkpoints.reading import read_checked
+
+    meta = AnnotationFile(Path(settings["data_root"], settings["ann_file"])).meta
+    trained_on = read_checked(checkpoint).list_of(meta.dataset)
+    require_same_list(trained_on, meta.split_list, f"{checkpoint}", "--allow-other-split")
+
+
 def main() -> str:
     args = parse_args()
     import torch
@@ -112,6 +128,10 @@ def main() -> str:
     checkpoint = checkpoint_for(args.config, args.checkpoint)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = load_model(args.config, checkpoint, device, args.cfg_options)
+    if not args.allow_other_split:
+        require_own_split(checkpoint, model.cfg.test_dataloader.dataset)
+    if model.temporal is not None and args.samples:
+        raise ValueError("--samples tears drives apart, which a model with memory needs whole.")
     MMLogger.get_instance("robustness", log_level="ERROR")  # one table for each run is too much
     cases = [(CLEAN, 1), *((kind, severity) for kind in args.kinds for severity in SEVERITIES)]
     found: dict[str, list[dict[str, float]]] = {}

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from mmengine.evaluator import BaseMetric, Evaluator
 from mmengine.fileio import get_file_backend
 from mmengine.logging import MessageHub
 from mmengine.model import BaseModel
-from mmengine.runner import Runner
+from mmengine.runner import BaseLoop, Runner
 from mmengine.runner.checkpoint import save_checkpoint
 from processes import run_python
 
@@ -22,6 +23,7 @@ import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.reading import read_checked
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.engine.checkpoint_hook import AtomicCheckpointHook, AtomicLocalBackend
+from gsmap.utils.shards import digest
 
 
 @pytest.fixture
@@ -238,6 +240,34 @@ def test_data_of_another_split_is_refused_unless_allowed(tmp_path):
     with pytest.raises(ValueError, match="the model was trained on the split near"):
         learn(tmp_path, 2, tmp_path / "epoch_1.pth", train=far, val=far)
     assert learn(tmp_path, 2, tmp_path / "epoch_1.pth", train=near, val=listed("")) == 1
+
+
+class Scoring(BaseLoop):
+    """A test that is about to run."""
+
+    def __init__(self):
+        self.evaluator = Evaluator(Nothing())
+        self.evaluator.dataset_meta = {"classes": ["divider"]}
+
+    def run(self):
+        raise AssertionError
+
+
+def test_a_test_tells_results_which_checkpoint_it_is_of_and_how_that_was_calibrated(tmp_path):
+    path, calibration = tmp_path / "a.pth", {"law": "laplace", "sigmas": 1.0}
+    path.write_bytes(b"weights")
+    for meta, address in (({"calibration": calibration}, path), ({}, "https://host/a.pth")):
+        loop = Scoring()
+        runner = SimpleNamespace(_val_loop=None, _test_loop=loop, _load_from=str(address))
+        AtomicCheckpointHook(interval=1).after_load_checkpoint(runner, {"meta": meta})
+        said = loop.evaluator.metrics[0].dataset_meta
+        assert said["classes"] == ["divider"]
+        assert said.get("checkpoint") == (digest(path) if meta else None)
+        assert said["calibration"] == meta.get("calibration", {})
+    with pytest.raises(ValueError, match="calibration must name a law"):
+        AtomicCheckpointHook(interval=1).after_load_checkpoint(
+            runner, {"meta": {"calibration": "x"}}
+        )
 
 
 def test_the_best_of_the_validations_is_kept(tmp_path):

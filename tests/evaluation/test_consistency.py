@@ -158,7 +158,7 @@ def files(tmp_path):
     meta = AnnotationMeta("own", "ego", "val", CONFIG.classes, GRID.x_range, GRID.y_range)
     write_annotations(tmp_path / "own.arrow", meta, samples)
     results = [(f.token, vectors_of(f.predictions, CONFIG.classes)) for f in frames]
-    write_results(tmp_path / "results.json", results)
+    write_results(tmp_path / "results.json", results, {"trained_on": "official"})
     return tmp_path / "results.json", AnnotationFile(tmp_path / "own.arrow")
 
 
@@ -167,6 +167,8 @@ def test_tracks_are_written_and_read_again(files, tmp_path):
     figures = evaluate_drives(results, annotations, CONFIG, tmp_path / "tracks.json")
     frames = drive_frames(tmp_path / "tracks.json", annotations, CONFIG.classes)
     assert [frame.track_ids.tolist() for frame in frames] == [[0]] * 3
+    about = json.loads((tmp_path / "tracks.json").read_text())["meta"]
+    assert about == {"trained_on": "official", "classes": list(CONFIG.classes)}
     assert evaluate_drives(tmp_path / "tracks.json", annotations, CONFIG) == figures
     assert figures["consistency/C-mAP"] == pytest.approx(1 / 3)  # of three classes
 

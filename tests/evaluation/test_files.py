@@ -295,6 +295,18 @@ def annotated(path: Path, count: int, scenes: int = 1, **options: object) -> Pat
     return path
 
 
+def test_a_prior_of_another_split_is_refused_unless_allowed(tmp_path, capsys):
+    here, other = ("near@" + digit * 16 for digit in "01")
+    truth = annotated(tmp_path / "val.arrow", 4, split_list=here)
+    train = annotated(tmp_path / "train.arrow", 4, split_list=other)
+    words = [str(truth), "--prior", str(train), "--eval", "chamfer"]
+    with pytest.raises(ValueError, match=f"prior of .*train.arrow was .* {other}, .*{here}"):
+        command()(words)
+    command()([*words, "--allow-other-split"])
+    command()([str(truth), "--prior", str(truth), "--eval", "chamfer"])
+    assert capsys.readouterr().out.count("fitted on 4 training samples") == 2
+
+
 @pytest.mark.parametrize("name", ["trained_on", "split_list"])
 def test_results_of_a_model_of_another_split_are_refused_unless_allowed(tmp_path, name):
     here, other = ("near@" + digit * 16 for digit in "01")

@@ -95,6 +95,8 @@ def test_keys_have_a_prefix_only_if_asked_for_and_mmengine_does_not_warn(prefix,
 def test_results_are_written_with_gaussians_and_without_ground_truth(tmp_path):
     path = tmp_path / "results.json"
     evaluator = build(eval=[], out_file=str(path))
+    of_model = {"checkpoint": "0" * 64, "calibration": {"law": "laplace", "sigmas": 1.0}}
+    evaluator.dataset_meta = {**evaluator.dataset_meta, **of_model, "split": "val"}
     evaluator.process([sample("b", 0.2, truth=False), sample("a", 0.1, truth=False)])
     assert evaluator.evaluate(2) == {}
     written = json.loads(path.read_text())
@@ -103,7 +105,7 @@ def test_results_are_written_with_gaussians_and_without_ground_truth(tmp_path):
     assert vector["cls_name"] == "divider"
     assert vector["pts"][0] == pytest.approx([0.2, -20.0])
     assert len(vector["gaussian_rotations"]) == 20
-    assert written["meta"]["classes"] == list(CLASSES)
+    assert written["meta"] == {"classes": list(CLASSES), **of_model}
 
 
 def raised(found: Det3DDataSample, predicted_m: float) -> Det3DDataSample:

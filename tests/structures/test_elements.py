@@ -77,6 +77,13 @@ def test_ground_truth_has_full_confidence_and_a_sample_may_be_empty():
         (([LINE, [[0.0, np.nan]]], [0, 0]), "element 1 has a point that is not finite"),
         (([LINE], [0], [np.nan]), r"element 0 has the score nan, not in \[0, 1\]"),
         (([LINE] * 3, [0] * 3, [1, 0, 1.01]), r"element 2 has the score 1.01, not in \[0, 1\]"),
+        (
+            ([LINE, LINE], [0, 0], None, [np.ones((2, 2)), [[1.0, 1.0], [1.0, 0.0]]]),
+            "element 1 has a Gaussian whose scales are not positive numbers",
+        ),
+        (([LINE], [0], None, [[[np.inf, 1.0]] * 2]), "element 0 has a Gaussian whose scales"),
+        (([LINE], [0], None, [[[-1.0, np.nan]] * 2]), "element 0 has a Gaussian whose scales"),
+        (([LINE], [0], None, None, [[0.0, np.nan]]), "Gaussian whose rotation is not finite"),
         (([LINE] * 3, [0] * 3, [1, -0.5, 2]), r"element 1 has the score -0.5, not in \[0, 1\]"),
     ],
 )

@@ -50,6 +50,26 @@ def test_ground_truth_as_predictions_scores_1(files, tmp_path, capsys):
     assert orange.mean() > 1e-3  # the dividers, in the colour of all pictures
 
 
+def test_maps_of_a_model_of_another_split_are_not_scored_unless_allowed(files, tmp_path):
+    results, ann = files
+    here, other = ("near@" + digit * 16 for digit in "01")
+    content = json.loads(results.read_text())
+    (tmp_path / "r.json").write_text(json.dumps({**content, "meta": {"trained_on": other}}))
+    samples = list(AnnotationFile(ann))
+    words = [str(tmp_path / "r.json"), "--ann", str(tmp_path / "a.arrow"), "--out", str(tmp_path)]
+    for truth in (False, True):
+        split = "val" if truth else "test"
+        meta = AnnotationMeta("own", "lidar", split, options={"split_list": here})
+        found = samples if truth else [replace(sample, instances=None) for sample in samples]
+        write_annotations(tmp_path / "a.arrow", meta, found)
+        if truth:
+            with pytest.raises(ValueError, match=f"r.json was trained on the split {other}"):
+                main(words)
+            words.append("--allow-other-split")
+        main(words)
+    assert (tmp_path / "scores.json").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

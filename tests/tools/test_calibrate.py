@@ -9,13 +9,22 @@ import torch
 
 from gsmap.apis.loading import load_model
 from gsmap.checkpoints.reading import read_checked
-from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSample
+from gsmap.evaluation.results_json import (
+    GROUND_TRUTH_KEY,
+    read_samples,
+    vectors_of,
+    write_results,
+)
 from gsmap.structures.elements import MapElements
+from gsmap.utils.shards import digest
 from tools.calibrate import main as calibrate
 from tools.evaluate import main as evaluate
 
 CLASSES = ("divider", "ped_crossing", "boundary")
 NAME = "gsmap_r18_minicity"
+ACROSS = "uncertainty/line/across/coverage@1"
 
 
 @pytest.fixture
@@ -84,7 +93,47 @@ def test_the_split_that_a_model_was_trained_on_and_the_law_are_kept(files, tmp_p
     assert found.trained_on == read_checked(source).trained_on == ("minicity", f"near@{'0' * 16}")
     assert found.dataset_meta == trained
     meta = torch.load(target, weights_only=True)["meta"]
-    assert meta["calibration"] == {"law": "laplace", "sigmas": 1.0}
+    assert meta["calibration"] == found.calibration == {"law": "laplace", "sigmas": 1.0}
+
+
+def test_predictions_of_another_checkpoint_are_refused(files, tmp_path, monkeypatch):
+    source, target = tmp_path / "trained.pth", tmp_path / "calibrated.pth"
+    torch.save({"state_dict": read_checked(NAME).state}, source)
+    words = ["calibrate.py", NAME, str(source), *map(str, files), str(target)]
+    monkeypatch.setattr("sys.argv", words)
+    content = json.loads(files[0].read_text())
+    files[0].write_text(json.dumps({**content, "meta": {"checkpoint": "0" * 64}}))
+    with pytest.raises(ValueError, match=r"results.json was made with another checkpoint than .*t"):
+        calibrate()
+    assert not target.exists()
+    files[0].write_text(json.dumps({**content, "meta": {"checkpoint": digest(source)}}))
+    calibrate()
+    assert target.exists()
+
+
+def test_sigmas_are_not_fitted_on_the_split_of_the_training(files, tmp_path, monkeypatch):
+    truth, _ = read_samples(files[1], GROUND_TRUTH_KEY, CLASSES)
+    samples = [
+        MapSample(
+            token, "s", "town", i, [], np.eye(4),
+            instances=[MapInstance(k, p) for p, k, _ in lines.rows],
+        )
+        for i, (token, lines) in enumerate(truth.items())
+    ]  # fmt: skip
+    source, trained = tmp_path / "trained.pth", {"dataset": "minicity", "split": "train"}
+    torch.save({"state_dict": read_checked(NAME).state, "meta": {"dataset_meta": trained}}, source)
+    for split in ("train", "val"):
+        path = tmp_path / f"{split}.arrow"
+        write_annotations(path, AnnotationMeta("minicity", "lidar", split), samples)
+        target = tmp_path / f"of_{split}.pth"
+        words = [NAME, str(source), str(files[0]), str(path), str(target)]
+        monkeypatch.setattr("sys.argv", ["calibrate.py", *words])
+        if split == "train":
+            with pytest.raises(ValueError, match="split 'train', which the model was trained on"):
+                calibrate()
+        else:
+            calibrate()
+        assert target.exists() == (split == "val")
 
 
 @pytest.mark.parametrize("sigmas", ["0", "-1", "3.1", "nan"])
@@ -110,16 +159,22 @@ def test_the_command_scores_and_draws_sigmas(files, tmp_path, capsys):
     figures = json.loads(out.read_text())
     assert figures["uncertainty/divider/num_vertices"] == 800
     third = 0.2611  # of a normal distribution within a third of its sigma
-    assert figures["uncertainty/line/across/coverage@1"] == pytest.approx(third, abs=0.03)
+    assert figures[ACROSS] == pytest.approx(third, abs=0.03)
     assert "chamfer/mAP" in figures
     evaluate([*words, "--law", "laplace", "--reliability", str(tmp_path / "laplace.png")])
-    tails = json.loads(out.read_text())["uncertainty/line/across/coverage@1"]
+    tails = json.loads(out.read_text())[ACROSS]
     assert tails == pytest.approx(0.2133, abs=0.03)  # within 0.8117 / 3 sigma
+    said = json.loads(files[0].read_text())
+    said["meta"] = {"calibration": {"law": "laplace", "sigmas": 1.0}}
+    files[0].write_text(json.dumps(said))  # as the results of a calibrated model
+    for law, share in (([], tails), (["--law", "normal"], figures[ACROSS])):
+        evaluate([*words[:-1], *law, "--uncertainty"])
+        assert json.loads(out.read_text())[ACROSS] == share
     assert (tmp_path / "laplace.png").read_bytes() != curves.read_bytes()
     assert curves.stat().st_size > 1000
     printed = capsys.readouterr().out
-    assert "matched vertices, normal law" in printed
-    assert "matched vertices, laplace law" in printed
+    laws = [line.split()[2] for line in printed.splitlines() if "matched vertices," in line]
+    assert laws == ["normal", "laplace", "laplace", "normal"]
 
 
 @pytest.mark.parametrize(

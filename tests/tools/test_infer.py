@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,7 @@ from mmdet3d.registry import MODELS
 from gsmap import MapInferencer
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import read_config
+from gsmap.utils.shards import digest
 from tools import infer
 
 
@@ -173,14 +175,18 @@ def test_a_bag_with_one_bad_image_loses_one_frame(
     assert len(results(tmp_path / "map.json")) == len(others)
 
 
-def test_results_name_the_scenes_of_data_and_training(monkeypatch):
-    trained = SimpleNamespace(trained_on=("nuscenes", "near@" + "0" * 16))
-    monkeypatch.setattr("gsmap.checkpoints.reading.read_checked", lambda path: trained)
-    args = SimpleNamespace(model=["gsmap_r18_minicity"])
+def test_results_name_the_model_and_the_scenes_of_data_and_training(model, tmp_path):
+    path, near = tmp_path / "calibrated.pth", "near@" + "0" * 16
+    calibration = {"law": "laplace", "sigmas": 1.0}
+    trained = {"dataset": "nuscenes", "split_list": near}
+    meta = {"dataset_meta": trained, "calibration": calibration}
+    torch.save({**torch.load(model[1], weights_only=True), "meta": meta}, path)
+    args = SimpleNamespace(model=[model[0], str(path)])
     data = {"classes": ("divider",), "dataset": "nuscenes", "split_list": "official"}
-    about = infer.about_results(args, data)
-    assert about == {
-        "classes": ["divider"], "split_list": "official", "trained_on": trained.trained_on[1],
-    }  # fmt: skip
-    assert "trained_on" not in infer.about_results(args, {**data, "dataset": "minicity"})
-    assert infer.about_results(args, {"classes": ("divider",)}) == {"classes": ["divider"]}
+    about = {"classes": ["divider"], "checkpoint": digest(path), "calibration": calibration}
+    assert infer.about_results(args, {"classes": ("divider",)}) == about
+    listed = {**about, "split_list": "official"}
+    assert infer.about_results(args, data) == {**listed, "trained_on": near}
+    assert infer.about_results(args, {**data, "dataset": "minicity"}) == listed
+    plain = infer.about_results(SimpleNamespace(model=model), {"classes": ("divider",)})
+    assert plain == {"classes": ["divider"], "checkpoint": digest(Path(model[1]))}

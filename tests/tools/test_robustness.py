@@ -5,7 +5,10 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
+from gsmap.datasets.annotations.file import write_annotations
+from gsmap.datasets.annotations.record import AnnotationMeta
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
 FILE = "gsmap_minicity_val.arrow"
@@ -54,6 +57,21 @@ def test_a_run_writes_table_figures_and_plot(tool, minicity_root, tmp_path, monk
     }  # fmt: skip
     assert (tmp_path / "robustness.md").read_text() in said
     assert (tmp_path / "robustness.png").stat().st_size > 1000
+
+
+def test_data_of_another_split_is_refused_unless_allowed(tool, tmp_path, monkeypatch):
+    here, other = ("near@" + digit * 16 for digit in "01")
+    meta = AnnotationMeta("minicity", "lidar", "val", options={"split_list": here})
+    write_annotations(tmp_path / "a.arrow", meta, [])
+    state = {"weight": torch.ones(1)}
+    settings = {"data_root": str(tmp_path), "ann_file": "a.arrow"}
+    for dataset, split in (("minicity", here), ("nuscenes", other), ("minicity", other)):
+        trained = {"dataset": dataset, "split_list": split}
+        torch.save({"state_dict": state, "meta": {"dataset_meta": trained}}, tmp_path / "a.pth")
+        if (dataset, split) != ("minicity", other):
+            tool.require_own_split(tmp_path / "a.pth", settings)
+    with pytest.raises(ValueError, match=f"a.pth was trained on the split {other}, .* of {here}"):
+        tool.require_own_split(tmp_path / "a.pth", settings)
 
 
 def test_no_samples_are_refused_at_once(tool, monkeypatch, capsys):

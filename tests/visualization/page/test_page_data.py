@@ -110,6 +110,43 @@ def test_gaussians_have_curves_of_reliability_and_results_without_them_none(data
     assert panels[1]["lines"][1]["ap"][0] == "100.0"  # boundaries are perfect
 
 
+def test_intervals_are_of_the_law_that_results_or_the_options_name(case, tmp_path):
+    path, results = case
+    content = json.loads(results["good"].read_text())
+    calibrated = tmp_path / "calibrated.json"
+    meta = {"calibration": {"law": "laplace", "sigmas": 1.0}}
+    calibrated.write_text(json.dumps({**content, "meta": meta}))
+
+    def panels(law=None, **files):
+        return page_data(path, files, replace(NO_IMAGES, law=law))["reliability"]
+
+    normal, laplace = panels(a=results["good"]), panels(a=calibrated)
+    assert panels("laplace", a=results["good"]) == laplace
+    assert panels("normal", a=calibrated) == normal
+    # a panel's curve of errors across of the divider: 0, 0.4, 0.8, 1.2 m at a sigma of 0.5 m
+    shares = [panel[0]["lines"][1]["points"][0] for panel in (normal, laplace)]
+    assert dict(shares[0])[0.65] == 0.5  # within 0.935 sigma
+    assert dict(shares[1])[0.65] == 0.25  # within 0.742 sigma
+    assert laplace[0]["lines"][1]["label"] == "across, in the interval of 68.3 % (laplace law)"
+    both = panels(a=results["good"], b=calibrated)
+    assert "(normal | laplace law)" in both[0]["lines"][0]["label"]
+    assert both[0]["lines"][1]["points"] == shares
+
+
+def test_results_of_a_model_of_another_split_are_refused_unless_allowed(case, tmp_path):
+    path, results = case
+    file, (here, other) = AnnotationFile(path), ("near@" + digit * 16 for digit in "01")
+    meta = replace(file.meta, options={"split_list": here})
+    write_annotations(tmp_path / "val.arrow", meta, list(file))
+    content = json.loads(results["good"].read_text())
+    (tmp_path / "r.json").write_text(json.dumps({**content, "meta": {"trained_on": other}}))
+    files = {"a": tmp_path / "r.json"}
+    with pytest.raises(ValueError, match=f"r.json was trained on the split {other}, .*{here}"):
+        page_data(tmp_path / "val.arrow", files, NO_IMAGES)
+    allowed = replace(NO_IMAGES, allow_other_split=True)
+    assert page_data(tmp_path / "val.arrow", files, allowed)["results"] == ["a"]
+
+
 def test_parts_of_the_samples_have_a_table(case, tmp_path):
     path, results = case
     options = PageOptions(image_width=0, by="map")

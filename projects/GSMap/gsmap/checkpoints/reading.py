@@ -29,6 +29,7 @@ from gsmap.checkpoints.settings import (
     scale_steps,
 )
 from gsmap.utils.faults import in_words
+from gsmap.utils.model_facts import calibration_of
 from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
 # what torch's reader raises on bytes that make no sense
@@ -52,6 +53,7 @@ class Checkpoint:
         can_bus: Whether the training samples had vehicle signals, as far as it says.
         trained_on: The training's data set and its list of scenes, empty where it does not say.
         dataset_meta: What it says of the training's data set, not checked.
+        calibration: Law and interval that its sigmas were fitted by; empty if they were not.
     """
 
     state: dict[str, Tensor]
@@ -60,6 +62,12 @@ class Checkpoint:
     can_bus: bool
     trained_on: tuple[str, str] = ("", "")
     dataset_meta: Mapping[str, Any] = field(default_factory=dict)
+    calibration: dict[str, Any] = field(default_factory=dict)
+
+    def list_of(self, dataset: object) -> str:
+        """Return the list of scenes it was trained on; nothing if that is of another data set."""
+        own, identity = self.trained_on
+        return identity if own == dataset else ""
 
 
 @contextmanager
@@ -105,6 +113,7 @@ def read_checked(path: str | Path) -> Checkpoint:
         said = meta.get("dataset_meta")
         said = said if isinstance(said, Mapping) else {}
         trained_on = str(said.get("dataset", "")), checked_identity(said.get(SPLIT_LIST))
+        calibration = calibration_of(meta)
         if not isinstance(state, Mapping) or not all(map(_is_weight, state, state.values())):
             state = {}
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
@@ -116,7 +125,7 @@ def read_checked(path: str | Path) -> Checkpoint:
             "had failed; use an earlier epoch's."
         )
     state = {key.removeprefix("module."): value for key, value in state.items()}
-    return Checkpoint(state, settings, size, signals, trained_on, said)
+    return Checkpoint(state, settings, size, signals, trained_on, said, calibration)
 
 
 def _checked_size(size: Any) -> tuple[int, int] | None:

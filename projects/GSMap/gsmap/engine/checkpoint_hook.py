@@ -18,6 +18,8 @@ from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
 from gsmap.engine.run_log import innermost
 from gsmap.utils.files import write_bytes, write_text
+from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, calibration_of
+from gsmap.utils.shards import digest
 from gsmap.utils.split_lists import (
     SPLIT_LIST,
     TRAINED_ON,
@@ -52,6 +54,14 @@ def _metainfo(loader: Any) -> dict[str, Any]:
     return getattr(loader.dataset, "metainfo", {})
 
 
+def _tell_results(loop: Any, path: Path, meta: dict[str, Any]) -> None:
+    """Tell what writes results which checkpoint they are of, and how that was calibrated."""
+    facts: dict[str, Any] = {CALIBRATION: calibration_of(meta)}
+    if path.is_file():  # not an address
+        facts[CHECKPOINT] = digest(path)
+    loop.evaluator.dataset_meta = {**(loop.evaluator.dataset_meta or {}), **facts}
+
+
 @HOOKS.register_module()
 class AtomicCheckpointHook(CheckpointHook):
     """mmengine's hook, for runs that may be killed and for checkpoints from strangers.
@@ -81,13 +91,15 @@ class AtomicCheckpointHook(CheckpointHook):
         torch.serialization.add_safe_globals(mmengine_globals())
 
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
-        """Drop the text that mmengine would run as a config; check and note the model's split."""
+        """Drop the text that mmengine would run as a config; check and note the model's origin."""
         meta = checkpoint.get("meta", {})
         meta.pop("config", None)
         trained = meta.get("dataset_meta")
         for loop in (runner._val_loop, runner._test_loop):
             if isinstance(loop, BaseLoop) and isinstance(trained, dict):
                 self._check_split(trained, loop)
+        if isinstance(runner._test_loop, BaseLoop):
+            _tell_results(runner._test_loop, Path(str(runner._load_from)), meta)
 
     def before_save_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
         """Note the model's settings, the size of the scaled images, and if there are signals.

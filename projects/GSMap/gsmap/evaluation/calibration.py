@@ -15,11 +15,13 @@ from gsmap.evaluation.evaluator import Sample
 from gsmap.evaluation.report import MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import equivalent_orders
+from gsmap.utils.model_facts import LAW_NAMES
 
 AXES = ("along", "across")
 DISTANCES_M = (0.0, 10.0, 20.0, np.inf)  # from the vehicle
 LEVELS = np.linspace(0.05, 0.95, 19)  # of central intervals
-LAWS = {"normal": stats.norm(), "laplace": stats.laplace(scale=0.5**0.5)}  # of variance 1
+_STANDARD = stats.norm(), stats.laplace(scale=0.5**0.5)  # of variance 1
+LAWS = dict(zip(LAW_NAMES, _STANDARD, strict=True))
 COVERED = (2 * stats.norm.cdf([1.0, 2.0]) - 1).tolist()  # by one and two sigma of a normal law
 _FEWEST = 100  # vertices of a class whose sigmas are fitted
 _COLUMNS = (

@@ -1,7 +1,8 @@
 """Drives of a result file: tracks read from it, made, and written beside its elements."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,11 +38,16 @@ def drive_frames(
         FileNotFoundError: If the result file does not exist.
         ValueError: If it is malformed, lacks a sample, or only some of its vectors have a track.
     """
+    return _frames_of(SampleFile(results, RESULTS_KEY, classes), annotations)
+
+
+def _frames_of(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFrame]:
+    """Return what `drive_frames` does; then the file has said what it says of itself."""
     if not annotations.meta.options.get("poses", True):
         raise ValueError(f"{annotations.path} knows no poses, which consistency needs.")
-    found = {}
+    found, results = {}, samples.path
     items = items_of(results, RESULTS_KEY, "give a result file")
-    samples = SampleFile(results, RESULTS_KEY, classes)  # first, for what it says of a bad file
+    # samples first, for what they say of a bad file
     for (token, elements, _), (item, _) in zip(samples, items, strict=True):
         given = [vector.get(TRACK_KEY) for vector in item["vectors"]]
         found[token] = elements, _track_ids(given, results, token)
@@ -86,11 +92,16 @@ def _track_ids(ids: list[object], results: Path, token: str) -> IntArray | None:
     return np.array(ids, np.int64)
 
 
-def write_tracks(path: Path, frames: Sequence[DriveFrame], config: ConsistencyConfig) -> None:
+def write_tracks(
+    path: Path,
+    frames: Sequence[DriveFrame],
+    config: ConsistencyConfig,
+    about: Mapping[str, Any],
+) -> None:
     """Write results with the track of each element: ``track_id``, -1 for one of a low score.
 
     Tracks are those that the frames have, or made as `make_tracks` does; they persist over a
-    scene's frames.
+    scene's frames. ``about`` is what the results say of themselves.
     """
     samples = []
     for scene in by_scene(frames):
@@ -98,7 +109,7 @@ def write_tracks(path: Path, frames: Sequence[DriveFrame], config: ConsistencyCo
             vectors = vectors_of(frame.predictions, config.classes)
             ids = zip(vectors, tracks.tolist(), strict=True)
             samples.append((frame.token, [{**vector, TRACK_KEY: t} for vector, t in ids]))
-    write_results(path, samples, {"classes": list(config.classes)})
+    write_results(path, samples, {**about, "classes": list(config.classes)})
 
 
 def evaluate_drives(
@@ -119,8 +130,9 @@ def evaluate_drives(
         FileNotFoundError: If the result file does not exist.
         ValueError: If it is malformed, lacks a sample, or the annotations have no ground truth.
     """
-    frames = drive_frames(results, annotations, config.classes)
+    samples = SampleFile(results, RESULTS_KEY, config.classes)
+    frames = _frames_of(samples, annotations)
     figures = consistency(frames, config)
     if tracks_file is not None:
-        write_tracks(tracks_file, frames, config)
+        write_tracks(tracks_file, frames, config, samples.about)
     return figures

@@ -19,7 +19,7 @@ from gsmap.structures.elements import MapElements
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.shards import WHOLE, Shard
-from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON, require_same_list
+from gsmap.utils.split_lists import require_results_of
 from gsmap.utils.words import counted
 
 CHUNK = 64  # samples per task: large enough to hide the hand-over, small enough to share evenly
@@ -199,16 +199,16 @@ class SamplePairs:
                 else:
                     waiting[own][token] = elements if len(waiting[own]) < CHUNK else place
         if isinstance(self._truth, AnnotatedTruth) and not self._allow_other_split:
-            for name in (TRAINED_ON, SPLIT_LIST):
-                of_model, subject = (
-                    self._results.about.get(name),
-                    f"the model of {self._results.path}",
-                )
-                require_same_list(of_model, self._truth.split_list, subject, "--allow-other-split")
+            require_results_of(self._truth.split_list, self.about, self._results.path)
         self._mismatches = mismatch_notes(*waiting, self._allow_mismatch)
         nothing = MapElements.from_polylines()
         for token, kept in waiting[1].items():
             yield self._counted(token, nothing, self._load(self._truth, token, kept))
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What the result file says of itself, after the walk."""
+        return self._results.about
 
     def _load(self, side: Any, token: str, kept: Any) -> MapElements:
         """Return the elements of a sample that waited."""

@@ -18,6 +18,7 @@ from gsmap.evaluation.report import flat_metrics, format_table
 from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.evaluation.sample_ap import METHODS
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
 
 
@@ -126,8 +127,8 @@ class MapMetric(BaseMetric):
             MMLogger.get_current_instance().info("\n%s", format_table(report))
         if self.out_file is not None:  # after the figures: a disk may be full
             samples = ((record["token"], record["vectors"]) for record in records)
-            about = {name: self.dataset_meta.get(name) for name in (SPLIT_LIST, TRAINED_ON)}
-            about = {name: identity for name, identity in about.items() if identity}
+            keys = SPLIT_LIST, TRAINED_ON, CHECKPOINT, CALIBRATION
+            about = {key: said for key in keys if (said := self.dataset_meta.get(key))}
             write_results(self.out_file, samples, {"classes": list(self._meta("classes")), **about})
             print_log(f"Results of {len(records)} samples written to {self.out_file}", "current")
         return flat_metrics(reports)

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.chamfer_ap import ChamferConfig, nearest_by_chamfer
 from gsmap.evaluation.evaluator import MapEvaluator
 from gsmap.evaluation.file_evaluation import Evaluation, match_samples, read_ground_truth
 from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
+from gsmap.utils.split_lists import require_same_list
 
 _MIN_PRECISION = 1e-3  # an element that is right once in a thousand samples adds nothing
 _REFINEMENTS = 3  # how often a chosen element is moved to the mean of what it matches
@@ -145,6 +147,7 @@ def evaluate_prior(
     truth_path: str | Path,
     evaluator: MapEvaluator,
     max_elements: int = 50,
+    allow_other_split: bool = False,
 ) -> Evaluation:
     """Fit a prior on one file of ground truth and score it on another.
 
@@ -153,7 +156,18 @@ def evaluate_prior(
         truth_path: Annotation file or MapTR's JSON, to score on.
         evaluator: The metrics.
         max_elements: Elements of the prior.
+        allow_other_split: Whether both files may be of different splits of a data set.
+
+    Raises:
+        FileNotFoundError: If a file does not exist.
+        ValueError: If a file is malformed, or the splits differ.
     """
+    paths = [path for path in (train_path, truth_path) if Path(path).suffix.lower() != ".json"]
+    metas = [AnnotationFile(path).meta for path in paths]
+    if len({meta.dataset for meta in metas}) < len(metas) and not allow_other_split:
+        train_list, truth_list = (meta.split_list for meta in metas)
+        subject = f"the prior of {train_path}"
+        require_same_list(train_list, truth_list, subject, "--allow-other-split")
     chamfer = evaluator.chamfer or ChamferConfig(evaluator.classes)
     everything, _ = read_ground_truth(train_path, evaluator.classes)
     step = max(1, -(-len(everything) // _MAX_TRAINING_SAMPLES))

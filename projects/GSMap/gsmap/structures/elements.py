@@ -72,7 +72,8 @@ class MapElements:
 
         Raises:
             ValueError: If the lengths disagree, the points are not (x, y[, z]), a point is not
-                finite, or a score is outside [0, 1].
+                finite, a score is outside [0, 1], or a Gaussian is none: a scale that is not
+                positive, a value that is not finite.
         """
         labels = np.asarray(labels, np.int64).reshape(-1)
         scores = None if scores is None else np.asarray(scores, np.float64).reshape(-1)
@@ -88,15 +89,17 @@ class MapElements:
         except (TypeError, IndexError, ValueError) as error:
             raise ValueError(f"polylines must be lists of (x, y) or (x, y, z): {error}") from error
         offsets = np.cumsum([0, *map(len, polylines)])
-        finite = np.isfinite(points).all(axis=1)
-        if not finite.all():
-            index = np.searchsorted(offsets, finite.argmin(), side="right") - 1
-            raise ValueError(f"element {index} has a point that is not finite.")
+        _require(np.isfinite(points).all(axis=1), offsets, "point that is not finite")
         if scores is not None and not ((scores >= 0) & (scores <= 1)).all():  # NaN is not
             index = ((scores >= 0) & (scores <= 1)).argmin()
             raise ValueError(f"element {index} has the score {scores[index]}, not in [0, 1].")
         scales = _per_vertex(scales, "scales", (len(points), 2))
         rotations = _per_vertex(rotations, "rotations", (len(points),))
+        if scales is not None:
+            positive = ((scales > 0) & np.isfinite(scales)).all(axis=1)
+            _require(positive, offsets, "Gaussian whose scales are not positive numbers")
+        if rotations is not None:
+            _require(np.isfinite(rotations), offsets, "Gaussian whose rotation is not finite")
         return cls(points, offsets, labels, scores, scales, rotations)
 
     def __len__(self) -> int:
@@ -165,6 +168,13 @@ class MapElements:
             for values, chosen in ((self.scores, rows), (self.scales, take), (self.rotations, take))
         )
         return MapElements(self.points[take], offsets, self.labels[rows], scores, scales, rotations)
+
+
+def _require(right: BoolArray, offsets: IntArray, fault: str) -> None:
+    """Raise ValueError with the first element of which a vertex is not right. (M,), (N + 1,)"""
+    if not right.all():
+        index = np.searchsorted(offsets, right.argmin(), side="right") - 1
+        raise ValueError(f"element {index} has a {fault}.")
 
 
 def _joined(polylines: PerElement) -> FloatArray:

@@ -45,3 +45,19 @@ def require_same_list(model: Any, data: Any, subject: str, remedy: str) -> None:
             "whose places may be among those of the training: take data of the same split, or "
             f"allow it with {remedy}."
         )
+
+
+def require_results_of(split_list: str, about: Mapping[str, Any], path: object) -> None:
+    """Refuse results of a model of another list than that of the data to score.
+
+    Args:
+        split_list: The list of the data; nothing if it is unknown.
+        about: What the result file says of itself.
+        path: The result file, for the message.
+
+    Raises:
+        ValueError: If both are known and differ.
+    """
+    for name in (TRAINED_ON, SPLIT_LIST):
+        subject = f"the model of {path}"
+        require_same_list(about.get(name), split_list, subject, "--allow-other-split")

@@ -50,6 +50,9 @@ class PageOptions:
         allow_mismatch: Samples without results count as without predictions, results without
             ground truth are left out; otherwise both are errors.
         by: Parts of the samples that have their AP in a table, as `read_groups` takes them.
+        allow_other_split: Whether models may be of another split than the annotation file.
+        law: Distribution of the errors that Gaussians tell of; by default that of each result's
+            calibration, or the normal one.
 
     Raises:
         ValueError: If a value is out of its range.
@@ -61,6 +64,8 @@ class PageOptions:
     image_width: int = 320
     allow_mismatch: bool = False
     by: str | None = None
+    allow_other_split: bool = False
+    law: str | None = None
 
     def __post_init__(self) -> None:
         if self.max_frames < 1 or self.image_width < 0 or not 0 <= self.score_thr <= 1:
@@ -91,10 +96,8 @@ def page_data(
     file = AnnotationFile(annotations)
     meta, view, style = file.meta, FRAME_VIEWS[file.meta.frame], MapStyle(file.meta.classes)
     truth = read_ground_truth(annotations, meta.classes)[0] if results else {}
-    scored = [
-        score_result(name, path, truth, meta, options.allow_mismatch)
-        for name, path in results.items()
-    ]
+    how = options.allow_mismatch, options.allow_other_split, options.law
+    scored = [score_result(name, path, truth, meta, *how) for name, path in results.items()]
     tokens, seconds = file.column("token"), file.seconds_into_scene
     chosen = choose_frames(tokens, options.max_frames, scored, options.score_thr)
     root = Path(annotations).parent if options.data_root is None else options.data_root

@@ -12,10 +12,12 @@ from gsmap.evaluation.file_evaluation import mismatch_notes
 from gsmap.evaluation.matches import FrameMatches
 from gsmap.evaluation.raster_ap import RasterConfig
 from gsmap.evaluation.report import MetricReport
-from gsmap.evaluation.results_json import RESULTS_KEY, THREE_D, read_samples
+from gsmap.evaluation.results_json import RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
+from gsmap.utils.model_facts import law_of
+from gsmap.utils.split_lists import require_results_of
 
 MATCH_M = 1.0
 """Chamfer distance in metres within which the page calls a prediction a hit."""
@@ -32,6 +34,7 @@ class ScoredResult:
         matches: Their matches by Chamfer distance, by token.
         reports: One report per metric.
         notes: What the reader should know of the samples.
+        law: Distribution of the errors that its Gaussians tell of.
     """
 
     name: str
@@ -39,6 +42,7 @@ class ScoredResult:
     matches: Mapping[str, FrameMatches]
     reports: list[MetricReport]
     notes: list[str]
+    law: str
 
     def hits(self, token: str) -> IntArray:
         """Return the ground truth that each counted prediction hits within 1 m, or -1. (N,)"""
@@ -58,6 +62,8 @@ def score_result(
     truth: Mapping[str, MapElements],
     meta: AnnotationMeta,
     allow_mismatch: bool = False,
+    allow_other_split: bool = False,
+    law: str | None = None,
 ) -> ScoredResult:
     """Score a result file with the rules of ``tools/evaluate.py``.
 
@@ -67,12 +73,17 @@ def score_result(
         truth: Ground truth of each sample, by token.
         meta: Classes and range.
         allow_mismatch: As in ``mismatch_notes``.
+        allow_other_split: Whether the model may be of another split than the ground truth.
+        law: Distribution of the errors; None for that of the model's calibration, or the normal.
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If it is malformed, or its samples are not those of the ground truth.
+        ValueError: If it is malformed, or its samples or its split are not the ground truth's.
     """
-    predictions, others = read_samples(path, RESULTS_KEY, meta.classes, gaussians=True)
+    file = SampleFile(path, RESULTS_KEY, meta.classes, gaussians=True)
+    predictions, others = {token: found for token, found, _ in file}, file.ignored
+    if not allow_other_split:
+        require_results_of(meta.split_list, file.about, path)
     try:
         notes = mismatch_notes(predictions, truth, allow_mismatch)
     except ValueError as error:
@@ -83,7 +94,8 @@ def score_result(
     evaluator, nothing = _evaluator(meta), MapElements.from_polylines()
     found = [evaluator.match(t, predictions.get(t, nothing), gt) for t, gt in truth.items()]
     matches = {sample["chamfer"].token: sample["chamfer"] for sample in found}
-    return ScoredResult(name, predictions, matches, evaluator.reports(found), notes)
+    reports, law = evaluator.reports(found), law or law_of(file.about)
+    return ScoredResult(name, predictions, matches, reports, notes, law)
 
 
 def scored_by_distance(

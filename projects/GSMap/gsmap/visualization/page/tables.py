@@ -7,7 +7,15 @@ import numpy as np
 
 from gsmap.evaluation.average_precision import precision_recall
 from gsmap.evaluation.bootstrap import Interval, Resamples, ap_differences, ap_intervals
-from gsmap.evaluation.calibration import AXES, LEVELS, Vertices, matched_vertices, reliability
+from gsmap.evaluation.calibration import (
+    AXES,
+    COVERED,
+    LEVELS,
+    Vertices,
+    half_widths,
+    matched_vertices,
+    reliability,
+)
 from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
 from gsmap.evaluation.groups import Groups, ap_by_group, group_table
 from gsmap.evaluation.matches import ClassDetections
@@ -158,7 +166,7 @@ def curves(results: Sequence[ScoredResult], style: MapStyle) -> list[dict[str, A
 def reliability_curves(
     results: Sequence[ScoredResult], truth: Mapping[str, MapElements], style: MapStyle
 ) -> list[dict[str, Any]]:
-    """Return a panel per class: the share of errors within intervals of the Gaussians.
+    """Return a panel per class: the share of errors within intervals of each result's law.
 
     Args:
         results: One result or two; those without Gaussians have no curve.
@@ -166,6 +174,7 @@ def reliability_curves(
         style: Names of the classes.
     """
     found = [_vertices(result, truth, style) for result in results]
+    laws = " | ".join(dict.fromkeys(r.law for r, each in zip(results, found, strict=True) if each))
     panels = []
     for label in range(len(style.classes)):
         own = [each.of(each.labels == label) if each else None for each in found]
@@ -173,15 +182,18 @@ def reliability_curves(
         for axis, name in enumerate(AXES):
             shares: list[float] = []
             points: list[list[list[float]]] = []
-            for each in own:
+            for result, each in zip(results, own, strict=True):
                 if each is None or not len(each.labels):
                     shares.append(UNDEFINED)
                     points.append([])
                     continue
                 errors, sigmas = each.errors[:, axis], each.sigmas[:, axis]
-                shares.append(float((errors <= sigmas).mean()))
-                points.append(np.stack([LEVELS, reliability(errors, sigmas)], 1).round(3).tolist())
-            label_ap = {"label": f"{name}, within 1 sigma", "ap": [_figure(s) for s in shares]}
+                width = half_widths(result.law, COVERED)[0]
+                shares.append(float((errors <= width * sigmas).mean()))
+                curve = reliability(errors, sigmas, result.law)
+                points.append(np.stack([LEVELS, curve], 1).round(3).tolist())
+            title = f"{name}, in the interval of 68.3 % ({laws} law)"
+            label_ap = {"label": title, "ap": [_figure(s) for s in shares]}
             lines.append(label_ap | {"points": points})
         if any(map(any, (line["points"] for line in lines))):
             panels.append({"metric": "Gaussians", "class": label, "lines": lines})
