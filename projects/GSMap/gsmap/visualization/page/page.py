@@ -96,8 +96,8 @@ def page_data(
     file = AnnotationFile(annotations)
     meta, view, style = file.meta, FRAME_VIEWS[file.meta.frame], MapStyle(file.meta.classes)
     truth = read_ground_truth(annotations, meta.classes)[0] if results else {}
-    how = options.allow_mismatch, options.allow_other_split, options.law
-    scored = [score_result(name, path, truth, meta, *how) for name, path in results.items()]
+    rules = options.allow_mismatch, options.allow_other_split, options.law
+    scored = [score_result(name, path, truth, meta, *rules) for name, path in results.items()]
     tokens, seconds = file.column("token"), file.seconds_into_scene
     chosen = choose_frames(tokens, options.max_frames, scored, options.score_thr)
     root = Path(annotations).parent if options.data_root is None else options.data_root
