@@ -103,3 +103,8 @@ def test_gaussians_start_neutral_on_it():
 def test_channels_that_hold_no_code_are_refused():
     with pytest.raises(ValueError, match="embed_dims must be divisible by 4, got 18"):
         mapqr(embed_dims=18)
+
+
+def test_embeddings_of_points_from_their_instance_are_refused():
+    with pytest.raises(ValueError, match="MapQRDecoder has queries of instances, no embeddings"):
+        mapqr({**HEAD, "points_from_instances": True})

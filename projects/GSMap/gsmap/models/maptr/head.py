@@ -139,9 +139,14 @@ class MapHead(DetectionHead):
         self.decoder: MapDecoder = MODELS.build(
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
         )
+        if points_from_instances and not self.decoder.point_queries:
+            raise ValueError(
+                f"{type(self.decoder).__name__} has queries of instances, no embeddings of points: "
+                "leave out points_from_instances."
+            )
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
         self.pts_embedding: nn.Linear | nn.Embedding | None = None
-        if self.decoder.point_queries and points_from_instances:
+        if points_from_instances:
             self.pts_embedding = nn.Linear(2 * embed_dims, num_points * 2 * embed_dims)
         elif self.decoder.point_queries:
             self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
