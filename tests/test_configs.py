@@ -353,7 +353,7 @@ def test_any_head_can_remember_the_features_of_the_map(path, minicity_root, anno
     train, test = (cfg[f"{part}_dataloader"].dataset for part in ("train", "test"))
     on_minicity(train, minicity_root, annotations)
     on_minicity(test, minicity_root, annotations)
-    cfg.model.temporal = {"bev": {}, "embed_dims": cfg.model.bev_encoder.embed_dims}
+    cfg.model.temporal = {"bev": {}, "embed_dims": cfg.model.bev_encoder.get("embed_dims", 64)}
     torch.manual_seed(0)
     model = MODELS.build(cfg.model)
     model.init_weights()
