@@ -1,11 +1,14 @@
 """A small MapTR with random weights, and generated samples for it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from mmengine.config import Config
 
+from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -73,3 +76,28 @@ def make_samples(folder, count=3):
         )
         for i in range(count)
     ]
+
+
+def drive(folder, count=4, scene="scene"):
+    """Return samples of one drive, 2 m and half a second apart."""
+    return [
+        replace(
+            sample,
+            token=f"{scene}{i}",
+            scene=scene,
+            timestamp_ns=i * 500_000_000,
+            global_from_frame=np.array(
+                [[1, 0, 0, 0], [0, 1, 0, 2.0 * i], [0, 0, 1, 0], [0, 0, 0, 1]]
+            ),
+        )
+        for i, sample in enumerate(make_samples(folder, count))
+    ]
+
+
+def make_remembering() -> MapInferencer:
+    """Return the small model with memory."""
+    cfg = make_config()
+    temporal = {"bev": {}, "queries": {"num": 2}, "embed_dims": 128}
+    cfg.merge_from_dict({"model.temporal": temporal})
+    torch.manual_seed(0)
+    return MapInferencer(cfg, None, device="cpu")

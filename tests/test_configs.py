@@ -343,6 +343,41 @@ def test_one_step_of_training_and_testing(path, minicity_root, annotations):
     assert ("scales" in predicted) == ("GSMap" in cfg.model.map_head.type)
 
 
+REMEMBERING = [p for p in LEAVES if p.parent.name in ANY_NUMBER and "minicity" in p.stem]
+
+
+@pytest.mark.parametrize("path", REMEMBERING, ids=lambda path: path.stem)
+def test_any_head_can_remember_the_features_of_the_map(path, minicity_root, annotations):
+    """A sample comes again half a second later: its memory counts, in training and testing."""
+    cfg = small(load(path))
+    train, test = (cfg[f"{part}_dataloader"].dataset for part in ("train", "test"))
+    on_minicity(train, minicity_root, annotations)
+    on_minicity(test, minicity_root, annotations)
+    cfg.model.temporal = {"bev": {}, "embed_dims": cfg.model.bev_encoder.get("embed_dims", 64)}
+    torch.manual_seed(0)
+    model = MODELS.build(cfg.model)
+    model.init_weights()
+    model.train()
+    for dataset, mode in ((train, "loss"), (test, "tensor")):
+        sample, found = DATASETS.build(dataset)[0], []
+        for number in range(2):
+            again = deepcopy(sample)
+            again["data_samples"].set_metainfo({"timestamp_ns": number * 500_000_000})
+            data = model.data_preprocessor(pseudo_collate([again]), mode == "loss")
+            with model.over_time(
+                model.extract_feat(data["inputs"], data["data_samples"]), data["data_samples"]
+            ) as outputs:
+                found.append(outputs["bev_feats"].detach())
+                if mode == "loss":
+                    check_gradients(model, model.map_head.loss(outputs, data["data_samples"]))
+                    assert model.temporal.bev.convz.weight.grad.abs().sum() > 0
+                else:
+                    (elements,) = model.map_head.predict(outputs, data["data_samples"])
+                    assert elements.pts.isfinite().all()
+        assert not torch.allclose(*found)
+        model.eval()
+
+
 def test_extended_classes_become_targets_that_both_metrics_score(minicity_root, annotations):
     cfg = load(REPO / "configs/maptr/maptr_r50_extended_24e.py")
     train, test = (cfg[f"{part}_dataloader"].dataset for part in ("train", "test"))

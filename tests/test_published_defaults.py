@@ -83,6 +83,7 @@ STREAMMAPNET = {
     "model.data_preprocessor.mean": [103.53, 116.28, 123.675],
     "model.bev_encoder.z_range": pytest.approx((-11 / 3, 17 / 3)),  # slices at -2.5 to 4.5 m
     "model.temporal": {"bev": {}, "queries": {"num": 33}},
+    "sync_bn": "torch",
 }
 CONFIGS: dict[str, dict[str, Any]] = {
     "maptr/maptr_r50_24e.py": {**SCHEDULE, **NUSCENES, **CAMERAS},

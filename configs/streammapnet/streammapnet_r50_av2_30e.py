@@ -17,4 +17,5 @@ train_dataloader = dict(
 val_dataloader = dict(sampler=dict(_delete_=True, type='StreamTestSampler'), dataset=_test)
 test_dataloader = val_dataloader
 param_scheduler = _base_._param_scheduler
+sync_bn = 'torch'  # of several ranks
 train_cfg = dict(max_epochs=30)

@@ -6,9 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from inferencer_cases import make_samples
+from inferencer_cases import drive, make_remembering, make_samples
 
 from gsmap.datasets.source import ground_from_frame, reframed
+from gsmap.structures.rigid import rigid
+from gsmap.structures.streams import Frame
 from gsmap.visualization.figure import figure_to_rgb
 
 
@@ -89,6 +91,42 @@ def test_a_live_rig_takes_the_signals_of_the_vehicle(inferencer, tmp_path):
         live(images, np.zeros(4))
     with pytest.raises(ValueError, match="can_bus must be finite"):
         live(images, np.full(18, np.nan))
+
+
+def test_a_live_rig_continues_a_stream_as_the_drive_does(inferencer, tmp_path):
+    """The calibration is that of the vehicle, and so is the pose; the model's is the LiDAR."""
+    samples, remembering = drive(tmp_path, 2), make_remembering()
+    for sample in samples:
+        for camera in sample.cameras:  # a file that holds the very pixels
+            image = cv2.imread(str(tmp_path / camera.path))
+            camera.path = f"{sample.token}_{camera.name}.png"
+            cv2.imwrite(str(tmp_path / camera.path), image)
+    turned = rigid([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [5, 0, 0])
+    samples[1].global_from_frame = samples[1].global_from_frame @ turned
+    whole = [found.pred_instances_3d.pts for found in remembering(samples, tmp_path)]
+    ground_from_lidar = ground_from_frame(samples[0], "lidar")
+    lidar_from_ground = np.linalg.inv(ground_from_lidar)
+    _, intrinsics, cams = in_memory(samples[0], tmp_path)
+    mounting = {name: cam @ lidar_from_ground for name, cam in cams.items()}
+    live, stream = remembering.live(intrinsics, mounting, "vehicle"), remembering.new_stream()
+    places = [
+        Frame(s.token, s.scene, s.timestamp_ns, s.global_from_frame @ lidar_from_ground)
+        for s in samples
+    ]
+    images = [in_memory(sample, tmp_path)[0] for sample in samples]
+    for pixels, at, expected in zip(images, places, whole, strict=True):
+        found = live.predict(pixels, at=at, stream=stream)
+        assert found.metainfo["token"] == at.token
+        torch.testing.assert_close(found.pred_instances_3d.pts, expected, atol=1e-3, rtol=0)
+    alone = live.predict(images[1]).pred_instances_3d.pts  # a first frame
+    assert (alone - whole[1]).abs().max() > 1e-2
+    with pytest.raises(ValueError, match=r"'scene0' .* comes too late: its stream is at 'scene1'"):
+        live(images[0], at=places[0], stream=stream)
+    with pytest.raises(ValueError, match=r"needs both at=Frame\(\.\.\.\) and stream=\.\.\., got"):
+        live(images[0], stream=stream)
+    plain = inferencer.live(intrinsics, mounting, "vehicle")
+    with pytest.raises(ValueError, match="the model has no memory"):
+        plain(images[0], at=places[0], stream=stream)
 
 
 def test_a_live_map_is_in_the_frame_of_its_calibration(inferencer, tmp_path):

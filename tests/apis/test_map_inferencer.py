@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from inferencer_cases import NAMES, make_config, make_samples
+from inferencer_cases import NAMES, drive, make_config, make_remembering, make_samples
 
 from gsmap.apis.loading import load_model
 from gsmap.apis.map_inferencer import MapInferencer
@@ -236,28 +236,8 @@ def test_load_model_gives_the_model_alone(tmp_path):
     assert all((v == 0.01).all() for v in loaded.values() if v.is_floating_point())
 
 
-def drive(folder, count=4, scene="scene"):
-    """Return samples of one drive, 2 m and half a second apart."""
-    return [
-        replace(
-            sample,
-            token=f"{scene}{i}",
-            scene=scene,
-            timestamp_ns=i * 500_000_000,
-            global_from_frame=np.array(
-                [[1, 0, 0, 0], [0, 1, 0, 2.0 * i], [0, 0, 1, 0], [0, 0, 0, 1]]
-            ),
-        )
-        for i, sample in enumerate(make_samples(folder, count))
-    ]
-
-
 def test_a_stream_of_ones_own_gives_what_the_whole_drive_gives(inferencer, tmp_path):
-    cfg = make_config()
-    temporal = {"bev": {}, "queries": {"num": 2}, "embed_dims": 128}
-    cfg.merge_from_dict({"model.temporal": temporal})
-    torch.manual_seed(0)
-    remembering = MapInferencer(cfg, None, device="cpu")
+    remembering = make_remembering()
     samples = drive(tmp_path)
     whole = remembering(samples, tmp_path)
     stream = remembering.new_stream()
@@ -272,3 +252,6 @@ def test_a_stream_of_ones_own_gives_what_the_whole_drive_gives(inferencer, tmp_p
         remembering(drive(tmp_path, 1, "other"), tmp_path, stream=stream)
     with pytest.raises(ValueError, match="the model has no memory"):
         inferencer.new_stream()
+    stream, dataset = remembering.new_stream(), remembering.dataset(samples, tmp_path)
+    for number, _ in enumerate(remembering.predict(dataset, stream=stream)):
+        assert stream.last.token == f"scene{number}"  # no sample before it is asked for

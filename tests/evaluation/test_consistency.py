@@ -122,6 +122,26 @@ def test_a_second_track_of_the_same_element_counts_against_it():
     assert consistency(frames, CONFIG)["consistency/CAP@0.5/divider"] == pytest.approx(1.0)
 
 
+def test_predictions_without_a_track_are_none_to_each_other():
+    """The first owns the element, so the second counts as false: AP is 1/2."""
+    frames = drive(0.0, 0.0)
+    for frame in frames:
+        frame.track_ids = np.array([-1])
+    found = consistency(frames, CONFIG)
+    assert found["consistency/CAP@0.5/divider"] == pytest.approx(0.5)
+    assert found["consistency/AP@0.5/divider"] == pytest.approx(1.0)
+    assert found["consistency/jitter_m"] == -1.0
+
+
+def test_a_track_of_another_class_with_the_same_number_does_not_jitter():
+    """MapTracker numbers its tracks by class: the boundary was 2 m beside the divider."""
+    frames = [replace(frame, pose=np.eye(4)) for frame in drive(0.0, 0.0)]
+    line = frames[0].predictions.polylines[0]
+    both = MapElements.from_polylines([line, line + np.array([0, 2.0])], [1, 2], [0.9, 0.9])
+    frames[0].predictions = both
+    assert jitter(frames, [np.zeros(2, int), np.zeros(1, int)], GRID).tolist() == [0.0]
+
+
 def test_a_low_score_has_no_track_and_does_not_count():
     found = track_drive(drive(0.0, 0.0, scores=(0.4, 0.41)), CONFIG)
     assert [ids.tolist() for ids in found] == [[-1], [0]]
@@ -197,6 +217,23 @@ def test_tracks_of_some_vectors_only_are_refused(files, tmp_path):
     (tmp_path / "some.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"track_id must be an integer .* got True"):
         drive_frames(tmp_path / "some.json", annotations, CONFIG.classes)
+
+
+def test_a_track_twice_in_a_sample_is_named(files, tmp_path):
+    results, annotations = files
+    content = json.loads(results.read_text())
+    for sample in content["results"]:
+        sample["vectors"] = [{**vector, "track_id": 4} for vector in sample["vectors"]]
+    twice = content["results"][1]["vectors"]
+    twice.append({**twice[0], "track_id": -1})  # any number can have none
+    twice.append({**twice[0], "track_id": -1})
+    twice.append({**twice[0], "cls_name": "boundary", "type": 2})  # MapTracker's are of a class
+    (tmp_path / "twice.json").write_text(json.dumps(content))
+    drive_frames(tmp_path / "twice.json", annotations, CONFIG.classes)
+    twice.append(twice[0])
+    (tmp_path / "twice.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"sample '1': two elements of a class have track_id 4"):
+        drive_frames(tmp_path / "twice.json", annotations, CONFIG.classes)
 
 
 def test_the_command_scores_drives_and_writes_tracks(files, tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 from head_cases import ALONG_Y, GSMAP, HEAD, LANES, bev, build_head
 from mmengine.structures import InstanceData
 from model_cases import build_small, make_images, make_samples, straight_elements
+from vectormapnet_cases import head as line_head
 
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.memory import StreamMemory, recalled
@@ -113,6 +115,39 @@ def test_a_stream_of_ones_own_refuses_another_scene():
     step(head, memory, meta(0))  # the detector's own streams know nothing of it
 
 
+def test_the_first_batch_of_a_stream_of_ones_own_has_one_scene_too():
+    head, memory = with_memory()
+    with (
+        memory.using(MapStream()),
+        pytest.raises(ValueError, match=r"'b0' .* another scene than 'a0'"),
+    ):
+        step(head, memory, meta(0), meta(0, "b"))
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda it: pickle.loads(pickle.dumps(it))])
+def test_a_copy_of_a_stream_goes_on_from_where_it_was(again):
+    """It holds the frame and its state: none of the model's weights."""
+    head, memory = with_memory()
+    stream = memory.new_stream()
+    with memory.using(stream):
+        step(head, memory, meta(0), feats=features(0))
+        copied = again(stream)
+        whole = step(head, memory, meta(1), feats=features(1))
+    assert copied.owner == str(memory)
+    assert copied.last.token == "a0"
+    with memory.using(copied):
+        assert torch.equal(step(head, memory, meta(1), feats=features(1)), whole)
+        with pytest.raises(ValueError, match=r"'a1' .*comes twice: its stream is at 'a1'"):
+            step(head, memory, meta(1))
+    _, other = with_memory()
+    other.name = "b.py with b.pth"
+    with (
+        pytest.raises(ValueError, match=r"of a model with MapHead, and b\.py with b\.pth cannot"),
+        other.using(again(stream)),
+    ):
+        pass
+
+
 def test_a_stream_of_one_model_is_refused_by_another_and_both_are_named():
     (head, memory), (_, other) = with_memory(), with_memory()
     memory.name, other.name = "a.py with a.pth", "b.py with b.pth"
@@ -138,6 +173,9 @@ def test_a_sample_without_a_pose_is_named():
     head, memory = with_memory()
     with pytest.raises(ValueError, match=r"'a0' has no \['lidar2global'\]"):
         step(head, memory, meta(0, lidar2global=None))
+    for wrong in (np.full((4, 4), np.nan), np.eye(3)):
+        with pytest.raises(ValueError, match=r"lidar2global of sample 'a0' must be a finite"):
+            step(head, memory, meta(0, lidar2global=wrong))
 
 
 def test_slots_start_anew_where_a_sample_does_not_follow():
@@ -309,6 +347,13 @@ def test_a_memory_that_does_not_fit_is_refused():
         StreamMemory(head, queries={"num": 4})
     with pytest.raises(ValueError, match=r"kept_dims must be 1 to 16, .* got 17"):
         StreamMemory(head, bev={"kept_dims": 17}, embed_dims=16)
+    with pytest.raises(ValueError, match=r"max_gap_s must be seconds > 0, got 0"):
+        StreamMemory(head, bev={}, max_gap_s=0)
+    with pytest.raises(ValueError, match="VectorMapNetHead can have no memory of queries"):
+        StreamMemory(line_head(), queries={"num": 2})
+    wide = StreamMemory(head, bev={}, embed_dims=32)
+    with pytest.raises(ValueError, match=r"have 16 channels, their memory 32: set temporal\.embed"):
+        step(head, wide.eval(), meta(0))
     single = build_head(HEAD, decoder={**HEAD["decoder"], "num_layers": 1})
     with pytest.raises(ValueError, match=r"set map_head\.decoder\.num_layers to 2 or more"):
         StreamMemory(single, queries={"num": 2})

@@ -1,5 +1,6 @@
 """A trained model on the cameras of one vehicle, whose images come frame by frame."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,9 @@ from gsmap.datasets.memory import VEHICLE, Cameras, bgr_by_name, source_in_memor
 from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
+from gsmap.structures.streams import Frame, MapStream
+
+_ALONE = Frame("in memory", "", 0, np.eye(4))
 
 if TYPE_CHECKING:
     from mmdet3d.structures import Det3DDataSample
@@ -21,8 +25,8 @@ class LiveMap:
     """The map around a vehicle, frame by frame, from images in memory.
 
     ``MapInferencer.live`` makes it. The calibration is fitted to the model once, with the first
-    frame. The models of this project see each frame by itself: nothing is kept from one to the
-    next.
+    frame. Nothing else is kept from one to the next: a model with memory (``temporal``) keeps what
+    it remembers in the caller's stream, and without one sees each frame as a first one.
 
     Args:
         inferencer: The trained model.
@@ -51,18 +55,34 @@ class LiveMap:
         self._sizes: dict[str, tuple[int, ...]] = {}
         self._dataset: VectorizedMapDataset
 
-    def __call__(self, images: Cameras, can_bus: np.ndarray | None = None) -> MapElements:
+    def __call__(
+        self,
+        images: Cameras,
+        can_bus: np.ndarray | None = None,
+        at: Frame | None = None,
+        stream: MapStream | None = None,
+    ) -> MapElements:
         """Return the map elements of one frame, in the frame of the calibration, as `predict`."""
-        found = self._inferencer.elements(self.predict(images, can_bus))
+        found = self._inferencer.elements(self.predict(images, can_bus, at, stream))
         return found.moved(self._frame_from_models)
 
-    def predict(self, images: Cameras, can_bus: np.ndarray | None = None) -> "Det3DDataSample":
+    def predict(
+        self,
+        images: Cameras,
+        can_bus: np.ndarray | None = None,
+        at: Frame | None = None,
+        stream: MapStream | None = None,
+    ) -> "Det3DDataSample":
         """Run the model on one frame.
 
         Args:
             images: RGB, uint8, at about the size that the model was trained on. each (H, W, 3)
             can_bus: Signals of the vehicle, as `motion_signals` makes them of poses; models that
                 were trained with signals see a standing vehicle without. (18,)
+            at: With a stream, the frame's name, scene, time and pose, the latter from the frame of
+                the calibration to the world.
+            stream: With a model that remembers, the drive that the frame continues
+                (``MapInferencer.new_stream``).
 
         Returns:
             The sample, with ``pred_instances_3d`` on the CPU in the frame of the config.
@@ -70,8 +90,15 @@ class LiveMap:
         Raises:
             TypeError: If an image is not uint8.
             ValueError: If an array has another shape, a matrix is none of its kind, a signal is not
-                finite, the cameras of the arguments differ, or they are not those of the model.
+                finite, the cameras of the arguments differ, or they are not those of the model; if
+                only one of ``at`` and ``stream`` is given, the model has no memory for them, or the
+                frame does not follow the stream's last.
         """
+        if (at is None) != (stream is None):
+            raise ValueError(
+                "a frame that continues a stream needs both at=Frame(...) and stream=..., got "
+                f"at={at} and stream={stream}."
+            )
         if can_bus is not None and not np.isfinite(can_bus).all():
             raise ValueError(f"can_bus must be finite, got {can_bus}.")
         pixels = bgr_by_name(images)
@@ -81,8 +108,14 @@ class LiveMap:
             self._sizes = sizes
         self._dataset.images_in_memory = pixels
         self._dataset.can_bus_in_memory = None if can_bus is None else np.asarray(can_bus, float)
+        frame = None if self._inferencer.model.temporal is None else _ALONE
+        if at is not None:
+            frame = replace(at, pose=at.pose @ self._frame_from_models)
+        self._dataset.frame_in_memory = frame
         allowed = self._allow_missing_cameras
-        (found,) = self._inferencer.predict(self._dataset, allow_missing_cameras=allowed)
+        (found,) = self._inferencer.predict(
+            self._dataset, allow_missing_cameras=allowed, stream=stream
+        )
         return found
 
     def _open(self, pixels: dict[str, np.ndarray]) -> None:

@@ -262,7 +262,8 @@ class MapInferencer:
             on_broken: Called with each sample that cannot be used, which is then left out; None
                 lets it be an error.
             stream: With a model that remembers, the drive that the samples continue, over several
-                calls (`new_stream`); None starts a new one for each scene.
+                calls (`new_stream`); None starts a new one for each scene. It is never ahead of
+                what was yielded by more than a batch.
 
         Yields:
             The samples in order, with ``pred_instances_3d`` on the CPU.
@@ -271,6 +272,7 @@ class MapInferencer:
             ValueError: If a file of a sample is missing or damaged, or a camera is absent; with
                 memory, if frames are out of order, and if there are several devices.
         """
+        ahead = 0 if stream is not None else len(self.replicas)  # batches before they are asked for
         if stream is None and self.model.temporal is not None:
             stream = self._memory().new_scenes()
         elif stream is not None:
@@ -290,7 +292,7 @@ class MapInferencer:
                 if batch is not None:
                     turn = number % len(pools)
                     pending.append(pools[turn].submit(self._step, turn, batch, stream))
-                if len(pending) > len(pools):
+                if len(pending) > ahead:
                     yield from pending.popleft().result()
             while pending:
                 yield from pending.popleft().result()

@@ -17,6 +17,7 @@ from gsmap.datasets.transforms.images import ScaleImages
 from gsmap.structures.calibration import NUM_CAN_BUS, without_history
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.structures.streams import Frame
 from gsmap.utils.split_lists import SPLIT_LIST
 
 _BROKEN = ("raise", "skip")
@@ -97,6 +98,7 @@ class VectorizedMapDataset(BaseDataset):
         self.broken_tokens: dict[str, str] = {}
         self.images_in_memory: Mapping[str, np.ndarray] = {}  # BGR, by camera, in place of files
         self.can_bus_in_memory: np.ndarray | None = None  # (18,), in place of a sample's
+        self.frame_in_memory: Frame | None = None  # token, scene, time and pose in place of its own
         self._broken_in_a_row = 0
         self._expected = {
             "classes": None if classes is None else tuple(classes),
@@ -228,6 +230,10 @@ class VectorizedMapDataset(BaseDataset):
             }
         if sample.lidar is not None:
             info.update(self._lidar(sample.lidar))
+        if self.frame_in_memory is not None:
+            frame = self.frame_in_memory
+            info.update({key: getattr(frame, key) for key in ("token", "scene", "timestamp_ns")})
+            info.update(timestamp=frame.timestamp_ns / 1e9, lidar2global=frame.pose)
         return info
 
     @property

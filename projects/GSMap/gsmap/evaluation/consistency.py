@@ -73,7 +73,8 @@ class DriveFrame:
         pose: From the annotation frame to the world. (4, 4)
         predictions: What the model predicts.
         truth: What is annotated.
-        track_ids: Track of each prediction, of one scene; None to make tracks. (N,)
+        track_ids: Track of each prediction, of one scene and class, -1 for none; None to make
+            tracks. (N,)
     """
 
     token: str
@@ -243,6 +244,16 @@ class FrameHits:
         return found
 
 
+def _told_apart(tracks: Sequence[IntArray]) -> list[IntArray]:
+    """Give each prediction of a scene that has no track (-1) one of its own, below -1. (N,) each"""
+    found, last = [], -1
+    for own in tracks:
+        none = own < 0
+        found.append(np.where(none, last - none.cumsum(), own))
+        last -= int(none.sum())
+    return found
+
+
 def score_scene(
     frames: Sequence[DriveFrame], config: ConsistencyConfig
 ) -> tuple[list[list[FrameHits]], IntArray]:
@@ -252,7 +263,7 @@ def score_scene(
         For each class the frames that have ground truth of it; the elements of each class.
     """
     truths = make_tracks([with_lines(f, f.truth) for f in frames], config, 1, config.min_truth_iou)
-    predicted = tracks_of(frames, config)
+    predicted = _told_apart(tracks_of(frames, config))
     of_class: list[list[FrameHits]] = [[] for _ in config.classes]
     counts = np.zeros(len(config.classes), np.int64)
     for frame, gt_tracks, tracks in zip(frames, truths, predicted, strict=True):
@@ -291,7 +302,8 @@ def jitter(frames: Sequence[DriveFrame], tracks: Sequence[IntArray], grid: BEVGr
         lines = _resampled(now.predictions, CHAMFER_POINTS)
         before = moved(_resampled(then.predictions, CHAMFER_POINTS), motion)
         for row, track in enumerate(tracks[index]):
-            for earlier in np.flatnonzero((tracks[index - 1] == track) & (track >= 0)):
+            same = then.predictions.labels == now.predictions.labels[row]
+            for earlier in np.flatnonzero(same & (tracks[index - 1] == track) & (track >= 0)):
                 norm = grid.norm_from_metres(before[earlier])
                 points = before[earlier][((norm >= 0) & (norm <= 1)).all(1)]
                 if len(points):

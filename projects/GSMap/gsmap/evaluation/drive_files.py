@@ -16,7 +16,7 @@ from gsmap.evaluation.consistency import (
     tracks_of,
 )
 from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile, vectors_of, write_results
-from gsmap.structures.elements import IntArray
+from gsmap.structures.elements import IntArray, MapElements
 from gsmap.utils.json_items import items_of
 
 TRACK_KEY = "track_id"
@@ -36,7 +36,8 @@ def drive_frames(
 
     Raises:
         FileNotFoundError: If the result file does not exist.
-        ValueError: If it is malformed, lacks a sample, or only some of its vectors have a track.
+        ValueError: If it is malformed, lacks a sample, only some of its vectors have a track, or
+            two elements of one class in one sample have the same.
     """
     return _frames_of(SampleFile(results, RESULTS_KEY, classes), annotations)
 
@@ -50,7 +51,10 @@ def _frames_of(samples: SampleFile, annotations: AnnotationFile) -> list[DriveFr
     # samples first, for what they say of a bad file
     for (token, elements, _), (item, _) in zip(samples, items, strict=True):
         given = [vector.get(TRACK_KEY) for vector in item["vectors"]]
-        found[token] = elements, _track_ids(given, results, token)
+        ids = _track_ids(given, results, token)
+        if ids is not None:
+            _check_tracks(ids, elements, results, token)
+        found[token] = elements, ids
     tracked = {ids is not None: token for token, (elements, ids) in found.items() if len(elements)}
     if len(tracked) > 1:
         raise ValueError(
@@ -90,6 +94,17 @@ def _track_ids(ids: list[object], results: Path, token: str) -> IntArray | None:
                 f"got {track!r:.40}."
             )
     return np.array(ids, np.int64)
+
+
+def _check_tracks(ids: IntArray, elements: MapElements, results: Path, token: str) -> None:
+    """Raise ValueError if two elements of a class have one track."""
+    pairs, counts = np.unique([elements.labels, ids], axis=1, return_counts=True)
+    twice = pairs[1, (counts > 1) & (pairs[1] >= 0)]
+    if len(twice):
+        raise ValueError(
+            f"{results}, sample {token!r}: two elements of a class have {TRACK_KEY} {twice[0]}: a "
+            "track is one element in each frame."
+        )
 
 
 def write_tracks(

@@ -29,7 +29,7 @@ class Frame:
 
     @classmethod
     def of(cls, meta: Mapping[str, Any]) -> "Frame":
-        """Read a sample's metainfo; ValueError if a field is missing."""
+        """Read a sample's metainfo; ValueError if a field is missing, or the pose is none."""
         missing = [k for k in ("scene", "timestamp_ns", "lidar2global") if meta.get(k) is None]
         if missing:
             raise ValueError(
@@ -37,6 +37,11 @@ class Frame:
                 "with memory needs: give each sample its scene, time and pose."
             )
         pose = np.asarray(meta["lidar2global"], np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError(
+                f"lidar2global of sample {meta.get('token')!r} must be a finite matrix (4, 4) "
+                f"from its annotation frame to the world, got {pose.tolist()}."
+            )
         return cls(str(meta.get("token")), str(meta["scene"]), int(meta["timestamp_ns"]), pose)
 
     def __str__(self) -> str:
@@ -96,6 +101,8 @@ class Slots:
 class Scenes:
     """Streams by the name of their scene, for testing; frames of a scene must come in order.
 
+    A copy, or what is pickled, goes on from where it was, with a model of the same name.
+
     Args:
         max_gap_s: A longer pause, in seconds, starts a stream anew.
         max_streams: Streams that are kept; the one that has waited longest goes first.
@@ -108,13 +115,17 @@ class Scenes:
 
     def claim(self, owner: object) -> None:
         """Belong to a model from its first frame on; ValueError, with both names, for another."""
-        if self.owner is None:
+        if self.owner is None or self.owner == str(owner):  # a copy has the name alone
             self.owner = owner
         if self.owner is not owner:
             raise ValueError(
                 f"this stream is of {self.owner}, and {owner} cannot read what that remembers: "
                 "start a new stream for each model (new_stream)."
             )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has: of the model its name, not the weights."""
+        return {**vars(self), "owner": None if self.owner is None else str(self.owner)}
 
     def previous(self, frames: Sequence[Frame]) -> list[StreamState | None]:
         """Return the state that each frame continues, or None.
@@ -172,10 +183,11 @@ class MapStream(Scenes):
 
     def previous(self, frames: Sequence[Frame]) -> list[StreamState | None]:
         """Return the state that each frame continues; ValueError also for another scene."""
+        reached = self.last or next(iter(frames), None)
         for frame in frames:
-            if self.last is not None and frame.scene != self.last.scene:
+            if reached is not None and frame.scene != reached.scene:
                 raise ValueError(
-                    f"frame {frame} is of another scene than {self.last}, where the stream is: "
+                    f"frame {frame} is of another scene than {reached}, where the stream is: "
                     "start a new stream for each scene."
                 )
         return super().previous(frames)

@@ -33,7 +33,7 @@ class BEVMemory(nn.Module):
             features. None starts from random weights, as published.
 
     Raises:
-        ValueError: If there are not as many channels, or a share is not within (0, 1).
+        ValueError: If there are not as many channels to keep, or a share is not within (0, 1).
     """
 
     def __init__(
@@ -54,7 +54,8 @@ class BEVMemory(nn.Module):
             raise ValueError(
                 f"temporal.bev.present_share must lie between 0 and 1, got {present_share}."
             )
-        self.grid, self.end_points, self.kept_dims = grid, end_points, kept_dims
+        self.grid, self.embed_dims = grid, embed_dims
+        self.end_points, self.kept_dims = end_points, kept_dims
         published = present_share is None
         self.neutral_keys = () if published else ("conv",)  # a checkpoint may lack them
         self.convz, self.convr, self.convq = (
@@ -96,7 +97,15 @@ class BEVMemory(nn.Module):
         return F.grid_sample(memory, places.to(memory), align_corners=False)
 
     def forward(self, feats: Tensor, past: Past) -> Tensor:
-        """Return the features of now (B, C, H, W), fused with those of the frames before."""
+        """Return the features of now (B, C, H, W), fused with those of the frames before.
+
+        ValueError if they have other channels than the memory.
+        """
+        if feats.shape[1] != self.embed_dims:
+            raise ValueError(
+                f"the map's features have {feats.shape[1]} channels, their memory "
+                f"{self.embed_dims}: set temporal.embed_dims={feats.shape[1]}."
+            )
         hidden = feats.detach()
         memory = past.memory.get("bev_feats")
         if memory is not None:

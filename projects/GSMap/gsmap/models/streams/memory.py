@@ -27,7 +27,7 @@ class StreamMemory(BaseModule):
     ``lidar2global`` in their metainfo.
 
     Args:
-        head: The detector's head.
+        head: The detector's head, for queries a `MapHead`.
         bev: Settings of `BEVMemory`, or None without memory of the map's features.
         queries: Settings of `QueryMemory`, or None without memory of queries.
         embed_dims: Channels of the map's features.
@@ -38,12 +38,12 @@ class StreamMemory(BaseModule):
         name: The model's, for errors.
 
     Raises:
-        ValueError: If there is neither memory, or one does not fit the head.
+        ValueError: If there is neither memory, one does not fit the head, or the pause is not > 0.
     """
 
     def __init__(
         self,
-        head: MapHead,
+        head: Any,
         bev: dict[str, Any] | None = None,
         queries: dict[str, Any] | None = None,
         embed_dims: int = 256,
@@ -53,6 +53,8 @@ class StreamMemory(BaseModule):
         super().__init__()
         if bev is None and queries is None:
             raise ValueError("temporal needs bev=dict(...), queries=dict(...) or both.")
+        if not max_gap_s > 0:
+            raise ValueError(f"temporal.max_gap_s must be seconds > 0, got {max_gap_s}.")
         self.max_gap_s, self.half = max_gap_s, half
         self.name = f"a model with {type(head).__name__}"
         self.bev: BEVMemory | None = None
@@ -61,6 +63,11 @@ class StreamMemory(BaseModule):
             self.bev = MODELS.build({**part, **bev})
         self.queries: QueryMemory | None = None
         if queries is not None:
+            if not isinstance(head, MapHead):
+                raise ValueError(
+                    f"{type(head).__name__} can have no memory of queries, which needs a MapHead: "
+                    "set temporal.queries=None; temporal.bev works with every head."
+                )
             part = {"type": "QueryMemory", "embed_dims": head.embed_dims}
             self.queries = MODELS.build({**part, **queries})
             self.queries.check(head)
