@@ -101,6 +101,21 @@ def test_the_mean_of_the_coordinates_is_kept_until_a_weight_changes(monkeypatch)
     assert built.coordinate_feature().requires_grad
 
 
+@pytest.mark.parametrize("fused", [False, True])
+def test_a_step_of_training_is_seen_by_the_next_validation(fused):
+    """A fused optimizer changes weights without a new version."""
+    built = head()
+    optimizer = torch.optim.AdamW(built.parameters(), lr=0.1, fused=fused)
+    with torch.no_grad():
+        before = built.coordinate_feature()
+    sum(losses(built, sample([0, -5, 0, 5])).values()).backward()
+    optimizer.step()
+    with torch.no_grad():
+        after = built.coordinate_feature()
+        torch.testing.assert_close(after, built._mean_feature())
+    assert (after - before).abs().max() > 0.01
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

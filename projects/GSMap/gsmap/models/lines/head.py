@@ -115,6 +115,7 @@ class LineHead(DetectionHead):
         Differs from the paper, as released: points see the map's coordinates through this mean.
         """
         if torch.is_grad_enabled() or torch.compiler.is_compiling():
+            self._kept = None  # fused optimizers change weights without a new version
             return self._mean_feature()
         state = tensor_versions(self.coordinates)
         if self._kept is None or self._kept[0] != state:
