@@ -167,6 +167,9 @@ def shrink_images(cfg: Config) -> None:
                 width, height = step.size = tuple(side // 4 for side in step.size)
                 if cfg.model.bev_encoder.type in TIED:
                     cfg.model.bev_encoder.image_size = padded_size((height, width), 32)
+                encoder = cfg.model.bev_encoder
+                if encoder.type == "BezierBEVEncoder" and "position_size" not in encoder:
+                    encoder.position_size = (height, width)  # of images not cut yet
             if step.type == "CropImages":
                 step.top //= 4
 

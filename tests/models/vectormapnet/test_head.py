@@ -182,6 +182,9 @@ def test_the_detectors_targets_are_needed_too():
     cfg = read_config(CONFIG)
     cfg.model.map_head.detector.type = "MapHead"
     cfg.model.map_head.detector.losses = [{"type": "QueryMaskLoss"}]
+    with pytest.raises(ValueError, match="MapHead needs the targets of FormatMapTargets"):
+        check_config(cfg)
+    cfg.train_dataloader.dataset.pipeline.insert(-1, {"type": "FormatMapTargets"})
     with pytest.raises(ValueError, match="QueryMaskLoss needs the targets of MakeInstanceMasks"):
         check_config(cfg)
 
