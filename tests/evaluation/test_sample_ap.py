@@ -1,5 +1,6 @@
 """AP per sample of drawn lines: cases worked by hand, and against a plain second implementation."""
 
+# Over 400 lines: the cases, and the second implementation that they are compared with.
 import json
 from dataclasses import replace
 from functools import partial

@@ -135,9 +135,8 @@ class MakePVMask(BaseTransform):
     num_classes: int | None = None
 
     def __post_init__(self) -> None:
-        names = "stride", "pad_size_divisor", "thickness_px"
-        numbers = {name: getattr(self, name) for name in names}
-        check_positive(**numbers, num_classes=self.num_classes or 1)
+        check_positive(stride=self.stride, pad_size_divisor=self.pad_size_divisor)
+        check_positive(thickness_px=self.thickness_px, num_classes=self.num_classes or 1)
 
     def _points(self, points: np.ndarray) -> np.ndarray:
         """Return an element as homogeneous points along it. (200, 4)."""

@@ -51,8 +51,8 @@ class MakeLineMaps(BaseTransform):
     forward: str | None = None
 
     def __post_init__(self) -> None:
-        sizes = ("num_classes", "pixel_m", "thickness_px", "gap_px", "step_m")
-        check_positive(**{name: getattr(self, name) for name in sizes})
+        check_positive(num_classes=self.num_classes, pixel_m=self.pixel_m, step_m=self.step_m)
+        check_positive(thickness_px=self.thickness_px, gap_px=self.gap_px)
         if self.num_directions < 1 or 360 % self.num_directions:
             raise ValueError(f"num_directions must divide 360, got {self.num_directions}.")
 
