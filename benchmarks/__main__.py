@@ -22,6 +22,7 @@ COMMANDS = {
     "shape": "shape",
     "step": "step",
     "stream": "stream",
+    "vectorize": "vectorize",
 }
 
 

@@ -39,6 +39,13 @@ LSS = {
     "embed_dims": 128,
     "camera_aware": False,
 }
+BOXES = {
+    "num_queries": 40,
+    "in_channels": 96,
+    "embed_dims": 64,
+    "decoder": {"num_layers": 2, "num_heads": 4, "ffn_dims": 64},
+    "coder": {"max_num": 200},
+}
 # method and encoder: config and overrides; heads see no more of an encoder than its features
 CASES = {
     "MapTR, GKT": (MAPTR, {}),
@@ -55,6 +62,10 @@ CASES = {
     "MGMap": ("configs/mgmap/mgmap_r18_minicity.py", {}),
     "PivotNet": ("configs/pivotnet/pivotnet_r18_minicity.py", {}),
     "BeMapNet": ("configs/bemapnet/bemapnet_r18_minicity.py", {}),
+    "VectorMapNet's boxes": (
+        "configs/vectormapnet/vectormapnet_r18_minicity.py",
+        {"model.map_head": {"_delete_": True, "type": "KeyPointHead", **BOXES}},
+    ),
     "GSMap, heights": (
         GSMAP,
         {"model.map_head.reference": {"coords": 3, "z_range": (-5.0, 3.0)}},
@@ -72,6 +83,7 @@ OWN_SMALL = {
         "model.map_head.queries": (20, 25, 15),
         "model.map_head.score_threshold": None,
     },
+    "VectorMapNet's boxes": {},
 }
 
 
@@ -97,6 +109,8 @@ def test_every_method_and_encoder_predicts_as_in_torch(case, annotations, tmp_pa
     inferencer = MapInferencer(REPO / config, None, "cpu", {**small, **overrides})
     dataset = inferencer.dataset(annotations, annotations.parent)
     shake(inferencer.model)
+    if case == "VectorMapNet's boxes":  # shaken states that no norm ends make every score 1
+        inferencer.model.map_head.cls_branch.weight.data *= 0.003
     exported = export(inferencer, dataset, tmp_path / "model.onnx")
     (scores, metres), found, expected = compare(inferencer, dataset, exported)
     assert len(found) == len(expected) > 50

@@ -1,4 +1,4 @@
-"""Clusters of whole balls are those of DBSCAN."""
+"""Clusters are those of DBSCAN."""
 
 import tracemalloc
 
@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from sklearn.cluster import DBSCAN
 
-from gsmap.models.hdmapnet import clustering
 from gsmap.models.hdmapnet.clustering import dense_clusters
 
 
-@pytest.mark.parametrize("most_pairs", [clustering._MOST_PAIRS, 3000])
-def test_clusters_are_dbscans_and_numbered_alike(most_pairs, monkeypatch):
-    monkeypatch.setattr(clustering, "_MOST_PAIRS", most_pairs)
+def test_clusters_are_dbscans_and_numbered_alike():
     rng, several = np.random.default_rng(0), 0
     for _ in range(60):
         dims, number = rng.integers(1, 5), rng.integers(1, 9)
@@ -28,7 +25,7 @@ def test_clusters_are_dbscans_and_numbered_alike(most_pairs, monkeypatch):
 
 
 @pytest.mark.parametrize("apart", [0.4, 0.6])
-def test_points_in_more_balls_than_are_made(apart):
+def test_a_chain_is_one_cluster_or_none(apart):
     """A chain of 200 points, and the same points as a cluster for each."""
     points = apart * np.arange(200.0)[:, None]
     found = dense_clusters(points, 0.5, 1)

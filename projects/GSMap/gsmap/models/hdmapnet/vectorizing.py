@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from numba import njit
 from torch import Tensor, from_numpy
-from torch.nn.functional import avg_pool2d, max_pool2d
 
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.models.hdmapnet.clustering import dense_clusters
@@ -139,7 +139,9 @@ def _check(semantic: Tensor, embedding: Tensor, direction: Tensor, config: Vecto
             f"which make no circle in steps of {config.degrees} degrees."
         )
     named = {"semantic": semantic, "embedding": embedding, "direction": direction}
-    broken = [name for name, values in named.items() if not bool(values.isfinite().all())]
+    broken = [
+        name for name, values in named.items() if not torch.stack(values.aminmax()).isfinite().all()
+    ]
     if broken:
         raise ValueError(f"{' and '.join(broken)} have values that are not finite.")
 
@@ -203,11 +205,31 @@ def ridge_pixels(probs: FloatArray, tolerance: float) -> BoolArray:
         probs: Probability of a class, 0 outside its clusters. (H, W)
         tolerance: What a pixel may have less than the largest.
     """
-    values = from_numpy(probs.astype(Float32))[None, None]
-    upright = avg_pool2d(values, (9, 5), 1, (4, 2)) > avg_pool2d(values, (5, 9), 1, (2, 4))
-    in_row, in_column = max_pool2d(values, (1, 5), 1, (0, 2)), max_pool2d(values, (5, 1), 1, (2, 0))
-    largest = in_row.where(upright, in_column)
-    return (((largest - values).abs() < tolerance) & (values > 0))[0, 0].numpy()
+    return _ridge(probs.astype(Float32), np.argwhere(probs > 0), tolerance)
+
+
+@njit(cache=True)
+def _ridge(probs: FloatArray, pixels: IntArray, tolerance: float) -> BoolArray:
+    """Return which of some pixels (row, column) (n, 2) are on a ridge. (H, W) -> (H, W)"""
+    ridge = np.zeros(probs.shape, np.bool_)
+    for i in range(len(pixels)):
+        row, column = pixels[i, 0], pixels[i, 1]
+        if _mean(probs, row, column, 4, 2) > _mean(probs, row, column, 2, 4):
+            largest = probs[row, max(column - 2, 0) : column + 3].max()
+        else:
+            largest = probs[max(row - 2, 0) : row + 3, column].max()
+        ridge[row, column] = largest - probs[row, column] < tolerance
+    return ridge
+
+
+@njit(cache=True)
+def _mean(values: FloatArray, row: int, column: int, down: int, aside: int) -> Float32:
+    """Return the mean around a pixel, with zeros beyond the map; summed as the release does."""
+    total = Float32(0)
+    for i in range(max(row - down, 0), min(row + down + 1, values.shape[0])):
+        for j in range(max(column - aside, 0), min(column + aside + 1, values.shape[1])):
+            total += values[i, j]
+    return total / Float32((2 * down + 1) * (2 * aside + 1))
 
 
 def along_longer_side(cluster: BoolArray, ridge: BoolArray) -> IntArray:
