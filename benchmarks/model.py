@@ -19,6 +19,9 @@ from gsmap.engine.launch import needed_targets, read_config
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid
 
+# transforms of images, cameras and LiDAR, whose targets `add_auxiliary_targets` makes
+AT_RANDOM = {"MakeBEVMask", "MakePVMask", "MakeDepthMap"}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add which models to measure, and how."""
@@ -140,7 +143,7 @@ def drive_on(samples: Sequence[Det3DDataSample]) -> None:
 def add_own_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> None:
     """Let the transforms that a config's head and losses need make targets of the elements."""
     cfg = read_config(path)
-    needed = needed_targets(cfg)
+    needed = needed_targets(cfg).keys() - AT_RANDOM
     instances = sample.gt_instances_3d
     results = {
         "token": sample.token,
@@ -157,7 +160,9 @@ def add_own_targets(sample: Det3DDataSample, path: str, grid: BEVGrid) -> None:
     for step in cfg.train_dataloader.dataset.pipeline:
         if step.type in needed:
             results = TRANSFORMS.build(step).transform(results)
-    sample.gt_instances_3d = results["gt_instances_3d"]
+    for name in results:
+        if name.startswith("gt_"):
+            setattr(sample, name, results[name])
 
 
 def add_auxiliary_targets(

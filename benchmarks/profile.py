@@ -50,7 +50,8 @@ def profile(path: str, args: argparse.Namespace) -> tuple[dict[str, float], list
     for _ in range(args.repeats + 1):  # the first is a warm-up
         with torch.autocast(args.device, enabled=args.fp16):
             features = timed("image backbone", model.folded_backbone, model.img_backbone, images)
-            features = timed("image neck", model.img_neck, features)
+            if model.img_neck is not None:
+                features = timed("image neck", model.img_neck, features)
             features = [feature.unflatten(0, (1, -1)) for feature in features]
             bev = timed("BEV encoder", model.bev_encoder, features, [samples[0].metainfo])
             timed("map head", model.map_head.predict, bev, samples)
