@@ -2,8 +2,8 @@
 
 import argparse
 import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,8 +12,6 @@ from torch.nn.functional import interpolate
 
 from benchmarks.measure import markdown_table
 from gsmap.apis.map_inferencer import MapInferencer
-from gsmap.models.hdmapnet.decoder import LineMaps
-from gsmap.models.hdmapnet.vectorizing import VectorizeConfig, vectorize
 
 FULL_SIZE = (200, 400)  # of nuScenes in the paper
 
@@ -33,20 +31,18 @@ def run(args: argparse.Namespace) -> None:
     inferencer = MapInferencer(args.config, args.checkpoint, "cpu")
     dataset = inferencer.dataset(args.truth, args.data_root)
     head, lines = inferencer.model.map_head, inferencer.model.map_head.lines
-    published = VectorizeConfig(degrees=head.vectorizing.degrees)
-    ways: dict[tuple[int, ...], Callable[[LineMaps], object]] = {
-        head.map_size: lines,
-        FULL_SIZE: lambda maps: vectorize(*maps, published),
-    }
-    spent: dict[tuple[int, ...], list[float]] = {size: [] for size in ways}
+    own = head.vectorizing
+    settings = {head.map_size: own, FULL_SIZE: type(own)(degrees=own.degrees)}  # as published
+    spent: dict[tuple[int, ...], list[float]] = {size: [] for size in settings}
 
-    def timed(maps: LineMaps) -> object:
-        for size, way in ways.items():
-            resized = LineMaps(*(enlarged(values, size) for values in maps))
+    def timed(maps: Any) -> object:
+        for size, setting in settings.items():
+            head.vectorizing = setting
+            resized = maps._make(enlarged(values, size) for values in maps)
             start = time.process_time()
-            way(resized)
+            found = lines(resized)
             spent[size].append(1000 * (time.process_time() - start))
-        return lines(maps)
+        return found
 
     head.lines = timed
     for _ in inferencer.predict(dataset, range(min(args.samples + 1, len(dataset)))):
