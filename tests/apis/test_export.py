@@ -71,6 +71,7 @@ CASES = {
         {"model.map_head.reference": {"coords": 3, "z_range": (-5.0, 3.0)}},
     ),
     "GSMap, unfolded": (GSMAP, {"model.map_head.coder.unfold_classes": [0, 2]}),
+    "GSMap, weighed": (GSMAP, {"model.map_head.coder.sigma_power": 1.0}),
     "GSMap on MGMapNet": ("projects/GSMap/configs/gsmap_mgmapnet_r18_minicity.py", {}),
 }
 # heads without MapTR's coder, of other necks; every line is found

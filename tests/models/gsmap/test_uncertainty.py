@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from head_cases import GSMAP, HEAD, LANES, N, P, bev, build_head, losses_of, train_a_step
+from mmdet3d.structures import Det3DDataSample
 from predictions import pairs_of
 
 from gsmap.models.gsmap.uncertainty import GaussianNLLLoss
@@ -118,3 +119,29 @@ def test_temperatures_stretch_the_sigmas_of_their_class():
 def test_temperatures_that_do_not_fit_are_refused(temperatures):
     with pytest.raises(ValueError, match="temperatures must be two numbers > 0 for each of the 3"):
         build_head(GSMAP, temperatures=temperatures)
+
+
+def test_scores_weighed_by_sigma_are_those_of_the_same_elements():
+    """All elements stay, their odds are divided by their own sigmas; points have none."""
+    plain = build_head(GSMAP, coder={"margin_m": None, "max_num": 200})
+    plain.eval()
+    torch.nn.init.normal_(plain.reference.gaussian_init.weight, std=0.1)
+    weighed = build_head(GSMAP, coder={"margin_m": None, "max_num": 200, "sigma_power": 1.0})
+    weighed.eval().load_state_dict(plain.state_dict())
+    with torch.no_grad():
+        (before,), (after,) = (
+            head.predict(bev(), [Det3DDataSample()]) for head in (plain, weighed)
+        )
+
+    def odds(found):
+        by_place = found.pts.flatten(1)[:, 0].double() + 1000 * found.labels_3d
+        order = by_place.argsort()
+        sigma = found.scales.amin(-1).log().mean(-1).exp()
+        return (found.scores_3d.logit().exp())[order], sigma[order]
+
+    (was, sigma), (now, same) = odds(before), odds(after)
+    torch.testing.assert_close(sigma, same)
+    assert sigma.std() > 0
+    torch.testing.assert_close(now, was / sigma, rtol=1e-3, atol=0)
+    with pytest.raises(ValueError, match="sigma_power needs Gaussians, got PointReference"):
+        build_head(HEAD, coder={"sigma_power": 1.0})

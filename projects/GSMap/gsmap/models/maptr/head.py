@@ -161,6 +161,11 @@ class MapHead(DetectionHead):
         )
         self.assigner = MapAssigner(match_costs)
         self.coder = MapCoder(grid=grid, **(coder or {}))
+        if self.coder.sigma_power and "scales" not in self.reference.outputs:
+            raise ValueError(
+                f"coder.sigma_power needs Gaussians, got {type(self.reference).__name__}: take "
+                "GSMapHead, or leave it out."
+            )
         self.check_parts()
 
     def check_parts(self) -> None:
