@@ -205,11 +205,11 @@ def ridge_pixels(probs: FloatArray, tolerance: float) -> BoolArray:
         probs: Probability of a class, 0 outside its clusters. (H, W)
         tolerance: What a pixel may have less than the largest.
     """
-    return _ridge(probs.astype(Float32), np.argwhere(probs > 0), tolerance)
+    return _ridge(probs.astype(Float32), np.argwhere(probs > 0), Float32(tolerance))
 
 
 @njit(cache=True)
-def _ridge(probs: FloatArray, pixels: IntArray, tolerance: float) -> BoolArray:
+def _ridge(probs: FloatArray, pixels: IntArray, tolerance: Float32) -> BoolArray:
     """Return which of some pixels (row, column) (n, 2) are on a ridge. (H, W) -> (H, W)"""
     ridge = np.zeros(probs.shape, np.bool_)
     for i in range(len(pixels)):
