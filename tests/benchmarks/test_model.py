@@ -46,15 +46,24 @@ def test_camera_masks_are_as_coarse_as_the_configs(config, stride):
     assert mask_stride(str(REPO / f"configs/maptrv2/maptrv2_{config}.py")) == stride
 
 
-@pytest.mark.parametrize("name", ["pivotnet", "mgmap", "mapqr", "maptrv2", "hdmapnet"])
-def test_heads_with_targets_of_their_own_have_losses(name):
+@pytest.mark.parametrize(
+    ("name", "field", "may_be_zero"),
+    [
+        ("pivotnet", "num_pts", set()),
+        ("mgmap", "masks", set()),
+        ("mapqr", "pts", set()),
+        ("maptrv2", "pts", set()),
+        ("hdmapnet", "pts", {"loss_pull"}),  # embeddings of an element that are alike already
+    ],
+)
+def test_heads_with_targets_of_their_own_have_losses(name, field, may_be_zero):
     args = argparse.Namespace(threads=torch.get_num_threads(), device="cpu", size=None)
     path = str(REPO / f"configs/{name}/{name}_r18_minicity.py")
     model, inputs, (sample,) = model_and_batch(path, args)
-    assert len(sample.gt_instances_3d) >= 15
+    assert len(sample.gt_instances_3d[field]) >= 15
     losses = model.loss(inputs, [sample])
     assert all(torch.isfinite(loss) for loss in losses.values())
-    assert sum(loss > 0 for loss in losses.values()) >= len(losses) - 1  # embeddings may be apart
+    assert all(loss > 0 for name, loss in losses.items() if name not in may_be_zero)
 
 
 def test_frames_per_second_are_those_of_the_time(capsys):
