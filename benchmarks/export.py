@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 
 from benchmarks.fps import frame_cost
-from benchmarks.measure import Cost, measure
-from benchmarks.model import add_arguments, in_fresh_processes, model_and_batch, report
-from gsmap.apis.export import export_onnx
+from benchmarks.measure import Cost, in_own_process, measure
+from benchmarks.model import add_arguments, model_and_batch, report
+from gsmap.apis.export import export_onnx, quantize_onnx
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.structures.calibration import calibration_arrays
 
@@ -18,30 +18,37 @@ __all__ = ["add_arguments", "run"]
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print both ways' time of every config.
+    """Measure and print every way's time of every config.
 
     Raises:
         ValueError: If another device or precision is asked for.
     """
     if args.device != "cpu" or args.fp16:
-        raise ValueError("benchmarks export measures single precision on the CPU.")
-    jobs = [(path, args) for path in args.configs]
-    in_torch, in_onnx = (in_fresh_processes(task, jobs) for task in (frame_cost, onnx_cost))
-    report(
-        args,
-        ["model", "torch, s", "ONNX Runtime, s", "ratio", "torch, wall s", "ONNX Runtime, wall s"],
-        [
-            [
-                *(Path(path).stem, f"{a.cpu_s:.3f}", f"{b.cpu_s:.3f}", f"{b.cpu_s / a.cpu_s:.2f}"),
-                *(f"{a.wall_s:.3f}", f"{b.wall_s:.3f}"),
-            ]
-            for (path, a), (_, b) in zip(in_torch, in_onnx, strict=True)
-        ],
-    )
+        raise ValueError("benchmarks export measures single precision and 8 bits on the CPU.")
+    rows = []
+    for path in args.configs:
+        costs = {
+            "torch": in_own_process(frame_cost, path, args),
+            "ONNX Runtime": in_own_process(onnx_cost, path, args, False),
+            "ONNX Runtime, 8 bits": in_own_process(onnx_cost, path, args, True),
+        }
+        first = costs["torch"]
+        for name, cost in costs.items():
+            ratios = cost.cpu_s / first.cpu_s, cost.wall_s / first.wall_s
+            times = f"{cost.cpu_s:.3f}", f"{cost.wall_s:.3f}"
+            rows.append([Path(path).stem, name, *times, *(f"{ratio:.2f}" for ratio in ratios)])
+    names = ["model", "way", "processor s", "wall s", "ratio to torch", "of wall s"]
+    report(args, names, rows)
 
 
-def onnx_cost(path: str, args: argparse.Namespace) -> Cost:
-    """Measure a config's way in ONNX Runtime; the file's own reading is not counted."""
+def onnx_cost(path: str, args: argparse.Namespace, eight_bits: bool) -> Cost:
+    """Measure a config's way in ONNX Runtime; the file's own reading is not counted.
+
+    Args:
+        path: The config.
+        args: Of the command.
+        eight_bits: Whether convolutions are in 8 bits, calibrated on the images of the batch.
+    """
     model, inputs, samples = model_and_batch(path, args)
     arrays = calibration_arrays(samples[0].metainfo, model.bev_encoder.calibration)
     arrays["images"] = inputs["imgs"][0].numpy()
@@ -50,5 +57,7 @@ def onnx_cost(path: str, args: argparse.Namespace) -> Cost:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "model.onnx")
         export_onnx(model.eval(), file, names, (height, width))
+        if eight_bits:
+            quantize_onnx(file, file, [arrays])
         exported = OnnxInferencer(file, num_threads=args.threads)
     return measure(partial(exported.run, arrays), torch.device("cpu"), args.repeats)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import shapely
 from drive_cases import CLASSES, drive_of
+from google.protobuf import descriptor_pb2, message_factory
 from PIL import Image
 
 from drivemaps.drive import DriveFrame
@@ -139,13 +140,31 @@ def test_the_map_grows_on_the_ground(camera_drive, true):
     assert lengths[0] < lengths[1] < lengths[2]
 
 
+def decoded(schema: object, message: object) -> object:
+    """Read a message of an MCAP file by the schema that stands in it, without foxglove's code."""
+    files = descriptor_pb2.FileDescriptorSet.FromString(schema.data)
+    return message_factory.GetMessages(files.file)[schema.name].FromString(message.data)
+
+
 def test_mcap_holds_images_lines_and_gaussians_of_every_frame(tmp_path, camera_drive, true):
     pytest.importorskip("foxglove", reason="pip install -e .[viz]")
     reader = pytest.importorskip("mcap.reader", reason="pip install mcap")
     drive, root = camera_drive
     write_mcap(tmp_path / "drive.mcap", Replay(drive, true, "lidar", COLOURS, root))
     with (tmp_path / "drive.mcap").open("rb") as file:
-        summary = reader.make_reader(file).get_summary()
+        made = reader.make_reader(file)
+        summary = made.get_summary()
+        messages = [(c.topic, m.log_time, decoded(s, m)) for s, c, m in made.iter_messages()]
+    for topic in ("/map", "/predictions", "/gaussians"):
+        updates = [(time_ns, message) for name, time_ns, message in messages if name == topic]
+        for time_ns, update in updates:
+            (entity,) = update.entities
+            assert entity.frame_locked  # the entity moves with its frame
+            assert entity.frame_id == ("global" if topic == "/map" else "vehicle")
+            assert entity.timestamp.ToNanoseconds() == time_ns
+            assert bool(entity.spheres) == (topic == "/gaussians") != bool(entity.lines)
+    projections = [list(m.P) for topic, _, m in messages if topic == "/CAM_FRONT/calibration"]
+    assert projections == [[200, 0, 200, 0, 0, 200, 112, 0, 0, 0, 1, 0]] * len(drive.frames)
     counts = summary.statistics.channel_message_counts
     found = {channel.topic: counts[k] for k, channel in summary.channels.items()}
     topics = {

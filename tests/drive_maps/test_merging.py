@@ -5,12 +5,13 @@ import pytest
 import shapely
 from drive_cases import CLASSES, drive_of, street
 
+from drivemaps.area_merging import merge_areas
 from drivemaps.config import MergeConfig
 from drivemaps.drive import DriveFrame
 from drivemaps.merging import confident, merge, suppress
 from drivemaps.scoring import map_figures, near_and_total_m
 from drivemaps.stitching import stitch
-from drivemaps.truth import true_map
+from drivemaps.truth import polygons_of, true_map
 from gsmap.structures.elements import MapElements
 
 
@@ -46,6 +47,17 @@ def test_ground_truth_fed_as_predictions_gives_1(make):
         assert set(of_class) == {*CLASSES, "mean"}
         # a vertex a metre from an end or corner may be missing, 150 m of line are there
         assert min(of_class.values()) > (0.99 if "@" in name else 1 - 1e-9), name
+
+
+def test_an_area_of_exactly_the_smallest_size_is_kept():
+    frame = drive_of().frames[0]
+    place = np.round(frame.sample.global_from_frame[:2, 3])  # its areas have no rounding
+    for width_m, kept in ((1.0, 1), (0.99, 0)):
+        square = place + [[0, 0], [width_m, 0], [width_m, 1], [0, 1], [0, 0]]
+        assert len(polygons_of([square])) == kept
+        elements = MapElements.from_polylines([square], [1], [0.9])
+        drive = replace(drive_of(), frames=[replace(frame, elements=elements)])
+        assert len(merge_areas(drive, 1, MergeConfig(min_area_confidence=0.0))) == kept
 
 
 def test_merging_beats_suppression_on_noisy_frames():
@@ -167,7 +179,8 @@ def test_a_line_of_10_m_whose_ends_meet_becomes_a_ring(side: float, closes: bool
     angles = np.arange(6) * np.pi / 3
     corners = side * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     start = corners[0] + 0.9 * (corners[5] - corners[0])
-    (line,) = stitch([np.concatenate([start[None], corners])])
+    long = np.array([[100.0, 0.0], [150.0, 0.0]])  # its length is nothing to the others
+    _, line = stitch([long, np.concatenate([start[None], corners])])
     assert np.array_equal(line[0], line[-1]) == closes
 
 

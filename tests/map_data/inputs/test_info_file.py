@@ -82,6 +82,23 @@ def test_sample_has_the_files_calibration_and_pose(tmp_path):
     assert sample.instances is None
 
 
+@pytest.mark.parametrize("shape", [(3, 4), (4, 4)])
+def test_larger_matrices_of_a_camera_are_read_too(tmp_path, shape):
+    """mmdet3d's files have intrinsics of several sizes, and poses without their last row."""
+    path = make_info(tmp_path, cameras=("CAM_FRONT",))
+    (plain,) = read_info_file(path)
+    content = pickle.loads(path.read_bytes())
+    camera = content["data_list"][0]["images"]["CAM_FRONT"]
+    intrinsics = np.eye(*shape)
+    intrinsics[:3, :3] = camera["cam2img"]
+    camera |= {"cam2img": intrinsics.tolist(), "lidar2cam": camera["lidar2cam"][:3]}
+    path.write_bytes(pickle.dumps(content))
+    (found,) = read_info_file(path)
+    for name in ("intrinsics", "cam_from_frame"):
+        expected, larger = (getattr(s.cameras[0], name) for s in (plain, found))
+        np.testing.assert_array_equal(larger, expected)
+
+
 def test_files_are_found_in_the_folders_of_nuscenes(tmp_path):
     path = make_info(tmp_path, cameras=("CAM_FRONT",))
     folder = tmp_path / "samples" / "CAM_FRONT"
