@@ -8,6 +8,7 @@ from gsmap.structures.gaussians import (
     GaussianSpace,
     extents_along_line,
     gaussians_along,
+    gaussians_along,
     line_errors,
     stretched,
 )
@@ -240,3 +241,12 @@ def covariances(gaussians: Gaussians) -> torch.Tensor:
     cos, sin = gaussians.rotations.cos(), gaussians.rotations.sin()
     axes = torch.stack([torch.stack([cos, sin], -1), torch.stack([-sin, cos], -1)], -1)
     return axes * gaussians.scales.square()[..., None, :] @ axes.transpose(-1, -2)
+
+
+def test_gaussians_along_a_line_are_half_as_long_as_their_centres_are_apart():
+    """Steps of 1, 2 and 4 m; an inner centre takes the mean of its two."""
+    points = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [1.0, 6.0]])
+    found = gaussians_along(points, across_m=0.6)
+    torch.testing.assert_close(found.scales[:, 0], torch.tensor([0.6, 0.75, 1.5, 2.0]))
+    torch.testing.assert_close(found.scales[:, 1], torch.full((4,), 0.6))
+    torch.testing.assert_close(found.rotations[[0, 3]], torch.tensor([0.0, torch.pi / 2]))

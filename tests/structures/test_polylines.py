@@ -103,6 +103,14 @@ def test_an_open_line_has_two_orders():
     assert (orders[2] == PADDING).all()
 
 
+@pytest.mark.parametrize(("num_points", "slots"), [(2, 2), (3, 2), (4, 3)])
+def test_there_is_room_for_two_orders_at_least(num_points: int, slots: int):
+    orders = equivalent_orders(np.array([[0.0, 0.0], [3.0, 0.0]]), num_points)
+    assert orders.shape == (slots, num_points, 2)
+    np.testing.assert_array_equal(orders[:2, [0, -1], 0], [[0, 3], [3, 0]])
+    assert (orders[2:] == PADDING).all()
+
+
 def test_a_ring_has_one_order_per_vertex_and_order_k_starts_at_vertex_minus_k():
     orders = equivalent_orders(SQUARE, 9)
     assert (orders[4:] == PADDING).all()
