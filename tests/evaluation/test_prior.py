@@ -28,6 +28,16 @@ def test_the_same_map_everywhere_is_found_exactly():
     assert score(prior, truth)["chamfer/mAP"] == 1.0
 
 
+def test_lines_are_averaged_in_the_point_order_nearest_to_the_first():
+    """Reversed lines, and rings that start elsewhere and run the other way, are put right first."""
+    curve = np.array([[0.0, 0], [1, 2], [3, 3], [6, 3]])
+    others = np.stack([curve + 1.0, curve[::-1] + 3.0])
+    np.testing.assert_allclose(prior_module._aligned_mean(curve, others), curve + 2.0)
+    turned = np.concatenate([RING[2:-1], RING[:3]])  # starts at its third corner
+    others = np.stack([RING, turned + 1.0, turned[::-1] - 0.4])
+    np.testing.assert_allclose(prior_module._aligned_mean(RING, others), RING + 0.2)
+
+
 def test_scores_order_elements_by_how_often_they_are_right():
     """The line at 0 is there always, the one at 6 in two of four samples."""
     truth = [
