@@ -78,6 +78,26 @@ def test_signals_that_a_drive_does_not_have_come_from_its_poses_if_that_is_asked
         assert found[9] > 9.0  # an accelerometer feels gravity
 
 
+def test_a_speed_comes_from_the_pose_and_the_time_of_the_sample_beside(
+    build, minicity_root, minicity_annotations, tmp_path
+):
+    """3 m ahead in half a second are 6 m/s; the first sample looks ahead, the second back."""
+    source = AnnotationFile(minicity_annotations["train"])
+    path, moved = tmp_path / "gsmap_minicity_train.arrow", source[0].global_from_frame.copy()
+    ahead = moved[:3, 0 if source.meta.frame == "ego" else 1]
+    moved[:3, 3] += 3.0 * ahead
+    here = replace(source[0], can_bus=None)
+    later = replace(
+        here, token="later", timestamp_ns=here.timestamp_ns + 5 * 10**8, global_from_frame=moved
+    )
+    write_annotations(path, source.meta, [here, later])
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root, ann_file=str(path))
+    dataset = build(**config, signals_from_poses=True)
+    for row in range(2):
+        velocity = dataset.get_data_info(row)["can_bus"][13:16]
+        np.testing.assert_allclose(velocity, [6, 0, 0], atol=1e-6)
+
+
 @pytest.fixture(scope="module")
 def with_heights(minicity_annotations, tmp_path_factory) -> Path:
     """MiniCity's training file with points of three coordinates: z = 0.1 x - 1.8."""

@@ -70,6 +70,7 @@ def test_a_size_takes_each_image_without_its_padding():
     )
     assert [image.min() for image in results["img"]] == [9, 9]
     assert results["img_shape"] == (10, 10)
+    assert results["raw_shapes"] == [(10, 10), (10, 10)]  # nothing of them is padding now
     np.testing.assert_allclose(results["lidar2img"][0], np.diag([10 / 40, 10 / 20, 1, 1]))
     np.testing.assert_allclose(results["img_aug_matrix"][1], np.diag([10 / 20, 10 / 40, 1, 1]))
     with pytest.raises(ValueError, match="give scale or size"):
