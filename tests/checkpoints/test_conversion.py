@@ -26,6 +26,9 @@ from gsmap.checkpoints.convert import (
 from gsmap.checkpoints.key_map import KEY_MAPS, MAPTR, MAPTR_BEVFORMER, find_key_map
 from gsmap.checkpoints.reading import load_weights, read_weights
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
+from gsmap.models.gsmap.reference import GaussianReference
+from gsmap.models.gsmap.uncertainty import ErrorReference
+from gsmap.structures.grid import BEVGrid
 
 REPO = Path(__file__).resolve().parents[2]
 LAYER = "pts_bbox_head.transformer.encoder.layers.0."
@@ -135,7 +138,7 @@ def test_neutral_keys_may_be_missing_together_only():
     model = nn.ModuleDict({"head": Extended()})
     expected = model.state_dict()
     neutral = neutral_keys(model)
-    assert neutral == {"head.extra.weight", "head.extra.bias"}
+    assert neutral == [{"head.extra.weight", "head.extra.bias"}]
     without = {key: value for key, value in expected.items() if "extra" not in key}
     state = dict(without)
     adapt_state(state, expected, "", neutral)
@@ -143,7 +146,7 @@ def test_neutral_keys_may_be_missing_together_only():
     assert torch.equal(state["head.extra.weight"], model["head"].extra.weight)
     with pytest.raises(ValueError, match=r"never trained [^!]*: head\.extra\.bias, head\.extra\.w"):
         adapt_state(dict(without), expected, "", neutral, allow_untrained=False)
-    adapt_state(dict(without), without, "", set(), allow_untrained=False)
+    adapt_state(dict(without), without, "", [], allow_untrained=False)
     with pytest.raises(ValueError, match=r"missing: head\.extra\.bias\."):
         adapt_state({**without, "head.extra.weight": torch.ones(2, 2)}, expected, "", neutral)
 
@@ -158,6 +161,19 @@ def test_each_part_of_a_model_may_be_missing_alone():
     adapt_state(state, expected, "", neutral_keys(model))
     assert torch.equal(state["temporal.extra.weight"], model["temporal"].extra.weight)
     assert torch.equal(state["head.extra.weight"], torch.ones(2, 2))
+
+
+def test_a_trained_gsmap_may_lack_the_errors_alone():
+    """So what learns errors can start from a model that has none, whose Gaussians are kept."""
+    grid = BEVGrid((-15, 15), (-30, 30))
+    trained, made = (kind(grid, 8, num_layers=2) for kind in (GaussianReference, ErrorReference))
+    state = {key: torch.ones_like(value) for key, value in trained.state_dict().items()}
+    adapt_state(state, made.state_dict(), "", neutral_keys(made))
+    assert state.keys() == made.state_dict().keys()
+    assert all((v == 1).all() for k, v in state.items() if not k.startswith("error_branches."))
+    del state["gaussian_branches.0.0.bias"]
+    with pytest.raises(ValueError, match=r"missing: gaussian_branches\.0\.0\.bias\."):
+        adapt_state(state, made.state_dict(), "", neutral_keys(made))
 
 
 def test_a_file_of_something_else_is_refused(tmp_path):

@@ -184,7 +184,8 @@ def folder(tiny_config, minicity_annotations, tmp_path_factory) -> Path:
     model = MODELS.build(read_config(tiny_config).model)
     state = model.state_dict()
     torch.save(state, made / "tiny.pth")
-    torch.save({k: state[k] for k in state.keys() - neutral_keys(model)}, made / "maptr.pth")
+    of_maptr = state.keys() - set().union(*neutral_keys(model))
+    torch.save({key: state[key] for key in of_maptr}, made / "maptr.pth")
     return made
 
 

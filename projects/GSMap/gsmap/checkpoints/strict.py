@@ -1,6 +1,6 @@
 """Strict loading: every key is used and every weight is loaded, or an error names it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 
 from torch import Tensor, nn
@@ -9,24 +9,29 @@ from gsmap.checkpoints.convert import listed, ours_from_upstream
 from gsmap.checkpoints.key_map import is_upstream
 
 
-def neutral_keys(model: nn.Module, prefix: str = "") -> set[str]:
+def neutral_keys(model: nn.Module, prefix: str = "") -> list[set[str]]:
     """Return the state keys, behind ``prefix``, that modules declare neutral at the start.
 
     A module that extends another one, as GSMap's extend MapTR's, lists what it adds in its
     attribute ``neutral_keys`` (prefixes, relative to the module); a checkpoint may lack these.
+
+    Returns:
+        The keys of each declared prefix, which may be missing together only.
     """
-    declared = []
+    groups = []
+    state = model.state_dict(prefix=prefix)
     for name, module in model.named_modules():
         path = f"{prefix}{name}." if name else prefix
-        declared += [path + relative for relative in getattr(module, "neutral_keys", ())]
-    return {key for key in model.state_dict(prefix=prefix) if key.startswith(tuple(declared))}
+        for relative in getattr(module, "neutral_keys", ()):
+            groups.append({key for key in state if key.startswith(path + relative)})
+    return groups
 
 
 def adapt_state(
     state: dict[str, Tensor],
     expected: Mapping[str, Tensor],
     prefix: str,
-    neutral: set[str],
+    neutral: Sequence[set[str]],
     fit: Callable[[dict[str, Tensor]], None] | None = None,
     allow_untrained: bool = True,
 ) -> None:
@@ -38,8 +43,7 @@ def adapt_state(
         state: What a checkpoint has, under ``prefix``.
         expected: What the model has, under ``prefix``.
         prefix: What the keys begin with.
-        neutral: Keys that may be missing (``neutral_keys``), those of a part of the model
-            (``map_head``, ``temporal``) all together.
+        neutral: Keys that may be missing, those of a set all together (``neutral_keys``).
         fit: Changes the renamed state in place before it is compared.
         allow_untrained: Whether the neutral keys may be missing.
 
@@ -55,10 +59,7 @@ def adapt_state(
     missing = {
         key for key in expected if key not in state and not key.endswith("num_batches_tracked")
     }
-    parts: dict[str, set[str]] = {}
-    for key in neutral:
-        parts.setdefault(key.removeprefix(prefix).partition(".")[0], set()).add(key)
-    untrained = sorted(chain.from_iterable(keys for keys in parts.values() if keys <= missing))
+    untrained = sorted(chain.from_iterable(keys for keys in neutral if keys <= missing))
     missing -= set(untrained)
     state.update({key: expected[key] for key in untrained})  # they stay as they are
     problems = {
