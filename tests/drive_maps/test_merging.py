@@ -53,7 +53,7 @@ def test_an_area_of_exactly_the_smallest_size_is_kept():
     frame = drive_of().frames[0]
     place = np.round(frame.sample.global_from_frame[:2, 3])  # its areas have no rounding
     for width_m, kept in ((1.0, 1), (0.99, 0)):
-        square = place + [[0, 0], [width_m, 0], [width_m, 1], [0, 1], [0, 0]]
+        square = place + np.array([[0, 0], [width_m, 0], [width_m, 1], [0, 1], [0, 0]])
         assert len(polygons_of([square])) == kept
         elements = MapElements.from_polylines([square], [1], [0.9])
         drive = replace(drive_of(), frames=[replace(frame, elements=elements)])

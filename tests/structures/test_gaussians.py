@@ -8,7 +8,6 @@ from gsmap.structures.gaussians import (
     GaussianSpace,
     extents_along_line,
     gaussians_along,
-    gaussians_along,
     line_errors,
     stretched,
 )
