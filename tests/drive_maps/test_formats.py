@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import shapely
 from drive_cases import CLASSES, drive_of
-from google.protobuf import descriptor_pb2, message_factory
 from PIL import Image
 
 from drivemaps.drive import DriveFrame
@@ -142,6 +141,9 @@ def test_the_map_grows_on_the_ground(camera_drive, true):
 
 def decoded(schema: object, message: object) -> object:
     """Read a message of an MCAP file by the schema that stands in it, without foxglove's code."""
+    pytest.importorskip("google.protobuf", reason="pip install -e .[bags]")
+    from google.protobuf import descriptor_pb2, message_factory
+
     files = descriptor_pb2.FileDescriptorSet.FromString(schema.data)
     return message_factory.GetMessages(files.file)[schema.name].FromString(message.data)
 
