@@ -3,6 +3,7 @@
 import argparse
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,14 +43,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def in_fresh_processes(
     task: Callable[..., Cost], arguments: Sequence[tuple[Any, ...]]
 ) -> list[tuple[str, Cost]]:
-    """Call ``task`` on every tuple of arguments, each in a process of its own, one at a time.
+    """Call ``task`` on every tuple of arguments, on a CPU each in a process of its own, in turn.
 
-    What an earlier model leaves behind in the allocator would count as memory of the next one.
+    There, what an earlier model leaves behind in the allocator would count as memory of the next
+    one; a GPU's memory is counted by torch.
 
     Returns:
         The first argument of every call, and its result.
     """
-    return [(each[0], in_own_process(task, *each)) for each in arguments]
+    on_cpu = all(args.device == "cpu" for _, args, *_ in arguments)
+    call = partial(in_own_process, task) if on_cpu else task
+    return [(each[0], call(*each)) for each in arguments]
 
 
 def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:

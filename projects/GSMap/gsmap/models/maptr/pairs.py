@@ -42,6 +42,11 @@ class Predictions:
         self.references = decoded.references
         self.pts = decoded.references[..., : reference.coords]
 
+    @cached_property
+    def cost_masks(self) -> Tensor:
+        """Rendered masks for matching, without gradient. (B, N, h, w)"""
+        return self.reference.render(self.references.detach(), self.masks.cost_grid)
+
     def of_queries(self, queries: slice) -> "Predictions":
         """Return the predictions of some of the instance queries, scores in float32."""
         scores, decoded = self.scores[:, queries].float(), self.decoded.of_queries(queries)
@@ -64,13 +69,12 @@ class SamplePredictions:
     def __init__(self, batch: Predictions, index: int) -> None:
         self.scores, self.pts = batch.scores[index], batch.pts[index]
         self.references = batch.references[index]
-        self._batch = batch
+        self._batch, self._index = batch, index
 
-    @cached_property
+    @property
     def cost_masks(self) -> Tensor:
         """Rendered masks, without gradient. (N, h, w)"""
-        grid = self._batch.masks.cost_grid
-        return self._batch.reference.render(self.references.detach(), grid)
+        return self._batch.cost_masks[self._index]
 
 
 class SampleTruth:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 BLOCK_VALUES = 1 << 22  # how many distances are held at a time
+GPU_BLOCK_VALUES = 1 << 25  # fewer would cost more launches than arithmetic
 DISTANCE_EPS = 1e-6  # pixels that are nearer to an edge count as this near
 LENGTH_EPS = 1e-5  # added to an edge's squared length, as in MapVR: an edge may be a single point
 
@@ -35,7 +36,8 @@ def _edge_blocks(
     shape: tuple[int, ...], starts: Tensor, ends: Tensor
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Cut edges (K, E, 2) into blocks (K, b, 1, 1, 2), each with its first edge's index."""
-    size = max(1, BLOCK_VALUES // max(1, math.prod(shape)))
+    values = BLOCK_VALUES if starts.device.type == "cpu" else GPU_BLOCK_VALUES
+    size = max(1, values // max(1, math.prod(shape)))
     for i in range(0, starts.shape[1], size):
         yield i, starts[:, i : i + size, None, None], ends[:, i : i + size, None, None]
 

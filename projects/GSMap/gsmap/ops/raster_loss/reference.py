@@ -33,10 +33,10 @@ def _blur(images: Tensor, window: Tensor) -> Tensor:
 
 def dssim_map(preds: Tensor, targets: Tensor, window: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return 1 - SSIM in [0, 2], and the means of both masks in the window. 3 x (n, H, W)"""
-    mean_p, mean_t = _blur(preds, window), _blur(targets, window)
-    var_p = _blur(preds.square(), window) - mean_p.square()
-    var_t = _blur(targets.square(), window) - mean_t.square()
-    covariance = _blur(preds * targets, window) - mean_p * mean_t
+    images = torch.cat([preds, targets, preds.square(), targets.square(), preds * targets])
+    mean_p, mean_t, square_p, square_t, product = _blur(images, window).chunk(5)
+    var_p, var_t = square_p - mean_p.square(), square_t - mean_t.square()
+    covariance = product - mean_p * mean_t
     numerator = (2 * mean_p * mean_t + SSIM_C1) * (2 * covariance + SSIM_C2)
     denominator = (mean_p.square() + mean_t.square() + SSIM_C1) * (var_p + var_t + SSIM_C2)
     return 1 - numerator / denominator, mean_p, mean_t
