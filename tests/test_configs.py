@@ -299,6 +299,13 @@ def test_the_gsmap_of_one_word_trains_a_step(path, minicity_root, annotations):
     check_gradients(model, losses)
 
 
+def init_in_place(model):
+    """Initialise weights as a runner does: after it took them to a GPU, where they must stay."""
+    where = {name: value.data_ptr() for name, value in model.state_dict().items()}
+    model.init_weights()
+    assert where == {name: value.data_ptr() for name, value in model.state_dict().items()}
+
+
 @pytest.mark.parametrize("path", distinct(LEAVES), ids=lambda path: path.stem)
 def test_one_step_of_training_and_testing(path, minicity_root, annotations):
     cfg = small(load(path))
@@ -311,7 +318,7 @@ def test_one_step_of_training_and_testing(path, minicity_root, annotations):
         pytest.skip("the sparse LiDAR encoder needs spconv on a CPU")
     torch.manual_seed(0)
     model = MODELS.build(cfg.model)
-    model.init_weights()
+    init_in_place(model)
     model.train()
     batch = pseudo_collate([DATASETS.build(train)[0]])  # through the config's own pipeline
     data = model.data_preprocessor(batch, True)

@@ -108,7 +108,8 @@ class SamplingAttention(nn.Module):
         """Let each head look in its own direction, with equal weights."""
         constant_init(self.sampling_offsets, 0.0)
         offsets = directional_offsets(self.num_heads, self.num_points // self.num_parts)
-        self.sampling_offsets.bias.data = offsets.repeat(1, self.num_parts, 1).flatten()
+        with torch.no_grad():  # in place: the weights may lie on a GPU already
+            self.sampling_offsets.bias.copy_(offsets.repeat(1, self.num_parts, 1).flatten())
         constant_init(self.attention_weights, 0.0)
         xavier_init(self.value_proj, distribution="uniform")
         xavier_init(self.output_proj, distribution="uniform")
