@@ -53,15 +53,13 @@ def bilinear_cells(
     x, y = locations[..., 0] * width - 0.5, locations[..., 1] * height - 0.5
     x0, y0 = x.detach().floor(), y.detach().floor()
     right, lower = x - x0, y - y0
-    left, upper = 1 - right, 1 - lower
-    cols = torch.stack([x0, x0, x0 + 1, x0 + 1], -2)  # of the four corners (..., 4, S)
-    rows = torch.stack([y0, y0 + 1, y0, y0 + 1], -2)
-    shares_x = torch.stack([left, left, right, right], -2)
-    shares_y = torch.stack([upper, lower, upper, lower], -2)
-    inside = (cols >= 0) & (cols < width) & (rows >= 0) & (rows < height)
-    cells = torch.where(inside, rows * width + cols, 0)
-    cell_weights = shares_x * shares_y * weights[..., None, :] * inside
-    return cells.long().flatten(-2), cell_weights.flatten(-2)
+    cells, cell_weights = [], []
+    for col, wx in ((x0, 1 - right), (x0 + 1, right)):
+        for row, wy in ((y0, 1 - lower), (y0 + 1, lower)):
+            inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+            cells.append(torch.where(inside, row * width + col, 0))
+            cell_weights.append(wx * wy * weights * inside)
+    return torch.cat(cells, -1).long(), torch.cat(cell_weights, -1)
 
 
 def sum_rows(table: Tensor, rows: Tensor, weights: Tensor, backend: str = "auto") -> Tensor:
