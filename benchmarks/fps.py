@@ -6,14 +6,14 @@ from pathlib import Path
 import torch
 
 from benchmarks.measure import MIB, Cost, measure
-from benchmarks.model import add_arguments, drive_on, in_fresh_processes, model_and_batch, report
+from benchmarks.model import add_arguments, drive_on, measured_each, model_and_batch, report
 
 __all__ = ["add_arguments", "run"]
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure and print the frames per second of every config."""
-    costs = in_fresh_processes(frame_cost, [(path, args) for path in args.configs])
+    costs = measured_each(frame_cost, [(path, args) for path in args.configs])
     device = torch.device(args.device)
     first = costs[0][1].time_s(device)
     report(

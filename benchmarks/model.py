@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fp16", action="store_true", help="mixed precision")
 
 
-def in_fresh_processes(
+def measured_each(
     task: Callable[..., Cost], arguments: Sequence[tuple[Any, ...]]
 ) -> list[tuple[str, Cost]]:
     """Call ``task`` on every tuple of arguments, on a CPU each in a process of its own, in turn.

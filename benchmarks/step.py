@@ -25,7 +25,7 @@ def run(args: argparse.Namespace) -> None:
     for path in args.configs:
         sizes = args.rasters if "GSMap" in read_config(path).model.map_head.type else [""]
         tasks += [(path, args, raster) for raster in sizes]
-    costs = [cost for _, cost in models.in_fresh_processes(step_cost, tasks)]
+    costs = [cost for _, cost in models.measured_each(step_cost, tasks)]
     seconds = [cost.time_s(torch.device(args.device)) for cost in costs]
     peaks = [cost.peak_bytes for cost in costs]
     models.report(
