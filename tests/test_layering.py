@@ -1,6 +1,7 @@
 """Imports run down only: the arrows of docs/architecture.md, read from the source."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -120,6 +121,28 @@ def test_every_room_has_its_arrows():
 def test_no_two_rooms_import_each_other():
     for room, below in ALLOWED.items():
         assert not {other for other in below if room in ALLOWED[other]}, room
+
+
+def modules() -> dict[str, Path]:
+    """Return the files of all packages by the name under which they are imported."""
+    found = {}
+    for name, root in ROOTS.items():
+        for path in sorted(root.rglob("*.py")):
+            parts = path.relative_to(root).with_suffix("").parts
+            found[".".join([name, *parts]).removesuffix(".__init__")] = path
+    return found
+
+
+def test_no_files_import_each_other_in_a_circle():
+    """Not even for types alone, or within a function."""
+    files = modules()
+    below = {
+        name: (set(imported_names(path)) | {n.rpartition(".")[0] for n in imported_names(path)})
+        & files.keys() - {name}
+        for name, path in files.items()
+    }
+    assert "gsmap.models.maptr.pairs" in below["gsmap.models.maptr.losses"]
+    tuple(TopologicalSorter(below).static_order())  # CycleError names the circle
 
 
 def test_the_reader_of_imports_sees_what_a_file_imports():

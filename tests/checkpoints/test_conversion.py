@@ -25,7 +25,7 @@ from gsmap.checkpoints.convert import (
 )
 from gsmap.checkpoints.key_map import KEY_MAPS, MAPTR, MAPTR_BEVFORMER, find_key_map
 from gsmap.checkpoints.reading import load_weights, read_weights
-from gsmap.checkpoints.strict import adapt_state, neutral_keys
+from gsmap.checkpoints.strict import AddsWeights, adapt_state, neutral_keys
 from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.uncertainty import ErrorReference
 from gsmap.structures.grid import BEVGrid
@@ -123,7 +123,7 @@ def test_missing_left_over_and_reshaped_keys_are_errors_that_name_them(tmp_path,
     assert "map_head.cls_branches.0.6.bias (7,) instead of (3,)" in message
 
 
-class Extended(nn.Module):
+class Extended(nn.Module, AddsWeights):
     """A model that adds ``extra`` to ``base``."""
 
     neutral_keys = ("extra.",)

@@ -1,13 +1,15 @@
 """A trained model on the cameras of one vehicle, whose images come frame by frame."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from mmengine.config import Config
 
 from gsmap.datasets.memory import VEHICLE, Cameras, bgr_by_name, source_in_memory
-from gsmap.datasets.source import ground_from_frame
+from gsmap.datasets.source import Source, ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from gsmap.structures.streams import Frame, MapStream
@@ -17,8 +19,25 @@ _ALONE = Frame("in memory", "", 0, np.eye(4))
 if TYPE_CHECKING:
     from mmdet3d.structures import Det3DDataSample
 
-    from gsmap.apis.map_inferencer import MapInferencer
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+
+
+class Predictor(Protocol):
+    """What a `LiveMap` needs of the `MapInferencer` that makes it."""
+
+    cfg: Config
+    model: Any
+
+    def dataset(self, source: Source) -> "VectorizedMapDataset":
+        """Open samples as the config's test data set."""
+
+    def predict(
+        self, dataset: "VectorizedMapDataset", *, allow_missing_cameras: bool, stream: Any
+    ) -> "Iterator[Det3DDataSample]":
+        """Run the model on the samples of a data set."""
+
+    def elements(self, data_sample: "Det3DDataSample") -> MapElements:
+        """Return a predicted sample's map."""
 
 
 class LiveMap:
@@ -41,7 +60,7 @@ class LiveMap:
 
     def __init__(
         self,
-        inferencer: "MapInferencer",
+        inferencer: Predictor,
         intrinsics: Cameras,
         cam_from_frame: Cameras,
         frame: str | None = None,

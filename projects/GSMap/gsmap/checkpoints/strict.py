@@ -9,11 +9,19 @@ from gsmap.checkpoints.convert import listed, ours_from_upstream
 from gsmap.checkpoints.key_map import is_upstream
 
 
-def neutral_keys(model: nn.Module, prefix: str = "") -> list[set[str]]:
-    """Return the state keys, behind ``prefix``, that modules declare neutral at the start.
+class AddsWeights:
+    """A module that extends another one, as GSMap's extend MapTR's.
 
-    A module that extends another one, as GSMap's extend MapTR's, lists what it adds in its
-    attribute ``neutral_keys`` (prefixes, relative to the module); a checkpoint may lack these.
+    Attributes:
+        neutral_keys: What it adds without effect at the start: prefixes of state keys, relative to
+            the module. A checkpoint may lack these.
+    """
+
+    neutral_keys: tuple[str, ...] = ()
+
+
+def neutral_keys(model: nn.Module, prefix: str = "") -> list[set[str]]:
+    """Return the state keys, behind ``prefix``, that modules declare neutral (`AddsWeights`).
 
     Returns:
         The keys of each declared prefix, which may be missing together only.
@@ -22,7 +30,7 @@ def neutral_keys(model: nn.Module, prefix: str = "") -> list[set[str]]:
     state = model.state_dict(prefix=prefix)
     for name, module in model.named_modules():
         path = f"{prefix}{name}." if name else prefix
-        for relative in getattr(module, "neutral_keys", ()):
+        for relative in module.neutral_keys if isinstance(module, AddsWeights) else ():
             groups.append({key for key in state if key.startswith(path + relative)})
     return groups
 

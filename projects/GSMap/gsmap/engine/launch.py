@@ -29,6 +29,7 @@ from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.utils.faults import nearest, registered
 from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
+from gsmap.utils.targets import NeedsTargets
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 _COPIED = ("backend_args", "classes", "data_root", "grid", "vis_backends")  # read by no runner
@@ -268,7 +269,13 @@ def needed_targets(cfg: Config) -> dict[str, Any]:
     lists = [own.get(name) for own in heads for name in ("losses", "aux_heads")]
     parts = chain(heads, *(part for part in lists if isinstance(part, list)))
     kinds = [part.get("type") for part in parts if isinstance(part, dict)]
-    return {name: kind for kind in kinds for name in getattr(_class(kind), "transforms", ())}
+    return {name: kind for kind in kinds for name in _needs(kind).transforms}
+
+
+def _needs(kind: Any) -> type[NeedsTargets]:
+    """Return the class of a part, for what it needs; a part of a stranger needs nothing."""
+    found = _class(kind)
+    return found if found and issubclass(found, NeedsTargets) else NeedsTargets
 
 
 def _class(kind: Any, registry: Registry = MODELS) -> type | None:
@@ -295,13 +302,12 @@ def _check_targets(cfg: Config) -> None:
 def _check_shared(cfg: Config, steps: list[Any]) -> None:
     """Refuse a transform that has another value of a setting than the head (its ``shared``)."""
     head = (cfg.get("model") or {}).get("map_head") or {}
-    kind = _class(head.get("type"))
-    shared, made = getattr(kind, "shared", ()), getattr(kind, "transforms", ())
-    for step in steps if shared else ():
+    kind = _needs(head.get("type"))
+    for step in steps if kind.shared else ():
         transform = _class(step.get("type"), TRANSFORMS)
-        if getattr(transform, "__name__", None) not in made:
+        if transform is None or transform.__name__ not in kind.transforms:
             continue
-        for name in shared:
+        for name in kind.shared:
             own, other = _setting(kind, head, name), _setting(transform, step, name)
             if own != other:
                 raise ValueError(

@@ -6,9 +6,8 @@ from mmdet3d.registry import TASK_UTILS
 from torch import Tensor
 
 from gsmap.models.gsmap.reference import require_gaussians
-from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.matching import MapCost
-from gsmap.models.maptr.pairs import SamplePredictions, SampleTruth
+from gsmap.models.maptr.pairs import BuiltHead, SamplePredictions, SampleTruth
 from gsmap.models.maptr.parts import WEIGHT, weights_of
 from gsmap.ops.soft_iou import pairwise_dice_loss, pairwise_soft_iou
 
@@ -31,7 +30,7 @@ class IoUCost(MapCost):
             raise ValueError(f"kind must be 'iou' or 'dice', got {kind!r}.")
         self.kind = kind
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if the head has no Gaussians to render."""
         require_gaussians(self, head)
 

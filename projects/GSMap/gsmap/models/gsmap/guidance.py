@@ -4,13 +4,14 @@ from mmdet3d.registry import MODELS
 from mmengine.model import constant_init
 from torch import Tensor
 
+from gsmap.checkpoints.strict import AddsWeights
 from gsmap.models.maptr.decoder import Guidance
 from gsmap.models.maptr.layers import mlp
 from gsmap.structures.gaussians import GaussianSpace
 
 
 @MODELS.register_module()
-class GaussianGuidance(Guidance):
+class GaussianGuidance(Guidance, AddsWeights):
     """What a decoder layer takes from the Gaussians, for whichever attentions it has.
 
     Both parts start neutral: the sampling frame is the identity and the embedding zero, so a layer

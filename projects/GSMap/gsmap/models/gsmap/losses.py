@@ -7,9 +7,8 @@ from mmdet3d.registry import MODELS
 from torch import Tensor
 
 from gsmap.models.gsmap.reference import require_gaussians
-from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
 from gsmap.models.maptr.parts import WEIGHT, check_weight, weights_of
 from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
 from gsmap.ops.soft_iou import dice_loss, soft_iou
@@ -34,7 +33,7 @@ class MaskLoss(MapLoss):
         super().__init__(loss_weight, **flags)
         self.full_iou = full_iou
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if the head has no Gaussians to render, or other classes."""
         require_gaussians(self, head)
         check_weight(self, self.full_iou, head.classes)

@@ -8,8 +8,9 @@ from mmdet3d.registry import MODELS
 from mmengine.model import constant_init
 from torch import Tensor, nn
 
+from gsmap.checkpoints.strict import AddsWeights
 from gsmap.models.maptr import layers
-from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.pairs import BuiltHead
 from gsmap.models.maptr.references import PointReference
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import Gaussians, GaussianSpace
@@ -17,7 +18,7 @@ from gsmap.structures.grid import BEVGrid
 
 
 @MODELS.register_module()
-class GaussianReference(PointReference):
+class GaussianReference(PointReference, AddsWeights):
     """A Gaussian per query: its centre is the point, sigma and theta follow it (GSMap Eq. 1).
 
     What it adds to points starts neutral: every query has the same Gaussian, every layer leaves it.
@@ -100,7 +101,7 @@ class GaussianReference(PointReference):
         return render_gaussians(means, scales, rotations, grid)
 
 
-def require_gaussians(part: Any, head: MapHead) -> GaussianReference:
+def require_gaussians(part: Any, head: BuiltHead) -> GaussianReference:
     """Return a head's Gaussians; ValueError if a part of a model needs them and gets points."""
     if isinstance(head.reference, GaussianReference):
         return head.reference

@@ -10,9 +10,8 @@ from torch.distributions import Laplace, Normal
 
 from gsmap.models.gsmap.reference import GaussianReference, require_gaussians
 from gsmap.models.maptr import layers
-from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
 from gsmap.models.maptr.parts import WEIGHT
 from gsmap.structures.gaussians import (
     Gaussians,
@@ -113,7 +112,7 @@ class GaussianNLLLoss(MapLoss):
         super().__init__(loss_weight, **flags)
         self.laplace, self.detach_points, self.match_m = laplace, detach_points, match_m
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if the head has no Gaussians."""
         require_gaussians(self, head)
 

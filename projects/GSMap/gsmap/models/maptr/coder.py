@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import shortest_orders
+from gsmap.utils.targets import NeedsTargets
 
 Tensors = dict[str, Tensor]
 Samples = Sequence[Det3DDataSample]
@@ -124,7 +125,7 @@ class MapCoder:
         return {name: values[rows, orders] for name, values in fields.items()}
 
 
-class DetectionHead(BaseModule):
+class DetectionHead(BaseModule, NeedsTargets):
     """What every head shares: detections of its last layer.
 
     Attributes:

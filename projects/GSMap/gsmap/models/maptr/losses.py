@@ -1,22 +1,20 @@
 """Losses of matched pairs: what they share, and MapTR's, of points and of edges between them."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
 from gsmap.models.maptr.parts import WEIGHT, weights_of
 from gsmap.structures.tensors import check_same_shape
-
-if TYPE_CHECKING:
-    from gsmap.models.maptr.head import MapHead
+from gsmap.utils.targets import NeedsTargets
 
 _EPS = 1e-12
 
 
-class MapLoss(nn.Module):
+class MapLoss(nn.Module, NeedsTargets):
     """A loss of matched pairs: the weighted sum of its `values` over the number of pairs.
 
     Args:
@@ -56,7 +54,7 @@ class MapLoss(nn.Module):
                 "first_group_only to MapLoss.__init__."
             )
 
-    def check(self, head: "MapHead") -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if a head lacks what the loss reads; called when the head is built."""
 
     def reads(self, pairs: MatchedPairs) -> bool:

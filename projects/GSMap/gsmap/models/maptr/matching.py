@@ -1,7 +1,7 @@
 """Assignment of predictions to annotated map elements, and MapTR's cost of points."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,19 +9,8 @@ from mmdet3d.registry import TASK_UTILS
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from gsmap.models.maptr.pairs import BuiltHead, MapMatch, SamplePredictions, SampleTruth
 from gsmap.models.maptr.parts import WEIGHT, weights_of
-
-if TYPE_CHECKING:
-    from gsmap.models.maptr.head import MapHead
-    from gsmap.models.maptr.pairs import SamplePredictions, SampleTruth
-
-
-class MapMatch(NamedTuple):
-    """Matched pairs of one sample, sorted by query. (M,) each"""
-
-    query_inds: Tensor
-    gt_inds: Tensor  # the ground truth of each
-    order_inds: Tensor  # the closest equivalent point order of that ground truth
 
 
 class MapAssigner:
@@ -40,16 +29,14 @@ class MapAssigner:
             raise ValueError("match_costs must hold at least one cost.")
         self.match_costs = [TASK_UTILS.build(cost) for cost in match_costs]
         self.names = [type(cost).__name__ for cost in self.match_costs]
-        self.between_points = next(
-            (cost.between_points for cost in self.match_costs if hasattr(cost, "between_points")),
-            OrderedPointsCost.between_points,
-        )
+        of_points = (cost for cost in self.match_costs if isinstance(cost, OrderedPointsCost))
+        self.between_points = next(of_points, OrderedPointsCost()).between_points
 
     @torch.no_grad()
     def assign(
         self,
-        pred_instances: "SamplePredictions",
-        gt_instances: "SampleTruth",
+        pred_instances: SamplePredictions,
+        gt_instances: SampleTruth,
         img_meta: dict[str, Any] | None = None,
         repeats: int = 1,
     ) -> MapMatch:
@@ -127,11 +114,11 @@ class MapCost:
     def __init__(self, weight: WEIGHT = 1.0) -> None:
         self.weight = weight
 
-    def check(self, head: "MapHead") -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if a head lacks what the cost reads; called when the head is built."""
 
     def __call__(
-        self, pred_instances: "SamplePredictions", gt_instances: "SampleTruth", img_meta: Any = None
+        self, pred_instances: SamplePredictions, gt_instances: SampleTruth, img_meta: Any = None
     ) -> Tensor:
         """Return the weighted cost of each prediction with each ground truth. (N, K)"""
         raise NotImplementedError
@@ -164,13 +151,12 @@ class OrderedPointsCost(MapCost):
     def __init__(self, weight: WEIGHT = 5.0) -> None:
         super().__init__(weight)
 
-    @staticmethod
-    def between_points(pts: Tensor, targets: Tensor) -> Tensor:
+    def between_points(self, pts: Tensor, targets: Tensor) -> Tensor:
         """Return the distance of each coordinate, which also chooses the order of a pair."""
         return (pts - targets).abs()
 
     def __call__(
-        self, pred_instances: "SamplePredictions", gt_instances: "SampleTruth", img_meta: Any = None
+        self, pred_instances: SamplePredictions, gt_instances: SampleTruth, img_meta: Any = None
     ) -> Tensor:
         """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
         distances = order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1)

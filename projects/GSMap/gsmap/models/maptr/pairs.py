@@ -2,16 +2,25 @@
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import torch
 from mmdet.utils import reduce_mean
 from mmengine.structures import InstanceData
-from torch import Tensor
+from torch import Tensor, nn
 
-from gsmap.models.maptr.decoder import Decoded
+from gsmap.models.maptr.decoder import Decoded, MapDecoder
 from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.matching import MapMatch
 from gsmap.models.maptr.references import PointReference
+
+
+class BuiltHead(Protocol):
+    """What a cost or a loss may ask of the head that it belongs to, once that is built."""
+
+    classes: tuple[str, ...]
+    reference: PointReference
+    decoder: MapDecoder
+    instance_embedding: nn.Embedding
 
 
 class Predictions:
@@ -149,6 +158,14 @@ class GroundTruth:
     def masks(self) -> Tensor:
         """Masks of the losses. (T, H, W)"""
         return torch.cat([sample.masks for sample in self.samples])
+
+
+class MapMatch(NamedTuple):
+    """Matched pairs of one sample, sorted by query. (M,) each"""
+
+    query_inds: Tensor
+    gt_inds: Tensor  # the ground truth of each
+    order_inds: Tensor  # the closest equivalent point order of that ground truth
 
 
 class MatchedPairs:

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from gsmap.models.maptrv2.depth import depth_bins, depth_loss
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import check_same_shape
+from gsmap.utils.targets import NeedsTargets
 
 Samples = Sequence[Det3DDataSample]
 
@@ -32,7 +33,7 @@ def _stack_targets(head: Any, samples: Samples, name: str, device: torch.device)
 
 
 @MODELS.register_module()
-class BEVMaskHead(nn.Sequential):
+class BEVMaskHead(nn.Sequential, NeedsTargets):
     """Elements drawn in bird's-eye view, all in one mask (MapTRv2) or one mask a class (MGMapNet).
 
     Args:
@@ -104,7 +105,7 @@ class PVMaskHead(BEVMaskHead):
 
 
 @MODELS.register_module()
-class DepthSupervision(nn.Module):
+class DepthSupervision(nn.Module, NeedsTargets):
     """The depth of an encoder that lifts features, from ``gt_depth`` (V, H, W) of a LiDAR.
 
     What other auxiliary heads take, ``kwargs``, is not used.

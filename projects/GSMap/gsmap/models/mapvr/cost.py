@@ -6,9 +6,8 @@ import torch
 from mmdet3d.registry import TASK_UTILS
 from torch import Tensor
 
-from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.matching import MapCost
-from gsmap.models.maptr.pairs import SamplePredictions, SampleTruth
+from gsmap.models.maptr.pairs import BuiltHead, SamplePredictions, SampleTruth
 from gsmap.models.maptr.parts import WEIGHT, weights_of
 from gsmap.models.mapvr.losses import ElementRenderer
 from gsmap.ops.soft_iou import pairwise_dice_loss
@@ -30,7 +29,7 @@ class RenderedDiceCost(MapCost):
         super().__init__(weight)
         self.renderer = ElementRenderer(size, **rendering)
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if a polygon's class does not exist."""
         self.renderer.check(self, head)
 

@@ -7,9 +7,8 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.losses import MapLoss, turns
-from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
 from gsmap.models.maptr.parts import WEIGHT, check_classes
 from gsmap.ops.polyline_raster import DISTANCES, soft_rasters
 from gsmap.ops.soft_iou import dice_loss
@@ -47,7 +46,7 @@ class ElementRenderer:
         if min(softness) <= 0:
             raise ValueError(f"softness must be > 0, got {softness[0]} and {softness[1]}.")
 
-    def check(self, part: object, head: MapHead) -> None:
+    def check(self, part: object, head: BuiltHead) -> None:
         """Raise ValueError if a polygon's class, in the settings of a part, does not exist."""
         name = f"{type(part).__name__}.polygon_classes"
         check_classes(name, self.polygon_classes, head.classes)
@@ -98,7 +97,7 @@ class RenderedDiceLoss(MapLoss):
         super().__init__(loss_weight, last_layer_only, first_group_only)
         self.renderer = ElementRenderer(size, **rendering)
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if a polygon's class does not exist."""
         self.renderer.check(self, head)
 

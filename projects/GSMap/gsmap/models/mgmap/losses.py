@@ -8,9 +8,8 @@ from mmdet.models.losses.dice_loss import dice_loss
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
 from gsmap.models.mgmap.decoder import MaskedDecoded, MGMapDecoder, RefinedDecoded
 from gsmap.structures.tensors import check_same_shape
 
@@ -35,7 +34,7 @@ class QueryMaskLoss(MapLoss):
         super().__init__(loss_weight, **flags)
         self.dice_weight = dice_weight
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if there are other queries than masks, or none of both."""
         queries, masks = len(head.instance_embedding.weight), decoder_of(self, head).num_masks
         if queries != masks:
@@ -79,7 +78,7 @@ class ForegroundLoss(MapLoss):
         super().__init__(loss_weight, last_layer_only=True, first_group_only=True)
         self.dice_weight, self.pos_weight = dice_weight, pos_weight
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if there is no segmentation."""
         if not len(decoder_of(self, head).refinements):
             raise ValueError("ForegroundLoss needs a refinement: set decoder.refinements.")
@@ -96,7 +95,7 @@ class ForegroundLoss(MapLoss):
         return self.loss_weight * cross_entropy + self.dice_weight * dice
 
 
-def decoder_of(loss: MapLoss, head: MapHead) -> MGMapDecoder:
+def decoder_of(loss: MapLoss, head: BuiltHead) -> MGMapDecoder:
     """Return the head's decoder; ValueError if it has no masks for the loss."""
     if not isinstance(head.decoder, MGMapDecoder):
         raise ValueError(

@@ -7,10 +7,9 @@ import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.layers import mlp
 from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoded, MGMapNetDecoder
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import check_same_shape
@@ -102,7 +101,7 @@ class SamplingLocationLoss(MapLoss):
     def __init__(self, loss_weight: float = 5.0, **flags: bool) -> None:
         super().__init__(loss_weight, **flags)
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: BuiltHead) -> None:
         """Raise ValueError if the decoder does not say where it samples."""
         if not isinstance(head.decoder, MGMapNetDecoder):
             raise ValueError(

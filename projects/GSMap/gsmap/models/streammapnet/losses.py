@@ -1,6 +1,5 @@
 """StreamMapNet's distance of lines: smooth L1, per point, as a loss and as a matching cost."""
 
-from functools import partial
 from typing import Any
 
 import torch.nn.functional as F
@@ -8,7 +7,7 @@ from mmdet3d.registry import MODELS, TASK_UTILS
 from torch import Tensor
 
 from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.matching import MapCost
+from gsmap.models.maptr.matching import OrderedPointsCost
 from gsmap.models.maptr.pairs import MatchedPairs, SamplePredictions, SampleTruth
 from gsmap.models.maptr.parts import weights_of
 from gsmap.structures.tensors import check_same_shape
@@ -38,7 +37,7 @@ class SmoothPointsLoss(MapLoss):
 
 
 @TASK_UTILS.register_module()
-class SmoothPointsCost(MapCost):
+class SmoothPointsCost(OrderedPointsCost):
     """Smooth L1 distance to the closest equivalent point order, over P; it chooses that order.
 
     Args:
@@ -48,7 +47,11 @@ class SmoothPointsCost(MapCost):
 
     def __init__(self, weight: float = 50.0, beta: float = 0.01) -> None:
         super().__init__(weight)
-        self.between_points = partial(F.smooth_l1_loss, reduction="none", beta=beta)
+        self.beta = beta
+
+    def between_points(self, pts: Tensor, targets: Tensor) -> Tensor:
+        """Return the distance of each coordinate, which also chooses the order of a pair."""
+        return F.smooth_l1_loss(pts, targets, reduction="none", beta=self.beta)
 
     def __call__(
         self, pred_instances: SamplePredictions, gt_instances: SampleTruth, img_meta: Any = None

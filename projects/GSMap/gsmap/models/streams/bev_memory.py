@@ -8,12 +8,13 @@ from mmdet3d.registry import MODELS
 from mmengine.model import constant_init
 from torch import Tensor, nn
 
+from gsmap.checkpoints.strict import AddsWeights
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.past import Past
 
 
 @MODELS.register_module()
-class BEVMemory(nn.Module):
+class BEVMemory(nn.Module, AddsWeights):
     r"""Fuse the features of now, x, with those of the frame before, h (StreamMapNet).
 
     :math:`z = \sigma(W_z [h, x])`, :math:`r = \sigma(W_r [h, x])`, :math:`q = W_q [r h, x]`

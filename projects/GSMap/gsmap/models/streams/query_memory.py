@@ -9,6 +9,7 @@ from mmengine.model import BaseModule
 from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
+from gsmap.checkpoints.strict import AddsWeights
 from gsmap.models.maptr.decoder import Queries
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptr.pairs import MatchedPairs
@@ -18,7 +19,7 @@ _POSE = 12  # the first three rows of a motion
 
 
 @MODELS.register_module()
-class QueryMemory(BaseModule):
+class QueryMemory(BaseModule, AddsWeights):
     """Hand on the best queries of each frame, for any head (StreamMapNet).
 
     A query's state is updated by a small network that knows the motion; its reference is moved. In
