@@ -323,30 +323,6 @@ def test_a_query_that_has_moved_as_the_vehicle_has_no_loss(config):
     assert float(propagation.loss(head)) < 1e-6
 
 
-def matched_queries(match_lead: float, of_frame: int) -> list[list[int]]:
-    """Return which queries each layer's two elements go to; 0 and 1 are handed on."""
-    head, memory = with_memory()
-    memory.queries.match_lead = match_lead
-    head.train(), memory.train()
-    own, found = head.assigner.assign, []
-    head.assigner.assign = lambda *args: found.append(own(*args)) or found[-1]
-    for number in range(of_frame + 1):
-        found.clear()
-        with memory.over({"bev_feats": features(number)}, [meta(number)]) as outputs:
-            (sample,) = make_samples(LANES)
-            sample.set_metainfo(meta(number))
-            head.loss(outputs, [sample])
-    return [match.query_inds.tolist() for match in found]
-
-
-def test_with_a_lead_queries_that_were_handed_on_go_on_with_their_elements():
-    assert matched_queries(0.0, 0) == matched_queries(1e3, 0)  # nothing is handed on yet
-    (first, *later), (same, *led) = matched_queries(0.0, 1), matched_queries(1e3, 1)
-    assert same == first  # the memory enters behind the first layer
-    assert [0, 1] not in later
-    assert all(queries == [0, 1] for queries in led)
-
-
 def test_further_query_groups_keep_their_queries():
     groups = [{"num": 4}, {"name": "one2many", "num": 6, "repeats": 2}]
     head, memory = with_memory(query_groups=groups)
@@ -364,8 +340,6 @@ def test_further_query_groups_keep_their_queries():
 
 
 def test_a_memory_that_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match="match_lead must be >= 0"):
-        StreamMemory(build_head(HEAD), queries={"num": 2, "match_lead": -1.0})
     head = build_head(HEAD)
     with pytest.raises(ValueError, match="bev=dict"):
         StreamMemory(head)

@@ -320,11 +320,9 @@ class MapHead(DetectionHead):
             truths = self.prepare_gts(batch_gt_instances)
             for group, own in self.split_groups(outputs):
                 for number, layer in enumerate(own):
-                    remembers = memory is not None and group is self.query_groups[0]
-                    lead = memory.lead(number, group.num) if remembers else None
-                    pairs = self.match(layer, truths, batch_img_metas, group.repeats, lead)
+                    pairs = self.match(layer, truths, batch_img_metas, group.repeats)
                     is_last = number == len(own) - 1
-                    if remembers and is_last:
+                    if memory is not None and is_last and group is self.query_groups[0]:
                         memory.keep_targets(pairs)
                     prefix = "" if is_last else f"d{number}."
                     suffix = f"_{group.name}" if group.name else ""
@@ -348,27 +346,13 @@ class MapHead(DetectionHead):
         return GroundTruth(samples)
 
     def match(
-        self,
-        predictions: Predictions,
-        truths: GroundTruth,
-        metas: Metas,
-        repeats: int = 1,
-        lead: Tensor | None = None,
+        self, predictions: Predictions, truths: GroundTruth, metas: Metas, repeats: int = 1
     ) -> MatchedPairs:
-        """Match every sample's predictions of one layer with its ground truth.
-
-        Args:
-            predictions: Predictions of one layer and query group.
-            truths: Ground truth of the batch.
-            metas: Meta dict of each sample.
-            repeats: How often each ground truth may be matched.
-            lead: By how much each query is cheaper, on the CPU; None is 0. (B, N)
-        """
-        leads = [None] * len(metas) if lead is None else list(lead)
-        samples = zip(truths.samples, metas, leads, strict=True)
+        """Match every sample's predictions of one layer with its ground truth."""
+        samples = zip(truths.samples, metas, strict=True)
         matches = [
-            self.assigner.assign(SamplePredictions(predictions, index), truth, meta, repeats, own)
-            for index, (truth, meta, own) in enumerate(samples)
+            self.assigner.assign(SamplePredictions(predictions, index), truth, meta, repeats)
+            for index, (truth, meta) in enumerate(samples)
         ]
         return MatchedPairs(predictions, truths, matches)
 

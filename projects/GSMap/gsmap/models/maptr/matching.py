@@ -39,7 +39,6 @@ class MapAssigner:
         gt_instances: SampleTruth,
         img_meta: dict[str, Any] | None = None,
         repeats: int = 1,
-        lead: Tensor | None = None,
     ) -> MapMatch:
         """Match each ground truth to ``repeats`` predictions: min(N, K * repeats) pairs.
 
@@ -48,7 +47,6 @@ class MapAssigner:
             gt_instances: Its ground truth, K elements.
             img_meta: Its ``token`` names the sample in errors.
             repeats: How often each ground truth may be matched.
-            lead: By how much each query is cheaper, on the CPU; None is 0. (N,)
 
         Raises:
             FloatingPointError: If a cost (or, without ground truth, a score) is not finite.
@@ -59,8 +57,6 @@ class MapAssigner:
             return MapMatch(*torch.empty(3, 0, dtype=torch.long, device=device))
         sample = pred_instances, gt_instances, img_meta
         total = torch.stack([cost(*sample).float() for cost in self.match_costs]).cpu()
-        if lead is not None:
-            total[0] -= lead[:, None]
         queries, gts = (part.to(device) for part in assigned(total, self.names, img_meta, repeats))
         orders = gt_instances.pts_shifts[gts]  # (M, S, P, 2)
         distances = self.between_points(pred_instances.pts[queries, None].expand_as(orders), orders)

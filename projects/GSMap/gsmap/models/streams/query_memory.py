@@ -31,28 +31,15 @@ class QueryMemory(BaseModule, AddsWeights):
         num: Queries that are handed on, K.
         loss_weight: Weight of that loss, 0.1 of the points' 50 as published.
         beta: Distance, [0, 1] over the map, below which smooth L1 is a parabola.
-        match_lead: By how much a query that was handed on is cheaper in training's matching, so
-            that it, and not a new one, goes on with its element; 0 as published.
-
-    Raises:
-        ValueError: If ``match_lead`` is negative.
     """
 
     neutral_keys = ("fc.",)
 
     def __init__(
-        self,
-        embed_dims: int,
-        num: int = 33,
-        loss_weight: float = 5.0,
-        beta: float = 0.01,
-        match_lead: float = 0.0,
+        self, embed_dims: int, num: int = 33, loss_weight: float = 5.0, beta: float = 0.01
     ) -> None:
         super().__init__()
-        if not match_lead >= 0:
-            raise ValueError(f"temporal.queries.match_lead must be >= 0, got {match_lead}.")
         self.num, self.loss_weight, self.beta = num, loss_weight, beta
-        self.match_lead = match_lead
         self.fc = nn.Sequential(
             nn.Linear(embed_dims + _POSE, 2 * embed_dims),
             nn.LayerNorm(2 * embed_dims),
@@ -198,17 +185,6 @@ class Propagation:
         state = tree_unflatten(leaves, form)
         reference = self.memory.moved(head, queries.reference, self.past)
         return Queries(state, queries.position, reference)
-
-    def lead(self, number: int, count: int) -> Tensor | None:
-        """Return by how much each of a layer's N queries is cheaper in matching. (B, N)
-
-        None if none is: before the memory enters, behind the first layer, and without a lead.
-        """
-        if not self.memory.match_lead or self.handed_on is None or number == 0:
-            return None
-        lead = torch.zeros(len(self.past.continues), count)
-        lead[:, : self.memory.num] = self.memory.match_lead
-        return lead * self.past.continues[:, None].cpu()
 
     def choose(self, head: MapHead, scores: Tensor) -> None:
         """Choose what is handed on by the last layer's class logits. (B, N, classes)"""
