@@ -51,6 +51,11 @@ class ExportedDetector(nn.Module):
                 f"{type(head).__name__} cannot be exported: {head.not_exported}. Run the model "
                 "with tools/infer.py."
             )
+        if model.temporal is not None and model.temporal.elements is not None:
+            raise ValueError(
+                "temporal.elements works behind the network and has no ONNX operators: set "
+                "model.temporal.elements=None (temporal=None without other memory)."
+            )
         self.model = model
         of_stream = () if model.temporal is None else OF_STREAM
         self.input_names = ("images", *model.bev_encoder.calibration, *of_stream)

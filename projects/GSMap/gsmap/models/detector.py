@@ -150,6 +150,8 @@ class MapDetector(Base3DDetector):
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         with self.over_time(outputs, batch_data_samples) as outputs:
             results = self.map_head.predict(outputs, batch_data_samples)
+            if self.temporal is not None:
+                results = self.temporal.updated(outputs, results)
         return self.add_pred_to_datasample(batch_data_samples, results)
 
     def _forward(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:

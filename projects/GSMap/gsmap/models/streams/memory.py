@@ -8,15 +8,18 @@ import numpy as np
 import torch
 from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
+from mmengine.structures import InstanceData
 from torch import Tensor
 
 from gsmap.models.maptr.head import MapHead
 from gsmap.models.streams.bev_memory import BEVMemory
+from gsmap.models.streams.element_memory import PREFIX, ElementMemory
 from gsmap.models.streams.query_memory import Propagation, QueryMemory
 from gsmap.structures.past import Past
 from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamState
 
-_EXACT = ("references", "targets")  # half precision would move a point by centimetres
+# beginnings of names: half precision would move a point by centimetres
+_EXACT = ("references", "targets", PREFIX)
 
 
 class StreamMemory(BaseModule):
@@ -30,6 +33,7 @@ class StreamMemory(BaseModule):
         head: The detector's head, for queries a `MapHead`.
         bev: Settings of `BEVMemory`, or None without memory of the map's features.
         queries: Settings of `QueryMemory`, or None without memory of queries.
+        elements: Settings of `ElementMemory`, or None without memory of elements.
         embed_dims: Channels of the map's features.
         max_gap_s: A longer pause between two frames, in seconds, starts a stream anew.
         half: Keep what is no place in half precision.
@@ -38,7 +42,7 @@ class StreamMemory(BaseModule):
         name: The model's, for errors.
 
     Raises:
-        ValueError: If there is neither memory, one does not fit the head, or the pause is not > 0.
+        ValueError: If there is no memory, one does not fit the head, or the pause is not > 0.
     """
 
     def __init__(
@@ -46,13 +50,16 @@ class StreamMemory(BaseModule):
         head: Any,
         bev: dict[str, Any] | None = None,
         queries: dict[str, Any] | None = None,
+        elements: dict[str, Any] | None = None,
         embed_dims: int = 256,
         max_gap_s: float = 2.0,
         half: bool = False,
     ) -> None:
         super().__init__()
-        if bev is None and queries is None:
-            raise ValueError("temporal needs bev=dict(...), queries=dict(...) or both.")
+        if bev is None and queries is None and elements is None:
+            raise ValueError(
+                "temporal needs bev=dict(...), queries=dict(...), elements=dict(...) or several."
+            )
         if not max_gap_s > 0:
             raise ValueError(f"temporal.max_gap_s must be seconds > 0, got {max_gap_s}.")
         self.max_gap_s, self.half = max_gap_s, half
@@ -71,6 +78,9 @@ class StreamMemory(BaseModule):
             part = {"type": "QueryMemory", "embed_dims": head.embed_dims}
             self.queries = MODELS.build({**part, **queries})
             self.queries.check(head)
+        self.elements: ElementMemory | None = None
+        if elements is not None:
+            self.elements = MODELS.build({"type": "ElementMemory", "head": head, **elements})
         self.streams: Slots | Scenes = Slots(max_gap_s)
 
     def __str__(self) -> str:
@@ -128,7 +138,7 @@ class StreamMemory(BaseModule):
 
     def enter(self, outputs: dict[str, Any], past: Past) -> dict[str, Any]:
         """Return a batch's outputs with its memory, as `over` yields them."""
-        outputs = dict(outputs)
+        outputs = {**outputs, "past": past}
         feats = outputs["bev_feats"]
         if self.bev is not None:
             with torch.autocast(feats.device.type, enabled=False):
@@ -137,15 +147,25 @@ class StreamMemory(BaseModule):
             outputs["query_memory"] = Propagation(self.queries, past)
         return outputs
 
+    def updated(
+        self, outputs: dict[str, Any], results: Sequence[InstanceData]
+    ) -> Sequence[InstanceData]:
+        """Return a batch's detections, updated by those of the frame before, which they replace."""
+        if self.elements is None:
+            return results
+        results = self.elements.updated(results, outputs["past"])
+        outputs["elements_left"] = self.elements.left(results)
+        return results
+
     def left(self, outputs: dict[str, Any]) -> dict[str, Tensor]:
         """Return what a batch leaves after its head, by name, without gradient. (B, ...) each"""
-        left: dict[str, Tensor] = {}
+        left: dict[str, Tensor] = dict(outputs.get("elements_left", {}))
         if self.bev is not None:
             left["bev_feats"] = self.bev.kept(outputs["bev_feats"])
         if self.queries is not None:
             left |= outputs["query_memory"].left()
         return {
-            name: values.half() if self.half and name not in _EXACT else values
+            name: values.half() if self.half and not name.startswith(_EXACT) else values
             for name, values in left.items()
         }
 
