@@ -188,6 +188,18 @@ def test_loaders_that_tear_streams_apart_are_refused(changes, reason):
     check_config(read_config(Config({**WITH_MEMORY, **changes, "model": {"temporal": None}})))
 
 
+def test_a_memory_of_elements_alone_is_not_trained_and_needs_order_in_tests_only():
+    train = {"train_dataloader": {"batch_size": 2, "sampler": {"type": "DefaultSampler"}}}
+    elements = {**WITH_MEMORY, **train, "model": {"temporal": {"elements": {}}}}
+    check_config(read_config(Config(elements)))
+    both = {"model": {"temporal": {"elements": {}, "bev": {}}}}
+    with pytest.raises(ValueError, match=r"train_dataloader\.sampler"):
+        check_config(read_config(Config({**elements, **both})))
+    torn = {"test_dataloader": {"sampler": {"type": "DefaultSampler"}}}
+    with pytest.raises(ValueError, match=r"test_dataloader\.sampler"):
+        check_config(read_config(Config({**elements, **torn})))
+
+
 def test_the_newest_whole_checkpoint_is_found_whatever_is_noted(tmp_path, capsys):
     assert newest_checkpoint(tmp_path) is None
     for number in (2, 9, 10, 11):

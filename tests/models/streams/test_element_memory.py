@@ -53,11 +53,11 @@ ZERO = torch.zeros(1, dtype=torch.long)
 def test_nearest_places_are_shapelys():
     shapely = pytest.importorskip("shapely")
     generator = np.random.default_rng(0)
-    points, lines = generator.normal(size=(3, 6, 2)) * 5, generator.normal(size=(4, 5, 2)) * 5
+    points, lines = generator.normal(size=(3, 6, 2)) * 5, generator.normal(size=(3, 5, 2)) * 5
     found = nearest_places(torch.tensor(points), torch.tensor(lines))
     wanted = [
-        [[shapely.Point(p).distance(shapely.LineString(other)) for p in own] for other in lines]
-        for own in points
+        [shapely.Point(p).distance(shapely.LineString(other)) for p in own]
+        for own, other in zip(points, lines, strict=True)
     ]
     np.testing.assert_allclose(found.distances.numpy(), wanted, atol=1e-12)
 

@@ -340,10 +340,13 @@ def _step_types(steps: Any) -> Iterator[Any]:
 
 def _check_streams(cfg: Config) -> None:
     """Refuse loaders that would not hand a model with memory the frames of each scene in order."""
-    if (cfg.get("model") or {}).get("temporal") is None:
+    temporal = (cfg.get("model") or {}).get("temporal")
+    if temporal is None:
         return
-    test = "StreamTestSampler"
-    for part, wanted in (("train", "StreamTrainSampler"), ("val", test), ("test", test)):
+    needed = dict.fromkeys(("val", "test"), "StreamTestSampler")
+    if temporal.get("bev") is not None or temporal.get("queries") is not None:
+        needed["train"] = "StreamTrainSampler"  # a memory of elements alone is not trained
+    for part, wanted in needed.items():
         loader = cfg.get(f"{part}_dataloader") or {}
         sampler = loader.get("sampler") or {}
         kind = sampler.get("type")

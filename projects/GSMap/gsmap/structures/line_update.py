@@ -11,7 +11,7 @@ _SHORT = 1e-9  # square metres; a shorter segment has no direction
 
 
 class LinePlaces(NamedTuple):
-    """The place on each of M lines that is nearest to each of P points of N elements. (N, M, P)"""
+    """The place on a line that is nearest to each of P points of an element, for K pairs. (K, P)"""
 
     distances: Tensor  # metres
     segments: Tensor  # number of the segment that it lies on
@@ -20,9 +20,9 @@ class LinePlaces(NamedTuple):
 
 
 def nearest_places(points: Tensor, lines: Tensor) -> LinePlaces:
-    """Return the nearest places on lines. (N, P, 2), (M, Q, 2) metres -> (N, M, P)"""
-    starts, steps = lines[None, :, None, :-1], lines.diff(dim=1)[None, :, None]
-    away = points[:, None, :, None] - starts  # (N, M, P, Q - 1, 2)
+    """Return the nearest places on lines, pair by pair. (K, P, 2), (K, Q, 2) metres -> (K, P)"""
+    starts, steps = lines[:, None, :-1], lines.diff(dim=1)[:, None]
+    away = points[:, :, None] - starts  # (K, P, Q - 1, 2)
     shares = (away * steps).sum(-1) / steps.square().sum(-1).clamp(min=_SHORT)
     kept = shares.clamp(0.0, 1.0)
     distances, segments = (away - kept[..., None] * steps).norm(dim=-1).min(-1)
@@ -52,15 +52,19 @@ def seen_again(
         known_labels: Their classes. (M,)
         gate_m: Largest distance, in metres, of an element from its line, and of a point.
     """
-    if not len(labels) or not len(known_labels):
+    rows, cols = (labels[:, None] == known_labels).nonzero(as_tuple=True)  # K pairs of one class
+    if not len(rows):
         return now
-    places = nearest_places(now.means, known.means)
+    places = nearest_places(now.means[rows], known.means[cols])
     count = places.beside.sum(-1)
-    mean = (places.distances * places.beside).sum(-1) / count.clamp(min=1)
-    fits = (labels[:, None] == known_labels) & (count > 1) & (mean < gate_m)  # (N, M)
-    line = mean.masked_fill(~fits, torch.inf).argmin(1)
-    rows = torch.arange(len(labels), device=labels.device)
-    distances, segments, shares, beside = (values[rows, line] for values in places)  # (N, P)
+    mean = (places.distances * places.beside).sum(-1) / count.clamp(min=1)  # (K,)
+    apart = mean.new_full((len(labels), len(known_labels)), torch.inf)
+    apart[rows, cols] = mean.masked_fill((count < 2) | (mean >= gate_m), torch.inf)
+    pairs = torch.zeros_like(apart, dtype=torch.long)
+    pairs[rows, cols] = torch.arange(len(rows), device=rows.device)
+    nearest, line = apart.min(1)
+    chosen = pairs.gather(1, line[:, None])[:, 0]
+    distances, segments, shares, beside = (values[chosen] for values in places)  # (N, P)
     line, shares = line[:, None], shares[..., None]
     starts, ends = known.means[line, segments], known.means[line, segments + 1]
     spread = covariances(known)
@@ -73,7 +77,8 @@ def seen_again(
     gain = toward / (normal.mT @ (toward + spread @ normal))
     means = now.means + (gain @ (normal.mT @ offset[..., None]))[..., 0]
     updated = with_covariances(means, own - gain @ toward.mT, now.rotations)
-    known_here = fits.any(1)[:, None] & beside & (distances < gate_m) & (along.norm(dim=-1) > 0.5)
+    known_here = (nearest < gate_m)[:, None] & beside & (distances < gate_m)
+    known_here &= along.norm(dim=-1) > 0.5  # a segment without length has no direction
     return Gaussians(
         torch.where(known_here[..., None], updated.means, now.means),
         torch.where(known_here[..., None], updated.scales, now.scales),
