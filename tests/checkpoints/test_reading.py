@@ -197,6 +197,23 @@ def test_a_model_is_tested_with_the_settings_of_its_checkpoint(small, tmp_path):
     assert adopt_settings(small, save(path, {"w": torch.ones(1)}), None) == []
 
 
+def test_the_memory_of_elements_is_the_configs_for_it_is_not_trained(small, tmp_path):
+    small.model.map_head.type = "GSMapHead"
+    trained = plain(small.model.to_dict())
+    path = with_settings(tmp_path / "a.pth", trained)
+    small.model.temporal = {"elements": {"gate_m": 2.0}}
+    assert adopt_settings(small, path, None) == []
+    assert small.model.temporal == {"elements": {"gate_m": 2.0}}
+    small.model.temporal = None
+    with_settings(path, {**trained, "temporal": {"elements": {}}})
+    assert adopt_settings(small, path, None) == []
+    assert small.model.temporal is None
+    with_settings(path, {**trained, "temporal": {"bev": {}, "embed_dims": 16, "elements": {}}})
+    small.model.temporal = {"elements": {"gate_m": 2.0}}
+    adopt_settings(small, path, None)
+    assert small.model.temporal == {"bev": {}, "embed_dims": 16, "elements": {"gate_m": 2.0}}
+
+
 @pytest.mark.parametrize(
     ("part", "value", "message"),
     [

@@ -153,8 +153,9 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
 
     Test images are scaled to the size that it was trained at, unless ``cfg_options`` set the scale.
     If it was trained with vehicle signals, those of samples without are computed from their poses.
-    How training started (`STARTS`) is left out. Parts that were never trained are refused when the
-    weights are loaded, unless the config sets ``model.allow_untrained``.
+    How training started (`STARTS`) is left out, and ``temporal.elements`` stays the config's. Parts
+    that were never trained are refused when the weights are loaded, unless the config sets
+    ``model.allow_untrained``.
 
     Args:
         cfg: The config; its ``model`` and ``test_dataloader`` change.
@@ -211,7 +212,7 @@ def _model_of(
 ) -> tuple[dict[str, Any], ConfigDict]:
     """Return a checkpoint's settings, checked, and with overrides; a model can be built of both."""
     try:
-        settings = checked(settings, config)
+        settings = _with_elements_of(checked(settings, config), config)
         own = Config({"model": settings})
         own.merge_from_dict(options)
         with building(own):
@@ -223,6 +224,15 @@ def _model_of(
             f"trained with, or, {_REMEDY}"
         ) from error
     return settings, own.model
+
+
+def _with_elements_of(settings: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
+    """Return a checkpoint's settings with the config's memory of elements, which is not trained."""
+    temporal, wanted = settings.get("temporal"), config.get("temporal") or {}
+    kept = dict(temporal) if isinstance(temporal, dict) else {}
+    kept.pop("elements", None)
+    kept |= {name: value for name, value in wanted.items() if name == "elements"}
+    return settings if kept == (temporal or {}) else {**settings, "temporal": kept or None}
 
 
 def load_weights(model: nn.Module, path: str | Path) -> None:
