@@ -4,10 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 import torch
 from head_cases import GSMAP, HEAD, build_head
 from mmengine.structures import InstanceData
 from model_cases import build_small, make_images, make_samples, small_config, straight_elements
+from vectormapnet_cases import head as line_head
 
 from gsmap.apis.export import ExportedDetector
 from gsmap.models.streams.element_memory import ElementMemory
@@ -51,7 +53,6 @@ ZERO = torch.zeros(1, dtype=torch.long)
 
 
 def test_nearest_places_are_shapelys():
-    shapely = pytest.importorskip("shapely")
     generator = np.random.default_rng(0)
     points, lines = generator.normal(size=(3, 6, 2)) * 5, generator.normal(size=(3, 5, 2)) * 5
     found = nearest_places(torch.tensor(points), torch.tensor(lines))
@@ -172,9 +173,17 @@ def test_no_onnx_file_leaves_out_the_memory_of_elements_in_silence():
         ExportedDetector(remembering(elements={}))
 
 
+def test_the_defaults_are_those_of_the_measured_figures():
+    elements = memory()
+    assert (elements.gate_m, elements.min_score, elements.noise_m) == (3.0, 0.05, 0.05)
+    assert elements.noise_rad == math.radians(0.15)
+
+
 def test_settings_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"temporal.elements needs a head with Gaussians"):
         StreamMemory(build_head(HEAD), elements={})
+    with pytest.raises(ValueError, match="needs a head with Gaussians, got VectorMapNetHead"):
+        StreamMemory(line_head(), elements={})
     with pytest.raises(ValueError, match="gate_m > 0"):
         memory(gate_m=0.0)
     with pytest.raises(ValueError, match="temporal needs bev"):

@@ -228,11 +228,14 @@ def _model_of(
 
 def _with_elements_of(settings: dict[str, Any], config: dict[str, Any]) -> dict[str, Any]:
     """Return a checkpoint's settings with the config's memory of elements, which is not trained."""
-    temporal, wanted = settings.get("temporal"), config.get("temporal") or {}
-    kept = dict(temporal) if isinstance(temporal, dict) else {}
-    kept.pop("elements", None)
-    kept |= {name: value for name, value in wanted.items() if name == "elements"}
-    return settings if kept == (temporal or {}) else {**settings, "temporal": kept or None}
+    elements = (config.get("temporal") or {}).get("elements")
+    temporal = settings.get("temporal") or {}
+    if not isinstance(temporal, dict) or temporal.get("elements") == elements:
+        return settings
+    kept = {name: value for name, value in temporal.items() if name != "elements"}
+    if elements is not None:
+        kept["elements"] = elements
+    return {**settings, "temporal": kept or None}
 
 
 def load_weights(model: nn.Module, path: str | Path) -> None:

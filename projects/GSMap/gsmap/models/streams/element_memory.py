@@ -9,12 +9,12 @@ from mmdet3d.registry import MODELS
 from mmengine.structures import InstanceData
 from torch import Tensor
 
+from gsmap.models.maptr.head import MapHead
 from gsmap.structures.gaussians import Gaussians, moved_gaussians
 from gsmap.structures.line_update import seen_again
 from gsmap.structures.past import Past
 
 PREFIX = "element_"
-_FIELDS = {"means": "pts", "scales": "scales", "rotations": "rotations"}  # of detections
 
 
 @MODELS.register_module()
@@ -45,7 +45,7 @@ class ElementMemory:
         noise_m: float = 0.05,
         noise_deg: float = 0.15,
     ) -> None:
-        if "scales" not in head.reference.outputs:
+        if not isinstance(head, MapHead) or "scales" not in head.reference.outputs:
             raise ValueError(
                 f"temporal.elements needs a head with Gaussians, got {type(head).__name__}: take "
                 "GSMapHead, or leave it out."
@@ -63,16 +63,17 @@ class ElementMemory:
         """Return a batch's detections, as the head predicts them, with updated Gaussians."""
         if f"{PREFIX}labels" not in past.memory:
             return list(results)
-        known = Gaussians(*(past.memory[f"{PREFIX}{name}"] for name in _FIELDS))
+        labels = past.memory[f"{PREFIX}labels"]
+        known = Gaussians(*(past.memory[f"{PREFIX}{name}"] for name in Gaussians._fields))
         spread = past.seconds.sqrt()
         drift = self.noise_m * spread, self.noise_rad * spread
         moved = moved_gaussians(known, past.now_from_then, *drift)
         return [
-            self._update(found, Gaussians(*(values[index] for values in moved)), labels)
-            if past.continues[index]
+            self._update(found, Gaussians(*(values[index] for values in moved)), labels[index])
+            if goes_on
             else found
-            for index, (found, labels) in enumerate(
-                zip(results, past.memory[f"{PREFIX}labels"], strict=True)
+            for index, (found, goes_on) in enumerate(
+                zip(results, past.continues.tolist(), strict=True)
             )
         ]
 
@@ -105,7 +106,7 @@ class ElementMemory:
             for row, part in zip(rows, values, strict=True):
                 row[: len(part)] = part
             frames.append([rows[0] - 1, *rows[1:]])  # label -1: no element
-        names = ["labels", *_FIELDS]
+        names = ["labels", *Gaussians._fields]
         return {
             f"{PREFIX}{name}": torch.stack(parts)
             for name, parts in zip(names, zip(*frames, strict=True), strict=True)
