@@ -251,9 +251,9 @@ from gsmap.utils.cli import run_command
 signal.signal(signal.SIGINT, signal.default_int_handler)  # these tests may run in the background
 def command():
     if os.fork() == 0:
-        print("ready", flush=True)
         time.sleep(1)
         os._exit(0)
+    print("ready", flush=True)  # by the parent: Python ignores what is raised at the end of a fork
     time.sleep(60)
 run_command(command, heed_kill=False)
 """

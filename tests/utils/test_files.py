@@ -95,7 +95,7 @@ def test_what_a_killed_writer_left_goes_with_the_next_write_and_nothing_else(tmp
         write_text(path, "beside a living writer")
         assert leftovers(tmp_path) == [half]
         writer.kill()
-    (tmp_path / half.replace("a.", "folder.")).mkdir()
+    (tmp_path / f"folder{half.removeprefix('a')}").mkdir()
     foreign = half[: half.index("-") - 8] + "0" * 8 + half[half.index("-") :]  # another machine's
     (rested := tmp_path / f"rested_{foreign}").touch()
     os.utime(rested, (0, 0))
