@@ -21,15 +21,25 @@ class LinePlaces(NamedTuple):
 
 def nearest_places(points: Tensor, lines: Tensor) -> LinePlaces:
     """Return the nearest places on lines, pair by pair. (K, P, 2), (K, Q, 2) metres -> (K, P)"""
-    starts, steps = lines[:, None, :-1], lines.diff(dim=1)[:, None]
-    away = points[:, :, None] - starts  # (K, P, Q - 1, 2)
-    shares = (away * steps).sum(-1) / steps.square().sum(-1).clamp(min=_SHORT)
+    points, lines = points.mT.contiguous(), lines.mT.contiguous()  # many points along the last axis
+    starts, steps = lines[:, :, None, :-1], lines.diff(dim=-1)[:, :, None]
+    away = points[..., None] - starts  # (K, 2, P, Q - 1)
+    shares = (away * steps).sum(1) / steps.square().sum(1).clamp(min=_SHORT)
     kept = shares.clamp(0.0, 1.0)
-    distances, segments = (away - kept[..., None] * steps).norm(dim=-1).min(-1)
+    squares, segments = (away - kept[:, None] * steps).square().sum(1).min(-1)
     own, kept = (values.gather(-1, segments[..., None])[..., 0] for values in (shares, kept))
     before = (segments == 0) & (own < 0)
-    behind = (segments == lines.shape[1] - 2) & (own > 1)
-    return LinePlaces(distances, segments, kept, ~(before | behind))
+    behind = (segments == lines.shape[-1] - 2) & (own > 1)
+    return LinePlaces(squares.sqrt(), segments, kept, ~(before | behind))
+
+
+def _worth_measuring(
+    now: Gaussians, labels: Tensor, known: Gaussians, known_labels: Tensor, gate_m: float
+) -> tuple[Tensor, ...]:
+    """Return the K pairs of one class whose boxes are less than the gate apart. (K,), (K,)"""
+    (low, high), (known_low, known_high) = (part.means.aminmax(dim=1) for part in (now, known))
+    gaps = torch.maximum(low[:, None] - known_high, known_low - high[:, None]).amax(-1)  # (N, M)
+    return ((labels[:, None] == known_labels) & (gaps < gate_m)).nonzero(as_tuple=True)
 
 
 def seen_again(
@@ -52,7 +62,7 @@ def seen_again(
         known_labels: Their classes. (M,)
         gate_m: Largest distance, in metres, of an element from its line, and of a point.
     """
-    rows, cols = (labels[:, None] == known_labels).nonzero(as_tuple=True)  # K pairs of one class
+    rows, cols = _worth_measuring(now, labels, known, known_labels, gate_m)
     if not len(rows):
         return now
     places = nearest_places(now.means[rows], known.means[cols])

@@ -117,7 +117,7 @@ class BEVMemory(nn.Module, AddsWeights):
         joined = torch.cat([hidden, feats], 1)
         update, reset = self.convz(joined).sigmoid(), self.convr(joined).sigmoid()
         candidate = self.convq(torch.cat([reset * hidden, feats], 1))
-        fused = (1 - update) * hidden + update * candidate
+        fused = torch.lerp(hidden, candidate, update)
         return self.ln(fused.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
     def kept(self, fused: Tensor) -> Tensor:
