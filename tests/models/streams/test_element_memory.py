@@ -14,7 +14,7 @@ from vectormapnet_cases import head as line_head
 from gsmap.apis.export import ExportedDetector
 from gsmap.models.streams.element_memory import ElementMemory
 from gsmap.models.streams.memory import StreamMemory
-from gsmap.structures.gaussians import Gaussians, covariances
+from gsmap.structures.gaussians import Gaussians, covariances, gaussians_along
 from gsmap.structures.line_update import nearest_places, seen_again
 from gsmap.structures.past import Past
 from gsmap.structures.rigid import rigid
@@ -95,6 +95,30 @@ def test_of_two_lines_the_nearer_one_is_seen_again():
     torch.testing.assert_close(found.means[0, :, 0], torch.full((9,), 0.7).double())
 
 
+def test_among_many_lines_an_element_is_updated_as_by_the_nearest_one_alone():
+    """Lines whose boxes are too far apart are not measured, which must change nothing."""
+    torch.manual_seed(0)
+    gate_m = 4.0
+    starts, steps = torch.rand(2, 24, 1, 2).double() * 24 - 12, torch.rand(2, 24, 1, 2) - 0.5
+    places = starts + steps * torch.arange(9.0)[:, None]
+    now, known = (gaussians_along(points, 0.3) for points in places)
+    labels = torch.arange(24) % 2
+    found = seen_again(now, labels, known, labels, gate_m)
+    for index, points in enumerate(places[0]):
+        same = (labels == labels[index]).nonzero()[:, 0]
+        near = nearest_places(points.expand(len(same), -1, -1), known.means[same])
+        mean = (near.distances * near.beside).sum(-1) / near.beside.sum(-1).clamp(min=1)
+        mean[near.beside.sum(-1) < 2] = torch.inf
+        one = same[mean.argmin()][None]
+        own = Gaussians(*(part[index, None] for part in now))
+        alone = seen_again(
+            own, labels[one], Gaussians(*(part[one] for part in known)), labels[one], gate_m
+        )
+        torch.testing.assert_close(found.means[index], alone.means[0])
+    updated = (found.means - now.means).abs().amax((1, 2)) > 0
+    assert 4 < int(updated.sum()) < 24
+
+
 def test_what_a_frame_leaves_moves_with_the_vehicle_and_grows_by_the_noise():
     elements = memory(noise_m=0.2, noise_deg=0.0)
     left = elements.left([detected(line(2.0))])
@@ -166,6 +190,14 @@ def test_a_detector_updates_its_elements_from_the_second_frame_on():
     assert torch.equal(second.scores_3d, updated[1].scores_3d)
     assert not torch.allclose(second.pts, updated[1].pts)
     assert float(updated[1].scales.mean()) < float(second.scales.mean())
+
+
+def test_elements_alone_need_no_poses_in_training():
+    model = remembering(elements={}).train()
+    torch.manual_seed(0)
+    losses = model.loss(make_images(1), make_samples(straight_elements()))
+    assert torch.isfinite(sum(losses.values()))
+    assert model.temporal.streams.states == []
 
 
 def test_no_onnx_file_leaves_out_the_memory_of_elements_in_silence():

@@ -124,6 +124,9 @@ class StreamMemory(BaseModule):
         Yields:
             The outputs, with ``bev_feats`` of all frames so far and ``query_memory`` for the head.
         """
+        if self.training and self.bev is None and self.queries is None:
+            yield outputs  # elements take no part in training, which needs no poses for them
+            return
         frames = [Frame.of(meta) for meta in metas]
         before = self.streams.previous(frames)
         outputs = self.enter(outputs, recalled(frames, before, outputs["bev_feats"].device))
