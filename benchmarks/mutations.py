@@ -58,17 +58,12 @@ def run(args: argparse.Namespace) -> None:
         places = [(n, i) for n, f in modules.items() for i in range(count_places(f.read_text()))]
         share = (args.number + number) // len(args.rooms)
         drawn = [places[k] for k in rng.permutation(len(places))[:share]]
-        every = tests_of(room, None)
-        if verdict("", "", every, None) != SURVIVED:
+        if verdict("", "", tests_of(room, None), None) != SURVIVED:
             raise ValueError(f"the tests of {room} fail without a mutation: mend them first.")
         found = []
         for name, index in drawn:
             line, change, source = mutant(modules[name].read_text(), index)
-            near = tests_of(room, name)
-            result = verdict(name, source, near, args.seconds)
-            if result == SURVIVED and (others := [path for path in every if path not in near]):
-                result = verdict(name, source, others, args.seconds)
-            found.append(result)
+            found.append(verdict_of_room(room, name, source, args.seconds))
             print(f"{found[-1]}: {modules[name].relative_to(REPO)}:{line} {change}", flush=True)
         rows.append([room, str(len(found)), *(str(found.count(v)) for v in VERDICTS)])
     print(markdown_table(["room", "mutants", *VERDICTS], rows))
@@ -153,6 +148,14 @@ def _changes(node: ast.expr) -> list[dict[str, object]]:
         case ast.Attribute(attr=name) if name in NAMES:
             return [{"attr": NAMES[name]}]
     return []
+
+
+def verdict_of_room(room: str, module: str, source: str, seconds: float) -> str:
+    """Return the `verdict` of the nearest tests, or of the room's others if these all pass."""
+    near = tests_of(room, module)
+    result = verdict(module, source, near, seconds)
+    others = [path for path in tests_of(room, None) if path not in near]
+    return verdict(module, source, others, seconds) if result == SURVIVED and others else result
 
 
 def verdict(module: str, source: str, tests: Sequence[str], seconds: float | None) -> str:

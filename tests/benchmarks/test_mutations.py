@@ -42,12 +42,31 @@ def test_each_place_changes_alone_and_types_and_messages_do_not():
 
 
 def test_tests_of_a_module_are_those_of_its_room_that_import_it():
-    tests = mutations.tests_of("gsmap.structures.rigid", "structures")
+    tests = mutations.tests_of("structures", "gsmap.structures.rigid")
     names = [Path(path).name for path in tests]
     assert {"test_rigid.py", "test_vehicle_signals.py"} <= set(names)
+    assert set(tests) < set(mutations.tests_of("structures", None))
     modules = mutations.modules_of("structures")
     assert modules["gsmap.structures.rigid"].name == "rigid.py"
     assert "gsmap.ops.raster_loss.numba" not in mutations.modules_of("ops")
+
+
+@pytest.mark.parametrize("nearest", ["caught", "not caught", "timed out"])
+def test_only_what_the_nearest_tests_miss_meets_the_others_of_the_room(nearest, monkeypatch):
+    asked = []
+
+    def verdict(_module, _source, tests, _seconds):
+        asked.append([Path(path).name for path in tests])
+        return nearest if len(asked) == 1 else "caught"
+
+    monkeypatch.setattr(mutations, "verdict", verdict)
+    mutations.verdict_of_room("structures", "gsmap.structures.rigid", "", 1.0)
+    near, *others = asked
+    assert "test_rigid.py" in near
+    assert len(others) == (nearest == "not caught")
+    for files in others:
+        assert "test_gaussians.py" in files
+        assert not set(near) & set(files)
 
 
 @pytest.mark.parametrize(
