@@ -42,8 +42,9 @@ def test_the_loss_moves_gaussians_onto_the_line(ran):
 
 
 def test_a_model_sees_images_in_memory(ran):
-    shipped = ("gsmap", "gsmap_lines_errors", "gsmap_mgmapnet", "gsmap_mgmapnet_errors", "maptr")
-    assert ran["list_models"]()[:5] == [f"{name}_r18_minicity" for name in shipped]
+    shipped = ("gsmap", "gsmap_lines_errors", "gsmap_mgmapnet", "gsmap_mgmapnet_errors")
+    shipped = (*shipped, "gsmap_stream_finetune", "maptr")
+    assert ran["list_models"]()[:6] == [f"{name}_r18_minicity" for name in shipped]
     assert not ran["model"].training
     assert len(ran["elements"]) > 0
     assert ran["elements"].has_gaussians

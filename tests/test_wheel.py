@@ -90,7 +90,8 @@ def test_every_config_of_the_wheel_finds_its_bases(site, tmp_path):
 
 def test_the_wheel_holds_the_models_that_ship_and_scripts_that_run(site):
     shipped = {path.name for path in (site / "gsmap/.mim/models").iterdir()}
-    names = ("gsmap", "gsmap_lines_errors", "gsmap_mgmapnet", "gsmap_mgmapnet_errors", "maptr")
+    names = ("gsmap", "gsmap_lines_errors", "gsmap_mgmapnet", "gsmap_mgmapnet_errors")
+    names = (*names, "gsmap_stream_finetune", "maptr")
     weights = {f"{name}_r18_minicity.pth" for name in names}
     assert shipped == {"registry.json", "README.md", *weights}
     assert not (site / "gsmap/gone.py").exists()

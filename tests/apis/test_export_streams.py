@@ -21,7 +21,11 @@ STREAMS = {
     "GSMap": ("projects/GSMap/configs/gsmap_stream_r18_minicity.py", {}),
     "GSMap, small state": (
         "projects/GSMap/configs/gsmap_stream_r18_minicity.py",
-        {"model.temporal.half": True, "model.temporal.bev.kept_dims": 32},
+        {
+            "model.temporal.half": True,
+            "model.temporal.bev.kept_dims": 32,
+            "model.temporal.queries.covariance": "fused",
+        },
     ),
 }
 

@@ -93,7 +93,8 @@ def test_a_wrong_name_gets_the_nearest_right_one():
         find_config("gsmap_r18_minicty")
     with pytest.raises(FileNotFoundError, match=r"did you mean maptr_r18_minicity\?"):
         find_checkpoint("models/maptr_r18_minicty.pth")
-    shipped = ("gsmap", "gsmap_lines_errors", "gsmap_mgmapnet", "gsmap_mgmapnet_errors", "maptr")
+    shipped = ("gsmap", "gsmap_lines_errors", "gsmap_mgmapnet", "gsmap_mgmapnet_errors")
+    shipped = (*shipped, "gsmap_stream_finetune", "maptr")
     names = ", ".join(f"{name}_r18_minicity" for name in shipped)
     with pytest.raises(FileNotFoundError, match=rf"x\.pth.*{names}"):
         find_checkpoint("x.pth")

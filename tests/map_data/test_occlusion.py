@@ -89,7 +89,7 @@ def test_a_sample_without_boxes_or_map_has_nothing_hidden(tmp_path):
 
 
 def test_shares_have_words_that_sort():
-    words = [word_for(share, (5, 20)) for share in (0, 0.049, 0.05, 0.2, 1.0)]
+    words = [word_for(share, (5, 20)) for share in (0, 0.0499, 0.05, 0.2, 1.0)]
     assert words == ["00-05 % hidden"] * 2 + ["05-20 % hidden"] + ["20-100 % hidden"] * 2
 
 

@@ -25,6 +25,20 @@ def test_conversions_by_hand_and_back(kind):
     np.testing.assert_allclose(NUSCENES.metres_from_norm(norm), points, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("grid", "front_left", "rear_right", "ahead"),
+    [
+        (NUSCENES, (-15.0, 30.0), (15.0, -30.0), (0.0, 15.0)),  # x to the right, y ahead
+        (BEVGrid((-30, 30), (-15, 15)), (30.0, 15.0), (-30.0, -15.0), (15.0, 0.0)),  # x ahead
+    ],
+)
+def test_the_map_from_its_front_edge_and_from_its_left(grid, front_left, rear_right, ahead):
+    points = np.array([front_left, rear_right, ahead])
+    found = grid.front_from_metres(points)
+    np.testing.assert_allclose(found, [[0, 0], [1, 1], [0.25, 0.5]], atol=1e-12)
+    np.testing.assert_allclose(grid.metres_from_front(found), points, atol=1e-12)
+
+
 def test_height_above_ground_is_kept():
     points = torch.tensor([[3.0, 6.0, 1.7]])
     torch.testing.assert_close(NUSCENES.norm_from_metres(points), torch.tensor([[0.6, 0.6, 1.7]]))

@@ -236,7 +236,8 @@ def test_a_missing_checkpoint_is_named(tiny_config):
     assert done.stderr == (
         "error: There is no checkpoint nowhere.pth, and no model of that name (gsmap_r18_minicity, "
         "gsmap_lines_errors_r18_minicity, gsmap_mgmapnet_r18_minicity, "
-        "gsmap_mgmapnet_errors_r18_minicity, maptr_r18_minicity ship).\n"
+        "gsmap_mgmapnet_errors_r18_minicity, gsmap_stream_finetune_r18_minicity, "
+        "maptr_r18_minicity ship).\n"
     )
 
 
