@@ -208,8 +208,9 @@ def test_drawing_names_bad_arguments(change, match):
 
 
 def test_soft_rasters_name_bad_arguments():
-    with pytest.raises(ValueError, match="softness must be > 0"):
-        soft_rasters(torch.zeros(1, 3, 2), 4, 4, line_softness=0.0)
+    for kind in ("line_softness", "polygon_softness"):
+        with pytest.raises(ValueError, match="softness must be > 0"):
+            soft_rasters(torch.zeros(1, 3, 2), 4, 4, **{kind: 0.0})
     with pytest.raises(ValueError, match=r"distance must be one of .* got 'cubed'"):
         soft_rasters(torch.zeros(1, 3, 2), 4, 4, distance="cubed")
     with pytest.raises(ValueError, match=r"vertices must have shape \(n, V, 2\)"):

@@ -55,6 +55,14 @@ def small_attention(**kwargs):
     return GeometryDecoupledAttention(8, 2, num_points=3, ffn_dims=16, **kwargs).eval()
 
 
+def test_the_defaults_are_the_releases():
+    attention = GeometryDecoupledAttention()
+    assert attention.num_points == 20
+    for block in (attention.inter, attention.intra):
+        assert (block.attention.embed_dim, block.attention.num_heads) == (256, 8)
+        assert (block.ffn[0].out_features, block.attention.dropout) == (1024, 0.1)
+
+
 def test_the_first_step_sees_other_instances_and_the_second_ones_own():
     attention, query = small_attention(), torch.randn(1, 12, 8, requires_grad=True)
     output = attention(query)
