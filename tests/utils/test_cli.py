@@ -243,6 +243,26 @@ run_command(command, heed_kill={heed_kill})
     assert len(os.listdir(tmp_path)) == left
 
 
+def test_ctrl_c_that_arrives_while_an_error_is_told_is_one_line(capsys, monkeypatch):
+    """A rank in a collective hears of its peers' end before it can heed the signal itself."""
+
+    class PeerError(ValueError):
+        def __str__(self) -> str:
+            signal.raise_signal(signal.SIGINT)
+            return "closed by peer"
+
+    monkeypatch.delenv("RANK", raising=False)
+    before = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(SystemExit) as left:
+            run_command(lambda: fail(PeerError()))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert left.value.code == 130
+    assert capsys.readouterr().err == "interrupted: nothing half-written is left\n"
+
+
 def test_ctrl_c_is_one_line_with_forked_workers_and_none_from_other_ranks(tmp_path):
     """A terminal sends it to the whole group: workers of a data loader, all ranks of a machine."""
     program = """

@@ -64,21 +64,22 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     if heed_kill and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup wants it
         signal.signal(signal.SIGHUP, end)
     try:
-        text = command()
-        if text is not None:
-            sys.stdout.write(f"{text}\n")
-        sys.stdout.flush()
-    except KeyboardInterrupt:
+        try:
+            text = command()
+            if text is not None:
+                sys.stdout.write(f"{text}\n")
+            sys.stdout.flush()
+        except Exception as error:
+            if not _say(error):
+                raise
+            sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:  # also of a rank whose peers' end was an error before
         if is_first_rank():
             sys.stderr.write("interrupted: nothing half-written is left\n")
         if "RANK" in os.environ and not heed_kill:
             sys.stderr.flush()
             os._exit(128 + signal.SIGINT)  # the interpreter's own end would wait for other ranks
         sys.exit(128 + signal.SIGINT)
-    except Exception as error:
-        if not _say(error):
-            raise
-        sys.exit(BAD_INPUT)
 
 
 def _say(error: BaseException | None) -> bool:
