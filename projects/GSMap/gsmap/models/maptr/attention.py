@@ -17,7 +17,12 @@ from mmdet3d.registry import MODELS
 from mmengine.model import constant_init, xavier_init
 from torch import Tensor, nn
 
-from gsmap.ops.deformable_sampling import bilinear_cells, deformable_sample, sum_rows
+from gsmap.ops.deformable_sampling import (
+    bilinear_cells,
+    deformable_sample,
+    has_kernel,
+    sum_rows,
+)
 from gsmap.structures.tensors import at_least_float32
 
 _IM2COL_STEP = 64
@@ -32,13 +37,15 @@ def has_compiled_op(value: Tensor) -> bool:
 def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor) -> Tensor:
     """Do what `deformable_sample` does, by mmcv's compiled op on a GPU where it was built.
 
+    A kernel of `deformable_sample` that is switched on goes first.
+
     Args:
         value: Cells of the map, row by row. (B, H * W, heads, C)
         shape: Rows H and columns W of the map.
         locations: (x, y) in [0, 1] over the map. (B, Q, heads, S, 2)
         weights: Weight of each sample. (B, Q, heads, S)
     """
-    if not has_compiled_op(value):
+    if has_kernel(value) or not has_compiled_op(value):
         return deformable_sample(value, shape, locations, weights)
     shapes = torch.tensor([shape], device=value.device)
     samples = locations[:, :, :, None].contiguous(), weights[:, :, :, None].contiguous()
@@ -149,7 +156,7 @@ class BEVDeformableAttention(SamplingAttention):
         weights = self.weights(query)
         # Projection and sampling commute: projecting after it pays when few cells are looked at.
         few = weights.numel() * _CORNERS < tokens[..., 0].numel() * self.num_heads
-        if few and not has_compiled_op(tokens):
+        if few and not (has_kernel(tokens) or has_compiled_op(tokens)):
             sampled = self._sample_then_project(tokens, shape, locations, weights)
         else:
             sampled = sample_map(self.values(tokens), shape, locations, weights)

@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsmap.ops.backends import choose_backend, fused_operator
+from gsmap.structures.tensors import at_least_float32
 
 _sum_rows = fused_operator(
     "deformable_sampling.sum_rows",
@@ -12,28 +13,58 @@ _sum_rows = fused_operator(
     lambda table, weights, rows: (len(rows), table.shape[1]),
     differentiable=2,
 )
+_deformable_sample = fused_operator(
+    "deformable_sampling.deformable_sample",
+    "Tensor value, Tensor locations, Tensor weights, int height, int width",
+    lambda value, locations, *_: (*locations.shape[:3], value.shape[3]),
+    differentiable=3,
+    dtype=torch.float32,
+)
+
+
+def has_kernel(value: Tensor) -> bool:
+    """Return whether `deformable_sample` samples a map by one kernel, if it chooses itself."""
+    like = at_least_float32(value[:0])
+    return choose_backend("auto", like, ("triton",), "deformable_sample") == "triton"
 
 
 def deformable_sample(
-    value: Tensor, shape: tuple[int, int], locations: Tensor, weights: Tensor
+    value: Tensor,
+    shape: tuple[int, int],
+    locations: Tensor,
+    weights: Tensor,
+    backend: str = "auto",
 ) -> Tensor:
     """Sum bilinear samples of a map, each head with its own places (Deformable DETR Eq. 2).
 
     Each output row is one weighted bag of table rows: no tensor of samples in between. The heads'
-    sums are concatenated. -> (B, Q, heads * C)
+    sums are concatenated, in the wider type of map and weights, at least float32.
+    -> (B, Q, heads * C)
 
     Args:
-        value: Flattened map, row-major. (B, H * W, heads, C)
+        value: Flattened map, row-major, also in half precision. (B, H * W, heads, C)
         shape: Rows and columns of the map.
         locations: Sampling points (x, y), [0, 1] over the map. (B, Q, heads, S, 2)
         weights: Attention weights. (B, Q, heads, S)
+        backend: As in `sum_rows`; ``"triton"`` is one kernel forward and one backward, which adds
+            the map's gradient up in any order.
+
+    Raises:
+        ValueError: If ``backend`` does not serve.
     """
+    dtype = torch.promote_types(torch.promote_types(value.dtype, weights.dtype), torch.float32)
+    locations, weights = locations.to(dtype), weights.to(dtype)
+    if backend in ("auto", "triton"):
+        fused = choose_backend(backend, weights, ("triton",), "deformable_sample")
+        if fused == "triton":
+            return _deformable_sample(value, locations, weights, *shape, fused).flatten(2)
+    value = value.to(dtype)
     batch, num_cells, heads, channels = value.shape
     cells, cell_weights = bilinear_cells(locations, weights, shape)  # (B, Q, heads, 4 S)
     sample = torch.arange(batch, device=value.device).view(-1, 1, 1, 1)
     head = torch.arange(heads, device=value.device).view(1, 1, -1, 1)
     rows = (sample * num_cells + cells) * heads + head
-    return sum_rows(value.reshape(-1, channels), rows, cell_weights).flatten(2)
+    return sum_rows(value.reshape(-1, channels), rows, cell_weights, backend).flatten(2)
 
 
 def bilinear_cells(

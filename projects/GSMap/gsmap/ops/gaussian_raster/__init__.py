@@ -42,7 +42,7 @@ def render_gaussians(
     gaussians = torch.cat([means, scales, rotations[..., None]], -1)  # (..., P, 5), the widest type
     gaussians = at_least_float32(gaussians)
     with torch.autocast(means.device.type, enabled=False):
-        backend = choose_backend(backend, gaussians)
+        backend = choose_backend(backend, gaussians, kernel="render_gaussians")
         if backend == "reference":
             return render_gaussians_reference(
                 gaussians[..., :2], gaussians[..., 2:4], gaussians[..., 4], grid

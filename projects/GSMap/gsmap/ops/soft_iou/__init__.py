@@ -38,7 +38,9 @@ def pairwise_soft_iou(preds: Tensor, targets: Tensor, backend: str = "auto") -> 
     preds, targets = preds.to(dtype).flatten(1), targets.to(dtype).flatten(1)  # (N, HW), (K, HW)
     wants_gradient = torch.is_grad_enabled() and (preds.requires_grad or targets.requires_grad)
     backend = choose_backend(
-        "reference" if backend == "auto" and wants_gradient else backend, preds
+        "reference" if backend == "auto" and wants_gradient else backend,
+        preds,
+        kernel="pairwise_soft_iou",
     )
     if backend == "reference":
         minima = pairwise_minima_reference(preds, targets)

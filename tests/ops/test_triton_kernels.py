@@ -1,0 +1,126 @@
+import os
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+from processes import run_python
+from triton_cases import CASES, deformable_problem
+from triton_resources import find_ptxas, launches
+
+import gsmap
+from gsmap.ops import backends
+from gsmap.ops.deformable_sampling import deformable_sample, has_kernel
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+needs_ptxas = pytest.mark.skipif(not find_ptxas(), reason="needs the assembler of Triton's wheel")
+
+
+@pytest.mark.parametrize("kernel", CASES)
+def test_kernels_equal_the_float64_reference_in_the_interpreter(kernel):
+    """A process of its own: Triton reads ``TRITON_INTERPRET`` when it is imported."""
+    pytest.importorskip("triton")
+    paths = [str(Path(__file__).parent), str(Path(gsmap.__file__).parents[1])]
+    environment = {"TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(paths)}
+    result = run_python("-c", f"import triton_cases; triton_cases.run({kernel!r})", env=environment)
+    assert result.returncode == 0, result.stderr
+
+
+@needs_gpu
+@pytest.mark.parametrize(("kernel", "name"), [(k, name) for k in CASES for name in CASES[k]])
+def test_kernels_equal_the_float64_reference_on_a_gpu(kernel, name):
+    CASES[kernel][name]("cuda")
+
+
+def call_deformable_sample(module):
+    """As MapTR's decoder: 1,000 queries of 8 heads on 200 x 100 cells."""
+    value = torch.zeros(1, 20000, 8, 32)
+    locations, weights = torch.zeros(1, 1000, 8, 4, 2), torch.zeros(1, 1000, 8, 4)
+    inputs = value, locations, weights, 200, 100
+    module.deformable_sample_backward(module.deformable_sample(*inputs), *inputs)
+
+
+LAUNCHES = {"deformable_sampling": call_deformable_sample}
+
+
+@needs_ptxas
+@pytest.mark.parametrize("folder", LAUNCHES)
+def test_kernels_compile_for_hopper_without_spills(folder, monkeypatch, record_property):
+    module = import_module(f"gsmap.ops.{folder}.triton")
+    found = launches(module, monkeypatch)
+    LAUNCHES[folder](module)
+    assert len(found) == sum(name.endswith("_kernel") for name in vars(module))
+    for name, (registers, spilled) in found.items():
+        record_property(name, registers)
+        print(f"{folder} {name}: {registers} registers, {spilled} bytes spilled")
+        assert spilled == 0
+        assert registers <= 128  # at least 16 of 64 warps at a time
+
+
+@needs_gpu
+def test_kernels_are_captured_in_a_graph():
+    """Capture forbids waits, and memory from outside of the graph's pool."""
+    leaves = [x.cuda().requires_grad_() for x in deformable_problem((21, 33), 32, 4)]
+
+    def step():
+        out = deformable_sample(leaves[0], (21, 33), *leaves[1:], backend="triton")
+        return out.detach(), *torch.autograd.grad(out.square().sum(), leaves)
+
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        expected = step()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = step()
+    graph.replay()
+    torch.testing.assert_close(captured, expected)
+
+
+def test_auto_takes_a_kernel_that_is_switched_on(monkeypatch):
+    table = torch.zeros(0, device="meta")
+    monkeypatch.setitem(backends.DEVICES, "triton", "meta")
+    monkeypatch.setitem(backends.INSTALLED, "triton", True)
+    monkeypatch.setattr(backends, "AUTO_KERNELS", {"render_gaussians"})
+    assert not has_kernel(table)
+    monkeypatch.setattr(backends, "AUTO_KERNELS", {"deformable_sample"})
+    assert has_kernel(table)
+    assert has_kernel(table.bfloat16())
+    assert not has_kernel(table.double())
+    torch.use_deterministic_algorithms(True)
+    try:
+        assert not has_kernel(table)
+        with pytest.raises(ValueError, match="adds gradients up in any order: use 'reference'"):
+            backends.choose_backend("triton", table, ("triton",), "deformable_sample")
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+def test_the_switch_names_kernels():
+    trusted = {name for name, on in backends.TRITON_KERNELS.items() if on}
+    assert backends.triton_kernels("") == trusted
+    assert backends.triton_kernels(" deformable_sample,") == trusted | {"deformable_sample"}
+    assert backends.triton_kernels("all") == set(backends.TRITON_KERNELS)
+    with pytest.raises(ValueError, match=r"GSMAP_TRITON_KERNELS names \['rasters'\]"):
+        backends.triton_kernels("rasters,deformable_sample")
+
+
+def test_gradcheck_of_the_plain_deformable_sampling():
+    leaves = [x.double().requires_grad_() for x in deformable_problem((3, 4), 2, 2, 2)]
+    assert torch.autograd.gradcheck(
+        lambda value, *places: deformable_sample(value, (3, 4), *places, "reference"), leaves
+    )
+
+
+def test_half_precision_is_summed_in_float32_by_every_backend():
+    value, locations, weights = deformable_problem((5, 7), 6, 3, dtype=torch.bfloat16)
+    out = deformable_sample(value, (5, 7), locations, weights)
+    assert out.dtype == torch.float32
+    expected = deformable_sample(value.float(), (5, 7), locations, weights)
+    torch.testing.assert_close(out, expected, atol=0, rtol=0)
+
+
+def test_an_unknown_backend_is_named():
+    value, locations, weights = deformable_problem((5, 7), 6, 3)
+    with pytest.raises(ValueError, match="does not serve tensors on cpu"):
+        deformable_sample(value, (5, 7), locations, weights, "triton")

@@ -1,0 +1,161 @@
+"""Cases that Triton's kernels are tested on, in the interpreter and on a GPU, against float64."""
+
+import pytest
+import torch
+
+from gsmap.ops.deformable_sampling import deformable_sample
+
+CASES = {}  # kernel -> name of a case -> check of a device
+
+
+def case(kernel, *variants):
+    """Register a check, called with the device and a variant's arguments."""
+
+    def register(check):
+        cases = CASES.setdefault(kernel, {})
+        for variant in variants or ((),):
+            name = " ".join([check.__name__, *map(str, variant)])
+            cases[name] = lambda device, variant=variant: check(device, *variant)
+        return check
+
+    return register
+
+
+def run(kernel):
+    """Run the cases of a kernel in Triton's interpreter, on the CPU."""
+    torch.set_num_threads(1)
+    for name, check in CASES[kernel].items():
+        try:
+            check("cpu")
+        except Exception as error:
+            raise AssertionError(f"case {name!r} of {kernel}") from error
+
+
+def values_and_gradients(function, leaves, upstream):
+    """Return the result of a function, and the gradients in its floating-point arguments."""
+    leaves = [leaf.detach().requires_grad_(leaf.is_floating_point()) for leaf in leaves]
+    out = function(*leaves)
+    wanted = [leaf for leaf in leaves if leaf.requires_grad]
+    return out.detach().cpu(), [
+        grad.cpu() for grad in torch.autograd.grad(out, wanted, upstream.to(out))
+    ]
+
+
+def compare(function, leaves, device, shape, half=False):
+    """Assert that ``function(backend, *leaves)`` gives the reference's values and gradients.
+
+    Values of size 1 are sums of up to some hundred float32 products, hence 1e-5; gradients are
+    compared as whole tensors. A gradient in half precision has its three (bfloat16: two) digits.
+    """
+    upstream = torch.randn(shape, generator=torch.Generator().manual_seed(1))
+    on_device = [leaf.to(device) for leaf in leaves]
+    out, grads = values_and_gradients(lambda *x: function("triton", *x), on_device, upstream)
+    exact = [leaf.double() if leaf.is_floating_point() else leaf for leaf in leaves]
+    true, true_grads = values_and_gradients(
+        lambda *x: function("reference", *x), exact, upstream.double()
+    )
+    assert out.dtype == torch.float32
+    assert out.shape == true.shape == torch.Size(shape)
+    torch.testing.assert_close(out, true.float(), atol=1e-5, rtol=1e-5)
+    for leaf, grad, true_grad in zip(leaves, grads, true_grads, strict=True):
+        assert grad.dtype == leaf.dtype
+        limit = 5e-3 if leaf.dtype != torch.float32 else 2e-5
+        assert (grad.double() - true_grad).norm() <= limit * true_grad.norm()
+
+
+def deformable_problem(shape, channels, samples, queries=9, spread=1.6, dtype=torch.float32):
+    """Return a map of two samples with three heads, locations around its middle, and weights."""
+    generator = torch.Generator().manual_seed(0)
+    cells = shape[0] * shape[1]
+    value = torch.randn(2, cells, 3, channels, generator=generator).to(dtype)
+    locations = torch.rand(2, queries, 3, samples, 2, generator=generator) - 0.5
+    weights = torch.randn(2, queries, 3, samples, generator=generator) / samples**0.5
+    return value, locations * spread + 0.5, weights
+
+
+@case(
+    "deformable_sample",
+    ((21, 33), 32, 1),
+    ((21, 33), 8, 20),
+    ((5, 7), 6, 3),  # channels are no power of two
+    ((1, 1), 4, 2),
+    ((3, 2), 600, 1, 2),  # a row is more than a block
+    ((21, 33), 32, 2, 0),  # no query
+    ((21, 33), 4, 4, 9, 20.0),  # far off: nearly all outside
+    ((21, 33), 4, 4, 9, 1e-3),  # all within a cell
+    ((21, 33), 16, 4, 9, 1.6, torch.bfloat16),
+    ((21, 33), 20, 4, 9, 1.6, torch.float16),
+)
+def equals_float64(device, shape, channels, samples, *further):
+    problem = deformable_problem(shape, channels, samples, *further)
+    compare(
+        lambda backend, *leaves: deformable_sample(leaves[0], shape, *leaves[1:], backend=backend),
+        problem,
+        device,
+        (*problem[2].shape[:2], 3 * channels),
+    )
+
+
+@case("deformable_sample")
+def takes_any_strides(device):
+    value, locations, weights = (x.to(device) for x in deformable_problem((5, 7), 8, 3))
+    turned = (
+        value.permute(3, 2, 1, 0).contiguous().permute(3, 2, 1, 0),
+        locations.transpose(1, 3).contiguous().transpose(1, 3),
+        weights[..., None].expand(-1, -1, -1, -1, 2)[..., 1],
+    )
+    upstream = torch.randn(2, 9, 24)
+
+    def sample(*leaves):
+        return deformable_sample(leaves[0], (5, 7), *leaves[1:], backend="triton")
+
+    plain = values_and_gradients(sample, (value, locations, weights), upstream)
+    strided = values_and_gradients(sample, turned, upstream.mT.contiguous().mT)
+    torch.testing.assert_close(strided, plain)
+
+
+@case("deformable_sample")
+def poisons_rows_of_locations_that_are_not_numbers_alone(device):
+    value, locations, weights = deformable_problem((5, 7), 6, 3)
+    clean = deformable_sample(value, (5, 7), locations, weights, "reference").unflatten(-1, (3, 6))
+    locations[0, 3, 1, 2, 0] = float("nan")
+    locations[1, 2, 0, 0] = float("inf")
+    poisoned = torch.zeros(2, 9, 3, 6, dtype=torch.bool)
+    poisoned[0, 3, 1] = poisoned[1, 2, 0] = True
+    leaves = [x.to(device) for x in (value, locations, weights)]
+    out, (in_value, *_) = values_and_gradients(
+        lambda *x: deformable_sample(x[0], (5, 7), *x[1:], backend="triton"),
+        leaves,
+        torch.ones(2, 9, 18),
+    )
+    out = out.unflatten(-1, (3, 6))
+    assert out[poisoned].isnan().all()
+    torch.testing.assert_close(out[~poisoned], clean[~poisoned])
+    assert in_value.isfinite().all()
+
+
+@case("deformable_sample")
+def works_twice_under_compile_and_autocast(device):
+    leaves = [x.to(device).requires_grad_() for x in deformable_problem((5, 7), 8, 3)]
+
+    def loss(value, locations, weights):
+        scaled = value * 2
+        out = deformable_sample(scaled, (5, 7), locations, weights, backend="triton")
+        return out.square().sum()
+
+    total = loss(*leaves)
+    first = torch.autograd.grad(total, leaves, retain_graph=True)
+    torch.testing.assert_close(torch.autograd.grad(total, leaves), first)
+    compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
+    torch.testing.assert_close(torch.autograd.grad(compiled(*leaves), leaves), first)
+    with torch.autocast(device, torch.bfloat16):
+        torch.testing.assert_close(torch.autograd.grad(loss(*leaves), leaves), first)
+
+
+@case("deformable_sample")
+def refuses_a_gradient_of_the_gradient(device):
+    leaves = [x.to(device).requires_grad_() for x in deformable_problem((5, 7), 8, 3)]
+    out = deformable_sample(leaves[0], (5, 7), *leaves[1:], backend="triton")
+    grads = torch.autograd.grad(out.square().sum(), leaves, create_graph=True)
+    with pytest.raises(RuntimeError, match="no autograd formula was registered"):
+        torch.autograd.grad(grads[0].square().sum(), leaves)
