@@ -15,6 +15,7 @@ import triton
 import triton.language as tl
 
 BLOCK = 512  # values of a program: 16 bytes a thread of float32
+OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 
 
 @triton.jit
@@ -139,7 +140,7 @@ def deformable_sample(value, locations, weights, height, width):
         sizes, grid = _layout(value, weights)
         counts = weights.shape[:3].numel(), weights.shape[1], weights.shape[2]
         with torch.cuda.device_of(value):
-            forward_kernel[grid](*tensors, *counts, height, width, **sizes, num_warps=4)
+            forward_kernel[grid](*tensors, *counts, height, width, **sizes, **OPTIONS)
     return out
 
 
@@ -154,5 +155,5 @@ def deformable_sample_backward(grads, value, locations, weights, height, width):
         sizes, grid = _layout(value, weights)
         counts = weights.shape[:3].numel(), weights.shape[1], weights.shape[2]
         with torch.cuda.device_of(value):
-            backward_kernel[grid](*tensors, *counts, height, width, **sizes, num_warps=4)
+            backward_kernel[grid](*tensors, *counts, height, width, **sizes, **OPTIONS)
     return in_value.to(value.dtype), in_locations, in_weights
