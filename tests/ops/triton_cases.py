@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from gsmap.ops.deformable_sampling import deformable_sample
+from gsmap.ops.kernel_sampling import sample_kernels
 
 CASES = {}  # kernel -> name of a case -> check of a device
 
@@ -36,12 +37,11 @@ def values_and_gradients(function, leaves, upstream):
     leaves = [leaf.detach().requires_grad_(leaf.is_floating_point()) for leaf in leaves]
     out = function(*leaves)
     wanted = [leaf for leaf in leaves if leaf.requires_grad]
-    return out.detach().cpu(), [
-        grad.cpu() for grad in torch.autograd.grad(out, wanted, upstream.to(out))
-    ]
+    grads = torch.autograd.grad(out, wanted, upstream.to(out), materialize_grads=True)
+    return out.detach().cpu(), [grad.cpu() for grad in grads]
 
 
-def compare(function, leaves, device, shape, half=False):
+def compare(function, leaves, device, shape):
     """Assert that ``function(backend, *leaves)`` gives the reference's values and gradients.
 
     Values of size 1 are sums of up to some hundred float32 products, hence 1e-5; gradients are
@@ -57,7 +57,8 @@ def compare(function, leaves, device, shape, half=False):
     assert out.dtype == torch.float32
     assert out.shape == true.shape == torch.Size(shape)
     torch.testing.assert_close(out, true.float(), atol=1e-5, rtol=1e-5)
-    for leaf, grad, true_grad in zip(leaves, grads, true_grads, strict=True):
+    floating = [leaf for leaf in leaves if leaf.is_floating_point()]
+    for leaf, grad, true_grad in zip(floating, grads, true_grads, strict=True):
         assert grad.dtype == leaf.dtype
         limit = 5e-3 if leaf.dtype != torch.float32 else 2e-5
         assert (grad.double() - true_grad).norm() <= limit * true_grad.norm()
@@ -159,3 +160,76 @@ def refuses_a_gradient_of_the_gradient(device):
     grads = torch.autograd.grad(out.square().sum(), leaves, create_graph=True)
     with pytest.raises(RuntimeError, match="no autograd formula was registered"):
         torch.autograd.grad(grads[0].square().sum(), leaves)
+
+
+def kernel_problem(shape, heads, channels, samples, queries=11, spread=1.2, dtype=torch.float32):
+    """Return maps of 2 x 3 cameras, points, weights, flags and offsets of a kernel."""
+    generator = torch.Generator().manual_seed(0)
+    value = torch.randn(2, 3, shape[0] * shape[1], heads, channels, generator=generator).to(dtype)
+    uv = (torch.rand(2, 3, queries, heads, 2, generator=generator) - 0.5) * spread + 0.5
+    weights = torch.randn(2, queries, heads, samples, generator=generator) / samples**0.5
+    seen = torch.rand(2, 3, queries, generator=generator) < 0.4
+    seen[:, 0, : queries // 2] = False  # a program's cells are all unseen by a camera
+    offsets = torch.randint(-2, 3, (samples, 2), generator=generator)
+    return value, uv, weights, seen, offsets
+
+
+def sample_kernels_by(backend, shape, bilinear):
+    """Return `sample_kernels` with the tensors of `kernel_problem` as arguments."""
+
+    def sample(value, uv, weights, seen, offsets):
+        return sample_kernels(value, shape, uv, seen, weights, offsets, bilinear, backend)
+
+    return sample
+
+
+@case(
+    "sample_kernels",
+    (False, (21, 33), 2, 16, 1),
+    (False, (21, 33), 4, 64, 15),
+    (True, (21, 33), 8, 8, 3),
+    (True, (5, 7), 3, 6, 20),  # neither heads nor channels nor the kernel are a power of two
+    (False, (5, 7), 3, 6, 3),
+    (False, (1, 1), 1, 4, 2),
+    (True, (1, 1), 1, 4, 2),
+    (False, (5, 7), 2, 4, 3, 0),  # no cell
+    (False, (5, 7), 2, 4, 3, 5, 30.0),  # far off: moved to the border
+    (True, (5, 7), 2, 4, 3, 5, 30.0),  # far off: nothing
+    (True, (5, 7), 2, 4, 3, 5, 1e-3),  # all at one place
+    (False, (5, 7), 2, 20, 3, 5, 1.2, torch.bfloat16),
+    (True, (5, 7), 2, 20, 3, 5, 1.2, torch.float16),
+)
+def kernels_equal_float64(device, bilinear, shape, heads, channels, samples, *further):
+    problem = kernel_problem(shape, heads, channels, samples, *further)
+    compare(
+        lambda backend, *leaves: sample_kernels_by(backend, shape, bilinear)(*leaves),
+        problem,
+        device,
+        (*problem[2].shape[:3], channels),
+    )
+
+
+@case("sample_kernels")
+def rounds_half_to_even_as_torch_does(device):
+    """Points between pixels, k / 2 of a pixel apart, beyond the border, too; exact in binary."""
+    steps = torch.arange(-6, 40) / 2
+    uv = torch.stack([steps / 16, steps / 8], -1)[None, None, :, None]  # (1, 1, Q, 1, 2)
+    value = torch.arange(8 * 16).float().view(1, 1, -1, 1, 1)
+    seen = torch.ones(1, 1, len(steps), dtype=torch.bool)
+    problem = value, uv, torch.ones(1, len(steps), 1, 1), seen, torch.tensor([[1, -2]])
+    expected = sample_kernels_by("reference", (8, 16), False)(*problem)
+    out = sample_kernels_by("triton", (8, 16), False)(*(x.to(device) for x in problem))
+    assert torch.equal(out.cpu(), expected)
+    assert len(expected.unique()) > 20
+
+
+@case("sample_kernels", (False,), (True,))
+def ignores_what_is_not_seen(device, bilinear):
+    problem = kernel_problem((5, 7), 3, 6, 3)
+    upstream = torch.randn(2, 11, 3, 6)
+    sample = sample_kernels_by("triton", (5, 7), bilinear)
+    clean = values_and_gradients(sample, [x.to(device) for x in problem], upstream)
+    for value in (float("nan"), -1e30):
+        problem[1][~problem[3]] = value
+        other = values_and_gradients(sample, [x.to(device) for x in problem], upstream)
+        torch.testing.assert_close(other, clean)

@@ -55,8 +55,7 @@ def resources(kernel, values, options):
     source = ASTSource(fn=kernel, signature=signature, constexprs=constants, attrs=attributes)
     options = {"enable_fp_fusion": True, **options}
     built = triton.compile(source, target=GPUTarget("cuda", 90, 32), options=options)
-    command = [find_ptxas(), "-v", "--gpu-name=sm_90a", "-o", "/dev/null", "-"]
-    command[-1] = "/dev/stdin"
+    command = [find_ptxas(), "-v", "--gpu-name=sm_90a", "-o", "/dev/null", "/dev/stdin"]
     result = subprocess.run(
         command, input=built.asm["ptx"], capture_output=True, text=True, check=True
     )
@@ -71,7 +70,7 @@ class Recorder:
 
     kernel: object
     name: str
-    found: dict = field(default_factory=dict)
+    found: list = field(default_factory=list)
 
     def __getitem__(self, grid):
         return self.launch
@@ -80,12 +79,12 @@ class Recorder:
         names = [parameter.name for parameter in self.kernel.params]
         values = dict(zip(names, arguments, strict=False))
         values |= {name: keywords.pop(name) for name in names if name in keywords}
-        self.found[self.name] = resources(self.kernel, values, keywords)
+        self.found.append((self.name, *resources(self.kernel, values, keywords)))
 
 
 def launches(module, monkeypatch):
-    """Let the launches of a module's kernels compile them; return what will be found, by kernel."""
-    found = {}
+    """Let launches of a module's kernels compile them; return their names, registers, spills."""
+    found = []
     for name, kernel in vars(module).items():
         if name.endswith("_kernel"):
             monkeypatch.setattr(module, name, Recorder(kernel, name, found))

@@ -1,8 +1,10 @@
 import pytest
 import torch
 
-from gsmap.models.encoders.gkt import GeometryKernelAttention, kernel_cells, kernel_offsets
+from gsmap.models.encoders import gkt
+from gsmap.models.encoders.gkt import GeometryKernelAttention, kernel_offsets
 from gsmap.models.encoders.projection import PillarProjection
+from gsmap.ops.kernel_sampling.reference import kernel_cells
 
 
 def test_kernel_offsets_run_through_dy_first():
@@ -49,6 +51,28 @@ def test_attention_equals_its_definition():
     out = module(query, img_feats, projection)
     torch.testing.assert_close(out, expected)
     torch.testing.assert_close(out[:, 0], module.output_proj.bias.expand(2, -1))
+
+
+@pytest.mark.parametrize("released_cells", [False, True])
+@pytest.mark.parametrize("bilinear", [False, True])
+def test_one_bag_a_cell_equals_the_pairs_of_cells_and_cameras(
+    bilinear, released_cells, monkeypatch
+):
+    """What a GPU's kernel does, here by its reference."""
+    torch.manual_seed(0)
+    module = GeometryKernelAttention(8, 2, (3, 5), bilinear, released_cells)
+    torch.nn.init.normal_(module.attention_weights.weight)
+    query, img_feats = torch.randn(2, 6, 8), torch.randn(2, 3, 8, 4, 7)
+    uv = torch.rand(2, 3, 6, 2, 2).requires_grad_(bilinear)
+    projection = PillarProjection(uv, torch.rand(2, 3, 6) < 0.5)
+    leaves = [*module.parameters(), *([uv] if bilinear else [])]
+    results = []
+    for kernel in (False, True):
+        monkeypatch.setattr(gkt, "has_kernel", lambda value, kernel=kernel: kernel)
+        out = module(query, img_feats, projection)
+        results.append([out, *torch.autograd.grad(out.square().sum(), leaves)])
+    # sums of some ten float32 products, in another order
+    torch.testing.assert_close(*results, atol=1e-5, rtol=1e-5)
 
 
 def test_attention_runs_when_no_camera_sees_anything():

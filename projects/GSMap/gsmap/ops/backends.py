@@ -21,9 +21,13 @@ TRITON_KERNELS = {
     "deformable_sample": False,
     "pairwise_soft_iou": True,
     "render_gaussians": True,
+    "sample_kernels": False,
 }
 SWITCH = "GSMAP_TRITON_KERNELS"  # environment: further kernels for "auto", with commas, or "all"
-UNORDERED = ("deformable_sample",)  # their gradients are added up in any order (atomics)
+UNORDERED = (
+    "deformable_sample",
+    "sample_kernels",
+)  # their gradients are added up in any order (atomics)
 
 
 def triton_kernels(switch: str) -> set[str]:

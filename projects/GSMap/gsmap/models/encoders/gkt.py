@@ -6,7 +6,9 @@ from mmengine.model import constant_init, xavier_init
 from torch import Tensor, nn
 
 from gsmap.models.encoders.projection import PillarProjection
-from gsmap.ops.deformable_sampling import bilinear_cells, sum_rows
+from gsmap.ops.deformable_sampling import sum_rows
+from gsmap.ops.kernel_sampling import has_kernel, sample_kernels
+from gsmap.ops.kernel_sampling.reference import kernel_pixels
 
 
 def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
@@ -15,24 +17,6 @@ def kernel_offsets(kernel_size: tuple[int, int]) -> Tensor:
     dx = torch.arange(cols) - cols // 2
     dy = torch.arange(rows) - rows // 2
     return torch.stack(torch.meshgrid(dx, dy, indexing="ij"), -1).flatten(0, 1)
-
-
-def kernel_cells(uv: Tensor, offsets: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return the feature pixels under a kernel centred at projected points, borders replicated.
-
-    Coordinates are rounded half to even after the offset is added, without a half-pixel shift, as
-    the original does. Points in [0, 1] (..., 2), offsets (dx, dy) in pixels (S, 2) -> (..., S)
-    """
-    height, width = shape
-    position = uv * uv.new_tensor([width, height])
-    return border_pixels(torch.round(position[..., None, :] + offsets.to(uv)), shape)
-
-
-def border_pixels(position: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return row-major indices of pixels (x, y), moved onto the map. (..., 2) -> (...)"""
-    height, width = shape
-    cols, rows = position[..., 0].clamp(0, width - 1), position[..., 1].clamp(0, height - 1)
-    return (rows * width + cols).long()
 
 
 @MODELS.register_module()
@@ -88,26 +72,41 @@ class GeometryKernelAttention(nn.Module):
 
         The projected pillars have as many points as there are heads. (B, Q, C) -> (B, Q, C)
         """
-        batch, num_queries = query.shape[:2]
-        num_views, (height, width) = img_feats.shape[1], img_feats.shape[-2:]
+        height, width = img_feats.shape[-2:]
         value = self.value_proj(img_feats.flatten(3).transpose(2, 3))  # (B, V, h * w, C)
         logits = self.attention_weights(query).float().unflatten(-1, (self.num_heads, -1))
+        weights = logits.softmax(-1)  # (B, Q, heads, S)
         visible = projection.visible
         served = visible[:1].expand_as(visible) if self.released_cells else visible
-        sample, view, cell = served.nonzero(as_tuple=True)  # T pairs
-        uv = projection.uv[sample, view, cell]  # (T, heads, 2)
-        weights = logits.softmax(-1)[sample, cell]  # (T, heads, S)
-        if self.bilinear:
-            places = uv[:, :, None] + self.offsets / uv.new_tensor([width, height])
-            pixels, weights = bilinear_cells(places, weights, (height, width))  # (T, heads, 4 S)
+        shape = (height, width)
+        if has_kernel(value):
+            maps = value.unflatten(-1, (self.num_heads, -1))
+            summed = sample_kernels(
+                maps, shape, projection.uv, served, weights, self.offsets, self.bilinear
+            ).flatten(2)
         else:
-            pixels = kernel_cells(uv, self.offsets, (height, width))
+            summed = self._sum_pairs(value.float(), shape, projection.uv, served, weights)
+        count = visible.sum(1).clamp(min=1)  # (B, Q)
+        return self.output_proj(summed / count[..., None])
+
+    def _sum_pairs(
+        self, value: Tensor, shape: tuple[int, int], uv: Tensor, served: Tensor, weights: Tensor
+    ) -> Tensor:
+        """Do what `sample_kernels` does for the pairs of a cell and a camera that sees it alone.
+
+        Maps (B, V, h * w, C), the rest as there. (B, Q, C)
+        """
+        batch, num_queries = weights.shape[:2]
+        num_views, num_pixels = value.shape[1:3]
+        sample, view, cell = served.nonzero(as_tuple=True)  # T pairs
+        pixels, pair_weights = kernel_pixels(
+            uv[sample, view, cell], self.offsets, weights[sample, cell], shape, self.bilinear
+        )  # (T, heads, S)
         image = (sample * num_views + view).view(-1, 1, 1)
-        head = torch.arange(self.num_heads, device=query.device).view(1, -1, 1)
-        rows = (image * (height * width) + pixels) * self.num_heads + head
-        table = value.float().reshape(-1, value.shape[-1] // self.num_heads)
-        out = sum_rows(table, rows, weights).flatten(1)  # (T, C)
+        head = torch.arange(self.num_heads, device=value.device).view(1, -1, 1)
+        rows = (image * num_pixels + pixels) * self.num_heads + head
+        table = value.reshape(-1, value.shape[-1] // self.num_heads)
+        out = sum_rows(table, rows, pair_weights).flatten(1)  # (T, C)
         target = sample * num_queries + cell
         summed = out.new_zeros(batch * num_queries, out.shape[-1]).index_add(0, target, out)
-        count = visible.sum(1).clamp(min=1)  # (B, Q)
-        return self.output_proj(summed.view(batch, num_queries, -1) / count[..., None])
+        return summed.view(batch, num_queries, -1)

@@ -28,7 +28,7 @@ def _locate(locations, weights, sample, ok, height, width):
 
 
 @triton.jit
-def _corner(col, row, ok, height, width):
+def find_corner(col, row, ok, height, width):
     """Return the flat index of a cell, 0 if it is not on the map, and whether it is. (ROWS,)"""
     inside = (col >= 0) & (col < width) & (row >= 0) & (row < height) & ok
     cell = tl.where(inside, row, 0.0).to(tl.int32) * width + tl.where(inside, col, 0.0).to(tl.int32)
@@ -66,7 +66,7 @@ def forward_kernel(
     for s in range(S):
         left, top, dx, dy, weight = _locate(locations, weights, row * S + s, ok, height, width)
         for corner in tl.static_range(4):
-            cell, inside = _corner(left + corner % 2, top + corner // 2, ok, height, width)
+            cell, inside = find_corner(left + corner % 2, top + corner // 2, ok, height, width)
             share = weight * (dx if corner % 2 else 1 - dx) * (dy if corner // 2 else 1 - dy)
             at = (start + cell * (heads * C))[:, None] + channel[None, :]
             seen = tl.load(value + at, inside[:, None] & exists[None, :], 0.0).to(tl.float32)
@@ -106,7 +106,7 @@ def backward_kernel(
         grad_x = tl.zeros((ROWS,), tl.float32)
         grad_y = tl.zeros((ROWS,), tl.float32)
         for corner in tl.static_range(4):
-            cell, inside = _corner(left + corner % 2, top + corner // 2, ok, height, width)
+            cell, inside = find_corner(left + corner % 2, top + corner // 2, ok, height, width)
             across = dx if corner % 2 else 1 - dx
             down = dy if corner // 2 else 1 - dy
             at = (start + cell * (heads * C))[:, None] + channel[None, :]
