@@ -51,7 +51,15 @@ def call_sample_kernels(module):
         module.sample_kernels_backward(module.sample_kernels(*inputs), *inputs)
 
 
+def call_render_gaussians(module):
+    """As a step of four samples: 360 instances of 20 Gaussians on 200 x 100 pixels."""
+    inputs = torch.zeros(360, 20, 5), [-15.0, -30.0, 0.3, 0.3], 200, 100
+    module.render_gaussians_backward(module.render_gaussians(*inputs), *inputs)
+    module.render_gaussians_in_warps_backward(module.render_gaussians_in_warps(*inputs), *inputs)
+
+
 LAUNCHES = {
+    "gaussian_raster": call_render_gaussians,
     "deformable_sampling": call_deformable_sample,
     "kernel_sampling": call_sample_kernels,
 }

@@ -1,10 +1,16 @@
 """Cases that Triton's kernels are tested on, in the interpreter and on a GPU, against float64."""
 
+from unittest import mock
+
+import gaussian_cases
 import pytest
 import torch
 
+from gsmap.ops import backends
 from gsmap.ops.deformable_sampling import deformable_sample
+from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.kernel_sampling import sample_kernels
+from gsmap.structures.grid import BEVGrid
 
 CASES = {}  # kernel -> name of a case -> check of a device
 
@@ -233,3 +239,45 @@ def ignores_what_is_not_seen(device, bilinear):
         problem[1][~problem[3]] = value
         other = values_and_gradients(sample, [x.to(device) for x in problem], upstream)
         torch.testing.assert_close(other, clean)
+
+
+def in_warps(yes=True):
+    """Let `render_gaussians` take the kernels that have a warp a tile, or the others."""
+    kernels = {"render_gaussians_in_warps"} if yes else set()
+    return mock.patch.object(backends, "AUTO_KERNELS", kernels)
+
+
+@case("render_gaussians", *((name,) for name in gaussian_cases.CASES))
+def masks_equal_float64_in_warps(device, name):
+    with in_warps():
+        gaussian_cases.compare_with_reference(name, "triton", device)
+
+
+@case("render_gaussians", (False,), (True,))
+def masks_of_nothing(device, warps):
+    with in_warps(warps):
+        for shape in ((0, 4), (3, 0)):
+            empty = torch.zeros(*shape, 2), torch.ones(*shape, 2), torch.zeros(shape)
+            masks = render_gaussians(
+                *(x.to(device) for x in empty), gaussian_cases.ODD_GRID, "triton"
+            )
+            assert masks.shape == (shape[0], 21, 33)
+            assert not masks.any()
+
+
+@case("render_gaussians", (False,), (True,))
+def one_parameter_that_is_not_a_number_shows_in_all_of_its_mask(device, warps):
+    grid, upstream = BEVGrid((-15, 15), (-30, 30), 11, 17), torch.ones(5, 11, 17)
+    problem = gaussian_cases.random_gaussians(5, 35, 0.3, 0.5)
+    for n, values in enumerate([problem[0][..., 0], problem[0][..., 1], problem[1][..., 0]]):
+        values[n, 34 - n] = float("nan")
+    problem[2][3, 20] = float("nan")
+    with in_warps(warps):
+        masks, grads = gaussian_cases.render_with_gradients(
+            problem, grid, "triton", upstream, device
+        )
+    assert masks[:4].isnan().all()
+    assert masks[4].isfinite().all()
+    for grad in grads:
+        assert grad[4].isfinite().all()
+    assert grads[0][:4].isnan().flatten(1).any(1).all()

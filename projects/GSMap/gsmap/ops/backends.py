@@ -21,6 +21,7 @@ TRITON_KERNELS = {
     "deformable_sample": False,
     "pairwise_soft_iou": True,
     "render_gaussians": True,
+    "render_gaussians_in_warps": False,  # in place of that of render_gaussians, "triton", too
     "sample_kernels": False,
 }
 SWITCH = "GSMAP_TRITON_KERNELS"  # environment: further kernels for "auto", with commas, or "all"

@@ -5,16 +5,23 @@ import math
 import torch
 from torch import Tensor
 
+from gsmap.ops import backends
 from gsmap.ops.backends import choose_backend, fused_operator
 from gsmap.ops.gaussian_raster.reference import render_gaussians_reference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 
-_render = fused_operator(
-    "gaussian_raster.render_gaussians",
-    "Tensor gaussians, float[] frame, int height, int width",
-    lambda gaussians, frame, height, width: (len(gaussians), height, width),
-    differentiable=1,
+_ARGUMENTS = "Tensor gaussians, float[] frame, int height, int width"
+
+
+def _masks_shape(gaussians: Tensor, frame: list[float], height: int, width: int) -> tuple[int, ...]:
+    """Return the shape of the masks of all Gaussians."""
+    return len(gaussians), height, width
+
+
+_render = fused_operator("gaussian_raster.render_gaussians", _ARGUMENTS, _masks_shape, 1)
+_render_in_warps = fused_operator(
+    "gaussian_raster.render_gaussians_in_warps", _ARGUMENTS, _masks_shape, 1
 )
 
 
@@ -49,7 +56,9 @@ def render_gaussians(
             )
         flat = gaussians.reshape(math.prod(means.shape[:-2]), *gaussians.shape[-2:])
         frame = [grid.x_range[0], grid.y_range[0], *grid.pixel_size_m]
-        masks = _render(flat, frame, grid.height, grid.width, backend)
+        in_warps = backend == "triton" and "render_gaussians_in_warps" in backends.AUTO_KERNELS
+        render = _render_in_warps if in_warps else _render
+        masks = render(flat, frame, grid.height, grid.width, backend)
         return masks.reshape(*means.shape[:-2], grid.height, grid.width)
 
 
