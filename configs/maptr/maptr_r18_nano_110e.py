@@ -6,7 +6,7 @@ _base_ = './maptr_r50_24e.py'
 model = dict(
     img_backbone=dict(
         depth=18, frozen_stages=-1, norm_eval=False, norm_cfg=dict(requires_grad=True),
-        init_cfg=dict(checkpoint='torchvision://resnet18')),
+        init_cfg=dict(checkpoint='https://download.pytorch.org/models/resnet18-f37072fd.pth')),
     img_neck=dict(in_channels=[512]),
     bev_encoder=dict(bev_pixel_m=0.75),
     map_head=dict(query_groups=[dict(num=100)], decoder=dict(num_layers=2, layer=dict(num_heads=4))))

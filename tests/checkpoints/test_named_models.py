@@ -52,12 +52,6 @@ def test_the_inferencer_takes_a_name_alone():
     torch.testing.assert_close(inferencer.model.state_dict()[key], state[key].float())
 
 
-def test_a_file_comes_before_a_name(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("gsmap_r18_minicity").write_text("mine")
-    assert find_checkpoint("gsmap_r18_minicity") == Path("gsmap_r18_minicity")
-
-
 def test_a_config_is_found_by_its_path_in_the_repository_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = "configs/maptr/maptr_r18_minicity.py"
@@ -113,6 +107,21 @@ def test_a_damaged_file_is_refused(tmp_path, monkeypatch):
     assert list_models() == ["gsmap_r18_minicity"]
     with pytest.raises(ValueError, match=r"damaged or another file: its sha256"):
         find_checkpoint("gsmap_r18_minicity")
+
+
+def test_a_file_of_the_working_folder_does_not_stand_for_a_named_model(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = []
+    monkeypatch.setattr(registry, "print_log", lambda text, **_: said.append(text))
+    for name in ("gsmap_r18_minicity", "maptr_r18_minicity"):
+        Path(name).write_bytes(b"somebody's")
+        assert find_checkpoint(name) == shipped(f"models/{name}.pth")
+        assert checkpoint_for(name, None) == shipped(f"models/{name}.pth")
+        assert find_checkpoint(f"./{name}") == Path(name)
+    assert said[0] == (
+        "gsmap_r18_minicity is the model of that name; the file of that name in the working "
+        "folder is ./gsmap_r18_minicity."
+    )
 
 
 def test_a_file_without_a_known_digest_is_called_unverified_once(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ model = dict(
         norm_cfg=dict(type='BN', requires_grad=True),
         norm_eval=True,
         style='pytorch',
-        init_cfg=dict(type='Pretrained', checkpoint='torchvision://resnet50')),
+        init_cfg=dict(type='Pretrained', checkpoint='https://download.pytorch.org/models/resnet50-19c8e357.pth')),
     img_neck=dict(type='BiFPN'),
     bev_encoder=dict(type='BezierBEVEncoder'),
     map_head=dict(type='BezierHead', decoder=dict(num_layers=6)))

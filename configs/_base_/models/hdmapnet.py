@@ -1,6 +1,6 @@
 # HDMapNet of cameras as published: 75.26 M parameters that do something, 65 M of them learn what each camera sees from
 # above.
-_weights = 'https://download.openmmlab.com/mmclassification/v0/efficientnet/efficientnet-b0_3rdparty_8xb32-aa_in1k_20220119-8d939117.pth'
+_weights = 'https://github.com/lukemelas/EfficientNet-PyTorch/releases/download/1.0/efficientnet-b0-355c32eb.pth'
 model = dict(
     type='MapDetector',
     data_preprocessor=dict(
@@ -15,7 +15,7 @@ model = dict(
         drop_path_rate=0.1875,  # of the last of 16 blocks: 0.2 x 15 / 16, what the trunk has by default
         out_indices=(4, 5),
         norm_eval=False,
-        init_cfg=dict(type='Pretrained', prefix='backbone', checkpoint=_weights)),
+        init_cfg=dict(type='Pretrained', checkpoint=_weights)),
     img_neck=dict(type='JoinLevels', in_channels=(112, 320), out_channels=64),
     bev_encoder=dict(type='ViewTransformEncoder', image_size=(128, 352), stride=16, bev_pixel_m=0.3),
     map_head=dict(type='HDMapNetHead', embed_dims=64))

@@ -1,6 +1,5 @@
 # MapTR with ResNet-50 and geometry kernel attention, as published (tiny): 35.92 M trainable parameters.
-# torchvision://resnet50 is fetched from download.pytorch.org; without a network set
-# model.img_backbone.init_cfg.checkpoint to a local copy, or to None to train from scratch.
+# The backbone's weights are fetched; without a network see docs/install.md#weights-of-backbones.
 model = dict(
     type='MapDetector',
     data_preprocessor=dict(
@@ -19,7 +18,7 @@ model = dict(
         norm_cfg=dict(type='BN', requires_grad=False),
         norm_eval=True,
         style='pytorch',
-        init_cfg=dict(type='Pretrained', checkpoint='torchvision://resnet50')),
+        init_cfg=dict(type='Pretrained', checkpoint='https://download.pytorch.org/models/resnet50-19c8e357.pth')),
     img_neck=dict(
         type='mmdet.FPN',
         in_channels=[2048],

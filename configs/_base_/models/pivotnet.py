@@ -16,11 +16,12 @@ model = dict(
         norm_cfg=dict(type='BN', requires_grad=True),
         norm_eval=True,
         style='pytorch',
-        init_cfg=dict(type='Pretrained', checkpoint='torchvision://resnet50')),
+        init_cfg=dict(type='Pretrained', checkpoint='https://download.pytorch.org/models/resnet50-19c8e357.pth')),
     bev_encoder=dict(type='PivotBEVEncoder'),
     map_head=dict(type='PivotHead', queries=((20, 10), (25, 2), (15, 30)), decoder=dict(num_layers=6)))
 
-_swin = 'https://github.com/SwinTransformer/storage/releases/download/v1.0.0/swin_tiny_patch4_window7_224.pth'
+# of a segmentation model (UperNet on ADE20K), as in the release
+_swin = 'https://github.com/SwinTransformer/storage/releases/download/v1.0.1/upernet_swin_tiny_patch4_window7_512.pth'
 _swin_t = dict(  # what Swin-T changes
     img_backbone=dict(
         _delete_=True, type='mmdet.SwinTransformer', embed_dims=96, depths=(2, 2, 6, 2), num_heads=(3, 6, 12, 24),

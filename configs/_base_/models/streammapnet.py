@@ -1,6 +1,6 @@
 # What StreamMapNet has in place of MapTR's parts (maptr_r50.py), as published: three levels of a backbone with
-# deformable convolutions, one query per element, memory of BEV and of queries. detectron2's weights of ResNet-50 (caffe)
-# are fetched; without a network set model.img_backbone.init_cfg to None or to a local copy.
+# deformable convolutions, one query per element, memory of BEV and of queries. The
+# weights of ResNet-50 are detectron2's (caffe), fetched; without a network see docs/install.md#weights-of-backbones.
 _streammapnet = dict(
     data_preprocessor=dict(mean=[103.53, 116.28, 123.675], std=[1.0, 1.0, 1.0], bgr_to_rgb=False),
     img_backbone=dict(
@@ -10,7 +10,7 @@ _streammapnet = dict(
         style='caffe',
         dcn=dict(type='DCNv2', deform_groups=1, fallback_on_stride=False),
         stage_with_dcn=(False, False, True, True),
-        init_cfg=dict(checkpoint='open-mmlab://detectron2/resnet50_caffe')),
+        init_cfg=dict(checkpoint='https://download.openmmlab.com/pretrain/third_party/resnet50_msra-5891d200.pth')),
     img_neck=dict(
         _delete_=True,
         type='mmdet.FPN',

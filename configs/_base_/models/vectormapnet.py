@@ -1,5 +1,5 @@
-# VectorMapNet with ResNet-50 as published: 36.73 M trainable parameters. detectron2's weights of ResNet-50 (caffe) are
-# fetched; without a network set model.img_backbone.init_cfg to None or to a local copy.
+# VectorMapNet with ResNet-50 as published: 36.73 M trainable parameters. The weights of ResNet-50
+# are detectron2's (caffe), fetched; without a network see docs/install.md#weights-of-backbones.
 model = dict(
     type='MapDetector',
     data_preprocessor=dict(
@@ -19,7 +19,7 @@ model = dict(
         style='caffe',
         dcn=dict(type='DCNv2', deform_groups=1, fallback_on_stride=False),
         stage_with_dcn=(False, False, True, True),
-        init_cfg=dict(type='Pretrained', checkpoint='open-mmlab://detectron2/resnet50_caffe')),
+        init_cfg=dict(type='Pretrained', checkpoint='https://download.openmmlab.com/pretrain/third_party/resnet50_msra-5891d200.pth')),
     img_neck=dict(
         type='mmdet.FPN',
         in_channels=[256, 512, 1024, 2048],

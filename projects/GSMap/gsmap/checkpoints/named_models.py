@@ -85,14 +85,21 @@ def find_config(config: str | Path) -> Path:
 def find_checkpoint(checkpoint: str | Path) -> Path:
     """Return a checkpoint's file; asked for by name, it is checked against its digest.
 
-    A warning says so where the registry has no digest.
+    A warning says so where the registry has no digest. A name means the registry's model, whatever
+    the working folder holds; ``./NAME`` is a file there.
 
     Raises:
         FileNotFoundError: If it is neither, or the named model's file is not there.
         ValueError: If the named model's file is not the registry's.
     """
     if Path(checkpoint).is_file():
-        return Path(checkpoint)
+        if str(checkpoint) not in named_models():
+            return Path(checkpoint)
+        print_log(
+            f"{checkpoint} is the model of that name; the file of that name in the working folder "
+            f"is ./{checkpoint}.",
+            level=logging.WARNING,
+        )
     model = _named(checkpoint, "checkpoint")
     if not model.file.is_file():
         remedy = f"fetch it from {model.address}" if model.address else "check it out again"
@@ -127,8 +134,8 @@ def checkpoint_for(config: str | Path, checkpoint: str | Path | None) -> Path:
         FileNotFoundError: If it does not exist.
         ValueError: If none is given with a config.
     """
-    is_config = Path(config).is_file() or str(config) in named_configs().keys() - named_models()
-    if checkpoint is None and is_config:
+    is_config = str(config) in named_configs() or Path(config).is_file()
+    if checkpoint is None and is_config and str(config) not in named_models():
         raise ValueError(f"give a checkpoint after {config}: only a model's name stands for both.")
     return find_checkpoint(config if checkpoint is None else checkpoint)
 

@@ -8,12 +8,11 @@ import torch
 from mmdet3d.registry import HOOKS
 from mmengine.fileio import LocalBackend, register_backend
 from mmengine.hooks import CheckpointHook
-from mmengine.runner import BaseLoop, EpochBasedTrainLoop, Runner
+from mmengine.runner import BaseLoop, CheckpointLoader, EpochBasedTrainLoop, Runner
 from mmengine.runner import checkpoint as mmengine_checkpoint
-from torch.hub import load_state_dict_from_url
 
 from gsmap.checkpoints.convert import listed
-from gsmap.checkpoints.reading import refusing
+from gsmap.checkpoints.published import load_from_file, load_from_torchvision, load_published
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
 from gsmap.engine.run_log import innermost
@@ -41,12 +40,6 @@ class AtomicLocalBackend(LocalBackend):
     def put_text(self, obj: str, filepath: str | Path, encoding: str = "utf-8") -> None:
         """Write text to ``filepath`` in one step."""
         self.put(obj.encode(encoding), filepath)
-
-
-def _fetched(address: str, **options: Any) -> Any:
-    """Fetch a checkpoint as torch's hub does, whose default would run code of it."""
-    with refusing(address):
-        return load_state_dict_from_url(address, **{**options, "weights_only": True})
 
 
 def _metainfo(loader: Any) -> dict[str, Any]:
@@ -87,7 +80,10 @@ class AtomicCheckpointHook(CheckpointHook):
 
     def before_run(self, runner: Runner) -> None:
         """Let torch read mmengine's checkpoints; mmengine reads one right after this."""
-        mmengine_checkpoint.load_url = _fetched
+        mmengine_checkpoint.load_url = load_published
+        register = CheckpointLoader.register_scheme
+        register(("torchvision://", "modelzoo://"), load_from_torchvision, force=True)
+        register("", load_from_file, force=True)
         torch.serialization.add_safe_globals(mmengine_globals())
 
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
