@@ -84,6 +84,9 @@ def swin_state(address: str, state: dict[str, torch.Tensor]) -> dict[str, Any]:
     )  # fmt: skip
     theirs = {}
     for key, value in state.items():
+        if "downsample." in key:  # four neighbours: column by column there, interleaved in mmdet
+            parts = value.reshape(-1, value.shape[-1] // 4, 4).transpose(1, 2)
+            value = parts[:, [0, 2, 1, 3]].reshape(value.shape)
         for ours, upstream in names:
             key = key.replace(ours, upstream)
         theirs[key] = value
