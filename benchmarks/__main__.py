@@ -12,6 +12,7 @@ COMMANDS = {
     "export": "export",
     "fps": "fps",
     "heads": "heads",
+    "kernels": "kernels",
     "live": "live",
     "masks": "masks",
     "minicity": "minicity",
