@@ -36,7 +36,7 @@ from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.extras import import_extra
-from gsmap.utils.files import file_name, write_text
+from gsmap.utils.files import file_names, write_text
 from gsmap.utils.split_lists import require_results_of
 from gsmap.utils.words import counted
 from gsmap.visualization.bev_view import draw_lines
@@ -45,6 +45,7 @@ from gsmap.visualization.plots import WIDTH_IN, finish_panel, panel_grid
 from gsmap.visualization.style import MapStyle
 
 FORMATS = ("geojson", "osm", "rrd", "mcap", "mp4", "png", "svg")
+_LON_LAT = "_lonlat"  # ends the name of a map in degrees
 EXTRAS = {"rrd": ("rerun", "viz"), "mcap": ("foxglove", "viz"), "mp4": ("av", "viz")}
 
 
@@ -138,7 +139,7 @@ def write_map(
         paths.append(f"{stem}.{key}")
         writers[key](paths[-1], elements)
     if "geojson" in args.formats and origin is not None:
-        paths.append(f"{stem}_lonlat.geojson")
+        paths.append(f"{stem}{_LON_LAT}.geojson")
         write_geojson(paths[-1], elements, classes, origin)
     return paths
 
@@ -217,12 +218,13 @@ def main(argv: list[str] | None = None) -> str:
             "mp4 shows the single frames."
         )
     drives, merged, spent_s = [], [], 0.0
-    for scene in args.scene or sorted(set(ann.column("scene"))):
+    names = file_names(sorted(set(ann.column("scene"))), ("", _LON_LAT))
+    for scene in args.scene or names:
         drives.append(confident(read_drive(ann, scene, results), args.score_thr))
         start_s = time.process_time()
         merged.append(merge(drives[-1], config) if has_poses else MapElements.from_polylines())
         spent_s += time.process_time() - start_s
-        for path in write_map(args.out / file_name(scene), args, ann, drives[-1], merged[-1]):
+        for path in write_map(args.out / names[scene], args, ann, drives[-1], merged[-1]):
             seen = counted(len(drives[-1].frames), "frame")
             print(f"{counted(len(merged[-1]), 'element')} of {seen}: {path}")
     if has_truth(ann):

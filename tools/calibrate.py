@@ -26,7 +26,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.calibration import LAWS, fitted_factors, matched_vertices
 from gsmap.evaluation.chamfer_ap import ChamferConfig
 from gsmap.evaluation.file_evaluation import SamplePairs
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import atomic_write
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.shards import digest
@@ -42,7 +42,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "ground_truth", type=Path, help="annotation file (*.arrow), or JSON with a list of GTs"
     )
-    parser.add_argument("target", type=Path, help="checkpoint to write; must not exist")
+    parser.add_argument("target", type=output_file, help="checkpoint to write; must not exist")
     parser.add_argument(
         "--sigmas",
         type=float,

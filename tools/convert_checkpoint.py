@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import atomic_write
 
 
 def main() -> str:
     parser = CommandParser(description=__doc__)
     parser.add_argument("source", type=Path, help="checkpoint to read")
-    parser.add_argument("target", type=Path, help="checkpoint to write; must not exist")
+    parser.add_argument("target", type=output_file, help="checkpoint to write; must not exist")
     args = parser.parse_args()
     if args.target.exists():
         raise FileExistsError(f"{args.target} exists already: choose another name or remove it.")

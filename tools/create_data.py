@@ -13,6 +13,7 @@ import sys
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import without_options
+from gsmap.utils.terminal import printable
 
 COMMANDS = {
     "minicity": ("minicity.cli", "generate the MiniCity data set"),
@@ -47,7 +48,7 @@ def make() -> str | None:
         return run_on_ray(arguments, sys.argv)
     module, _ = COMMANDS[arguments.command]
     words = without_options(sys.argv, "--shard")  # the whole is made by the same command
-    arguments.command = shlex.join(["python", *words])
+    arguments.command = printable(shlex.join(["python", *words]))
     return importlib.import_module(module).run(arguments)
 
 

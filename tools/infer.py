@@ -9,7 +9,7 @@ with calibration.yaml, or a bag of ROS 1 or 2 (docs/inference.md).
 
 import argparse
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ from gsmap.datasets.source import Source
 from gsmap.engine.arguments import add_config_options
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.utils.cli import CommandParser, output_file, run_command
-from gsmap.utils.files import write_bytes
+from gsmap.utils.files import own_folder, write_bytes
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.progress import Progress
 from gsmap.utils.ray_shards import run_on_ray
@@ -47,6 +47,7 @@ if TYPE_CHECKING:  # slow to import
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 
 _ONE_SAMPLE_HZ = 1e-4
+_SAMPLES = ".arrow"  # what the samples go to, in place of the suffix of --out
 SKIPPED = DOUBTFUL = 1  # exit code when frames were broken, or a calibration is implausible
 
 
@@ -120,6 +121,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     args = parser.parse_args(argv)
     if not args.model and not args.check_calibration:
         parser.error("the following arguments are required: --model")
+    if args.out and args.out.suffix == _SAMPLES:
+        parser.error(f"--out names a JSON file, the samples go to a {_SAMPLES}: got {args.out}")
     if args.model and len(args.model) > 2:
         parser.error(f"--model takes a name, or a config and a checkpoint, got {args.model}")
     return args
@@ -127,13 +130,16 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
 
 def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
     """Open the input and say what its reader has to say; with a folder for frames, few samples."""
+    all_samples = frames is None
     place = args.out.with_suffix("") if args.out else (args.show_dir or Path()) / "input"
+    if frames is None:
+        frames = own_folder(place.with_name(f"{place.name}_frames"))
     options = InputOptions(
         data_root=args.data_root,
         allow_missing_cameras=args.allow_missing_cameras,
         version=args.version,
-        rate_hz=args.rate if frames is None else _ONE_SAMPLE_HZ,
-        frames_dir=frames or place.with_name(f"{place.name}_frames"),
+        rate_hz=args.rate if all_samples else _ONE_SAMPLE_HZ,
+        frames_dir=frames,
         vehicle_frame=args.vehicle_frame,
         vehicle_ground_z_m=args.vehicle_ground_z,
         topics=parse_topics(args.topics),
@@ -145,6 +151,25 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
     if not source.has_poses:
         print("no pose is known: single frames only, no map of the drive")
     return source
+
+
+def require_own_samples(path: Path) -> None:
+    """Refuse to replace an annotation file that is not the samples of an earlier run.
+
+    Raises:
+        ValueError: If it is another one.
+    """
+    from gsmap.apis.map_inferencer import SAMPLES_BY
+
+    if not path.exists():
+        return
+    with suppress(ValueError):  # it is no annotation file at all
+        if AnnotationFile(path).meta.command == SAMPLES_BY:
+            return
+    raise ValueError(
+        f"{path} is there, and not from an earlier run of this command, which writes the samples "
+        "of its input to that name: give another --out."
+    )
 
 
 def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
@@ -208,6 +233,11 @@ def predict(
     tokens, broken = dataset.annotations.column("token"), {}
     done = set(results.done) if results else set()
     with Progress(total=len(chosen), unit="samples", smoothing=0.05) as bar:
+        if results and results.dropped:
+            bar.write(
+                f"{results.path} had {counted(results.dropped, 'sample')} of a run with other "
+                "settings, which are not used"
+            )
         if results and done:
             bar.write(f"going on after {len(done)} of {counted(len(chosen), 'sample')}")
             broken.update(results.broken)
@@ -263,6 +293,8 @@ def main(argv: list[str] | None = None) -> str | None:
         raise ValueError(f"--width must be >= 1 pixel, got {args.width}.")
     source = read_input(args)
     if not isinstance(source.samples, AnnotationFile):
+        if args.out:
+            require_own_samples(args.out.with_suffix(_SAMPLES))
         check_calibration(args, source)
     from gsmap.apis.map_inferencer import select_samples
 
@@ -277,7 +309,8 @@ def main(argv: list[str] | None = None) -> str | None:
     settings, made_from = run_settings(args), digest(dataset.annotations.path)
     run = {**settings, "input": str(args.input.resolve()), "samples": made_from}
     run["images"] = str(source.data_root)  # its folder tells content and calibration
-    log = ResultLog(args.shard.path_of(args.out), run) if args.out else nullcontext()
+    wanted = [tokens[index] for index in chosen]
+    log = ResultLog(args.shard.path_of(args.out), run, wanted) if args.out else nullcontext()
     with log as results:
         broken = predict(args, inferencer, dataset, chosen, results)
         if chosen and len(broken) == len(chosen):
@@ -297,7 +330,7 @@ def print_summary(
     where = " and ".join(str(path) for path in (out, args.show_dir) if path)
     print(f"{count - len(broken)} of {counted(count, 'sample')} predicted: {where}")
     if args.out and not isinstance(source.samples, AnnotationFile):
-        annotations = args.out.with_suffix(".arrow")
+        annotations = args.out.with_suffix(_SAMPLES)
         write_bytes(annotations, Path(ann_file).read_bytes())
         if source.has_poses:
             print(

@@ -14,7 +14,7 @@ from gsmap.evaluation.match_files import report_shards
 from gsmap.evaluation.report import format_table, write_figures
 from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
 from gsmap.evaluation.results_json import merge_results
-from gsmap.utils.cli import CommandParser, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.shards import ShardFile, find_shards
 from gsmap.utils.words import counted
 
@@ -35,7 +35,7 @@ MERGE = {ANNOTATIONS: merge_annotations, RESULTS: merge_results, MATCHES: merge_
 
 def main(argv: list[str] | None = None) -> str:
     parser = CommandParser(description=__doc__)
-    parser.add_argument("targets", metavar="FILE", type=Path, nargs="+", help="file to make")
+    parser.add_argument("targets", metavar="FILE", type=output_file, nargs="+", help="file to make")
     lines = []
     for target in parser.parse_args(argv).targets:
         shards = find_shards(target)

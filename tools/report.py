@@ -13,7 +13,9 @@ from pathlib import Path
 from gsmap.evaluation.calibration import LAWS
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.visualization.film import write_drive_film
-from gsmap.visualization.page.page import PageOptions, page_data, write_page
+from gsmap.visualization.page.page import PageOptions, is_own_page, page_data, write_page
+
+_PAGE = Path("report.html")  # if none is named
 
 
 def parse_args() -> argparse.Namespace:
@@ -25,8 +27,8 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument(
         "--out",
         type=output_file,
-        default=Path("report.html"),
-        help="page to write, or a film (*.mp4) of one drive",
+        default=_PAGE,
+        help="page to write (default: report.html), or a film (*.mp4) of one drive",
     )
     parser.add_argument(
         "--compare", type=Path, metavar="RESULTS", help="second result file, shown beside the first"
@@ -83,6 +85,10 @@ def parse_args() -> argparse.Namespace:
 
 def main() -> str:
     args = parse_args()
+    if args.out is _PAGE and _PAGE.exists() and not is_own_page(_PAGE):
+        raise FileExistsError(
+            f"{_PAGE} is there, and no page of this command: --out names another."
+        )
     paths = [args.results, *([args.compare] if args.compare else [])]
     names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     if len(names) != len(paths) or len(set(names)) != len(names):

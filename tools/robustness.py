@@ -19,7 +19,7 @@ from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.arguments import add_config_options
 from gsmap.utils.cli import CommandParser, run_command
-from gsmap.utils.files import write_text
+from gsmap.utils.files import lock_folder, read_json, write_text
 from gsmap.utils.progress import Progress
 from gsmap.utils.split_lists import require_same_list
 
@@ -107,6 +107,49 @@ def resilience(found: dict[str, list[dict[str, float]]], kind: str) -> float:
     return 100 * float(np.mean([of["mean"] for of in found[kind]])) / max(clean, 1e-9)
 
 
+def earlier_figures(path: Path) -> dict[str, list[dict[str, float]]]:
+    """Return the figures of an earlier run into the folder; none without one.
+
+    Raises:
+        ValueError: If the file holds anything else.
+    """
+    if not path.exists():
+        return {}
+    figures = read_json(path)
+    good = isinstance(figures, dict) and all(
+        isinstance(rows, list)
+        and len(rows) == (1 if kind == CLEAN else len(SEVERITIES))
+        and all(isinstance(row, dict) and isinstance(row.get("mean"), float) for row in rows)
+        for kind, rows in figures.items()
+    )
+    if not good or CLEAN not in figures or not {*figures} <= {CLEAN, *KINDS}:
+        raise ValueError(f"{path} holds no figures of this command: give another --out.")
+    return figures
+
+
+def kept_figures(
+    before: dict[str, list[dict[str, float]]],
+    clean: list[dict[str, float]],
+    args: argparse.Namespace,
+) -> dict[str, list[dict[str, float]]]:
+    """Return the earlier run's figures of corruptions that this run does not measure.
+
+    Without corruption both must score the same: figures of another model or other samples belong
+    into another folder.
+
+    Raises:
+        ValueError: If they do not, and figures would be lost.
+    """
+    others = {kind: rows for kind, rows in before.items() if kind not in {CLEAN, *args.kinds}}
+    if others and before[CLEAN] != clean:
+        raise ValueError(
+            f"{args.out} has figures of {', '.join(others)} of another model or other samples "
+            f"(AP {before[CLEAN][0]['mean']:.1f} without corruption, here {clean[0]['mean']:.1f}): "
+            "give another --out, or name these --kinds too."
+        )
+    return others
+
+
 def require_own_split(checkpoint: Path, settings: Any) -> None:
     """Refuse a data set of another split than that of the model's training."""
     from gsmap.checkpoints.reading import read_checked
@@ -135,18 +178,26 @@ def main() -> str:
     MMLogger.get_instance("robustness", log_level="ERROR")  # one table for each run is too much
     cases = [(CLEAN, 1), *((kind, severity) for kind in args.kinds for severity in SEVERITIES)]
     found: dict[str, list[dict[str, float]]] = {}
-    with Progress(total=len(cases), unit="corruptions") as bar, torch.no_grad():
+    with (
+        lock_folder(args.out, ".robustness", "wait for its end, or give another --out"),
+        Progress(total=len(cases), unit="corruptions") as bar,
+        torch.no_grad(),
+    ):
+        before = earlier_figures(args.out / "robustness.json")
         for kind, severity in cases:
             settings = corrupted(model.cfg.test_dataloader.dataset, kind, severity, args.seed)
             figures = average_precisions(model, settings, args.samples)
             found.setdefault(kind, []).append(figures)
             bar.update(1)
-    text = table(found)
-    write_text(args.out / "robustness.json", json.dumps(found, indent=1) + "\n")
-    write_text(args.out / "robustness.md", text)
-    means = {kind: [of["mean"] for of in figures] for kind, figures in found.items()}
-    clean = means.pop(CLEAN)[0]
-    save_figure(plot_severities(means, clean, SEVERITIES), args.out / "robustness.png")
+            if kind == CLEAN:
+                kept = kept_figures(before, found[CLEAN], args)
+        found = {kind: rows for kind in (CLEAN, *KINDS) if (rows := {**kept, **found}.get(kind))}
+        text = table(found)
+        write_text(args.out / "robustness.json", json.dumps(found, indent=1) + "\n")
+        write_text(args.out / "robustness.md", text)
+        means = {kind: [of["mean"] for of in figures] for kind, figures in found.items()}
+        clean = means.pop(CLEAN)[0]
+        save_figure(plot_severities(means, clean, SEVERITIES), args.out / "robustness.png")
     return f"{text}\nfiles: {args.out}"
 
 

@@ -47,6 +47,11 @@ def choose_start(cfg: Config, resume: str | None) -> None:
     if cfg.load_from and "://" not in str(cfg.load_from):
         cfg.load_from = str(find_checkpoint(cfg.load_from))
         read_weights(cfg.load_from)
+        if not cfg.resume and Path(cfg.load_from).resolve().parent == Path(cfg.work_dir).resolve():
+            raise ValueError(
+                f"{cfg.load_from}, from which this run is to start, lies in its work folder, whose "
+                "checkpoints it would replace: give another --work-dir, or --resume."
+            )
 
 
 def writes_alone(work_dir: str) -> AbstractContextManager:

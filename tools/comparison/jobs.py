@@ -16,7 +16,7 @@ import torch
 
 from comparison.plan import RECORD, SETTINGS, Run
 from gsmap.checkpoints.settings import plain
-from gsmap.utils.files import lock_folder, write_text
+from gsmap.utils.files import lock_folder, open_to_append, require_no_link, write_text
 from gsmap.utils.parallel import die_with_parent
 from gsmap.utils.progress import Progress
 
@@ -53,6 +53,7 @@ class Job:
     def __init__(self, run: Run, device: str | None) -> None:
         self.run = run
         self.device = device
+        require_no_link(run.folder, run.folder.parent.parent)
         self._lock = lock_folder(run.folder, ".lock", "wait for its end")
         write_text(run.folder / SETTINGS, json.dumps(plain(run.settings), indent=1))
         self.record: dict[str, Any] = {"machine": machine(), "load_at_start": os.getloadavg()[0]}
@@ -74,7 +75,7 @@ class Job:
             environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
             environment["WORLD_SIZE"] = str(count)
         command = self.run.commands()[self.stage]
-        with open(self.run.folder / f"{self.stage}.log", "a") as log:
+        with open_to_append(self.run.folder / f"{self.stage}.log") as log:
             self._processes = [
                 subprocess.Popen(
                     command,

@@ -46,10 +46,20 @@ class MapOrigin:
         """Return longitude and latitude, in degrees on the WGS 84 ellipsoid. (n, 2)
 
         Points (n, >= 2) are in metres of the global frame.
+
+        Raises:
+            ValueError: If a point lies farther from the origin than the projection reaches.
         """
         east, north = self._projection(self.longitude_deg, self.latitude_deg)
         x, y = np.asarray(points)[:, :2].T
-        return np.stack(self._projection(x + east, y + north, inverse=True), axis=1)
+        degrees = np.stack(self._projection(x + east, y + north, inverse=True), axis=1)
+        if not np.isfinite(degrees).all():
+            raise ValueError(
+                f"the map reaches {max(np.abs(x).max(), np.abs(y).max()):.3g} m from the origin of "
+                "its frame, where there is no longitude and latitude: its poses are wrong, or "
+                "--formats geojson without --origin writes metres."
+            )
+        return degrees
 
 
 def known_origin(meta: AnnotationMeta, map_name: str) -> MapOrigin | None:

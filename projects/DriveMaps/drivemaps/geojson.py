@@ -52,4 +52,4 @@ def write_geojson(
     if origin is None:
         collection["frame"] = "global frame of the poses, metres"
     collection["features"] = features
-    write_text(path, json.dumps(collection, indent=1) + "\n")
+    write_text(path, json.dumps(collection, indent=1, allow_nan=False) + "\n")

@@ -29,6 +29,8 @@ def _open(path: Path) -> AnnotationFile:
             if not reader.get_batch(number).equals(batch):
                 raise ValueError(f"part {number} is another one")
     except (pa.ArrowException, OSError, ValueError) as error:
+        if isinstance(error, MemoryError) or getattr(error, "errno", None):
+            raise  # what the machine lacks is no fault of the file
         raise ValueError(
             f"{path}: the footer, by which other programs read the file, is damaged ({error}); "
             f"{file.remedy}"

@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 
-from gsmap.utils.files import SUFFIX, try_lock
+from gsmap.utils.files import SUFFIX, require_no_link, try_lock
 from gsmap.utils.parallel import default_workers, ordered_map
 from gsmap.utils.progress import Progress
 from minicity.config import TRAIN_LOCATIONS, VAL_LOCATIONS, VERSION, MiniCityConfig, make_token
@@ -140,8 +140,9 @@ def _partial_folder(root: Path) -> Iterator[Path]:
     """A locked folder beside ``root`` to write into, gone afterwards unless it was renamed."""
     root.parent.mkdir(parents=True, exist_ok=True)
     partial = root.with_name(f"{root.name}{SUFFIX}")
+    require_no_link(partial)
     partial.mkdir(exist_ok=True)
-    handle = os.open(partial, os.O_RDONLY)
+    handle = os.open(partial, os.O_RDONLY | os.O_NOFOLLOW)
     try:
         locked = try_lock(handle)
         if not locked and (locked is False or any(partial.iterdir())):
@@ -151,7 +152,8 @@ def _partial_folder(root: Path) -> Iterator[Path]:
             )
         try:
             for leftover in partial.iterdir():
-                shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+                folder = leftover.is_dir() and not leftover.is_symlink()
+                shutil.rmtree(leftover) if folder else leftover.unlink()
             yield partial
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)

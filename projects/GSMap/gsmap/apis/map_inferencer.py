@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # slow to import, and of no use before there is a model
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
     from gsmap.visualization.map_visualizer import MapVisualizer
 
+SAMPLES_BY = "tools/infer.py"  # the command that an inferencer's own annotation files name
 _LOOK_AT = 100  # samples whose cameras are an input's
 
 
@@ -213,7 +214,7 @@ class MapInferencer:
             y_range=tuple(grid["y_range"]),
             dim=max((i.points.shape[1] for s in samples for i in s.instances or ()), default=2),
             options={} if has_poses else {"poses": False},
-            command="tools/infer.py",
+            command=SAMPLES_BY,
         )
         path = Path(self._scratch.name) / f"samples{self._files}.arrow"
         write_annotations(path, meta, samples)

@@ -1,11 +1,13 @@
 """Predictions on their way to a result file: what a killed run goes on from."""
 
+import io
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from gsmap.evaluation.results_json import write_results
-from gsmap.utils.files import lock
+from gsmap.utils.files import lock, naming_file, open_to_append
 
 _SUFFIX = ".unfinished"
 
@@ -18,17 +20,25 @@ class ResultLog:
     Args:
         out: The result file.
         settings: What decides the predictions, as plain values.
+        tokens: The frames of the run; by default any may be in the file.
 
     Raises:
         RuntimeError: If another process is at work on the same result file.
+        ValueError: If ``OUT.unfinished`` is no such file, is damaged, or has other frames; it stays
+            as it is.
 
     Attributes:
         done: Tokens of the frames that need no more work.
         broken: Reason of each broken frame, by token.
+        dropped: Number of frames of a run with other settings, which are not used.
     """
 
-    def __init__(self, out: Path, settings: dict[str, Any]) -> None:
+    def __init__(
+        self, out: Path, settings: dict[str, Any], tokens: Iterable[str] | None = None
+    ) -> None:
         self.out = out
+        self.dropped = 0
+        self._tokens = None if tokens is None else frozenset(tokens)
         self.path = out.with_name(out.name + _SUFFIX)
         self._head = json.dumps(settings, sort_keys=True) + "\n"
         self.done: set[str] = set()
@@ -36,17 +46,65 @@ class ResultLog:
 
     def __enter__(self) -> "ResultLog":
         self.out.parent.mkdir(parents=True, exist_ok=True)
-        self._file = self.path.open("a", encoding="utf-8")
-        held = f"another process writes {self.path}: wait for its end, or give another --out."
-        lock(self._file, held)
-        content = self.path.read_bytes()
-        whole = content[: content.rfind(b"\n") + 1]  # a kill may cut the last line
-        if not whole.startswith(self._head.encode()):
-            whole = self._head.encode()
-        for line in whole.decode().splitlines()[1:]:
-            self._note(json.loads(line))
-        self.path.write_bytes(whole)
+        self._file = io.BufferedRandom(open_to_append(self.path))
+        try:
+            held = f"another process writes {self.path}: wait for its end, or give another --out."
+            lock(self._file, held)
+            self._take_up()
+        except BaseException:
+            self._file.close()
+            raise
         return self
+
+    def _take_up(self) -> None:
+        """Note the frames that are there, and cut off what cannot be used."""
+        self._file.seek(0)
+        head, end = self._file.readline(), 0
+        same = head == self._head.encode()
+        if head.endswith(b"\n"):
+            self._require(isinstance(_value(head), dict), 1)
+            end = self._file.tell()
+        else:  # a kill cut the first line, if it is one of this file's
+            self._require(not head or head.startswith(b"{"), 1)
+        for number, line in enumerate(self._file if end else (), 2):
+            if not line.endswith(b"\n"):
+                break  # a kill cut the last line
+            frame = _value(line)
+            self._require(self._is_frame(frame, same), number)
+            self._note(frame)
+            end += len(line)
+        if not same:
+            self.dropped = len(self.done)
+            self.done.clear()
+            self.broken.clear()
+            end = 0
+        with naming_file(self.path):
+            self._file.truncate(end)
+            if not end:
+                self._file.write(self._head.encode())
+            self._file.flush()
+
+    def _is_frame(self, frame: Any, same: bool) -> bool:
+        """Whether a line is a frame's, of this run if it is of the same settings, and no second."""
+        if not isinstance(frame, dict):
+            return False
+        token, vectors = frame.get("sample_token"), frame.get("vectors", [])
+        known = not same or self._tokens is None or token in self._tokens
+        vectors_fit = isinstance(vectors, list) and all(isinstance(v, dict) for v in vectors)
+        reason_fits = isinstance(frame.get("broken", ""), str)
+        return (
+            isinstance(token, str)
+            and known
+            and token not in self.done
+            and (vectors_fit and reason_fits)
+        )
+
+    def _require(self, good: bool, number: int) -> None:
+        if not good:
+            raise ValueError(
+                f"{self.path}, line {number}, is no frame of this run: the file is damaged, or "
+                "another program's. Take it away to begin again, or give another --out."
+            )
 
     def __exit__(self, *raised: object) -> None:
         self._file.close()
@@ -58,8 +116,9 @@ class ResultLog:
 
     def _append(self, line: dict[str, Any]) -> None:
         self._note(line)
-        self._file.write(json.dumps(line, separators=(",", ":")) + "\n")
-        self._file.flush()
+        with naming_file(self.path):
+            self._file.write(json.dumps(line, separators=(",", ":")).encode() + b"\n")
+            self._file.flush()
 
     def add(self, token: str, vectors: list[dict[str, Any]]) -> None:
         """Keep a frame's predictions."""
@@ -91,3 +150,11 @@ class ResultLog:
             write_results(self.out, ((t, vectors(at)) for t, at in sorted(places)), meta)
         self.path.unlink()
         return len(places)
+
+
+def _value(line: bytes) -> Any:
+    """Return the value of a line of JSON, None if it is none."""
+    try:
+        return json.loads(line)
+    except (ValueError, RecursionError):
+        return None

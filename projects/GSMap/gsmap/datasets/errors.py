@@ -33,7 +33,8 @@ def naming(what: object, remedy: str) -> Iterator[None]:
     except Exception as error:
         expected = isinstance(error, _UNEXPECTED) or type(error) is Exception  # nuScenes' devkit
         of_arrow = type(error) is OSError and error.errno is None
-        if not (expected or of_arrow) or str(what) in str(error):
+        of_machine = isinstance(error, MemoryError)  # also Arrow's own
+        if of_machine or not (expected or of_arrow) or str(what) in str(error):
             raise
         reason = str(error)
         if isinstance(error, KeyError):

@@ -1,6 +1,7 @@
 """Checkpoints that are whole or absent when written, and run no code when read."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from gsmap.checkpoints.published import load_from_file, load_from_torchvision, l
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
 from gsmap.engine.run_log import innermost
-from gsmap.utils.files import write_bytes, write_text
+from gsmap.utils.files import take_from_link, write_bytes, write_text
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, calibration_of
 from gsmap.utils.shards import digest
 from gsmap.utils.split_lists import (
@@ -26,6 +27,7 @@ from gsmap.utils.split_lists import (
     require_same_list,
 )
 
+NEWEST = "last_checkpoint"  # file of a work folder, which mmengine opens as it stands
 VALIDATED = "last_validation"  # file of a work folder: the iteration validated last
 
 
@@ -116,6 +118,12 @@ class AtomicCheckpointHook(CheckpointHook):
             checkpoint["meta"][IMAGE_SIZE] = list(dataset.scaled_image_size())
             checkpoint["meta"][SIGNALS] = dataset.sample(0).can_bus is not None
 
+    def _save_checkpoint_with_step(self, runner: Runner, step: int, meta: dict) -> None:
+        """Save a checkpoint; the file that tells of the newest is never written through a link."""
+        if runner.rank == 0:
+            take_from_link(Path(runner.work_dir, NEWEST))
+        super()._save_checkpoint_with_step(runner, step, meta)
+
     def _check_split(self, trained: dict[str, Any], loop: Any) -> None:
         """Refuse data of another split, and tell results what the model was trained on."""
         scored = _metainfo(loop.dataloader)
@@ -130,6 +138,7 @@ class AtomicCheckpointHook(CheckpointHook):
     def before_train(self, runner: Runner) -> None:
         """Make up for the validation that was due when a run was cut off, then begin as ever."""
         super().before_train(runner)
+        self._forget_others_best(runner)
         if isinstance(runner.val_loop, BaseLoop):
             self._check_split(_metainfo(runner.train_dataloader), runner.val_loop)
         loop, marker = runner.train_loop, Path(runner.work_dir, VALIDATED)
@@ -140,6 +149,23 @@ class AtomicCheckpointHook(CheckpointHook):
         if due and runner.val_loop is not None and not validated:
             runner.logger.info("The run was cut off before its validation, which is made up for.")
             runner.val_loop.run()
+
+    def _forget_others_best(self, runner: Runner) -> None:
+        """Keep mmengine from removing, as the best before, a file that only a checkpoint names."""
+        folder = Path(self.out_dir).resolve()
+        if self._is_elsewhere(getattr(self, "best_ckpt_path", None), folder):
+            self.best_ckpt_path = None
+        paths = getattr(self, "best_ckpt_path_dict", {})
+        paths.update({name: None for name, p in paths.items() if self._is_elsewhere(p, folder)})
+
+    @staticmethod
+    def _is_elsewhere(path: Any, folder: Path) -> bool:
+        """Whether a path is none of a best checkpoint of a run's folder."""
+        if not isinstance(path, str):
+            return path is not None
+        place = Path(path)
+        name = re.fullmatch(r"best_.+_\d+\.pth", place.name)
+        return not name or place.is_symlink() or place.resolve().parent != folder
 
     def after_val_epoch(self, runner: Runner, metrics: dict[str, float] | None = None) -> None:
         """Keep the best checkpoint and note which state was validated.

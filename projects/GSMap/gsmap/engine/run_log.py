@@ -3,10 +3,12 @@
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
 from mmdet3d.registry import HOOKS
+from mmengine.dist import master_only
 from mmengine.hooks import Hook
 from mmengine.logging import MMLogger
 from mmengine.model import is_model_wrapper
@@ -17,6 +19,7 @@ from torch import nn
 from gsmap.engine.cpu_autocast import CPUAutocastOptimWrapper
 from gsmap.engine.launch import newest_checkpoint, rank_timeout_s
 from gsmap.engine.rank_watch import RankWatch
+from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 
 # How mmengine's long records begin, and those that say nothing about the run
@@ -41,6 +44,16 @@ class MapRunner(Runner):
     """
 
     _watch: RankWatch | None = None
+
+    @master_only
+    def dump_config(self) -> None:
+        """Write the whole config into the work folder, but never over the one that was read."""
+        source = self.cfg.filename and Path(self.cfg.filename)
+        target = Path(self.work_dir, source.name if source else f"{self.timestamp}.py")
+        if source and target.exists() and source.exists() and target.samefile(source):
+            self.logger.info(f"{target} stays as it is; the whole config is in {self.log_dir}.")
+            return
+        write_text(target, self.cfg.dump())
 
     def build_logger(self, *args: Any, **kwargs: Any) -> MMLogger:
         """Build mmengine's logger, which tells its dumps only if ``log_level`` is ``DEBUG``."""

@@ -9,11 +9,14 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gsmap.structures.bezier import curve_points
-from gsmap.structures.elements import MapElements
+from gsmap.structures.elements import FARTHEST_M, MapElements
 from gsmap.utils.files import atomic_write
 from gsmap.utils.json_items import Place, items_of
 from gsmap.utils.shards import ShardFile
@@ -135,12 +138,35 @@ class SampleFile:
             for name in ("scales", "rotations")
             if self._gaussians and vectors and all(f"gaussian_{name}" in v for v in vectors)
         }
-        return MapElements.from_polylines(
+        elements = MapElements.from_polylines(
             polylines,
             [label_of.get(v["cls_name"], -1) for v in vectors],
             [v["confidence_level"] for v in vectors] if self._key == RESULTS_KEY else None,
             **extra,
         )
+        _require_near(elements)
+        return elements
+
+
+def _require_near(elements: MapElements) -> None:
+    """Refuse lines that no map around a vehicle has; what resamples them would take all memory.
+
+    Raises:
+        ValueError: If a point is too far, or a line too long.
+    """
+    points = elements.points
+    if not len(points):
+        return
+    steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
+    starts = elements.offsets[:-1]
+    steps[starts[starts < len(steps)]] = 0.0
+    if np.abs(points).max() > FARTHEST_M or steps.sum() > FARTHEST_M:
+        lengths = [steps[a:b].sum() for a, b in pairwise(elements.offsets)]
+        if (worst := max(np.abs(points).max(), *lengths)) > FARTHEST_M:
+            raise ValueError(
+                f"a line of {worst:.3g} m, or that far from the vehicle: at most "
+                f"{FARTHEST_M / 1000:g} km are read"
+            )
 
 
 def _points_of(vector: Mapping[str, Any]) -> Any:

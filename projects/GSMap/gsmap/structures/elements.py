@@ -28,6 +28,10 @@ def annotated(results: Mapping[str, Any], transform: object) -> Sequence[Any]:
     return elements
 
 
+FARTHEST_M = 1e5
+"""How far from the vehicle a point of a map around it may lie, and how long a line may be."""
+
+
 @dataclass(frozen=True, eq=False)
 class MapElements:
     """Polylines and rings of one sample, one after another in one array.

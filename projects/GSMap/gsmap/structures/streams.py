@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmap.structures.rigid import invert_rigid
+from gsmap.structures.rigid import invert_rigid, is_rigid
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,24 @@ class Frame:
         scene: Name of its scene.
         timestamp_ns: Its time in nanoseconds.
         pose: From the annotation frame to the world. (4, 4)
+
+    Raises:
+        ValueError: If the pose is no rigid motion.
     """
 
     token: str
     scene: str
     timestamp_ns: int
     pose: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        pose = np.asarray(self.pose)
+        if pose.shape != (4, 4) or not is_rigid(pose):
+            raise ValueError(
+                f"the pose of sample {self.token!r} (lidar2global) must be a rigid motion (4, 4) "
+                "from its frame to the world: finite, with a rotation, and 0, 0, 0, 1 below; got "
+                f"{pose.tolist()!r:.200}."
+            )
 
     @classmethod
     def of(cls, meta: Mapping[str, Any]) -> "Frame":
@@ -37,11 +49,6 @@ class Frame:
                 "with memory needs: give each sample its scene, time and pose."
             )
         pose = np.asarray(meta["lidar2global"], np.float64)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError(
-                f"lidar2global of sample {meta.get('token')!r} must be a finite matrix (4, 4) "
-                f"from its annotation frame to the world, got {pose.tolist()}."
-            )
         return cls(str(meta.get("token")), str(meta["scene"]), int(meta["timestamp_ns"]), pose)
 
     def __str__(self) -> str:

@@ -10,20 +10,27 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from gsmap.utils.faults import in_words
+from gsmap.utils.inputs import declare_files, inputs_kept
 from gsmap.utils.parallel import die_with_parent
+from gsmap.utils.terminal import print_safely
 
 BAD_INPUT = 2  # exit code, as argparse's for bad arguments
 ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+_LONGEST_PATH = 4096  # as Linux has it
 CLEAN_UP_S = 5.0  # how long further Ctrl-C are not answered
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser that calls its command as the user does: ``gsmap NAME``, or by its script's name."""
+    """A parser that calls its command as the user does: ``gsmap NAME``, or by its script's name.
+
+    Arguments of the type `output_file` name what the command writes, and all others that name a
+    file what it reads: none may be both (`inputs.declare_files`).
+    """
 
     program: str | None = None
 
@@ -32,14 +39,46 @@ class CommandParser(argparse.ArgumentParser):
             description = re.sub(r"(python )?tools/(\w+)\.py", r"gsmap \2", description)
         super().__init__(prog or self.program, description=description, **options)
 
+    def parse_known_args(self, *args: Any, **kwargs: Any) -> tuple[argparse.Namespace, list[str]]:
+        """Parse arguments, and refuse an output that is an input."""
+        found, rest = super().parse_known_args(*args, **kwargs)
+        inputs: list[Path] = []
+        outputs: dict[Path, str] = {}
+        for action in self._actions:
+            option = action.option_strings[0] if action.option_strings else action.metavar
+            for path in _files_in(getattr(found, action.dest, None)):
+                if action.type is output_file:
+                    outputs[path] = str(option or action.dest)
+                elif path.is_file():
+                    inputs.append(path)
+        declare_files(inputs, outputs)
+        return found, rest
+
+
+def _files_in(value: Any) -> Iterator[Path]:
+    """Yield the paths, and the texts that may be such, in the value of an argument."""
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, str) and 0 < len(value) < _LONGEST_PATH and "\0" not in value:
+        yield Path(value)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _files_in(item)
+    elif isinstance(value, dict):
+        yield from _files_in(list(value.values()))
+
 
 def is_first_rank() -> bool:
     """Whether this process speaks for a run; known before the processes have met."""
     return os.environ.get("RANK", os.environ.get("SLURM_PROCID", "0")) == "0"
 
 
+@inputs_kept()
 def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> None:
     """Run a command, print what it returns, and leave in words whatever a user can cause.
+
+    Nothing that it prints can make the terminal act (`terminal.printable`), and none of its outputs
+    replaces one of its inputs (`inputs.declare_files`).
 
     A file that cannot be read, understood or written, and whatever a ``raise`` statement says, end
     with ``error: ...`` and exit code 2 (`faults.in_words`); Ctrl-C with one line and 130; ``kill``
@@ -53,6 +92,8 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
         heed_kill: Whether ``kill`` lets the clean-up run; processes that wait for each other had
             better die at once.
     """
+    print_safely()
+    os.environ.setdefault("NO_COLOR", "1")  # colours are control characters as well
     logging.raiseExceptions = False  # a log file on a full disk is no reason for tracebacks
     threading.excepthook = _end_of_thread
     end = _End()

@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any
 
+from gsmap.utils.inputs import InputReplacedError
+
 _FULL = "free some space there, or write elsewhere"
 _LESS = (
     "take a smaller batch (train_dataloader.batch_size=1), fewer processes (num_workers, "
@@ -62,7 +64,8 @@ def in_words(error: BaseException) -> str | None:
     of_parser = isinstance(error, ValueError) and type(error) is not ValueError  # such as Arrow's
     meant = last == "RAISE_VARARGS" or of_parser  # Python itself finds the others
     if _IN_WORKER in text:  # all that torch hands on
-        meant, text = isinstance(error, ValueError), text.rstrip().splitlines()[-1]
+        meant = isinstance(error, ValueError | InputReplacedError)
+        text = text.rstrip().splitlines()[-1]
         text = text.partition(": ")[2]
     return (
         _of_the_machine(error, text)

@@ -10,13 +10,18 @@ import platform
 import re
 import secrets
 import shutil
+import stat
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal
+
+from gsmap.utils.inputs import forget_output, require_no_input
 
 SUFFIX = ".gsmap-partial"  # no other program's name
 _BOOT = Path("/proc/sys/kernel/random/boot_id")  # the same for all containers of a machine
@@ -24,6 +29,9 @@ _MACHINE = _BOOT.read_text()[:8] if _BOOT.exists() else secrets.token_hex(4)
 _OURS = re.compile(rf".+\.([0-9a-f]{{8}})-[0-9a-f]{{8}}{re.escape(SUFFIX)}", re.DOTALL)
 _DAY_S = 24 * 3600.0
 _DEVICES = Path("/dev")
+_STREAMS = Path("/dev/fd"), Path("/proc/self/fd")  # links to what a process has open
+_OWN_FOLDERS: set[Path] = set()
+_HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # what `lock_folder` writes
 _CHANGED = re.compile(r"-[0-9a-f]{16}\Z")  # as `file_name` ends a changed name
 DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)  # what it raises
 _LONGEST_NAME = 100  # bytes; a file system takes 255, with all that is appended
@@ -36,11 +44,68 @@ def file_name(foreign: str) -> str:
     has others, is empty or long, begins with a dot or hyphen, or ends as such a name does is
     changed and gets a digest, so that two names never make one file.
     """
-    plain = re.sub(r"[^\w.+=-]", "_", foreign).lstrip(".-").encode()[:_LONGEST_NAME]
-    name = plain.decode(errors="ignore") or "unnamed"
+    name = _plain_name(foreign)
     if name == foreign and not _CHANGED.search(name):
         return name
-    return f"{name}-{hashlib.sha256(foreign.encode(errors='surrogatepass')).hexdigest()[:16]}"
+    return _changed_name(foreign)
+
+
+def file_names(foreign: Iterable[str], endings: Sequence[str] = ("",)) -> dict[str, str]:
+    """Make the names of several files (`file_name`), no two of which are one file.
+
+    Where two differ in nothing but capitals, as some disks do not tell apart, or one is another
+    with an ending, both get a digest.
+
+    Args:
+        foreign: The names that a file brings.
+        endings: What is appended to each name.
+
+    Returns:
+        The name of the file of each.
+    """
+    names = {name: file_name(name) for name in foreign}
+    while True:
+        uses = Counter(f"{name}{e}".casefold() for name in names.values() for e in endings)
+        met = [
+            name
+            for name, file in names.items()
+            if any(uses[f"{file}{e}".casefold()] > 1 for e in endings)
+        ]
+        changed = {name: _changed_name(name) for name in met}
+        if all(names[name] == new for name, new in changed.items()):
+            return names
+        names |= changed
+
+
+def _plain_name(foreign: str) -> str:
+    plain = re.sub(r"[^\w.+=-]", "_", foreign).lstrip(".-").encode()[:_LONGEST_NAME]
+    return plain.decode(errors="ignore") or "unnamed"
+
+
+def _changed_name(foreign: str) -> str:
+    digest = hashlib.sha256(foreign.encode(errors="surrogatepass")).hexdigest()[:16]
+    return f"{_plain_name(foreign)}-{digest}"
+
+
+@contextmanager
+def naming_file(path: Path) -> Iterator[None]:
+    """Say which file it was where the system refuses to write to one that is open."""
+    try:
+        yield
+    except OSError as error:
+        if not error.errno or error.filename:
+            raise
+        raise type(error)(error.errno, error.strerror, str(path)) from error
+
+
+def own_folder(path: Path) -> Path:
+    """Return a folder whose name a command chooses, and let no link below it be followed.
+
+    From then on `atomic_write` refuses (``ValueError``) what a link would lead out of it.
+    """
+    require_no_link(path)
+    _OWN_FOLDERS.add(path)
+    return path
 
 
 @contextmanager
@@ -48,10 +113,18 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
     """Open a file that takes its name only when the block ends well.
 
     Until then it is another file beside it (`partial_path`), which any exception removes. A reader
-    sees the old file or the new one. A device or a pipe, such as ``/dev/null``, is written to as it
-    is. Parent folders are made; text is UTF-8.
+    sees the old file or the new one. It has the mode of the file that it replaces. A link is
+    replaced, not followed. A device or a pipe, such as ``/dev/null``, is written to as it is.
+    Parent folders are made; text is UTF-8.
+
+    Raises:
+        InputReplacedError: If the file is an input of the command (`inputs.declare_files`).
     """
     path = Path(path)
+    require_no_input(path)
+    for folder in _OWN_FOLDERS:
+        if path.is_relative_to(folder):
+            require_no_link(path.parent, folder.parent)
     encoding = None if "b" in mode else "utf-8"
     special = _is_special(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -62,10 +135,13 @@ def atomic_write(path: str | Path, mode: Literal["w", "wb"] = "w") -> Iterator[I
             io.BufferedWriter(_Raw(made, failures)) as buffer,
             buffer if encoding is None else io.TextIOWrapper(buffer, encoding) as file,
         ):
+            if not special:
+                _keep_mode(path, file.fileno())
             yield file
             file.flush()
             if not special:
                 os.fsync(file.fileno())
+                forget_output(path)
                 os.replace(made, path)
     except Exception as raised:
         error = failures[0] if failures else raised
@@ -80,7 +156,7 @@ class _Raw(io.FileIO):
     """A file that notes why it cannot be written: some libraries tell it in words of their own."""
 
     def __init__(self, path: Path, failures: list[OSError]) -> None:
-        super().__init__(str(path), "w")
+        super().__init__(str(path), "w", opener=_open_unlinked)
         self._failures = failures
 
     def write(self, data: Any) -> int | None:  # type: ignore[override]
@@ -89,6 +165,75 @@ class _Raw(io.FileIO):
         except OSError as error:
             self._failures.append(error)
             raise
+
+
+def _open_unlinked(path: str, flags: int) -> int:
+    """Open a file, or a pipe that somebody reads from, for writing; no file elsewhere by a link."""
+    follows = _is_special(Path(path))  # /dev/stdout
+    return os.open(path, flags | (0 if follows else os.O_NOFOLLOW), 0o666)
+
+
+def _keep_mode(path: Path, handle: int) -> None:
+    """Give an open file the permissions of the one that it is to replace."""
+    with suppress(FileNotFoundError):
+        before, own = path.lstat().st_mode, os.fstat(handle).st_mode
+        wanted = stat.S_IMODE(before) & 0o777
+        if stat.S_ISREG(before) and stat.S_IMODE(own) != wanted:
+            os.fchmod(handle, wanted)
+
+
+def open_to_append(path: Path) -> IO[bytes]:
+    """Open a file to read it and add to it, unbuffered; it is made if there is none.
+
+    Raises:
+        ValueError: If it is no plain file of one name: a link leads elsewhere, and a pipe or a
+            folder holds no text.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    status = None
+    with suppress(FileNotFoundError):
+        status = path.lstat()
+    if status is None or _is_plain(status):
+        file = io.FileIO(os.open(path, flags, 0o666), "a+")
+        if _is_plain(os.fstat(file.fileno())):
+            return file
+        file.close()
+    raise ValueError(
+        f"{path} is a link, a pipe or a folder, and no file of this program: take it away, or "
+        "write elsewhere."
+    )
+
+
+def require_no_link(path: Path, below: Path | None = None) -> None:
+    """Refuse a folder that a link leads elsewhere from.
+
+    Args:
+        path: A folder whose name the command chooses.
+        below: A folder above it that the user named, through whatever links; by default its parent.
+
+    Raises:
+        ValueError: If it, or a folder between the two, is a link.
+    """
+    top = path.parent if below is None else below
+    for folder in (path, *path.parents):
+        if folder == top:
+            return
+        if folder.is_symlink():
+            raise ValueError(
+                f"{folder} is a link, and what is written there would go elsewhere: take it away, "
+                "or write elsewhere."
+            )
+
+
+def take_from_link(path: Path) -> None:
+    """Free a name that a library is to write to from what leads elsewhere: a link, a hard link."""
+    with suppress(FileNotFoundError):
+        if not _is_plain(path.lstat()):
+            path.unlink()
+
+
+def _is_plain(status: os.stat_result) -> bool:
+    return stat.S_ISREG(status.st_mode) and status.st_nlink == 1
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -121,8 +266,11 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         file.write(content)
 
 
+_touch = partial(Path.touch, exist_ok=False)  # not through a link
+
+
 @contextmanager
-def partial_path(path: Path, make: Callable[[Path], object] = Path.touch) -> Iterator[Path]:
+def partial_path(path: Path, make: Callable[[Path], object] = _touch) -> Iterator[Path]:
     """Make an empty file or folder beside ``path``, which the block fills and gives that name.
 
     It is ``PATH.<machine>-<random>.gsmap-partial``, locked while the block runs, and goes with its
@@ -184,10 +332,14 @@ def lock_folder(folder: Path, name: str, advice: str) -> IO[str]:
         RuntimeError: If another process has it; its number, its machine and since when.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    file = open(folder / name, "a+", encoding="utf-8", errors="replace")  # noqa: SIM115 - kept
+    raw = open_to_append(folder / name)
+    file = io.TextIOWrapper(io.BufferedRandom(raw), "utf-8", "replace")
     os.register_at_fork(after_in_child=file.close)  # workers must not hold it for a killed parent
     file.seek(0)
-    lock(file, f"{folder} is in use by {file.read(200) or 'another process'}: {advice}.")
+    holder = file.read(200)
+    if not _HOLDER.fullmatch(holder):
+        raise ValueError(f"{folder / name} is another program's file: write elsewhere.")
+    lock(file, f"{folder} is in use by {holder or 'another process'}: {advice}.")
     file.truncate(0)
     file.write(f"process {os.getpid()} on {platform.node()} since {time.strftime('%F %T')}")
     file.flush()
@@ -211,7 +363,7 @@ def _remove_leftovers(folder: Path) -> None:
 
 def _open(path: Path) -> int:
     """Open a file or folder to lock it; network disks lock files only for who may write."""
-    return os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    return os.open(path, os.O_NOFOLLOW | (os.O_RDONLY if path.is_dir() else os.O_RDWR))
 
 
 def _remove(path: Path) -> None:
@@ -219,5 +371,14 @@ def _remove(path: Path) -> None:
 
 
 def _is_special(path: Path) -> bool:
-    """Whether a path is a device, a pipe or the like, which must not be replaced by a file."""
-    return path.exists() and not path.is_dir() and (not path.is_file() or path.parent == _DEVICES)
+    """Whether a path is a device, a pipe or the like, which must not be replaced by a file.
+
+    A link to one is a file's name like any other, but for those that the system makes.
+    """
+    follow = path.parent in (_DEVICES, *_STREAMS)
+    try:
+        mode = path.stat(follow_symlinks=follow).st_mode
+    except OSError:
+        return False
+    plain = stat.S_ISREG(mode) and path.parent != _DEVICES
+    return not (plain or stat.S_ISDIR(mode) or stat.S_ISLNK(mode))

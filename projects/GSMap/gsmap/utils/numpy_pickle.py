@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-_CODE = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,4}")
+_CODE = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,3}")
 _STATE_PARTS = {int, str, type(None)}
 _MAX_DIMS = 8
+_MAX_EMPTY = 1000  # length along an axis of an array without values
 _LARGEST = {"b": 1, "U": 0x10FFFF}  # of booleans and characters, as integers
 
 
@@ -60,6 +61,8 @@ class CheckedArray(np.ndarray):
         whole = isinstance(shape, tuple) and all(type(n) is int and n >= 0 for n in shape)
         if not whole or len(shape) > _MAX_DIMS:
             raise pickle.UnpicklingError(f"an array has the shape {shape!r}")
+        if math.prod(shape) == 0 and max(shape) > _MAX_EMPTY:
+            raise pickle.UnpicklingError(f"an array without values has the shape {shape!r:.80}")
         dtype = checked.dtype
         if math.prod(shape) * dtype.itemsize != len(data):
             raise pickle.UnpicklingError(f"an array {shape} of {dtype} has {len(data)} bytes")

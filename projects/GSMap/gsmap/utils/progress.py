@@ -5,6 +5,8 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
+from gsmap.utils.terminal import own_stream
+
 _PLAIN = {"mininterval": 60.0, "maxinterval": 60.0}
 _FORMAT = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed}"
 
@@ -16,6 +18,8 @@ class Progress(tqdm):
         if not sys.stderr.isatty():
             title = f"{kwargs['desc']}: " if kwargs.get("desc") else ""
             kwargs |= {**_PLAIN, "desc": title, "bar_format": _FORMAT, "file": _Lines(sys.stderr)}
+        else:
+            kwargs.setdefault("file", own_stream(sys.stderr))  # it moves the cursor
         super().__init__(*args, **kwargs)
 
 

@@ -1,6 +1,7 @@
 """Composition of cameras and bird's-eye views into one picture, rendered or written."""
 
 import base64
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from io import BytesIO
@@ -36,6 +37,7 @@ FORMATS = tuple(_SAVE_OPTIONS)
 _MARGIN, _GAP, _HEADER, _TICKS, _TITLE = 26, 6, 84, 60, 44  # px at DPI
 _USABLE = _WIDTH - 2 * _MARGIN
 _PNG_IN_SVG = re.compile(rb"data:image/png;base64,([\w+/=\s]+)")
+_RANDOM = re.compile(r"[0-9a-f]{16,}")
 _LONG_NUMBER = re.compile(rb"(?<!scale\()\b(\d+\.\d\d)\d{2,}")
 _TALLEST = 0.5 * _USABLE  # of a camera row or a BEV panel
 _LONGEST_TITLE = 88  # characters
@@ -196,11 +198,18 @@ def sample_title(metainfo: Mapping[str, Any]) -> str:
 
 
 def sample_name(metainfo: Mapping[str, Any], suffix: str) -> str:
-    """Return a file name that sorts by scene and time and ends in the last letters of the token."""
-    name, seconds = str(metainfo.get("token") or ""), metainfo.get("seconds")
-    if seconds is not None:
-        name = f"{metainfo.get('scene') or 'scene'}_{seconds:07.2f}s_{name[-8:]}"
-    return file_name(name) + suffix
+    """Return a file name that sorts by scene and time and ends in the last letters of the token.
+
+    A token that is not a random number of 16 hexadecimal digits or more may end as another one
+    does, so that its digest comes last.
+    """
+    token, seconds = str(metainfo.get("token") or ""), metainfo.get("seconds")
+    if seconds is None:
+        return file_name(token) + suffix
+    name = file_name(f"{metainfo.get('scene') or 'scene'}_{seconds:07.2f}s_{token[-8:]}")
+    if len(token) > 8 and not _RANDOM.fullmatch(token):
+        name += f"-{hashlib.sha256(token.encode(errors='surrogatepass')).hexdigest()[:8]}"
+    return name + suffix
 
 
 def save_figure(figure: Figure, path: str | Path) -> Path:

@@ -14,6 +14,7 @@ from pyarrow import feather
 from gsmap.datasets.errors import naming
 from gsmap.structures.rigid import rigid
 from gsmap.utils.files import SUFFIX as PARTIAL
+from gsmap.utils.inputs import heed_input
 
 # The order of MapTR and MapTRv2: camera embeddings of their checkpoints depend on it.
 RING_CAMERAS = (
@@ -38,6 +39,7 @@ MAP_CHANGE_LOGS = (
 
 def _read_feather(path: Path) -> Any:
     """Read a table; ``ArrowException`` if it is damaged, which might end the process later."""
+    heed_input(path)
     table = feather.read_table(path, memory_map=False)
     table.validate(full=True)
     return table.to_pandas()

@@ -8,6 +8,7 @@ import pyarrow.compute as pc
 
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.annotations.schema import matrices_of
+from gsmap.structures.elements import FARTHEST_M
 from gsmap.structures.rigid import is_rigid
 
 _OPTIONAL = {"lidar", "can_bus", "instances", "ego_from_frame"}
@@ -91,18 +92,22 @@ def _are_own_names(names: pa.StringArray, rows: np.ndarray, _meta: AnnotationMet
 
 
 def _are_polylines(lists: pa.ListArray, _rows: np.ndarray, meta: AnnotationMeta) -> np.ndarray:
-    """Say which polylines have two finite points or more."""
+    """Say which polylines have two points or more, all of them finite and within reach."""
     counts = np.diff(lists.offsets.to_numpy())
     good = (counts % meta.dim == 0) & (counts >= 2 * meta.dim)
-    finite = np.isfinite(lists.values.to_numpy(zero_copy_only=False))
-    if not finite.all():
-        good[np.repeat(np.arange(len(counts)), counts)[~finite]] = False
+    near = np.abs(lists.values.to_numpy(zero_copy_only=False)) <= FARTHEST_M  # NaN is not
+    if not near.all():
+        good[np.repeat(np.arange(len(counts)), counts)[~near]] = False
     return good
 
 
+_FARTHEST_POSE_M = 1e8  # several times the Earth
 _TRANSFORM = (
-    lambda arrays, *_: is_rigid(matrices_of(arrays, 4, 4)),
-    " is no rigid transform: it must be finite, with a rotation and 0, 0, 0, 1 below",
+    lambda arrays, *_: (
+        is_rigid(matrices_of(arrays, 4, 4))
+        & (np.abs(matrices_of(arrays, 4, 4)[:, :3, 3]) <= _FARTHEST_POSE_M).all(-1)
+    ),
+    " is no rigid transform: it must be finite, with a rotation, a translation within 100,000 km and 0, 0, 0, 1 below",
 )
 _SIZE = lambda numbers, *_: numbers.to_numpy() > 0, " {0}: the size is not positive"
 _NAME = (
@@ -136,6 +141,9 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
         lambda labels, _, meta: (labels.to_numpy() >= 0) & (labels.to_numpy() < len(meta.classes)),
         " {0} is none of the classes {1.classes}",
     ),
-    "points": (_are_polylines, " of an element must be (n >= 2, {1.dim}), not NaN or infinite"),
+    "points": (
+        _are_polylines,
+        " of an element must be (n >= 2, {1.dim}), not NaN, infinite or beyond 100 km",
+    ),
 }
 """By field: which items of an array are good, and what is said of the first that is not."""

@@ -31,10 +31,12 @@ from gsmap.datasets.annotations.schema import (
     schema_of,
 )
 from gsmap.utils.files import atomic_write
+from gsmap.utils.inputs import heed_input
 from gsmap.utils.shards import WHOLE, Shard, ShardFile
 
 SHARD_KIND = "annotations"
 _ROWS_PER_BATCH = 256
+_WORDS = ("dataset", "frame", "split", "command", "source_fingerprint")  # of the metadata
 
 
 class AnnotationWriter:
@@ -199,12 +201,15 @@ class AnnotationFile(Sequence[MapSample]):
                 "docs/data.md)."
             )
         try:
+            heed_input(self.path)
             self._map = pa.memory_map(str(self.path))
             self._state = self._current_state()
             self._content = self._map.read_buffer()
             schema, self._batches, seal, ends = read_messages(self._content)
             self.meta = _meta_of(schema)
         except (pa.ArrowException, OSError, ValueError, TypeError) as error:
+            if isinstance(error, MemoryError) or getattr(error, "errno", None):
+                raise  # what the machine lacks is no fault of the file
             raise ValueError(
                 f"{self.path} is not a whole annotation file ({error}): delete it and run "
                 "tools/create_data.py again."
@@ -219,6 +224,8 @@ class AnnotationFile(Sequence[MapSample]):
             elif [end for end, _ in sums] != ends:
                 raise ValueError("it was replaced after this run had opened it")
         except (pa.ArrowException, ValueError, TypeError, KeyError) as error:
+            if isinstance(error, MemoryError):
+                raise
             text = str(error).rstrip(".")
             raise ValueError(
                 f"{self.path} is damaged: {text}. Copy it again, or {self.remedy}"
@@ -365,4 +372,16 @@ def _meta_of(schema: pa.Schema) -> AnnotationMeta:
             f"it has format version {found} or other columns than version {FORMAT_VERSION}, which "
             f"this program reads: make it again with `{command or 'tools/create_data.py'}`"
         )
+    _require_plain(values)
     return AnnotationMeta(**values)
+
+
+def _require_plain(values: dict[str, Any]) -> None:
+    """Refuse words of a file's metadata that no terminal, picture or map could hold."""
+    classes = values.get("classes")
+    words = {name: values.get(name) for name in _WORDS}
+    if isinstance(classes, list):
+        words |= {f"class {number}": name for number, name in enumerate(classes)}
+    for name, word in words.items():
+        if word is not None and not (isinstance(word, str) and word.isprintable()):
+            raise ValueError(f"its {name} must be plain text, got {word!a:.80}")

@@ -36,6 +36,9 @@ from gsmap.visualization.page.tables import (
 )
 from gsmap.visualization.style import MATCH_COLOURS, MapStyle
 
+_GENERATOR = b'<meta name="generator" content="gsmap">'
+_HEAD_BYTES = 4096  # of a page, within which it names its generator
+
 
 @dataclass(frozen=True)
 class PageOptions:
@@ -218,6 +221,12 @@ def _block(value: Any) -> str:
 
 def _digest(text: str) -> str:
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def is_own_page(path: Path) -> bool:
+    """Whether a file is a page that `write_page` has written."""
+    with path.open("rb") as file:
+        return _GENERATOR in file.read(_HEAD_BYTES)
 
 
 def write_page(path: str | Path, data: Mapping[str, Any]) -> str:

@@ -1,0 +1,132 @@
+"""What a command reads, which none of its outputs may replace."""
+
+import os
+import stat
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+_Identity = tuple[int, int, int]  # device and number of a file, and when it was last changed
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+
+
+class InputReplacedError(RuntimeError):
+    """A command would write over a file that it reads."""
+
+
+class _Command:
+    """What the command that runs reads and writes."""
+
+    runs = False
+    inputs: dict[_Identity, Path] = {}  # files that its arguments name
+    outputs: dict[_Identity, str] = {}  # files there already that its options name as outputs
+    hooked = False
+
+
+@contextmanager
+def inputs_kept() -> Iterator[None]:
+    """Refuse, while the block runs, whatever would write over an input (`declare_files`)."""
+    _Command.runs = True
+    try:
+        yield
+    finally:
+        _Command.runs = False
+        _Command.inputs.clear()
+        _Command.outputs.clear()
+
+
+def declare_files(inputs: Iterable[Path], outputs: Mapping[Path, str]) -> None:
+    """Tell which files a command's arguments name, before it begins to work.
+
+    From then on reading a file that is an output ends the command, wherever it is read: by an
+    argument, in a folder that is read, by a name in a config, also by another name of it (a link or
+    a hard link). Writing over an input does, too.
+
+    Args:
+        inputs: Files that it reads.
+        outputs: Files that it writes, with the options that name them.
+
+    Raises:
+        InputReplacedError: If a file is an input and an output.
+        ValueError: If two options name one output.
+    """
+    places: dict[str, str] = {}
+    for path, option in outputs.items():
+        if path.is_file() or not path.exists():  # a device may take several
+            first = places.setdefault(os.path.realpath(path), option)
+            if first != option:
+                raise ValueError(f"{first} and {option} both name {path}: give two names.")
+    there = {i: f"{option} {path}" for path, option in outputs.items() if (i := _identity(path))}
+    for path in inputs:
+        _require_other(path, there)
+    if not _Command.runs:
+        return
+    _Command.inputs |= {i: path for path in inputs if (i := _identity(path))}
+    _Command.outputs |= there
+    if there and not _Command.hooked:
+        sys.addaudithook(_on_event)
+        _Command.hooked = True
+
+
+def heed_input(path: str | bytes | os.PathLike) -> None:
+    """Refuse to read a file that the command is to write; for what Python does not open itself.
+
+    Raises:
+        InputReplacedError: If it is one of the outputs.
+    """
+    if _Command.outputs:
+        _require_other(path, _Command.outputs)
+
+
+def _require_other(path: str | bytes | os.PathLike, outputs: Mapping[_Identity, str]) -> None:
+    output = outputs.get(_identity(path)) if outputs else None
+    if output:
+        raise InputReplacedError(
+            f"{output} would replace what this command reads ({os.fsdecode(path)}): give another "
+            "name."
+        )
+
+
+def require_no_input(path: Path) -> None:
+    """Refuse to replace a file that the command's arguments name as an input.
+
+    Raises:
+        InputReplacedError: If it is one.
+    """
+    read = _Command.inputs.get(_identity(path)) if _Command.inputs else None
+    if read:
+        raise InputReplacedError(
+            f"{path} would replace what this command reads ({read}): name another place for what "
+            "it writes."
+        )
+
+
+def forget_output(path: Path) -> None:
+    """Let a file be read again: it is to be replaced, and what takes its name is an output."""
+    if _Command.outputs:
+        _Command.outputs.pop(_identity(path), None)
+
+
+def _on_event(event: str, arguments: tuple[Any, ...]) -> None:
+    """Look at each file that Python opens (an audit hook), and at SQLite's."""
+    if not _Command.outputs:
+        return
+    if event == "open":
+        path, _, flags = arguments
+        if isinstance(path, str | bytes) and not (flags or 0) & _WRITING:
+            heed_input(path)
+    elif event == "sqlite3.connect" and isinstance(arguments[0], str):
+        heed_input(arguments[0].removeprefix("file:").partition("?")[0])
+
+
+def _identity(path: str | bytes | os.PathLike) -> _Identity | None:
+    """Return what tells a file from others, under any of its names; None if there is none."""
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError):  # a name with a zero byte
+        return None
+    if not stat.S_ISREG(status.st_mode):
+        return None
+    return status.st_dev, status.st_ino, status.st_mtime_ns
