@@ -86,9 +86,7 @@ def parse_args() -> argparse.Namespace:
 def main() -> str:
     args = parse_args()
     if args.out is _PAGE and _PAGE.exists() and not is_own_page(_PAGE):
-        raise FileExistsError(
-            f"{_PAGE} is there, and no page of this command: --out names another."
-        )
+        raise FileExistsError(f"{_PAGE} is there, and no page of this command: give --out PAGE.")
     paths = [args.results, *([args.compare] if args.compare else [])]
     names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     if len(names) != len(paths) or len(set(names)) != len(names):

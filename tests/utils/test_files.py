@@ -15,8 +15,13 @@ from gsmap.utils.files import (
     SUFFIX,
     atomic_write,
     file_name,
+    file_names,
     lock_folder,
+    open_to_append,
+    own_folder,
     partial_path,
+    require_no_link,
+    take_from_link,
     write_bytes,
     write_text,
 )
@@ -159,6 +164,10 @@ def test_a_folder_is_for_one_process_and_says_whose(tmp_path):
     here, (said, says) = tmp_path / "new", os.pipe()
     here.mkdir()
     (here / ".lock").write_bytes(b"\xff of another program")
+    with pytest.raises(ValueError, match=r"\.lock is another program's file"):
+        lock_folder(here, ".lock", "wait")
+    assert (here / ".lock").read_bytes() == b"\xff of another program"
+    (here / ".lock").write_bytes(b"")
     with lock_folder(here, ".lock", "wait"):
         worker = os.fork()  # one that outlives the block
         if worker == 0:
@@ -234,3 +243,99 @@ def test_a_full_disk_is_told_whatever_a_library_says_of_it(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("target", ["file", "folder", "nothing", "pipe"])
+def test_a_link_is_replaced_and_not_followed(target, tmp_path):
+    place = tmp_path / target
+    if target == "file":
+        place.write_text("theirs")
+    elif target == "folder":
+        place.mkdir()
+    elif target == "pipe":
+        os.mkfifo(place)
+    link = tmp_path / "link"
+    link.symlink_to(place)
+    write_text(link, "ours")
+    assert not link.is_symlink()
+    assert link.read_text() == "ours"
+    assert target != "file" or place.read_text() == "theirs"
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o664, 0o4755])
+def test_a_file_that_is_replaced_keeps_its_permissions(mode, tmp_path):
+    path = tmp_path / "secret"
+    path.write_text("old")
+    path.chmod(mode)
+    with atomic_write(path) as file:
+        assert stat.S_IMODE(os.fstat(file.fileno()).st_mode) == mode & 0o777
+        file.write("new")
+    assert stat.S_IMODE(path.stat().st_mode) == mode & 0o777
+
+
+def test_the_system_s_own_links_are_followed():
+    read, write = os.pipe()
+    write_text(f"/dev/fd/{write}", "through")
+    assert os.read(read, 7) == b"through"
+    os.close(read)
+    os.close(write)
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling", "hard", "pipe", "folder"])
+def test_what_is_added_to_is_a_plain_file_of_its_own(kind, tmp_path):
+    theirs, path = tmp_path / "theirs", tmp_path / "log"
+    theirs.write_text("keys")
+    make = {
+        "link": lambda: path.symlink_to(theirs),
+        "dangling": lambda: path.symlink_to(tmp_path / "new"),
+        "hard": lambda: os.link(theirs, path),
+        "pipe": lambda: os.mkfifo(path),
+        "folder": path.mkdir,
+    }
+    make[kind]()
+    with pytest.raises(ValueError, match="log is a link, a pipe or a folder"):
+        open_to_append(path)
+    with pytest.raises(ValueError, match="log is a link, a pipe or a folder"):
+        lock_folder(tmp_path, "log", "wait")
+    assert theirs.read_text() == "keys"
+    assert not (tmp_path / "new").exists()
+    if kind != "folder":
+        take_from_link(path)
+        assert not path.exists()
+        assert theirs.read_text() == "keys"
+        with open_to_append(path) as file:
+            file.write(b"a")
+        with open_to_append(path) as file:
+            file.write(b"b")
+        take_from_link(path)
+        assert path.read_bytes() == b"ab"
+
+
+def test_no_link_leads_out_of_a_folder_whose_name_a_command_chooses(tmp_path):
+    elsewhere, named = tmp_path / "elsewhere", tmp_path / "named"
+    elsewhere.mkdir()
+    named.symlink_to(tmp_path)  # what the user names may be a link
+    own = own_folder(named / "frames")
+    write_text(own / "drive/front/0", "x")
+    (own / "drive/back").symlink_to(elsewhere)
+    with pytest.raises(ValueError, match="drive/back is a link, and what is written there"):
+        write_text(own / "drive/back/0", "x")
+    (tmp_path / "other").symlink_to(elsewhere)
+    with pytest.raises(ValueError, match="other is a link"):
+        own_folder(named / "other")
+    require_no_link(named / "a/b", named)
+    assert not any(elsewhere.iterdir())
+
+
+def test_files_of_several_names_never_meet():
+    plain = file_names(["a", "b", "c_lonlat"], ("", "_lonlat"))
+    assert plain == {"a": "a", "b": "b", "c_lonlat": "c_lonlat"}
+    for names, endings in (
+        (["x", "X"], ("",)),
+        (["a", "a_lonlat", "b"], ("", "_lonlat")),
+        (["a", "A_lonLat", file_names(["a", "A"])["a"] + "_LONLAT"], ("", "_lonlat")),
+    ):
+        files = file_names(names, endings)
+        assert files.get("b", "b") == "b"
+        made = [f"{file}{ending}".casefold() for file in files.values() for ending in endings]
+        assert len({*made}) == len(made) == len(names) * len(endings)

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 _Identity = tuple[int, int, int]  # device and number of a file, and when it was last changed
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
@@ -20,8 +20,8 @@ class _Command:
     """What the command that runs reads and writes."""
 
     runs = False
-    inputs: dict[_Identity, Path] = {}  # files that its arguments name
-    outputs: dict[_Identity, str] = {}  # files there already that its options name as outputs
+    inputs: ClassVar[dict[_Identity, Path]] = {}  # files that its arguments name
+    outputs: ClassVar[dict[_Identity, str]] = {}  # files there already that an option names
     hooked = False
 
 

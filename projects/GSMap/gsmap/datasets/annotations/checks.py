@@ -107,7 +107,8 @@ _TRANSFORM = (
         is_rigid(matrices_of(arrays, 4, 4))
         & (np.abs(matrices_of(arrays, 4, 4)[:, :3, 3]) <= _FARTHEST_POSE_M).all(-1)
     ),
-    " is no rigid transform: it must be finite, with a rotation, a translation within 100,000 km and 0, 0, 0, 1 below",
+    " is no rigid transform: it must be finite, with a rotation, a translation within 100,000 km "
+    "and 0, 0, 0, 1 below",
 )
 _SIZE = lambda numbers, *_: numbers.to_numpy() > 0, " {0}: the size is not positive"
 _NAME = (
