@@ -84,8 +84,9 @@ def parse_args() -> argparse.Namespace:
 
 
 def main() -> str:
+    foreign = _PAGE.exists() and not is_own_page(_PAGE)
     args = parse_args()
-    if args.out is _PAGE and _PAGE.exists() and not is_own_page(_PAGE):
+    if args.out is _PAGE and foreign:
         raise FileExistsError(f"{_PAGE} is there, and no page of this command: give --out PAGE.")
     paths = [args.results, *([args.compare] if args.compare else [])]
     names = args.names or [f"{path.resolve().parent.name}/{path.stem}" for path in paths]

@@ -124,6 +124,20 @@ def test_origins_are_those_of_the_devkits():
         MapOrigin(120.0, 0.0)
 
 
+def test_a_map_off_the_earth_has_no_degrees(tmp_path):
+    pytest.importorskip("pyproj", reason="pip install -e .[maps]")
+    origin = MapOrigin(48.0, 11.0)
+    for far_m in (1e9, 1e200, np.inf):
+        line = np.array([[0.0, 0.0], [far_m, 1.0]])
+        with pytest.raises(ValueError, match=r"the map reaches .* where there is no longitude"):
+            origin.lon_lat(line)
+    elements = MapElements.from_polylines([[[0.0, 0.0], [1e9, 1.0]]], [0], [1.0])
+    for write in (write_geojson, write_lanelet2):
+        with pytest.raises(ValueError, match="no longitude and latitude"):
+            write(tmp_path / "map", elements, CLASSES, origin)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_map_grows_on_the_ground(camera_drive, true):
     drive, _ = camera_drive
     lengths = []

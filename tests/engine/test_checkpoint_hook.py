@@ -277,6 +277,44 @@ def test_the_best_of_the_validations_is_kept(tmp_path):
         learn(tmp_path / "other", 2, save_best="chamfer/mAP", rule="greater")
 
 
+def test_a_checkpoint_names_no_file_that_its_training_removes(tmp_path):
+    learn(tmp_path / "run", 2, save_best="figure", rule="greater")
+    precious, best = tmp_path / "keys", tmp_path / "run/best_figure_epoch_2.pth"
+    precious.write_text("mine")
+    (tmp_path / "run/best_figure_epoch_1.pth").symlink_to(precious)
+    for named in (
+        str(precious), str(tmp_path / "run/../keys"), str(tmp_path / "run/epoch_1.pth"),
+        str(tmp_path / "run/best_figure_epoch_1.pth"), 5,
+    ):  # fmt: skip
+        content = torch.load(tmp_path / "run/epoch_2.pth", weights_only=False)
+        content["message_hub"]["runtime_info"] |= {"best_ckpt": named, "best_score": -1.0}
+        torch.save(content, tmp_path / "run/foreign.pth")
+        learn(tmp_path / "run", 3, tmp_path / "run/foreign.pth", save_best="figure", rule="greater")
+        assert precious.read_text() == "mine"
+        assert (tmp_path / "run/epoch_1.pth").exists()
+        assert best.exists()
+    content["message_hub"]["runtime_info"]["best_ckpt"] = str(best)
+    torch.save(content, tmp_path / "run/own.pth")
+    learn(tmp_path / "run", 3, tmp_path / "run/own.pth", save_best="figure", rule="greater")
+    assert not best.exists()  # the run's own, which a better one has followed
+
+
+@pytest.mark.parametrize("kind", ["link", "hard", "pipe"])
+def test_the_name_of_the_newest_checkpoint_is_written_to_no_other_file(kind, tmp_path):
+    keys, name = tmp_path / "keys", tmp_path / "run/last_checkpoint"
+    keys.write_text("mine")
+    name.parent.mkdir()
+    if kind == "link":
+        name.symlink_to(keys)
+    elif kind == "hard":
+        os.link(keys, name)
+    else:
+        os.mkfifo(name)
+    learn(tmp_path / "run", 1)
+    assert keys.read_text() == "mine"
+    assert name.read_text() == str(tmp_path / "run/epoch_1.pth")
+
+
 def test_a_checkpoint_holds_the_models_settings_and_no_text_that_runs(tmp_path):
     learn(tmp_path, 1)
     settings = read_checked(tmp_path / "epoch_1.pth").settings

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from mmengine.config import Config
 from mmengine.evaluator import Evaluator
 from mmengine.evaluator.metric import DumpResults
 from mmengine.hooks import Hook
@@ -29,3 +30,27 @@ def test_dumps_are_told_to_whoever_debugs(level, tmp_path):
     assert "what matters" in text
     for dump in ("System environment", "riddle", "Hooks will be executed"):
         assert (dump in text) == (level == "DEBUG")
+
+
+@pytest.mark.parametrize("kind", ["link", "input", "earlier"])
+def test_the_config_of_a_run_replaces_no_other_file(kind, tmp_path):
+    source, keys, work = tmp_path / "mine.py", tmp_path / "keys", tmp_path / "run"
+    source.write_text("a = 1  # my notes\n")
+    keys.write_text("mine")
+    work.mkdir()
+    if kind == "link":
+        (work / "mine.py").symlink_to(keys)
+    elif kind == "earlier":
+        (work / "mine.py").write_text("a = 0\n")
+    cfg = Config.fromfile(source)
+    MapRunner(
+        torch.nn.Linear(1, 1),
+        str(tmp_path if kind == "input" else work),
+        experiment_name=f"dumped-{kind}",
+        default_scope="mmdet3d",
+        cfg=cfg,
+    )
+    assert keys.read_text() == "mine"
+    assert source.read_text() == "a = 1  # my notes\n"
+    assert (work / "mine.py").exists() == (kind != "input")
+    assert kind == "input" or (work / "mine.py").read_text().strip() == "a = 1"

@@ -203,6 +203,17 @@ def test_heights_count_in_chamfer_if_asked_and_never_in_raster(tmp_path):
             '"cls_name": "divider", "confidence_level": 1}]}]}',
             "t0.*coordinates",
         ),
+        (
+            '{"results": [{"sample_token": "t0", "vectors": [{"pts": [[0, 0], [1e9, 1]],'
+            '"cls_name": "divider", "confidence_level": 1}]}]}',
+            "t0.*a line of 1e\\+09 m, or that far from the vehicle",
+        ),
+        (  # each point is near, the line is long
+            '{"results": [{"sample_token": "t0", "vectors": [{"pts": ['
+            + ", ".join(["[0, 0], [9e4, 0]"] * 3)
+            + '], "cls_name": "divider", "confidence_level": 1}]}]}',
+            "t0.*a line of 4.5e\\+05 m",
+        ),
         (  # names of two kinds could not be sorted in the notes
             '{"results": [{"sample_token": "t0", "vectors": [{"pts": [[0, 0], [1, 1]],'
             '"cls_name": null, "confidence_level": 1}, {"pts": [[0, 0], [1, 1]],'

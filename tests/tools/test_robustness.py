@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,24 @@ def test_a_run_writes_table_figures_and_plot(tool, minicity_root, tmp_path, monk
     }  # fmt: skip
     assert (tmp_path / "robustness.md").read_text() in said
     assert (tmp_path / "robustness.png").stat().st_size > 1000
+
+
+def test_figures_of_earlier_runs_into_a_folder_are_kept(tool, tmp_path):
+    path = tmp_path / "robustness.json"
+    assert tool.earlier_figures(path) == {}
+    clean, other = [{"mean": 40.0}], [{"mean": 41.0}]
+    rows = [{"mean": 20.0}] * 5
+    path.write_text(json.dumps({"none": clean, "fog": rows, "jpeg": rows}))
+    before = tool.earlier_figures(path)
+    args = Namespace(out=tmp_path, kinds=["jpeg", "rain"])
+    assert tool.kept_figures(before, clean, args) == {"fog": rows}
+    with pytest.raises(ValueError, match=r"has figures of fog of another model .* give another"):
+        tool.kept_figures(before, other, args)
+    assert tool.kept_figures(before, other, Namespace(out=tmp_path, kinds=["fog", "jpeg"])) == {}
+    for wrong in ("[]", "{}", '{"none": [{"mean": 1.0}], "mist": []}', '{"none": [{"mean": "a"}]}'):
+        path.write_text(wrong)
+        with pytest.raises(ValueError, match=r"robustness.json holds no figures of this command"):
+            tool.earlier_figures(path)
 
 
 def test_data_of_another_split_is_refused_unless_allowed(tool, tmp_path, monkeypatch):

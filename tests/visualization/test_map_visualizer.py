@@ -143,6 +143,8 @@ def test_scene_and_time_name_a_picture(tmp_path):
     meta = {"scene": "scene/7", "seconds": 12.5, "token": "0123456789abcdef"}
     assert sample_name(meta | {"scene": "a"}, ".png") == "a_0012.50s_89abcdef.png"
     assert sample_name(meta, ".png") == "scene_7_0012.50s_89abcdef-8f86fd439eaf1e35.png"
+    names = {sample_name(meta | {"token": f"{c}-SAMETAIL"}, ".png") for c in "abc"}
+    assert len(names) == 3
     assert sample_title(meta) == "scene/7  ·  12.50 s  ·  0123456789abcdef"
     assert sample_name({"scene": "a", "token": "b/1"}, ".png") == "b_1-c2c4324fdbeececd.png"
     sample = make_sample(tmp_path, cameras=0)

@@ -1,5 +1,6 @@
 """Annotation files: what is written comes back, and a wrong or half file is refused."""
 
+import errno
 import os
 import pickle
 import resource
@@ -19,6 +20,8 @@ from gsmap.datasets.annotations.record import (
     MapInstance,
     SweepRecord,
 )
+from gsmap.structures.rigid import rigid
+from gsmap.utils.faults import in_words
 
 
 def test_every_field_survives_across_batches_and_with_absent_parts(tmp_path: Path):
@@ -117,6 +120,11 @@ def test_pickle_hands_on_the_path_and_checksums_alone(tmp_path: Path):
             "appears twice",
         ),
         ({"token": ""}, "token"),
+        (
+            {"instances": [MapInstance(0, np.array([[0.0, 0.0], [1e9, 0.0]]))]},
+            "nor beyond 100 km",
+        ),
+        ({"global_from_frame": rigid(np.eye(3), (1e12, 0, 0))}, "translation within 100,000 km"),
         ({"scene": "../x"}, "scene '../x' would lead out of a folder"),
         ({"scene": "/abs/x"}, "scene '/abs/x' would lead out of a folder"),
         ({"map_name": "a\\..\\b"}, "map_name .* would lead out of a folder"),
@@ -221,3 +229,24 @@ def test_a_full_disk_leaves_the_old_file_alone(tmp_path: Path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert AnnotationFile(tmp_path / "a.arrow")[0].token == "token1"
     assert [p.name for p in tmp_path.iterdir()] == ["a.arrow"]
+
+
+def test_what_the_machine_lacks_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "a.arrow"
+    write_annotations(path, META, [])
+    for error in (
+        OSError(errno.EMFILE, "Too many open files"),
+        OSError(errno.EACCES, "Permission denied"),
+        pa.ArrowMemoryError("malloc of size 64 failed"),
+    ):
+
+        def failing(*_: object, error: Exception = error) -> None:
+            raise error
+
+        with monkeypatch.context() as patch:
+            patch.setattr(pa, "memory_map", failing)
+            with pytest.raises(type(error)) as raised:
+                AnnotationFile(path)
+        assert raised.value is error
+        assert "delete" not in in_words(raised.value)
+    AnnotationFile(path)

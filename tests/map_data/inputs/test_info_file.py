@@ -62,6 +62,24 @@ def test_pickle_that_would_run_code_is_refused_and_nothing_runs(tmp_path):
     assert not target.exists()
 
 
+@pytest.mark.parametrize("shape", [(1, 10**9), (10**9, 0), (0, 10**9), (10**9,)])
+def test_no_array_has_more_values_than_the_file_has_bytes(tmp_path, shape):
+    def number(value):
+        return b"\x8a\x08" + value.to_bytes(8, "little")
+
+    path = tmp_path / "huge.pkl"
+    for code in (b"S0", b"S1"):
+        content = pickle.dumps(np.zeros((0, 7), "S1"), 2)
+        assert content.count(b"K\x00K\x07\x86") == 1
+        written = b"(" + b"".join(map(number, shape)) + b"t"
+        content = content.replace(b"K\x00K\x07\x86", written).replace(b"S1", code)
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"huge.pkl cannot be read as a pickle of plain data"):
+            load_plain_pickle(path)
+    path.write_bytes(pickle.dumps(np.zeros((0, 7)), 4))
+    assert load_plain_pickle(path).shape == (0, 7)
+
+
 @pytest.mark.parametrize("content", [b"", b"\x80\x04garbage", b"not a pickle"])
 def test_broken_pickle_is_named(tmp_path, content):
     path = tmp_path / "broken.pkl"

@@ -173,7 +173,11 @@ def test_a_sample_without_a_pose_is_named():
     head, memory = with_memory()
     with pytest.raises(ValueError, match=r"'a0' has no \['lidar2global'\]"):
         step(head, memory, meta(0, lidar2global=None))
-    for wrong in (np.full((4, 4), np.nan), np.eye(3)):
+    scaled, mirrored, sheared = (np.eye(4) for _ in range(3))
+    scaled[:3, :3] *= 2.0
+    mirrored[0, 0] = -1.0
+    sheared[3, 0] = 1.0
+    for wrong in (np.full((4, 4), np.nan), np.eye(3), scaled, mirrored, sheared):
         with pytest.raises(ValueError, match=r"lidar2global of sample 'a0' must be a finite"):
             step(head, memory, meta(0, lidar2global=wrong))
 

@@ -34,8 +34,8 @@ class Frame:
         pose = np.asarray(self.pose)
         if pose.shape != (4, 4) or not is_rigid(pose):
             raise ValueError(
-                f"the pose of sample {self.token!r} (lidar2global) must be a rigid motion (4, 4) "
-                "from its frame to the world: finite, with a rotation, and 0, 0, 0, 1 below; got "
+                f"lidar2global of sample {self.token!r} must be a finite rigid motion (4, 4) from "
+                "its annotation frame to the world, a rotation with 0, 0, 0, 1 below: got "
                 f"{pose.tolist()!r:.200}."
             )
 

@@ -43,12 +43,12 @@ class CommandParser(argparse.ArgumentParser):
         """Parse arguments, and refuse an output that is an input."""
         found, rest = super().parse_known_args(*args, **kwargs)
         inputs: list[Path] = []
-        outputs: dict[Path, str] = {}
+        outputs: list[tuple[Path, str]] = []
         for action in self._actions:
             option = action.option_strings[0] if action.option_strings else action.metavar
             for path in _files_in(getattr(found, action.dest, None)):
                 if action.type is output_file:
-                    outputs[path] = str(option or action.dest)
+                    outputs.append((path, str(option or action.dest)))
                 elif path.is_file():
                     inputs.append(path)
         declare_files(inputs, outputs)

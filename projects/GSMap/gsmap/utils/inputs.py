@@ -3,7 +3,7 @@
 import os
 import stat
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
@@ -37,7 +37,7 @@ def inputs_kept() -> Iterator[None]:
         _Command.outputs.clear()
 
 
-def declare_files(inputs: Iterable[Path], outputs: Mapping[Path, str]) -> None:
+def declare_files(inputs: Iterable[Path], outputs: Sequence[tuple[Path, str]]) -> None:
     """Tell which files a command's arguments name, before it begins to work.
 
     From then on reading a file that is an output ends the command, wherever it is read: by an
@@ -46,19 +46,19 @@ def declare_files(inputs: Iterable[Path], outputs: Mapping[Path, str]) -> None:
 
     Args:
         inputs: Files that it reads.
-        outputs: Files that it writes, with the options that name them.
+        outputs: Files that it writes, each with the option that names it.
 
     Raises:
         InputReplacedError: If a file is an input and an output.
         ValueError: If two options name one output.
     """
     places: dict[str, str] = {}
-    for path, option in outputs.items():
+    for path, option in outputs:
         if path.is_file() or not path.exists():  # a device may take several
             first = places.setdefault(os.path.realpath(path), option)
             if first != option:
                 raise ValueError(f"{first} and {option} both name {path}: give two names.")
-    there = {i: f"{option} {path}" for path, option in outputs.items() if (i := _identity(path))}
+    there = {i: f"{option} {path}" for path, option in outputs if (i := _identity(path))}
     for path in inputs:
         _require_other(path, there)
     if not _Command.runs:
