@@ -293,10 +293,13 @@ def test_a_checkpoint_names_no_file_that_its_training_removes(tmp_path):
         assert precious.read_text() == "mine"
         assert (tmp_path / "run/epoch_1.pth").exists()
         assert best.exists()
-    content["message_hub"]["runtime_info"]["best_ckpt"] = str(best)
+    earlier = tmp_path / "run/best_figure_epoch_1.pth"
+    earlier.unlink()
+    earlier.write_bytes(best.read_bytes())
+    content["message_hub"]["runtime_info"]["best_ckpt"] = str(earlier)
     torch.save(content, tmp_path / "run/own.pth")
     learn(tmp_path / "run", 3, tmp_path / "run/own.pth", save_best="figure", rule="greater")
-    assert not best.exists()  # the run's own, which a better one has followed
+    assert not earlier.exists()  # the run's own, which a better one has followed
 
 
 @pytest.mark.parametrize("kind", ["link", "hard", "pipe"])

@@ -15,9 +15,10 @@ from nuscenes import NuScenes
 from nuscenes.utils.splits import create_splits_scenes
 from processes import run_python
 
+from gsmap.utils.files import SUFFIX
 from minicity import generate as generate_module
 from minicity.config import TRAIN_LOCATIONS, VAL_LOCATIONS, MiniCityConfig
-from minicity.generate import MARKER, generate, plan_scenes
+from minicity.generate import MARKER, _partial_folder, generate, plan_scenes
 from minicity.scene import SceneMaker
 
 TINY = {"image_size": (128, 72), "samples_per_scene": 1, "sweeps_per_sample": 0, "progress": False}
@@ -140,6 +141,22 @@ def test_a_folder_with_other_files_is_refused_and_left_alone(tmp_path: Path) -> 
     with pytest.raises(ValueError, match="not a complete MiniCity data set"):
         generate(tmp_path, 2, workers=0, **TINY)
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_no_link_is_followed_where_leftovers_are_removed(tmp_path: Path) -> None:
+    elsewhere, root = tmp_path / "elsewhere", tmp_path / "root"
+    partial = tmp_path / f"root{SUFFIX}"
+    elsewhere.mkdir()
+    (elsewhere / "mine").write_text("mine")
+    partial.symlink_to(elsewhere)
+    with pytest.raises(ValueError, match="is a link, and what is written there would go elsewhere"):
+        generate(root, scenes=2, workers=1, **TINY)
+    partial.unlink()
+    partial.mkdir()
+    (partial / "link").symlink_to(elsewhere)
+    with _partial_folder(root) as folder:
+        assert not list(folder.iterdir())
+    assert (elsewhere / "mine").read_text() == "mine"
 
 
 def test_a_failing_scene_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

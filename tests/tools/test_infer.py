@@ -135,6 +135,27 @@ def test_other_settings_start_anew(drive, model, tmp_path, capsys):
     assert len(results(out)) == 1
 
 
+def test_nothing_is_written_over_samples_of_another_origin_nor_through_a_link(
+    drive, model, minicity_annotations, tmp_path, capsys
+):
+    words = [str(drive), "--model", *model, "--max-samples", "1", "--out"]
+    samples, content = tmp_path / "map.arrow", minicity_annotations["val"].read_bytes()
+    samples.write_bytes(content)
+    with pytest.raises(ValueError, match=r"map.arrow is there, and not from an earlier run"):
+        infer.main([*words, str(tmp_path / "map.json")])
+    assert samples.read_bytes() == content
+    samples.unlink()
+    for _ in range(2):  # its own may be replaced
+        infer.main([*words, str(tmp_path / "map.json")])
+    with pytest.raises(SystemExit):
+        infer.main([*words, str(samples)])
+    assert "--out names a JSON file" in capsys.readouterr().err
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "other_frames").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ValueError, match="other_frames is a link"):
+        infer.main([*words, str(tmp_path / "other.json")])
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -144,7 +144,7 @@ _RULES: dict[str, tuple[Callable[..., np.ndarray], str]] = {
     ),
     "points": (
         _are_polylines,
-        " of an element must be (n >= 2, {1.dim}), not NaN, infinite or beyond 100 km",
+        " of an element must be (n >= 2, {1.dim}), not NaN or infinite, nor beyond 100 km",
     ),
 }
 """By field: which items of an array are good, and what is said of the first that is not."""
