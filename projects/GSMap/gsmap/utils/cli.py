@@ -39,7 +39,9 @@ class CommandParser(argparse.ArgumentParser):
             description = re.sub(r"(python )?tools/(\w+)\.py", r"gsmap \2", description)
         super().__init__(prog or self.program, description=description, **options)
 
-    def parse_known_args(self, *args: Any, **kwargs: Any) -> tuple[argparse.Namespace, list[str]]:
+    def parse_known_args(  # type: ignore[override]
+        self, *args: Any, **kwargs: Any
+    ) -> tuple[argparse.Namespace, list[str]]:
         """Parse arguments, and refuse an output that is an input."""
         found, rest = super().parse_known_args(*args, **kwargs)
         inputs: list[Path] = []

@@ -182,7 +182,7 @@ def _keep_mode(path: Path, handle: int) -> None:
             os.fchmod(handle, wanted)
 
 
-def open_to_append(path: Path) -> IO[bytes]:
+def open_to_append(path: Path) -> io.FileIO:
     """Open a file to read it and add to it, unbuffered; it is made if there is none.
 
     Raises:

@@ -81,8 +81,9 @@ def heed_input(path: str | bytes | os.PathLike) -> None:
 
 
 def _require_other(path: str | bytes | os.PathLike, outputs: Mapping[_Identity, str]) -> None:
-    output = outputs.get(_identity(path)) if outputs else None
-    if output:
+    found = _identity(path) if outputs else None
+    if found is not None and found in outputs:
+        output = outputs[found]
         raise InputReplacedError(
             f"{output} would replace what this command reads ({os.fsdecode(path)}): give another "
             "name."
@@ -95,8 +96,9 @@ def require_no_input(path: Path) -> None:
     Raises:
         InputReplacedError: If it is one.
     """
-    read = _Command.inputs.get(_identity(path)) if _Command.inputs else None
-    if read:
+    found = _identity(path) if _Command.inputs else None
+    if found is not None and found in _Command.inputs:
+        read = _Command.inputs[found]
         raise InputReplacedError(
             f"{path} would replace what this command reads ({read}): name another place for what "
             "it writes."
@@ -105,8 +107,8 @@ def require_no_input(path: Path) -> None:
 
 def forget_output(path: Path) -> None:
     """Let a file be read again: it is to be replaced, and what takes its name is an output."""
-    if _Command.outputs:
-        _Command.outputs.pop(_identity(path), None)
+    if _Command.outputs and (found := _identity(path)) is not None:
+        _Command.outputs.pop(found, None)
 
 
 def _on_event(event: str, arguments: tuple[Any, ...]) -> None:
