@@ -73,7 +73,7 @@ def main() -> None:
 
     cfg = load_config(args)
     if args.amp and torch.cuda.is_available():
-        cfg.optim_wrapper.type = "AmpOptimWrapper"
+        cfg.optim_wrapper.type = "MapAmpOptimWrapper"
         cfg.optim_wrapper.setdefault("loss_scale", "dynamic")
     elif args.amp:
         cfg.optim_wrapper.type = "CPUAutocastOptimWrapper"

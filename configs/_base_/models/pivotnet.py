@@ -2,7 +2,7 @@
 model = dict(
     type='MapDetector',
     data_preprocessor=dict(
-        type='Det3DDataPreprocessor',
+        type='MapDataPreprocessor',
         mean=[123.675, 116.28, 103.53],
         std=[58.395, 57.12, 57.375],
         bgr_to_rgb=False,  # the release swaps the channels of RGB images: BGR with the means of RGB

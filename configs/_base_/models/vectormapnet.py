@@ -3,7 +3,7 @@
 model = dict(
     type='MapDetector',
     data_preprocessor=dict(
-        type='Det3DDataPreprocessor',
+        type='MapDataPreprocessor',
         mean=[103.53, 116.28, 123.675],
         std=[1.0, 1.0, 1.0],
         bgr_to_rgb=False,

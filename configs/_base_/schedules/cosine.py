@@ -2,7 +2,8 @@
 # all epochs: 24, or the train_cfg = dict(max_epochs=...) of a leaf. Mixed precision: tools/train.py --amp, or
 # optim_wrapper.type='AmpOptimWrapper'.
 optim_wrapper = dict(
-    type='OptimWrapper',
+    type='MapOptimWrapper',
+    constructor='MergedGroupsConstructor',
     optimizer=dict(type='AdamW', lr=6e-4, weight_decay=0.01),
     paramwise_cfg=dict(custom_keys=dict(img_backbone=dict(lr_mult=0.1))),
     clip_grad=dict(max_norm=35, norm_type=2))

@@ -1,6 +1,7 @@
 # As published by HDMapNet: Adam 1e-3 for 4 samples per step, a tenth of it after every 10 of 30 epochs.
 optim_wrapper = dict(
-    type='OptimWrapper',
+    type='MapOptimWrapper',
+    constructor='MergedGroupsConstructor',
     optimizer=dict(type='Adam', lr=1e-3, weight_decay=1e-7),
     clip_grad=dict(max_norm=5, norm_type=2))
 param_scheduler = [dict(type='StepLR', by_epoch=True, step_size=10, gamma=0.1)]

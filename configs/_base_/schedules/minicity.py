@@ -1,7 +1,8 @@
 # MiniCity from scratch on two CPU cores: every weight learns at the same rate, short warm-up, cosine decay per
 # iteration.
 optim_wrapper = dict(
-    type='OptimWrapper',
+    type='MapOptimWrapper',
+    constructor='MergedGroupsConstructor',
     optimizer=dict(type='AdamW', lr=6e-4, weight_decay=0.01, fused=True),
     clip_grad=dict(max_norm=35, norm_type=2))
 param_scheduler = [

@@ -2,7 +2,8 @@
 # warm-up over 400 iterations. Its release does not say the number of GPUs; 8 are assumed. A tenth of the learning rate
 # holds for what it calls backbone: all before its BEV neck.
 optim_wrapper = dict(
-    type='OptimWrapper',
+    type='MapOptimWrapper',
+    constructor='MergedGroupsConstructor',
     optimizer=dict(type='AdamW', lr=1e-3, weight_decay=0.01),
     paramwise_cfg=dict(
         custom_keys={

@@ -8,11 +8,14 @@ import gsmap.datasets.stream_samplers
 import gsmap.datasets.vectorized_map_dataset
 import gsmap.engine.checkpoint_hook
 import gsmap.engine.cpu_autocast
+import gsmap.engine.figures
 import gsmap.engine.gaussian_health_hook
 import gsmap.engine.log_processor
+import gsmap.engine.optimizers
 import gsmap.engine.run_log
 import gsmap.evaluation.gaussian_metric
 import gsmap.evaluation.map_metric
+import gsmap.models.data_preprocessor
 import gsmap.models.detector
 import gsmap.visualization.map_visualization_hook
 import gsmap.visualization.map_visualizer  # noqa: F401

@@ -13,6 +13,8 @@ MODEL_SETTINGS = "model_settings"  # key of a checkpoint's meta: JSON, as a conf
 STARTS = {"init_cfg", "pretrained", "allow_untrained"}
 IMAGE_SIZE = "image_size"  # key of a checkpoint's meta: width and height that images are scaled to
 SIGNALS = "can_bus"  # key of a checkpoint's meta: whether training samples had vehicle signals
+# what a checkpoint names and later versions replace by a part with the same arguments
+_RENAMED = {"Det3DDataPreprocessor": "MapDataPreprocessor"}
 _KEY = re.compile(r"[a-zA-Z]\w*")
 _TEXT = re.compile(r"[\w -]*")  # no name of a file, an address or a module, and no expression
 _LARGEST = 1_000_000  # layers, channels, voxels
@@ -84,6 +86,8 @@ def _checked(value: Any, name: str, known: set[str]) -> Any:
         pairs = ((key, inner) for key, inner in value.items() if key not in STARTS)
         return {key: _checked(inner, f"{name}.{key}", known) for key, inner in pairs}
     if name.endswith(".type"):
+        if value not in known:
+            value = _RENAMED.get(value, value)
         _check_type(value, name, known)
     elif isinstance(value, str) and not (_TEXT.fullmatch(value) or value in known):
         raise ValueError(f"{name} is {value!r:.60}, no plain word and not the config's")

@@ -16,6 +16,8 @@ from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.published import load_from_file, load_from_torchvision, load_published
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
+from gsmap.engine.figures import finish_checks
+from gsmap.engine.optimizers import fit_optimizer_state
 from gsmap.engine.run_log import innermost
 from gsmap.utils.files import take_from_link, write_bytes, write_text
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, calibration_of
@@ -89,9 +91,13 @@ class AtomicCheckpointHook(CheckpointHook):
         torch.serialization.add_safe_globals(mmengine_globals())
 
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
-        """Drop the text that mmengine would run as a config; check and note the model's origin."""
+        """Drop the text that mmengine would run as a config; check and note the model's origin.
+
+        The optimizer's state is fitted to the run's parameter groups (`fit_optimizer_state`).
+        """
         meta = checkpoint.get("meta", {})
         meta.pop("config", None)
+        fit_optimizer_state(checkpoint, runner.optim_wrapper)
         trained = meta.get("dataset_meta")
         for loop in (runner._val_loop, runner._test_loop):
             if isinstance(loop, BaseLoop) and isinstance(trained, dict):
@@ -103,8 +109,9 @@ class AtomicCheckpointHook(CheckpointHook):
         """Note the model's settings, the size of the scaled images, and if there are signals.
 
         Raises:
-            FloatingPointError: If a weight is not finite; such a checkpoint is of no use.
+            FloatingPointError: If a loss or a weight is not finite; such a checkpoint is of no use.
         """
+        finish_checks(runner)
         state = checkpoint["state_dict"]
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
         if broken:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
+from gsmap.models.loss_check import LossCheck
 from gsmap.models.streams.memory import StreamMemory
 from gsmap.structures.grid import BEVGrid
 
@@ -75,6 +76,7 @@ class MapDetector(Base3DDetector):
         # convolution takes them for channels first and is silently wrong
         parts = () if self.img_backbone is None else self.img_backbone.modules()
         self.channels_last = not any(isinstance(part, ModulatedDeformConv2d) for part in parts)
+        self.loss_check = LossCheck()
         self.allow_untrained = allow_untrained
         self.img_neck = MODELS.build(img_neck) if img_neck else None
         self.img_augment = MODELS.build(img_augment) if img_augment else None
@@ -129,21 +131,19 @@ class MapDetector(Base3DDetector):
         return self.temporal.over(outputs, [sample.metainfo for sample in batch_data_samples])
 
     def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
-        """Return all losses; FloatingPointError, with the samples, if one is not finite."""
+        """Return all losses as scalars; FloatingPointError if one is not finite (`LossCheck`)."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
         with self.over_time(outputs, batch_data_samples) as outputs:
             losses = self.map_head.loss(outputs, batch_data_samples)
-        # mmengine reads each loss anyway: no new synchronisation
-        means = torch.stack([loss.detach().float().mean() for loss in losses.values()])
-        finite = torch.isfinite(means).tolist()
-        bad = [name for name, good in zip(losses, finite, strict=True) if not good]
-        if bad:
-            tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
-            raise FloatingPointError(
-                f"losses {bad} are not finite; samples {tokens}: look at their images and ground "
-                "truth, then at the learning rate and at the loss scale of mixed precision."
-            )
+        losses = {name: loss.mean() if loss.dim() else loss for name, loss in losses.items()}
+        tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
+        self.loss_check.start(losses, tokens)
         return losses
+
+    def parse_losses(self, losses: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the sum of what is named a loss, and all figures of a step, that sum first."""
+        total = torch.stack([value for name, value in losses.items() if "loss" in name]).sum()
+        return total, {"loss": total, **losses}
 
     def predict(self, batch_inputs: Inputs, batch_data_samples: Samples) -> list[Det3DDataSample]:
         """Add ``pred_instances_3d``, as the head's ``predict`` returns them, to the samples."""

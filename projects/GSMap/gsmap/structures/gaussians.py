@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
-from gsmap.structures.tensors import at_least_float32
+from gsmap.structures.tensors import at_least_float32, constant, kept
 
 ACTIVATIONS = ("sigmoid", "softplus", "exp")
 _ROUND = 1e-6  # relative difference of both variances, below which a Gaussian has no direction
@@ -105,7 +105,7 @@ class GaussianSpace:
     def scales(self, raw: Tensor) -> Tensor:
         """Activate sigma: zero gives ``init_scales_m``. (..., 2) -> (..., 2) metres"""
         low, high = self.min_scale_m, self.max_scale_m
-        shifted = raw + raw.new_tensor(self._start)
+        shifted = raw + constant(raw, self._start)
         above = {
             "sigmoid": lambda x: (high - low) * x.sigmoid(),
             "softplus": F.softplus,
@@ -137,7 +137,7 @@ class GaussianSpace:
         scales = gaussians.scales.sqrt() if self.literal_covariance else gaussians.scales
         margin = _MARGIN * (self.max_scale_m - self.min_scale_m)
         scales = scales.clamp(self.min_scale_m + margin, self.max_scale_m - margin)
-        raw = self._before_activation(scales) - scales.new_tensor(self._start)
+        raw = self._before_activation(scales) - constant(scales, self._start)
         theta = gaussians.rotations[..., None] - self.heading_rad
         return torch.cat([centres, like[..., 2:-3], raw, theta], -1)
 
@@ -150,11 +150,20 @@ class GaussianSpace:
         Gaussian. They multiply (x, y) in metres from the left. (..., D) -> (..., 2, 2)
         """
         gaussians = self.decode(reference)
-        start = self.scales(gaussians.scales.new_zeros(2))
-        stretch = gaussians.scales / (start.square() if self.literal_covariance else start)
+        like = gaussians.scales
+        # computed as the scales are, so that their quotient is exactly one
+        start = kept(like, (self, "start", like.dtype), lambda: self._first_scales(like))
         turned = _rotations(gaussians.rotations)
-        back = turned if invariant else _rotations(stretch.new_tensor(self.heading_rad))
-        return (turned * stretch[..., None, :]) @ back.transpose(-1, -2)
+        back = turned
+        if not invariant:
+            heading = constant(like, self.heading_rad)
+            back = kept(like, (self, "heading", like.dtype), lambda: _rotations(heading))
+        return (turned * (like / start)[..., None, :]) @ back.transpose(-1, -2)
+
+    def _first_scales(self, like: Tensor) -> Tensor:
+        """Return the standard deviations of the Gaussian that a query starts with. (2,)"""
+        start = self.scales(like.new_zeros(2))
+        return start.square() if self.literal_covariance else start
 
     def describe(self, reference: Tensor) -> Tensor:
         """Return numbers of unit size that describe the Gaussians. (..., 5 or more) -> (..., 6)

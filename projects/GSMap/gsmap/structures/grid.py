@@ -99,12 +99,12 @@ class BEVGrid:
         (..., 2)
         """
         order, scale, shift = self._front
-        return _affine(self.norm_from_metres(points)[..., order], scale, shift)
+        return _affine(_chosen(self.norm_from_metres(points), order), scale, shift)
 
     def metres_from_front(self, points: Array) -> Array:
         """Map [0, 1] from the front edge and from the left to metres. (..., 2)"""
         order, scale, shift = self._front
-        return self.metres_from_norm(_affine(points, scale, shift)[..., order])
+        return self.metres_from_norm(_chosen(_affine(points, scale, shift), order))
 
     @property
     def _front(self) -> tuple[list[int], tuple[float, float], tuple[float, float]]:
@@ -127,6 +127,15 @@ class BEVGrid:
         x = self.x_range[0] + dx * (torch.arange(self.width, device=device, dtype=dtype) + 0.5)
         y = self.y_range[0] + dy * (torch.arange(self.height, device=device, dtype=dtype) + 0.5)
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+
+
+def _chosen(points: Array, order: list[int]) -> Array:
+    """Return coordinates in an order, without a list of indices to upload. (..., 2)"""
+    if isinstance(points, np.ndarray):
+        return points[..., order]
+    import torch
+
+    return torch.stack([points[..., axis] for axis in order], -1)
 
 
 def _affine(points: Array, scale: tuple[float, float], shift: tuple[float, float]) -> Array:

@@ -20,6 +20,7 @@ from gsmap.models.maptr.coder import Reference, Tensors
 from gsmap.models.maptr.layers import enlarged, mlp
 from gsmap.models.maptr.parts import PARTS
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import constant
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ class BezierHead(LineHead):
             controls = controls * curve.used(pieces)[..., None]
             drawn = curve(controls, pieces)
             if self.losses.redrawn_in_px:
-                size = drawn.new_tensor(self.mask_size).flip(0)
+                size = constant(drawn, self.mask_size).flip(0)
                 drawn = torch.where(instances.redrawn[own, None, None], drawn * size, drawn)
             found.append(TrueCurves(controls, pieces, drawn, instances.masks[own].float()))
         return found

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsmap.models.encoders.projection import PillarProjection
 from gsmap.models.maptr.attention import SamplingAttention, sample_map
+from gsmap.structures.tensors import constant
 
 
 @MODELS.register_module()
@@ -56,7 +57,7 @@ class SpatialCrossAttention(SamplingAttention):
         summed = query.new_zeros(query.shape, dtype=torch.float32)
         for feats, offset, weight in zip(levels, offsets, weights, strict=True):
             height, width = feats.shape[-2:]
-            offset = offset / query.new_tensor([width, height])
+            offset = offset / constant(query, [width, height])
             value = self.values(feats.flatten(3).transpose(2, 3)).float()  # (B, V, hw, heads, C')
             for sample, view in product(*(range(n) for n in feats.shape[:2])):
                 cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)

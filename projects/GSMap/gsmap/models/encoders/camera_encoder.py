@@ -9,6 +9,7 @@ from mmengine.model import BaseModule
 from torch import Tensor
 
 from gsmap.structures.calibration import calibration_arrays
+from gsmap.structures.tensors import uploaded
 
 
 def stack_calibration(
@@ -16,8 +17,8 @@ def stack_calibration(
 ) -> dict[str, Tensor]:
     """Stack what an encoder reads of the samples, see `calibration_arrays`. (B, ...) each"""
     arrays = [calibration_arrays(meta, names) for meta in img_metas]
-    stacks = {name: np.stack([each[name] for each in arrays]) for name in names}
-    return {name: torch.as_tensor(stack, device=device) for name, stack in stacks.items()}
+    stacks = [torch.from_numpy(np.stack([each[name] for each in arrays])) for name in names]
+    return dict(zip(names, uploaded(stacks, device), strict=True))
 
 
 class CameraEncoder(BaseModule):

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import constant
 
 _MIN_DEPTH_M = 1e-5
 
@@ -66,7 +67,7 @@ def visible_points(projected: Tensor, img_shape: tuple[int, int]) -> PillarProje
     """
     depth = projected[..., 2]
     uv = projected[..., :2] / depth.clamp(min=_MIN_DEPTH_M)[..., None]
-    uv = uv / uv.new_tensor([img_shape[1], img_shape[0]])
+    uv = uv / constant(uv, [img_shape[1], img_shape[0]])
     inside = (depth > _MIN_DEPTH_M) & ((uv > 0) & (uv < 1)).all(-1)
     return PillarProjection(uv, inside.any(-1))
 

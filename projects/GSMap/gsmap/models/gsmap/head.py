@@ -20,6 +20,7 @@ from gsmap.models.maptr.pairs import MatchedPairs
 from gsmap.models.maptr.parts import DEFAULTS, PARTS, WEIGHT, brought, with_points_weight
 from gsmap.structures.gaussians import Gaussians, stretched
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import constant
 
 
 @MODELS.register_module()
@@ -98,7 +99,7 @@ class GSMapHead(MapHead):
         found = super().detected(fields, best)
         if self.temperatures is None:
             return found
-        factors = found["scales"].new_tensor(self.temperatures)[best.labels][:, None]  # (M, 1, 2)
+        factors = constant(found["scales"], self.temperatures)[best.labels][:, None]  # (M, 1, 2)
         means, scales, rotations = found["pts"][..., :2], found["scales"], found["rotations"]
         _, scales, rotations = stretched(Gaussians(means, scales, rotations), factors)
         return {**found, "scales": scales, "rotations": rotations}

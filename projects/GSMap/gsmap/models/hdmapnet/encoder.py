@@ -13,6 +13,7 @@ from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.hdmapnet.layout import ahead_size
 from gsmap.models.maptr.layers import enlarged
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import constant
 
 
 def conv_block(inputs: int, outputs: int) -> list[nn.Module]:
@@ -160,7 +161,7 @@ def sampled(maps: Tensor, places: Tensor) -> Tensor:
 
     (n, C, h, w), columns and rows (n, H, W, 2) -> (n, C, H, W)
     """
-    last = places.new_tensor([maps.shape[-1] - 1, maps.shape[-2] - 1])
+    last = constant(places, [maps.shape[-1] - 1, maps.shape[-2] - 1])
     inside = ((places >= 0) & (places < last)).all(-1)
     values = F.grid_sample(maps, 2 * places / last - 1, align_corners=True)
     return values * inside[:, None]

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsmap.models.hdmapnet.decoder import LineMaps
+from gsmap.structures.tensors import constant
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class LineMapLosses:
             directions: Direction 1 to K forward and backward, 0 for none. (B, 2, H, W)
         """
         classes = torch.cat([(numbers == 0).all(1, keepdim=True), numbers > 0], 1)
-        weight = torch.tensor(self.pos_weight, device=numbers.device)
+        weight = constant(numbers, self.pos_weight, torch.float)
         semantic = F.binary_cross_entropy_with_logits(
             maps.semantic, classes.to(maps.semantic), pos_weight=weight
         )

@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsmap.structures.tensors import constant
+
 LINE = 0  # the place of a line's logit; the other one is of none
 
 
@@ -69,7 +71,7 @@ class LineLosses:
         labels = [torch.full_like(case.lines.logits[:, 0], 1 - LINE).long() for case in cases]
         for label, own in zip(labels, rows, strict=True):
             label[own] = LINE
-        weights = logits.new_tensor([1.0, self.none_weight])
+        weights = constant(logits, [1.0, self.none_weight])
         return self.cls * F.cross_entropy(logits, torch.cat(labels), weights)
 
 

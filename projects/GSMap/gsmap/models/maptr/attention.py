@@ -23,7 +23,7 @@ from gsmap.ops.deformable_sampling import (
     has_kernel,
     sum_rows,
 )
-from gsmap.structures.tensors import at_least_float32
+from gsmap.structures.tensors import at_least_float32, constant
 
 _IM2COL_STEP = 64
 _CORNERS = 4
@@ -47,9 +47,9 @@ def sample_map(value: Tensor, shape: tuple[int, int], locations: Tensor, weights
     """
     if has_kernel(value) or not has_compiled_op(value):
         return deformable_sample(value, shape, locations, weights)
-    shapes = torch.tensor([shape], device=value.device)
+    shapes = constant(value, [shape], torch.long)
     samples = locations[:, :, :, None].contiguous(), weights[:, :, :, None].contiguous()
-    arguments = value.contiguous(), shapes, shapes.new_zeros(1), *samples, _IM2COL_STEP
+    arguments = value.contiguous(), shapes, constant(value, [0], torch.long), *samples, _IM2COL_STEP
     return MultiScaleDeformableAttnFunction.apply(*arguments)
 
 
@@ -66,7 +66,7 @@ def place_samples(
     """
     if frames is not None:
         offsets = torch.sum(frames[:, :, None, None] * offsets[..., None, :], -1)
-    size = offsets.new_tensor([shape[1], shape[0]])
+    size = constant(offsets, [shape[1], shape[0]])
     return reference[:, :, None, None, :2] + offsets / size
 
 

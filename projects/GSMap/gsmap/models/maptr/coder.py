@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import shortest_orders
+from gsmap.structures.tensors import constant
 from gsmap.utils.targets import NeedsTargets
 
 Tensors = dict[str, Tensor]
@@ -86,7 +87,7 @@ class MapCoder:
         best, labels, query = self.best(scores)
         keep = torch.ones_like(best, dtype=torch.bool)
         if self.margin_m is not None:
-            low, high = pts.new_tensor([self.grid.x_range, self.grid.y_range]).T
+            low, high = constant(pts, [self.grid.x_range, self.grid.y_range]).T
             chosen = pts[query][..., :2]
             keep = (chosen.amin(1) >= low - self.margin_m).all(-1)
             keep &= (chosen.amax(1) <= high + self.margin_m).all(-1)
@@ -118,7 +119,7 @@ class MapCoder:
         if not self.unfold_classes:
             return fields
         points = fields["pts"]
-        lines = torch.isin(labels, labels.new_tensor(self.unfold_classes))
+        lines = torch.isin(labels, constant(labels, self.unfold_classes))
         orders = torch.arange(points.shape[1], device=points.device).repeat(len(points), 1)
         orders[lines] = torch.from_numpy(shortest_orders(points[lines].cpu().numpy())).to(orders)
         rows = torch.arange(len(points), device=points.device)[:, None]

@@ -12,6 +12,7 @@ from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.polyline_raster import draw_polylines
 from gsmap.structures.gaussians import gaussians_along
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import constant
 
 SOURCES = ("full", "points", "gaussians")
 
@@ -78,7 +79,7 @@ class ElementMasks:
             return render_gaussians(*gaussians_along(polylines[..., :2].float(), across_m), grid)
         filled = None
         if self.filled_classes:
-            filled = torch.isin(labels, labels.new_tensor(self.filled_classes))
+            filled = torch.isin(labels, constant(labels, self.filled_classes))
         return draw_polylines(polylines[..., :2].float(), grid, self.line_width_m, filled)
 
     def held(self, references: Tensor, labels: Tensor, coords: int) -> Tensor:
@@ -91,7 +92,7 @@ class ElementMasks:
         """
         if not self.held_classes:
             return references
-        held = torch.isin(labels, labels.new_tensor(self.held_classes))[:, None, None]
+        held = torch.isin(labels, constant(labels, self.held_classes))[:, None, None]
         points = references[..., :coords]
         return torch.cat([torch.where(held, points.detach(), points), references[..., coords:]], -1)
 

@@ -9,6 +9,8 @@ from mmdet3d.registry import MODELS
 from mmengine.registry import Registry
 from torch import Tensor, nn
 
+from gsmap.structures.tensors import constant
+
 PARTS = dict[str, Any]
 WEIGHT = float | Sequence[float]  # one for all classes, or one for each
 DEFAULTS: Mapping[str, Any] = MappingProxyType({})  # settings of a part: all as its class has them
@@ -78,7 +80,7 @@ def refuse_twins(names: Sequence[str], what: str) -> None:
 
 def weights_of(weight: WEIGHT, labels: Tensor) -> Tensor:
     """Return each element's weight, by its class. (M,) int64 -> (M,) float32 or ()"""
-    weights = torch.tensor(weight, dtype=torch.float32, device=labels.device)
+    weights = constant(labels, weight, torch.float32)
     return weights[labels] if weights.ndim else weights
 
 

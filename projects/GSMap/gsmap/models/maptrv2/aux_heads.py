@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from gsmap.models.maptrv2.depth import depth_bins, depth_loss
 from gsmap.ops.soft_iou import dice_loss
-from gsmap.structures.tensors import check_same_shape
+from gsmap.structures.tensors import check_same_shape, constant
 from gsmap.utils.targets import NeedsTargets
 
 Samples = Sequence[Det3DDataSample]
@@ -136,6 +136,6 @@ def class_mask_losses(
     """
     check_same_shape(logits=logits, targets=targets)
     logits, targets = logits.float(), targets.float()
-    weight = torch.tensor(pos_weight, device=logits.device)
+    weight = constant(logits, pos_weight, torch.float)
     cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
     return cross_entropy, dice_loss(logits.sigmoid().flatten(1, 2), targets.flatten(1, 2)).mean()

@@ -12,6 +12,7 @@ from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
 from gsmap.models.maptr.parts import WEIGHT, check_classes
 from gsmap.ops.polyline_raster import DISTANCES, soft_rasters
 from gsmap.ops.soft_iou import dice_loss
+from gsmap.structures.tensors import constant
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class ElementRenderer:
 
     def is_polygon(self, labels: Tensor) -> Tensor:
         """Return which elements are rendered as polygons. (n,) -> (n,)"""
-        return torch.isin(labels, labels.new_tensor(self.polygon_classes))
+        return torch.isin(labels, constant(labels, self.polygon_classes))
 
     def render(self, points: Tensor, is_polygon: Tensor) -> Tensor:
         """Return masks of elements whose vertices are normalised. (n, P, 2), (n,) -> (n, H, W)"""

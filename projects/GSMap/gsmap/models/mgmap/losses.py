@@ -11,7 +11,7 @@ from torch import Tensor
 from gsmap.models.maptr.losses import MapLoss
 from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
 from gsmap.models.mgmap.decoder import MaskedDecoded, MGMapDecoder, RefinedDecoded
-from gsmap.structures.tensors import check_same_shape
+from gsmap.structures.tensors import check_same_shape, constant
 
 
 @MODELS.register_module()
@@ -89,7 +89,7 @@ class ForegroundLoss(MapLoss):
         drawn = [sample.pipeline_masks.bool().any(0) for sample in pairs.truths.samples]
         targets = torch.stack([torch.stack([own, ~own]) for own in drawn]).to(logits)
         check_same_shape(logits=logits, gt_masks=targets)  # (B, 2, H, W)
-        weight = logits.new_tensor(self.pos_weight)
+        weight = constant(logits, self.pos_weight)
         cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, pos_weight=weight)
         dice = dice_loss(logits.sigmoid(), targets)
         return self.loss_weight * cross_entropy + self.dice_weight * dice

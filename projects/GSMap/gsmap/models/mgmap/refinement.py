@@ -8,6 +8,7 @@ from mmengine.model import BaseModule
 from torch import Tensor, nn
 
 from gsmap.ops.deformable_sampling import deformable_sample
+from gsmap.structures.tensors import constant
 
 BINS, SAMPLES = 5, 2  # bins of a patch and samples of a bin along each axis
 _BOX = 0.1  # side of a patch, of the map's side
@@ -21,7 +22,7 @@ def patches_around(feats: Tensor, centres: Tensor) -> Tensor:
     (B, Q, 2). -> (B, Q, C, 5, 5)
     """
     height, width = feats.shape[2:]
-    size = centres.new_tensor([width, height])
+    size = constant(centres, [width, height])
     steps = (torch.arange(BINS * SAMPLES, device=feats.device) + 0.5) / (BINS * SAMPLES)
     grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1)  # (10, 10, 2)
     corners = (centres.clamp(max=1.0) - _BOX / 2) * size

@@ -12,6 +12,7 @@ from torch import Tensor
 from gsmap.models.lines.losses import Case, LineLosses
 from gsmap.models.maptr.matching import assigned
 from gsmap.models.pivotnet.matching import match_pivots, sequence_costs
+from gsmap.structures.tensors import constant
 
 PIVOT = 1  # the place of its logit; the other one is of a point between
 
@@ -97,7 +98,7 @@ class PivotLosses(LineLosses):
         collinear = (offsets * between).sum(1) / between.sum(1).clamp(min=1)
         point_cls = kinds.sum()  # 0 without pairs
         if len(kinds):
-            classes = kinds.new_tensor([self.between_weight, 1.0])
+            classes = constant(kinds, [self.between_weight, 1.0])
             point_cls = F.cross_entropy(kinds.flatten(0, 1), is_pivot.flatten().long(), classes)
         return {
             "mask": self.mask * masks.sum() / number,

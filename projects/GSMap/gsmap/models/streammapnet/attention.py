@@ -5,6 +5,7 @@ from mmdet3d.registry import MODELS
 from torch import Tensor
 
 from gsmap.models.maptr.attention import BEVDeformableAttention
+from gsmap.structures.tensors import constant
 
 
 @MODELS.register_module()
@@ -19,7 +20,7 @@ class LinePointAttention(BEVDeformableAttention):
     def offsets_in_cells(self, query: Tensor) -> Tensor:
         """Return the learned offsets (x, y) in cells. (B, N, heads, P, 2)"""
         offsets = super().offsets_in_cells(query)
-        return offsets * offsets.new_tensor([1.0, -1.0])
+        return offsets * constant(offsets, [1.0, -1.0])
 
     def locations(
         self, query: Tensor, reference: Tensor, shape: tuple[int, int], frames: Tensor | None
@@ -30,4 +31,4 @@ class LinePointAttention(BEVDeformableAttention):
             turns = frames.unflatten(1, (-1, self.num_points))[:, :, None]  # (B, N, 1, P, 2, 2)
             offsets = torch.sum(turns * offsets[..., None, :], -1)
         points = reference[..., :2].unflatten(1, (-1, self.num_points))
-        return points[:, :, None] + offsets / offsets.new_tensor([shape[1], shape[0]])
+        return points[:, :, None] + offsets / constant(offsets, [shape[1], shape[0]])

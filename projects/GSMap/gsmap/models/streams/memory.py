@@ -17,6 +17,7 @@ from gsmap.models.streams.element_memory import PREFIX, ElementMemory
 from gsmap.models.streams.query_memory import Propagation, QueryMemory
 from gsmap.structures.past import Past
 from gsmap.structures.streams import Frame, MapStream, Scenes, Slots, StreamState
+from gsmap.structures.tensors import uploaded
 
 # beginnings of names: half precision would move a point by centimetres
 _EXACT = ("references", "targets", PREFIX)
@@ -185,9 +186,10 @@ def recalled(
         name: torch.stack([torch.zeros_like(v) if s is None else s.values[name] for s in before])
         for name, v in like.items()
     }
-    return Past(
-        {name: values.to(device) for name, values in memory.items()},
-        torch.as_tensor(np.stack(motions), device=device),
-        torch.tensor(seconds, dtype=torch.float64, device=device),
-        torch.tensor([state is not None for state in before], device=device),
-    )
+    moves = [
+        torch.from_numpy(np.stack(motions)),
+        torch.tensor(seconds, dtype=torch.float64),
+        torch.tensor([state is not None for state in before]),
+    ]
+    remembered = {name: values.to(device) for name, values in memory.items()}
+    return Past(remembered, *uploaded(moves, device))

@@ -20,6 +20,7 @@ from gsmap.models.maptr.matching import assigned
 from gsmap.models.maptr.parts import PARTS
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import constant
 
 _CORNERS = 2
 
@@ -72,7 +73,7 @@ class KeyPointReference(Reference):
 
     def size(self, like: Tensor) -> Tensor:
         """Return the numbers of pixels. (2,)"""
-        return like.new_tensor(self.canvas.size)
+        return constant(like, self.canvas.size)
 
 
 class KeyPointPredictions(NamedTuple):

@@ -11,6 +11,7 @@ from gsmap.models.maptr.layers import init_matrices
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.detector import CodedMap
 from gsmap.models.vectormapnet.layers import Cache, GatedLayer, joined, most_likely
+from gsmap.structures.tensors import constant
 
 _CONDITION = 5  # tokens of class and box, in front of those of the points
 _FORBIDDEN = -1e9  # logit
@@ -178,7 +179,7 @@ class PolylineGenerator(BaseModule):
     def noisy(self, tokens: Tensor, by_x: bool = False) -> Tensor:
         """Return coordinates x, y, x, y, ... some of which are drawn anew around them. (n, T)"""
         axis = torch.arange(tokens.shape[1], device=tokens.device) % 2
-        scale = tokens.new_tensor(self.noise_px, dtype=torch.float)[axis]
+        scale = constant(tokens, self.noise_px, torch.float)[axis]
         noise = (torch.randn(tokens.shape, device=tokens.device) * scale).round()
         chosen = torch.rand(tokens.shape, device=tokens.device) < self.noise_share
         return self.moved(tokens, noise.long(), by_x).where(chosen, tokens)
@@ -187,7 +188,7 @@ class PolylineGenerator(BaseModule):
         """Return coordinates plus noise, on the canvas; with ``by_x``, y is x. (n, T)"""
         number = torch.arange(tokens.shape[1], device=tokens.device)
         moved = (tokens + noise)[:, number // 2 * 2 if by_x else number]
-        return moved.clamp(min=1).minimum(tokens.new_tensor(self.canvas.size)[number % 2])
+        return moved.clamp(min=1).minimum(constant(tokens, self.canvas.size)[number % 2])
 
     @torch.no_grad()
     def generate(self, bev_feats: Tensor, elements: Elements, draw: Draw) -> Tensor:
@@ -241,7 +242,7 @@ class PolylineGenerator(BaseModule):
         index = torch.arange(pairs.shape[1], device=tokens.device)
         index = index.minimum((number[:, None] - 1).clamp(min=0))
         points = pairs.gather(1, index[..., None].expand(-1, -1, 2)) - 1
-        steps = pairs.new_tensor(self.canvas.steps, dtype=torch.float)
+        steps = constant(pairs, self.canvas.steps, torch.float)
         return self.metres(points / steps), number
 
 

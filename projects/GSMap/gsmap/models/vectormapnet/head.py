@@ -14,6 +14,7 @@ from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.detector import KeyPointHead, targets_of
 from gsmap.models.vectormapnet.generator import Elements, PolylineGenerator
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import constant
 
 
 @MODELS.register_module()
@@ -120,6 +121,6 @@ class VectorMapNetHead(DetectionHead):
         corners = self.canvas.norm_from_metres(found.pts[..., :2])
         if not isinstance(self.detector, KeyPointHead):
             corners = torch.stack([corners.amin(1), corners.amax(1)], 1)
-        size = corners.new_tensor(self.canvas.size)
+        size = constant(corners, self.canvas.size)
         pixels = (corners * size).round().clamp(min=0).minimum(size)
         return pixels.long().flatten(1)

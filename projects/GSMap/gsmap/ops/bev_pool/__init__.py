@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import constant
 
 
 def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) -> Tensor:
@@ -30,9 +31,9 @@ def cell_indices(points_m: Tensor, grid: BEVGrid, z_range: tuple[float, float]) 
         raise ValueError(f"points_m must end in (x, y, z), got shape {tuple(points_m.shape)}.")
     if not z_range[0] < z_range[1]:
         raise ValueError(f"z_range must be (low, high) with low < high, got {z_range}.")
-    lower = points_m.new_tensor([grid.x_range[0], grid.y_range[0], z_range[0]])
-    size = points_m.new_tensor([*grid.pixel_size_m, z_range[1] - z_range[0]])
-    limit = torch.tensor([grid.width, grid.height, 1], device=points_m.device)
+    lower = constant(points_m, [grid.x_range[0], grid.y_range[0], z_range[0]])
+    size = constant(points_m, [*grid.pixel_size_m, z_range[1] - z_range[0]])
+    limit = constant(points_m, [grid.width, grid.height, 1], torch.long)
     index = ((points_m - lower) / size).long()  # (..., 3)
     inside = ((index >= 0) & (index < limit)).all(-1)
     return torch.where(inside, index[..., 1] * grid.width + index[..., 0], -1)

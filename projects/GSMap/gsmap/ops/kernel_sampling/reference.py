@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from gsmap.ops.deformable_sampling import bilinear_cells, sum_rows
+from gsmap.structures.tensors import constant
 
 
 def kernel_cells(uv: Tensor, offsets: Tensor, shape: tuple[int, int]) -> Tensor:
@@ -13,7 +14,7 @@ def kernel_cells(uv: Tensor, offsets: Tensor, shape: tuple[int, int]) -> Tensor:
     the original does. Points in [0, 1] (..., 2), offsets (dx, dy) in pixels (S, 2) -> (..., S)
     """
     height, width = shape
-    position = uv * uv.new_tensor([width, height])
+    position = uv * constant(uv, [width, height])
     return border_pixels(torch.round(position[..., None, :] + offsets.to(uv)), shape)
 
 
@@ -39,7 +40,7 @@ def kernel_pixels(
     if not bilinear:
         return kernel_cells(uv, offsets, shape), weights
     height, width = shape
-    places = uv[..., None, :] + offsets / uv.new_tensor([width, height])
+    places = uv[..., None, :] + offsets / constant(uv, [width, height])
     return bilinear_cells(places, weights, shape)
 
 
