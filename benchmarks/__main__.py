@@ -13,6 +13,7 @@ COMMANDS = {
     "fps": "fps",
     "heads": "heads",
     "kernels": "kernels",
+    "launches": "launches",
     "live": "live",
     "masks": "masks",
     "minicity": "minicity",

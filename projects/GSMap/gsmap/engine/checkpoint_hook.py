@@ -93,11 +93,12 @@ class AtomicCheckpointHook(CheckpointHook):
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
         """Drop the text that mmengine would run as a config; check and note the model's origin.
 
-        The optimizer's state is fitted to the run's parameter groups (`fit_optimizer_state`).
+        Of a run that goes on, the optimizer's state is fitted to its groups of parameters.
         """
         meta = checkpoint.get("meta", {})
         meta.pop("config", None)
-        fit_optimizer_state(checkpoint, runner.optim_wrapper)
+        if "optimizer" in checkpoint and runner._resume:
+            fit_optimizer_state(checkpoint, runner.optim_wrapper)
         trained = meta.get("dataset_meta")
         for loop in (runner._val_loop, runner._test_loop):
             if isinstance(loop, BaseLoop) and isinstance(trained, dict):

@@ -4,13 +4,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
-from mmengine.optim import OptimWrapper
 from mmengine.registry import OPTIM_WRAPPERS
 from torch import nn
 
+from gsmap.engine.optimizers import MapOptimWrapper
+
 
 @OPTIM_WRAPPERS.register_module()
-class CPUAutocastOptimWrapper(OptimWrapper):
+class CPUAutocastOptimWrapper(MapOptimWrapper):
     """Runs forward and losses under bfloat16 autocast of the CPU; weights stay float32.
 
     bfloat16 has the exponents of float32, so the loss needs no scale. Parts that need float32
