@@ -58,12 +58,12 @@ def run(args: argparse.Namespace) -> None:
             f"torch {torch.__version__} has no backends in Python: use a newer one, such as 2.13."
         )
     for path in args.configs:
-        counted = Trial(path, None if args.own_size else tuple(args.size), args.batch)
-        with counted.gpu:
-            for name, count in (("a step", counted.step), ("a frame", counted.frame)):
+        trial = Trial(path, None if args.own_size else tuple(args.size), args.batch)
+        with trial.gpu:
+            for what, count in ((f"a step of {args.batch}", trial.step), ("a frame", trial.frame)):
                 count()
-                print(f"{path}, {name} of {args.batch if name == 'a step' else 1}\n")
-                print(_table(counted.gpu, args.waits))
+                count()
+                print(f"{path}, {what}\n\n{_table(trial.gpu, args.waits)}")
 
 
 class Trial:
@@ -82,47 +82,47 @@ class Trial:
     def __init__(self, path: str, size: tuple[int, int] | None, batch: int) -> None:
         options = argparse.Namespace(size=size, device="cpu", threads=torch.get_num_threads())
         self.model, inputs, self.samples = models.model_and_batch(path, options, batch)
-        self.images = [(image * 50 + 120).clamp(0, 255).to(torch.uint8) for image in inputs["imgs"]]
+        pixels = (inputs["imgs"] * 50 + 120).clamp(0, 255).to(torch.uint8)
+        self.inputs = {"img": list(pixels)} if self.model.bev_encoder is not None else {}
+        if self.model.lidar_encoder is not None:
+            scale = torch.tensor([20.0, 40.0, 2.0, 1.0, 0.0])
+            self.inputs["points"] = [(torch.rand(2000, 5) - 0.5) * scale for _ in range(batch)]
         self.settings = read_config(path).optim_wrapper
         self.gpu = PretendedGPU()
         self.wrapper: Any = None
 
     def step(self) -> dict[str, Any]:
-        """Count a training step, once a first one has kept what is kept; return its figures."""
+        """Count a training step and return its figures; the first one makes what is kept."""
         if self.wrapper is None:
             self.model.to(DEVICE)
             self.model.init_weights()  # as mmengine does, once the model is on its device
             self.wrapper = build_optim_wrapper(self.model, self.settings)
         self.model.train()
-        figures: dict[str, Any] = {}
-        for _ in range(2):
-            models.drive_on(self.samples)
-            self.gpu.clear()
-            with self._parts():
-                figures = self.model.train_step(self._data(self.samples), self.wrapper)
-                with self.gpu.part("figures"):
-                    named = {f"train/{name}": value for name, value in figures.items()}
-                    keep_figures(self.wrapper.message_hub, named)
+        models.drive_on(self.samples)
+        self.gpu.clear()
+        with self._parts():
+            figures = self.model.train_step(self._data(self.samples), self.wrapper)
+            with self.gpu.part("figures"):
+                named = {f"train/{name}": value for name, value in figures.items()}
+                keep_figures(self.wrapper.message_hub, named)
         return figures
 
     @torch.no_grad()
     def frame(self) -> Any:
-        """Count a prediction of one sample, once a first one has kept what is kept; return it."""
+        """Count a prediction of one sample and return it; the first one makes what is kept."""
         self.model.to(DEVICE)
         self.model.eval()
-        found: list[Any] = []
+        models.drive_on(self.samples)
         sample = self.samples[0].clone()
         for name in sample.keys():  # noqa: SIM118  as a pipeline for tests packs it
             delattr(sample, name)
-        for _ in range(2):
-            models.drive_on([sample])
-            self.gpu.clear()
-            with self._parts():
-                found = self.model.test_step(self._data([sample]))
-        return found[0]
+        self.gpu.clear()
+        with self._parts():
+            return self.model.test_step(self._data([sample]))[0]
 
     def _data(self, samples: list[Any]) -> dict[str, Any]:
-        return {"inputs": {"img": self.images[: len(samples)]}, "data_samples": samples}
+        inputs = {name: values[: len(samples)] for name, values in self.inputs.items()}
+        return {"inputs": inputs, "data_samples": samples}
 
     @contextmanager
     def _parts(self) -> Iterator[None]:

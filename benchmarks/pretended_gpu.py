@@ -16,6 +16,7 @@ import contextlib
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,8 @@ from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_a
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 from gsmap.ops import backends
+from gsmap.ops.deformable_sampling import deformable_sample
+from gsmap.ops.kernel_sampling.reference import sample_kernels_reference
 
 NAME = "pretended"
 DEVICE = f"{NAME}:0"
@@ -159,6 +162,8 @@ class PretendedGPU(TorchDispatchMode):
         change(_flag(torch._C._set_only_lift_cpu_tensors))  # torch.tensor(.., device) is an upload
         change(_replaced(F, "scaled_dot_product_attention", _attention))
         change(_replaced(backends, "DEVICES", {**backends.DEVICES, "triton": NAME}))
+        installed = {**backends.INSTALLED, "triton": True}
+        change(_replaced(backends, "INSTALLED", installed))
         types = [*foreach_utils._foreach_supported_types, PretendedTensor]
         change(_replaced(foreach_utils, "_foreach_supported_types", types))
         PretendedGPU.current = self
@@ -425,7 +430,36 @@ _OWN_MATHS: dict[Any, Callable[..., Any]] = {
 }
 
 
+def _sampled(value: Tensor, locations: Tensor, weights: Tensor, *shape: int) -> Tensor:
+    sampled = deformable_sample(value, shape, locations, weights, "reference")
+    return sampled.unflatten(2, (weights.shape[2], -1))
+
+
+def _sampled_kernels(
+    value: Tensor, uv: Tensor, weights: Tensor, seen: Tensor, offsets: Tensor, *settings: Any
+) -> Tensor:
+    *shape, bilinear = settings
+    return sample_kernels_reference(value, tuple(shape), uv, seen, weights, offsets, bilinear)
+
+
+# operators that have no kernel for the CPU, differentiable in their first three tensors
+_REFERENCES = {"deformable_sample": _sampled, "sample_kernels": _sampled_kernels}
+
+
 def _by_cpu_kernel(func: Any, name: str, args: Any) -> Any:
-    """Compute one of the project's operators by the kernel that serves the CPU."""
+    """Compute one of the project's operators by what serves the CPU."""
     inputs = [arg.detach() if isinstance(arg, Tensor) else arg for arg in args[:-1]]
-    return func(*inputs, "cpu")
+    function = name.removeprefix("gsmap.")
+    reference = _REFERENCES.get(function.removesuffix("_backward"))
+    if reference is None:
+        return func(*inputs, "cpu")
+    if not function.endswith("_backward"):
+        return reference(*inputs)
+
+    def gradients() -> list[Tensor]:
+        leaves = [tensor.requires_grad_() for tensor in inputs[1:4]]
+        result = reference(*leaves, *inputs[4:])
+        return list(torch.autograd.grad(result, leaves, inputs[0], materialize_grads=True))
+
+    with ThreadPoolExecutor(1) as thread:  # autograd is off below this mode
+        return thread.submit(gradients).result()

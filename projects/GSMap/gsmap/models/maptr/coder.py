@@ -84,16 +84,17 @@ class MapCoder:
 
         Class logits (N, classes), points in metres (N, P, 2 or 3).
         """
-        best, labels, query = self.best(scores)
-        keep = torch.ones_like(best, dtype=torch.bool)
+        found = self.best(scores)
+        keep = torch.ones_like(found.scores, dtype=torch.bool)
         if self.margin_m is not None:
             low, high = constant(pts, [self.grid.x_range, self.grid.y_range]).T
-            chosen = pts[query][..., :2]
+            chosen = pts[found.query_inds][..., :2]
             keep = (chosen.amin(1) >= low - self.margin_m).all(-1)
             keep &= (chosen.amax(1) <= high + self.margin_m).all(-1)
         if self.score_threshold is not None:
-            keep &= best > self.score_threshold
-        return Detections(best[keep], labels[keep], query[keep])
+            keep &= found.scores > self.score_threshold
+        kept = keep.nonzero()[:, 0]  # the one wait for the device
+        return Detections(*(values[kept] for values in found))
 
     def weighed(self, scores: Tensor, fields: Tensors) -> Tensor:
         """Weigh class logits (N, classes) by ``scales``, sigmas in metres (N, P, 2), if wanted."""
