@@ -21,6 +21,8 @@ from gsmap.ops import backends
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.kernel_sampling import sample_kernels
+from gsmap.ops.polyline_raster import draw_polylines
+from gsmap.ops.raster_loss import raster_loss
 from gsmap.structures.grid import BEVGrid
 
 COLUMNS = (
@@ -189,11 +191,12 @@ def sampling_cases(reduced: bool) -> Iterator[Case]:
             yield Case(
                 "deformable_sample",
                 f"{size}, {dtype}".replace("torch.", ""),
-                lambda backend, value, *places, dtype=dtype: deformable_sample(
+                lambda backend, value, places, weights, dtype=dtype: deformable_sample(
                     value.to(dtype) if backend == "triton" else value,
                     (height, width),
-                    *places,
-                    backend=backend,
+                    places,
+                    weights,
+                    backend,
                 ),
                 (value, torch.rand(batch, queries, 8, 4, 2), torch.rand(batch, queries, 8, 4)),
                 largest_error=largest_error,
@@ -238,11 +241,22 @@ def raster_cases(reduced: bool) -> Iterator[Case]:
     grid = BEVGrid((-15.0, 15.0), (-30.0, 30.0), *((21, 33) if reduced else (200, 100)))
     for count in (2,) if reduced else (90, 360):
         lines = random_polylines(count, grid)
+        gaussians = gaussians_along(lines, (1.0, 0.4))
         for kernel in ("render_gaussians", "render_gaussians_in_warps"):
             yield Case(
                 kernel,
                 f"{count} instances",
-                lambda backend, *gaussians: render_gaussians(*gaussians, grid, backend),
-                gaussians_along(lines, (1.0, 0.4)),
+                lambda backend, means, scales, rotations: render_gaussians(
+                    means, scales, rotations, grid, backend
+                ),
+                gaussians,
                 instances=True,
             )
+        targets = draw_polylines(random_polylines(count, grid), grid)
+        yield Case(
+            "raster_loss",
+            f"{count} instances",
+            lambda backend, preds, targets: raster_loss(preds, targets.detach(), backend=backend),
+            (render_gaussians(*gaussians, grid), targets),
+            instances=True,
+        )

@@ -2,24 +2,13 @@ import math
 
 import pytest
 import torch
+from raster_loss_cases import MASKS, SETTINGS, sparse_masks
 
 from benchmarks.masks import ERRORS_M, LENGTHS_M, MISS_SIZES, miss, push
 from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
 from gsmap.ops.raster_loss.reference import dssim_map, gaussian_window
 
 BACKENDS = ["reference", "cpu"]
-SETTINGS = [
-    {},
-    {"window_size": 5, "foreground_weight": 3.0, "alpha": 0.3},
-    {"alpha": 1.0, "foreground_weight": 5.0},
-    {"alpha": 0.0},
-]
-
-
-def sparse_masks(shape, share, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    masks = torch.rand(2, *shape, generator=generator)
-    return masks * (torch.rand(2, *shape, generator=generator) < share)
 
 
 def direct_ssim(pred, target, size=11, sigma=1.5):
@@ -127,18 +116,6 @@ def test_equal_masks_cost_nothing(normalize, backend):
     masks[1] = 0
     loss = raster_loss(masks, masks, normalize=normalize, backend=backend)
     torch.testing.assert_close(loss, torch.zeros(2), atol=1e-6, rtol=0)
-
-
-MASKS = {
-    "dense": (sparse_masks((21, 33), 0.3), sparse_masks((21, 33), 0.3, seed=1)),
-    "sparse": (sparse_masks((21, 33), 0.005), sparse_masks((21, 33), 0.005, seed=1)),
-    "smaller than the window": (sparse_masks((7, 4), 0.3), sparse_masks((7, 4), 0.3, seed=1)),
-    "one pixel": (sparse_masks((1, 1), 1.0), sparse_masks((1, 1), 1.0, seed=1)),
-    "faint": (1e-3 * sparse_masks((21, 33), 0.3), 1e-2 * sparse_masks((21, 33), 0.3, seed=1)),
-    "empty prediction": (torch.zeros(2, 21, 33), sparse_masks((21, 33), 0.3)),
-    "empty target": (sparse_masks((21, 33), 0.3), torch.zeros(2, 21, 33)),
-    "both empty": (torch.zeros(2, 40, 50), torch.zeros(2, 40, 50)),
-}
 
 
 @pytest.mark.usefixtures("poisoned_empty")

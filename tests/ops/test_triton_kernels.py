@@ -58,7 +58,14 @@ def call_render_gaussians(module):
     module.render_gaussians_in_warps_backward(module.render_gaussians_in_warps(*inputs), *inputs)
 
 
+def call_raster_loss(module):
+    """As a step of four samples: 360 masks of 200 x 100 pixels."""
+    inputs = torch.zeros(360, 200, 100), torch.zeros(360, 200, 100), torch.zeros(11), 1.0
+    module.raster_loss_sums_backward(module.raster_loss_sums(*inputs), *inputs)
+
+
 LAUNCHES = {
+    "raster_loss": call_raster_loss,
     "gaussian_raster": call_render_gaussians,
     "deformable_sampling": call_deformable_sample,
     "kernel_sampling": call_sample_kernels,

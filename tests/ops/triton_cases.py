@@ -5,11 +5,13 @@ from unittest import mock
 import gaussian_cases
 import pytest
 import torch
+from raster_loss_cases import MASKS, SETTINGS
 
 from gsmap.ops import backends
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.kernel_sampling import sample_kernels
+from gsmap.ops.raster_loss import raster_loss
 from gsmap.structures.grid import BEVGrid
 
 CASES = {}  # kernel -> name of a case -> check of a device
@@ -281,3 +283,59 @@ def one_parameter_that_is_not_a_number_shows_in_all_of_its_mask(device, warps):
     for grad in grads:
         assert grad[4].isfinite().all()
     assert grads[0][:4].isnan().flatten(1).any(1).all()
+
+
+def loss_by(backend, settings, normalize, target):
+    """Return the loss of predictions by a backend."""
+    return lambda pred: raster_loss(
+        pred, target.to(pred), normalize=normalize, backend=backend, **settings
+    )
+
+
+@case(
+    "raster_loss",
+    *((name, 0, "both") for name in MASKS),
+    ("dense", 1, "foreground"),
+    ("dense", 2, "pixels"),
+    ("sparse", 3, "pixels"),
+    ("larger than a block", 0, "both"),
+)
+def losses_equal_float64(device, name, number, normalize):
+    generator = torch.Generator().manual_seed(0)
+    masks = {**MASKS, "larger than a block": torch.rand(2, 2, 29, 41, generator=generator)}
+    pred, target = masks[name]
+    upstream = torch.tensor([1.0, -0.5])
+    out, (grad,) = values_and_gradients(
+        loss_by("triton", SETTINGS[number], normalize, target), [pred.to(device)], upstream
+    )
+    true, (true_grad,) = values_and_gradients(
+        loss_by("reference", SETTINGS[number], normalize, target), [pred.double()], upstream
+    )
+    # sums of some hundred float32 terms of size 1, as of the kernels on a CPU
+    torch.testing.assert_close(out, true.float(), atol=1e-6, rtol=1e-5)
+    assert (grad - true_grad).norm() <= 1e-5 * true_grad.norm()
+
+
+@case("raster_loss")
+def losses_of_nothing_and_of_equal_masks(device):
+    loss = loss_by("triton", {}, "both", torch.zeros(0, 4, 5))
+    out, (grad,) = values_and_gradients(loss, [torch.zeros(0, 4, 5).to(device)], torch.zeros(0))
+    assert out.shape == (0,)
+    assert grad.shape == (0, 4, 5)
+    masks = MASKS["both empty"][0]
+    out, (grad,) = values_and_gradients(
+        loss_by("triton", {}, "both", masks), [masks.to(device)], torch.ones(2)
+    )
+    assert not out.any()
+    assert grad.isfinite().all()
+
+
+@case("raster_loss")
+def losses_repeat_bit_by_bit_and_twice(device):
+    pred, target = (x.to(device) for x in MASKS["dense"])
+    leaf = pred.requires_grad_()
+    loss = loss_by("triton", {}, "both", target)
+    out = loss(leaf)
+    first = torch.autograd.grad(out.sum(), leaf, retain_graph=True)[0]
+    assert torch.equal(first, torch.autograd.grad(out.sum(), leaf)[0])
+    assert torch.equal(out, loss(leaf))

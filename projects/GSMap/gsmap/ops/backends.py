@@ -20,6 +20,7 @@ INSTALLED = {backend: find_spec(package) is not None for backend, package in PAC
 TRITON_KERNELS = {
     "deformable_sample": False,
     "pairwise_soft_iou": True,
+    "raster_loss": False,
     "render_gaussians": True,
     "render_gaussians_in_warps": False,  # in place of that of render_gaussians, "triton", too
     "sample_kernels": False,

@@ -54,7 +54,7 @@ def raster_loss(
         normalize: ``"both"``, ``"foreground"`` or ``"pixels"``.
         window_size: Side of SSIM's window in pixels, odd.
         window_sigma: Standard deviation of SSIM's window in pixels.
-        backend: As in `choose_backend`, without ``"triton"``.
+        backend: As in `choose_backend`.
 
     Raises:
         ValueError: If the shapes disagree, or ``normalize`` or ``backend`` does not serve.
@@ -69,9 +69,10 @@ def raster_loss(
     dtype = torch.promote_types(preds.dtype, torch.float32)
     preds, targets = preds.to(dtype), targets.detach().to(dtype)
     with torch.autocast(preds.device.type, enabled=False):
-        if choose_backend(backend, preds, ("cpu",)) == "cpu":
+        backend = choose_backend(backend, preds, kernel="raster_loss")
+        if backend != "reference":
             window = gaussian_window(window_size, window_sigma, preds)
-            sums = _raster_loss_sums(preds, targets, window, foreground_weight, "cpu")
+            sums = _raster_loss_sums(preds, targets, window, foreground_weight, backend)
         else:
             sums = checkpoint(
                 raster_loss_sums_reference,
