@@ -10,8 +10,9 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
+from gsmap.datasets.annotations.record import CameraRecord
 from gsmap.datasets.source import ground_from_frame
-from gsmap.structures.rigid import invert_rigid
+from gsmap.structures.rigid import invert_rigid, rigid
 from mapdata.options import InputOptions
 
 AXLE_M = 0.3  # height of base_link above the road
@@ -71,23 +72,50 @@ class Recorder:
         )
         self.send(topic, "tf2_msgs/msg/TFMessage", time_ns, transforms=[item])
 
-    def info(self, camera, time_ns, distortion=()):
+    def odometry(self, topic, time_ns, parent, child, pose):
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+        zero = self.type("geometry_msgs/msg/Vector3")(0.0, 0.0, 0.0)
+        self.send(
+            topic,
+            "nav_msgs/msg/Odometry",
+            time_ns,
+            header=self.header(time_ns, parent),
+            child_frame_id=child,
+            pose=self.type("geometry_msgs/msg/PoseWithCovariance")(
+                self.type("geometry_msgs/msg/Pose")(
+                    self.type("geometry_msgs/msg/Point")(*pose[:3, 3].tolist()),
+                    self.type("geometry_msgs/msg/Quaternion")(x, y, z, w),
+                ),
+                np.zeros(36),
+            ),
+            twist=self.type("geometry_msgs/msg/TwistWithCovariance")(
+                self.type("geometry_msgs/msg/Twist")(zero, zero), np.zeros(36)
+            ),
+        )
+
+    def region(self, x, y, width, height):
+        return self.type("sensor_msgs/msg/RegionOfInterest")(x, y, height, width, False)
+
+    def info(self, camera, time_ns, distortion=(), **changed):
+        """Send a camera info; ``changed`` are fields, its arrays ``d``, ``k`` and ``p``."""
         names = ("D", "K", "R", "P") if self.ros1 else ("d", "k", "r", "p")
         k = camera.intrinsics
         values = (np.array(distortion, float), k.ravel(), np.eye(3).ravel(), np.eye(3, 4).ravel())
-        roi = self.type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
+        fields = {
+            "header": self.header(time_ns, f"{camera.name}_optical"),
+            "height": camera.height,
+            "width": camera.width,
+            "distortion_model": "plumb_bob",
+            "binning_x": 0,
+            "binning_y": 0,
+            "roi": self.region(0, 0, 0, 0),
+            **dict(zip(names, values, strict=True)),
+        }
         self.send(
             self.info_topic.format(camera.name),
             "sensor_msgs/msg/CameraInfo",
             time_ns,
-            header=self.header(time_ns, f"{camera.name}_optical"),
-            height=camera.height,
-            width=camera.width,
-            distortion_model="plumb_bob",
-            binning_x=0,
-            binning_y=0,
-            roi=roi,
-            **dict(zip(names, values, strict=True)),
+            **fields | changed,
         )
 
     def image(self, camera, time_ns, content, raw=None, **changed):
@@ -96,7 +124,8 @@ class Recorder:
             data = np.frombuffer(content, np.uint8)
             kind = "sensor_msgs/msg/CompressedImage"
             topic = f"{self.image_topic.format(camera.name)}/compressed"
-            self.send(topic, kind, time_ns, header=header, format="jpeg", data=data)
+            fields = {"header": header, "format": "jpeg", "data": data}
+            self.send(topic, kind, time_ns, **fields | changed)
             return
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
         image = image[..., ::-1] if raw == "rgb8" else image
@@ -150,6 +179,72 @@ def record(recorder, samples, root, poses="tf", raw=None, distortion=(), more=No
             recorder.image(camera, at, content, raw, **changed)
         for topic in damaged:
             recorder.writer.write(recorder.connections[topic], 1, b"\0\1\0\0\1\2\3")
+
+
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 100_000_000
+AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # of a camera that looks ahead
+PINHOLE = np.array([[250.0, 0, 160], [0, 250, 90], [0, 0, 1]])
+
+
+def at(x=0.0, y=0.0, z=0.0, rotation=None):
+    """Return a pose. (4, 4)"""
+    return rigid(np.eye(3) if rotation is None else rotation, (x, y, z))
+
+
+def picture(width=320, height=180):
+    """Return a picture of coloured ramps, BGR. (H, W, 3)"""
+    x, y = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
+    return np.stack([x, y, 255 - x], -1).astype(np.uint8)
+
+
+def jpeg(width=320, height=180):
+    """Return the picture as JPEG."""
+    return cv2.imencode(".jpg", picture(width, height))[1].tobytes()
+
+
+class Straight:
+    """A straight drive at 5 m/s, all cameras 2 m ahead of the origin, images at 10 Hz.
+
+    What is recorded can be changed: methods are replaced by others with the same arguments.
+    """
+
+    def __init__(self, recorder, names=("front", "rear"), count=11):
+        self.recorder, self.count = recorder, count
+        self.cameras = [CameraRecord(n, "", 320, 180, PINHOLE, np.eye(4)) for n in names]
+        self.times_ns = [START_NS + i * STEP_NS for i in range(count)]
+
+    def mount(self, camera):
+        pose = at(2.0, 0.0, 1.5, AHEAD)
+        frame = f"{camera.name}_optical"
+        self.recorder.transform("/tf_static", START_NS, "base_link", frame, pose)
+
+    def poses(self, i, time_ns):
+        self.recorder.transform("/tf", time_ns, "odom", "base_link", at(0.5 * i))
+
+    def info(self, camera, time_ns):
+        self.recorder.info(camera, time_ns)
+
+    def image(self, camera, time_ns):
+        self.recorder.image(camera, time_ns, jpeg())
+
+    def before(self):
+        """Send further messages at the start."""
+
+    def write(self, **replaced):
+        """Record the drive and return its path."""
+        for name, method in replaced.items():
+            setattr(self, name, method)
+        with self.recorder:
+            self.before()
+            for camera in self.cameras:
+                self.mount(camera)
+            for i, time_ns in enumerate(self.times_ns):
+                self.poses(i, time_ns)
+                for camera in self.cameras:
+                    self.info(camera, time_ns)
+                    self.image(camera, time_ns)
+        return self.recorder.path
 
 
 def options(tmp_path, **more):

@@ -308,3 +308,62 @@ def test_the_benchmark_times_every_set_of_classes(tmp_path):
     result = measure_extraction(tmp_path, stride=10)
     assert result["frames"] == 3  # 30 poses
     assert all(value > 0 for value in result.values())
+
+
+def cut_lane(content):
+    content["lane_segments"]["12"]["left_lane_boundary"] = []
+
+
+def point_of_a_lane(content):
+    del content["lane_segments"]["12"]["left_lane_boundary"][1:]
+
+
+def nan_in_a_lane(content):
+    content["lane_segments"]["12"]["right_lane_boundary"][0]["x"] = float("nan")
+
+
+def lane_without_a_side(content):
+    del content["lane_segments"]["12"]["right_lane_boundary"]
+
+
+def lane_of_unknown_paint(content):
+    content["lane_segments"]["12"]["left_lane_mark_type"] = "PINK"
+
+
+def short_crossing(content):
+    content["pedestrian_crossings"]["12"] = {**crossing(12, (1, 2), (0, 1)), "edge1": []}
+
+
+def short_area(content):
+    content["drivable_areas"]["12"] = {"id": 12, "area_boundary": []}
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (cut_lane, "lane segment cannot be used: its left_lane_boundary has 0 points, and needs 2"),
+        (point_of_a_lane, "lane segment cannot be used: its left_lane_boundary has 1 points"),
+        (nan_in_a_lane, "lane segment cannot be used: its right_lane_boundary holds NaN"),
+        (lane_without_a_side, "lane segment cannot be used: it has no 'right_lane_boundary'"),
+        (lane_of_unknown_paint, "lane segment cannot be used: 'PINK' is not a valid LaneMarkType"),
+        (short_crossing, "crossing cannot be used: its edge1 has 0 points, and needs 2"),
+        (short_area, "drivable area cannot be used: its area_boundary has 0 points, and needs 3"),
+    ],
+)
+def test_a_bad_element_of_a_map_costs_itself_and_is_named(tmp_path, spoil, reason):
+    content = road_map()
+    spoil(content)
+    write_log(tmp_path / "val" / "log", content=content)
+    summary = convert_argoverse2(Argoverse2Options(tmp_path, split="val", rate_hz=None, workers=1))
+    assert summary.samples["val"] == 10
+    assert f"1 x {reason}" in summary.text()
+    assert "for example 12 of log" in summary.text()
+
+
+def test_a_map_without_any_good_lane_costs_its_log(tmp_path):
+    content = road_map()
+    for lane in content["lane_segments"].values():
+        lane["left_lane_boundary"] = []
+    write_log(tmp_path / "val" / "log", content=content)
+    with pytest.raises(RuntimeError, match="none of its 4 lane_segments can be used: lane segment"):
+        convert_argoverse2(Argoverse2Options(tmp_path, split="val", rate_hz=None, workers=1))

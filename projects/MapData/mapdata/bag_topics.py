@@ -8,7 +8,7 @@ IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 INFO = "sensor_msgs/msg/CameraInfo"
 _KINDS = (IMAGES, (INFO,))
 _GENERIC = ("compressed", "raw", "image", "image_raw", "image_color", "image_mono", "image_rect",
-            "image_rect_color")  # fmt: skip
+            "image_rect_color", "image_rect_raw")  # fmt: skip
 # words in a topic that say nothing about which camera it is
 _WORDS = {
     "", "camera", "image", "img", "info", "camerainfo", "caminfo", "calibration", "raw", "color",

@@ -1,9 +1,8 @@
 """Samples of a bag: images, camera info, transforms and poses of ROS 1, ROS 2 or Foxglove."""
 
 import hashlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,81 +12,57 @@ import numpy as np
 from gsmap.datasets.errors import naming
 from gsmap.datasets.source import Source
 from gsmap.structures.rigid import invert_rigid, rigid
-from gsmap.utils.extras import import_extra
 from gsmap.utils.files import file_name
 from mapdata.argoverse2.samples import thin_out
+from mapdata.bag_cameras import ImageTopic, camera_of, is_calibrated
+from mapdata.bag_files import Bag, bag_at, damage_in
 from mapdata.bag_images import write_image
+from mapdata.bag_poses import FrameTree, Odometry, PoseChain, is_static_topic, odometry_poses
 from mapdata.bag_topics import camera_topics, chosen_topics, image_topics
 from mapdata.folders.images import read_rig
-from mapdata.folders.rig import (
-    PoseAt,
-    PoseTrack,
-    RigCamera,
-    RigFrame,
-    nearest_images,
-    rig_samples,
-    rotation_of,
-)
-from mapdata.foxglove_mcap import FoxgloveBag, is_foxglove
+from mapdata.folders.rig import RigCamera, RigFrame, nearest_images, rig_samples, rotation_of
 from mapdata.options import InputOptions
+from mapdata.ros_bag import library_errors
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_VEHICLE_FRAMES = ("base_footprint", "base_link")
 _TOLERANCE_NS = 50_000_000
-_GAP_NS, _FOREVER_NS = 10**9, 10**20
-
-
-def is_bag(path: Path) -> bool:
-    """Whether a path is a bag: ``.bag``, ``.mcap``, ``.db3``, or a folder of rosbag2."""
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    return path.suffix in (".bag", ".mcap", ".db3")
+_REACH_NS = 100_000_000  # of the first and the last pose
+_RULES = b"2"  # of making images, so that those of other rules are not taken
+_CHOOSE = "choose cameras with --topics"
 
 
 def read_bag(path: Path, options: InputOptions) -> Source:
     """Read the samples of a bag, in the frame ``ego``, and write their images as files.
 
-    A message that cannot be read is left out and noted. An image that cannot be decoded is noted
-    and not written, so that its frame is known to be broken. The folder of a bag's images is named
-    by its content, and images that are there are kept.
+    A message or a topic that cannot be read is left out and noted. An image that cannot be decoded
+    is noted and not written, so that its frame is known to be broken. The folder of a bag's images
+    is named by its content, and images that are there are kept.
 
     Raises:
         RuntimeError: If ``rosbags`` is not installed; the message names the extra.
         ValueError: If the bag is damaged or lacks what is needed; the message lists what it holds.
     """
-    highlevel = import_extra("rosbags.highlevel", "bags")
-    typesys = import_extra("rosbags.typesys", "bags")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     with naming(path, "see docs/inference.md"):
-        with _of_rosbags():
-            bag: Any = highlevel.AnyReader([path], default_typestore=store)
-            bag = FoxgloveBag(path) if is_foxglove(path) else bag
-            bag.open()
         try:
-            return _read(bag, path, options)
-        finally:
-            bag.close()
+            bag = bag_at(path)
+            try:
+                bag.open()
+                return _read(bag, path, options)
+            finally:
+                bag.close()
+        except ValueError as error:
+            damage = damage_in(path)
+            if damage is None:
+                raise
+            raise ValueError(damage) from error
 
 
-@contextmanager
-def _of_rosbags() -> Iterator[None]:
-    """Turn what rosbags and the parsers below it raise for a damaged bag into a ``ValueError``."""
-    try:
-        yield
-    except MemoryError as error:
-        raise ValueError("a length in it asks for more memory than there is") from error
-    except Exception as error:
-        if isinstance(error, OSError) and error.errno:
-            raise
-        raise ValueError(str(error) or type(error).__name__) from error
-
-
-def _messages(bag: Any, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
+def _messages(bag: Bag, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
     """Yield the messages of some connections: connection, time in nanoseconds, content."""
     found = iter(bag.messages(connections)) if connections else iter(())
     while True:
-        with _of_rosbags():
+        with library_errors():
             message = next(found, None)
         if message is None:
             return
@@ -96,28 +71,43 @@ def _messages(bag: Any, connections: Sequence[Any]) -> Iterator[tuple[Any, int, 
 
 @dataclass
 class _Content:
-    """What a first pass over a bag finds; topics are those of images."""
+    """What a first pass over a bag finds; infos and images are by the topic of the images."""
 
     infos: dict[str, Any] = field(default_factory=dict)
-    frame_ids: dict[str, str] = field(default_factory=dict)
-    times_ns: dict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
-    transforms: dict[str, tuple[str, list[int], list[np.ndarray]]] = field(default_factory=dict)
-    static: set[str] = field(default_factory=set)
-    odometry: tuple[list[int], list[np.ndarray]] = field(default_factory=lambda: ([], []))
+    images: dict[str, ImageTopic] = field(default_factory=lambda: defaultdict(ImageTopic))
+    tree: FrameTree = field(default_factory=FrameTree)
+    odometries: dict[tuple[str, str, str], Odometry] = field(default_factory=dict)
     digest: Any = field(default_factory=hashlib.sha256)
     unread: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    unstamped: Counter[str] = field(default_factory=Counter)
+
+    def notes(self) -> list[str]:
+        """Say what cannot be read, and which stamps are 0."""
+        notes = [
+            f"{len(reasons)} messages of {topic!r} cannot be read and are left out: {reasons[0]}"
+            for topic, reasons in self.unread.items()
+        ]
+        notes += [
+            f"{count} transforms or poses of {topic!r} have the stamp 0: their time of recording "
+            "is used"
+            for topic, count in self.unstamped.items()
+        ]
+        return notes + [
+            note for topic, images in self.images.items() for note in images.notes(topic)
+        ]
 
 
-def _read(bag: Any, path: Path, options: InputOptions) -> Source:
+def _read(bag: Bag, path: Path, options: InputOptions) -> Source:
     kinds, listing = {c.topic: c.msgtype for c in bag.connections}, _listing(bag)
-    calibration, vehicle_frame = options.calibration, options.vehicle_frame
+    calibration, notes = options.calibration, list(bag.notes)
     ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m))
     topics = chosen_topics(kinds, options.topics, listing, calibration is None)
     if calibration is None:
         topics = topics or camera_topics(kinds, listing)
         content = _first_pass(bag, topics)
-        vehicle = _vehicle_frame(content, vehicle_frame)
-        rig = {t: _camera(name, t, content, vehicle, ground) for name, (t, _) in topics.items()}
+        vehicle = content.tree.choose_vehicle(options.vehicle_frame)
+        rig, of_cameras = _rig(topics, content, vehicle, ground, by_hand=bool(options.topics))
+        notes += of_cameras
     else:
         given, ground = read_rig(calibration, ground)
         images = {name: t for name, (t, _) in topics.items()} or image_topics(kinds)
@@ -126,29 +116,34 @@ def _read(bag: Any, path: Path, options: InputOptions) -> Source:
             for camera, place in given
         }
         content = _first_pass(bag, topics)
-        vehicle = _vehicle_frame(content, vehicle_frame) if content.transforms else ""
+        for name in topics:
+            _require_messages(name, topics[name], content)
+        has_frames = bool(content.tree.frames)
+        vehicle = content.tree.choose_vehicle(options.vehicle_frame) if has_frames else ""
         rig = {topics[camera.name][0]: camera for camera, _ in given}
     content.digest.update(calibration.read_bytes() if calibration else b"")
-    times = {name: np.unique(content.times_ns[topic]) for name, (topic, _) in topics.items()}
+    times = {
+        camera.name: np.unique(content.images[topic].times_ns) for topic, camera in rig.items()
+    }
     first = next((name for name in times if "front" in name.lower()), next(iter(times)))
-    wanted = thin_out(times[first], options.rate_hz)
-    nearest = nearest_images(times, wanted.tolist(), _TOLERANCE_NS)
+    pose_at, of_poses = _poses(content, vehicle, ground)
+    asked = len(thin_out(times[first], options.rate_hz))
+    wanted = thin_out(_near_poses(times[first], pose_at), options.rate_hz).tolist()
     frames = [
         RigFrame(
             f"{path.stem}_{time_ns}",
             time_ns,
             {name: (f"{file_name(name)}/{t}.jpg", t) for name, t in found.items()},
         )
-        for time_ns, found in zip(wanted.tolist(), nearest, strict=True)
+        for time_ns, found in zip(wanted, nearest_images(times, wanted, _TOLERANCE_NS), strict=True)
     ]
-    pose_at = _pose_at(content, vehicle, ground)
     samples = rig_samples(path.stem, list(rig.values()), frames, pose_at)
+    notes += content.notes() + content.tree.notes + of_poses
+    notes += _usage(len(samples), asked, times, pose_at, first)
+    notes += _absences(frames, times, first)
     root = options.frames_dir / f"{file_name(path.stem)}-{content.digest.hexdigest()[:16]}"
-    notes = [
-        f"{len(reasons)} messages of {topic!r} cannot be read and are left out: {reasons[0]}"
-        for topic, reasons in content.unread.items()
-    ]
-    notes += _write_images(bag, rig, frames, root)
+    used = {sample.timestamp_ns for sample in samples}
+    notes += _write_images(bag, rig, [frame for frame in frames if frame.time_ns in used], root)
     return Source(samples, "ego", root, pose_at is not None, tuple(notes))
 
 
@@ -163,17 +158,17 @@ def _topic_of(name: str, place: str, images: Mapping[str, str], kinds: Mapping[s
     return topic
 
 
-def _listing(bag: Any) -> str:
+def _listing(bag: Bag) -> str:
     """Say what a bag holds."""
     return "; ".join(
-        f"{name} ({info.msgtype or 'several types'}, {info.msgcount})"
-        for name, info in sorted(bag.topics.items())
+        f"{name} ({info.msgtype}, {info.msgcount})" for name, info in sorted(bag.topics.items())
     )
 
 
-def _stamp_ns(header: Any) -> int:
+def _time_ns(header: Any, recorded_ns: int) -> int:
+    """Return the time of a message: its stamp, or when it was recorded if the stamp is 0."""
     stamp = header.stamp
-    return int(stamp.sec) * 10**9 + int(getattr(stamp, "nanosec", 0) or 0)
+    return int(stamp.sec) * 10**9 + int(getattr(stamp, "nanosec", 0) or 0) or recorded_ns
 
 
 def _matrix(place: Any, turn: Any) -> np.ndarray:
@@ -184,150 +179,198 @@ def _matrix(place: Any, turn: Any) -> np.ndarray:
     return pose
 
 
-def _first_pass(bag: Any, topics: Mapping[str, tuple[str, str]]) -> _Content:
+def _first_pass(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> _Content:
     """Gather calibration, transforms, poses and the times of all images."""
     content = _Content()
+    content.digest.update(_RULES)
     topic_of: dict[str, list[str]] = defaultdict(list)
     for topic, info in topics.values():
         if info:
             topic_of[info].append(topic)
     images = {topic for topic, _ in topics.values()}
     kinds = (*_TRANSFORMS, _ODOMETRY)
-    chosen = [c for c in bag.connections if c.topic in images | set(topic_of) or c.msgtype in kinds]
+    wanted = [c for c in bag.connections if c.topic in images | set(topic_of) or c.msgtype in kinds]
+    chosen = []
+    for connection in wanted:
+        try:
+            bag.parser(connection)
+            chosen.append(connection)
+        except ValueError as error:
+            content.unread[connection.topic].append(" ".join(str(error).split()))
     for connection, time_ns, raw in _messages(bag, chosen):
         topic, kind = connection.topic, connection.msgtype
         content.digest.update(f"{topic} {kind} {len(raw)}\n".encode())
         content.digest.update(raw)
         try:
             with naming(f"the message at {time_ns} ns", "it is damaged"):
-                with _of_rosbags():
-                    message = bag.deserialize(raw, kind)
+                with library_errors():
+                    message = bag.parser(connection)(raw)
                 if topic in topic_of:
-                    content.infos |= {t: message for t in topic_of[topic] if t not in content.infos}
+                    for images_of in topic_of[topic]:
+                        known = content.infos.get(images_of)
+                        if known is None or not is_calibrated(known):
+                            content.infos[images_of] = message
                 else:
-                    _keep(content, message, topic, kind)
+                    _keep(content, message, topic, kind, time_ns)
         except ValueError as error:
             content.unread[topic].append(str(error))
-    for name, (topic, info) in topics.items():
-        if topic not in content.frame_ids or (info and topic not in content.infos):
-            reason = next((content.unread[t][0] for t in (topic, info) if content.unread[t]), "")
-            raise ValueError(
-                f"camera {name!r} has no message on {topic} or {info or 'its info'}: choose others "
-                f"with --topics, or give --calibration. {reason}"
-            )
     return content
 
 
-def _keep(content: _Content, message: Any, topic: str, kind: str) -> None:
+def _keep(content: _Content, message: Any, topic: str, kind: str, recorded_ns: int) -> None:
     """Keep an image's time, or the poses of a message."""
     if kind in _TRANSFORMS:
-        _add_transforms(content, message.transforms, topic.endswith("tf_static"))
-    elif kind == _ODOMETRY:
-        pose, time_ns = message.pose.pose, _stamp_ns(message.header)
-        content.odometry[1].append(_matrix(pose.position, pose.orientation))
-        content.odometry[0].append(time_ns)
+        is_static = is_static_topic(topic)
+        for item in message.transforms:
+            pose = _matrix(item.transform.translation, item.transform.rotation)
+            child, parent = item.child_frame_id.lstrip("/"), item.header.frame_id.lstrip("/")
+            time_ns = _time_ns(item.header, recorded_ns)
+            content.tree.add(topic, child, parent, time_ns, pose)
+            if not is_static and _is_unstamped(item.header):
+                content.unstamped[topic] += 1
+        return
+    time_ns = _time_ns(message.header, recorded_ns)
+    if kind == _ODOMETRY:
+        pose = _matrix(message.pose.pose.position, message.pose.pose.orientation)
+        parent, child = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
+        key = topic, parent, child
+        odometry = content.odometries.setdefault(key, Odometry(*key))
+        odometry.poses.append(pose)
+        odometry.times_ns.append(time_ns)
+        if _is_unstamped(message.header):
+            content.unstamped[topic] += 1
     else:
-        content.times_ns[topic].append(_stamp_ns(message.header))
-        content.frame_ids.setdefault(topic, message.header.frame_id)
+        content.images[topic].add(message, time_ns)
+        content.images[topic].unstamped += _is_unstamped(message.header)
 
 
-def _add_transforms(content: _Content, transforms: Sequence[Any], is_static: bool) -> None:
-    """Keep transforms, of static ones the first."""
-    for item in transforms:
-        child, parent = item.child_frame_id.lstrip("/"), item.header.frame_id.lstrip("/")
-        time_ns = _stamp_ns(item.header)
-        pose = _matrix(item.transform.translation, item.transform.rotation)
-        if is_static:
-            content.static.add(child)
-        _, times, poses = content.transforms.setdefault(child, (parent, [], []))
-        if not is_static or not times:
-            times.append(time_ns)
-            poses.append(pose)
+def _is_unstamped(header: Any) -> bool:
+    """Whether the stamp of a message is 0."""
+    return _time_ns(header, 0) == 0
 
 
-def _vehicle_frame(content: _Content, wanted: str | None) -> str:
-    frames = set(content.transforms) | {parent for parent, _, _ in content.transforms.values()}
-    for name in _VEHICLE_FRAMES if wanted is None else (wanted,):
-        if name in frames:
-            return name
-    raise ValueError(
-        f"its transforms have no frame {wanted or ' or '.join(_VEHICLE_FRAMES)!s}: name the "
-        f"vehicle's with --vehicle-frame, or give --calibration calibration.yaml; there are "
-        f"{sorted(frames) or 'no transforms at all'}"
-    )
+def _require_messages(name: str, topics: tuple[str, str], content: _Content) -> None:
+    """Raise a ``ValueError`` unless there are images of a camera, and its info if it has one."""
+    topic, info = topics
+    if not content.images[topic].times_ns or (info and topic not in content.infos):
+        reason = next((content.unread[t][0] for t in (topic, info) if t in content.unread), "")
+        raise ValueError(
+            f"camera {name!r} has no message on {topic} or {info or 'its info'}: choose others "
+            f"with --topics, or give --calibration. {reason}".rstrip(" .")
+        )
 
 
-def _chain(content: _Content, frame: str) -> list[str]:
-    """Return a frame and those above it, up to the root."""
-    chain = [frame]
-    while chain[-1] in content.transforms:
-        parent = content.transforms[chain[-1]][0]
-        if parent in chain:
-            raise ValueError(f"its transforms lead from {parent!r} back to it")
-        chain.append(parent)
-    return chain
+def _rig(
+    topics: Mapping[str, tuple[str, str]],
+    content: _Content,
+    vehicle: str,
+    ground: np.ndarray,
+    by_hand: bool,
+) -> tuple[dict[str, RigCamera], list[str]]:
+    """Return the cameras by the topic of their images, and what is to be said of them.
+
+    A camera that cannot be used is left out, unless it was asked for or there is no other.
+    """
+    rig, notes = {}, []
+    left_out: dict[str, ValueError] = {}
+    is_any_readable = any(not content.images[topic].trouble for topic, _ in topics.values())
+    for name, pair in topics.items():
+        trouble = content.images[pair[0]].trouble
+        try:
+            if trouble and is_any_readable and not by_hand:
+                raise ValueError(f"camera {name!r}: {trouble}")
+            rig[pair[0]], assumed = _camera(name, pair, content, vehicle, ground)
+            notes += assumed
+        except ValueError as error:
+            left_out[name] = error
+    if left_out and (by_hand or not rig):
+        raise next(iter(left_out.values()))
+    notes += [
+        f"{topics[name][0]} is left out: {str(error).rstrip('.')}; {_CHOOSE}"
+        for name, error in left_out.items()
+    ]
+    return rig, notes
 
 
 def _camera(
-    name: str, topic: str, content: _Content, vehicle: str, ground: np.ndarray
-) -> RigCamera:
-    """Read a camera's calibration and its place on the vehicle."""
-    info, frame = content.infos[topic], content.frame_ids[topic].lstrip("/")
-    above, of_vehicle = _chain(content, frame), _chain(content, vehicle)
-    if above[-1] != of_vehicle[-1]:
+    name: str, topics: tuple[str, str], content: _Content, vehicle: str, ground: np.ndarray
+) -> tuple[RigCamera, list[str]]:
+    """Return a camera by its info and its place on the vehicle, and what was assumed."""
+    _require_messages(name, topics, content)
+    images, info = content.images[topics[0]], content.infos[topics[0]]
+    frame = images.frame_id or info.header.frame_id.lstrip("/")
+    vehicle_from_cam = content.tree.between(vehicle, frame)
+    if vehicle_from_cam is None:
         raise ValueError(
             f"camera {name!r}: no transform leads from its frame {frame!r} to {vehicle!r}: give "
             "--calibration calibration.yaml, or another --vehicle-frame; there are those of "
-            f"{sorted(content.transforms)}"
+            f"{sorted(content.tree.edges)}"
         )
-
-    def root_from(chain: Sequence[str]) -> np.ndarray:
-        pose = np.eye(4)
-        for step in chain[:-1]:
-            pose = content.transforms[step][2][0] @ pose
-        return pose
-
-    vehicle_from_cam = invert_rigid(root_from(of_vehicle)) @ root_from(above)
-
-    def value(key: str) -> np.ndarray:
-        found = getattr(info, key) if hasattr(info, key) else getattr(info, key.upper())
-        return np.asarray(found, np.float64)
-
-    rectified = "rect" in topic.rsplit("/", 2)[-1] or "rect" in topic.rsplit("/", 2)[-2]
-    return RigCamera(
-        name,
-        value("p").reshape(3, 4)[:, :3] if rectified else value("k").reshape(3, 3),
-        invert_rigid(vehicle_from_cam) @ ground,
-        (int(info.width), int(info.height)),
-        np.zeros(0) if rectified else value("d"),
-        str(info.distortion_model),
-    )
+    return camera_of(name, images, info, topics, invert_rigid(vehicle_from_cam) @ ground)
 
 
-def _pose_at(content: _Content, vehicle: str, ground: np.ndarray) -> PoseAt | None:
+def _poses(
+    content: _Content, vehicle: str, ground: np.ndarray
+) -> tuple[PoseChain | None, list[str]]:
     """Return the ground's poses by the transforms above the vehicle, or else by odometry."""
-    above = _chain(content, vehicle)[:-1]
-    if content.static.issuperset(above):
-        steps = [PoseTrack(*content.odometry)] if content.odometry[0] else []
-    else:
-        gaps = [_FOREVER_NS if frame in content.static else _GAP_NS for frame in above]
-        found = [content.transforms[frame] for frame in above]
-        steps = [PoseTrack(t, poses, gap) for (_, t, poses), gap in zip(found, gaps, strict=True)]
+    chain = content.tree.poses(vehicle, ground) if vehicle else None
+    if chain is not None:
+        return chain, []
+    return odometry_poses(list(content.odometries.values()), content.tree, vehicle, ground)
 
-    def pose_at(time_ns: int) -> np.ndarray | None:
-        pose = ground
-        for step in steps:
-            parent_from_child = step.at(time_ns)
-            if parent_from_child is None:
-                return None
-            pose = parent_from_child @ pose
-        return pose
 
-    return pose_at if steps else None
+def _near_poses(times_ns: np.ndarray, pose_at: PoseChain | None) -> np.ndarray:
+    """Return the times that the poses span, or all where there are none. (n,) -> (m,)"""
+    if pose_at is None:
+        return times_ns
+    start_ns, end_ns = pose_at.span_ns
+    near = times_ns[(times_ns >= start_ns - _REACH_NS) & (times_ns <= end_ns + _REACH_NS)]
+    return near if len(near) else times_ns
+
+
+def _usage(
+    count: int,
+    asked: int,
+    times_ns: Mapping[str, np.ndarray],
+    pose_at: PoseChain | None,
+    first: str,
+) -> list[str]:
+    """Say how many of the samples that were asked for have a pose; ValueError if none has."""
+    if pose_at is None or count >= asked:
+        return []
+    where = (
+        f"the images of {first!r} are from {_span(times_ns[first])}, the poses from "
+        f"{_span(pose_at.span_ns)}; gaps of more than 1 s are not bridged"
+    )
+    if not count:
+        raise ValueError(
+            f"no image has a pose near its time: {where}; images and transforms need one clock"
+        )
+    return [f"{count} of {asked} samples used: the others have no pose near them: {where}"]
+
+
+def _absences(
+    frames: Sequence[RigFrame], times_ns: Mapping[str, np.ndarray], first: str
+) -> list[str]:
+    """Say which cameras have no image at some samples."""
+    notes = []
+    for name, found in times_ns.items():
+        count = sum(name not in frame.images for frame in frames)
+        note = f"camera {name!r} has no image within 50 ms at {count} of {len(frames)} samples"
+        if count == len(frames):
+            of_first = _span(times_ns[first])
+            note += f": its images are from {_span(found)}, those of {first!r} from {of_first}"
+        notes += [note] if count else []
+    return notes
+
+
+def _span(times_ns: Sequence[int] | np.ndarray) -> str:
+    """Return the first and last of ascending times in words."""
+    return f"{times_ns[0] / 1e9:.3f} to {times_ns[-1] / 1e9:.3f} s"
 
 
 def _write_images(
-    bag: Any, rig: Mapping[str, RigCamera], frames: Sequence[RigFrame], frames_dir: Path
+    bag: Bag, rig: Mapping[str, RigCamera], frames: Sequence[RigFrame], frames_dir: Path
 ) -> list[str]:
     """Write the images of frames that are not there yet; say which cannot be used, and why."""
     missing = {
@@ -338,12 +381,13 @@ def _write_images(
     }
     chosen = [c for c in bag.connections if c.topic in rig]
     unusable = []
-    for connection, _, raw in _messages(bag, chosen) if missing else ():
+    for connection, recorded_ns, raw in _messages(bag, chosen) if missing else ():
         camera = rig[connection.topic]
         try:
-            with _of_rosbags():
-                message = bag.deserialize(raw, connection.msgtype)
-                target = missing.pop((camera.name, _stamp_ns(message.header)), None)
+            with library_errors():
+                message = bag.parser(connection)(raw)
+                time_ns = _time_ns(message.header, recorded_ns)
+                target = missing.pop((camera.name, time_ns), None)
         except ValueError:
             continue  # the first pass has named it
         if target is not None:

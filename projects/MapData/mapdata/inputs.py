@@ -5,7 +5,8 @@ from pathlib import Path
 from gsmap.datasets.source import Source, annotated
 from mapdata.argoverse2.log import logs_in
 from mapdata.argoverse2.samples import read_logs
-from mapdata.bags import is_bag, read_bag
+from mapdata.bag_files import is_bag, parts_in, suffix_advice
+from mapdata.bags import read_bag
 from mapdata.folders.images import NAMES, read_image_folder
 from mapdata.infos.recordings import read_info_file
 from mapdata.nuscenes.tables import read_nuscenes, versions_in
@@ -15,7 +16,7 @@ _FILES = ("*.arrow", "*.pkl")
 KINDS = (
     "an annotation file (.arrow), an info file of mmdet3d (.pkl), a nuScenes-format root, "
     "Argoverse 2 logs, a folder of images with calibration.yaml or calibration.json, a bag of ROS "
-    "(.bag, .mcap, .db3 or a folder of rosbag2)"
+    "(.bag, .mcap, .db3, a folder of rosbag2 or of the parts of one recording)"
 )
 
 
@@ -38,7 +39,8 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
     path, options = Path(path), options or InputOptions()
     if not path.exists():
         raise FileNotFoundError(f"There is no input {path}.")
-    if not is_bag(path) and (options.topics or options.calibration):
+    may_be_bag = is_bag(path) or (path.is_dir() and bool(parts_in(path)))
+    if not may_be_bag and (options.topics or options.calibration):
         raise ValueError(f"--topics and --calibration belong to a bag, and {path} is none.")
     if is_bag(path):
         return read_bag(path, options)
@@ -52,6 +54,8 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
         return Source(samples, "lidar", root)
     if path.suffix in (".yaml", ".yml", ".json"):
         return read_image_folder(path, options.frames_dir)
+    if advice := suffix_advice(path):
+        raise ValueError(f"{path} cannot be used: {advice}.")
     raise ValueError(f"{path} is no input: it must be {KINDS}.")
 
 
@@ -63,7 +67,8 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
     if logs:
         root = folder.parent if logs == [folder] else folder
         samples, left_out = read_logs(logs, root, options.rate_hz)
-        notes = tuple(f"{count} samples left out: {reason}" for reason, count in left_out.items())
+        used = f"{len(samples)} samples used, left out"
+        notes = tuple(f"{used}: {count} for {reason}" for reason, count in left_out.items())
         return Source(samples, "ego", root, notes=notes)
     files = [folder / name for name in NAMES if (folder / name).is_file()]
     files = files or sorted(path for pattern in _FILES for path in folder.glob(pattern))
@@ -72,4 +77,6 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
     if files:
         names = ", ".join(path.name for path in files)
         raise ValueError(f"{folder} holds several files ({names}): name one of them.")
+    if parts_in(folder):
+        return read_bag(folder, options)
     raise FileNotFoundError(f"{folder} holds no input: it must be {KINDS}.")

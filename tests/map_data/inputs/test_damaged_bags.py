@@ -17,7 +17,7 @@ def test_a_damaged_bag_and_a_missing_extra_are_named(tmp_path, monkeypatch):
     path.write_bytes(b"no bag at all")
     with pytest.raises(ValueError, match=r"a.mcap cannot be used"):
         open_input(path)
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     with pytest.raises(RuntimeError, match=r"`pip install -e .\[bags\]`"):
         open_input(path)
 

@@ -63,6 +63,9 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
                 summary.add_sample(options.split, sample)
             for reason, count in result.left_out.items():
                 summary.add_problem(f"sample left out: {reason}", log_dir.name, count)
+            for reason, numbers in result.elements.items():
+                for number in numbers:
+                    summary.add_problem(reason.rstrip("."), f"{number} of {log_dir.name}")
             for kind, count in result.invalid.items():
                 reason = f"invalid polygon among the {kind} takes no part"
                 summary.add_problem(reason, log_dir.name, count)

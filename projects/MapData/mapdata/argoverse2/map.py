@@ -4,7 +4,7 @@ Whatever does not depend on the vehicle's pose is done once per log; a frame the
 vectorised geometry calls. ``docs/data.md`` states both sets of rules.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from av2.map.map_api import ArgoverseStaticMap
 
 from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.errors import naming
+from mapdata.argoverse2.map_file import read_map_file
 from mapdata.argoverse2.rules import (
     EDGE_MARGIN_M,
     clip_lines,
@@ -51,9 +52,18 @@ def find_map(log_dir: Path) -> Path:
 
 
 class Argoverse2Map:
-    """A log's map, as the official API reads it, prepared for cutting out what the vehicle sees."""
+    """A log's map, as the official API reads it, prepared for cutting out what the vehicle sees.
 
-    def __init__(self, static_map: ArgoverseStaticMap) -> None:
+    Args:
+        static_map: The map.
+        left_out: Numbers of the elements that its file holds and that cannot be used, by kind and
+            reason.
+    """
+
+    def __init__(
+        self, static_map: ArgoverseStaticMap, left_out: Mapping[str, Sequence[str]] | None = None
+    ) -> None:
+        self.left_out = dict(left_out or {})
         lanes = static_map.get_scenario_lane_segments()
         links = link_lanes([(s.id, s.predecessors, s.successors) for s in lanes])
         self._lanes = GeometryLayer([shapely.Polygon(s.polygon_boundary) for s in lanes])
@@ -88,7 +98,7 @@ class Argoverse2Map:
         """
         path = find_map(log_dir)
         with naming(path, "download it again"):
-            return cls(ArgoverseStaticMap.from_json(path))
+            return cls(*read_map_file(path))
 
     @property
     def invalid_counts(self) -> dict[str, int]:

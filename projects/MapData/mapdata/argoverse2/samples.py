@@ -70,11 +70,19 @@ class Argoverse2Options(FileOptions):
 
 @dataclass
 class LogSamples:
-    """A log's samples by time, how many are left out by reason, and invalid polygons by kind."""
+    """A log's samples by time, and what is left out of it.
+
+    Args:
+        samples: The samples.
+        left_out: Number of samples that are left out, by reason.
+        invalid: Number of invalid polygons of the map, by kind.
+        elements: Numbers of elements of the map that are left out, by kind and reason.
+    """
 
     samples: list[MapSample] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     invalid: Counter[str] = field(default_factory=Counter)
+    elements: dict[str, Sequence[str]] = field(default_factory=dict)
 
 
 def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -> LogSamples:
@@ -94,6 +102,7 @@ def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -
     log_map = Argoverse2Map.from_log(log_dir) if with_map else None
     if log_map is not None:
         result.invalid = +Counter(log_map.invalid_counts)  # those that are not zero
+        result.elements = log_map.left_out
     for timestamp_ns in times:
         try:
             with naming(log_dir, "download the log again"):

@@ -122,32 +122,39 @@ class PoseTrack:
         times_ns: In any order; of equal times one counts. (n,)
         poses: Global from vehicle. (n, 4, 4)
         gap_ns: Longest gap that is bridged; the ends reach a tenth of it.
+        holds: Whether each pose holds until the next one where the gap is longer.
 
     Raises:
         ValueError: If there is no pose, or one is not finite.
     """
 
     def __init__(
-        self, times_ns: Iterable[int], poses: Iterable[np.ndarray], gap_ns: int = 1_000_000_000
+        self,
+        times_ns: Iterable[int],
+        poses: Iterable[np.ndarray],
+        gap_ns: int = 1_000_000_000,
+        holds: bool = False,
     ) -> None:
         times, matrices = np.array(list(times_ns), np.int64), np.array(list(poses), np.float64)
         if not len(times) or not np.isfinite(matrices).all():
             raise ValueError("poses must be finite, at least one.")
         self.times_ns, first = np.unique(times, return_index=True)
-        self.poses, self.gap_ns = matrices[first], gap_ns
+        self.poses, self.gap_ns, self.holds = matrices[first], gap_ns, holds
 
     def at(self, time_ns: int) -> np.ndarray | None:
         """Return the pose at a time, interpolated; None where none is near. (4, 4)"""
         after = int(np.searchsorted(self.times_ns, time_ns))
         if after < len(self.times_ns) and self.times_ns[after] == time_ns:
             return self.poses[after]
+        if self.holds and after == len(self.times_ns):
+            return self.poses[-1]
         if after in (0, len(self.times_ns)):
             nearest = max(after - 1, 0)
             near = abs(int(self.times_ns[nearest]) - time_ns) <= self.gap_ns // 10
             return self.poses[nearest] if near else None
         t0, t1 = self.times_ns[after - 1 : after + 1].tolist()
         if t1 - t0 > self.gap_ns:
-            return None
+            return self.poses[after - 1] if self.holds else None
         share, (a, b) = (time_ns - t0) / (t1 - t0), self.poses[after - 1 : after + 1]
         pose = (1 - share) * a + share * b
         turns = Rotation.from_matrix([a[:3, :3], b[:3, :3]])

@@ -1,0 +1,138 @@
+"""Bags of ROS 1 and ROS 2 as rosbags reads them, each topic by itself."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from heapq import merge
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from gsmap.utils.extras import import_extra
+
+Parser = Callable[[bytes], Any]
+
+
+@contextmanager
+def library_errors() -> Iterator[None]:
+    """Turn what rosbags and the parsers below it raise for a damaged bag into a ``ValueError``."""
+    try:
+        yield
+    except MemoryError as error:
+        raise ValueError("a length in it asks for more memory than there is") from error
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno:
+            raise
+        raise ValueError(str(error) or type(error).__name__) from error
+
+
+def ros_parser(msgtype: str, definition: str, is_idl: bool, is_ros1: bool) -> Parser:
+    """Return a function that makes a message of its content.
+
+    Args:
+        msgtype: Type of the messages, such as ``sensor_msgs/msg/Image``.
+        definition: Its definition as the bag holds it; empty takes that of ROS 2 Humble.
+        is_idl: Whether the definition is in IDL.
+        is_ros1: Whether the content is serialized as in ROS 1.
+
+    Raises:
+        ValueError: If the definition cannot be read.
+    """
+    typesys = import_extra("rosbags.typesys", "bags")
+    with library_errors():
+        if not definition:
+            store = _standard_store()
+        else:
+            store = typesys.get_typestore(typesys.Stores.EMPTY)
+            store.register(_types(typesys, msgtype, definition, is_idl))
+        if msgtype not in store.fielddefs:
+            raise ValueError(f"the bag does not define its type {msgtype!r}")
+    deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+    return lambda content: deserialize(content, msgtype)
+
+
+@cache
+def _standard_store() -> Any:
+    """Return the types of ROS 2 Humble."""
+    typesys = import_extra("rosbags.typesys", "bags")
+    return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+
+def _types(typesys: Any, msgtype: str, definition: str, is_idl: bool) -> dict[str, Any]:
+    """Return the types that a definition names."""
+    if not is_idl:
+        return dict(typesys.get_types_from_msg(definition, msgtype))
+    separator = "=" * 80 + "\n"
+    if not definition.startswith(f"{separator}IDL: "):
+        return dict(typesys.get_types_from_idl(definition))
+    found: dict[str, Any] = {}
+    for part in definition.split(separator)[1:]:
+        found |= typesys.get_types_from_idl(part.partition("\n")[2])
+    return found
+
+
+@dataclass
+class RosBag:
+    """The parts of one recording, read by rosbags.
+
+    Args:
+        paths: Bags of ROS 1, or files or folders of rosbag2.
+        notes: What is to be said about the files.
+    """
+
+    paths: Sequence[Path]
+    notes: list[str] = field(default_factory=list)
+    connections: list[Any] = field(default_factory=list)
+    _readers: list[Any] = field(default_factory=list)
+    _parsers: dict[tuple[str, str], Parser] = field(default_factory=dict)
+    _is_ros1: bool = False
+
+    def open(self) -> None:
+        """Read which topics there are; ValueError if that fails."""
+        self._is_ros1 = self.paths[0].suffix == ".bag"
+        module = "rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2"
+        reader_type = import_extra(module, "bags").Reader
+        for path in self.paths:
+            with library_errors():
+                reader = reader_type(path)
+                reader.open()
+            self._readers.append(reader)
+            self.connections += reader.connections
+
+    def close(self) -> None:
+        """Close the files."""
+        for reader in self._readers:
+            reader.close()
+        self._readers.clear()
+
+    @property
+    def topics(self) -> dict[str, Any]:
+        """Type and number of the messages of each topic."""
+        found: dict[str, Any] = {}
+        for connection in self.connections:
+            topic = found.setdefault(
+                connection.topic, SimpleNamespace(msgtype=connection.msgtype, msgcount=0)
+            )
+            topic.msgcount += connection.msgcount
+            if topic.msgtype != connection.msgtype:
+                topic.msgtype = "several types"
+        return found
+
+    def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        """Yield connection, time in nanoseconds and content of messages, in their order of time."""
+        parts = []
+        for reader in self._readers:
+            known = {id(connection) for connection in reader.connections}
+            of_reader = [c for c in connections if id(c) in known]
+            if of_reader:
+                parts.append(reader.messages(connections=of_reader))
+        yield from merge(*parts, key=lambda message: message[1])
+
+    def parser(self, connection: Any) -> Parser:
+        """Return what parses the messages of a connection; ValueError if nothing does."""
+        key = connection.msgtype, connection.msgdef.data
+        if key not in self._parsers:
+            is_idl = connection.msgdef.format.name == "IDL"
+            self._parsers[key] = ros_parser(*key, is_idl, self._is_ros1)
+        return self._parsers[key]
