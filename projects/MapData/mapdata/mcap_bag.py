@@ -9,7 +9,7 @@ from typing import Any
 
 from gsmap.utils.extras import import_extra
 from mapdata.foxglove_messages import ROS_TYPES, foxglove_parser
-from mapdata.ros_bag import Parser, library_errors, ros_parser
+from mapdata.ros_bag import Parser, RosTypes, library_errors
 
 MAGIC = b"\x89MCAP0\r\n"
 _OF_ROS_2 = ("ros2msg", "ros2idl", "omgidl", "")
@@ -63,9 +63,11 @@ class McapBag:
     connections: list[McapConnection] = field(default_factory=list)
     topics: dict[str, Any] = field(default_factory=dict)
     _parsers: dict[McapConnection, Parser] = field(default_factory=dict)
+    _types: RosTypes = field(init=False)
 
     def open(self) -> None:
         """Read which topics there are; ValueError if that fails."""
+        self._types = RosTypes()
         for path in self.paths:
             with library_errors(), path.open("rb") as file:
                 channels, schemas, counts = _contents(file)
@@ -105,7 +107,7 @@ class McapBag:
     def parser(self, connection: McapConnection) -> Parser:
         """Return what parses the messages of a connection; ValueError if nothing does."""
         if connection not in self._parsers:
-            self._parsers[connection] = _parser_of(connection)
+            self._parsers[connection] = _parser_of(connection, self._types)
         return self._parsers[connection]
 
 
@@ -145,7 +147,7 @@ def _listed_type(connection: McapConnection) -> str:
     return name if is_known else f"{name} in {connection.encoding}"
 
 
-def _parser_of(connection: McapConnection) -> Parser:
+def _parser_of(connection: McapConnection, types: RosTypes) -> Parser:
     """Return what parses the messages of a connection."""
     schema, encoding = connection.schema, connection.encoding
     with library_errors():
@@ -155,4 +157,4 @@ def _parser_of(connection: McapConnection) -> Parser:
             raise ValueError(f"its messages are in the encoding {encoding!r}")
         text = "" if schema is None else schema.data.decode()
         is_idl = schema is not None and schema.encoding in ("ros2idl", "omgidl")
-    return ros_parser(connection.msgtype, text, is_idl, encoding == "ros1")
+    return types.parser(connection.msgtype, text, is_idl, encoding == "ros1")

@@ -27,29 +27,50 @@ def library_errors() -> Iterator[None]:
         raise ValueError(str(error) or type(error).__name__) from error
 
 
-def ros_parser(msgtype: str, definition: str, is_idl: bool, is_ros1: bool) -> Parser:
-    """Return a function that makes a message of its content.
+class RosTypes:
+    """The types of a bag's messages, made as they are needed.
 
-    Args:
-        msgtype: Type of the messages, such as ``sensor_msgs/msg/Image``.
-        definition: Its definition as the bag holds it; empty takes that of ROS 2 Humble.
-        is_idl: Whether the definition is in IDL.
-        is_ros1: Whether the content is serialized as in ROS 1.
-
-    Raises:
-        ValueError: If the definition cannot be read.
+    Definitions that contradict each other, or that cannot be read, concern their own type alone.
     """
-    typesys = import_extra("rosbags.typesys", "bags")
-    with library_errors():
+
+    def __init__(self) -> None:
+        self._typesys = import_extra("rosbags.typesys", "bags")
+        self._common = self._empty()
+
+    def _empty(self) -> Any:
+        return self._typesys.get_typestore(self._typesys.Stores.EMPTY)
+
+    def parser(self, msgtype: str, definition: str, is_idl: bool, is_ros1: bool) -> Parser:
+        """Return a function that makes a message of its content.
+
+        Args:
+            msgtype: Type of the messages, such as ``sensor_msgs/msg/Image``.
+            definition: Its definition as the bag holds it; empty takes that of ROS 2 Humble.
+            is_idl: Whether the definition is in IDL.
+            is_ros1: Whether the content is serialized as in ROS 1.
+
+        Raises:
+            ValueError: If the definition cannot be read.
+        """
+        with library_errors():
+            store = self._store_of(msgtype, definition, is_idl)
+            if msgtype not in store.fielddefs:
+                raise ValueError(f"the bag does not define its type {msgtype!r}")
+        deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        return lambda content: deserialize(content, msgtype)
+
+    def _store_of(self, msgtype: str, definition: str, is_idl: bool) -> Any:
+        """Return a store that has a type."""
         if not definition:
-            store = _standard_store()
-        else:
-            store = typesys.get_typestore(typesys.Stores.EMPTY)
-            store.register(_types(typesys, msgtype, definition, is_idl))
-        if msgtype not in store.fielddefs:
-            raise ValueError(f"the bag does not define its type {msgtype!r}")
-    deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-    return lambda content: deserialize(content, msgtype)
+            return _standard_store()
+        types = _types(self._typesys, msgtype, definition, is_idl)
+        try:
+            self._common.register(types)
+            return self._common
+        except self._typesys.TypesysError:  # it contradicts a type of another topic
+            store = self._empty()
+            store.register(types)
+            return store
 
 
 @cache
@@ -87,9 +108,11 @@ class RosBag:
     _readers: list[Any] = field(default_factory=list)
     _parsers: dict[tuple[str, str], Parser] = field(default_factory=dict)
     _is_ros1: bool = False
+    _types: RosTypes = field(init=False)
 
     def open(self) -> None:
         """Read which topics there are; ValueError if that fails."""
+        self._types = RosTypes()
         self._is_ros1 = self.paths[0].suffix == ".bag"
         module = "rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2"
         reader_type = import_extra(module, "bags").Reader
@@ -134,5 +157,5 @@ class RosBag:
         key = connection.msgtype, connection.msgdef.data
         if key not in self._parsers:
             is_idl = connection.msgdef.format.name == "IDL"
-            self._parsers[key] = ros_parser(*key, is_idl, self._is_ros1)
+            self._parsers[key] = self._types.parser(*key, is_idl, self._is_ros1)
         return self._parsers[key]
