@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsmap.models.maptr.decoder import Decoded
 from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.pairs import Predictions
+from gsmap.models.maptr.pairs import MatchedPairs, Predictions
 
 
 def stacked(outputs: list[Predictions]) -> SimpleNamespace:
@@ -35,5 +35,17 @@ def predicted(
 
 
 def pairs_of(**values: object) -> SimpleNamespace:
-    """Return matched pairs of given values, for a loss alone; one pair if none is said."""
-    return SimpleNamespace(**{"avg_factor": 1.0, **values})
+    """Return matched pairs of one layer, of given values, for a loss; one pair if none is said."""
+    one_layer = {"num_layers": 1, "by_layer": lambda of_pairs: of_pairs[None]}
+    pairs = SimpleNamespace(**{"avg_factor": 1.0, **one_layer, **values})
+    pairs.layer = lambda _: pairs
+    return pairs
+
+
+def triples(pairs: MatchedPairs) -> list[list[Tensor]]:
+    """Return query, ground truth and order of the pairs of each layer and sample. (M, 3) each"""
+    by_layer = [pairs.layer(number) for number in range(pairs.num_layers)]
+    return [
+        list(torch.stack([own.query_inds, own.gt_inds, own.order_inds], -1).split(own.counts))
+        for own in by_layer
+    ]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from mmengine.structures import InstanceData
-from predictions import predicted, stacked
+from predictions import predicted, stacked, triples
 from scipy.optimize import linear_sum_assignment
 
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
@@ -264,10 +264,8 @@ def match_rows(
     """Compare the pairs of query, ground truth and order of every layer."""
     gts = head.prepare_gts(batch_gt)
     wrong = 0.0
-    for layer, predictions in enumerate(outputs):
-        pairs = head.match(predictions, gts, metas)
-        for image, match in enumerate(pairs.matches):
-            ours = torch.stack([match.query_inds, match.gt_inds, match.order_inds], -1)
+    for layer, matches in enumerate(triples(head.match(outputs, gts, metas))):
+        for image, ours in enumerate(matches):
             wrong = max(wrong, largest_difference(ours, data[f"match_l{layer}_b{image}"]))
     yield Row(name, "query, ground truth and order of matches", wrong, 0)
 
@@ -287,7 +285,7 @@ def check_loss(golden: Golden, name: str) -> Iterator[Row]:
             scores=torch.from_numpy(saved["all_cls_scores"][-1, 0]),
             pts=torch.from_numpy(saved["all_pts_preds"][-1, 0]),
         )
-        (gt,) = head.prepare_gts([gt_instances(golden.gt_sets[case])]).samples
+        gt = head.prepare_gts([gt_instances(golden.gt_sets[case])]).sample(0)
         keys = ("cost_cls_lastlayer", "cost_pts_lastlayer")
         for key, cost in zip(keys, head.assigner.match_costs, strict=True):
             ours = cost(prediction, gt, {})

@@ -9,7 +9,7 @@ import torch
 from mmdet3d.structures import Det3DDataSample
 from mmengine.model import BaseModel
 from mmengine.structures import InstanceData
-from predictions import stacked
+from predictions import stacked, triples
 from torch import Tensor
 
 from gsmap.datasets.annotations.record import MapInstance
@@ -206,11 +206,9 @@ def match_rows(
     """Compare the matches of all layers; copies of one ground truth stand for each other."""
     prepared = head.prepare_gts([gt])
     different = total = 0
-    for layer, predictions in enumerate(outputs):
-        match = head.match(predictions, prepared, [meta], repeats).matches[0]
-        ours = zip(match.query_inds, match.gt_inds, match.order_inds, strict=True)
+    for layer, (ours,) in enumerate(triples(head.match(outputs, prepared, [meta], repeats))):
         listed = data[f"match_{group}_l{layer}"]
         reference = {(q, g % len(gt), order) for q, g, order in listed.tolist()}
-        different += len(reference - {tuple(map(int, triple)) for triple in ours})
+        different += len(reference - set(map(tuple, ours.tolist())))
         total += len(listed)
     yield Row(name, f"share of {group} matches that differ", different / total, FLIPPED)

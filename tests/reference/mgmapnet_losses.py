@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
-from predictions import predicted
+from predictions import predicted, triples
 from torch import Tensor, nn
 
 from gsmap.models.maptr.head import MapHead
@@ -129,12 +129,11 @@ def match_rows(
     prepared = head.prepare_gts(gts)
     for label, (group, own) in zip(GROUPS, head.split_groups(outputs), strict=True):
         wrong = 0
-        for layer, predictions in enumerate(own):
-            pairs = head.match(predictions, prepared, [{}] * B, group.repeats)
-            for sample, match in enumerate(pairs.matches):
-                triples = torch.stack([match.query_inds, match.gt_inds, match.order_inds], -1)
+        pairs = head.match(own, prepared, [{}] * B, group.repeats)
+        for layer, matches in enumerate(triples(pairs)):
+            for sample, match in enumerate(matches):
                 listed = data[f"match_{label}_l{layer}_b{sample}"]
-                wrong += len(set(map(tuple, triples.tolist())) ^ set(map(tuple, listed.tolist())))
+                wrong += len(set(map(tuple, match.tolist())) ^ set(map(tuple, listed.tolist())))
         yield Row(name, f"{label}: matches that differ", wrong, 0)
 
 

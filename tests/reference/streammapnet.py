@@ -9,14 +9,13 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
-from predictions import predicted
+from predictions import predicted, triples
 from torch import Tensor, nn
 
 from gsmap.checkpoints.key_map import STREAMMAPNET
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.pairs import SamplePredictions
 from gsmap.models.streammapnet.attention import LinePointAttention
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.memory import StreamMemory
@@ -326,14 +325,13 @@ def loss_rows(
     """Compare costs, matches and losses of three layers."""
     metas = [{"token": "a"}] * BATCH
     truths = head.prepare_gts(gts)
-    for number, layer in enumerate(outputs):
-        pairs = head.match(layer, truths, metas)
+    for number, matches in enumerate(triples(head.match(outputs, truths, metas))):
         yield Row(name, f"{tag}matches of layer {number} that differ", sum(
-            differing(pairs.matches[slot], data[f"{tag}match_l{number}_b{slot}"])
+            differing(matches[slot], data[f"{tag}match_l{number}_b{slot}"])
             for slot in range(BATCH)
         ), 0)  # fmt: skip
     for slot in range(BATCH):
-        sample = SamplePredictions(outputs[-1], slot), truths.samples[slot]
+        sample = outputs[-1].sample(slot), truths.sample(slot)
         for cost, key in zip(head.assigner.match_costs, ("cls", "reg"), strict=True):
             value = cost(*sample).detach()
             off = largest_relative(value, data[f"{tag}cost_{key}_b{slot}"])
@@ -346,7 +344,6 @@ def loss_rows(
     sum(losses.values()).backward()
 
 
-def differing(match: Any, wanted: np.ndarray) -> int:
+def differing(match: Tensor, wanted: np.ndarray) -> int:
     """Return how many pairs of a sample (query, ground truth, order) are only in one list."""
-    ours = torch.stack(list(match), -1).numpy().tolist()
-    return len(set(map(tuple, ours)) ^ set(map(tuple, wanted.tolist())))
+    return len(set(map(tuple, match.tolist())) ^ set(map(tuple, wanted.tolist())))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 from mmengine.structures import InstanceData
-from predictions import stacked
+from predictions import stacked, triples
 from torch import Tensor
 
 from gsmap.models.maptr.head import MapHead
@@ -70,12 +70,13 @@ class Recorder:
         hook = self.head.decoder.layers[1].register_forward_pre_hook(
             lambda _, args: layer_in.append(args)
         )
-        own_match, number = self.head.match, iter(range(LAYERS))
+        own_match = self.head.match
 
         def match(*args: Any) -> Any:
-            pairs, layer = own_match(*args), next(number)
-            for slot, each in enumerate(pairs.matches):
-                self.matches[f"match_t{frame}_l{layer}_b{slot}"] = each
+            pairs = own_match(*args)
+            for layer, matches in enumerate(triples(pairs)):
+                for slot, each in enumerate(matches):
+                    self.matches[f"match_t{frame}_l{layer}_b{slot}"] = each
             return pairs
 
         self.head.match = match  # type: ignore[method-assign]

@@ -1,6 +1,7 @@
 import pytest
 import torch
 from head_cases import HEAD, LANES, along_y, bev, build_head, elements, with_layer
+from predictions import triples
 
 from gsmap.models.gemap.attention import GeometryDecoupledAttention
 from gsmap.models.gemap.losses import euclidean_relation_loss, euclidean_shape_loss
@@ -32,9 +33,9 @@ def test_the_loss_compares_relations_within_each_sample_only():
     actual = head.loss_by_feat(outputs, truths, [{}, {}])["loss_euclidean"]
     gts = head.prepare_gts(truths)
     ((_, own),) = head.split_groups(outputs)
-    pairs = head.match(own[1], gts, [{}, {}])
-    samples = zip(own[1].pts, pairs.matches, strict=True)
-    points = torch.cat([pts[match.query_inds] for pts, match in samples]), pairs.gt_pts
+    pairs = head.match(own[1:], gts, [{}, {}])
+    samples = zip(own[1].pts, *triples(pairs), strict=True)
+    points = torch.cat([pts[match[:, 0]] for pts, match in samples]), pairs.gt_pts
     shape = euclidean_shape_loss(*points)
     expected = 0.005 * (shape + euclidean_relation_loss(*points, [2, 3]))
     torch.testing.assert_close(actual, expected)

@@ -19,7 +19,6 @@ from predictions import predicted, stacked
 
 from gsmap.models.gsmap.layer import GaussianDecoderLayer
 from gsmap.models.maptr.losses import PointsLoss
-from gsmap.models.maptr.pairs import SamplePredictions
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.grid import BEVGrid
 
@@ -159,19 +158,19 @@ def test_matching_reads_the_rendered_masks():
     scores = stacked(outputs).scores
     scores[-1, 0, 1] = scores[-1, 0, 0]
     predictions = predictions_of(head, predicted(head, scores, references), 1)
-    pairs = head.match(predictions, head.prepare_gts([lane]), [{}])
-    assert pairs.matches[0].query_inds.tolist() == [1]
+    pairs = head.match([predictions], head.prepare_gts([lane]), [{}])
+    assert pairs.query_inds.tolist() == [1]
 
     blind = build_head(GSMAP, iou_cost=None)
     predictions = predictions_of(blind, predicted(blind, scores, references), 1)
-    pairs = blind.match(predictions, blind.prepare_gts([lane]), [{}])
-    assert pairs.matches[0].query_inds.tolist() == [0]
+    pairs = blind.match([predictions], blind.prepare_gts([lane]), [{}])
+    assert pairs.query_inds.tolist() == [0]
 
 
 def test_the_masks_of_matching_carry_no_gradient():
     head = build_head(GSMAP)
     predictions = predictions_of(head, head(bev()), 1)
-    sample = SamplePredictions(predictions, 0)
+    sample = predictions.sample(0)
     assert sample.cost_masks.shape == (6, 80, 40)
     assert not sample.cost_masks.requires_grad
     assert sample.references.requires_grad

@@ -5,7 +5,6 @@ import pytest
 import torch
 from predictions import stacked
 
-from gsmap.models.maptr.pairs import SamplePredictions
 
 SQUARE = heads.elements(((-4, -4), (4, -4)), labels=[1])
 SQUARE.polylines = torch.tensor([[[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-4, -4]]])
@@ -90,8 +89,8 @@ def test_an_unknown_overlap_is_refused():
 
 def total_cost(head: torch.nn.Module) -> torch.Tensor:
     """Return the summed matching costs of a new model's first prediction. (N, K)"""
-    prediction = SamplePredictions(heads.predictions_of(head, head(heads.bev()), 0), 0)
-    (gt,) = head.prepare_gts([heads.LANES]).samples
+    prediction = heads.predictions_of(head, head(heads.bev()), 0).sample(0)
+    gt = head.prepare_gts([heads.LANES]).sample(0)
     return sum(cost(prediction, gt, {}) for cost in head.assigner.match_costs)
 
 
@@ -143,7 +142,7 @@ def test_masks_come_from_full_resolution_or_from_the_matched_points(source):
     heads.train_a_step(head, SQUARE)
     predictions = heads.predictions_of(head, head(heads.bev()), 1)
     gts = head.prepare_gts([SQUARE])
-    pairs = head.match(predictions, gts, [{}])
+    pairs = head.match([predictions], gts, [{}])
     drawn = {"full": SQUARE.polylines, "points": SQUARE.pts}[source]
     expected = head.masks.draw(drawn, SQUARE.labels_3d, head.masks.grid)
     torch.testing.assert_close(pairs.gt_masks, expected)

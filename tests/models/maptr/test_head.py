@@ -61,7 +61,7 @@ def test_the_divisor_is_the_number_of_matched_elements_in_the_batch(head):
     outputs = stacked(outputs_with(torch.cat([one.pts + 1.0]), head))
     both = predicted(head, outputs.scores.repeat(1, 2, 1, 1), outputs.pts.repeat(1, 2, 1, 1, 1))
     gts = head.prepare_gts([one, three])
-    pairs = head.match(both[0], gts, [{}, {}])
+    pairs = head.match(both, gts, [{}, {}])
     assert pairs.avg_factor.item() == 4.0
     assert pairs.gt_pts.shape == (4, 20, 2)
     assert (pairs.query_labels() >= 0).sum(1).tolist() == [1, 3]

@@ -62,19 +62,19 @@ def test_the_ground_truth_is_drawn_at_full_resolution_or_from_its_points():
     gt.polylines = torch.tensor([[[-3.0, -20], [3, 0], [-3, 20]]])  # what five points do not show
     full, points = (ElementMasks(ALONG_Y, source=source) for source in ("full", "points"))
     labels = gt.labels_3d
-    assert torch.equal(full.draw_sample(gt, full.grid), full.draw(gt.polylines, labels, full.grid))
-    assert torch.equal(points.draw_sample(gt, full.grid), full.draw(gt.pts, labels, full.grid))
+    assert torch.equal(full.draw_batch([gt], full.grid), full.draw(gt.polylines, labels, full.grid))
+    assert torch.equal(points.draw_batch([gt], full.grid), full.draw(gt.pts, labels, full.grid))
 
 
 def test_a_mask_of_gaussians_is_one_that_a_prediction_can_equal_as_wide_as_the_band():
     gt = elements(((-3, -20), (-3, 20)))
     band, soft = (ElementMasks(ALONG_Y, source=source) for source in ("points", "gaussians"))
-    mask = soft.draw_sample(gt, soft.grid)
+    mask = soft.draw_batch([gt], soft.grid)
     across_m = 0.75 / math.sqrt(2 * math.pi)
     own = gaussians_along(gt.pts, across_m)
     assert torch.equal(mask, render_gaussians(*own, soft.grid))
     centre = mask.shape[1] // 2  # the row of the middle point, where its neighbours add little
-    drawn = band.draw_sample(gt, soft.grid)
+    drawn = band.draw_batch([gt], soft.grid)
     assert mask[0, centre].sum().item() == pytest.approx(drawn[0, centre].sum().item(), rel=0.1)
 
 
@@ -83,7 +83,7 @@ def test_targets_without_polylines_are_named():
     del gt.polylines
     masks = ElementMasks(ALONG_Y)
     with pytest.raises(ValueError, match=r"'full' need gt_instances_3d.polylines: .*FormatMapT"):
-        masks.draw_sample(gt, masks.grid)
+        masks.draw_batch([gt], masks.grid)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def fit(target_pts: torch.Tensor, mask: torch.Tensor, masks: ElementMasks) -> fl
 def test_a_crossings_mask_fits_its_points_whichever_order_is_matched(crossing):
     gt, matched = crossing
     masks = ElementMasks(ALONG_Y)
-    full, own = masks.draw_sample(gt, masks.grid), masks.draw(matched, gt.labels_3d, masks.grid)
+    full, own = masks.draw_batch([gt], masks.grid), masks.draw(matched, gt.labels_3d, masks.grid)
     assert fit(matched, full, masks) < 0.2
     assert fit(matched, own, masks) < 0.2  # source='points'
 

@@ -19,7 +19,7 @@ def test_masks_of_queries_by_hand():
         predictions=SimpleNamespace(decoded=MaskedDecoded(states, states, states, logits)),
         samples=torch.tensor([0]),
         query_inds=torch.tensor([1]),
-        truths=SimpleNamespace(samples=[SimpleNamespace(pipeline_masks=drawn)]),
+        truths=SimpleNamespace(pipeline_masks=drawn),
         of_truths=lambda values: values[[1]],
         of_queries=lambda values: values[[0], [1]],
     )
@@ -33,13 +33,10 @@ def test_masks_of_queries_by_hand():
 def test_the_segmentation_by_hand():
     """One sample of two cells, one drawn; a second one without elements is all background."""
     logits = torch.zeros(2, 2, 1, 2)
-    samples = [
-        SimpleNamespace(pipeline_masks=torch.tensor([[[True, False]], [[True, False]]])),
-        SimpleNamespace(pipeline_masks=torch.zeros(0, 1, 2, dtype=torch.bool)),
-    ]
+    drawn = torch.tensor([[[True, False]], [[True, False]]])
     pairs = pairs_of(
         predictions=SimpleNamespace(decoded=SimpleNamespace(segmentation=logits)),
-        truths=SimpleNamespace(samples=samples),
+        truths=SimpleNamespace(pipeline_masks=drawn, counts=[2, 0]),
     )
     cross_entropy = 0.693147 * (4 + 1) / 2  # half of the cells are positive, four times as heavy
     dice = 1 - 2 * 1.0 / (1.0 + 2 + 0.002)

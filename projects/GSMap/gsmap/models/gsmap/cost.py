@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.models.maptr.matching import MapCost
-from gsmap.models.maptr.pairs import BuiltHead, SamplePredictions, SampleTruth
+from gsmap.models.maptr.pairs import BuiltHead, SampleView
 from gsmap.models.maptr.parts import WEIGHT, weights_of
 from gsmap.ops.soft_iou import pairwise_dice_loss, pairwise_soft_iou
 
@@ -35,7 +35,7 @@ class IoUCost(MapCost):
         require_gaussians(self, head)
 
     def __call__(
-        self, pred_instances: SamplePredictions, gt_instances: SampleTruth, img_meta: Any = None
+        self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
         """Compare the masks of matching, (N, h, w) and (K, h, w). (N, K)"""
         preds, targets = pred_instances.cost_masks, gt_instances.cost_masks

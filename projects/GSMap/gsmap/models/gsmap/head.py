@@ -113,7 +113,7 @@ class GSMapHead(MapHead):
             space.decode(pairs.pred_references),
             rendered=pairs.pred_masks,
             masks=pairs.gt_masks,
-            labels=pairs.gt_labels,
+            labels=pairs.host_labels,
             class_names=self.classes,
             floor_m=space.floor_m,
         )

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gsmap.ops.soft_iou import soft_iou
 from gsmap.structures.gaussians import AT_FLOOR, Gaussians, extents_along_line
+from gsmap.structures.tensors import uploaded
 
 
 @torch.no_grad()
@@ -24,7 +25,7 @@ def gaussian_statistics(
         gaussians: Gaussians of the predictions. (M, P)
         rendered: Their masks in [0, 1]. (M, H, W)
         masks: Masks of their ground truths in [0, 1]. (M, H, W)
-        labels: Class indices. (M,)
+        labels: Class indices, on the host. (M,)
         class_names: Names of the classes.
         floor_m: Smallest sigma in metres.
 
@@ -35,14 +36,15 @@ def gaussian_statistics(
     """
     if not len(labels):
         return {}
-    iou = soft_iou(rendered, masks)
-    extents = extents_along_line(gaussians)  # (M, P, 2)
+    counts = labels.bincount(minlength=len(class_names)).tolist()
+    (order,) = uploaded([labels.argsort(stable=True)], rendered.device)
+    iou = soft_iou(rendered, masks)[order].split(counts)
+    extents = extents_along_line(gaussians)[order].split(counts)  # (n, P, 2) of each class
     figures = {}
-    for label, name in enumerate(class_names):
-        chosen = labels == label
-        if chosen.any():
-            along, across = extents[chosen].flatten(0, 1).median(0).values
-            figures[f"soft_iou/{name}"] = iou[chosen].mean()
+    for name, count, own_iou, own_extents in zip(class_names, counts, iou, extents, strict=True):
+        if count:
+            along, across = own_extents.flatten(0, 1).median(0).values
+            figures[f"soft_iou/{name}"] = own_iou.mean()
             figures[f"sigma_along/{name}"], figures[f"sigma_across/{name}"] = along, across
     at_floor = (gaussians.scales < AT_FLOOR * floor_m).all(-1)
     return {**figures, "at_floor": at_floor.float().mean()}

@@ -1,9 +1,10 @@
 """MapTR's decoder: point queries interact, look at the BEV and refine their reference."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
+import torch
 from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule, ModuleList
 from torch import Tensor, nn
@@ -53,6 +54,23 @@ class Decoded:
     def of_queries(self, queries: slice) -> "Decoded":
         """Return what belongs to some of the instance queries."""
         return type(self)(**{name: value[:, queries] for name, value in vars(self).items()})
+
+
+class JoinedDecoded(Decoded):
+    """What several layers returned: each field is joined along the queries when it is first read.
+
+    Args:
+        layers: What each layer returned, L of them, with fields (B, N, ...).
+    """
+
+    def __init__(self, layers: Sequence[Decoded]) -> None:
+        self._layers = layers
+
+    def __getattr__(self, name: str) -> Tensor:
+        """Return a field of all layers. (B, L * N, ...)"""
+        joined = torch.cat([getattr(layer, name) for layer in self._layers], 1)
+        setattr(self, name, joined)
+        return joined
 
 
 @MODELS.register_module()

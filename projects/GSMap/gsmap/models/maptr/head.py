@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
+from mmdet.utils import reduce_mean
 from mmdet3d.registry import MODELS
 from mmengine.logging import print_log
 from mmengine.model import bias_init_with_prob
@@ -20,13 +21,7 @@ from gsmap.models.maptr.layers import classification_branch, init_matrices
 from gsmap.models.maptr.losses import MapLoss
 from gsmap.models.maptr.masks import ElementMasks
 from gsmap.models.maptr.matching import MapAssigner, MapCost
-from gsmap.models.maptr.pairs import (
-    GroundTruth,
-    MatchedPairs,
-    Predictions,
-    SamplePredictions,
-    SampleTruth,
-)
+from gsmap.models.maptr.pairs import GroundTruth, MatchedPairs, Predictions
 from gsmap.models.maptr.parts import (
     PARTS,
     AuxHead,
@@ -318,16 +313,11 @@ class MapHead(DetectionHead):
         losses: Tensors = {}
         with torch.autocast(outputs[-1].scores.device.type, enabled=False):
             truths = self.prepare_gts(batch_gt_instances)
-            for group, own in self.split_groups(outputs):
-                for number, layer in enumerate(own):
-                    pairs = self.match(layer, truths, batch_img_metas, group.repeats)
-                    is_last = number == len(own) - 1
-                    if memory is not None and is_last and group is self.query_groups[0]:
-                        memory.keep_targets(pairs)
-                    prefix = "" if is_last else f"d{number}."
-                    suffix = f"_{group.name}" if group.name else ""
-                    for name, value in self.layer_losses(group, pairs, is_last).items():
-                        losses[f"{prefix}{name}{suffix}"] = value
+            for group, layers in self.split_groups(outputs):
+                pairs = self.match(layers, truths, batch_img_metas, group.repeats)
+                if memory is not None and group is self.query_groups[0]:
+                    memory.keep_targets(pairs.layer(-1))
+                losses.update(self.group_losses(group, pairs))
         return losses
 
     def split_groups(
@@ -342,38 +332,61 @@ class MapHead(DetectionHead):
 
     def prepare_gts(self, batch_gt_instances: Instances) -> GroundTruth:
         """Return the ground truth of a batch as costs and losses read it."""
-        samples = [SampleTruth(gt, self.reference, self.masks) for gt in batch_gt_instances]
-        return GroundTruth(samples)
+        return GroundTruth(batch_gt_instances, self.reference, self.masks)
 
     def match(
-        self, predictions: Predictions, truths: GroundTruth, metas: Metas, repeats: int = 1
+        self,
+        layers: Sequence[Predictions],
+        truths: GroundTruth,
+        metas: Metas,
+        repeats: int = 1,
     ) -> MatchedPairs:
-        """Match every sample's predictions of one layer with its ground truth."""
-        samples = zip(truths.samples, metas, strict=True)
-        matches = [
-            self.assigner.assign(SamplePredictions(predictions, index), truth, meta, repeats)
-            for index, (truth, meta) in enumerate(samples)
-        ]
-        return MatchedPairs(predictions, truths, matches)
+        """Match every sample's predictions of each layer with its ground truth."""
+        predictions = Predictions.joined(layers)
+        matches, counts = self.assigner.assign(predictions, truths, metas, repeats)
+        count = torch.full((), float(sum(counts)), device=predictions.scores.device)
+        avg_factor = reduce_mean(count).clamp(min=1.0)
+        return MatchedPairs(predictions, truths, matches, counts, avg_factor)
 
-    def layer_losses(self, group: QueryGroup, pairs: MatchedPairs, is_last: bool) -> Tensors:
-        """Return the weighted losses of one layer's predictions, and figures to log."""
-        losses: Tensors = {}
+    def group_losses(self, group: QueryGroup, pairs: MatchedPairs) -> Tensors:
+        """Return the weighted losses of all layers of a query group, and figures to log."""
+        numbers = range(pairs.num_layers)
+        by_layer: list[Tensors] = [{} for _ in numbers]
         first = group is self.query_groups[0]
         chosen = ("cls", *self.losses) if group.losses is None else group.losses
         if "cls" in chosen:
-            # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
-            one_hot = F.one_hot(pairs.query_labels() + 1, len(self.classes) + 1)[..., 1:]
-            scores = pairs.predictions.scores.flatten(0, 1)  # (B * N, classes)
-            loss = self.loss_cls(scores, one_hot.flatten(0, 1), avg_factor=pairs.avg_factor)
-            losses["loss_cls"] = group.weight * loss
+            for found, value in zip(by_layer, self.class_losses(pairs), strict=True):
+                found["loss_cls"] = group.weight * value
         for name, loss in cast(Any, self.losses.items()):
-            applies = (is_last or not loss.last_layer_only) and (first or not loss.first_group_only)
-            if applies and name in chosen and loss.reads(pairs):
-                losses[f"loss_{name}"] = group.weight * loss(pairs)
-        if is_last and first:
-            losses.update(self.statistics(pairs))
+            if name not in chosen or (loss.first_group_only and not first):
+                continue
+            among = numbers[-1:] if loss.last_layer_only else numbers
+            among = [number for number in among if loss.reads(pairs.layer(number))]
+            if len(among) == len(numbers):
+                values = list(loss.by_layer(pairs))
+            else:
+                values = [loss(pairs.layer(number)) for number in among]
+            for number, value in zip(among, values, strict=True):
+                by_layer[number][f"loss_{name}"] = group.weight * value
+        if first:
+            by_layer[-1].update(self.statistics(pairs.layer(-1)))
+        suffix = f"_{group.name}" if group.name else ""
+        losses = {}
+        for number, found in enumerate(by_layer):
+            prefix = "" if number == numbers[-1] else f"d{number}."
+            losses.update({f"{prefix}{name}{suffix}": value for name, value in found.items()})
         return losses
+
+    def class_losses(self, pairs: MatchedPairs) -> Tensor:
+        """Return the classification loss of each layer. (L,)"""
+        # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
+        one_hot = F.one_hot(pairs.query_labels() + 1, len(self.classes) + 1)[..., 1:]
+        scores = pairs.predictions.scores  # (B, L * N, classes)
+        each = self.loss_cls(
+            scores.flatten(0, 1), one_hot.flatten(0, 1), reduction_override="none"
+        )
+        by_layer = each.view(len(scores), pairs.num_layers, -1).transpose(0, 1)
+        return by_layer.flatten(1).sum(1) / pairs.avg_factor
 
     def statistics(self, pairs: MatchedPairs) -> Tensors:
         """Return figures to log beside the losses; their names do not start with ``loss``."""

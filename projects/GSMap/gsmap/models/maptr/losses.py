@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
@@ -16,6 +17,8 @@ _EPS = 1e-12
 
 class MapLoss(nn.Module, NeedsTargets):
     """A loss of matched pairs: the weighted sum of its `values` over the number of pairs.
+
+    The pairs are of all decoder layers at once.
 
     Args:
         loss_weight: Weight of the loss, or one for each class; a pair has that of its ground truth.
@@ -40,7 +43,9 @@ class MapLoss(nn.Module, NeedsTargets):
         first_group_only: bool = False,
     ) -> None:
         super().__init__()
-        if isinstance(loss_weight, Sequence) and type(self).forward is not MapLoss.forward:
+        own = {name: getattr(type(self), name) for name in ("forward", "by_layer")}
+        is_sum = own == {name: getattr(MapLoss, name) for name in own}
+        if isinstance(loss_weight, Sequence) and not is_sum:
             raise TypeError(f"{type(self).__name__} is no sum over pairs: give one loss_weight.")
         self.loss_weight = loss_weight
         self.last_layer_only, self.first_group_only = last_layer_only, first_group_only
@@ -66,12 +71,23 @@ class MapLoss(nn.Module, NeedsTargets):
         raise NotImplementedError
 
     def forward(self, pairs: MatchedPairs) -> Tensor:
-        """Return the weighted loss, 0 with a gradient of 0 if nothing is matched. ()"""
+        """Return the weighted loss of one layer, 0 with a gradient of 0 without pairs. ()"""
+        (loss,) = self.by_layer(pairs)
+        return loss
+
+    def by_layer(self, pairs: MatchedPairs) -> Tensor:
+        """Return the weighted loss of each layer. (L,)
+
+        A loss that overrides `forward` is called with the pairs of one layer after another.
+        """
+        if type(self).forward is not MapLoss.forward:
+            return torch.stack([self(pairs.layer(number)) for number in range(pairs.num_layers)])
         values = self.values(pairs)
-        if not isinstance(self.loss_weight, Sequence):
-            return self.loss_weight * (values.sum() / pairs.avg_factor)
-        weights = weights_of(self.loss_weight, pairs.gt_labels)
-        return (weights * values.movedim(0, -1)).sum() / pairs.avg_factor
+        if isinstance(self.loss_weight, Sequence):
+            weights = weights_of(self.loss_weight, pairs.gt_labels)
+            values = (weights * values.movedim(0, -1)).movedim(-1, 0)
+        sums = pairs.by_layer(values).flatten(1).sum(1) / pairs.avg_factor
+        return sums if isinstance(self.loss_weight, Sequence) else self.loss_weight * sums
 
 
 @MODELS.register_module()

@@ -96,13 +96,24 @@ class ElementMasks:
         points = references[..., :coords]
         return torch.cat([torch.where(held, points.detach(), points), references[..., coords:]], -1)
 
-    def draw_sample(self, gt_instances: InstanceData, grid: BEVGrid) -> Tensor:
-        """Draw a sample's ground truth, before its matching is known. (K, H, W)"""
+    def draw_batch(self, gt_instances: Sequence[InstanceData], grid: BEVGrid) -> Tensor:
+        """Draw the ground truth of all samples, before its matching is known. (T, H, W)"""
+        labels = torch.cat([sample.labels_3d for sample in gt_instances])
         if self.of_points:
-            return self.draw(gt_instances.pts, gt_instances.labels_3d, grid)
-        if "polylines" not in gt_instances:
+            return self.draw(torch.cat([sample.pts for sample in gt_instances]), labels, grid)
+        if any("polylines" not in sample for sample in gt_instances):
             raise ValueError(
                 "masks of source 'full' need gt_instances_3d.polylines: make the targets with "
                 "FormatMapTargets."
             )
-        return self.draw(gt_instances.polylines, gt_instances.labels_3d, grid)
+        lines = [sample.polylines for sample in gt_instances]
+        most = max(own.shape[1] for own in lines)
+        return self.draw(torch.cat([_lengthened(own, most) for own in lines]), labels, grid)
+
+
+def _lengthened(lines: Tensor, length: int) -> Tensor:
+    """Repeat the last points of lines up to a length. (K, M, 2 or 3) -> (K, length, 2 or 3)"""
+    if not len(lines):
+        return lines.new_zeros(0, length, lines.shape[2])
+    ends = lines[:, -1:].expand(-1, length - lines.shape[1], -1)
+    return torch.cat([lines, ends], 1) if ends.shape[1] else lines

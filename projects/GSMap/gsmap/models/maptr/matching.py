@@ -1,24 +1,27 @@
 """Assignment of predictions to annotated map elements, and MapTR's cost of points."""
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
+from mmdet.models.task_modules.assigners.match_cost import FocalLossCost
 from mmdet3d.registry import TASK_UTILS
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from gsmap.models.maptr.pairs import BuiltHead, MapMatch, SamplePredictions, SampleTruth
+from gsmap.models.maptr.pairs import BuiltHead, GroundTruth, MapMatches, Predictions, SampleView
 from gsmap.models.maptr.parts import WEIGHT, weights_of
+from gsmap.structures.tensors import uploaded
 
 
 class MapAssigner:
     """Hungarian assignment under summed costs, then each pair's point order (MapTR Eqs. 3-5).
 
     Args:
-        match_costs: Configs of the costs. Each is called with predictions, ground truth and the
-            meta dict and returns (N, K).
+        match_costs: Configs of the costs. Each is called for every sample, with the predictions of
+            all layers, the ground truth and the meta dict, and returns (N, K).
 
     Raises:
         ValueError: If there is no cost.
@@ -35,32 +38,95 @@ class MapAssigner:
     @torch.no_grad()
     def assign(
         self,
-        pred_instances: SamplePredictions,
-        gt_instances: SampleTruth,
-        img_meta: dict[str, Any] | None = None,
+        predictions: Predictions,
+        truths: GroundTruth,
+        metas: Sequence[dict[str, Any]],
         repeats: int = 1,
-    ) -> MapMatch:
-        """Match each ground truth to ``repeats`` predictions: min(N, K * repeats) pairs.
+    ) -> tuple[MapMatches, list[int]]:
+        """Match each ground truth to ``repeats`` predictions of its sample, in every layer.
+
+        All costs are read from the device in one copy, and all matches return in one.
 
         Args:
-            pred_instances: The sample's predictions, N queries.
-            gt_instances: Its ground truth, K elements.
-            img_meta: Its ``token`` names the sample in errors.
+            predictions: Predictions of L layers, N queries each.
+            truths: Ground truth, K elements of a sample.
+            metas: Meta dict of each sample; its ``token`` names the sample in errors.
             repeats: How often each ground truth may be matched.
+
+        Returns:
+            The matches, and how many each sample has in a layer: min(N, K * repeats).
 
         Raises:
             FloatingPointError: If a cost (or, without ground truth, a score) is not finite.
         """
-        device, num_gts = pred_instances.scores.device, len(gt_instances.labels)
-        if num_gts == 0:
-            check_finite(pred_instances.scores[None], ["class scores"], img_meta)
-            return MapMatch(*torch.empty(3, 0, dtype=torch.long, device=device))
-        sample = pred_instances, gt_instances, img_meta
-        total = torch.stack([cost(*sample).float() for cost in self.match_costs]).cpu()
-        queries, gts = (part.to(device) for part in assigned(total, self.names, img_meta, repeats))
-        orders = gt_instances.pts_shifts[gts]  # (M, S, P, 2)
-        distances = self.between_points(pred_instances.pts[queries, None].expand_as(orders), orders)
-        return MapMatch(queries, gts, distances.sum((-1, -2)).argmin(-1))
+        layers = len(predictions.layers)
+        num_queries = predictions.scores.shape[1] // layers
+        first_query = num_queries * np.arange(layers)[:, None]
+        matches = []
+        counts = []
+        of_samples, labels = self.costs(predictions, truths, metas)
+        for index, costs in enumerate(of_samples):
+            by_layer = costs.unflatten(1, (layers, num_queries)).unbind(1)
+            pairs = [assigned(own, self.names, metas[index], repeats) for own in by_layer]
+            queries, gts = (torch.stack(part).numpy() for part in zip(*pairs, strict=True))
+            counts.append(queries.shape[1])
+            samples = np.full_like(queries, index)
+            rows = gts + truths.first[index]
+            matches.append(np.stack([samples, queries, queries + first_query, gts, rows]))
+        on_host = torch.from_numpy(np.concatenate(matches, 2))  # (5, L, M)
+        (packed,) = uploaded([on_host], predictions.scores.device)
+        samples, queries, joined, gts, rows = packed.unbind(0)
+        orders = truths.pts_shifts[rows]  # (L, M, S, P, 2 or 3)
+        pts = predictions.pts[samples, joined]
+        distances = self.between_points(pts[:, :, None].expand_as(orders), orders)
+        order = distances.sum((-1, -2)).argmin(-1)
+        host_labels = labels[on_host[-1]]
+        return MapMatches(samples, queries, joined, gts, rows, order, host_labels), counts
+
+    def costs(
+        self, predictions: Predictions, truths: GroundTruth, metas: Sequence[dict[str, Any]]
+    ) -> tuple[list[Tensor], Tensor]:
+        """Return what the assignment reads, on the host: the one wait for the device.
+
+        Returns:
+            The costs of each sample, (n, L * N, K), and the classes of all ground truth. (T,)
+
+        Raises:
+            FloatingPointError: If a score of a sample without ground truth is not finite.
+        """
+        shape = predictions.scores.shape
+        flat = SimpleNamespace(scores=predictions.scores.flatten(0, 1))
+        classes = SimpleNamespace(labels=torch.arange(shape[2], device=predictions.scores.device))
+        by_class = [
+            cost(flat, classes).view(shape) if reads_classes_alone(cost) else None
+            for cost in self.match_costs
+        ]
+        parts: list[Tensor] = []
+        for index, count in enumerate(truths.counts):
+            pred, truth = predictions.sample(index), truths.sample(index)
+            if not count:
+                parts.append((pred.scores * 0).sum(0))  # not a number if a score is not finite
+                continue
+            for cost, of_classes in zip(self.match_costs, by_class, strict=True):
+                if of_classes is None:
+                    parts.append(cost(pred, truth, metas[index]).float())
+                else:
+                    parts.append(of_classes[index][:, truth.labels].float())
+        parts.append(truths.labels.float())
+        host = torch.cat([part.flatten() for part in parts]).cpu()
+        read = iter(host.split([part.numel() for part in parts]))
+        found = []
+        for count, meta in zip(truths.counts, metas, strict=True):
+            if not count:
+                check_finite(next(read)[None], ["class scores"], meta)
+            own = [next(read).view(shape[1], count) for _ in self.match_costs if count]
+            found.append(torch.stack(own) if own else host.new_zeros(1, shape[1], 0))
+        return found, next(read).long()
+
+
+def reads_classes_alone(cost: Any) -> bool:
+    """Return whether a cost of mmdet depends on scores and label alone, so one a class will do."""
+    return type(cost) is FocalLossCost and not cost.binary_input
 
 
 def assigned(
@@ -118,7 +184,7 @@ class MapCost:
         """Raise ValueError if a head lacks what the cost reads; called when the head is built."""
 
     def __call__(
-        self, pred_instances: SamplePredictions, gt_instances: SampleTruth, img_meta: Any = None
+        self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
         """Return the weighted cost of each prediction with each ground truth. (N, K)"""
         raise NotImplementedError
@@ -156,7 +222,7 @@ class OrderedPointsCost(MapCost):
         return (pts - targets).abs()
 
     def __call__(
-        self, pred_instances: SamplePredictions, gt_instances: SampleTruth, img_meta: Any = None
+        self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
         """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
         distances = order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1)

@@ -7,7 +7,7 @@ from mmdet3d.registry import TASK_UTILS
 from torch import Tensor
 
 from gsmap.models.maptr.matching import MapCost
-from gsmap.models.maptr.pairs import BuiltHead, SamplePredictions, SampleTruth
+from gsmap.models.maptr.pairs import BuiltHead, SampleView
 from gsmap.models.maptr.parts import WEIGHT, weights_of
 from gsmap.models.mapvr.losses import ElementRenderer
 from gsmap.ops.soft_iou import pairwise_dice_loss
@@ -34,7 +34,7 @@ class RenderedDiceCost(MapCost):
         self.renderer.check(self, head)
 
     def __call__(
-        self, pred_instances: SamplePredictions, gt_instances: SampleTruth, img_meta: Any = None
+        self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
         """Compare ``pts`` (N, P, 2) with ``first_pts`` (K, P, 2) of ``labels`` (K,). (N, K)"""
         preds, is_polygon = pred_instances.pts, self.renderer.is_polygon(gt_instances.labels)

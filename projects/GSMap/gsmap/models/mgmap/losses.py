@@ -48,8 +48,7 @@ class QueryMaskLoss(MapLoss):
         """Return the weighted loss."""
         logits = cast(MaskedDecoded, pairs.predictions.decoded).mask_logits.float()
         own = pairs.of_queries(logits)  # (M, H, W)
-        drawn = torch.cat([sample.pipeline_masks for sample in pairs.truths.samples])
-        masks = pairs.of_truths(drawn).to(own)
+        masks = pairs.of_truths(pairs.truths.pipeline_masks).to(own)
         check_same_shape(logits=own, gt_masks=masks)
         targets = torch.zeros_like(logits)
         targets[pairs.samples, pairs.query_inds] = masks
@@ -86,7 +85,8 @@ class ForegroundLoss(MapLoss):
     def forward(self, pairs: MatchedPairs) -> Tensor:
         """Return the weighted loss."""
         logits = cast(RefinedDecoded, pairs.predictions.decoded).segmentation.float()
-        drawn = [sample.pipeline_masks.bool().any(0) for sample in pairs.truths.samples]
+        truths = pairs.truths
+        drawn = [own.bool().any(0) for own in truths.pipeline_masks.split(truths.counts)]
         targets = torch.stack([torch.stack([own, ~own]) for own in drawn]).to(logits)
         check_same_shape(logits=logits, gt_masks=targets)  # (B, 2, H, W)
         weight = constant(logits, self.pos_weight)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsmap.models.maptr.losses import MapLoss
 from gsmap.models.maptr.matching import OrderedPointsCost
-from gsmap.models.maptr.pairs import MatchedPairs, SamplePredictions, SampleTruth
+from gsmap.models.maptr.pairs import MatchedPairs, SampleView
 from gsmap.models.maptr.parts import weights_of
 from gsmap.structures.tensors import check_same_shape
 
@@ -54,7 +54,7 @@ class SmoothPointsCost(OrderedPointsCost):
         return F.smooth_l1_loss(pts, targets, reduction="none", beta=self.beta)
 
     def __call__(
-        self, pred_instances: SamplePredictions, gt_instances: SampleTruth, img_meta: Any = None
+        self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
     ) -> Tensor:
         """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
         orders = gt_instances.pts_shifts
