@@ -5,7 +5,6 @@ import pytest
 import torch
 from predictions import stacked
 
-
 SQUARE = heads.elements(((-4, -4), (4, -4)), labels=[1])
 SQUARE.polylines = torch.tensor([[[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-4, -4]]])
 

@@ -100,7 +100,10 @@ class EuclideanLoss(MapLoss):
 
     def by_layer(self, pairs: MatchedPairs) -> Tensor:
         """Return the weighted loss of parts that are means, in the plane: heights are left out."""
-        pred, target = pairs.by_layer(pairs.pred_pts[..., :2]), pairs.by_layer(pairs.gt_pts[..., :2])
+        pred, target = (
+            pairs.by_layer(pairs.pred_pts[..., :2]),
+            pairs.by_layer(pairs.gt_pts[..., :2]),
+        )
         shape = euclidean_shape_loss(pred, target)
         counts = pairs.counts[: len(pairs.counts) // pairs.num_layers]
         relation = euclidean_relation_loss(pred, target, counts)

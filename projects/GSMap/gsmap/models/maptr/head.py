@@ -382,9 +382,7 @@ class MapHead(DetectionHead):
         # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
         one_hot = F.one_hot(pairs.query_labels() + 1, len(self.classes) + 1)[..., 1:]
         scores = pairs.predictions.scores  # (B, L * N, classes)
-        each = self.loss_cls(
-            scores.flatten(0, 1), one_hot.flatten(0, 1), reduction_override="none"
-        )
+        each = self.loss_cls(scores.flatten(0, 1), one_hot.flatten(0, 1), reduction_override="none")
         by_layer = each.view(len(scores), pairs.num_layers, -1).transpose(0, 1)
         return by_layer.flatten(1).sum(1) / pairs.avg_factor
 
