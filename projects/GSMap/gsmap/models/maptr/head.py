@@ -360,8 +360,8 @@ class MapHead(DetectionHead):
         for name, loss in cast(Any, self.losses.items()):
             if name not in chosen or (loss.first_group_only and not first):
                 continue
-            among = numbers[-1:] if loss.last_layer_only else numbers
-            among = [number for number in among if loss.reads(pairs.layer(number))]
+            candidates = numbers[-1:] if loss.last_layer_only else numbers
+            among = [number for number in candidates if loss.reads(pairs.layer(number))]
             if len(among) == len(numbers):
                 values = list(loss.by_layer(pairs))
             else:

@@ -61,19 +61,19 @@ class MapAssigner:
         """
         layers = len(predictions.layers)
         num_queries = predictions.scores.shape[1] // layers
-        first_query = num_queries * np.arange(layers)[:, None]
+        first_query = num_queries * torch.arange(layers)[:, None]
         matches = []
         counts = []
         of_samples, labels = self.costs(predictions, truths, metas)
         for index, costs in enumerate(of_samples):
             by_layer = costs.unflatten(1, (layers, num_queries)).unbind(1)
             pairs = [assigned(own, self.names, metas[index], repeats) for own in by_layer]
-            queries, gts = (torch.stack(part).numpy() for part in zip(*pairs, strict=True))
-            counts.append(queries.shape[1])
-            samples = np.full_like(queries, index)
-            rows = gts + truths.first[index]
-            matches.append(np.stack([samples, queries, queries + first_query, gts, rows]))
-        on_host = torch.from_numpy(np.concatenate(matches, 2))  # (5, L, M)
+            query, gt = (torch.stack(part) for part in zip(*pairs, strict=True))  # (L, m)
+            counts.append(query.shape[1])
+            sample = torch.full_like(query, index)
+            row = gt + truths.first[index]
+            matches.append(torch.stack([sample, query, query + first_query, gt, row]))
+        on_host = torch.cat(matches, 2)  # (5, L, M)
         (packed,) = uploaded([on_host], predictions.scores.device)
         samples, queries, joined, gts, rows = packed.unbind(0)
         orders = truths.pts_shifts[rows]  # (L, M, S, P, 2 or 3)
