@@ -9,8 +9,8 @@ from mmdet3d.registry import MODELS, TASK_UTILS
 from mmengine.config import Config, ConfigDict
 
 MODEL_SETTINGS = "model_settings"  # key of a checkpoint's meta: JSON, as a config's text is code
-# settings of the start of a training, which may load files
-STARTS = {"init_cfg", "pretrained", "allow_untrained"}
+# settings of a training alone; those of its start may load files
+STARTS = {"init_cfg", "pretrained", "allow_untrained", "autocast", "compiled"}
 IMAGE_SIZE = "image_size"  # key of a checkpoint's meta: width and height that images are scaled to
 SIGNALS = "can_bus"  # key of a checkpoint's meta: whether training samples had vehicle signals
 # what a checkpoint names and later versions replace by a part with the same arguments

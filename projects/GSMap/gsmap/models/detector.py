@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from mmcv.ops import ModulatedDeformConv2d
@@ -13,12 +13,14 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.logging import MMLogger
 from torch import Tensor
+from torch.utils._pytree import tree_map_only
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
 from gsmap.models.loss_check import LossCheck
 from gsmap.models.streams.memory import StreamMemory
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import at_least_float32
 
 Inputs = dict[str, Any]
 Samples = Sequence[Det3DDataSample]
@@ -47,10 +49,18 @@ class MapDetector(Base3DDetector):
         allow_untrained: Whether a checkpoint may lack the parts that start without effect, as
             MapTR's lack GSMap's Gaussians: so a training may start, and nothing else does unless it
             is asked. Other weights must all be there, by our names or upstream's, and no further.
+        autocast: ``"bfloat16"`` lets backbone, neck and encoders compute in it in training, where
+            nearly all arithmetic is; head, matching and losses stay in float32. It needs no loss
+            scale. None leaves training as it is (``--amp`` then casts the head, too).
+        compiled: Compile backbone, neck, encoders and head once a training starts, which takes a
+            minute or more.
 
     Raises:
-        ValueError: If there is neither camera nor LiDAR, or both but no fusion.
+        ValueError: If there is neither camera nor LiDAR, or both but no fusion, or ``autocast`` is
+            another type.
     """
+
+    compiler: ClassVar[str] = "inductor"  # backend of torch.compile
 
     def __init__(
         self,
@@ -66,6 +76,8 @@ class MapDetector(Base3DDetector):
         temporal: dict | None = None,
         fold_batch_norms: bool = True,
         allow_untrained: bool = True,
+        autocast: str | None = None,
+        compiled: bool = False,
         data_preprocessor: dict | None = None,
         init_cfg: dict | None = None,
     ) -> None:
@@ -78,6 +90,9 @@ class MapDetector(Base3DDetector):
         self.channels_last = not any(isinstance(part, ModulatedDeformConv2d) for part in parts)
         self.loss_check = LossCheck()
         self.allow_untrained = allow_untrained
+        if autocast not in (None, "bfloat16"):
+            raise ValueError(f"autocast must be None or 'bfloat16', got {autocast!r}.")
+        self.autocast, self.compiled = autocast, compiled
         self.img_neck = MODELS.build(img_neck) if img_neck else None
         self.img_augment = MODELS.build(img_augment) if img_augment else None
         if not (bev_encoder or lidar_encoder):
@@ -91,6 +106,17 @@ class MapDetector(Base3DDetector):
         self.bev_fuser = MODELS.build(bev_fuser) if bev_fuser else None
         self.map_head = MODELS.build({**shared, "classes": classes, **map_head})
         self.temporal = None if temporal is None else StreamMemory(self.map_head, **temporal)
+
+    def train(self, mode: bool = True) -> "MapDetector":
+        """Switch between training and prediction; the first training compiles what is wanted."""
+        super().train(mode)
+        if mode and self.compiled:
+            for part in (self.img_backbone, self.img_neck, self.bev_encoder, self.lidar_encoder):
+                if part is not None:
+                    part.compile(backend=self.compiler)
+            self.map_head.compile(backend=self.compiler)
+            self.compiled = False  # it is now
+        return self
 
     def extract_img_feats(self, imgs: Tensor) -> list[Tensor]:
         """Run backbone and neck on all cameras. (B, V, 3, H, W) -> list of (B, V, C, h, w)"""
@@ -109,6 +135,15 @@ class MapDetector(Base3DDetector):
 
     def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return the BEV encoder's outputs: ``bev_feats`` (B, C, H, W) and what its losses need."""
+        if not (self.training and self.autocast):
+            return self._encode(batch_inputs, batch_data_samples)
+        device = next(self.parameters()).device.type
+        with torch.autocast(device, getattr(torch, self.autocast)):
+            outputs = self._encode(batch_inputs, batch_data_samples)
+        return tree_map_only(Tensor, _in_float32, outputs)
+
+    def _encode(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
+        """Do what `extract_feat` does, in whatever types hold."""
         outputs: dict[str, Tensor] = {}
         if self.bev_encoder is not None:
             imgs = batch_inputs["imgs"]
@@ -174,3 +209,8 @@ class MapDetector(Base3DDetector):
         fit = partial(self.map_head.fit_state, prefix=f"{prefix}map_head.")
         adapt_state(state_dict, own, prefix, neutral, fit, self.allow_untrained)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def _in_float32(values: Tensor) -> Tensor:
+    """Return half-precision features in float32."""
+    return at_least_float32(values) if values.is_floating_point() else values

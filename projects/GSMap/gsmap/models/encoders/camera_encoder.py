@@ -12,6 +12,7 @@ from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.tensors import uploaded
 
 
+@torch.compiler.disable  # numpy's float64 is not for compilers
 def stack_calibration(
     img_metas: Sequence[dict[str, Any]], names: Sequence[str], device: torch.device
 ) -> dict[str, Tensor]:
