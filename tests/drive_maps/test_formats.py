@@ -19,11 +19,13 @@ from drivemaps.rerun import write_rerun
 from drivemaps.truth import true_map
 from drivemaps.video import write_video
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord
+from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.image_files import encode_jpeg
 from gsmap.structures.elements import MapElements
 
 ORIGIN = MapOrigin(48.26, 11.67)
 COLOURS = ("#FF9500", "#2D8CFF", "#1DB954")
-JPEG = b"\xff\xd8\xff\xd9"  # both viewers take the bytes as they are
+JPEG = encode_jpeg(np.full((225, 400, 3), 90, np.uint8), 90)
 
 
 @pytest.fixture(scope="module")
@@ -205,6 +207,18 @@ def test_rerun_recording_holds_cameras_lines_and_gaussians(tmp_path, camera_driv
     assert content[:3] == b"RRF"
     for entity in (b"/world/map", b"/world/vehicle/CAM_FRONT", b"predictions/gaussians"):
         assert entity in content
+
+
+@pytest.mark.parametrize(("module", "write"), [("foxglove", write_mcap), ("rerun", write_rerun)])
+def test_a_recording_to_hand_on_copies_images_alone(module, write, tmp_path, camera_drive, true):
+    pytest.importorskip(module, reason="pip install -e .[viz]")
+    drive, _ = camera_drive
+    for number in range(len(drive.frames)):
+        (tmp_path / f"{number}.jpg").symlink_to(tmp_path / "key")
+    (tmp_path / "key").write_text("secret")
+    with pytest.raises(BrokenSampleError, match=r"'CAM_FRONT': .*0\.jpg is not an image"):
+        write(tmp_path / "recording", Replay(drive, true, "lidar", COLOURS, tmp_path))
+    assert not (tmp_path / "recording").exists()
 
 
 def test_a_film_shows_every_frame_at_the_pace_of_the_drive(tmp_path, camera_drive, true):

@@ -177,8 +177,8 @@ def test_heights_count_in_chamfer_if_asked_and_never_in_raster(tmp_path):
     ("text", "message"),
     [
         ("", "is empty"),
-        ('{"GTs": []}', "no complete list under 'results'"),
-        ('{"results": {"a": 1}}', "no complete list"),
+        ('{"GTs": []}', r"an object with \['GTs'\] and no list under 'results'"),
+        ('{"results": {"a": 1}}', "an object under 'results' and no list .*sample_token"),
         ('{"results": [{"sample_token": "t0", "vectors": []}', "no complete list"),
         ('{"results": [{"vectors": []}]}', "no sample_token"),
         ('{"results": [{"sample_token": "t0", "vectors": [{"pts": [}]}]}', "no complete list|t0"),

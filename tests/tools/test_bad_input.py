@@ -102,7 +102,7 @@ evaluate: nothing.json VAL --shard 0/2 | --shard needs --out
 evaluate: nothing.json VAL --shard / --out out.json | expected I/N with I from 0 to N - 1
 evaluate: nowhere.json VAL | No such file or directory: 'nowhere.json'; check the path.
 evaluate: damaged.json VAL | damaged.json is empty or holds no complete list
-evaluate: list.json VAL | list.json is empty or holds no complete list
+evaluate: list.json VAL | list.json holds a list and no list under 'results'
 evaluate: VAL nothing.json | holds ground truth: name the result file before it
 evaluate: nothing.json VAL | 2 samples have no results
 evaluate: nothing.json damaged.arrow | damaged.arrow is not a whole annotation file

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drivemaps.replay import Moment, Replay
 from gsmap.datasets.annotations.record import CameraRecord
+from gsmap.datasets.image_files import image_content
 from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.elements import FloatArray
 from gsmap.structures.rigid import invert_rigid
@@ -17,7 +18,6 @@ from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
 
 _GLOBAL, _FRAME, _GROUND = "global", "vehicle", "base_footprint"  # x ahead, y left, on the road
-_FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".webp": "webp"}
 
 
 def write_mcap(path: str | Path, replay: Replay) -> None:
@@ -25,6 +25,7 @@ def write_mcap(path: str | Path, replay: Replay) -> None:
 
     Raises:
         FileNotFoundError: If an image is missing.
+        BrokenSampleError: If a file is no image, or damaged; nothing of it is copied.
         RuntimeError: If ``foxglove-sdk`` is missing.
     """
     foxglove = import_extra("foxglove", "viz")
@@ -96,12 +97,10 @@ class _Log:
         )
         self._send(f"/{camera.name}/calibration", calibration, time_ns)
         if data_root is not None:
-            file = data_root / camera.path
+            where, size = f"camera {camera.name!r}", (camera.width, camera.height)
+            content, kind = image_content(data_root / camera.path, where, size)
             image = m.CompressedImage(
-                timestamp=stamp,
-                frame_id=camera.name,
-                data=file.read_bytes(),
-                format=_FORMATS.get(file.suffix.lower(), file.suffix[1:]),
+                timestamp=stamp, frame_id=camera.name, data=content, format=kind
             )
             self._send(f"/{camera.name}/image", image, time_ns)
 

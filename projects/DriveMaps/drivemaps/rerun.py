@@ -1,7 +1,6 @@
 """A drive and its map as a recording for the rerun viewer."""
 
 from collections.abc import Sequence
-from mimetypes import guess_type
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ from matplotlib.colors import to_rgba_array
 
 from drivemaps.replay import Moment, Replay
 from gsmap.datasets.annotations.record import CameraRecord
+from gsmap.datasets.image_files import image_content
 from gsmap.structures.rigid import invert_rigid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
@@ -25,6 +25,7 @@ def write_rerun(path: str | Path, replay: Replay) -> None:
 
     Raises:
         FileNotFoundError: If an image is missing.
+        BrokenSampleError: If a file is no image, or damaged; nothing of it is copied.
         RuntimeError: If ``rerun-sdk`` is missing.
     """
     rr = import_extra("rerun", "viz")
@@ -73,9 +74,9 @@ def _log_camera(recording: Any, rr: Any, camera: CameraRecord, data_root: Path |
         rr.Pinhole(image_from_camera=camera.intrinsics, width=camera.width, height=camera.height),
     )
     if data_root is not None:
-        file = data_root / camera.path
-        kind, _ = guess_type(file.name)
-        recording.log(entity, rr.EncodedImage(contents=file.read_bytes(), media_type=kind))
+        where, size = f"camera {camera.name!r}", (camera.width, camera.height)
+        content, kind = image_content(data_root / camera.path, where, size)
+        recording.log(entity, rr.EncodedImage(contents=content, media_type=f"image/{kind}"))
 
 
 def _log_predictions(recording: Any, rr: Any, moment: Moment, colours: Sequence[str]) -> None:

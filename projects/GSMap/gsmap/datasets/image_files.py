@@ -1,19 +1,36 @@
 """Image files: their size, their pixels with every doubt about them an error, and JPEG."""
 
+import struct
+import zlib
 from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 import simplejpeg
-from PIL import Image, UnidentifiedImageError
+from PIL import BmpImagePlugin, Image, JpegImagePlugin, PngImagePlugin, WebPImagePlugin
 
 from gsmap.datasets.errors import BrokenSampleError
+from gsmap.utils.files import fetch_advice
 
+_PLUGINS = (JpegImagePlugin, PngImagePlugin, WebPImagePlugin, BmpImagePlugin)  # no other is opened
+FORMATS = ("JPEG", "PNG", "WEBP", "BMP")
+_STARTS = {b"\xff\xd8": "jpeg", b"\x89PNG": "png", b"RIFF": "webp", b"BM": "bmp"}
 _JPEG_START = b"\xff\xd8"
 _EXIF = b"Exif\0\0"
-_HEADER_BYTES = 1 << 17
-_ORIENTATION = 0x0112  # EXIF's tag; 1 is upright
+_ORIENTATION = 0x0112  # EXIF's tag
+_TURNED = range(2, 9)  # 1 is upright, 0 is not set, others mean nothing
+_DIM = 1 << 14  # of 16 bits; what stays below has 14 bits or fewer, and would be next to black
+# what pillow and simplejpeg raise on files that make no sense
+_DAMAGE = (
+    ValueError, OSError, SyntaxError, EOFError, LookupError, TypeError, AttributeError,
+    ArithmeticError, AssertionError, RuntimeError, struct.error, zlib.error,
+    Image.DecompressionBombError,
+)  # fmt: skip
+
+
+class _UnfitError(Exception):
+    """An image is whole, but cannot be used as it is."""
 
 
 def image_size(file: Path, where: str) -> tuple[int, int]:
@@ -23,13 +40,15 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
     """
     if not file.is_file():
         raise FileNotFoundError(f"{where}: no image at {file}; paths are relative to data_root.")
-    try:
-        with Image.open(file) as image:
-            return image.size
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        if getattr(error, "errno", None):
-            raise
-        raise ValueError(f"{where}: {file} is not an image; fetch it again.") from error
+    with file.open("rb") as opened:
+        start = opened.read(100)
+        try:
+            with Image.open(opened, formats=FORMATS) as image:
+                return image.size
+        except _DAMAGE as error:
+            if getattr(error, "errno", None):
+                raise
+            raise ValueError(_no_image(where, file, start)) from error
 
 
 def read_image(
@@ -69,12 +88,14 @@ def decode_image(
         where: What messages begin with, such as the sample and the camera.
         size: Width and height in pixels that it must have; None takes any.
     """
+    if _format_of(content) is None:
+        raise BrokenSampleError(_no_image(where, path, content))
     try:
-        found = _size(content)
-        image = _decoded(content) if size in (None, found) else None
-    except UnidentifiedImageError as error:
-        raise BrokenSampleError(f"{where}: {path} is not an image; copy it again.") from error
-    except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
+        decode = _decoded_jpeg if content.startswith(_JPEG_START) else _decoded_other
+        found, image = decode(content, size)
+    except _UnfitError as error:
+        raise BrokenSampleError(f"{where}: {path} cannot be used: {error}.") from error
+    except _DAMAGE as error:
         raise BrokenSampleError(
             f"{where}: {path} is truncated or damaged ({error}); copy it again."
         ) from error
@@ -87,28 +108,86 @@ def decode_image(
     return image
 
 
+def image_content(file: Path, where: str, size: tuple[int, int]) -> tuple[bytes, str]:
+    """Return an image file's content to be copied, once it is known to be that of an image.
+
+    Args:
+        file: The file.
+        where: What messages begin with.
+        size: Width and height in pixels that it must have.
+
+    Returns:
+        The content and its format: ``jpeg``, ``png`` or ``webp``. A BMP becomes a JPEG.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        BrokenSampleError: As by ``read_image``.
+    """
+    content = file.read_bytes()
+    image = decode_image(content, str(file), where, size)
+    kind = _format_of(content) or ""
+    return (encode_jpeg(image, 95), "jpeg") if kind == "bmp" else (content, kind)
+
+
 def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
     """Return an image, BGR (H, W, 3), as the content of a JPEG file of a quality in 0 to 100."""
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def _size(content: bytes) -> tuple[int, int]:
-    """Return an image's width and height; a JPEG must be upright as it is stored."""
-    if not content.startswith(_JPEG_START):
-        with Image.open(BytesIO(content)) as picture:
-            return picture.size
-    if content.find(_EXIF, 0, _HEADER_BYTES) >= 0:
-        with Image.open(BytesIO(content)) as picture:
-            orientation = picture.getexif().get(_ORIENTATION, 1)
-        if orientation != 1:
-            raise ValueError(f"its EXIF wants it turned, orientation {orientation}: turn the file")
+def _format_of(content: bytes) -> str | None:
+    """Return the format that a file's first bytes tell, if it is one that is read."""
+    return next((kind for start, kind in _STARTS.items() if content.startswith(start)), None)
+
+
+def _no_image(where: str, path: object, content: bytes) -> str:
+    advice = fetch_advice(content, "copy it again, or convert it to one of these")
+    return f"{where}: {path} is not an image (JPEG, PNG, WebP or BMP); {advice}."
+
+
+def _decoded_jpeg(
+    content: bytes, size: tuple[int, int] | None
+) -> tuple[tuple[int, int], np.ndarray | None]:
+    """Return a JPEG's size, and its pixels, BGR, unless another size is asked for."""
+    if _EXIF in content:
+        with Image.open(BytesIO(content), formats=FORMATS) as picture:
+            _require_upright(picture)
     height, width = simplejpeg.decode_jpeg_header(content)[:2]
-    return width, height
+    if size not in (None, (width, height)):
+        return (width, height), None
+    return (width, height), simplejpeg.decode_jpeg(content, colorspace="BGR")
 
 
-def _decoded(content: bytes) -> np.ndarray:
-    """Decode an image; a warning is an error. (H, W, 3)."""
-    if content.startswith(_JPEG_START):
-        return simplejpeg.decode_jpeg(content, colorspace="BGR")
-    with Image.open(BytesIO(content)) as picture:
-        return np.ascontiguousarray(np.asarray(picture.convert("RGB"))[:, :, ::-1])
+def _decoded_other(
+    content: bytes, size: tuple[int, int] | None
+) -> tuple[tuple[int, int], np.ndarray | None]:
+    """Return an image's size, and its pixels, BGR, unless another size is asked for."""
+    with Image.open(BytesIO(content), formats=FORMATS) as picture:
+        if size not in (None, picture.size):
+            return picture.size, None
+        picture.load()  # a PNG may say only behind its pixels how it is turned
+        _require_upright(picture)
+        if picture.mode.startswith("I"):
+            return picture.size, _from_deep_grey(np.asarray(picture))
+        return picture.size, np.ascontiguousarray(np.asarray(picture.convert("RGB"))[:, :, ::-1])
+
+
+def _require_upright(picture: Image.Image) -> None:
+    """Refuse a picture that viewers turn: calibrations are for pixels as they are stored."""
+    orientation = picture.getexif().get(_ORIENTATION)
+    if orientation in _TURNED:
+        raise _UnfitError(
+            f"its EXIF wants it turned, orientation {orientation}: turn its pixels, or remove that "
+            "entry if the calibration is for the pixels as they are stored"
+        )
+
+
+def _from_deep_grey(grey: np.ndarray) -> np.ndarray:
+    """Return 16-bit grey values in 8 bits, as BGR. (H, W, 3)"""
+    brightest = int(grey.max())
+    if 0 < brightest < _DIM:
+        raise _UnfitError(
+            f"its grey values end at {brightest} of 65535, as those of a camera of "
+            f"{brightest.bit_length()} bits or of depth do, and it would be next to black: spread "
+            "them over 16 bits, or save 8 bits"
+        )
+    return cv2.cvtColor((grey >> 8).clip(0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)

@@ -1,5 +1,6 @@
 """Files that are whole or absent, whatever stops their writer."""
 
+import codecs
 import fcntl
 import hashlib
 import io
@@ -34,6 +35,7 @@ _OWN_FOLDERS: set[Path] = set()
 _HOLDER = re.compile(r"(process \d+ on \S+ since [\d: -]+)?")  # what `lock_folder` writes
 _CHANGED = re.compile(r"-[0-9a-f]{16}\Z")  # as `file_name` ends a changed name
 DAMAGED_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError)  # what it raises
+_LFS_POINTER = b"version https://git-lfs.github.com/"
 _LONGEST_NAME = 100  # bytes; a file system takes 255, with all that is appended
 
 
@@ -242,12 +244,27 @@ def write_text(path: str | Path, text: str) -> None:
         file.write(text)
 
 
+def fetch_advice(start: bytes, otherwise: str) -> str:
+    """Return how to get a file that is not what its name says, by the bytes it starts with."""
+    if start.startswith(_LFS_POINTER):
+        return "it is a pointer of Git LFS: fetch the file itself with `git lfs pull`"
+    if start[:100].lstrip().lower().startswith((b"<!doctype html", b"<html")):
+        return "it is a web page: download the file itself"
+    return otherwise
+
+
 def read_text(path: str | Path) -> str:
-    """Return the content of a text file in UTF-8; ValueError with its name if it is not such."""
+    """Return the content of a text file in UTF-8, without a byte order mark.
+
+    Raises:
+        ValueError: With its name and the remedy, if it is in another encoding.
+    """
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} cannot be read: {error}.") from error
+        wide = error.object.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        reason = "it is UTF-16" if wide else str(error)
+        raise ValueError(f"{path} cannot be read: {reason}; save it as UTF-8.") from error
 
 
 def read_json(path: str | Path) -> Any:

@@ -2,14 +2,18 @@
 
 import json
 import re
-from codecs import getincrementaldecoder
+from codecs import BOM_UTF8, getincrementaldecoder
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
+from gsmap.utils.files import fetch_advice
+
 Place = tuple[int, int]
 """Where an item begins, and its length, in bytes."""
 _BLOCK = 1 << 20
+_SHOWN = 5  # names in a message
+_KINDS = {"{": "an object", "[": "a list", '"': "a text"}
 _SPACE = re.compile(r"[ \t\n\r]*")
 _DECODER = json.JSONDecoder()
 
@@ -32,13 +36,21 @@ def items_of(
         ValueError: If it is no JSON, or has no list there; maybe only after some items.
     """
     with path.open("rb") as file:
+        under = "" if key is None else f" under {key!r}"
         try:
             yield from _Text(file).items(key, beside or {})
+        except _FormError as error:
+            raise ValueError(f"{path} holds {error} and no list{under}: {advice}.") from error
         except (ValueError, RecursionError) as error:
-            under = "" if key is None else f" under {key!r}"
+            file.seek(0)
+            advice = fetch_advice(file.read(100), advice)
             raise ValueError(
                 f"{path} is empty or holds no complete list{under} ({error!r:.80}): {advice}."
             ) from error
+
+
+class _FormError(ValueError):
+    """There is JSON, but another value where the list should be."""
 
 
 class _Text:
@@ -48,31 +60,41 @@ class _Text:
         self._file, self._decode = file, getincrementaldecoder("utf-8")().decode
         self._text = ""
         self._at = 0  # where the next value begins, in the text
-        self._byte = 0  # and in the file
+        self._byte = len(BOM_UTF8) if file.read(len(BOM_UTF8)) == BOM_UTF8 else 0  # in the file
+        file.seek(self._byte)
 
     def items(self, key: str | None, beside: dict[str, Any]) -> Iterator[tuple[Any, Place]]:
         """Yield the items of the list under a key, and note the values of names in ``beside``."""
-        found = False
+        found, names = False, []
+        self._require("[" if key is None else "{", "")
         for _ in () if key is None else self._parts("{", "}"):
             if self._sign() != '"':
                 raise self._error("no name")
             name, _ = self._value()
             self._take(":")
             if name != key:
+                names.append(f"{name:.30}")
                 value, _ = self._value()
                 if name in beside:
                     beside[name] = value
                 continue
-            if found or self._sign() != "[":
-                raise self._error(f"a second {key!r}" if found else "no list")
+            if found:
+                raise self._error(f"a second {key!r}")
+            self._require("[", f" under {key!r}")
             found = True
             yield from (self._value() for _ in self._parts("[", "]"))
         if key is None:
             yield from (self._value() for _ in self._parts("[", "]"))
         elif not found:
-            raise self._error(f"no {key!r}")
+            raise _FormError(f"an object with {names[:_SHOWN] or 'nothing'}")
         if self._sign():
             raise self._error("more text")
+
+    def _require(self, opening: str, where: str) -> None:
+        """Refuse another value than the one that begins so; what is no value is left."""
+        sign = self._sign()
+        if sign != opening and sign in _KINDS:
+            raise _FormError(_KINDS[sign] + where)
 
     def _parts(self, opening: str, closing: str) -> Iterator[None]:
         """Stop before each part of an object or a list, for that to be taken."""

@@ -19,7 +19,7 @@ from gsmap.datasets.errors import BrokenSampleError, naming
 from gsmap.datasets.image_files import image_size, read_image
 from gsmap.datasets.source import Source
 from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
-from gsmap.utils.files import file_name
+from gsmap.utils.files import file_name, read_text
 from mapdata.folders.rig import (
     PoseTrack,
     RigCamera,
@@ -115,7 +115,7 @@ class _Loader(yaml.SafeLoader):
 
 def _content(file: Path) -> Any:
     """Read a calibration file's values."""
-    text = file.read_text(encoding="utf-8")
+    text = read_text(file)
     try:
         content = json.loads(text) if file.suffix == ".json" else yaml.load(text, _Loader)
     except yaml.YAMLError as error:

@@ -112,8 +112,8 @@ def thumbnail(path: Path, width_px: int) -> str:
         image = read_image(str(path), "page")
     except BrokenSampleError as error:
         raise ValueError(
-            f"no readable image at {path}: give the folder that image paths start from as "
-            "--data-root, or leave the images out with --no-images."
+            f"no readable image at {path} ({error}): give the folder that image paths start from "
+            "as --data-root, or leave the images out with --no-images."
         ) from error
     height, width = image.shape[:2]
     if width > width_px:

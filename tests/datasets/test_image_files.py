@@ -1,0 +1,106 @@
+"""Images of the formats and pixels that cameras leave: read, or named with the cause."""
+
+import struct
+from io import BytesIO
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsmap.datasets.errors import BrokenSampleError
+from gsmap.datasets.image_files import decode_image, image_content, image_size
+
+COLOURS = np.full((24, 32, 3), (200, 30, 10), np.uint8)
+RAMP = np.tile(np.linspace(0, 65535, 256).astype(np.uint16), (2, 1))
+
+
+def saved(pixels: np.ndarray, kind: str, **options: object) -> bytes:
+    """The content of an image file. (H, W) or RGB (H, W, 3)"""
+    buffer = BytesIO()
+    Image.fromarray(pixels).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def turned(orientation: int) -> Image.Exif:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    return exif
+
+
+def decoded(content: bytes) -> np.ndarray:
+    return decode_image(content, "a.png", "camera 'front'")
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "BMP"])
+def test_formats_that_are_read_give_their_pixels(kind, tmp_path):
+    content = saved(COLOURS, kind)
+    np.testing.assert_allclose(decoded(content), COLOURS[..., ::-1], atol=3)  # some are lossy
+    (tmp_path / "a").write_bytes(content)
+    assert image_size(tmp_path / "a", "a") == (32, 24)
+
+
+@pytest.mark.parametrize("kind", ["GIF", "TIFF", "PPM", "EPS"])
+def test_no_other_format_is_opened_under_any_name(kind, tmp_path):
+    (tmp_path / "a.png").write_bytes(saved(COLOURS, kind))
+    message = r"a\.png is not an image \(JPEG, PNG, WebP or BMP\); .*convert"
+    with pytest.raises(BrokenSampleError, match=message):
+        decoded((tmp_path / "a.png").read_bytes())
+    with pytest.raises(ValueError, match=message):
+        image_size(tmp_path / "a.png", "camera 'front'")
+
+
+def test_sixteen_bits_of_grey_become_eight_from_dark_to_bright():
+    image, content = decoded(saved(RAMP, "PNG")), np.frombuffer(saved(RAMP, "PNG"), np.uint8)
+    np.testing.assert_array_equal(image, cv2.imdecode(content, cv2.IMREAD_COLOR))
+    assert (image[0, 0].tolist(), image[0, -1].tolist()) == ([0, 0, 0], [255, 255, 255])
+    assert not decoded(saved(RAMP * 0, "PNG")).any()
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_grey_of_fewer_bits_in_sixteen_is_named_in_place_of_a_black_image(bits):
+    message = f"a.png cannot be used: .* end at {(1 << bits) - 1} of 65535, .* {bits} bits"
+    with pytest.raises(BrokenSampleError, match=message):
+        decoded(saved(RAMP >> (16 - bits), "PNG"))
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
+def test_an_orientation_of_exif_counts_in_every_format(kind):
+    for orientation in range(2, 9):
+        message = f"EXIF wants it turned, orientation {orientation}: turn its pixels"
+        with pytest.raises(BrokenSampleError, match=message):
+            decoded(saved(COLOURS, kind, exif=turned(orientation)))
+    for orientation in (0, 1, 9):  # not set, upright, without a meaning
+        assert decoded(saved(COLOURS, kind, exif=turned(orientation))).shape == (24, 32, 3)
+
+
+def test_an_orientation_counts_behind_other_segments_of_a_jpeg():
+    content, filler = (
+        saved(COLOURS, "JPEG", exif=turned(6)),
+        struct.pack(">H", 65535) + bytes(65533),
+    )
+    with pytest.raises(BrokenSampleError, match="orientation 6"):
+        decoded(content[:2] + 3 * (b"\xff\xe2" + filler) + content[2:])
+
+
+@pytest.mark.parametrize(
+    ("content", "remedy"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n", "git lfs pull"),
+        (b"<!DOCTYPE html><html>not found</html>", "it is a web page: download"),
+        (b"", "copy it again"),
+    ],
+)
+def test_what_stands_in_place_of_an_image_is_named(content, remedy):
+    with pytest.raises(BrokenSampleError, match=rf"a\.png is not an image .*{remedy}"):
+        decoded(content)
+
+
+def test_content_to_be_copied_is_that_of_an_image(tmp_path):
+    for kind in ("JPEG", "PNG", "WEBP"):
+        (tmp_path / "a.jpg").write_bytes(saved(COLOURS, kind))
+        content, found = image_content(tmp_path / "a.jpg", "a", (32, 24))
+        assert (content, found) == (saved(COLOURS, kind), kind.lower())
+    (tmp_path / "a.jpg").write_bytes(saved(COLOURS, "BMP"))
+    content, found = image_content(tmp_path / "a.jpg", "a", (32, 24))
+    assert (content[:2], found) == (b"\xff\xd8", "jpeg")
