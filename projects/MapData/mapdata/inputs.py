@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from gsmap.datasets.source import Source, annotated
+from gsmap.utils.files import is_hidden
 from mapdata.argoverse2.log import logs_in
 from mapdata.argoverse2.samples import read_logs
 from mapdata.bag_files import is_bag, parts_in, suffix_advice
@@ -71,7 +72,8 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
         notes = tuple(f"{used}: {count} for {reason}" for reason, count in left_out.items())
         return Source(samples, "ego", root, notes=notes)
     files = [folder / name for name in NAMES if (folder / name).is_file()]
-    files = files or sorted(path for pattern in _FILES for path in folder.glob(pattern))
+    found = (path for pattern in _FILES for path in folder.glob(pattern) if not is_hidden(path))
+    files = files or sorted(found)
     if len(files) == 1:
         return open_input(files[0], options)
     if files:

@@ -197,7 +197,7 @@ def test_distorted_images_are_rectified_into_a_folder_of_their_own(tmp_path):
     written = cv2.imread(str(source.data_root / "front/a.png.jpg"))
     assert np.abs(written.astype(int) - expected).mean() < 3  # JPEG's loss
     assert not (source.data_root / "front/b.png.jpg").exists()
-    (note,) = source.notes
+    _, note = source.notes
     assert "front/b.png is not an image" in note
 
 
@@ -321,7 +321,7 @@ def test_a_bad_first_image_does_not_end_the_run(tmp_path):
     (drive / "front/-.png").write_bytes(b"")
     source = open_input(drive, InputOptions(frames_dir=tmp_path / "frames"))
     assert [camera.width for s in source.samples for camera in s.cameras] == [160, 160]
-    (note,) = source.notes
+    _, note = source.notes
     assert "front/-.png is not an image" in note
 
 

@@ -41,4 +41,5 @@ def naming(what: object, remedy: str) -> Iterator[None]:
             reason = f"it has no {error}"
         elif not isinstance(error, (ValueError, OSError)) and type(error) is not Exception:
             reason = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{what} cannot be used: {reason.rstrip('.')}; {remedy}.") from error
+        advice = "" if reason.rstrip(".").endswith(remedy) else f"; {remedy}"
+        raise ValueError(f"{what} cannot be used: {reason.rstrip('.')}{advice}.") from error

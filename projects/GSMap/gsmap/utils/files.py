@@ -244,6 +244,11 @@ def write_text(path: str | Path, text: str) -> None:
         file.write(text)
 
 
+def is_hidden(path: Path) -> bool:
+    """Whether a file or folder is of the kind that systems leave beside others, as ``._a.jpg``."""
+    return path.name.startswith(".")
+
+
 def fetch_advice(start: bytes, otherwise: str) -> str:
     """Return how to get a file that is not what its name says, by the bytes it starts with."""
     if start.startswith(_LFS_POINTER):

@@ -1,14 +1,13 @@
 """Samples of a folder of images with one calibration file (docs/inference.md)."""
 
-import csv
 import hashlib
 import json
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 import yaml
@@ -19,7 +18,10 @@ from gsmap.datasets.errors import BrokenSampleError, naming
 from gsmap.datasets.image_files import image_size, read_image
 from gsmap.datasets.source import Source
 from gsmap.structures.rigid import invert_rigid, is_rigid, rigid
-from gsmap.utils.files import file_name, read_text
+from gsmap.utils.files import file_name, is_hidden, read_text
+from gsmap.utils.words import counted
+from mapdata.folders.names import in_order, times_of_names
+from mapdata.folders.poses import read_poses
 from mapdata.folders.rig import (
     PoseTrack,
     RigCamera,
@@ -28,6 +30,7 @@ from mapdata.folders.rig import (
     rig_samples,
     rotation_of,
 )
+from mapdata.unix_times import span_of
 
 NAMES = ("calibration.yaml", "calibration.yml", "calibration.json")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
@@ -38,8 +41,8 @@ _CAMERA_KEYS = {
 }  # fmt: skip
 # A camera's axes (right, down, ahead) in a vehicle's (ahead, left, up).
 _AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+_RATE_HZ = 10.0  # where a calibration file has no rate_hz
 _MOST_VALUES = 100_000  # in a calibration file
-_TIME = re.compile(r"(?:^|\D)(\d{10}(?:\d{3}|\d{6}|\d{9})?)(?:\.(\d{1,9}))?$")
 
 
 def read_image_folder(file: Path, frames_dir: Path) -> Source:
@@ -63,21 +66,24 @@ def read_image_folder(file: Path, frames_dir: Path) -> Source:
                 _require_keys(camera, _CAMERA_KEYS, "a camera")
                 images[str(name)] = _images_of(file.parent, str(name), camera)
                 rig.append(_camera(str(name), camera, ground, images[str(name)]))
-        rate_hz = float(content.get("rate_hz", 10.0))
+        rate_hz = float(content["rate_hz"]) if "rate_hz" in content else None
         tolerance_ns = round(float(content.get("max_time_difference_ms", 50.0)) * 1e6)
-        if not 0 < rate_hz < np.inf or tolerance_ns < 0:
+        if not 0 < (_RATE_HZ if rate_hz is None else rate_hz) < np.inf or tolerance_ns < 0:
             raise ValueError("rate_hz must be > 0, and max_time_difference_ms >= 0")
-        frames, time_of = _frames(images, rate_hz, tolerance_ns, file)
-        pose_at = None
+        frames, time_of, assumed = _frames(images, rate_hz, tolerance_ns, file)
+        notes = [note for note in (assumed, *_notes_on(frames, images, tolerance_ns)) if note]
+        poses = None
         if content.get("poses"):
             place = _below(file.parent, str(content["poses"]), "poses")
-            pose_at = _read_poses(place, time_of, ground).at
-        scene, root, notes = file.parent.resolve().name, file.parent, []
-        samples = rig_samples(scene, rig, frames, pose_at)
+            poses = read_poses(place, time_of, ground)
+        used, missing = _with_poses(frames, poses)
+        notes += missing
+        scene, root = file.parent.resolve().name, file.parent
+        samples = rig_samples(scene, rig, used, None if poses is None else poses.at)
         if any(camera.is_distorted for camera in rig):
             root = frames_dir / f"{file_name(scene)}-{_digest(file, frames)}"
-            notes = [_rectify(sample, rig, file.parent, root) for sample in samples]
-        return Source(samples, "ego", root, pose_at is not None, tuple(chain(*notes)))
+            notes += chain(*(_rectify(sample, rig, file.parent, root) for sample in samples))
+        return Source(samples, "ego", root, poses is not None, tuple(notes))
 
 
 def read_rig(file: Path, ground: np.ndarray) -> tuple[list[tuple[RigCamera, str]], np.ndarray]:
@@ -156,15 +162,18 @@ def _require_keys(value: Any, known: set[str], what: str) -> None:
 
 
 def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> list[Path]:
-    """Return a camera's images in the order of their names."""
+    """Return a camera's images in the order of their names; hidden files are none."""
     pattern = str(camera.get("images", name))
     place = _below(folder, pattern, "images")
     found = place.iterdir() if place.is_dir() else folder.glob(pattern)
-    paths = sorted(p for p in found if p.suffix.lower() in _SUFFIXES and p.is_file())
+    files = [path for path in found if path.is_file() and not is_hidden(path)]
+    paths = sorted((p for p in files if p.suffix.lower() in _SUFFIXES), key=in_order)
     if not paths:
+        others = sorted({path.suffix for path in files})
+        holds = f" It holds files with {others[:5]}, and {list(_SUFFIXES)} are read." * bool(others)
         raise FileNotFoundError(
             f"camera {name!r} has no image at {place}: `images` names a file, a folder or a "
-            "pattern, from the calibration file's folder (by default the camera's name)."
+            f"pattern, from the calibration file's folder (by default the camera's name).{holds}"
         )
     if len({path.stem for path in paths}) < len(paths):
         raise ValueError(f"two of its images at {place} have one name: rename one")
@@ -233,49 +242,42 @@ def _mounting(camera: Mapping[str, Any]) -> np.ndarray:
     return rigid(rotation, camera["position_m"])
 
 
-def _time_ns(stem: str) -> int | None:
-    """Read the Unix time at the end of a file's name: s, ms, us, ns, or s with a fraction."""
-    found = _TIME.search(stem)
-    if found is None:
-        return None
-    whole, fraction = found[1], found[2]
-    if fraction is not None and len(whole) > 10:
-        return None
-    return int(whole) * 10 ** (19 - len(whole)) + int((fraction or "0").ljust(9, "0"))
-
-
 def _frames(
-    images: Mapping[str, list[Path]], rate_hz: float, tolerance_ns: int, file: Path
-) -> tuple[list[RigFrame], dict[str, int]]:
+    images: Mapping[str, list[Path]], rate_hz: float | None, tolerance_ns: int, file: Path
+) -> tuple[list[RigFrame], dict[str, int], str]:
     """Put images of one time together: by the times in their names, or by equal names.
 
     Returns:
-        The frames, and the time of each file name that has one.
+        The frames, the time of each file name that has one, and what was assumed.
     """
     root, scene = file.parent, file.parent.resolve().name
-    time_of = {path.stem: _time_ns(path.stem) for paths in images.values() for path in paths}
-    known = {stem: time_ns for stem, time_ns in time_of.items() if time_ns is not None}
-    if len(known) == len(time_of):
+    known = times_of_names({path.stem for paths in images.values() for path in paths})
+    assumed = ""
+    if known is not None:
         at = {name: {known[path.stem]: path for path in paths} for name, paths in images.items()}
         times = {name: np.array(sorted(found), np.int64) for name, found in at.items()}
         wanted = next(iter(times.values())).tolist()
+        _require_rate(wanted, rate_hz)
         groups = [
             (str(time_ns), time_ns, {name: (at[name][t], t) for name, t in nearest.items()})
             for time_ns, nearest in zip(
                 wanted, nearest_images(times, wanted, tolerance_ns), strict=True
             )
         ]
+        assumed = f"the names of the images are taken as Unix times, {span_of(wanted)}"
     elif all(len(paths) == 1 for paths in images.values()):
         known = {paths[0].stem: 0 for paths in images.values()}
         groups = [("0", 0, {name: (paths[0], 0) for name, paths in images.items()})]
     else:
-        stems = [path.stem for path in next(iter(images.values()))]
-        known = {stem: round(i * 1e9 / rate_hz) for i, stem in enumerate(stems)}
+        stems, rate = [path.stem for path in next(iter(images.values()))], rate_hz or _RATE_HZ
+        known = {stem: round(i * 1e9 / rate) for i, stem in enumerate(stems)}
         named = {name: {path.stem: path for path in paths} for name, paths in images.items()}
         groups = [
             (stem, known[stem], {n: (p[stem], known[stem]) for n, p in named.items() if stem in p})
             for stem in stems
         ]
+        by_whom = "rate_hz" if rate_hz else "assumed, as there is no rate_hz"
+        assumed = f"the names of the images hold no Unix times: {rate:g} a second ({by_whom})"
     frames = [
         RigFrame(
             f"{scene}_{label}",
@@ -284,30 +286,60 @@ def _frames(
         )
         for label, time_ns, found in groups
     ]
-    return frames, known
+    return frames, known, assumed
 
 
-def _read_poses(path: Path, time_of: Mapping[str, int], ground: np.ndarray) -> PoseTrack:
-    """Read a CSV file with x, y, z, qw, qx, qy, qz, and timestamp_ns or frame (a file's name)."""
-    if not path.is_file():
-        raise FileNotFoundError(f"There is no file of poses {path}.")
-    times, poses = [], []
-    with naming(path, "see docs/inference.md"), path.open(encoding="utf-8", newline="") as file:
-        for row in _rows(file):
-            if "frame" in row and row["frame"] not in time_of:
-                continue
-            times.append(time_of[row["frame"]] if "frame" in row else int(row["timestamp_ns"]))
-            turn = rotation_of([row[f"q{axis}"] for axis in "wxyz"])
-            poses.append(rigid(turn, [float(row[axis]) for axis in "xyz"]) @ ground)
-        return PoseTrack(times, poses)
+def _require_rate(times_ns: Sequence[int], rate_hz: float | None) -> None:
+    """Refuse a rate that the times in the names of images contradict: one of the two is wrong."""
+    if rate_hz is None or len(times_ns) < 2:
+        return
+    step_s = float(np.median(np.diff(times_ns))) / 1e9
+    if not 0.5 < step_s * rate_hz < 2:
+        raise ValueError(
+            f"the names of the images read as Unix times ({span_of(times_ns)}), one every "
+            f"{step_s:g} s, and rate_hz says {rate_hz:g} a second: leave rate_hz out if they are "
+            "times, else rename the images (0001.jpg, 0002.jpg, ...)"
+        )
 
 
-def _rows(file: TextIO) -> Iterator[dict[str, str]]:
-    """Yield the rows of a CSV file by their columns."""
-    try:
-        yield from csv.DictReader(file)
-    except csv.Error as error:
-        raise ValueError(f"it is no CSV: {error}") from error
+def _notes_on(
+    frames: Sequence[RigFrame], images: Mapping[str, Sequence[Path]], tolerance_ns: int
+) -> list[str]:
+    """Say how many images of each camera are used, where it is not one a sample."""
+    first = next(iter(images))
+    used = Counter(name for frame in frames for name in frame.images)
+    return [
+        f"camera {name!r}: {used[name]} of {counted(len(paths), 'image')} used, for "
+        f"{counted(len(frames), 'sample')}; the others have no partner among those of {first!r}, "
+        f"by equal names or by times within {tolerance_ns / 1e6:g} ms"
+        for name, paths in images.items()
+        if not used[name] == len(paths) == len(frames)
+    ]
+
+
+def _with_poses(
+    frames: Sequence[RigFrame], poses: PoseTrack | None
+) -> tuple[list[RigFrame], list[str]]:
+    """Return the frames with a pose, and say how many have none.
+
+    Raises:
+        ValueError: If none has one.
+    """
+    if poses is None:
+        return list(frames), []
+    used = [frame for frame in frames if poses.at(frame.time_ns) is not None]
+    missing = len(frames) - len(used)
+    spans = (
+        f"images are from {span_of(frame.time_ns for frame in frames)}, poses from "
+        f"{span_of(poses.times_ns.tolist())}"
+    )
+    if not used:
+        raise ValueError(f"no image has a pose near its time: {spans}")
+    note = (
+        f"{len(used)} of {counted(len(frames), 'sample')} used: {missing} have no pose within "
+        f"0.1 s, nor poses around them less than 1 s apart ({spans})"
+    )
+    return used, [note] if missing else []
 
 
 def _rectify(sample: MapSample, rig: Sequence[RigCamera], root: Path, target: Path) -> list[str]:
