@@ -5,6 +5,7 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from gsmap.utils.words import counted
 from mapdata.folders.names import in_order, times_of_names
 from mapdata.folders.poses import read_poses
 from mapdata.folders.rig import (
+    PoseAt,
     PoseTrack,
     RigCamera,
     RigFrame,
@@ -76,10 +78,11 @@ def read_image_folder(file: Path, frames_dir: Path) -> Source:
         if content.get("poses"):
             place = _below(file.parent, str(content["poses"]), "poses")
             poses = read_poses(place, time_of, ground)
-        used, missing = _with_poses(frames, poses)
+        pose_at = None if poses is None else cache(poses.at)  # asked for by frames and by images
+        used, missing = _with_poses(frames, poses, pose_at)
         notes += missing
         scene, root = file.parent.resolve().name, file.parent
-        samples = rig_samples(scene, rig, used, None if poses is None else poses.at)
+        samples = rig_samples(scene, rig, used, pose_at)
         if any(camera.is_distorted for camera in rig):
             root = frames_dir / f"{file_name(scene)}-{_digest(file, frames)}"
             notes += chain(*(_rectify(sample, rig, file.parent, root) for sample in samples))
@@ -318,16 +321,16 @@ def _notes_on(
 
 
 def _with_poses(
-    frames: Sequence[RigFrame], poses: PoseTrack | None
+    frames: Sequence[RigFrame], poses: PoseTrack | None, pose_at: PoseAt | None
 ) -> tuple[list[RigFrame], list[str]]:
     """Return the frames with a pose, and say how many have none.
 
     Raises:
         ValueError: If none has one.
     """
-    if poses is None:
+    if poses is None or pose_at is None:
         return list(frames), []
-    used = [frame for frame in frames if poses.at(frame.time_ns) is not None]
+    used = [frame for frame in frames if pose_at(frame.time_ns) is not None]
     missing = len(frames) - len(used)
     spans = (
         f"images are from {span_of(frame.time_ns for frame in frames)}, poses from "
