@@ -42,9 +42,13 @@ _BEV_QUERY_RULES = (
 )
 _CODE_WEIGHTS = {_HEAD + "code_weights": torch.ones(4)}  # of box coordinates: a loss of weight 0
 
+# the fixed offsets of the kernel, a buffer of the code that MapTR's weights were published with
+_GRID_OFFSETS = (
+    r"pts_bbox_head\.transformer\.encoder\.layers\.\d+\.attentions\.1\.attention\.grid_offsets"
+)
 _KERNELS = (_ENCODER_LAYER + "attentions.1.attention.", _OUR_ENCODER_LAYER + "cross_attn.")
 _DEFORMABLE = _ENCODER_LAYER + "attentions.1.deformable_attention."
-MAPTR = KeyMap("maptr", (*_BEV_QUERY_RULES, _KERNELS), _CODE_WEIGHTS)
+MAPTR = KeyMap("maptr", (*_BEV_QUERY_RULES, _KERNELS), _CODE_WEIGHTS, idle=_GRID_OFFSETS)
 MAPTR_BEVFORMER = KeyMap(
     "maptr-bevformer",
     (*_BEV_QUERY_RULES, (_DEFORMABLE, _OUR_ENCODER_LAYER + "cross_attn.")),
@@ -72,6 +76,7 @@ MAPQR = KeyMap(
     ),
     {**_CODE_WEIGHTS, **_MASK_WEIGHTS},
     markers=(_HEIGHTS,),
+    idle=_GRID_OFFSETS,
 )
 
 _ENHANCED = _TRANSFORMER + "bevencode."
@@ -118,7 +123,8 @@ MGMAP = KeyMap(
     markers=(_ACTIVATION,),
     # never called, but for a second name of glimpse_transformer_0 and weights in a loss
     idle=r"pts_bbox_head\.(conv_seg|glimpse_transformer|loss_fn_?|(cls|reg)_branches\.[6-9]|"
-    r"transformer\.bevencode\.(fpn_conv|attention)|(rego_hs_fuser|layer_norms)_\d\.[1-5])\.",
+    r"transformer\.bevencode\.(fpn_conv|attention)|(rego_hs_fuser|layer_norms)_\d\.[1-5])\.|"
+    + _GRID_OFFSETS,
 )
 
 _LIFTED_RULES = (
@@ -184,6 +190,7 @@ GEMAP = KeyMap(
         _HEAD + "loss_pv_seg.loss_fn.pos_weight": None,
     },
     markers=_GEOMETRY_RULES[:1],
+    idle=_GRID_OFFSETS,
 )
 GEMAP_FULL = KeyMap(
     "gemap-full",

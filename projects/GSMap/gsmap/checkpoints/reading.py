@@ -6,12 +6,14 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
 from mmengine.config import Config, ConfigDict
+from mmengine.logging import print_log
 from torch import Tensor, nn
 
 from gsmap.checkpoints.building import building
@@ -28,7 +30,9 @@ from gsmap.checkpoints.settings import (
     plain,
     scale_steps,
 )
+from gsmap.checkpoints.unwrapping import Unwrapped, unwrap
 from gsmap.utils.faults import in_words
+from gsmap.utils.files import fetch_advice
 from gsmap.utils.model_facts import calibration_of
 from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
@@ -70,22 +74,35 @@ class Checkpoint:
         return identity if own == dataset else ""
 
 
+class UnfitError(ValueError):
+    """A checkpoint is whole, but not one whose weights can be used."""
+
+
 @contextmanager
 def refusing(path: object) -> Iterator[None]:
     """Say in a line which checkpoint cannot be read, and why."""
     try:
         yield
+    except UnfitError:
+        raise
     except pickle.UnpicklingError as error:
         reason = str(error).split(". ")[0]
-        raise ValueError(
-            f"{path} was not loaded: it is broken, or holds more than tensors and plain data "
-            f"({reason}); {_REMEDY}"
-        ) from error
+        otherwise = f"it is broken, or holds more than tensors and plain data ({reason}); {_REMEDY}"
+        raise ValueError(f"{path} was not loaded: {_advice(path, otherwise)}.") from error
     except _DAMAGE as error:
+        advice = _advice(path, "fetch it again, or use an earlier epoch's")
         raise ValueError(
-            f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); "
-            "fetch it again, or use an earlier epoch's."
+            f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); {advice}."
         ) from error
+
+
+def _advice(path: object, otherwise: str) -> str:
+    """Return what to do about a file that cannot be read, by what it starts with."""
+    file = Path(str(path))
+    if not file.is_file():
+        return otherwise
+    with file.open("rb") as opened:
+        return fetch_advice(opened.read(100), otherwise.rstrip("."))
 
 
 def read_checked(path: str | Path) -> Checkpoint:
@@ -102,8 +119,8 @@ def read_checked(path: str | Path) -> Checkpoint:
     with refusing(path):
         with torch.serialization.safe_globals(mmengine_globals()):
             checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
-        state = checkpoint.get("state_dict", checkpoint) if isinstance(checkpoint, Mapping) else {}
-        meta = (checkpoint.get("meta") if state is not checkpoint else None) or {}
+        unwrapped = _unwrapped(path, checkpoint)
+        meta = (unwrapped.holder or {}).get("meta") or {}
         if not isinstance(meta, Mapping):
             raise TypeError(f"meta must be a dictionary, got {meta!r:.60}")
         settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
@@ -114,17 +131,13 @@ def read_checked(path: str | Path) -> Checkpoint:
         said = said if isinstance(said, Mapping) else {}
         trained_on = str(said.get("dataset", "")), checked_identity(said.get(SPLIT_LIST))
         calibration = calibration_of(meta)
-        if not isinstance(state, Mapping) or not all(map(_is_weight, state, state.values())):
-            state = {}
+        state = unwrapped.state
         broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
-    if not state:
-        raise ValueError(f"{path} holds no state dict of tensors: give a training checkpoint.")
     if broken:
         raise ValueError(
             f"{path} holds NaN or infinite weights ({listed(broken)}): the training that wrote it "
             "had failed; use an earlier epoch's."
         )
-    state = {key.removeprefix("module."): value for key, value in state.items()}
     return Checkpoint(state, settings, size, signals, trained_on, said, calibration)
 
 
@@ -137,10 +150,22 @@ def _checked_size(size: Any) -> tuple[int, int] | None:
     return tuple(size)
 
 
-def _is_weight(key: Any, value: Any) -> bool:
-    """Whether an entry of a state dict is a weight: a plain tensor under a name."""
-    plain_tensor = isinstance(value, Tensor) and value.layout is torch.strided
-    return isinstance(key, str) and plain_tensor and not (value.is_quantized or value.is_meta)
+def _unwrapped(path: Path, content: Any) -> Unwrapped:
+    """Return the weights of a checkpoint, and say once what else is not used."""
+    try:
+        unwrapped = unwrap(content)
+    except ValueError as error:
+        raise UnfitError(f"{path} {error}.") from error
+    if unwrapped.left_out:
+        _say_left_out(path, tuple(unwrapped.left_out.items()))
+    return unwrapped
+
+
+@cache
+def _say_left_out(path: Path, left_out: tuple[tuple[str, int], ...]) -> None:
+    """Say once what of a checkpoint is not used."""
+    text = ", ".join(f"{count} {what}" for what, count in left_out)
+    print_log(f"{path}: {text} left out")
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:
