@@ -62,9 +62,8 @@ def unwrap(content: Any) -> Unwrapped:
         odd = next(key for key, value in weights.items() if not _is_plain(value))
         raise ValueError(f"holds no state dict of plain tensors: {odd!r:.80} is another kind")
     left_out = {"entries that are no tensors": len(found) - len(weights)}
-    dotted = any("." in key for key in weights)
-    counters = {key for key, value in weights.items() if "." not in key and value.numel() == 1}
-    if dotted:
+    counters = {key for key, value in weights.items() if _is_counter(key, value)}
+    if _is_dotted(weights):
         weights = {key: value for key, value in weights.items() if key not in counters}
         left_out["counters"] = len(counters)
     state = _plain_keys(weights)
@@ -100,6 +99,11 @@ def _is_state(value: Any) -> bool:
 def _is_dotted(value: Mapping[str, Any]) -> bool:
     """Whether the keys are those of a model's parts."""
     return any("." in key for key in value)
+
+
+def _is_counter(key: str, value: Tensor) -> bool:
+    """Whether an entry is one number beside the parts of a model."""
+    return "." not in key and not key.startswith(_AVERAGED) and value.numel() == 1
 
 
 def _is_plain(value: Tensor) -> bool:

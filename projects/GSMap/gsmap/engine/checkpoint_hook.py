@@ -16,6 +16,7 @@ from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.published import load_from_file, load_from_torchvision, load_published
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
+from gsmap.checkpoints.unwrapping import unwrap
 from gsmap.engine.figures import finish_checks
 from gsmap.engine.optimizers import fit_optimizer_state
 from gsmap.engine.run_log import innermost
@@ -93,8 +94,12 @@ class AtomicCheckpointHook(CheckpointHook):
     def after_load_checkpoint(self, runner: Runner, checkpoint: dict) -> None:
         """Drop the text that mmengine would run as a config; check and note the model's origin.
 
-        Of a run that goes on, the optimizer's state is fitted to its groups of parameters.
+        Weights that another training loop wrapped are put where mmengine looks for them. Of a run
+        that goes on, the optimizer's state is fitted to its groups of parameters.
         """
+        state = unwrap(checkpoint).state  # the command has checked the file
+        if state.keys() != checkpoint.get("state_dict", {}).keys():
+            checkpoint["state_dict"] = state
         meta = checkpoint.get("meta", {})
         meta.pop("config", None)
         if "optimizer" in checkpoint and runner._resume:
