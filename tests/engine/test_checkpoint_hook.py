@@ -259,14 +259,15 @@ def test_a_test_tells_results_which_checkpoint_it_is_of_and_how_that_was_calibra
     for meta, address in (({"calibration": calibration}, path), ({}, "https://host/a.pth")):
         loop = Scoring()
         runner = SimpleNamespace(_val_loop=None, _test_loop=loop, _load_from=str(address))
-        AtomicCheckpointHook(interval=1).after_load_checkpoint(runner, {"meta": meta})
+        content = {"state_dict": {"w": torch.ones(1)}, "meta": meta}
+        AtomicCheckpointHook(interval=1).after_load_checkpoint(runner, content)
         said = loop.evaluator.metrics[0].dataset_meta
         assert said["classes"] == ["divider"]
         assert said.get("checkpoint") == (digest(path) if meta else None)
         assert said["calibration"] == meta.get("calibration", {})
     with pytest.raises(ValueError, match="calibration must name a law"):
         AtomicCheckpointHook(interval=1).after_load_checkpoint(
-            runner, {"meta": {"calibration": "x"}}
+            runner, {"model": {"w": torch.ones(1)}, "meta": {"calibration": "x"}}
         )
 
 

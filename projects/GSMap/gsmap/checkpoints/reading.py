@@ -30,7 +30,7 @@ from gsmap.checkpoints.settings import (
     plain,
     scale_steps,
 )
-from gsmap.checkpoints.unwrapping import Unwrapped, unwrap
+from gsmap.checkpoints.unwrapping import UnfitError, Unwrapped, unwrap
 from gsmap.utils.faults import in_words
 from gsmap.utils.files import fetch_advice
 from gsmap.utils.model_facts import calibration_of
@@ -74,17 +74,13 @@ class Checkpoint:
         return identity if own == dataset else ""
 
 
-class UnfitError(ValueError):
-    """A checkpoint is whole, but not one whose weights can be used."""
-
-
 @contextmanager
 def refusing(path: object) -> Iterator[None]:
     """Say in a line which checkpoint cannot be read, and why."""
     try:
         yield
-    except UnfitError:
-        raise
+    except UnfitError as error:
+        raise ValueError(f"{path} {error}.") from error
     except pickle.UnpicklingError as error:
         reason = str(error).split(". ")[0]
         otherwise = f"it is broken, or holds more than tensors and plain data ({reason}); {_REMEDY}"
@@ -152,10 +148,7 @@ def _checked_size(size: Any) -> tuple[int, int] | None:
 
 def _unwrapped(path: Path, content: Any) -> Unwrapped:
     """Return the weights of a checkpoint, and say once what else is not used."""
-    try:
-        unwrapped = unwrap(content)
-    except ValueError as error:
-        raise UnfitError(f"{path} {error}.") from error
+    unwrapped = unwrap(content)
     if unwrapped.left_out:
         _say_left_out(path, tuple(unwrapped.left_out.items()))
     return unwrapped

@@ -17,6 +17,10 @@ _AVERAGED = "ema_"
 _SHOWN = 8  # keys in a message
 
 
+class UnfitError(ValueError):
+    """A checkpoint holds no weights that can be used; the message follows its name."""
+
+
 @dataclass(frozen=True)
 class Unwrapped:
     """Weights without what they were wrapped in.
@@ -44,7 +48,7 @@ def unwrap(content: Any) -> Unwrapped:
         content: What the file holds.
 
     Raises:
-        ValueError: If there are no weights, or two under one key; the message lists the keys.
+        UnfitError: If there are no weights, or two under one key; the message lists the keys.
     """
     found = _find(content, 0)
     if found is None:
@@ -53,14 +57,14 @@ def unwrap(content: Any) -> Unwrapped:
         else:
             names = [key for key in content if isinstance(key, str)]
             keys = f"has the keys {names[:_SHOWN]!r:.300}" if names else "has no key"
-        raise ValueError(
+        raise UnfitError(
             f"holds no state dict of tensors: it {keys}, and weights lie in it as they are, or "
             f"under {', '.join(WRAPPERS)}: give a training checkpoint"
         )
     weights = {key: value for key, value in found.items() if isinstance(value, Tensor)}
     if not all(map(_is_plain, weights.values())):
         odd = next(key for key, value in weights.items() if not _is_plain(value))
-        raise ValueError(f"holds no state dict of plain tensors: {odd!r:.80} is another kind")
+        raise UnfitError(f"holds no state dict of plain tensors: {odd!r:.80} is another kind")
     left_out = {"entries that are no tensors": len(found) - len(weights)}
     counters = {key for key, value in weights.items() if _is_counter(key, value)}
     if _is_dotted(weights):
@@ -121,7 +125,7 @@ def _plain_keys(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     state: dict[str, Tensor] = {}
     for key, value in weights.items():
         if names[key] in state:
-            raise ValueError(
+            raise UnfitError(
                 f"holds two weights under {names[key]!r:.80}, with and without a prefix"
             )
         state[names[key]] = value

@@ -14,6 +14,7 @@ from mmengine.runner import checkpoint as mmengine_checkpoint
 
 from gsmap.checkpoints.convert import listed
 from gsmap.checkpoints.published import load_from_file, load_from_torchvision, load_published
+from gsmap.checkpoints.reading import refusing
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plain
 from gsmap.checkpoints.unwrapping import unwrap
@@ -97,7 +98,8 @@ class AtomicCheckpointHook(CheckpointHook):
         Weights that another training loop wrapped are put where mmengine looks for them. Of a run
         that goes on, the optimizer's state is fitted to its groups of parameters.
         """
-        state = unwrap(checkpoint).state  # the command has checked the file
+        with refusing(runner._load_from):
+            state = unwrap(checkpoint).state
         if state.keys() != checkpoint.get("state_dict", {}).keys():
             checkpoint["state_dict"] = state
         meta = checkpoint.get("meta", {})
