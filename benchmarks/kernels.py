@@ -21,7 +21,7 @@ from gsmap.ops import backends
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.kernel_sampling import sample_kernels
-from gsmap.ops.polyline_raster import draw_polylines
+from gsmap.ops.polyline_raster import draw_polylines, soft_rasters
 from gsmap.ops.raster_loss import raster_loss
 from gsmap.structures.grid import BEVGrid
 
@@ -252,6 +252,25 @@ def raster_cases(reduced: bool) -> Iterator[Case]:
                 gaussians,
                 instances=True,
             )
+        vertices = grid.px_from_metres(lines)
+        for distance in ("squared", "plain"):
+            yield Case(
+                "soft_rasters",
+                f"{count} lines, {distance} distance",
+                lambda backend, vertices, distance=distance: soft_rasters(
+                    vertices, grid.height, grid.width, distance=distance, backend=backend
+                ),
+                (vertices,),
+                instances=True,
+            )
+        yield Case(
+            "draw_polylines",
+            f"{count} lines",
+            lambda backend, lines: draw_polylines(lines, grid, backend=backend),
+            (lines,),
+            instances=True,
+            differentiable=False,
+        )
         targets = draw_polylines(random_polylines(count, grid), grid)
         yield Case(
             "raster_loss",

@@ -197,7 +197,7 @@ def test_compiled_model_keeps_the_gradient():
         ({"polylines": torch.zeros(3, 1, 2)}, "P >= 2"),
         ({"width_m": 0.0}, "width_m must be > 0"),
         ({"filled": torch.zeros(2, dtype=torch.bool)}, r"filled must be bool of shape \(3,\)"),
-        ({"backend": "triton"}, "backend must be one of"),
+        ({"backend": "cuda"}, "backend must be one of"),
         ({"polylines": torch.zeros(3, 4, 2).double(), "backend": "cpu"}, "computes in float32"),
     ],
 )

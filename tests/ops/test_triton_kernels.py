@@ -64,7 +64,18 @@ def call_raster_loss(module):
     module.raster_loss_sums_backward(module.raster_loss_sums(*inputs), *inputs)
 
 
+def call_polyline_raster(module):
+    """As a step of four samples: 360 lines of 20 points, there and back, on 200 x 100 pixels."""
+    flags = torch.zeros(360, dtype=torch.bool)
+    for plain in (False, True):
+        inputs = torch.zeros(360, 40, 2), flags, 200, 100, [2.0, 4.0], plain
+        module.soft_rasters_backward(module.soft_rasters(*inputs), *inputs)
+    frame = [-15.0, -30.0, 0.3, 0.3]
+    module.draw_polylines(torch.zeros(360, 20, 2), flags, 200, 100, frame, 0.3, 0.3)
+
+
 LAUNCHES = {
+    "polyline_raster": call_polyline_raster,
     "raster_loss": call_raster_loss,
     "gaussian_raster": call_render_gaussians,
     "deformable_sampling": call_deformable_sample,

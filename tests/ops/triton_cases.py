@@ -11,6 +11,7 @@ from gsmap.ops import backends
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.ops.kernel_sampling import sample_kernels
+from gsmap.ops.polyline_raster import draw_polylines, soft_rasters
 from gsmap.ops.raster_loss import raster_loss
 from gsmap.structures.grid import BEVGrid
 
@@ -339,3 +340,81 @@ def losses_repeat_bit_by_bit_and_twice(device):
     first = torch.autograd.grad(out.sum(), leaf, retain_graph=True)[0]
     assert torch.equal(first, torch.autograd.grad(out.sum(), leaf)[0])
     assert torch.equal(out, loss(leaf))
+
+
+def random_vertices(count, spread=1.0):
+    """Return six polylines over and around 21 x 33 pixels, and which are polygons."""
+    generator = torch.Generator().manual_seed(0)
+    vertices = torch.rand(6, count, 2, generator=generator) * torch.tensor([40.0, 25.0]) - 3
+    middle = torch.tensor([16.0, 10.0])
+    kinds = torch.tensor([True, False, True, False, False, True])
+    return (vertices - middle) * spread + middle, kinds
+
+
+@case(
+    "soft_rasters",
+    (1, "squared"),
+    (2, "plain"),
+    (9, "squared"),
+    (17, "plain"),  # 34 edges: more than a number has bits
+    (4, "squared", 5.0),  # far off
+    (4, "plain", 1e-2),  # tiny
+    (3, "squared", 0.0),  # single points
+)
+def soft_rasters_equal_float64(device, count, distance, spread=1.0):
+    vertices, kinds = random_vertices(count, spread)
+    upstream = torch.randn(6, 21, 33, generator=torch.Generator().manual_seed(1))
+
+    def render(backend):
+        return lambda v: soft_rasters(
+            v, 21, 33, kinds.to(v.device), distance=distance, backend=backend
+        )
+
+    out, (grad,) = values_and_gradients(render("triton"), [vertices.to(device)], upstream)
+    true, (true_grad,) = values_and_gradients(render("reference"), [vertices.double()], upstream)
+    # the tolerances of the kernels on a CPU: pixels are up to 40 away at a float32 spacing of 4e-6
+    torch.testing.assert_close(out, true.float(), atol=1e-5, rtol=0)
+    assert (grad - true_grad).norm() <= 1e-4 * true_grad.norm()
+
+
+@case("soft_rasters")
+def soft_rasters_of_nothing_and_of_no_numbers(device):
+    empty = torch.zeros(0, 20, 2, device=device, requires_grad=True)
+    masks = soft_rasters(empty, 7, 9, backend="triton")
+    masks.sum().backward()
+    assert masks.shape == (0, 7, 9)
+    assert empty.grad.shape == (0, 20, 2)
+    vertices, kinds = random_vertices(4)
+    vertices[0, 2, 1], vertices[1, 3, 0] = float("nan"), float("inf")
+    out, (grad,) = values_and_gradients(
+        lambda v: soft_rasters(v, 9, 9, kinds.to(device), backend="triton"),
+        [vertices.to(device)],
+        torch.ones(6, 9, 9),
+    )
+    assert out[:2].isnan().all()
+    assert out[2:].isfinite().all()
+    assert grad[:2].isnan().all()
+    assert grad[2:].isfinite().all()
+
+
+@case("draw_polylines", (2, 0.6, 1.0), (9, 0.6, 1.0), (20, 3.0, 1.0), (4, 0.6, 3.0), (3, 0.6, 0.0))
+def drawings_equal_float64(device, count, width_m, spread):
+    grid = BEVGrid((-15, 15), (-30, 30), 41, 33)
+    vertices, filled = random_vertices(count, spread)
+    lines = (vertices - torch.tensor([17.0, 9.5])) * torch.tensor([0.9, 2.8])
+    mask = draw_polylines(lines.to(device), grid, width_m, filled.to(device), backend="triton")
+    exact = draw_polylines(lines.double(), grid, width_m, filled, backend="reference")
+    # pixels are up to 40 m away at a float32 spacing of 4e-6 m, and 1.2 m wide
+    torch.testing.assert_close(mask.cpu(), exact.float(), atol=1e-5, rtol=0)
+
+
+@case("draw_polylines")
+def drawings_of_nothing_and_of_no_numbers(device):
+    grid = BEVGrid((-15, 15), (-30, 30), 9, 5)
+    empty = torch.zeros(0, 20, 2, device=device)
+    assert draw_polylines(empty, grid, backend="triton").shape == (0, 9, 5)
+    lines, _ = random_vertices(4)
+    lines[1, 3, 0] = float("nan")
+    mask = draw_polylines(lines.to(device), grid, backend="triton")
+    assert mask[1].isnan().all()
+    assert mask[[0, 2, 3, 4, 5]].isfinite().all()

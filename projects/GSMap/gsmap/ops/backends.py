@@ -19,11 +19,13 @@ INSTALLED = {backend: find_spec(package) is not None for backend, package in PAC
 # run it and found it equal to the reference. backend="triton" takes any of them.
 TRITON_KERNELS = {
     "deformable_sample": False,
+    "draw_polylines": False,
     "pairwise_soft_iou": True,
     "raster_loss": False,
     "render_gaussians": True,
     "render_gaussians_in_warps": False,  # in place of that of render_gaussians, "triton", too
     "sample_kernels": False,
+    "soft_rasters": False,
 }
 SWITCH = "GSMAP_TRITON_KERNELS"  # environment: further kernels for "auto", with commas, or "all"
 UNORDERED = (

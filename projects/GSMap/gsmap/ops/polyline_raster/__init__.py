@@ -42,7 +42,7 @@ def draw_polylines(
         width_m: Width of a line in metres; AP_raster draws 5 pixels of 0.125 m.
         filled: Which polylines are filled as polygons (to their vertices, without the line's
             width), bool; all are drawn as lines without it. (K,)
-        backend: As in `choose_backend`, without ``"triton"``.
+        backend: As in `choose_backend`.
 
     Raises:
         ValueError: If a shape is wrong, ``width_m`` is not positive or ``backend`` does not serve.
@@ -58,10 +58,11 @@ def draw_polylines(
     dx, dy = grid.pixel_size_m
     half_width_m, pixel_m = width_m / 2, (dx * dy) ** 0.5
     with torch.autocast(polylines.device.type, enabled=False):
-        if choose_backend(backend, polylines, ("cpu",)) == "cpu":
+        backend = choose_backend(backend, polylines, kernel="draw_polylines")
+        if backend != "reference":
             frame = [grid.x_range[0], grid.y_range[0], dx, dy]
             height, width = grid.height, grid.width
-            return _draw(polylines, flags, height, width, frame, half_width_m, pixel_m, "cpu")
+            return _draw(polylines, flags, height, width, frame, half_width_m, pixel_m, backend)
         pixels = grid.pixel_centres(polylines.device, polylines.dtype)
         return draw_reference(polylines, flags, pixels, half_width_m, pixel_m)
 
@@ -92,7 +93,7 @@ def soft_rasters(
         polygon_softness: :math:`\tau` of polygons, in the unit of D.
         distance: ``"squared"``: D in square pixels, as in MapVR's released rasterizer; ``"plain"``:
             D in pixels, as in its equations.
-        backend: As in `choose_backend`, without ``"triton"``.
+        backend: As in `choose_backend`.
 
     Raises:
         ValueError: If a shape is wrong, a softness is not positive, ``distance`` is unknown or
@@ -114,8 +115,9 @@ def soft_rasters(
         stay = vertices[:, -1:].expand_as(vertices)  # a polygon's ring is padded by its last corner
         rings = torch.cat([vertices, torch.where(flags[:, None, None], stay, back)], 1)
         softness = [line_softness, polygon_softness]
-        if choose_backend(backend, rings, ("cpu",)) == "cpu":
-            return _soft_rasters(rings, flags, height, width, softness, plain, "cpu")
+        backend = choose_backend(backend, rings, kernel="soft_rasters")
+        if backend != "reference":
+            return _soft_rasters(rings, flags, height, width, softness, plain, backend)
         return soft_rasters_reference(rings, flags, height, width, softness, plain)
 
 
