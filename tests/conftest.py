@@ -6,10 +6,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 import gsmap  # noqa: F401 - before mmcv.ops, which may need its stand-in
 
 REPO = Path(__file__).resolve().parents[1]
+
+# The same examples each time, however slow the machine is
+settings.register_profile(
+    "steady", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("steady")
 
 TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
 STATM = Path("/proc/self/statm")

@@ -2,9 +2,11 @@
 
 import os
 import runpy
+import socket
 import subprocess
 import sys
 import tempfile
+import time
 import traceback
 from collections.abc import Callable
 from io import FileIO, TextIOWrapper
@@ -12,6 +14,25 @@ from pathlib import Path
 from typing import Any
 
 REPO = Path(__file__).resolve().parents[1]
+_held: list[socket.socket] = []  # keeps ports from being handed out again
+
+
+def free_port() -> int:
+    """Return a port of this machine that nobody has, and nobody else is given meanwhile.
+
+    A server that sets ``SO_REUSEADDR``, as torch's store does, can listen on it.
+    """
+    probe = socket.socket()
+    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    probe.bind(("127.0.0.1", 0))
+    _held.append(probe)
+    return int(probe.getsockname()[1])
+
+
+def search_path(*folders: object) -> dict[str, str]:
+    """Return the variable that has new processes import from folders, and from `tests`."""
+    paths = [*map(str, folders), str(REPO / "tests"), os.environ.get("PYTHONPATH", "")]
+    return {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
 def run_python(*words: object, env: Any = None, **options: Any) -> subprocess.CompletedProcess:
@@ -21,6 +42,13 @@ def run_python(*words: object, env: Any = None, **options: Any) -> subprocess.Co
         **{"cwd": REPO, "capture_output": True, "text": True, "check": False, **options},
         env={**os.environ, **(env or {})},
     )
+
+
+def wait_for(file: Path, process: subprocess.Popen) -> None:
+    """Wait until a process has made a file; an error, with what it said, if it ends before."""
+    while not file.exists():
+        assert process.poll() is None, process.stdout and process.stdout.read()[-3000:]
+        time.sleep(0.02)
 
 
 def run_tool(*words: object) -> subprocess.CompletedProcess:

@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from gsmap.datasets.annotations.record import CLASSES
@@ -134,7 +135,11 @@ class Step:
         started = time.monotonic()
         environment = {**os.environ, "PYTHON": sys.executable}
         status = subprocess.run(
-            command, cwd=shipped(), env=environment, check=False, preexec_fn=die_with_parent
+            command,
+            cwd=shipped(),
+            env=environment,
+            check=False,
+            preexec_fn=partial(die_with_parent, os.getpid()),
         ).returncode
         missing = [str(product) for product in self.products if not product.exists()]
         if status or missing:

@@ -1,56 +1,52 @@
 import argparse
-import os
 import platform
-import sys
 import time
 
 import pytest
 import torch
-from processes import run_python
 
 from benchmarks import raster
-from benchmarks.measure import Cost, markdown_table, measure
+from benchmarks.measure import MIB, Cost, in_own_process, markdown_table, measure
 from gsmap.structures.grid import BEVGrid
 
 CPU = torch.device("cpu")
 needs_proc = pytest.mark.skipif(platform.system() != "Linux", reason="reads /proc")
 
 
-PEAKS = """
-import torch
-from benchmarks.measure import MIB, measure
-
-def one_after_the_other():
+def one_after_the_other() -> None:
     for _ in range(2):
-        torch.ones(16 * MIB)
+        torch.ones(64 * MIB)
 
-def together():
-    return torch.ones(16 * MIB), torch.ones(16 * MIB)
 
-for function in (one_after_the_other, together):
-    print(measure(function, torch.device("cpu"), 1).peak_bytes / MIB)
-"""
+def together() -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.ones(64 * MIB), torch.ones(64 * MIB)
+
+
+def wait() -> None:
+    time.sleep(0.5)
 
 
 @needs_proc
 def test_peak_is_what_a_call_had_in_use_at_once():
-    """Two tensors of 64 MiB, one after the other: 64 MiB; both kept: 128 MiB.
+    """Two tensors of 256 MiB, one after the other: 256 MiB; both kept: 512 MiB.
 
     In a process of its own: what ran before decides whether freed pages go back at once.
     """
-    paths = {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = run_python("-c", PEAKS, env=paths, check=True)
-    one, two = (float(line) for line in done.stdout.split())
-    # pages that the process touches beside the tensors: a few MiB
-    assert abs(one - 64) < 8
-    assert abs(two - 128) < 8
+    one, two = (
+        in_own_process(measure, function, CPU, 1).peak_bytes / MIB
+        for function in (one_after_the_other, together)
+    )
+    # beside the tensors: pages that the process touches, and Linux counts pages in lumps
+    assert abs(one - 256) < 64
+    assert abs(two - 512) < 64
 
 
 @needs_proc
 def test_waiting_takes_wall_time_and_no_processor_time():
-    cost = measure(lambda: time.sleep(0.05), CPU, 2)
-    assert cost.wall_s >= 0.05
-    assert cost.cpu_s < 0.04
+    """In a process of its own, whose other threads have nothing to do."""
+    cost = in_own_process(measure, wait, CPU, 2)
+    assert cost.wall_s >= 0.5
+    assert cost.cpu_s < 0.4
     assert cost.time_s(CPU) == cost.cpu_s
 
 

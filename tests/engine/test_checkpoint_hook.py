@@ -4,7 +4,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,6 +22,7 @@ import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.reading import read_checked
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.engine.checkpoint_hook import AtomicCheckpointHook, AtomicLocalBackend
+from gsmap.utils.files import SUFFIX
 from gsmap.utils.shards import digest
 
 
@@ -148,7 +148,8 @@ def test_a_killed_writer_leaves_the_old_file_whole(tmp_path):
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as writer:
         assert writer.stdout.readline() == b"ready\n"
-        time.sleep(0.3)  # long enough to be in the middle of one of the writes
+        while not list(tmp_path.glob(f"*{SUFFIX}")):  # in the middle of one of the writes
+            assert writer.poll() is None
         writer.send_signal(signal.SIGKILL)
     content = path.read_bytes()
     assert content in (b"whole", b"whole" * 20_000_000)

@@ -42,7 +42,7 @@ def maps(draw: st.DrawFn) -> MapElements:
 
 
 @given(gt=maps())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_ground_truth_as_prediction_gives_one(gt):
     metrics = score([(gt, gt)])
     for key in AP_KEYS:
@@ -51,7 +51,7 @@ def test_ground_truth_as_prediction_gives_one(gt):
 
 
 @given(gt=maps())
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_moved_by_a_hundred_metres_gives_zero(gt):
     moved = MapElements.from_polylines(
         [p + np.array([100.0, 0.0]) for p in gt.polylines], gt.labels, gt.scores
@@ -62,7 +62,7 @@ def test_moved_by_a_hundred_metres_gives_zero(gt):
 
 
 @given(pred=maps(), gt=maps(), turn=st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_reversing_lines_and_rings_changes_nothing(pred, gt, turn):
     flip = np.random.default_rng(turn).integers(2, size=len(pred)).astype(bool)
     lines = [p[::-1] if f else p for p, f in zip(pred.polylines, flip, strict=True)]
@@ -73,7 +73,7 @@ def test_reversing_lines_and_rings_changes_nothing(pred, gt, turn):
 
 
 @given(pred=maps(), gt=maps(), label=st.integers(0, 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_miss_below_all_scores_never_raises_ap(pred, gt, label):
     far = [[90.0, 0.0], [95.0, 5.0], [90.0, 5.0]]
     scores = np.append(pred.scores, 0.1)
@@ -85,7 +85,7 @@ def test_a_miss_below_all_scores_never_raises_ap(pred, gt, label):
 
 
 @given(pred=maps(), gt=maps())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_order_of_elements_and_samples_changes_no_digit(pred, gt):
     order = np.arange(len(pred))[::-1]
     frames = [(pred, gt), (gt, pred), (gt, gt)]

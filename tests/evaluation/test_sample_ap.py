@@ -235,7 +235,7 @@ def test_figures_equal_a_plain_implementation(seed):
 
 
 @given(seed=st.integers(0, 2**32 - 1), rows=st.integers(1, 40), columns=st.integers(1, 40))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_distances_equal_those_of_all_pairs_of_pixels(seed, rows, columns):
     rng = np.random.default_rng(seed)
     found, true = np.where(
@@ -256,7 +256,7 @@ def test_distances_equal_those_of_all_pairs_of_pixels(seed, rows, columns):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_looser_thresholds_and_the_truth_itself(seed):
     rng = np.random.default_rng(seed)
     truth = random_map(rng, 6, False)

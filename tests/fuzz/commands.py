@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 from mmdet3d.registry import MODELS
-from processes import REPO
+from processes import REPO, free_port
 
 import gsmap.registered  # noqa: F401
 import tools.build_map
@@ -135,7 +135,7 @@ class Data:
                 "create_data", "check", self.annotations, "--data-root", self.root, "--workers", 2
             ),
             "train, two ranks": command(
-                "gsmap.engine.torchrun", "--nproc_per_node=2", "--master_port=29615",
+                "gsmap.engine.torchrun", "--nproc_per_node=2", f"--master_port={free_port()}",
                 "tools/train.py", self.config, "--launcher", "pytorch", "--work-dir", out,
                 "--cfg-options", "train_dataloader.num_workers=2", "train_cfg.max_epochs=5000",
                 "train_dataloader.persistent_workers=True", "train_cfg.val_interval=5000",

@@ -30,7 +30,7 @@ BUILT = {  # settings that do nothing if mmengine builds them
 
 def read_all(reader: str, folder: Path) -> dict[str, str]:
     """Read every file of a folder in one process; how each ended, by its name."""
-    done = run_python(SCRIPT, reader, folder, timeout=120)
+    done = run_python(SCRIPT, reader, folder)
     assert done.returncode == 0, f"{done.stdout[-300:]}\n{done.stderr[-2000:]}"
     return dict(line.split(": ", 1) for line in done.stdout.splitlines())
 

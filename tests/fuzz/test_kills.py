@@ -117,6 +117,7 @@ def test_two_conversions_at_once_make_what_one_makes(minicity_root, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # several trainings
 def test_commands_that_are_killed_leave_what_they_leave_unkilled(
     minicity_root, minicity_annotations, tiny_config
 ):

@@ -51,13 +51,11 @@ def interrupt(command: list[str], ready: Callable[[int], bool]) -> subprocess.Co
         # a job in the background ignores Ctrl-C, and hands that on to what it starts
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    deadline = time.monotonic() + 120
     while not ready(process.pid):
         assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate()
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
@@ -79,16 +77,16 @@ def test_ctrl_c_while_workers_render_leaves_nothing_half_written(tmp_path):
 
 
 def has_starting_worker(pid: int) -> bool:
-    """Whether a worker is in the midst of its imports, which take seconds."""
+    """Whether a worker is in the midst of its imports, which take seconds: it has NumPy."""
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     try:
-        commands = [Path(f"/proc/{child}/cmdline").read_text() for child in children]
+        return any(
+            "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()
+            and "/numpy/" in Path(f"/proc/{child}/maps").read_text()
+            for child in children
+        )
     except OSError:  # one of them has just ended
         return False
-    if not any("spawn_main" in command for command in commands):
-        return False
-    time.sleep(0.5)
-    return True
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")

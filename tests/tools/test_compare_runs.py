@@ -11,7 +11,8 @@ import time
 from pathlib import Path
 
 import pytest
-from processes import run_python
+from processes import run_python, search_path, wait_for
+from waiting import waiting_config
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -42,23 +43,23 @@ def ranks(folder: Path) -> list[int]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # several trainings
 def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_config, tmp_path):
-    words = ["tools/compare.py", f"good={tiny_config}", "--seeds", "1"]
+    config, waits = waiting_config(tiny_config, tmp_path)
+    words = ["tools/compare.py", f"good={config}", "--seeds", "1"]
     words += ["--budget", "2", "--batch", "2", "--out", str(tmp_path)]
-    threads = {"OMP_NUM_THREADS": "1"}
+    threads = {"OMP_NUM_THREADS": "1", **search_path()}
     folder = tmp_path / "good/seed_0"
     command = [sys.executable, *words]
     with subprocess.Popen(command, cwd=REPO, env={**os.environ, **threads}) as comparison:
-        while not (folder / "epoch_1.pth").exists() and comparison.poll() is None:
-            time.sleep(0.02)
+        wait_for(folder / "epoch_1.pth", comparison)
         comparison.send_signal(signal.SIGKILL)
-    assert comparison.returncode == -signal.SIGKILL, "it ended before it could be killed"
-    end = time.monotonic() + 20
-    while (ranks(folder) or not free(folder)) and time.monotonic() < end:
+    assert comparison.returncode == -signal.SIGKILL
+    while ranks(folder) or not free(folder):  # training dies with it
         time.sleep(0.05)
-    assert not ranks(folder)  # training died with it
+    waits.unlink()
 
-    bad = f"bad={tiny_config},optim_wrapper.optimizer.lr=-1.0"
+    bad = f"bad={config},optim_wrapper.optimizer.lr=-1.0"
     done = run_python(*words[:2], bad, *words[2:], env=threads)
     assert done.returncode == 2
     assert "error: bad/seed_0 did not end" in done.stderr

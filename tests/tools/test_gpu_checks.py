@@ -11,6 +11,7 @@ REPO = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # several trainings
 def test_every_part_runs_and_is_written_down(tmp_path):
     results = tmp_path / "gpu.md"
     environment = {**os.environ, "PYTHON": sys.executable, "RESULTS": str(results), "REDUCED": "1"}

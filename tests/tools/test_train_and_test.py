@@ -6,14 +6,14 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 import torch
 from mmengine.runner import FlexibleRunner
-from processes import run_tool
+from processes import free_port, run_tool, search_path, wait_for
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from waiting import waiting_config
 
 from gsmap.checkpoints.reading import read_checked
 from tools.train import main as train
@@ -23,7 +23,8 @@ DIST_TRAIN = "tools/dist_train.sh"
 
 
 def environment() -> dict[str, str]:
-    return {**os.environ, "OMP_NUM_THREADS": "1", "PYTHON": sys.executable, "PORT": "29613"}
+    own = {"OMP_NUM_THREADS": "1", "PYTHON": sys.executable, "PORT": str(free_port())}
+    return {**os.environ, **own, **search_path()}
 
 
 def run(*command: object) -> str:
@@ -47,24 +48,18 @@ def use(*words: object) -> str:
 def trained(tiny_config, tmp_path_factory) -> Path:
     """The work folder of a run that was killed with SIGKILL after its first epoch, then resumed."""
     work = tmp_path_factory.mktemp("work")
-    command = [
-        sys.executable,
-        "tools/train.py",
-        str(tiny_config),
-        "--work-dir",
-        str(work),
-        "--resume",
-    ]
+    leaf, waits = waiting_config(tiny_config, tmp_path_factory.mktemp("leaf"))
+    command = ["tools/train.py", str(leaf), "--work-dir", str(work), "--resume"]
     with subprocess.Popen(
-        command, cwd=REPO, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT
-    ) as training:
-        last = work / "last_checkpoint"
-        while not last.exists() and training.poll() is None:
-            time.sleep(0.02)
+        [sys.executable, *command], cwd=REPO, env=environment(), text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    ) as training:  # fmt: skip
+        wait_for(work / "last_checkpoint", training)
         training.send_signal(signal.SIGKILL)
-    assert training.returncode == -signal.SIGKILL, "the run ended before it could be killed"
-    (work / "killed_after").write_text(Path(last.read_text()).name)
-    (work / "resumed.log").write_text(use(*command[1:]))
+    assert training.returncode == -signal.SIGKILL
+    waits.unlink()
+    (work / "killed_after").write_text(Path((work / "last_checkpoint").read_text()).name)
+    (work / "resumed.log").write_text(use(*command))
     return work
 
 
@@ -306,10 +301,9 @@ run_command(command, heed_kill=False)
 
 def end(*command: object, path: Path) -> tuple[int, list[str]]:
     """Run a command that must fail; return its exit code and the lines that it said."""
-    paths = os.pathsep.join([str(path), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
-        [str(part) for part in command], cwd=REPO, env=environment() | {"PYTHONPATH": paths},
-        text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False, timeout=300,
+        [str(part) for part in command], cwd=REPO, env=environment() | search_path(path),
+        text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
     )  # fmt: skip
     return done.returncode, done.stdout.splitlines()
 

@@ -193,31 +193,35 @@ def test_impatience_does_not_cut_the_clean_up_off(tmp_path):
     """Ctrl-C, five times: the half-written file goes all the same, and there is one line."""
     program = f"""
 import os, signal, time
-from gsmap.utils.cli import run_command
+from gsmap.utils import cli
 from gsmap.utils.files import atomic_write
+cli.CLEAN_UP_S = 600.0
 signal.signal(signal.SIGINT, signal.default_int_handler)  # these tests may run in the background
 unlink = os.unlink
 def slowly(path):
     print("cleaning", flush=True)
-    time.sleep(0.5)
+    input()
     unlink(path)
 os.unlink = slowly
 def command():
     with atomic_write({str(tmp_path / "a")!r}):
         print("ready", flush=True)
-        time.sleep(60)
-run_command(command)
+        while True:
+            time.sleep(0.05)
+cli.run_command(command)
 """
     with subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
         assert process.stdout.readline() == b"ready\n"
         process.send_signal(signal.SIGINT)
         assert process.stdout.readline() == b"cleaning\n"
         for _ in range(4):
             process.send_signal(signal.SIGINT)
-        assert process.wait() == 130
-        assert process.stderr.read() == b"interrupted: nothing half-written is left\n"
+        _, said = process.communicate(b"done\n")
+        assert process.returncode == 130
+        assert said == b"interrupted: nothing half-written is left\n"
     assert os.listdir(tmp_path) == []
 
 
@@ -230,7 +234,8 @@ from gsmap.utils.files import atomic_write
 def command():
     with atomic_write({str(tmp_path / "a")!r}):
         print("ready", flush=True)
-        time.sleep(60)
+        while True:
+            time.sleep(0.05)
 run_command(command, heed_kill={heed_kill})
 """
     with subprocess.Popen(
@@ -271,10 +276,11 @@ from gsmap.utils.cli import run_command
 signal.signal(signal.SIGINT, signal.default_int_handler)  # these tests may run in the background
 def command():
     if os.fork() == 0:
-        time.sleep(1)
-        os._exit(0)
+        while True:
+            signal.pause()  # it dies with its parent
     print("ready", flush=True)  # by the parent: Python ignores what is raised at the end of a fork
-    time.sleep(60)
+    while True:
+        time.sleep(0.05)
 run_command(command, heed_kill=False)
 """
     for rank, said in (("0", b"interrupted: nothing half-written is left\n"), ("1", b"")):

@@ -6,7 +6,6 @@ import signal
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -71,13 +70,13 @@ def test_an_exception_keeps_the_old_file_and_leaves_nothing_behind(error, tmp_pa
 
 
 WRITES = """
-import platform, sys, time
+import platform, signal, sys
 from gsmap.utils.files import atomic_write
 platform.node = lambda: "same"  # as in containers
 with atomic_write(sys.argv[1]) as file:
     file.write("half")
     print("ready", flush=True)
-    time.sleep(60)
+    signal.pause()
 """
 
 
@@ -172,8 +171,7 @@ def test_a_folder_is_for_one_process_and_says_whose(tmp_path):
         worker = os.fork()  # one that outlives the block
         if worker == 0:
             os.write(says, b"started")
-            time.sleep(60)
-            os._exit(0)
+            signal.pause()
         who = f"new is in use by process {os.getpid()} on"
         with pytest.raises(RuntimeError, match=rf"{who} \S+ since 20[\d: -]+: wait."):
             lock_folder(here, ".lock", "wait")

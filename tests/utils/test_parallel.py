@@ -26,16 +26,17 @@ def die(value: int) -> int:
     os._exit(value)
 
 
-def hang(value: int) -> int:
-    time.sleep(30 * value)
-    return value
+def hang(_: int) -> None:
+    while True:
+        time.sleep(0.05)
 
 
 def write_and_wait(path: Path) -> None:
     """Stand for a task that writes for long, and cleans up after itself."""
     try:
         path.write_text("half")
-        time.sleep(60)
+        while True:
+            time.sleep(0.05)
     finally:
         path.unlink()
 
@@ -71,22 +72,18 @@ def test_tasks_are_drawn_as_needed():
 def test_a_dead_worker_and_a_hung_one_end_with_words():
     with pytest.raises(RuntimeError, match=r"died.*fewer --workers"):
         list(ordered_map(die, [1], 2))
-    start = time.monotonic()
     with pytest.raises(RuntimeError, match=r"more than 2 s"):
         list(ordered_map(hang, [1], 2, timeout_s=2))
-    assert time.monotonic() - start < 15
     with pytest.raises(ValueError, match="workers"):
         list(ordered_map(hang, [1], 0))
 
 
 def test_what_ends_early_stops_the_tasks_under_way_through_their_clean_up(tmp_path):
-    started = time.monotonic()
     tasks = [tmp_path / str(number) for number in range(8)]
     results = ordered_map(fail_once_others_write, reversed(tasks[:2]), 2)
     with pytest.raises(ValueError, match="bad"):
         next(results)
     assert list(tmp_path.iterdir()) == []
-    assert time.monotonic() - started < 50
 
 
 def test_the_function_may_carry_more_than_a_pipe_takes():
@@ -101,7 +98,7 @@ def test_a_program_that_cannot_be_imported_anew_ends_in_words():
         "from gsmap.utils.parallel import ordered_map\n"
         "print(list(ordered_map(functools.partial(operator.contains, bytes(10**6)), [1, 2], 2)))"
     )
-    done = run_python("-", input=program, timeout=60)
+    done = run_python("-", input=program)
     assert done.returncode == 1
     assert "RuntimeError: a worker process died" in done.stderr
 
@@ -110,20 +107,44 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path):
     """They hold its output open, so it ends when the last of them has."""
     program = tmp_path / "program.py"
     program.write_text(
-        "import functools, os, time\n"
+        "import functools, os, signal\n"
         "from gsmap.utils.parallel import ordered_map\n"
         "if __name__ == '__main__':\n"
         "    say = functools.partial(os.write, 1)  # a line in one piece, print may do it in two\n"
         "    results = ordered_map(say, [b'ready\\n', b'ready\\n'], 2)\n"
         "    next(results)\n"
-        "    time.sleep(60)\n"
+        "    signal.pause()\n"
     )
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE) as parent:
         assert parent.stdout.readline() == b"ready\n"
         parent.send_signal(signal.SIGKILL)
-        started = time.monotonic()
-        parent.stdout.read()
-    assert time.monotonic() - started < 30
+        assert parent.stdout.read() in (b"", b"ready\n")
+
+
+ORPHAN = """
+import os, signal, sys, time
+from gsmap.utils.cli import run_command
+
+def until_the_parent_is_dead():
+    while os.getppid() == parent:
+        time.sleep(0.01)
+
+def command():
+    if os.fork() == 0:
+        print("alive", flush=True)
+        while True:
+            time.sleep(1)
+    os._exit(0)
+
+parent = os.getpid()
+os.register_at_fork(after_in_child=until_the_parent_is_dead)
+run_command(command)
+"""
+
+
+def test_a_fork_dies_also_if_its_parent_died_before_it_could_ask_for_that():
+    """It holds the output open, so this ends when it has."""
+    assert run_python("-c", ORPHAN).stdout == ""
 
 
 def test_a_signal_that_another_thread_is_given_waits_until_processes_have_started():

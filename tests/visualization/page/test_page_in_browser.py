@@ -26,12 +26,14 @@ ARGUMENTS = [
     "--headless=new",
     "--no-sandbox",
     "--disable-gpu",
+    "--disable-dev-shm-usage",  # containers have 64 MB of it
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
     "--no-first-run",
     "--window-size=1400,900",
 ]
+WAIT_S = 600  # as long as a test may take
 
 
 @pytest.fixture(scope="module")
@@ -85,13 +87,13 @@ def until_drawn(browser):
     """Scroll to the small maps and wait until they are drawn."""
     browser.execute_script("document.getElementById('grid').scrollIntoView()")
     drawn = (By.CSS_SELECTOR, ".card svg")
-    WebDriverWait(browser, 20).until(lambda found: len(found.find_elements(*drawn)) == FRAMES)
+    WebDriverWait(browser, WAIT_S).until(lambda found: len(found.find_elements(*drawn)) == FRAMES)
 
 
 def until_position(browser, position):
     """Wait for the frame at a position, counted from 1; 0 is the overview."""
     wanted = f"{position} of {FRAMES}" if position else ""
-    WebDriverWait(browser, 20).until(lambda found: text(found, "#position") == wanted)
+    WebDriverWait(browser, WAIT_S).until(lambda found: text(found, "#position") == wanted)
 
 
 def open_frame(browser, index):
@@ -230,11 +232,11 @@ def test_small_maps_are_drawn_when_they_come_near(browser, page):
     write_page(page.with_name("many.html"), data | {"frames": 60 * data["frames"]})
     browser.get(page.with_name("many.html").as_uri())
     drawn = "return document.querySelectorAll('.card svg').length"
-    WebDriverWait(browser, 20).until(lambda found: found.execute_script(drawn))
+    WebDriverWait(browser, WAIT_S).until(lambda found: found.execute_script(drawn))
     assert browser.execute_script(drawn) < 30 * FRAMES
     browser.execute_script("document.querySelector('.card:last-child').scrollIntoView()")
     last = (By.CSS_SELECTOR, ".card:last-child svg")
-    WebDriverWait(browser, 20).until(lambda found: found.find_elements(*last))
+    WebDriverWait(browser, WAIT_S).until(lambda found: found.find_elements(*last))
 
 
 def test_the_first_screen_has_the_best_typical_and_worst_frame(opened):

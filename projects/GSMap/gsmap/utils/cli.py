@@ -16,7 +16,7 @@ from typing import Any
 
 from gsmap.utils.faults import in_words
 from gsmap.utils.inputs import declare_files, inputs_kept
-from gsmap.utils.parallel import die_with_parent
+from gsmap.utils.parallel import have_forks_die_too
 from gsmap.utils.terminal import print_safely
 
 BAD_INPUT = 2  # exit code, as argparse's for bad arguments
@@ -100,7 +100,7 @@ def run_command(command: Callable[[], str | None], heed_kill: bool = True) -> No
     threading.excepthook = _end_of_thread
     end = _End()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
-    os.register_at_fork(after_in_child=die_with_parent)
+    have_forks_die_too()
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background
         signal.signal(signal.SIGINT, end)
     signal.signal(signal.SIGTERM, end if heed_kill else signal.SIG_DFL)

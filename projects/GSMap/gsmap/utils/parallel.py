@@ -28,11 +28,21 @@ def default_workers() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def die_with_parent(parent: int | None = None) -> None:
+def die_with_parent(parent: int) -> None:
     """Have Linux kill this process when its parent, of that number, dies, however it dies."""
     _PRCTL(1, signal.SIGKILL)
-    if parent is not None and os.getppid() != parent:  # it is dead already
+    if os.getppid() != parent:  # it is dead already
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def have_forks_die_too() -> None:
+    """Have every process that this one forks, and every one that those fork, die with it."""
+    parent = [0]
+
+    def note() -> None:
+        parent[0] = os.getpid()
+
+    os.register_at_fork(before=note, after_in_child=lambda: die_with_parent(parent[0]))
 
 
 class _Worker:

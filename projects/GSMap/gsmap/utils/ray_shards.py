@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from gsmap.utils.extras import import_extra
@@ -79,7 +80,7 @@ def _make(words: Sequence[str], shard: str, folder: str) -> tuple[str, float]:
         capture_output=True,
         text=True,
         errors="replace",
-        preexec_fn=die_with_parent,
+        preexec_fn=partial(die_with_parent, os.getpid()),
     )
     if ended.returncode < 0 or ended.returncode >= 128:
         raise ShardKilledError(f"shard {shard} was killed: exit code {ended.returncode}")
