@@ -7,6 +7,9 @@ Examples:
         --formats geojson osm rrd mcap --origin 48.26 11.67
 """
 
+import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+
+# isort: split
 import argparse
 import json
 import time

@@ -13,6 +13,9 @@ Examples:
     python tools/compare.py --list --tables 'MapVR Table 5*'
 """
 
+import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+
+# isort: split
 import argparse
 import shlex
 import sys

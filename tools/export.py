@@ -8,6 +8,9 @@ Examples:
 The config sets the cameras. The image size is that of its test samples, or ``--size``.
 """
 
+import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+
+# isort: split
 import argparse
 import logging
 import tempfile

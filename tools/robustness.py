@@ -8,6 +8,9 @@ Example:
     python tools/robustness.py gsmap_r18_minicity --data-root data/minicity --samples 50 --out r
 """
 
+import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+
+# isort: split
 import argparse
 import json
 from pathlib import Path

@@ -4,6 +4,9 @@
 Or give the name of a model that ships: ``python tools/test.py gsmap_r18_minicity``.
 """
 
+import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+
+# isort: split
 import argparse
 import json
 from pathlib import Path
@@ -12,8 +15,9 @@ from mmengine.config import Config
 
 from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.engine.arguments import add_common_arguments
-from gsmap.utils.cli import CommandParser, is_first_rank, output_file, run_command
+from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import write_text
+from gsmap.utils.interrupt import is_first_rank
 
 
 def parse_args() -> argparse.Namespace:

@@ -1,6 +1,9 @@
 #!/usr/bin/env python
 """Train a model: ``python tools/train.py CONFIG``."""
 
+import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+
+# isort: split
 import argparse
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -9,8 +12,9 @@ from mmengine.config import Config
 
 from gsmap.checkpoints.named_models import find_checkpoint
 from gsmap.engine.arguments import add_common_arguments
-from gsmap.utils.cli import CommandParser, is_first_rank, run_command
+from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import lock_folder
+from gsmap.utils.interrupt import is_first_rank
 
 
 def parse_args() -> argparse.Namespace:

@@ -5,6 +5,9 @@ Plugins of other packages are left out. The plugin of open3d, which mmdet3d inst
 usual command on machines without libusb.
 """
 
+import gsmap  # noqa: F401 - first: Ctrl-C is one line from here on, foreign settings are kept out
+
+# isort: split
 from absl import app
 from tensorboard import default, main_lib, program
 from tensorboard.plugins.base_plugin import FlagsError

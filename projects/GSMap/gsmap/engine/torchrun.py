@@ -9,6 +9,11 @@ import signal
 import sys
 from typing import Any
 
+from gsmap.utils.interrupt import leave_at_once_on_ctrl_c
+
+if __name__ == "__main__":
+    leave_at_once_on_ctrl_c()  # until torchrun's own answer, the import of torch takes seconds
+# isort: split
 from torch.distributed.elastic.multiprocessing.api import SignalException, SubprocessContext
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError, ProcessFailure
 from torch.distributed.run import main

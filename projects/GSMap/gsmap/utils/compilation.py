@@ -4,7 +4,7 @@ import logging
 
 from numba.core import event
 
-from gsmap.utils.cli import is_first_rank
+from gsmap.utils.interrupt import is_first_rank
 
 
 class CompilationNotice(event.Listener):

@@ -5,12 +5,14 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, TimeoutError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import util
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -20,7 +22,22 @@ from gsmap.utils.faults import in_words
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 LAUNCHER = "GSMAP_LAUNCHER"  # variable with the number of torchrun's process, for its ranks
+_interpreter_flags = util._args_from_interpreter_flags  # type: ignore[attr-defined]
 _PRCTL = ctypes.CDLL(None).prctl  # found before a fork, which may happen within a lock
+
+
+def _safe_interpreter_flags() -> list[str]:
+    """Return options for Python processes that take no code from the working folder.
+
+    They are started with ``-c``, which puts that folder first on their search path until they have
+    been sent that of their parent.
+    """
+    safe = "-P" if sys.version_info >= (3, 11) else "-I"
+    flags = _interpreter_flags()
+    return flags if safe in flags else [*flags, safe]
+
+
+util._args_from_interpreter_flags = _safe_interpreter_flags  # type: ignore[attr-defined]
 
 
 def default_workers() -> int:

@@ -1,0 +1,171 @@
+"""No Ctrl-C and no ``kill`` is lost, and each is one line, from the first imports on."""
+
+import pytest
+from processes import REPO, run_python
+
+LINE = "interrupted: nothing half-written is left\n"
+LOST = """
+import ctypes, os, signal, sys, time
+from importlib.machinery import ExtensionFileLoader
+from gsmap.utils.cli import run_command
+
+number = signal.{name}
+signal.signal(signal.SIGINT, signal.default_int_handler)  # these tests may run in the background
+
+class Finalized:
+    def __del__(self):
+        signal.raise_signal(number)
+
+class Extension(ExtensionFileLoader):
+    def exec_module(self, module):
+        signal.raise_signal(number)
+        os.write(1, b"whole ")
+
+def in_a_finalizer():
+    Finalized()
+
+def in_c():
+    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
+
+def after_a_fork():
+    os.register_at_fork(after_in_parent=lambda: signal.raise_signal(number))
+    if os.fork() == 0:
+        os._exit(0)
+
+def by_a_library():
+    try:
+        signal.raise_signal(number)
+    except BaseException:
+        pass
+
+def by_a_generator():
+    def values():
+        try:
+            yield 1
+        finally:
+            signal.raise_signal(number)
+    next(values())
+
+def while_an_extension_starts():
+    Extension("a", "a.so").exec_module(None)
+
+def command():
+    {how}()
+    os.write(1, b"went on")
+    while {waits}:
+        time.sleep(0.01)
+
+run_command(command)
+"""
+WAYS = (
+    "in_a_finalizer", "in_c", "after_a_fork", "by_a_library", "by_a_generator",
+    "while_an_extension_starts",
+)  # fmt: skip
+
+
+def end(how: str, name: str, waits: bool) -> tuple[int, str, str]:
+    done = run_python("-c", LOST.format(how=how, name=name, waits=waits))
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("how", WAYS)
+def test_a_signal_whose_exception_is_dropped_is_sent_again(how):
+    wanted = "whole went on" if "extension" in how else "went on"
+    assert end(how, "SIGINT", True) == (130, wanted, LINE)
+    assert end(how, "SIGTERM", True) == (143, wanted, "")
+
+
+def test_a_signal_that_was_dropped_counts_also_if_the_command_ends_in_peace():
+    assert end("by_a_library", "SIGINT", False) == (130, "went on", LINE)
+    assert end("by_a_library", "SIGTERM", False) == (143, "went on", "")
+
+
+FOLLOWS = """
+import signal
+from gsmap.utils.cli import run_command
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+def command():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt as error:
+        raise {raised}
+
+run_command(command)
+"""
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "said"),
+    [
+        ("ImportError('numpy.core.multiarray failed to import') from error", 130, LINE),
+        ("SystemError('initialization of _C raised unreported exception')", 130, LINE),
+        ("OSError(5, 'Input/output error', 'a.json')", 2, "error: [Errno 5] Input/output error"),
+    ],
+)
+def test_an_error_that_follows_from_a_signal_is_the_signal_but_a_failed_clean_up(
+    raised, code, said
+):
+    done = run_python("-c", FOLLOWS.format(raised=raised))
+    assert done.returncode == code
+    assert done.stderr.startswith(said)
+    assert done.stderr.count("\n") == 1
+
+
+WHILE_IMPORTING = """
+import os, runpy, signal, sys, tempfile
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+class Interrupting:
+    count = 0
+
+    def find_spec(self, name, path=None, target=None):
+        if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+            Interrupting.count += 1
+            if Interrupting.count == wanted:
+                signal.raise_signal(signal.SIGINT)
+
+for wanted in {numbers}:
+    with tempfile.TemporaryFile() as said:
+        sys.stdout.flush()
+        pid = os.fork()
+        if pid == 0:
+            os.dup2(said.fileno(), 1)
+            os.dup2(said.fileno(), 2)
+            sys.meta_path.insert(0, Interrupting())
+            sys.argv = {argv}
+            {run}
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        said.seek(0)
+        print(wanted, code, repr(said.read().decode()))
+"""
+COMMANDS = {
+    "train": (
+        ["{repo}/tools/train.py", "gsmap_maptr_r18_minicity", "--work-dir", "{out}/work"],
+        "runpy.run_path(sys.argv[0], run_name='__main__')",
+        (1, 2, 10, 50, 150, 400, 1000, 2000),
+    ),
+    "build_map": (
+        ["{repo}/tools/build_map.py", "--help"],
+        "runpy.run_path(sys.argv[0], run_name='__main__')",
+        (1, 5, 25, 100),
+    ),
+    "torchrun": (
+        ["-c", "--nproc_per_node=1", "{repo}/tools/train.py"],
+        "runpy.run_module('gsmap.engine.torchrun', run_name='__main__', alter_sys=True)",
+        (1, 20, 200, 500),
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_ctrl_c_during_imports_is_one_line(name, tmp_path):
+    argv, run, numbers = COMMANDS[name]
+    words = [word.format(repo=REPO, out=tmp_path) for word in argv]
+    code = WHILE_IMPORTING.format(numbers=numbers, argv=words, run=run)
+    done = run_python("-c", code, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [f"{number} 130 {LINE!r}" for number in numbers]
