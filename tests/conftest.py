@@ -2,8 +2,10 @@
 
 import ctypes
 import os
+import random
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
@@ -22,6 +24,13 @@ TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
 STATM = Path("/proc/self/statm")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 resident = {"bytes": 0}  # after the last trim
+
+
+def pytest_runtest_setup() -> None:
+    """Give each test, and fixtures that are made for it, one seed."""
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002 - of libraries
+    torch.manual_seed(0)
 
 
 def pytest_runtest_logfinish() -> None:

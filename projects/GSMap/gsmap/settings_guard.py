@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager, contextmanager
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
+from typing import Any
 
 _LIBRARIES = "LD_LIBRARY_PATH"
 
@@ -21,13 +22,17 @@ _LIBRARIES = "LD_LIBRARY_PATH"
 def _without_relative_files(module: ModuleType) -> Iterator[None]:
     """Let no file exist under a relative path while a module is imported."""
     exists = os.path.exists
-    os.path.exists = lambda path: os.path.isabs(path) and exists(path)
+
+    def exists_elsewhere(path: Any) -> bool:
+        return (isinstance(path, int) or os.path.isabs(path)) and exists(path)
+
+    os.path.exists = exists_elsewhere
     try:
         yield
     finally:
         os.path.exists = exists
-    if hasattr(module, "_config_fname"):  # numba's, which it reads again
-        module._config_fname = os.devnull
+    if "_config_fname" in vars(module):  # numba's, which it reads again
+        vars(module)["_config_fname"] = os.devnull
 
 
 @contextmanager
