@@ -32,6 +32,12 @@ def pipeline(args: argparse.Namespace) -> dict[str, float]:
     return benchmarks.measure_pipeline(config, args.root, args.samples)
 
 
+def images(args: argparse.Namespace) -> dict[str, float]:
+    from benchmarks.images import measure_images
+
+    return measure_images(args.folder, args.samples, args.workers)
+
+
 def argoverse2(args: argparse.Namespace) -> dict[str, float]:
     from benchmarks.argoverse2 import measure_extraction
 
@@ -59,6 +65,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     command.add_argument("--config", default="configs/_base_/datasets/minicity.py")
     command.add_argument("--samples", type=int, default=20)
     command.set_defaults(measure=pipeline)
+    command = commands.add_parser("images", help="image steps of a sample, and samples a second")
+    command.add_argument("folder", type=Path, help="six JPEG files, such as a frame of nuScenes")
+    command.add_argument("--samples", type=int, default=10)
+    command.add_argument("--workers", type=int, nargs="*", default=[], help="numbers of processes")
+    command.set_defaults(measure=images)
     command = commands.add_parser("av2", help="Argoverse 2 ground truth per frame")
     command.add_argument("root", type=Path)
     command.add_argument("--split", default="val")

@@ -17,13 +17,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(225, 400), metavar=("H", "W"))
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--amp", action="store_true", help="mixed precision")
+    parser.add_argument("--cuda-graphs", action="store_true", help="frames that are replayed")
     parser.add_argument("--repeats", type=int, default=20)
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure and print the shortest time of a frame, of a rig that is known and of a new one."""
     torch.set_num_threads(args.threads)
-    inferencer = MapInferencer(args.model, device=args.device)
+    graphs = args.cuda_graphs or None
+    inferencer = MapInferencer(args.model, device=args.device, amp=args.amp, cuda_graphs=graphs)
     names = inferencer.cfg.test_dataloader.dataset.cameras
     pixels = np.random.default_rng(0).integers(0, 256, (*args.size, 3), np.uint8)
     images = dict.fromkeys(names, pixels)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from mmdet3d.registry import MODELS, TRANSFORMS
 from mmdet3d.structures import Det3DDataSample
+from mmengine.config import DictAction
 from mmengine.structures import InstanceData
 
 from benchmarks.measure import Cost, in_own_process, markdown_table
@@ -38,6 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--fp16", action="store_true", help="mixed precision")
+    parser.add_argument(
+        "--cfg-options",
+        nargs="+",
+        action=DictAction,
+        metavar="KEY=VALUE",
+        help="overrides of all configs, such as switches for a GPU",
+    )
 
 
 def measured_each(
@@ -59,7 +67,7 @@ def measured_each(
 def build(path: str, args: argparse.Namespace, raster: str = "") -> Any:
     """Build a config's model with random weights, with another raster size if one is given."""
     torch.set_num_threads(args.threads)
-    cfg = read_config(path)
+    cfg = read_config(path, getattr(args, "cfg_options", None))
     if raster:
         rows, columns = (int(side) for side in raster.split("x"))
         (x0, x1), (y0, y1) = cfg.model.grid.x_range, cfg.model.grid.y_range

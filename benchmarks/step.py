@@ -1,12 +1,14 @@
-"""Time and memory of a training step: forward, losses and backward."""
+"""Time and memory of a whole training step, from pixels on the host to new weights."""
 
 import argparse
 from pathlib import Path
 
 import torch
+from mmengine.optim import build_optim_wrapper
 
 from benchmarks import model as models
 from benchmarks.measure import MIB, Cost, measure
+from gsmap.engine.figures import keep_figures
 from gsmap.engine.launch import read_config
 
 
@@ -20,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure and print forward, losses and backward of every config and raster size."""
+    """Measure and print a step of every config and raster size."""
     tasks = []
     for path in args.configs:
         sizes = args.rasters if "GSMap" in read_config(path).model.map_head.type else [""]
@@ -42,15 +44,22 @@ def run(args: argparse.Namespace) -> None:
 
 
 def step_cost(path: str, args: argparse.Namespace, raster: str = "") -> Cost:
-    """Measure a config's training step, with another raster size if one is given."""
+    """Measure a config's training step, with another raster size if one is given.
+
+    The step is mmengine's, from pixels on the host to new weights, with the config's optimizer,
+    clipping and figures.
+    """
     model, inputs, samples = models.model_and_batch(path, args, args.batch, raster)
     model.train()
+    wrapper = build_optim_wrapper(model, read_config(path, args.cfg_options).optim_wrapper)
+    images = [(each * 50 + 120).clamp(0, 255).to("cpu", torch.uint8) for each in inputs["imgs"]]
+    batch = [sample.cpu() for sample in samples]
 
     def step() -> None:
-        models.drive_on(samples)
-        model.zero_grad(set_to_none=True)
-        with torch.autocast(args.device, enabled=args.fp16):
-            losses = model.loss(inputs, samples)
-        sum(losses.values()).backward()
+        models.drive_on(batch)
+        data = {"inputs": {"img": list(images)}, "data_samples": [each.clone() for each in batch]}
+        figures = model.train_step(data, wrapper)
+        named = {f"train/{name}": value for name, value in figures.items()}
+        keep_figures(wrapper.message_hub, named)
 
     return measure(step, torch.device(args.device), args.repeats)

@@ -2,8 +2,10 @@
 
 import numpy as np
 import torch
+from mmengine.dataset import pseudo_collate
 
 from gsmap.apis.export import export_onnx, graph_inputs, largest_differences
+from gsmap.apis.fast_frame import FastFrames, StaticFrame
 from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.elements import elements_of_predictions
 
@@ -45,3 +47,22 @@ def shake(model, seed=0):
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
         parameter.data += 0.03 * torch.randn(parameter.shape, generator=generator)
+
+
+def assert_static_frames_are_equal(inferencer, dataset, indices=(0, 1)):
+    """Predict a batch as a function of fixed sizes, and compare all that is said of its samples."""
+    expected = inferencer.model.test_step(pseudo_collate([dataset[index] for index in indices]))
+    frames = FastFrames(StaticFrame(inferencer.model), torch.device("cpu"), capture=False)
+    batch = pseudo_collate([dataset[index] for index in indices])
+    assert frames.serves(batch)
+    for ours, theirs in zip(frames(batch), expected, strict=True):
+        assert ours.metainfo.keys() == theirs.metainfo.keys()
+        for name in ("batch_input_shape", "pad_shape", "token"):
+            assert ours.metainfo[name] == theirs.metainfo[name]
+        found, wanted = ours.pred_instances_3d, theirs.pred_instances_3d
+        assert found.metainfo == wanted.metainfo
+        assert sorted(found.keys()) == sorted(wanted.keys())
+        assert len(found) == len(wanted) > 0
+        for name, values in wanted.items():
+            assert found[name].dtype == values.dtype
+            torch.testing.assert_close(found[name], values, atol=2 * POINTS_M, rtol=1e-4)

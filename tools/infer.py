@@ -107,6 +107,11 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     group.add_argument("--batch-size", type=int, default=1, help="samples per forward pass")
     group.add_argument("--workers", type=int, default=0, help="processes that read images")
     group.add_argument("--amp", action="store_true", help="mixed precision")
+    group.add_argument(
+        "--cuda-graphs",
+        action=argparse.BooleanOptionalAction,
+        help="on a GPU, record the launches of a frame once and replay them",
+    )
     add_config_options(group)
     group = parser.add_argument_group("pictures")
     group.add_argument("--format", default="png", choices=FORMATS)
@@ -191,7 +196,12 @@ def open_model(args: argparse.Namespace) -> "MapInferencer":
 
     config, checkpoint = args.model[0], args.model[1] if len(args.model) > 1 else None
     inferencer = MapInferencer(
-        config, checkpoint_for(config, checkpoint), args.device, args.cfg_options, args.amp
+        config,
+        checkpoint_for(config, checkpoint),
+        args.device,
+        args.cfg_options,
+        args.amp,
+        args.cuda_graphs,
     )
     visualizer = inferencer.visualizer
     visualizer.show_order = args.order

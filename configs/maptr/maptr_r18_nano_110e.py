@@ -11,7 +11,7 @@ model = dict(
     bev_encoder=dict(bev_pixel_m=0.75),
     map_head=dict(query_groups=[dict(num=100)], decoder=dict(num_layers=2, layer=dict(num_heads=4))))
 _scale = dict(type='ScaleImages', scale=0.2)
-_steps = [_base_._load, _base_._photometric, _scale, _base_._targets, _base_._pack]
+_steps = [_base_._load_bytes, _base_._photometric, _scale, _base_._targets, _base_._pack]
 train_dataloader = dict(batch_size=24, dataset=dict(pipeline=_steps))
 val_dataloader = dict(dataset=dict(pipeline=[_base_._load, _scale, _base_._pack]))
 test_dataloader = val_dataloader

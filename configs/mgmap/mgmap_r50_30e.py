@@ -7,7 +7,7 @@ _base_.model.merge(_base_._mgmap)
 
 model = dict(grid=_base_.grid, classes=_base_.classes)
 _own_masks = dict(type='MakeInstanceMasks', size=(200, 100), mirrored=True)  # as released
-_steps = [_base_._load, _base_._photometric, _base_._scale, _base_._targets, _own_masks, _base_._pack]
+_steps = [_base_._load_bytes, _base_._photometric, _base_._scale, _base_._targets, _own_masks, _base_._pack]
 train_dataloader = dict(dataset=dict(pipeline=_steps))
 optim_wrapper = dict(optimizer=dict(lr=3e-4))
 auto_scale_lr = dict(base_batch_size=8)

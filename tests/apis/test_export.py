@@ -7,7 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from export_cases import POINTS_M, SCORES, SMALL, compare, export, shake
+from export_cases import (
+    POINTS_M,
+    SCORES,
+    SMALL,
+    assert_static_frames_are_equal,
+    compare,
+    export,
+    shake,
+)
 from fuzz.contents import exported_model
 from model_cases import IMAGE_SHAPE, NUM_CAMS, build_small
 from processes import run_python
@@ -125,6 +133,7 @@ def test_every_method_and_encoder_predicts_as_in_torch(case, annotations, tmp_pa
     inputs = looking_away(inputs)
     found = exported.run(inputs)
     with torch.no_grad():
+        assert_static_frames_are_equal(inferencer, dataset)
         tensors = map(torch.from_numpy, inputs.values())
         scores, _, points, *_ = ExportedDetector(inferencer.model).eval()(*tensors)
     assert len(scores) > 50

@@ -9,15 +9,11 @@ classes = ['divider', 'ped_crossing', 'boundary']
 
 _load = dict(type='LoadCameraImages')
 _scale = dict(type='ScaleImages', scale=0.3)
-_photometric = dict(
-    type='MultiViewWrapper',
-    transforms=[dict(type='PhotoMetricDistortion3D')],
-    override_aug_config=False,  # each camera its own, as in MapTR
-    collected_keys=[])
+_photometric = dict(type='DistortImages')  # each camera its own, as in MapTR
 _targets = dict(type='FormatMapTargets', num_points=20)
 _pack = dict(type='PackMapInputs')
 
-_workers = dict(num_workers=4, persistent_workers=True)
+_workers = dict(num_workers='cores', persistent_workers=True)
 _dataset = dict(
     type='VectorizedMapDataset', data_root=data_root, classes=classes, grid=grid, frame='ego',
     cameras=[

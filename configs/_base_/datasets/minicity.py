@@ -9,11 +9,7 @@ classes = ['divider', 'ped_crossing', 'boundary']
 
 _load = dict(type='LoadCameraImages', to_float32=False)
 _scale = dict(type='ScaleImages', scale=0.4)
-_photometric = dict(
-    type='MultiViewWrapper',
-    transforms=[dict(type='PhotoMetricDistortion3D')],
-    override_aug_config=False,  # each camera its own, as in MapTR
-    collected_keys=[])
+_photometric = dict(type='DistortImages')  # each camera its own, as in MapTR
 _targets = dict(type='FormatMapTargets', num_points=20)
 _pack = dict(type='PackMapInputs')
 

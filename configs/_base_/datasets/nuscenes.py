@@ -7,16 +7,13 @@ grid = dict(x_range=[-15.0, 15.0], y_range=[-30.0, 30.0])  # metres; travel is a
 classes = ['divider', 'ped_crossing', 'boundary']
 
 _load = dict(type='LoadCameraImages')
+_load_bytes = dict(type='LoadCameraImages', to_float32=False)  # before a step that converts anyway
 _scale = dict(type='ScaleImages', scale=0.5)
-_photometric = dict(
-    type='MultiViewWrapper',
-    transforms=[dict(type='PhotoMetricDistortion3D')],
-    override_aug_config=False,  # each camera its own, as in MapTR
-    collected_keys=[])
+_photometric = dict(type='DistortImages')  # each camera its own, as in MapTR
 _targets = dict(type='FormatMapTargets', num_points=20)
 _pack = dict(type='PackMapInputs')
 
-_workers = dict(num_workers=4, persistent_workers=True)
+_workers = dict(num_workers='cores', persistent_workers=True)
 _dataset = dict(
     type='VectorizedMapDataset', data_root=data_root, classes=classes, grid=grid, frame='lidar',
     cameras=[
@@ -30,7 +27,7 @@ train_dataloader = dict(
         **_dataset,
         ann_file='gsmap_nuscenes_train.arrow',
         split='train',
-        pipeline=[_load, _photometric, _scale, _targets, _pack]))
+        pipeline=[_load_bytes, _photometric, _scale, _targets, _pack]))
 val_dataloader = dict(
     batch_size=1,
     **_workers,
@@ -56,5 +53,5 @@ _depth_seg = [
 # Models with LiDAR see ten sweeps.
 _sweeps = dict(
     type='LoadLidarSweeps', sweeps_num=9, use_dim=[0, 1, 2, 3, 4], pad_empty_sweeps=True, remove_close=True)
-_lidar = [_load, _points, _sweeps, _photometric, _scale, _targets, _pack]
+_lidar = [_load_bytes, _points, _sweeps, _photometric, _scale, _targets, _pack]
 _lidar_test = [_load, _points, dict(_sweeps, test_mode=True), _scale, _pack]

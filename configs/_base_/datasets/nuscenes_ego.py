@@ -8,16 +8,13 @@ grid = dict(x_range=[-30.0, 30.0], y_range=[-15.0, 15.0])  # metres; travel is a
 classes = ['ped_crossing', 'divider', 'boundary']
 
 _load = dict(type='LoadCameraImages')
+_load_bytes = dict(type='LoadCameraImages', to_float32=False)  # before a step that converts anyway
 _scale = dict(type='ScaleImages', size=(800, 480))
-_photometric = dict(
-    type='MultiViewWrapper',
-    transforms=[dict(type='PhotoMetricDistortion3D')],
-    override_aug_config=False,
-    collected_keys=[])
+_photometric = dict(type='DistortImages')  # each camera its own, as in MapTR
 _targets = dict(type='FormatMapTargets', num_points=20, orders_of='points')
 _pack = dict(type='PackMapInputs')
 
-_workers = dict(num_workers=4, persistent_workers=True)
+_workers = dict(num_workers='cores', persistent_workers=True)
 _dataset = dict(
     type='VectorizedMapDataset', data_root=data_root, classes=classes, grid=grid, frame='ego',
     cameras=[
@@ -31,7 +28,7 @@ train_dataloader = dict(
         **_dataset,
         ann_file='gsmap_nuscenes_train_ego.arrow',
         split='train',
-        pipeline=[_load, _photometric, _scale, _targets, _pack]))
+        pipeline=[_load_bytes, _photometric, _scale, _targets, _pack]))
 val_dataloader = dict(
     batch_size=1,
     **_workers,

@@ -16,6 +16,13 @@ from mmdet3d.registry import DATASETS
 from mmengine.config import Config
 from torch.utils.data import DataLoader, Subset
 
+from gsmap.apis.fast_frame import (
+    CAPTURE_BY_DEFAULT,
+    FastFrames,
+    StaticFrame,
+    matrix_products,
+    reason_against,
+)
 from gsmap.apis.frame_loader import BrokenFrame, FrameDataset, collate
 from gsmap.apis.live_map import LiveMap
 from gsmap.apis.loading import load_model
@@ -96,11 +103,16 @@ class MapInferencer:
             the initial weights (for trying out a pipeline).
         device: Where to run, or several devices that share the batches; a GPU if there is one.
         cfg_options: Overrides of the config, by dotted name.
-        amp: Whether to run in mixed precision: float16 on a GPU, bfloat16 on a CPU.
+        amp: Whether to run in mixed precision: on a GPU backbone and neck in float16 and other
+            matrix products in TF32, on a CPU all in bfloat16.
+        cuda_graphs: Whether frames on a GPU are recorded once for each size of images and then
+            replayed (`FastFrames`). None: as ``CAPTURE_BY_DEFAULT`` says, if the model has a static
+            form.
 
     Raises:
         FileNotFoundError: If the config or the checkpoint does not exist.
-        ValueError: If the checkpoint belongs to another architecture, or cannot be read.
+        ValueError: If the checkpoint belongs to another architecture, or cannot be read; if
+            ``cuda_graphs`` is True on another device, or for a model without a static form.
     """
 
     def __init__(
@@ -110,6 +122,7 @@ class MapInferencer:
         device: str | torch.device | Sequence[str | torch.device] | None = None,
         cfg_options: dict | None = None,
         amp: bool = False,
+        cuda_graphs: bool | None = None,
     ):
         self.model = load_model(config, checkpoint, cfg_options=cfg_options)
         self.cfg: Config = self.model.cfg
@@ -119,10 +132,31 @@ class MapInferencer:
         models = [self.model, *(copy.deepcopy(self.model) for _ in names[1:])]
         self.replicas = [m.to(d) for m, d in zip(models, self.devices, strict=True)]
         self.amp = amp
+        self._fast_frames = [
+            self._open_fast_frames(model, device, cuda_graphs)
+            for model, device in zip(self.replicas, self.devices, strict=True)
+        ]
         self._camera_embeds = getattr(self.model.bev_encoder, "cams_embeds", None)
         self.visualizer = _build_visualizer(self.cfg)
         self._scratch = tempfile.TemporaryDirectory(prefix="gsmap-")
         self._files = 0
+
+    def _open_fast_frames(
+        self, model: Any, device: torch.device, cuda_graphs: bool | None
+    ) -> FastFrames | None:
+        """Return what replays frames on a GPU; None leaves them to ``test_step``."""
+        if device.type != "cuda":
+            if cuda_graphs:
+                raise ValueError(f"cuda_graphs=True needs a GPU, got {device}: leave it out.")
+            return None
+        if self.amp and model.img_backbone is not None:
+            model.halve_backbone()
+        reason = reason_against(model)
+        if cuda_graphs and reason:
+            raise ValueError(f"cuda_graphs=True does not serve this model: {reason}. Leave it out.")
+        if reason or not (CAPTURE_BY_DEFAULT if cuda_graphs is None else cuda_graphs):
+            return None
+        return FastFrames(StaticFrame(model), device)
 
     def dataset(
         self,
@@ -319,9 +353,18 @@ class MapInferencer:
         self, turn: int, batch: dict[str, Any], stream: Any = None
     ) -> "list[Det3DDataSample]":
         """Predict a batch on one device."""
-        own = nullcontext() if stream is None else self.model.temporal.using(stream)
-        with own, torch.autocast(self.devices[turn].type, enabled=self.amp):
-            return [sample.cpu() for sample in self.replicas[turn].test_step(batch)]
+        model, device = self.replicas[turn], self.devices[turn]
+        fast_frames = self._fast_frames[turn]
+        if fast_frames is not None and fast_frames.serves(batch):
+            return fast_frames(batch)
+        memory = nullcontext() if stream is None else self.model.temporal.using(stream)
+        on_cpu = device.type == "cpu"
+        with (
+            memory,
+            matrix_products(model.half_backbone is not None),
+            torch.autocast(device.type, enabled=self.amp and on_cpu),
+        ):
+            return [sample.cpu() for sample in model.test_step(batch)]
 
     def predict_images(
         self,

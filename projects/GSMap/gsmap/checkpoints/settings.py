@@ -47,10 +47,14 @@ def differences(ours: Any, others: Any, name: str = "") -> dict[str, tuple[Any, 
 
 def scale_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
     """Return the steps that scale images in pipelines of a config: train's, val's, test's."""
+    return [step for step in pipeline_steps(cfg, *parts) if step.get("type") == "ScaleImages"]
+
+
+def pipeline_steps(cfg: Config, *parts: str) -> list[ConfigDict]:
+    """Return all steps in pipelines of a config: train's, val's, test's."""
     loaders = [cfg.get(f"{part}_dataloader") or {} for part in parts]
     pipelines = [loader.get("dataset", {}).get("pipeline") or [] for loader in loaders]
-    steps = [step for pipeline in pipelines for step in pipeline if isinstance(step, ConfigDict)]
-    return [step for step in steps if step.get("type") == "ScaleImages"]
+    return [step for pipeline in pipelines for step in pipeline if isinstance(step, ConfigDict)]
 
 
 def checked(settings: Any, config: dict[str, Any]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from mmengine.registry import Registry, init_default_scope
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.checkpoints.named_models import find_config
-from gsmap.checkpoints.settings import scale_steps
+from gsmap.checkpoints.settings import pipeline_steps, scale_steps
 from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.utils.faults import nearest, registered
 from gsmap.utils.files import DAMAGED_ZIP
@@ -35,8 +35,9 @@ from gsmap.utils.targets import NeedsTargets
 _COPIED = ("backend_args", "classes", "data_root", "grid", "vis_backends")  # read by no runner
 _OWN_KEYS = (
     *_COPIED, "custom_imports", "find_unused_parameters", "model_wrapper_cfg", "runner_type",
-    "strategy", "sync_bn",
+    "images_on_device", "strategy", "sync_bn",
 )  # fmt: skip
+_MOST_WORKERS = 16
 _SECTIONS = ("_cfg", "_dataloader", "default_hooks", "model", "optim_wrapper", "randomness")
 
 
@@ -81,10 +82,42 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
         for step in steps:
             step.update(scale=factor, size=None)
     _check_keys(cfg)
+    _fit_loaders(cfg)
     with _naming(f"custom_imports of {cfg.filename or 'a config'}"):
         import_modules_from_strings(**cfg.get("custom_imports", {"imports": ["gsmap.registered"]}))
     init_default_scope(cfg.get("default_scope", "mmdet3d"))
     return cfg
+
+
+def _fit_loaders(cfg: Config) -> None:
+    """Fit the data loaders of a config to the machine, in place.
+
+    ``num_workers='cores'`` is the number of cores that a process has, at most 16. With
+    ``images_on_device`` pixels go to the device as they were decoded, from pinned memory, and what
+    the pipelines do to them is done there.
+
+    Raises:
+        ValueError: If a transform of another library reads the pixels before they are packed.
+    """
+    for part in ("train", "val", "test"):
+        loader = cfg.get(f"{part}_dataloader")
+        if not loader:
+            continue
+        if loader.get("num_workers") == "cores":
+            cores = len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+            loader.num_workers = min(max(cores, 1), _MOST_WORKERS)
+        if not cfg.get("images_on_device"):
+            continue
+        loader.pin_memory = True
+        for step in pipeline_steps(cfg, part):
+            if step.type == "LoadCameraImages":
+                step.on_device = True
+            elif step.type == "MultiViewWrapper":
+                raise ValueError(
+                    f"{cfg.filename}: images_on_device does not go with {step.type}, which reads "
+                    "pixels on the host: take DistortImages in its place, or leave out "
+                    "images_on_device."
+                )
 
 
 @contextmanager

@@ -35,9 +35,24 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
         if not _of_one_size(images):  # each on its own, padded to the largest
             return super().collate_data(data)
         data = self.cast_data(data)
-        data["inputs"]["imgs"] = self.normalised(torch.stack(data["inputs"]["img"]))
+        imgs = self.finished(torch.stack(data["inputs"]["img"]), data.get("data_samples") or ())
+        data["inputs"]["imgs"] = self.normalised(imgs)
         data.setdefault("data_samples", None)
         return data
+
+    @staticmethod
+    def finished(images: Tensor, samples: Sequence[Any]) -> Tensor:
+        """Take the steps that the pipeline has noted for the device (`image_steps`).
+
+        Args:
+            images: Pixels as they were packed. (B, V, 3, H, W)
+            samples: The samples.
+
+        Returns:
+            The images that the published pipelines pack. (B, V, 3, H', W')
+        """
+        steps = [sample.metainfo.get("image_steps") or () for sample in samples]
+        return take_noted_steps(images, steps) if any(steps) else images
 
     def normalised(self, images: Tensor) -> Tensor:
         """Turn pixel values to the network's input. (..., 3, H, W) -> (..., 3, H', W') float32"""
@@ -52,6 +67,32 @@ class MapDataPreprocessor(Det3DDataPreprocessor):
             return images
         margins = (0, columns - width, 0, rows - height)
         return torch.nn.functional.pad(images, margins, value=self.pad_value)
+
+
+def take_noted_steps(images: Tensor, steps: Sequence[Sequence[Any]]) -> Tensor:
+    """Take the noted steps of a batch on its device.
+
+    Args:
+        images: Pixels as they were packed. (B, V, 3, H, W)
+        steps: Steps of each sample, in their order (`gsmap.datasets.transforms.image_steps`).
+
+    Returns:
+        The images, in float32 if there was a step. (B, V, 3, H', W')
+    """
+    if not any(steps):
+        return images
+    batch = images.shape[:2]
+    together = []
+    for each in zip(*steps, strict=False):
+        step = each[0].joined(each[1:])
+        if step is None or len({len(own) for own in steps}) > 1:
+            alone = [take_noted_steps(images[i : i + 1], [own]) for i, own in enumerate(steps)]
+            return torch.cat(alone)
+        together.append(step)
+    images = images.flatten(0, 1)
+    for step in together:
+        images = step.on_device(images)
+    return images.unflatten(0, batch)
 
 
 def _of_one_size(images: Any) -> bool:

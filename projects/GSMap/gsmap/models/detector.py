@@ -17,6 +17,7 @@ from torch.utils._pytree import tree_map_only
 
 from gsmap.checkpoints.strict import adapt_state, neutral_keys
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
+from gsmap.models.encoders.half_backbone import HalfBackbone
 from gsmap.models.loss_check import LossCheck
 from gsmap.models.streams.memory import StreamMemory
 from gsmap.structures.grid import BEVGrid
@@ -53,7 +54,8 @@ class MapDetector(Base3DDetector):
             nearly all arithmetic is; head, matching and losses stay in float32. It needs no loss
             scale. None leaves training as it is (``--amp`` then casts the head, too).
         compiled: Compile backbone, neck, encoders and head once a training starts, which takes a
-            minute or more.
+            minute or more. True, or a mode of ``torch.compile``: with ``"reduce-overhead"`` what is
+            compiled is also captured in CUDA graphs.
 
     Raises:
         ValueError: If there is neither camera nor LiDAR, or both but no fusion, or ``autocast`` is
@@ -77,7 +79,7 @@ class MapDetector(Base3DDetector):
         fold_batch_norms: bool = True,
         allow_untrained: bool = True,
         autocast: str | None = None,
-        compiled: bool = False,
+        compiled: bool | str = False,
         data_preprocessor: dict | None = None,
         init_cfg: dict | None = None,
     ) -> None:
@@ -89,6 +91,7 @@ class MapDetector(Base3DDetector):
         parts = () if self.img_backbone is None else self.img_backbone.modules()
         self.channels_last = not any(isinstance(part, ModulatedDeformConv2d) for part in parts)
         self.loss_check = LossCheck()
+        self.half_backbone: HalfBackbone | None = None  # in place of both, for inference
         self.allow_untrained = allow_untrained
         if autocast not in (None, "bfloat16"):
             raise ValueError(f"autocast must be None or 'bfloat16', got {autocast!r}.")
@@ -111,10 +114,11 @@ class MapDetector(Base3DDetector):
         """Switch between training and prediction; the first training compiles what is wanted."""
         super().train(mode)
         if mode and self.compiled:
-            for part in (self.img_backbone, self.img_neck, self.bev_encoder, self.lidar_encoder):
+            chosen = None if self.compiled is True else self.compiled
+            parts = (self.img_backbone, self.img_neck, self.bev_encoder, self.lidar_encoder)
+            for part in (*parts, self.map_head):
                 if part is not None:
-                    part.compile(backend=self.compiler)
-            self.map_head.compile(backend=self.compiler)
+                    part.compile(backend=self.compiler, mode=chosen)
             self.compiled = False  # it is now
         return self
 
@@ -126,12 +130,19 @@ class MapDetector(Base3DDetector):
         if self.training and self.img_augment is not None:
             images = self.img_augment(images)
         folded, backbone = self.folded_backbone, self.img_backbone
+        if self.half_backbone is not None and not torch.is_grad_enabled():
+            feats = self.half_backbone(backbone, self.img_neck, images, self.channels_last)
+            return [feat.unflatten(0, (len(imgs), -1)) for feat in feats]
         if self.channels_last:
             images = images.contiguous(memory_format=torch.channels_last)
         feats = backbone(images) if folded is None else folded(backbone, images)
         if self.img_neck is not None:
             feats = self.img_neck(feats)
         return [feat.unflatten(0, (len(imgs), -1)) for feat in feats]
+
+    def halve_backbone(self) -> None:
+        """Let inference run image backbone and neck in float16 (`HalfBackbone`)."""
+        self.half_backbone = HalfBackbone()
 
     def extract_feat(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return the BEV encoder's outputs: ``bev_feats`` (B, C, H, W) and what its losses need."""

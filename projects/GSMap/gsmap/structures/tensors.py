@@ -163,3 +163,9 @@ def num_depth_bins(depth_range: tuple[float, float, float]) -> int:
             f"depth_range must be (low, high, step) with one bin or more, got {depth_range}."
         )
     return int((high - low) / step)
+
+
+def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:
+    """Return address and version of a module's tensors, which change with every weight."""
+    tensors = [*module.parameters(), *module.buffers()]
+    return [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.transforms.image_steps import finish_on_host
 from gsmap.structures.calibration import OUT_OF_SIGHT
 from gsmap.structures.rigid import invert_rigid, rigid
 
@@ -45,6 +46,7 @@ def generator(seed: int, token: str) -> np.random.Generator:
 
 def lose_cameras(results: dict[str, Any], lost: NDArray[np.integer[Any]]) -> None:
     """Black out views, and let them look where nothing of the map is, as inference does."""
+    finish_on_host(results)
     for view in lost.tolist():
         results["img"][view] = np.zeros_like(results["img"][view])
         _place(results, view, OUT_OF_SIGHT)
@@ -85,6 +87,7 @@ class CorruptImages(BaseTransform):
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Corrupt ``results['img']`` or its matrices."""
+        finish_on_host(results)
         rng, level = generator(self.seed, results["token"]), self.severity - 1
         for key in ("img", "lidar2cam", "lidar2img"):
             results[key] = list(results[key])

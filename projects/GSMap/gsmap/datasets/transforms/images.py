@@ -12,6 +12,13 @@ from mmengine.logging import print_log
 from torch.utils.data import get_worker_info
 
 from gsmap.datasets.image_files import read_image
+from gsmap.datasets.transforms.image_steps import (
+    CropTop,
+    Resize,
+    finish_on_host,
+    shape_after_steps,
+    take_step,
+)
 
 
 @TRANSFORMS.register_module()
@@ -26,9 +33,11 @@ class LoadCameraImages(BaseTransform):
 
     Args:
         to_float32: Whether to convert to float32 before anything else.
+        on_device: Whether later steps are noted for a GPU (`image_steps`); images stay uint8.
     """
 
     to_float32: bool = True
+    on_device: bool = False
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Load ``results['images']``; BrokenSampleError if one is not as its record says."""
@@ -37,10 +46,14 @@ class LoadCameraImages(BaseTransform):
             read_image(camera["img_path"], f"sample {token!r}, camera {name}", camera.get("size"))
             for name, camera in cameras.items()
         ]
+        results["to_float32"] = self.to_float32
         results["raw_shapes"] = [image.shape[:2] for image in images]
         shape = tuple(map(max, zip(*results["raw_shapes"], strict=True)))
         padded = [i if i.shape[:2] == shape else mmcv.impad(i, shape=shape) for i in images]
-        results["img"] = [i.astype(np.float32) if self.to_float32 else i for i in padded]
+        converts = self.to_float32 and not self.on_device
+        results["img"] = [i.astype(np.float32) if converts else i for i in padded]
+        if self.on_device:
+            results["image_steps"] = []
         results["img_shape"] = results["ori_shape"] = results["pad_shape"] = shape
         results["num_views"] = len(images)
         for key in ("img_path", "cam2img", "lidar2cam"):
@@ -85,7 +98,7 @@ class ScaleImages(BaseTransform):
         """Scale ``results['img']``."""
         if self.size is not None:
             return self._to_size(results, (int(self.size[0]), int(self.size[1])))
-        height, width = results["img"][0].shape[:2]
+        height, width = shape_after_steps(results)
         size = self.scaled(width, height)
         if self.trained_size is not None and max(size) != max(self.trained_size):
             size = _times((width, height), max(self.trained_size) / max(width, height))
@@ -94,7 +107,7 @@ class ScaleImages(BaseTransform):
             raise ValueError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
         matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
         if size != (width, height):
-            results["img"] = [mmcv.imresize(img, size) for img in results["img"]]
+            take_step(results, Resize(size, rounded=not results.get("to_float32", True)))
         for key in ("lidar2img", "img_aug_matrix"):
             results[key] = [matrix @ m for m in results[key]]
         results["img_shape"] = results["pad_shape"] = size[::-1]
@@ -104,9 +117,15 @@ class ScaleImages(BaseTransform):
     @staticmethod
     def _to_size(results: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
         """Bring each image, as large as it was loaded, to a size (width, height)."""
+        if len(set(results["raw_shapes"])) > 1:
+            finish_on_host(results)
+            results["img"] = [
+                mmcv.imresize(img[:height, :width], size)
+                for img, (height, width) in zip(results["img"], results["raw_shapes"], strict=True)
+            ]
+        else:
+            take_step(results, Resize(size, rounded=not results.get("to_float32", True)))
         for view, (height, width) in enumerate(results["raw_shapes"]):
-            img = results["img"][view][:height, :width]
-            results["img"][view] = mmcv.imresize(img, size)
             matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
             for key in ("lidar2img", "img_aug_matrix"):
                 results[key][view] = matrix @ results[key][view]
@@ -138,12 +157,12 @@ class CropImages(BaseTransform):
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Crop ``results['img']``."""
-        height, width = results["img"][0].shape[:2]
+        height, width = shape_after_steps(results)
         if height <= self.top:
             raise ValueError(f"top={self.top} leaves nothing of images of {height} rows.")
         matrix = np.eye(4)
         matrix[1, 2] = -self.top
-        results["img"] = [img[self.top :] for img in results["img"]]
+        take_step(results, CropTop(self.top))
         for key in ("lidar2img", "img_aug_matrix"):
             results[key] = [matrix @ m for m in results[key]]
         results["raw_shapes"] = [(rows - self.top, cols) for rows, cols in results["raw_shapes"]]

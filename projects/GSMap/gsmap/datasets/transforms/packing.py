@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
 from mmdet3d.structures import Det3DDataSample
+from numpy.typing import NDArray
 
 from gsmap.datasets.errors import BrokenSampleError
 
@@ -15,6 +17,7 @@ META_KEYS = (
     "sample_idx", "token", "scene", "map_name", "timestamp_ns", "seconds", "img_path", "cam_names",
     "lidar2img", "cam2img", "lidar2cam", "img_aug_matrix", "img_shape", "ori_shape",
     "lidar2global", "lidar2ego", "can_bus", "x_range", "y_range", "eval_ann_info",
+    "image_steps",
 )  # fmt: skip
 TARGET_KEYS = ("gt_instances_3d", "gt_depth", "gt_seg", "gt_pv_seg", "gt_lines", "gt_directions")
 _MATRIX_KEYS = ("lidar2img", "cam2img", "lidar2cam", "img_aug_matrix")
@@ -52,13 +55,21 @@ class PackMapInputs(BaseTransform):
 
     def _images(self, results: dict[str, Any]) -> torch.Tensor:
         """Stack the images, channels first. (V, 3, H, W)."""
-        for name, img in zip(results["cam_names"], results["img"], strict=True):
-            # one pass: the sum is finite only if every value is
-            if img.dtype.kind == "f" and not np.isfinite(img.sum(dtype=np.float64)):
+        images = results["img"]
+        if results.get("image_steps"):  # as decoded: a device puts the channels first
+            return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+        stacked = np.empty((len(images), 3, *images[0].shape[:2]), images[0].dtype)
+        for name, img, planes in zip(results["cam_names"], images, stacked, strict=True):
+            if img.dtype.kind == "f" and not _is_finite(img):
                 raise BrokenSampleError(
                     f"sample {results['token']!r}, camera {name}: the image holds NaN or infinity "
                     f"({results['images'][name]['img_path']}); check the file and the transforms "
                     "before packing."
                 )
-        stacked = np.stack([img.transpose(2, 0, 1) for img in results["img"]])
-        return torch.from_numpy(np.ascontiguousarray(stacked))
+            planes[:] = cv2.split(img)
+        return torch.from_numpy(stacked)
+
+
+def _is_finite(image: NDArray[np.floating[Any]]) -> bool:
+    """Return whether all values are finite: in one pass, as a sum is finite only if they are."""
+    return bool(np.isfinite(image.sum()) or np.isfinite(image).all())

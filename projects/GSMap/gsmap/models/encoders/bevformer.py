@@ -27,6 +27,8 @@ class SpatialCrossAttention(SamplingAttention):
         num_levels: Levels of image features; each head has S samples in every level.
     """
 
+    fixed_sizes = False  # whether unseen pairs of cell and camera are computed too, with weight 0
+
     def __init__(
         self,
         embed_dims: int = 256,
@@ -59,6 +61,11 @@ class SpatialCrossAttention(SamplingAttention):
             height, width = feats.shape[-2:]
             offset = offset / constant(query, [width, height])
             value = self.values(feats.flatten(3).transpose(2, 3)).float()  # (B, V, hw, heads, C')
+            if self.fixed_sizes:
+                summed = summed + _sample_all_pairs(
+                    value, (height, width), offset, weight, projection, repeats
+                )
+                continue
             for sample, view in product(*(range(n) for n in feats.shape[:2])):
                 cell = projection.visible[sample, view].nonzero()[:, 0]  # (T,)
                 centres = projection.uv[sample, view, cell].repeat(1, repeats, 1)  # (T, S, 2)
@@ -72,3 +79,37 @@ class SpatialCrossAttention(SamplingAttention):
                 summed[sample] = summed[sample].index_add(0, cell, seen[0])
         count = projection.visible.sum(1).clamp(min=1)
         return self.output_proj(summed / count[..., None])
+
+
+def _sample_all_pairs(
+    value: Tensor,
+    shape: tuple[int, int],
+    offsets: Tensor,
+    weights: Tensor,
+    projection: PillarProjection,
+    repeats: int,
+) -> Tensor:
+    """Sum what every cell samples in every camera, without a size that depends on values.
+
+    Args:
+        value: Projected features of each camera. (B, V, h * w, heads, C)
+        shape: Rows h and columns w of the features.
+        offsets: From the projected pillar, in [0, 1] over the map. (B, Q, heads, S, 2)
+        weights: Weight of each sample. (B, Q, heads, S)
+        projection: Where pillars fall, and which cells a camera sees.
+        repeats: Samples per pillar height.
+
+    Returns:
+        The sums over cameras. (B, Q, heads * C)
+    """
+    visible = projection.visible[..., None, None, None]  # (B, V, Q, 1, 1, 1)
+    centres = projection.uv.repeat(1, 1, 1, repeats, 1)[:, :, :, None]  # (B, V, Q, 1, S, 2)
+    locations = torch.where(visible, centres + offsets[:, None], 0)
+    pair_weights = weights[:, None] * visible[..., 0]  # (B, V, Q, heads, S)
+    sampled = sample_map(
+        value.flatten(0, 1),
+        shape=shape,
+        locations=locations.flatten(0, 1),
+        weights=pair_weights.flatten(0, 1),
+    )  # (B * V, Q, heads * C)
+    return sampled.unflatten(0, value.shape[:2]).sum(1)

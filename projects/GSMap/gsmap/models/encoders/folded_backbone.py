@@ -7,6 +7,8 @@ from mmcv.cnn import fuse_conv_bn
 from mmdet.models.backbones import ResNet
 from torch import Tensor, nn
 
+from gsmap.structures.tensors import tensor_versions
+
 
 class FoldedBackbone:
     """Runs a backbone; in inference a copy whose batch norms are part of its convolutions.
@@ -30,12 +32,6 @@ class FoldedBackbone:
         if self.folded is None or state != self.state:
             self.folded, self.state = fuse_conv_bn(copy.deepcopy(backbone)), state
         return self.folded(images)
-
-
-def tensor_versions(module: nn.Module) -> list[tuple[int, int]]:
-    """Return address and version of a module's tensors, which change with every weight."""
-    tensors = [*module.parameters(), *module.buffers()]
-    return [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in tensors]
 
 
 def can_be_folded(backbone: nn.Module) -> bool:

@@ -37,6 +37,7 @@ class GeometryKernelAttention(nn.Module):
     """
 
     offsets: Tensor
+    fixed_sizes = False  # whether unseen pairs of cell and camera are computed too, with weight 0
 
     def __init__(
         self,
@@ -79,7 +80,7 @@ class GeometryKernelAttention(nn.Module):
         visible = projection.visible
         served = visible[:1].expand_as(visible) if self.released_cells else visible
         shape = (height, width)
-        if has_kernel(value):
+        if self.fixed_sizes or has_kernel(value):
             maps = value.unflatten(-1, (self.num_heads, -1))
             summed = sample_kernels(
                 maps, shape, projection.uv, served, weights, self.offsets, self.bilinear

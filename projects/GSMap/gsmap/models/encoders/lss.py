@@ -36,6 +36,8 @@ class LSSEncoder(CameraEncoder):
         aspp_channels: Channels of each branch of the camera-aware depth head's pyramid.
     """
 
+    fixed_sizes = False  # whether points are scattered into cells, in place of sorted by cell
+
     def __init__(
         self,
         grid: BEVGrid,
@@ -89,7 +91,9 @@ class LSSEncoder(CameraEncoder):
         indices = cell_indices(points, self.cells, self.z_range)  # (B, V, D, h, w)
         with torch.autocast(feats.device.type, enabled=False):
             kernel = cast(Tensor, self.downsample[0].weight)
-            bev = bev_pool_conv3x3(depth, context, indices, self.cells, kernel.float())
+            bev = bev_pool_conv3x3(
+                depth, context, indices, self.cells, kernel.float(), self.fixed_sizes
+            )
         lifted = {"depth": depth, "depth_range": self.depth_range, "img_feats": feats}
         return {"bev_feats": self.downsample[1:](bev), **lifted}
 

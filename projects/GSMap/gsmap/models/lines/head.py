@@ -10,13 +10,13 @@ from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
-from gsmap.models.encoders.folded_backbone import tensor_versions
 from gsmap.models.lines.front import front_size, turned
 from gsmap.models.lines.losses import LINE, Case, LineLosses
 from gsmap.models.maptr.coder import DetectionHead, MapCoder, Samples, Tensors
 from gsmap.models.maptr.layers import enlarged
 from gsmap.models.maptr.parts import PARTS
 from gsmap.structures.grid import BEVGrid
+from gsmap.structures.tensors import tensor_versions
 
 # of the losses of decoder layers; of fewer, the last ones
 LAYER_WEIGHTS = (0.4, 0.4, 0.4, 0.8, 1.2, 1.6)

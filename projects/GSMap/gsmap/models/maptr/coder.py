@@ -85,16 +85,28 @@ class MapCoder:
         Class logits (N, classes), points in metres (N, P, 2 or 3).
         """
         found = self.best(scores)
-        keep = torch.ones_like(found.scores, dtype=torch.bool)
+        chosen = self.keep_mask(found.scores, pts[found.query_inds])
+        kept = chosen.nonzero()[:, 0]  # the one wait for the device
+        return Detections(*(values[kept] for values in found))
+
+    def keep_mask(self, scores: Tensor, pts: Tensor) -> Tensor:
+        """Return which detections lie on the map or close to it, and are sure enough.
+
+        Args:
+            scores: Their confidence. (M,)
+            pts: Their points in metres. (M, P, 2 or 3)
+
+        Returns:
+            True for those that count. (M,)
+        """
+        keep = torch.ones_like(scores, dtype=torch.bool)
         if self.margin_m is not None:
             low, high = constant(pts, [self.grid.x_range, self.grid.y_range]).T
-            chosen = pts[found.query_inds][..., :2]
-            keep = (chosen.amin(1) >= low - self.margin_m).all(-1)
-            keep &= (chosen.amax(1) <= high + self.margin_m).all(-1)
+            keep = (pts[..., :2].amin(1) >= low - self.margin_m).all(-1)
+            keep &= (pts[..., :2].amax(1) <= high + self.margin_m).all(-1)
         if self.score_threshold is not None:
-            keep &= found.scores > self.score_threshold
-        kept = keep.nonzero()[:, 0]  # the one wait for the device
-        return Detections(*(values[kept] for values in found))
+            keep &= scores > self.score_threshold
+        return keep
 
     def weighed(self, scores: Tensor, fields: Tensors) -> Tensor:
         """Weigh class logits (N, classes) by ``scales``, sigmas in metres (N, P, 2), if wanted."""

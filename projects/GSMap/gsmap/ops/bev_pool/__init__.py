@@ -62,7 +62,12 @@ def bev_pool(probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid) -> Te
 
 
 def bev_pool_conv3x3(
-    probs: Tensor, context: Tensor, cells: Tensor, grid: BEVGrid, weight: Tensor
+    probs: Tensor,
+    context: Tensor,
+    cells: Tensor,
+    grid: BEVGrid,
+    weight: Tensor,
+    fixed_sizes: bool = False,
 ) -> Tensor:
     """Return ``conv2d(bev_pool(...), weight, padding=1)``, differentiable also in the weight.
 
@@ -76,6 +81,8 @@ def bev_pool_conv3x3(
         cells: Cell of each point, -1 for none, from `cell_indices`. (B, V, D, h, w)
         grid: The cells, H rows and W columns.
         weight: The kernel. (O, C, 3, 3)
+        fixed_sizes: Whether no size may depend on values, as in a CUDA graph: both steps are then
+            taken one after the other.
 
     Raises:
         ValueError: If the shapes disagree.
@@ -87,7 +94,7 @@ def bev_pool_conv3x3(
             f"got {tuple(weight.shape)}."
         )
     exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)  # torch < 2.7
-    if exporting():  # ONNX can scatter sums, and has no bags of many sizes
+    if fixed_sizes or exporting():  # ONNX can scatter sums, and has no bags of many sizes
         return F.conv2d(bev_pool(probs, context, cells, grid), weight, padding=1)
     pixels, probs, counts = _sort_by_cell(probs, cells, grid)
     taps = weight.permute(1, 2, 3, 0).flatten(1)  # (C, 9*O)

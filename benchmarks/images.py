@@ -1,0 +1,112 @@
+"""How fast the image steps of nuScenes' pipelines are: processor time, and samples a second."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from mmcv.transforms import Compose
+from mmdet3d.registry import TRANSFORMS
+from mmengine.dataset import pseudo_collate
+from mmengine.registry import init_default_scope
+from torch.utils.data import DataLoader, Dataset
+
+import gsmap.registered  # noqa: F401
+
+_CAMERAS = 6
+_LOAD = {"type": "LoadCameraImages"}
+_BYTES = {**_LOAD, "to_float32": False}
+_NOTED = {**_LOAD, "on_device": True}
+_DISTORT = {"type": "DistortImages"}
+_SCALE = {"type": "ScaleImages", "scale": 0.5}
+_PACK = {"type": "PackMapInputs"}
+PIPELINES = {
+    "train": [_BYTES, _DISTORT, _SCALE, _PACK],
+    "train, images_on_device": [_NOTED, _DISTORT, _SCALE, _PACK],
+    "test": [_LOAD, _SCALE, _PACK],
+    "test, images_on_device": [_NOTED, _SCALE, _PACK],
+}
+
+
+class Frames(Dataset):
+    """One frame of six images again and again, through a pipeline without ground truth.
+
+    Args:
+        files: The image files.
+        pipeline: Name of one of ``PIPELINES``.
+        count: Number of samples.
+    """
+
+    def __init__(self, files: Sequence[Path], pipeline: str, count: int) -> None:
+        init_default_scope("mmdet3d")
+        self.files = files
+        self.pipeline = Compose([TRANSFORMS.build(step) for step in PIPELINES[pipeline]])
+        self.count = count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, row: int) -> Any:
+        cameras = {
+            file.stem: {"img_path": str(file), "cam2img": np.eye(4), "lidar2cam": np.eye(4)}
+            for file in self.files
+        }
+        return self.pipeline({"images": cameras, "token": str(row), "cam_names": list(cameras)})
+
+
+def measure_images(folder: Path, count: int = 10, workers: Sequence[int] = ()) -> dict[str, float]:
+    """Measure the image steps of nuScenes' pipelines.
+
+    Args:
+        folder: Six JPEG files or more, such as a frame of nuScenes; the first six are read.
+        count: Samples of each measurement, and of each process.
+        workers: Numbers of processes that deliver training samples.
+
+    Returns:
+        By pipeline the processor time of one thread in ms a sample; by number of processes the
+        samples a second that arrive in batches of four, pinned where there is a GPU.
+
+    Raises:
+        ValueError: If there are fewer than six images.
+    """
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in (".jpg", ".jpeg"))
+    if len(files) < _CAMERAS:
+        raise ValueError(f"{folder} has {len(files)} JPEG files: give a folder of six or more.")
+    cv2.setNumThreads(0)
+    torch.set_num_threads(1)
+    found = {}
+    for name in PIPELINES:
+        frames = Frames(files[:_CAMERAS], name, count)
+        np.random.seed(0)  # noqa: NPY002  what mmdet draws from
+        frames[0]
+        start = time.process_time()
+        for row in range(count):
+            frames[row]
+        found[f"{name}, ms a sample"] = 1e3 * (time.process_time() - start) / count
+    for number in workers:
+        for name in ("train", "train, images_on_device"):
+            frames = Frames(files[:_CAMERAS], name, count * number)
+            found[f"{name}, samples/s, {number} workers"] = _samples_per_second(frames, number)
+    return found
+
+
+def _samples_per_second(frames: Frames, workers: int) -> float:
+    """Return how many samples arrive in a second, once every process has delivered one batch."""
+    loader = DataLoader(
+        frames,
+        batch_size=4,
+        num_workers=workers,
+        collate_fn=pseudo_collate,
+        pin_memory=torch.cuda.is_available(),
+    )
+    arrived = 0
+    start = 0.0
+    for number, batch in enumerate(loader, 1):
+        if number == workers:
+            start = time.perf_counter()
+        elif number > workers:
+            arrived += len(batch["data_samples"])
+    return arrived / (time.perf_counter() - start)

@@ -1,0 +1,269 @@
+"""Frames on a GPU without launches one by one: a model as one static function, as a CUDA graph.
+
+A frame of these models is some thousand small operations, and a GPU would wait for the host to
+launch each. Where no size depends on values, all launches of a frame are recorded once for each
+size of images and replayed afterwards.
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from mmengine.structures import InstanceData
+from torch import Tensor, nn
+
+from gsmap.structures.calibration import calibration_arrays
+from gsmap.structures.grid import padded_size
+from gsmap.structures.tensors import tensor_versions, uploaded
+
+if TYPE_CHECKING:
+    from mmdet3d.structures import Det3DDataSample
+
+SWITCH = "cuda_graphs"  # of `MapInferencer`; --cuda-graphs of the commands
+CAPTURE_BY_DEFAULT = False  # until a GPU has found captured frames equal to eager ones
+_MOST_GRAPHS = 4  # of different sizes; each holds the memory of a frame
+_WARM_UP = 3  # frames before a capture: libraries choose and load their kernels
+
+
+def reason_against(model: Any) -> str:
+    """Why frames of a model cannot be one static function; empty if they can.
+
+    Args:
+        model: A `MapDetector`.
+    """
+    head = model.map_head
+    if model.lidar_encoder is not None:
+        return "it reads LiDAR, whose number of voxels changes"
+    if model.temporal is not None:
+        return "it remembers earlier frames (temporal)"
+    if head.not_exported:
+        return f"{type(head).__name__} has no fixed number of operations ({head.not_exported})"
+    if not hasattr(model.data_preprocessor, "normalised"):
+        return "its data_preprocessor is not MapDataPreprocessor"
+    return ""
+
+
+class StaticFrame(nn.Module):
+    """A model from pixels to its best elements, as a function of tensors of fixed sizes.
+
+    Args:
+        model: A `MapDetector` of cameras in evaluation mode. Its encoder takes the paths of fixed
+            sizes from then on, whose results differ from the others' by rounding.
+
+    Attributes:
+        layout: Name, shape and type of each field of an element, after the first call.
+
+    Raises:
+        ValueError: If the model has no static form (`reason_against`).
+    """
+
+    def __init__(self, model: Any) -> None:
+        super().__init__()
+        if reason := reason_against(model):
+            raise ValueError(f"this model has no static form: {reason}.")
+        self.model = model
+        self.names: tuple[str, ...] = model.bev_encoder.calibration
+        self.layout: dict[str, tuple[torch.Size, torch.dtype]] = {}
+        for part in model.bev_encoder.modules():
+            if hasattr(part, "fixed_sizes"):
+                part.fixed_sizes = True
+
+    def forward(self, images: Tensor, *calibration: Tensor) -> Tensor:
+        """Best elements of each sample, wherever they lie, best first.
+
+        Args:
+            images: Pixel values of the cameras, 0 to 255. (B, V, 3, H, W)
+            calibration: Arrays of ``names`` (`calibration_arrays`). (B, V, 4, 4) or (B, 18) each
+
+        Returns:
+            The fields of ``layout`` side by side, in float32. (B, M, F)
+        """
+        model = self.model
+        images = model.data_preprocessor.normalised(images)
+        feats = model.extract_img_feats(images)
+        given = dict(zip(self.names, calibration, strict=True))
+        shape = (images.shape[-2], images.shape[-1])
+        outputs = model.bev_encoder.encode(model.bev_encoder.levels(feats), given, shape)
+        last = model.map_head(outputs)[-1]
+        rows = [
+            self._elements(scores, references)
+            for scores, references in zip(last.scores, last.references, strict=True)
+        ]
+        return torch.stack(rows)
+
+    def _elements(self, scores: Tensor, references: Any) -> Tensor:
+        """Return the best elements of one sample, their fields side by side. (M, F)"""
+        head = self.model.map_head
+        decoded = head.reference.decode(references)
+        best = head.coder.best(head.coder.weighed(scores, decoded))
+        fields = {"scores_3d": best.scores, "labels_3d": best.labels}
+        fields |= head.detected(decoded, best)
+        self.layout = {name: (value.shape[1:], value.dtype) for name, value in fields.items()}
+        columns = [value.flatten(1).float() for value in _as_columns(fields.values())]
+        return torch.cat(columns, 1)
+
+    def unpack(self, elements: Tensor) -> dict[str, Tensor]:
+        """Return the fields of a sample's elements, on the host. (M, F) -> (M, ...) each"""
+        sizes = [shape.numel() for shape, _ in self.layout.values()]
+        parts = elements.split(sizes, 1)
+        return {
+            name: part.reshape(len(part), *shape).to(dtype)
+            for part, (name, (shape, dtype)) in zip(parts, self.layout.items(), strict=True)
+        }
+
+
+@dataclass
+class _Captured:
+    """A recorded frame of one size."""
+
+    graph: Any
+    inputs: list[Tensor]
+    output: Tensor
+    versions: list[tuple[int, int]]  # of the model's weights
+
+
+@dataclass
+class FastFrames:
+    """Predicts batches by a `StaticFrame`, recorded as a CUDA graph for each size.
+
+    Several threads may call it; their frames are computed one after another.
+
+    Args:
+        frame: The function.
+        device: Where its model is.
+        capture: Whether frames are recorded and replayed; else each is launched by itself.
+    """
+
+    frame: StaticFrame
+    device: torch.device
+    capture: bool = True
+    _graphs: "OrderedDict[Any, _Captured]" = field(default_factory=OrderedDict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def serves(self, batch: dict[str, Any]) -> bool:
+        """Return whether a batch has images of one size, as the function needs them."""
+        images = batch["inputs"].get("img")
+        shapes = {tuple(each.shape) for each in images or ()}
+        return len(shapes) == 1 and set(batch["inputs"]) == {"img"}
+
+    def __call__(self, batch: dict[str, Any]) -> "list[Det3DDataSample]":
+        """Return a collated batch's samples with ``pred_instances_3d``, on the CPU.
+
+        Args:
+            batch: ``inputs`` with ``img``, one tensor (V, 3, H, W) a sample, and ``data_samples``.
+
+        Raises:
+            RuntimeError: If a frame of this size cannot be captured.
+            ValueError: If a sample lacks what the encoder reads, or the number of cameras is
+                another than the model's.
+        """
+        samples = batch["data_samples"]
+        images = batch["inputs"]["img"]
+        if any(sample.metainfo.get("image_steps") for sample in samples):
+            preprocessor = self.frame.model.data_preprocessor
+            pixels = torch.stack(uploaded(images, self.device))
+            images = preprocessor.finished(pixels, samples)
+        else:
+            images = torch.stack(list(images))
+        self._add_shapes(batch, (images.shape[-2], images.shape[-1]))
+        names = self.frame.names
+        arrays = [calibration_arrays(sample.metainfo, names) for sample in samples]
+        stacks = [torch.from_numpy(np.stack([each[name] for each in arrays])) for name in names]
+        inputs = [images, *stacks]
+        with (
+            self._lock,
+            torch.no_grad(),
+            matrix_products(self.frame.model.half_backbone is not None),
+        ):
+            elements = self._run(inputs)
+        return [
+            self._with_predictions(sample, found)
+            for sample, found in zip(samples, elements, strict=True)
+        ]
+
+    def _add_shapes(self, batch: dict[str, Any], size: tuple[int, int]) -> None:
+        """Add the sizes of the padded images to the samples, as the data preprocessor does."""
+        preprocessor = self.frame.model.data_preprocessor
+        shape = padded_size(size, preprocessor.pad_size_divisor)
+        padded = preprocessor._get_pad_shape(batch)
+        for sample, pad_shape in zip(batch["data_samples"], padded, strict=True):
+            sample.set_metainfo({"batch_input_shape": shape, "pad_shape": pad_shape})
+
+    def _run(self, inputs: Sequence[Tensor]) -> Tensor:
+        """Return the elements of a batch, on the host. (B, M, F)"""
+        if not self.capture:
+            return self.frame(*(x.to(self.device) for x in inputs)).cpu()
+        key = tuple((x.shape, x.dtype) for x in inputs)
+        while True:
+            captured = self._graphs.get(key)
+            if captured is None:
+                captured = self._record(key, inputs)
+            for buffer, value in zip(captured.inputs, inputs, strict=True):
+                buffer.copy_(value, non_blocking=True)
+            captured.graph.replay()
+            # while the GPU works: are these still the weights whose addresses were recorded?
+            if tensor_versions(self.frame.model) == captured.versions:
+                self._graphs.move_to_end(key)
+                return captured.output.cpu()
+            del self._graphs[key]
+
+    def _record(self, key: Any, inputs: Sequence[Tensor]) -> _Captured:
+        """Record a frame of the inputs' sizes."""
+        while len(self._graphs) >= _MOST_GRAPHS:
+            self._graphs.popitem(last=False)
+        buffers = [x.to(self.device) for x in inputs]
+        with torch.cuda.device(self.device):
+            stream = torch.cuda.Stream()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                for _ in range(_WARM_UP):  # errors of the input itself are raised here, as they are
+                    self.frame(*buffers)
+            torch.cuda.current_stream().wait_stream(stream)
+            graph = torch.cuda.CUDAGraph()
+            try:
+                with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                    output = self.frame(*buffers)
+            except RuntimeError as error:
+                raise RuntimeError(
+                    f"a frame could not be captured as a CUDA graph ({error!s:.300}): run it "
+                    f"without ({SWITCH}=False, --no-{SWITCH.replace('_', '-')})."
+                ) from error
+        versions = tensor_versions(self.frame.model)
+        self._graphs[key] = _Captured(graph, buffers, output, versions)
+        return self._graphs[key]
+
+    def _with_predictions(self, sample: "Det3DDataSample", elements: Tensor) -> "Det3DDataSample":
+        """Return a sample with those of its elements that lie on the map. (M, F)"""
+        head = self.frame.model.map_head
+        fields = self.frame.unpack(elements)
+        on_map = head.coder.keep_mask(fields["scores_3d"], fields["pts"])
+        scores = fields.pop("scores_3d")[on_map]
+        labels = fields.pop("labels_3d")[on_map]
+        chosen = {name: value[on_map] for name, value in fields.items()}
+        chosen = head.coder.unfolded(chosen, labels)
+        chosen.update(scores_3d=scores, labels_3d=labels)
+        predicted = InstanceData(metainfo=dict(head.reference.metainfo), **chosen)
+        return self.frame.model.add_pred_to_datasample([sample], [predicted])[0]
+
+
+def _as_columns(values: Any) -> Iterator[Tensor]:
+    """Yield fields of elements as matrices. (M, ...) each"""
+    for value in values:
+        yield value[:, None] if value.dim() == 1 else value
+
+
+@contextmanager
+def matrix_products(in_tf32: bool) -> Iterator[None]:
+    """Let float32 matrix products on a GPU use TF32, or leave them as they are."""
+    before = torch.get_float32_matmul_precision()
+    if in_tf32:
+        torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)

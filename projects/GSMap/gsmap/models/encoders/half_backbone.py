@@ -1,0 +1,105 @@
+"""Image backbone and neck in half precision, for inference on a GPU."""
+
+import copy
+
+import torch
+from mmcv.cnn import fuse_conv_bn
+from mmdet.models.backbones import ResNet
+from mmdet.models.backbones.resnet import BasicBlock, Bottleneck
+from torch import Tensor, nn
+
+from gsmap.models.encoders.folded_backbone import can_be_folded
+from gsmap.structures.tensors import tensor_versions
+
+
+class HalfBackbone:
+    """Runs copies of an image backbone and its neck whose weights are float16, cast once.
+
+    Nearly all arithmetic of a frame is there. Autocast would cast every weight again at each frame.
+    Batch norms of ResNets are folded in float32, before the cast. On a GPU, convolutions of ResNet
+    blocks apply their bias, the residual and the ReLU themselves (cuDNN's fused operators). The
+    copies are made when they are first needed or a weight has changed.
+    """
+
+    def __init__(self) -> None:
+        self.backbone: nn.Module | None = None
+        self.neck: nn.Module | None = None
+        self.state: list[tuple[int, int]] = []  # address and version of the original tensors
+
+    @torch.no_grad()
+    def __call__(
+        self, backbone: nn.Module, neck: nn.Module | None, images: Tensor, channels_last: bool
+    ) -> list[Tensor]:
+        """Feature maps of normalised images.
+
+        Args:
+            backbone: The image backbone, in evaluation mode.
+            neck: Its neck, or None.
+            images: Normalised and padded images of all cameras, in float32. (n, 3, H, W)
+            channels_last: Whether images and weights are stored with the channels last.
+
+        Returns:
+            One map per level, in float32. (n, C, h, w) each
+        """
+        memory_format = torch.channels_last if channels_last else torch.contiguous_format
+        state = tensor_versions(backbone) + ([] if neck is None else tensor_versions(neck))
+        if self.backbone is None or state != self.state:
+            folds = can_be_folded(backbone)
+            copied = copy.deepcopy(backbone)
+            copied = fuse_conv_bn(copied) if folds else copied
+            self.backbone = copied.to(dtype=torch.float16, memory_format=memory_format)
+            self.neck = copy.deepcopy(neck)
+            if self.neck is not None:
+                self.neck.to(dtype=torch.float16, memory_format=memory_format)
+            self.fuses = folds and _is_plain(copied)
+            self.state = state
+        images = images.to(torch.float16, memory_format=memory_format)
+        if self.fuses and images.is_cuda:
+            feats = fused_resnet(self.backbone, images)
+        else:
+            feats = self.backbone(images)
+        if self.neck is not None:
+            feats = self.neck(feats)
+        return [feat.float() for feat in feats]
+
+
+def fused_resnet(backbone: ResNet, images: Tensor) -> tuple[Tensor, ...]:
+    """Feature maps of a folded ResNet, each block as fused convolutions of cuDNN.
+
+    Args:
+        backbone: ResNet whose batch norms are folded into its convolutions, on a GPU.
+        images: Its input, of the same type. (n, 3, H, W)
+
+    Returns:
+        The maps of ``backbone.out_indices``. (n, C, h, w) each
+    """
+    x = backbone.maxpool(_convolve(backbone.conv1, images))
+    feats = []
+    for index, name in enumerate(backbone.res_layers):
+        for block in getattr(backbone, name):
+            identity = x if block.downsample is None else block.downsample(x)
+            last = block.conv2
+            x = _convolve(block.conv1, x)
+            if isinstance(block, Bottleneck):
+                x = _convolve(block.conv2, x)
+                last = block.conv3
+            x = _convolve(last, x, identity)
+        if index in backbone.out_indices:
+            feats.append(x)
+    return tuple(feats)
+
+
+def _convolve(conv: nn.Conv2d, x: Tensor, identity: Tensor | None = None) -> Tensor:
+    """Convolution, then bias, the residual if there is one, and ReLU, as one operator."""
+    geometry = (conv.stride, conv.padding, conv.dilation, conv.groups)
+    if identity is None:
+        return torch.cudnn_convolution_relu(x, conv.weight, conv.bias, *geometry)
+    return torch.cudnn_convolution_add_relu(x, conv.weight, identity, 1.0, conv.bias, *geometry)
+
+
+def _is_plain(backbone: nn.Module) -> bool:
+    """Return whether a folded backbone is a ResNet of plain blocks, as `fused_resnet` takes it."""
+    if not isinstance(backbone, ResNet) or backbone.deep_stem or backbone.plugins is not None:
+        return False
+    blocks = [block for name in backbone.res_layers for block in getattr(backbone, name)]
+    return all(type(block) in (BasicBlock, Bottleneck) for block in blocks)
