@@ -1,8 +1,10 @@
 """What exceptions say to a user: the machine's, a file's, a config's, a data loader's worker's."""
 
+import errno
 import os
 import signal
 
+import pyarrow as pa
 import pytest
 import torch
 from mmengine import Registry
@@ -10,7 +12,9 @@ from mmengine.config import Config
 from torch.utils.data import DataLoader
 
 from gsmap.checkpoints.building import building
-from gsmap.utils.faults import in_words
+from gsmap.checkpoints.reading import refusing
+from gsmap.datasets.errors import naming
+from gsmap.utils.faults import in_words, is_of_the_machine
 
 PARTS = Registry("part")
 
@@ -144,3 +148,25 @@ def test_the_signal_of_a_worker_says_what_was_missing(cause, text):
         raise RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly") from OSError(cause)
 
     assert said(end).startswith(text)
+
+
+@pytest.mark.parametrize(
+    ("error", "of_machine"),
+    [
+        (MemoryError(), True),
+        (pa.ArrowMemoryError("malloc of size 64 failed"), True),
+        (OSError(errno.EMFILE, "Too many open files"), True),
+        (PermissionError(errno.EACCES, "Permission denied"), True),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried 4 bytes"), True),
+        (OSError(errno.EINVAL, "Invalid argument"), False),
+        (OSError("Expected to read 4 bytes, got 2"), False),
+        (RuntimeError("PytorchStreamReader failed reading zip archive"), False),
+        (ValueError("cannot allocate memory"), False),
+    ],
+)
+def test_a_file_is_not_to_blame_for_what_the_machine_lacks(error, of_machine):
+    assert is_of_the_machine(error) == of_machine
+    for reading in (refusing("a.pth"), naming("a.json", "copy it again")):
+        with pytest.raises(type(error) if of_machine else Exception) as raised, reading:
+            raise error
+        assert not of_machine or raised.value is error

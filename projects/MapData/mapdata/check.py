@@ -12,6 +12,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
+from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.words import counted
@@ -29,8 +30,8 @@ def _open(path: Path) -> AnnotationFile:
             if not reader.get_batch(number).equals(batch):
                 raise ValueError(f"part {number} is another one")
     except (pa.ArrowException, OSError, ValueError) as error:
-        if isinstance(error, MemoryError) or getattr(error, "errno", None):
-            raise  # what the machine lacks is no fault of the file
+        if is_of_the_machine(error):
+            raise
         raise ValueError(
             f"{path}: the footer, by which other programs read the file, is damaged ({error}); "
             f"{file.remedy}"

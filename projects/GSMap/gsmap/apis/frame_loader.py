@@ -1,6 +1,7 @@
 """Frames for inference: absent cameras are blank, and broken frames set apart."""
 
 import copy
+import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,8 @@ from gsmap.structures.calibration import OUT_OF_SIGHT
 
 if TYPE_CHECKING:
     from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
+
+_LACKS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}  # open files and memory
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,8 @@ class FrameDataset(Dataset):
         try:
             return self._frame(row)
         except (ValueError, OSError) as error:
+            if isinstance(error, OSError) and error.errno in _LACKS:
+                raise  # no frame is to blame
             return BrokenFrame(self.dataset.sample(row).token, str(error))
 
     def _frame(self, row: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -31,7 +32,7 @@ from gsmap.checkpoints.settings import (
     scale_steps,
 )
 from gsmap.checkpoints.unwrapping import UnfitError, Unwrapped, unwrap
-from gsmap.utils.faults import in_words
+from gsmap.utils.faults import in_words, is_of_the_machine
 from gsmap.utils.files import fetch_advice
 from gsmap.utils.model_facts import calibration_of
 from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
@@ -86,6 +87,8 @@ def refusing(path: object) -> Iterator[None]:
         otherwise = f"it is broken, or holds more than tensors and plain data ({reason}); {_REMEDY}"
         raise ValueError(f"{path} was not loaded: {_advice(path, otherwise)}.") from error
     except _DAMAGE as error:
+        if is_of_the_machine(error) and not _asks_for_more(error, Path(str(path))):
+            raise
         advice = _advice(path, "fetch it again, or use an earlier epoch's")
         raise ValueError(
             f"{path} is not a whole checkpoint ({type(error).__name__}: {error}); {advice}."
@@ -99,6 +102,12 @@ def _advice(path: object, otherwise: str) -> str:
         return otherwise
     with file.open("rb") as opened:
         return fetch_advice(opened.read(100), otherwise.rstrip("."))
+
+
+def _asks_for_more(error: BaseException, path: Path) -> bool:
+    """Whether more memory was asked for than a file has bytes, whatever tensors it tells of."""
+    asked = re.search(r"allocate (\d+) bytes", str(error))
+    return asked is not None and path.is_file() and int(asked[1]) > path.stat().st_size
 
 
 def read_checked(path: str | Path) -> Checkpoint:

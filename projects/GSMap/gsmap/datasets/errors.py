@@ -6,6 +6,8 @@ from contextlib import contextmanager
 import pyarrow as pa
 import shapely
 
+from gsmap.utils.faults import is_of_the_machine
+
 
 class BrokenSampleError(ValueError):
     """A sample cannot be used because one of its files is missing, damaged or empty.
@@ -33,8 +35,7 @@ def naming(what: object, remedy: str) -> Iterator[None]:
     except Exception as error:
         expected = isinstance(error, _UNEXPECTED) or type(error) is Exception  # nuScenes' devkit
         of_arrow = type(error) is OSError and error.errno is None
-        of_machine = isinstance(error, MemoryError)  # also Arrow's own
-        if of_machine or not (expected or of_arrow) or str(what) in str(error):
+        if is_of_the_machine(error) or not (expected or of_arrow) or str(what) in str(error):
             raise
         reason = str(error)
         if isinstance(error, KeyError):

@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
+import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.structures.elements import FloatArray, IntArray
 
 Lines = tuple[FloatArray, IntArray, IntArray]

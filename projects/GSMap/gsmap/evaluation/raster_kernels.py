@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
 WordArray = npt.NDArray[np.uint64]

@@ -18,6 +18,7 @@ _SHORTENED = (
     "a data file was shortened while it was read (end what writes there, make it again), or "
     "/dev/shm is full (take fewer num_workers)"
 )
+_FEWER = "use fewer processes (num_workers, --workers)"
 _REMEDIES = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
@@ -29,7 +30,9 @@ _REMEDIES = {
     errno.ENOTDIR: "a part of that path is a file",
     errno.EEXIST: "choose another name or remove it",
     errno.ENOENT: "check the path",
-    errno.EMFILE: "use fewer processes (num_workers, --workers)",
+    errno.EMFILE: _FEWER,
+    errno.ENFILE: _FEWER,
+    errno.ENOMEM: _FEWER,
 }
 _NO_MEMORY = re.compile(
     r"out of memory|(can't|Cannot|cannot) allocate memory|not enough memory|DataLoader worker \(pid"
@@ -73,6 +76,15 @@ def in_words(error: BaseException) -> str | None:
         or _of_a_config(error, text, scope, last)
         or (text if meant and isinstance(error, _CHECKS) else None)
     )
+
+
+def is_of_the_machine(error: BaseException) -> bool:
+    """Whether an error tells what the system lacks or refuses, and nothing of a file's content."""
+    if isinstance(error, MemoryError):  # also Arrow's
+        return True
+    if isinstance(error, OSError) and error.errno:
+        return error.errno != errno.EINVAL  # as a damaged file leads to a place before its start
+    return isinstance(error, RuntimeError | OSError) and bool(_NO_MEMORY.search(str(error)))
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

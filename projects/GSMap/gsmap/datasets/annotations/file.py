@@ -30,6 +30,7 @@ from gsmap.datasets.annotations.schema import (
     row_of,
     schema_of,
 )
+from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.files import atomic_write
 from gsmap.utils.inputs import heed_input
 from gsmap.utils.shards import WHOLE, Shard, ShardFile
@@ -208,8 +209,8 @@ class AnnotationFile(Sequence[MapSample]):
             schema, self._batches, seal, ends = read_messages(self._content)
             self.meta = _meta_of(schema)
         except (pa.ArrowException, OSError, ValueError, TypeError) as error:
-            if isinstance(error, MemoryError) or getattr(error, "errno", None):
-                raise  # what the machine lacks is no fault of the file
+            if is_of_the_machine(error):
+                raise
             raise ValueError(
                 f"{self.path} is not a whole annotation file ({error}): delete it and run "
                 "tools/create_data.py again."
@@ -224,7 +225,7 @@ class AnnotationFile(Sequence[MapSample]):
             elif [end for end, _ in sums] != ends:
                 raise ValueError("it was replaced after this run had opened it")
         except (pa.ArrowException, ValueError, TypeError, KeyError) as error:
-            if isinstance(error, MemoryError):
+            if is_of_the_machine(error):
                 raise
             text = str(error).rstrip(".")
             raise ValueError(

@@ -15,6 +15,7 @@ from pyarrow import feather
 
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.structures.grid import padded_size
+from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.inputs import heed_input
 
 # Argoverse 2's columns in the order of their use; the first five mean what nuScenes' values mean.
@@ -70,8 +71,8 @@ def _read_feather(path: str, load_dim: int) -> np.ndarray:
         table.validate(full=True)
         columns = [table[name].to_numpy().astype(np.float32) for name in names]
     except (pa.ArrowException, OSError, ValueError, TypeError) as error:
-        if isinstance(error, MemoryError) or getattr(error, "errno", None):
-            raise  # what the machine lacks is no fault of the file
+        if is_of_the_machine(error):
+            raise
         raise BrokenSampleError(
             f"{path} is not a whole LiDAR sweep ({error}): download it again."
         ) from error
