@@ -1,3 +1,4 @@
+import importlib
 import math
 
 import pytest
@@ -155,6 +156,28 @@ def test_autocast_second_backward_and_runs_change_nothing():
     assert torch.equal(plain, mixed)
     first = torch.autograd.grad(plain.sum(), pred, retain_graph=True)[0]
     assert torch.equal(first, torch.autograd.grad(plain.sum(), pred)[0])
+
+
+def test_many_masks_are_compared_some_at_a_time(monkeypatch):
+    """The plain path keeps some thirty tensors of its masks at once: of no more than so many."""
+    module = importlib.import_module("gsmap.ops.raster_loss")
+    torch.manual_seed(0)
+    preds, targets = torch.rand(2, 5, 7, 9, dtype=torch.float64)
+    numbers, sums = [], module.raster_loss_sums_reference
+    found = []
+    for most in (5, 2):
+        monkeypatch.setattr(module, "AT_ONCE", most)
+        monkeypatch.setattr(
+            module,
+            "raster_loss_sums_reference",
+            lambda pred, *rest: numbers.append(len(pred)) or sums(pred, *rest),
+        )
+        leaf = preds.clone().requires_grad_()
+        values = raster_loss(leaf, targets, backend="reference")
+        values.sum().backward()
+        found.append((values.detach(), leaf.grad))
+    torch.testing.assert_close(found[0], found[1], rtol=0, atol=0)
+    assert sorted(numbers) == [1, 1, 2, 2, 2, 2, 5, 5]  # forward, and again for the gradient
 
 
 def test_shapes_that_disagree_are_named():

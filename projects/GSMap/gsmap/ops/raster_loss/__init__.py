@@ -11,6 +11,7 @@ from gsmap.ops.raster_loss.reference import gaussian_window, raster_loss_sums_re
 
 NORMALIZATIONS = ("both", "foreground", "pixels")
 MIN_FOREGROUND = 0.005  # "foreground": a smaller ground truth counts as this share of the raster
+AT_ONCE = 512  # masks whose values in between are in memory at once, some 30 times their own
 _EPS = 1e-6
 _raster_loss_sums = fused_operator(
     "raster_loss.raster_loss_sums",
@@ -74,16 +75,19 @@ def raster_loss(
             window = gaussian_window(window_size, window_sigma, preds)
             sums = _raster_loss_sums(preds, targets, window, foreground_weight, backend)
         else:
-            sums = checkpoint(
-                raster_loss_sums_reference,
-                preds,
-                targets,
-                window_size,
-                window_sigma,
-                foreground_weight,
-                use_reentrant=False,
-                preserve_rng_state=False,  # nothing is random; saving it would wait for a GPU
-            )
+            parts = [
+                checkpoint(
+                    raster_loss_sums_reference,
+                    *part,
+                    window_size,
+                    window_sigma,
+                    foreground_weight,
+                    use_reentrant=False,
+                    preserve_rng_state=False,  # nothing is random; saving it would wait for a GPU
+                )
+                for part in zip(preds.split(AT_ONCE), targets.split(AT_ONCE), strict=True)
+            ]
+            sums = torch.cat(parts)
         l1, predicted, dissimilarity, foreground, excess, sees_target, sees_either = sums.unbind(-1)
         pixels = math.prod(preds.shape[1:])
         if normalize == "both":
