@@ -29,6 +29,13 @@ class BezierLines(NamedTuple):
     masks: Tensor  # logits (n, H, W)
 
 
+class Pairs(NamedTuple):
+    """Matched lines of a case."""
+
+    rows: Tensor  # numbers of the predicted ones (M,)
+    cols: Tensor  # and of the annotated ones (M,)
+
+
 class TrueCurves(NamedTuple):
     """Annotated lines of one class in one sample."""
 
@@ -94,14 +101,11 @@ class BezierLosses(LineLosses):
         ]
         return (torch.cat([self.line_costs(case), torch.stack(own)]),)
 
-    def pairs(self, case: Case, costs: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return matched predictions and annotations by the `costs` on the CPU. (M,)"""
-        rows, cols = assigned(costs[0], COSTS, {"token": case.token})
-        return rows.to(case.apart.device), cols.to(case.apart.device)
+    def pairs(self, case: Case, costs: list[Tensor]) -> Pairs:
+        """Match a case by its `costs`, on the CPU."""
+        return Pairs(*assigned(costs[0], COSTS, {"token": case.token}))
 
-    def __call__(
-        self, cases: Sequence[Case], matches: Sequence[tuple[Tensor, Tensor]]
-    ) -> dict[str, Tensor]:
+    def __call__(self, cases: Sequence[Case], matches: Sequence[Pairs]) -> dict[str, Tensor]:
         """Return the weighted losses of a layer and class, from the cases of all samples."""
         number = max(sum(len(case.truth.pieces) for case in cases), 1)
         rows, cols = zip(*matches, strict=True)

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsmap.structures.tensors import constant
+from gsmap.structures.tensors import constant, uploaded
 
 LINE = 0  # the place of a line's logit; the other one is of none
 
@@ -41,19 +42,24 @@ class LineLosses:
 
     @torch.no_grad()
     def match(self, cases: Sequence[Case]) -> list[Any]:
-        """Match the lines of each case; FloatingPointError if a cost is not a number."""
+        """Match the lines of each case; FloatingPointError if a cost is not a number.
+
+        All costs are read from the device in one copy, and all pairs return in one.
+        """
         parts = [self.costs(case) for case in cases]
         flat = torch.cat([part.flatten() for own in parts for part in own])
         values = iter(flat.cpu().split([part.numel() for own in parts for part in own]))
         read = ([next(values).view(part.shape) for part in own] for own in parts)
-        return [self.pairs(*each) for each in zip(cases, read, strict=True)]
+        matched = [self.pairs(*each) for each in zip(cases, read, strict=True)]
+        there = iter(uploaded([part for own in matched for part in own], flat.device))
+        return [own._make(islice(there, len(own))) for own in matched]
 
     def costs(self, case: Case) -> tuple[Tensor, ...]:
         """Return what the matching of a case reads; all cases are read in one copy."""
         raise NotImplementedError
 
     def pairs(self, case: Case, costs: list[Tensor]) -> Any:
-        """Match a case by its `costs`, on the CPU."""
+        """Match a case by its `costs`, on the CPU; return a NamedTuple of tensors there."""
         raise NotImplementedError
 
     def __call__(self, cases: Sequence[Case], matches: Sequence[Any]) -> dict[str, Tensor]:

@@ -80,8 +80,7 @@ class PivotLosses(LineLosses):
             is_pivot[pair, path] = True
             places = np.stack([np.interp(points, path, axis) for axis in line.T], -1)
             expected[pair] = torch.from_numpy(places)
-        device = case.apart.device
-        return Pairs(*(part.to(device) for part in (rows, cols, is_pivot, expected)))
+        return Pairs(rows, cols, is_pivot, expected)
 
     def __call__(self, cases: Sequence[Case], matches: Sequence[Pairs]) -> dict[str, Tensor]:
         """Return the weighted losses of a layer and class, from the cases of all samples."""
