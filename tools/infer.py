@@ -324,7 +324,8 @@ def main(argv: list[str] | None = None) -> str | None:
     with log as results:
         broken = predict(args, inferencer, dataset, chosen, results)
         if chosen and len(broken) == len(chosen):
-            raise ValueError(f"no frame can be used: {next(iter(broken.values()))}")
+            noted = "".join(f"; as said: {note}" for note in source.notes[-1:])
+            raise ValueError(f"no frame can be used: {next(iter(broken.values()))}{noted}")
         if results:
             count = results.finish(about_results(args, dataset.metainfo))
             args.shard.seal(args.out, RESULTS, made_from, settings, count)

@@ -72,6 +72,14 @@ def is_calibrated(info: Any) -> bool:
     return any(_is_pinhole(_matrix(info, name)) for name in ("k", "p"))
 
 
+def is_same_calibration(info: Any, other: Any) -> bool:
+    """Whether two camera infos hold the same size, K, P and distortion."""
+    sizes = ((item.width, item.height) for item in (info, other))
+    return next(sizes) == next(sizes) and all(
+        np.array_equal(_field(info, name), _field(other, name), equal_nan=True) for name in "kpd"
+    )
+
+
 def _is_pinhole(matrix: np.ndarray) -> bool:
     """Whether a matrix is finite and has focal lengths above 0."""
     return bool(np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) > 0)

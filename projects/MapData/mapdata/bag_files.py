@@ -14,8 +14,7 @@ Bag = RosBag | McapBag
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
 _PACKED = (".zstd", ".zst", ".lz4", ".gz", ".bz2", ".xz", ".zip", ".tar")
-_SQLITE = b"SQLite format 3\0"
-_ROS_1 = b"#ROSBAG V"
+_STARTS = {".mcap": MAGIC, ".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0"}
 
 
 def is_bag(path: Path) -> bool:
@@ -55,11 +54,9 @@ def bag_at(path: Path) -> Bag:
     parts = parts_in(path)
     if not (path / _METADATA).is_file():
         _check_parts(parts)
-        note = (
-            f"{path.name} has no {_METADATA}: {', '.join(part.name for part in parts)} are read as "
-            "the parts of one recording"
-        )
-        return _bag_of(parts, [note, *_notes_on(parts)])
+        names = ", ".join(part.name for part in parts)
+        note = f"{path.name} has no {_METADATA}: {names} are read as the parts of one recording"
+        return _bag_of(parts, [note] * (len(parts) > 1) + _notes_on(parts))
     listed = _listed_parts(path)
     notes = _notes_on(listed)
     if others := [part.name for part in parts if part not in listed]:
@@ -114,19 +111,26 @@ def damage_in(path: Path) -> str | None:
     if not path.is_dir():
         return _damage_of(path)
     file = path / _METADATA
-    if file.is_file() and not _is_metadata(file):
+    listed = _listed_names(file) if file.is_file() else []
+    if listed is None:
         return f"{_METADATA} is empty or damaged: `ros2 bag reindex {path.name}` writes it anew"
+    if missing := [name for name in listed if not (path / name).is_file()]:
+        return (
+            f"{_METADATA} names {', '.join(missing)}, not there: copy all files of the recording, "
+            f"or `ros2 bag reindex {path.name}` to go on with the others"
+        )
     found = ((part.name, _damage_of(part)) for part in parts_in(path))
     return next((f"{name}: {damage}" for name, damage in found if damage), None)
 
 
-def _is_metadata(file: Path) -> bool:
-    """Whether a file of metadata can be read."""
+def _listed_names(file: Path) -> list[str] | None:
+    """Return the names of the files in metadata, or None if they cannot be read."""
     try:
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
-        return isinstance(content["rosbag2_bagfile_information"], dict)
+        paths = content["rosbag2_bagfile_information"]["relative_file_paths"]
+        return [Path(str(path)).name for path in paths]
     except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError):
-        return False
+        return None
 
 
 def _damage_of(path: Path) -> str | None:
@@ -138,17 +142,22 @@ def _damage_of(path: Path) -> str | None:
         start = file.read(4096)
         file.seek(max(size - len(MAGIC), 0))
         end = file.read()
-    if path.suffix == ".mcap" and start.startswith(MAGIC) and end != MAGIC:
+    if not start.startswith(_STARTS[path.suffix]):
+        return (
+            f"it begins with {start[:12]!r} and is no {path.suffix} file: is it a pointer of git "
+            "lfs, a page of the web, or a bag older than ROSBAG V2.0?"
+        )
+    if path.suffix == ".mcap" and end != MAGIC:
         return (
             "it has no end, since the recorder was killed or the copy is cut short: copy it again, "
             f"or `mcap recover {path.name} -o whole.mcap` keeps all messages before the cut"
         )
-    if path.suffix == ".db3" and start.startswith(_SQLITE) and size < _sqlite_size(start):
+    if path.suffix == ".db3" and size < _sqlite_size(start):
         return (
             f"it is cut short: copy it again, or `sqlite3 {path.name} .recover | sqlite3 whole.db3`"
             " keeps what is readable"
         )
-    if path.suffix == ".bag" and start.startswith(_ROS_1):
+    if path.suffix == ".bag":
         index = re.search(rb"index_pos=(.{8})", start, re.DOTALL)
         position = struct.unpack("<Q", index[1])[0] if index else 0
         if not 0 < position <= size:

@@ -34,6 +34,7 @@ class Transforms:
         times_ns: Their times, as they came. (n,)
         poses: From the child to the parent. each (4, 4)
         count: Number of messages.
+        changed: Number of static ones that differ from the first.
     """
 
     topic: str
@@ -43,6 +44,7 @@ class Transforms:
     times_ns: list[int] = field(default_factory=list)
     poses: list[np.ndarray] = field(default_factory=list)
     count: int = 0
+    changed: int = 0
 
     def add(self, time_ns: int, pose: np.ndarray) -> None:
         """Add a message."""
@@ -50,6 +52,8 @@ class Transforms:
         if not self.is_static or not self.times_ns:
             self.times_ns.append(time_ns)
             self.poses.append(pose)
+        elif np.abs(pose - self.poses[0]).max() > _STILL_M:
+            self.changed += 1
 
     @cached_property
     def moves(self) -> bool:
@@ -183,6 +187,11 @@ class FrameTree:
                 ),
             )
             self._chosen[child] = best
+            if best.changed:
+                self.notes.append(
+                    f"{best.changed} of the transforms from {child!r} to {best} differ from the "
+                    "first, which is used"
+                )
             others = [str(edge) for edge in sources.values() if edge is not best]
             if others:
                 self.notes.append(

@@ -14,7 +14,7 @@ from gsmap.datasets.source import Source
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.utils.files import file_name
 from mapdata.argoverse2.samples import thin_out
-from mapdata.bag_cameras import ImageTopic, camera_of, is_calibrated
+from mapdata.bag_cameras import ImageTopic, camera_of, is_calibrated, is_same_calibration
 from mapdata.bag_files import Bag, bag_at, damage_in
 from mapdata.bag_images import write_image
 from mapdata.bag_poses import FrameTree, Odometry, PoseChain, is_static_topic, odometry_poses
@@ -79,11 +79,32 @@ class _Content:
     odometries: dict[tuple[str, str, str], Odometry] = field(default_factory=dict)
     digest: Any = field(default_factory=hashlib.sha256)
     unread: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    unreadable: dict[str, str] = field(default_factory=dict)
     unstamped: Counter[str] = field(default_factory=Counter)
+    changed_infos: Counter[str] = field(default_factory=Counter)
+
+    def add_info(self, topic: str, info: Any) -> None:
+        """Keep the first camera info with focal lengths, and count those that differ from it."""
+        known = self.infos.get(topic)
+        if known is None or not is_calibrated(known):
+            self.infos[topic] = info
+        elif not is_same_calibration(known, info):
+            self.changed_infos[topic] += 1
+
+    def reason(self, topics: Sequence[str]) -> str:
+        """Return why messages of some topics cannot be read, empty if they can."""
+        reasons = [self.unreadable[topic] for topic in topics if topic in self.unreadable]
+        reasons += [self.unread[topic][0] for topic in topics if topic in self.unread]
+        return reasons[0] if reasons else ""
 
     def notes(self) -> list[str]:
-        """Say what cannot be read, and which stamps are 0."""
-        notes = [
+        """Say what cannot be read or is not used."""
+        notes = [f"{topic!r} is left out: {why}" for topic, why in self.unreadable.items()]
+        notes += [
+            f"{count} messages of the camera info of {topic!r} differ from the first, which is used"
+            for topic, count in self.changed_infos.items()
+        ]
+        notes += [
             f"{len(reasons)} messages of {topic!r} cannot be read and are left out: {reasons[0]}"
             for topic, reasons in self.unread.items()
         ]
@@ -105,7 +126,7 @@ def _read(bag: Bag, path: Path, options: InputOptions) -> Source:
     if calibration is None:
         topics = topics or camera_topics(kinds, listing)
         content = _first_pass(bag, topics)
-        vehicle = content.tree.choose_vehicle(options.vehicle_frame)
+        vehicle = _vehicle(content, options.vehicle_frame)
         rig, of_cameras = _rig(topics, content, vehicle, ground, by_hand=bool(options.topics))
         notes += of_cameras
     else:
@@ -119,7 +140,7 @@ def _read(bag: Bag, path: Path, options: InputOptions) -> Source:
         for name in topics:
             _require_messages(name, topics[name], content)
         has_frames = bool(content.tree.frames)
-        vehicle = content.tree.choose_vehicle(options.vehicle_frame) if has_frames else ""
+        vehicle = _vehicle(content, options.vehicle_frame) if has_frames else ""
         rig = {topics[camera.name][0]: camera for camera, _ in given}
     content.digest.update(calibration.read_bytes() if calibration else b"")
     times = {
@@ -196,7 +217,7 @@ def _first_pass(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> _Content:
             bag.parser(connection)
             chosen.append(connection)
         except ValueError as error:
-            content.unread[connection.topic].append(" ".join(str(error).split()))
+            content.unreadable[connection.topic] = " ".join(str(error).split())
     for connection, time_ns, raw in _messages(bag, chosen):
         topic, kind = connection.topic, connection.msgtype
         content.digest.update(f"{topic} {kind} {len(raw)}\n".encode())
@@ -207,9 +228,7 @@ def _first_pass(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> _Content:
                     message = bag.parser(connection)(raw)
                 if topic in topic_of:
                     for images_of in topic_of[topic]:
-                        known = content.infos.get(images_of)
-                        if known is None or not is_calibrated(known):
-                            content.infos[images_of] = message
+                        content.add_info(images_of, message)
                 else:
                     _keep(content, message, topic, kind, time_ns)
         except ValueError as error:
@@ -249,14 +268,23 @@ def _is_unstamped(header: Any) -> bool:
     return _time_ns(header, 0) == 0
 
 
+def _vehicle(content: _Content, wanted: str | None) -> str:
+    """Choose the vehicle's frame; an error names topics that cannot be read, too."""
+    try:
+        return content.tree.choose_vehicle(wanted)
+    except ValueError as error:
+        topics = [*content.unreadable, *content.unread]
+        unread = f"; {', '.join(topics)} cannot be read: {content.reason(topics)}" if topics else ""
+        raise ValueError(f"{error}{unread}") from error
+
+
 def _require_messages(name: str, topics: tuple[str, str], content: _Content) -> None:
     """Raise a ``ValueError`` unless there are images of a camera, and its info if it has one."""
     topic, info = topics
     if not content.images[topic].times_ns or (info and topic not in content.infos):
-        reason = next((content.unread[t][0] for t in (topic, info) if t in content.unread), "")
         raise ValueError(
             f"camera {name!r} has no message on {topic} or {info or 'its info'}: choose others "
-            f"with --topics, or give --calibration. {reason}".rstrip(" .")
+            f"with --topics, or give --calibration. {content.reason(topics)}".rstrip(" .")
         )
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from bag_cases import PINHOLE, Recorder, Straight, jpeg, options, picture
+from bag_cases import PINHOLE, START_NS, Recorder, Straight, at, jpeg, options, picture
 
 from mapdata.bag_cameras import ImageTopic, camera_of, is_rectified
 from mapdata.bag_topics import parse_topics
@@ -272,3 +272,21 @@ def test_yuv_of_either_order_of_bytes_keeps_its_colours(straight, tmp_path, enco
     assert source.notes == ()
     found = cv2.imread(str(source.data_root / source.samples[0].cameras[0].path)).astype(int)
     assert np.abs(found - picture()).mean() < 4
+
+
+def test_camera_infos_and_static_transforms_that_change_are_counted(straight, tmp_path):
+    def info(camera, time_ns):
+        matrix = PINHOLE if time_ns < straight.times_ns[4] else 2 * PINHOLE
+        straight.recorder.info(camera, time_ns, k=matrix.ravel())
+
+    def before():
+        for ahead_m in (1.0, 3.0, 1.0):
+            straight.recorder.transform(
+                "/tf_static", START_NS, "base_link", "front_optical", at(ahead_m)
+            )
+
+    source = open_input(straight.write(info=info, before=before), options(tmp_path))
+    changed = [note for note in source.notes if "2 messages of the camera info of" in note]
+    assert len(changed) == 2
+    assert "'front_optical' to 'base_link' (4 messages on /tf_static) differ" in source.notes[-1]
+    assert source.notes[-1].startswith("2 of the transforms")

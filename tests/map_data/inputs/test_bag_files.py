@@ -127,6 +127,21 @@ def test_a_part_that_the_metadata_do_not_name_is_named(tmp_path):
     assert source.notes[0].startswith("drive_1.mcap in drive are not read, since metadata.yaml")
 
 
+def test_a_missing_part_is_named(tmp_path):
+    folder = bag_of(tmp_path, "mcap")
+    (folder / "drive.mcap").rename(tmp_path / "away.mcap")
+    with pytest.raises(ValueError, match=r"metadata\.yaml names drive\.mcap, not there: copy all"):
+        open_input(folder, options(tmp_path))
+
+
+@pytest.mark.parametrize("suffix", ["bag", "mcap", "db3"])
+def test_a_file_that_is_no_bag_is_named_with_its_first_bytes(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    path.write_text("version https://git-lfs.github.com/spec/v1\nsize 3\n")
+    with pytest.raises(ValueError, match=rf"begins with b'version http' and is no \.{suffix} file"):
+        open_input(path)
+
+
 def test_metadata_that_cannot_be_read_are_named(tmp_path):
     folder = bag_of(tmp_path, "sqlite")
     (folder / "metadata.yaml").write_text("")
@@ -177,3 +192,28 @@ def test_a_file_that_is_nearly_a_bag_says_what_to_do(tmp_path, name, message):
     (tmp_path / name).write_bytes(b"x")
     with pytest.raises(ValueError, match=message):
         open_input(tmp_path / name)
+
+
+def test_a_topic_whose_type_cannot_be_read_costs_itself_and_is_named(tmp_path):
+    folder = bag_of(tmp_path, "sqlite")
+    (file,) = folder.glob("*.db3")
+    with sqlite3.connect(file) as base:
+        base.execute(
+            "UPDATE message_definitions SET encoded_message_definition = 'uint8[ x ='"
+            "WHERE topic_type = 'tf2_msgs/msg/TFMessage'"
+        )
+        base.execute("UPDATE topics SET type_description_hash = ''")
+    with pytest.raises(
+        ValueError, match=r"no transforms at all; /tf_static, /tf cannot be read: Could"
+    ):
+        open_input(file, options(tmp_path))
+    with sqlite3.connect(file) as base:
+        base.execute("UPDATE topics SET type = 'tf/msg/tfMessage' WHERE name = '/tf'")
+        base.execute(
+            "UPDATE message_definitions SET encoded_message_definition = 'uint8[ x =', "
+            "topic_type = 'tf/msg/tfMessage' WHERE topic_type = 'tf2_msgs/msg/TFMessage'"
+        )
+    source = open_input(file, options(tmp_path))
+    assert not source.has_poses
+    assert len(source.samples) == 11
+    assert source.notes[0].startswith("'/tf' is left out: Could not parse")
