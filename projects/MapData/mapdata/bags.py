@@ -28,6 +28,7 @@ _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _TOLERANCE_NS = 50_000_000
 _REACH_NS = 100_000_000  # of the first and the last pose
+_AFTER_STAMP = 12  # bytes of a message of ROS up to the end of its stamp
 _RULES = b"2"  # of making images, so that those of other rules are not taken
 _CHOOSE = "choose cameras with --topics"
 
@@ -83,13 +84,15 @@ class _Content:
     unstamped: Counter[str] = field(default_factory=Counter)
     changed_infos: Counter[str] = field(default_factory=Counter)
 
-    def add_info(self, topic: str, info: Any) -> None:
+    def add_info(self, topic: str, info: Any) -> bool:
         """Keep the first camera info with focal lengths, and count those that differ from it."""
         known = self.infos.get(topic)
         if known is None or not is_calibrated(known):
             self.infos[topic] = info
-        elif not is_same_calibration(known, info):
+            return True
+        if not is_same_calibration(known, info):
             self.changed_infos[topic] += 1
+        return False
 
     def reason(self, topics: Sequence[str]) -> str:
         """Return why messages of some topics cannot be read, empty if they can."""
@@ -186,10 +189,10 @@ def _listing(bag: Bag) -> str:
     )
 
 
-def _time_ns(header: Any, recorded_ns: int) -> int:
-    """Return the time of a message: its stamp, or when it was recorded if the stamp is 0."""
+def _stamp_ns(header: Any) -> int:
+    """Return the stamp of a message; where it is 0, the time of recording stands for it."""
     stamp = header.stamp
-    return int(stamp.sec) * 10**9 + int(getattr(stamp, "nanosec", 0) or 0) or recorded_ns
+    return int(stamp.sec) * 10**9 + int(getattr(stamp, "nanosec", 0) or 0)
 
 
 def _matrix(place: Any, turn: Any) -> np.ndarray:
@@ -218,17 +221,21 @@ def _first_pass(bag: Bag, topics: Mapping[str, tuple[str, str]]) -> _Content:
             chosen.append(connection)
         except ValueError as error:
             content.unreadable[connection.topic] = " ".join(str(error).split())
+    known_infos: dict[str, bytes] = {}
     for connection, time_ns, raw in _messages(bag, chosen):
         topic, kind = connection.topic, connection.msgtype
         content.digest.update(f"{topic} {kind} {len(raw)}\n".encode())
         content.digest.update(raw)
+        if topic in known_infos and raw[_AFTER_STAMP:] == known_infos[topic]:
+            continue  # the camera info that is kept, once more
         try:
             with naming(f"the message at {time_ns} ns", "it is damaged"):
                 with library_errors():
                     message = bag.parser(connection)(raw)
                 if topic in topic_of:
-                    for images_of in topic_of[topic]:
-                        content.add_info(images_of, message)
+                    kept = [content.add_info(images_of, message) for images_of in topic_of[topic]]
+                    if any(kept):
+                        known_infos[topic] = bytes(raw[_AFTER_STAMP:])
                 else:
                     _keep(content, message, topic, kind, time_ns)
         except ValueError as error:
@@ -243,12 +250,13 @@ def _keep(content: _Content, message: Any, topic: str, kind: str, recorded_ns: i
         for item in message.transforms:
             pose = _matrix(item.transform.translation, item.transform.rotation)
             child, parent = item.child_frame_id.lstrip("/"), item.header.frame_id.lstrip("/")
-            time_ns = _time_ns(item.header, recorded_ns)
-            content.tree.add(topic, child, parent, time_ns, pose)
-            if not is_static and _is_unstamped(item.header):
+            stamp_ns = _stamp_ns(item.header)
+            content.tree.add(topic, child, parent, stamp_ns or recorded_ns, pose)
+            if not stamp_ns and not is_static:
                 content.unstamped[topic] += 1
         return
-    time_ns = _time_ns(message.header, recorded_ns)
+    stamp_ns = _stamp_ns(message.header)
+    time_ns = stamp_ns or recorded_ns
     if kind == _ODOMETRY:
         pose = _matrix(message.pose.pose.position, message.pose.pose.orientation)
         parent, child = message.header.frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
@@ -256,16 +264,11 @@ def _keep(content: _Content, message: Any, topic: str, kind: str, recorded_ns: i
         odometry = content.odometries.setdefault(key, Odometry(*key))
         odometry.poses.append(pose)
         odometry.times_ns.append(time_ns)
-        if _is_unstamped(message.header):
+        if not stamp_ns:
             content.unstamped[topic] += 1
     else:
         content.images[topic].add(message, time_ns)
-        content.images[topic].unstamped += _is_unstamped(message.header)
-
-
-def _is_unstamped(header: Any) -> bool:
-    """Whether the stamp of a message is 0."""
-    return _time_ns(header, 0) == 0
+        content.images[topic].unstamped += not stamp_ns
 
 
 def _vehicle(content: _Content, wanted: str | None) -> str:
@@ -414,7 +417,7 @@ def _write_images(
         try:
             with library_errors():
                 message = bag.parser(connection)(raw)
-                time_ns = _time_ns(message.header, recorded_ns)
+                time_ns = _stamp_ns(message.header) or recorded_ns
                 target = missing.pop((camera.name, time_ns), None)
         except ValueError:
             continue  # the first pass has named it
