@@ -63,7 +63,8 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
 def _open_folder(folder: Path, options: InputOptions) -> Source:
     """Read a folder by what lies in it."""
     if versions_in(folder):
-        return Source(read_nuscenes(folder, options.version), "lidar", folder)
+        samples, notes = read_nuscenes(folder, options.version)
+        return Source(samples, "lidar", folder, notes=tuple(notes))
     logs = logs_in(folder)
     if logs:
         root = folder.parent if logs == [folder] else folder

@@ -1,5 +1,6 @@
 """Which scenes belong to which split: published lists by name, lists in files, official ones."""
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,10 +8,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from gsmap.utils.files import file_name, read_json
+from gsmap.utils.files import file_name, read_json, read_text
 from gsmap.utils.split_lists import list_identity
 
 OFFICIAL = "official"
+_PARTS = ("train", "val", "test")
+_FORM = '{"train": ["scene-0001", ...], "val": [...]}, or a text file with a scene a line'
 _FAMILIES = ("streammapnet", "lilja_near", "lilja_far")  # files of published lists
 
 
@@ -74,19 +77,35 @@ def published_split(name: str, dataset: str) -> SplitList:
 def read_split_file(path: Path) -> SplitList:
     """Read a split file: JSON, an object with a list of scene names or tokens for each split.
 
-    It is the format of the nuScenes devkit's own ``splits.json``. The list has the file's name.
+    It is the format of the nuScenes devkit's own ``splits.json``. A text file (``.txt``) has the
+    scenes of one split, one a line, and the split's name in its own, such as ``av2_val.txt``. The
+    list has the file's name.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it has another form.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no split file at {path}.")
-    splits = read_json(path)
+    try:
+        splits = _lines_of(path) if path.suffix.lower() == ".txt" else read_json(path)
+    except ValueError as error:
+        raise ValueError(f"{str(error).rstrip('.')}; a split file is JSON like {_FORM}.") from error
     if not isinstance(splits, dict) or not all(
         isinstance(scenes, list) and all(isinstance(s, str) for s in scenes)
         for scenes in splits.values()
     ):
-        raise ValueError(
-            f'split file {path} must look like {{"train": ["scene-0001", ...], "val": [...]}}.'
-        )
+        raise ValueError(f"split file {path} must look like {_FORM}.")
     return SplitList(file_name(path.stem)[:100], splits)
+
+
+def _lines_of(path: Path) -> dict[str, list[str]]:
+    """Read the scenes of one split, whose name is a word of the file's name."""
+    words = [word for word in re.split(r"[^a-z]+", path.stem.lower()) if word in _PARTS]
+    if len(set(words)) != 1:
+        raise ValueError(f"the name of {path} must have one of the words {', '.join(_PARTS)}")
+    lines = (line.strip() for line in read_text(path).splitlines())
+    return {words[0]: [line for line in lines if line]}
 
 
 def asked_split(options: Any, dataset: str) -> SplitList | None:

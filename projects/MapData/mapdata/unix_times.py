@@ -2,6 +2,9 @@
 
 from collections.abc import Iterable
 from datetime import datetime, timezone
+from typing import Any
+
+import numpy as np
 
 _FROM_NS, _TO_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9  # the years 2000 to 2099
 _UNITS_NS = (10**9, 10**6, 10**3, 1)
@@ -23,6 +26,18 @@ def unix_time_ns(number: float, unit_ns: int | None = None) -> int | None:
         if _FROM_NS <= time_ns < _TO_NS:
             return time_ns
     return None
+
+
+def in_nanoseconds(time: Any, usual_unit_ns: int) -> int:
+    """Return a time that a file brings, in nanoseconds.
+
+    Args:
+        time: A Unix time of any unit, or a time of another clock; a number or the text of one.
+        usual_unit_ns: Unit in nanoseconds of a time that is no Unix time.
+    """
+    number = float(time) if isinstance(time, (float, np.floating)) else int(time)
+    known = unix_time_ns(number)
+    return round(number * usual_unit_ns) if known is None else known
 
 
 def span_of(times_ns: Iterable[int]) -> str:

@@ -36,8 +36,16 @@ from mapdata.infos.recordings import find_file
 from mapdata.nuscenes.map import NuScenesLocalMap, expansion, open_layers
 from mapdata.nuscenes.tables import pose_of
 from mapdata.summary import ConversionSummary
+from mapdata.unix_times import in_nanoseconds
 
 NUSCENES_SIZE = (1600, 900)
+_NEEDED = {
+    "lidar": "token, timestamp, lidar_path, lidar2ego_* and ego2global_* (translation, rotation), "
+    "and cams with data_path, cam_intrinsic and sensor2lidar_*",
+    "ego": "token, log_id, timestamp, lidar_path, e2g_* (translation, rotation), and cams with "
+    "img_fpath, intrinsics and extrinsics",
+}
+_MAPTRV2 = {"timestamp", "log_id", "lidar_path"}  # what MapTRv2's samples of Argoverse 2 have
 _BEYOND_M = 1.0  # roll and pitch may move what was cut in the plane by some centimetres
 
 
@@ -68,7 +76,34 @@ def _instances(info: Mapping[str, Any], meta: AnnotationMeta) -> list[MapInstanc
     ]
 
 
-def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
+class _Sizes:
+    """Sizes of a nuScenes info file's images, of which the first of a camera in a scene is read.
+
+    Args:
+        summary: Counts the images that are not there, whose size is taken to be nuScenes'.
+    """
+
+    def __init__(self, summary: ConversionSummary) -> None:
+        self._summary = summary
+        self._known: dict[tuple[str, str], tuple[int, int]] = {}
+
+    def __call__(self, scene: str, camera: str, file: Path) -> tuple[int, int]:
+        """Return width and height in pixels of a camera's image."""
+        if (scene, camera) in self._known:
+            return self._known[scene, camera]
+        if not file.is_file():
+            width, height = NUSCENES_SIZE
+            reason = f"image not there (taken to have {width} x {height} pixels)"
+            self._summary.add_problem(f"{camera}: {reason}", str(file))
+            return NUSCENES_SIZE
+        size = image_size(file, f"camera {camera}")
+        self._known[scene, camera] = size
+        return size
+
+
+def _nuscenes_sample(
+    info: Mapping[str, Any], meta: AnnotationMeta, root: Path, size_of: _Sizes
+) -> MapSample:
     """Read one entry of a nuScenes info file, in the LIDAR_TOP frame."""
     ego_from_frame = pose_of(info, "lidar2ego_")
     global_from_ego = pose_of(info, "ego2global_")
@@ -77,10 +112,14 @@ def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
         path = _relative(camera["data_path"], root)
         intrinsics = np.asarray(camera["cam_intrinsic"], np.float64)[:3, :3]
         cam_from_frame = np.linalg.inv(pose_of(camera, "sensor2lidar_"))
-        cameras.append(CameraRecord(name, path, *NUSCENES_SIZE, intrinsics, cam_from_frame))
+        size = size_of(str(info.get("scene_token", "")), name, root / path)
+        cameras.append(CameraRecord(name, path, *size, intrinsics, cam_from_frame))
     sweeps = []
     for sweep in info.get("sweeps", []):
-        path, time_ns = _relative(sweep["data_path"], root), int(sweep["timestamp"]) * 1000
+        path, time_ns = (
+            _relative(sweep["data_path"], root),
+            in_nanoseconds(sweep["timestamp"], 1000),
+        )
         sweeps.append(SweepRecord(path, time_ns, pose_of(sweep, "sensor2lidar_")))
     can_bus = info.get("can_bus")
     if can_bus is not None:  # the pose belongs into it, as MapTR puts it there on loading
@@ -92,7 +131,7 @@ def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
         token=info["token"],
         scene=info.get("scene_token", ""),
         map_name=info.get("map_location", ""),
-        timestamp_ns=int(info["timestamp"]) * 1000,
+        timestamp_ns=in_nanoseconds(info["timestamp"], 1000),
         cameras=cameras,
         global_from_frame=global_from_ego @ ego_from_frame,
         ego_from_frame=ego_from_frame,
@@ -102,7 +141,9 @@ def _nuscenes_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) 
     )
 
 
-def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
+def _argoverse_sample(
+    info: Mapping[str, Any], meta: AnnotationMeta, root: Path, _: _Sizes
+) -> MapSample:
     """Read one entry of an Argoverse 2 info file, in the vehicle's frame."""
     pose = pose_of(info, "e2g_")
     cameras = []
@@ -119,7 +160,7 @@ def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path)
         token=str(info["token"]),
         scene=info["log_id"],
         map_name=info["log_id"],
-        timestamp_ns=int(info["timestamp"]),
+        timestamp_ns=in_nanoseconds(info["timestamp"], 1),
         cameras=cameras,
         global_from_frame=pose,
         lidar=LidarRecord(_relative(info["lidar_path"], root), np.eye(4)),
@@ -129,6 +170,15 @@ def _argoverse_sample(info: Mapping[str, Any], meta: AnnotationMeta, root: Path)
 
 def _entries(content: Any, path: Path) -> tuple[list[Mapping[str, Any]], str]:
     """Return the samples of an info file and the frame of its data set."""
+    entries = content.get("samples", ()) if isinstance(content, Mapping) else content
+    first = entries[0] if isinstance(entries, list) and entries else None
+    if isinstance(first, Mapping) and "e2g_translation" in first and not first.keys() >= _MAPTRV2:
+        missing = ", ".join(sorted(_MAPTRV2 - first.keys()))
+        raise ValueError(
+            f"{path} is an info file of StreamMapNet or MapTracker, or of another form than "
+            f"MapTRv2's: its samples lack {missing}. Convert the data set itself with "
+            "tools/create_data.py nuscenes or av2."
+        )
     for key, frame in (("infos", "lidar"), ("samples", "ego")):
         entries = content.get(key) if isinstance(content, Mapping) else None
         if isinstance(entries, list):
@@ -158,9 +208,10 @@ def _samples(
         return NuScenesLocalMap(layers, meta.classes, meta.x_range, meta.y_range)
 
     read = _argoverse_sample if meta.frame == "ego" else _nuscenes_sample
+    size_of, needs = _Sizes(summary), _NEEDED[meta.frame]
     for number, info in entries:
-        with naming(f"{infos}, sample {number}", "make the file anew"):
-            sample = read(info, meta, root)
+        with naming(f"{infos}, sample {number}", f"a sample of such a file has {needs}"):
+            sample = read(info, meta, root, size_of)
             check_samples([sample], meta)
         if sample.instances is not None:
             _check_range(sample, meta)

@@ -11,6 +11,7 @@ from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, Lida
 from gsmap.datasets.errors import naming
 from gsmap.datasets.image_files import image_size
 from mapdata.infos.plain_pickle import load_plain_pickle
+from mapdata.unix_times import in_nanoseconds
 
 _REMEDY = (
     "GSMap needs images (img_path, cam2img, lidar2cam), lidar_points (lidar2ego), ego2global and "
@@ -123,7 +124,7 @@ def _sample(info: Mapping[str, Any], root: Path, where: str, allow_missing: bool
     cameras = _cameras(info["images"], root, where, allow_missing)
     ego_from_lidar = _matrix(lidar["lidar2ego"], 4, f"{where}: lidar2ego")
     global_from_ego = _matrix(info["ego2global"], 4, f"{where}: ego2global")
-    timestamp_ns = round(float(info["timestamp"]) * 1e9)
+    timestamp_ns = in_nanoseconds(info["timestamp"], 10**9)
     record = None
     if lidar.get("lidar_path"):
         path = _locate(lidar["lidar_path"], "LIDAR_TOP", root, f"{where}, LiDAR")

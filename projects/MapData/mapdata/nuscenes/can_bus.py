@@ -1,12 +1,16 @@
 """Vehicle signals of the nuScenes CAN bus expansion, in MapTR's layout of 18 numbers."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 
 from gsmap.datasets.errors import naming
 from gsmap.structures.vehicle_signals import pose_signals
+from gsmap.utils.files import read_json
 
+_NUSCENES_SCENE = re.compile(r"scene-(\d{4})")
+_FIELDS = ("utime", "accel", "rotation_rate", "vel")
 Messages = tuple[np.ndarray, np.ndarray]
 """Their times in microseconds (n,), and accelerations, rotation rates and velocities (n, 9)."""
 
@@ -30,23 +34,29 @@ def signals_at(timestamp_ns: int, global_from_ego: np.ndarray, messages: Message
 def read_messages(dataroot: Path, scene: str) -> Messages:
     """Read the ``pose`` messages of a scene from the folder ``can_bus`` of a data root.
 
-    There are none without the expansion, and for the scenes that the devkit itself refuses (161 to
-    176, 309 to 314).
+    There are none without the expansion, and for nuScenes' scenes that its devkit refuses (161 to
+    176, 309 to 314). Scenes may have any name.
 
     Raises:
         ValueError: If the scene's file is damaged.
     """
-    path, messages = dataroot / f"can_bus/{scene}_pose.json", []
-    with naming(path, "unpack the CAN bus expansion again"):
-        if path.is_file():
-            from nuscenes.can_bus.can_bus_api import NuScenesCanBus
-
-            api = NuScenesCanBus(dataroot=str(dataroot))
-            if int(scene[-4:]) not in api.can_blacklist:  # scenes whose signals are unreliable
-                messages = api.get_messages(scene, "pose", print_warnings=False)
+    path = dataroot / f"can_bus/{scene}_pose.json"
+    if not path.is_file() or _is_unreliable(scene, dataroot):
+        return np.zeros(0, np.int64), np.zeros((0, 9))
+    with naming(path, "unpack the CAN bus expansion again; a message has " + ", ".join(_FIELDS)):
+        messages = read_json(path)
         times_us = np.array([message["utime"] for message in messages], np.int64)
         rows = [[*m["accel"], *m["rotation_rate"], *m["vel"]] for m in messages]
         measured = np.array(rows, np.float64).reshape(-1, 9)
         if not np.isfinite(measured).all():
             raise ValueError("a number is not finite")
-    return times_us, measured
+    order = np.argsort(times_us, kind="stable")
+    return times_us[order], measured[order]
+
+
+def _is_unreliable(scene: str, dataroot: Path) -> bool:
+    """Whether the devkit refuses the signals of a scene, which is then one of nuScenes by name."""
+    from nuscenes.can_bus.can_bus_api import NuScenesCanBus
+
+    number = _NUSCENES_SCENE.fullmatch(scene)
+    return number is not None and int(number[1]) in NuScenesCanBus(str(dataroot)).can_blacklist

@@ -17,6 +17,7 @@ import shapely
 from gsmap.datasets.annotations.file import AnnotationWriter
 from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
 from gsmap.datasets.errors import naming
+from gsmap.utils.files import is_hidden
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.split_lists import SPLIT_LIST, list_identity
@@ -27,8 +28,15 @@ from mapdata.command_line import (
     fingerprint,
     options_from,
 )
-from mapdata.nuscenes.map import MAP_CLASSES, NuScenesLocalMap, check_classes, open_layers
-from mapdata.nuscenes.tables import CAMERAS, LIDAR, NuScenesTables
+from mapdata.nuscenes.map import (
+    MAP_CLASSES,
+    NuScenesLocalMap,
+    check_classes,
+    expansion,
+    maps_in,
+    open_layers,
+)
+from mapdata.nuscenes.tables import CAMERAS, NuScenesTables, versions_in
 from mapdata.overlap import Positions, overlap_notes
 from mapdata.splits import (
     OFFICIAL,
@@ -77,12 +85,12 @@ def _check_root(root: Path, version: str) -> None:
             f"minicity --root {root}` makes MiniCity."
         )
     if not (root / version / "scene.json").is_file():
-        found = sorted(p.parent.name for p in root.glob("*/scene.json"))
+        found = versions_in(root)
         raise FileNotFoundError(
             f"no version {version!r} in {root}: it has {', '.join(found) or 'no version at all'}. "
             "Name one with --version."
         )
-    if not any((root / "maps/expansion").glob("*.json")):
+    if not maps_in(root):
         raise FileNotFoundError(
             f"no map expansion in {root / 'maps/expansion'}: download `Map expansion pack "
             f"(v1.3)` from https://www.nuscenes.org/download and unpack it into {root / 'maps'}."
@@ -207,17 +215,19 @@ class _Conversion:
         """Read a scene's samples without ground truth, counting what is missing."""
         samples = []
         scene, tables = of_version
+        nuscenes_names = set(CAMERAS) if set(CAMERAS) & set(tables.cameras) else set()
+        expected = sorted(nuscenes_names | set(tables.cameras))
         for record in tables.samples_of(scene):
             token = record["token"]
-            if LIDAR not in record["data"]:  # its frame is not known
-                self.summary.add_problem(f"sample left out: no {LIDAR} key frame", token)
+            if tables.lidar not in record["data"]:  # its frame is not known
+                self.summary.add_problem(f"sample left out: no {tables.lidar} key frame", token)
                 continue
-            for name in CAMERAS:
+            for name in expected:
                 if name not in record["data"]:
                     self.summary.add_problem(f"{name} absent (sample kept without it)", token)
             sample = tables.read(record, scene)
             files = {f"{camera.name} image": camera.path for camera in sample.cameras}
-            for name, path in {**files, LIDAR: sample.lidar.path}.items():  # type: ignore[union-attr]
+            for name, path in {**files, tables.lidar: sample.lidar.path}.items():  # type: ignore[union-attr]
                 if not (self.options.root / path).is_file():
                     self.summary.add_problem(f"{name} file missing", path)
             samples.append(sample)
@@ -238,11 +248,12 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         _check_root(options.root, each)
     conversion = _Conversion(options)
     folders = [options.root / each for each in options.versions]
-    maps = sorted((options.root / "maps/expansion").glob("*.json"))
+    maps = [expansion(options.root, name) for name in maps_in(options.root)]
     sizes = {
         path.name if folder == folders[0] else f"{folder.name}/{path.name}": path.stat().st_size
         for folder in folders
         for path in sorted(folder.glob("*.json"))
+        if not is_hidden(path)
     }
     made_from = {
         "source_fingerprint": fingerprint(sizes, [*(f / "scene.json" for f in folders), *maps]),
@@ -263,6 +274,11 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         for writer in writers.values():  # a full disk shows here, before any file appears
             writer.finish()
     notes = conversion.summary.notes
+    foreign = sorted({c for _, tables in conversion.scenes for c in tables.cameras} - set(CAMERAS))
+    if foreign:
+        notes.append(
+            f"cameras {', '.join(foreign)}: name them in `cameras` of a config's data sets."
+        )
     if not (options.root / "can_bus").is_dir():
         notes.append("no CAN bus expansion: acceleration, rotation rate and velocity are 0.")
     if not options.shard.count:

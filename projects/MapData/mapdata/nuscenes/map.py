@@ -17,6 +17,7 @@ from gsmap.datasets.annotations.record import RANGES, MapInstance
 from gsmap.datasets.errors import naming
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.polylines import Points
+from gsmap.utils.files import is_hidden
 from mapdata.lane_graph import LaneLinks, LanePaths, link_lanes
 from mapdata.local_map import (
     POLYGON,
@@ -95,16 +96,18 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
         classes: Wanted classes, of ``MAP_CLASSES``.
 
     Raises:
-        FileNotFoundError: If the map is missing or unknown.
-        ValueError: If it is damaged.
+        FileNotFoundError: If the map is missing.
+        ValueError: If it is damaged, or its name is none of a file.
     """
-    from nuscenes.map_expansion.map_api import NuScenesMap, locations
-
     path = expansion(root, name)
-    if name not in locations or not path.is_file():
+    if Path(name).name != name:
+        raise ValueError(f"the location {name!r:.80} cannot be the name of a map: rename it.")
+    if not path.is_file():
         raise FileNotFoundError(
-            f"no map expansion for {name!r} in {path.parent}; the devkit knows "
-            f"{', '.join(locations)}. Unpack the map expansion pack (v1.3) there."
+            f"no map expansion for {name!r} in {path.parent}, which has "
+            f"{', '.join(maps_in(root)) or 'none'}. Unpack nuScenes' map expansion pack (v1.3) "
+            f"there, or put {path.name} there in its form; for other maps write the annotation "
+            "file with mapdata.custom.from_records (docs/custom_data.md)."
         )
     skipped: Counter[str] = Counter()
     names = set(AREA_CLASSES) & set(classes)
@@ -112,7 +115,7 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
         names |= set(SURFACE_LAYERS)
     marked = LINE_LAYERS if "divider" in classes else ()
     with naming(path, "unpack the map expansion pack (v1.3) again"):
-        nusc_map = NuScenesMap(str(root), name)
+        nusc_map = _open_map(root, name)
         areas = {area: _read_polygons(nusc_map, area, skipped) for area in sorted(names)}
         lines = [line for layer in marked for line in _read_lines(nusc_map, layer, skipped)]
         layers = MapLayers(lines, areas, skipped)
@@ -122,6 +125,26 @@ def open_layers(root: Path, name: str, classes: Collection[str]) -> MapLayers:
             if not np.isfinite(shapely.get_coordinates(geometries)).all():
                 raise ValueError("a point is not finite")
     return layers
+
+
+def maps_in(root: Path) -> list[str]:
+    """Return the names of the maps below a data root."""
+    files = (root / "maps/expansion").glob("*.json")
+    return sorted(path.stem for path in files if not is_hidden(path))
+
+
+def _open_map(root: Path, name: str) -> "NuScenesMap":
+    """Open a map with the devkit, which knows nuScenes' four towns alone by itself."""
+    from nuscenes.map_expansion.map_api import NuScenesMap, locations
+
+    own = name not in locations
+    if own:
+        locations.append(name)
+    try:
+        return NuScenesMap(str(root), name)
+    finally:
+        if own:
+            locations.remove(name)
 
 
 def _read_centerlines(nusc_map: "NuScenesMap", layers: MapLayers) -> None:

@@ -12,7 +12,9 @@ from pyquaternion import Quaternion
 
 from gsmap.datasets.annotations.record import CameraRecord, LidarRecord, MapSample, SweepRecord
 from gsmap.structures.rigid import invert_rigid, rigid
+from gsmap.utils.files import is_hidden
 from gsmap.utils.json_items import items_of
+from gsmap.utils.words import counted
 from mapdata.nuscenes.can_bus import read_messages, signals_at
 
 CAMERAS = (
@@ -69,7 +71,10 @@ def pose_of(record: Mapping[str, Any], prefix: str = "") -> np.ndarray:
     """
     turned = np.asarray(record[f"{prefix}rotation"], np.float64)
     rotation = turned if turned.shape == (3, 3) else Quaternion(turned).rotation_matrix
-    return rigid(rotation, np.asarray(record[f"{prefix}translation"], np.float64).reshape(3))
+    shift = np.asarray(record[f"{prefix}translation"], np.float64)
+    if shift.size != 3:
+        raise ValueError(f"{prefix}translation must be 3 numbers, got {shift.tolist()!r:.60}")
+    return rigid(rotation, shift.reshape(3))
 
 
 def _damaged(folder: Path, table: str, wrong: str) -> ValueError:
@@ -121,6 +126,7 @@ class NuScenesTables:
         self._records: dict[str, dict[str, dict[str, Any]]] = {}
         for table in ("sensor", "calibrated_sensor", "log", "sample", "scene"):
             self._keep(table, read_table(self._folder, table))
+        self.cameras, self.lidar = self._sensors()
         data = list(self._wanted_sample_data())
         wanted = {record["ego_pose_token"] for record in data}
         self._keep(
@@ -154,12 +160,37 @@ class NuScenesTables:
         sensor = self._records["calibrated_sensor"][record["calibrated_sensor_token"]]
         return self._records["sensor"][sensor["sensor_token"]]["channel"]
 
+    def _sensors(self) -> tuple[tuple[str, ...], str]:
+        """Return the channels of the cameras, nuScenes' first, and that of the LiDAR.
+
+        Raises:
+            ValueError: If the LiDAR is not LIDAR_TOP and its frame is asked for, or not the one.
+        """
+        channels = {sensor["channel"] for sensor in self._records["sensor"].values()}
+        seeing = {
+            self._records["sensor"][sensor["sensor_token"]]["channel"]
+            for sensor in self._records["calibrated_sensor"].values()
+            if sensor["camera_intrinsic"]
+        }
+        cameras = (*(c for c in CAMERAS if c in seeing), *sorted(seeing - set(CAMERAS)))
+        lidars = sorted(channel for channel in channels if "LIDAR" in channel.upper())
+        if LIDAR in channels:
+            return cameras, LIDAR
+        if len(lidars) == 1 and self.frame == "ego":
+            return cameras, lidars[0]
+        raise ValueError(
+            f"{self._folder} has no {LIDAR}, whose axes are those of the frame `lidar`; its "
+            f"channels are {sorted(channels)!r:.300}. Name the LiDAR so if its axes are (x right, "
+            "y ahead); else convert with --frame ego, which takes one LiDAR of any name."
+        )
+
     def _wanted_sample_data(self) -> Iterator[dict[str, Any]]:
+        wanted = {self.lidar, *self.cameras}
         for record in read_table(self._folder, "sample_data"):
             self._check_link("sample_data", record, "calibrated_sensor_token")
             channel = self._channel_of(record)
-            is_sweep = channel == LIDAR and self._max_sweeps > 0
-            if is_sweep or (record["is_key_frame"] and channel in (LIDAR, *CAMERAS)):
+            is_sweep = channel == self.lidar and self._max_sweeps > 0
+            if is_sweep or (record["is_key_frame"] and channel in wanted):
                 yield {name: record[name] for name in ("token", *_FIELDS["sample_data"])}
 
     def chain(
@@ -201,7 +232,7 @@ class NuScenesTables:
 
     def read(self, sample: dict[str, Any], scene: dict[str, Any]) -> MapSample:
         """Return a sample in the annotation frame, without instances and absent cameras."""
-        lidar = sample["data"][LIDAR]
+        lidar = sample["data"][self.lidar]
         global_from_lidar, calibration = self._global_from(lidar)
         ego_from_lidar, timestamp_ns = pose_of(calibration), sample["timestamp"] * 1000
         global_from_ego = global_from_lidar @ invert_rigid(ego_from_lidar)
@@ -211,7 +242,7 @@ class NuScenesTables:
             else (global_from_ego, np.eye(4), ego_from_lidar)
         )
         sweeps = self._sweeps(lidar, global_from_frame)
-        names = [name for name in CAMERAS if name in sample["data"]]
+        names = [name for name in self.cameras if name in sample["data"]]
         return MapSample(
             token=sample["token"],
             scene=scene["name"],
@@ -252,18 +283,22 @@ class NuScenesTables:
 
 def versions_in(root: Path) -> list[str]:
     """Return the version folders of a nuScenes-format root; none if it is no such root."""
-    return sorted(path.parent.name for path in root.glob("*/scene.json"))
+    folders = (path.parent for path in root.glob("*/scene.json"))
+    return sorted(folder.name for folder in folders if not is_hidden(folder))
 
 
-def read_nuscenes(root: Path, version: str | None = None) -> list[MapSample]:
+def read_nuscenes(root: Path, version: str | None = None) -> tuple[list[MapSample], list[str]]:
     """Read all samples that have a LIDAR_TOP key frame, whose frame they are in.
 
     Args:
         root: Data root.
         version: Version folder, such as ``v1.0-mini``; the only one by default.
 
+    Returns:
+        The samples, and how many are left out.
+
     Raises:
-        ValueError: If there is no such version or several, or a table is damaged.
+        ValueError: If there is no such version or several, no sample, or a table is damaged.
     """
     found = versions_in(root)
     if version is None and len(found) > 1:
@@ -271,9 +306,10 @@ def read_nuscenes(root: Path, version: str | None = None) -> list[MapSample]:
     if version is not None and version not in found:
         raise ValueError(f"{root} holds no version {version!r}, but {found}.")
     tables = NuScenesTables(version or found[0], root, max_sweeps=10)
-    return [
-        tables.read(record, scene)
-        for scene in tables.scene
-        for record in tables.samples_of(scene)
-        if LIDAR in record["data"]
-    ]
+    pairs = [(record, scene) for scene in tables.scene for record in tables.samples_of(scene)]
+    used = [(record, scene) for record, scene in pairs if tables.lidar in record["data"]]
+    note = f"{len(used)} of {counted(len(pairs), 'sample')} used: the others have no key frame of "
+    if not used:
+        raise ValueError(f"{root}: {note}{tables.lidar}; download the tables again.")
+    samples = [tables.read(record, scene) for record, scene in used]
+    return samples, [note + tables.lidar] if len(used) < len(pairs) else []
