@@ -5,6 +5,7 @@ import pickle
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from fuzz.attacks import Calls
@@ -198,3 +199,66 @@ def test_other_pickles_are_refused(content, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         convert(tmp_path, "nuscenes_infos_temporal_train.pkl", content, tmp_path)
     assert not (tmp_path / "out.arrow").exists()
+
+
+def own_info(root: Path, size: tuple[int, int] | None, **more: object) -> Path:
+    """An info file of MapTR's form with one camera, whose image is in place."""
+    pose = {"translation": [0.0] * 3, "rotation": [1.0, 0, 0, 0]}
+    camera = {"data_path": "samples/FRONT/0.jpg", "cam_intrinsic": np.eye(3)}
+    camera |= {f"sensor2lidar_{name}": value for name, value in pose.items()}
+    info = {
+        "token": "a",
+        "lidar_path": "0.bin",
+        "cams": {"FRONT": camera},
+        "timestamp": 17 * 10**14,
+    }
+    info |= {f"{way}_{n}": v for way in ("lidar2ego", "ego2global") for n, v in pose.items()}
+    if size is not None:
+        (root / "samples/FRONT").mkdir(parents=True)
+        cv2.imwrite(str(root / "samples/FRONT/0.jpg"), np.zeros((size[1], size[0], 3), np.uint8))
+    path = root / "own_val.pkl"
+    path.write_bytes(pickle.dumps({"infos": [info | more]}))
+    return path
+
+
+@pytest.mark.parametrize(("size", "recorded"), [((320, 180), (320, 180)), (None, (1600, 900))])
+def test_images_have_their_own_size_if_they_are_there(size, recorded, tmp_path):
+    path = own_info(tmp_path, size)
+    summary = convert_infos(path, tmp_path / "a.arrow", tmp_path, "val").text()
+    (camera,) = AnnotationFile(tmp_path / "a.arrow")[0].cameras
+    assert (camera.width, camera.height) == recorded
+    assert ("FRONT: image not there (taken to have 1600 x 900 pixels)" in summary) == (size is None)
+
+
+@pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**9])
+def test_times_of_info_files_may_have_any_unit(unit, tmp_path):
+    path = own_info(tmp_path, None, timestamp=17 * 10**17 // unit)
+    convert_infos(path, tmp_path / "a.arrow", tmp_path, "val")
+    assert AnnotationFile(tmp_path / "a.arrow")[0].timestamp_ns == 17 * 10**17
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"ego2global_translation": None}, "ego2global_translation must be 3 numbers, got nan"),
+        ({"cams": {"FRONT": {}}}, "it has no 'data_path'"),
+    ],
+)
+def test_a_field_that_is_missing_is_named_with_those_that_are_needed(more, message, tmp_path):
+    path = own_info(tmp_path, None, **more)
+    with pytest.raises(
+        ValueError, match=f"sample 0 cannot be used: {message}; a sample .* has token"
+    ):
+        convert_infos(path, tmp_path / "a.arrow", tmp_path, "val")
+
+
+@pytest.mark.parametrize("in_samples", [True, False], ids=["Argoverse 2", "nuScenes"])
+def test_info_files_of_streammapnet_are_named_with_what_they_lack(in_samples, tmp_path):
+    info = {"token": "a", "e2g_translation": [0, 0, 0], "e2g_rotation": np.eye(3), "cams": {}}
+    path = tmp_path / "av2_map_infos_val.pkl"
+    path.write_bytes(pickle.dumps({"samples": [info], "id2map": {}} if in_samples else [info]))
+    message = (
+        "of StreamMapNet or MapTracker, .* lack lidar_path, log_id, timestamp. Convert the data"
+    )
+    with pytest.raises(ValueError, match=message):
+        convert_infos(path, tmp_path / "a.arrow", tmp_path, "val")

@@ -170,3 +170,9 @@ def test_other_pickles_are_refused(tmp_path):
     path.write_bytes(pickle.dumps({"infos": []}))
     with pytest.raises(ValueError, match="not an info file of mmdet3d's format v2"):
         read_info_file(path)
+
+
+@pytest.mark.parametrize("time", [1532402927.5, 1532402927500, 1532402927500000000])
+def test_a_time_is_in_seconds_or_in_another_unit_of_unix_time(time, tmp_path):
+    (sample,) = read_info_file(make_info(tmp_path, timestamp=time))
+    assert sample.timestamp_ns == 1532402927500000000
