@@ -1,7 +1,10 @@
 #!/usr/bin/env bash
-# Every check that wants a GPU, in under 40 minutes on one: tools/gpu_checks.sh [WORK_FOLDER]. What it measures is appended to
-# WORK_FOLDER/results.md with date and device. A part that fails is named, and the others still run.
+# Every check that wants a GPU, the most valuable first, in eight minutes on one: tools/gpu_checks.sh [WORK_FOLDER]. What
+# it measures is appended to WORK_FOLDER/results.md after each part, with date and device. A part that fails or takes too
+# long is named, and the others still run. The last lines say which options may now be turned on.
 #   PYTHON=.venv/bin/python   the interpreter        RESULTS=FILE   where to append instead
+#   WHEELS=FOLDER             packages to install first, from tools/gpu_wheels.sh
+#   IMAGES=FOLDER             six JPEG files, such as a frame of nuScenes: also measures what the cores feed
 #   REDUCED=1                 each part at its smallest, on the CPU: whether the script works, not how fast anything is
 set -uo pipefail
 cd "$(dirname "$0")/.."
@@ -9,45 +12,59 @@ work=$(realpath -m "${1:-work_dirs/gpu_checks}")
 python=${PYTHON:-.venv/bin/python}
 results=$(realpath -m "${RESULTS:-$work/results.md}")
 mkdir -p "$work"
-gsmap=projects/GSMap/configs
-r50=(configs/maptr/maptr_r50_24e.py configs/mapvr/mapvr_r50_24e.py "$gsmap/gsmap_maptr_r50_24e.py" configs/gemap/gemap_simple_r50_24e.py
-    configs/maptrv2/maptrv2_r50_24e.py "$gsmap/gsmap_maptrv2_r50_24e.py" configs/mgmapnet/mgmapnet_r50_24e.py)
-r18=(maptr_r18_minicity configs/mapvr/mapvr_r18_minicity.py gsmap_r18_minicity)
+if [ -n "${WHEELS:-}" ]; then
+    "$python" -m pip install -q --no-index --no-deps --no-compile --upgrade --target "$work/site" "$WHEELS"/*.whl || exit 2
+    export PYTHONPATH="$work/site"
+    for folder in "" /projects/GSMap /projects/MapData /projects/DriveMaps /projects/MiniCity; do
+        PYTHONPATH="$PYTHONPATH:$PWD$folder"
+    done
+fi
+maptr=configs/maptr/maptr_r50_24e.py
+gsmap=projects/GSMap/configs/gsmap_maptr_r50_24e.py
 
 if [ -n "${REDUCED:-}" ]; then
     name="CPU, reduced: no figure of this block is a measurement"
     at=(--device cpu --repeats 1 --threads 1)
-    fps=("${r18[0]}" --size 90 160 "${at[@]}") memory=("${r18[2]}" --size 90 160 --rasters 64x32 "${at[@]}")
-    raster=(--instances 2 "${at[@]}") tests=(tests/ops/test_soft_iou.py)
-    data=(--scenes 2 --val-scenes 1 --samples-per-scene 2 --image-size 200x112) budget=1 batch=2 compared=("${r18[0]}")
+    models=(maptr_r18_minicity) fps=("${at[@]}" --size 64 96) step=("${at[@]}" --size 64 96 --rasters 64x32)
+    kernels=(--device cpu --reduced --kernels deformable_sample) tests=(tests/ops/test_soft_iou.py) graphs=() workers=()
+    export TRITON_INTERPRET=1
 else
     name=$("$python" -c 'import torch; print(torch.cuda.get_device_name())') || { echo "error: no GPU here; REDUCED=1 tries the script without one"; exit 2; }
     at=(--device cuda --threads 8)
-    fps=("${r50[@]}" "${at[@]}") memory=("$gsmap/gsmap_maptr_r50_24e.py" --rasters 128x64 200x100 256x128 --batch 4 "${at[@]}")
-    raster=("${at[@]}") tests=(tests/ops tests/models)
-    data=(--scenes 400 --samples-per-scene 5 --image-size 400x225) budget=6400 batch=4 compared=("${r18[@]}")
+    models=("$maptr" "$gsmap") fps=("${at[@]}" --repeats 30) step=("${at[@]}" --repeats 8 --batch 4)
+    kernels=(--device cuda) graphs=(--cuda-graphs) workers=(--workers 8)
+    tests=(tests/ops/test_triton_kernels.py tests/apis/test_fast_frame.py -k "gpu or captured")
 fi
 
 failed=()
-part() { # part TITLE COMMAND...: run it, and append its output with the command that made it
-    local title=$1 start=$SECONDS
-    shift
+part() { # part TITLE SECONDS COMMAND...: run it, and append its output with the command that made it
+    local title=$1 limit=${REDUCED:+3600} start=$SECONDS
+    limit=${limit:-$2}
+    shift 2
     echo "[${SECONDS} s] $title: $*"
-    "$@" >"$work/part.log" 2>&1 || failed+=("$title")
-    { printf '\n### %s\n\n```\n%s\n```\n' "$title" "$*"; echo; grep -E '^(\||[0-9]+ (passed|failed)|=+ .*(passed|failed))|error' "$work/part.log"; } >>"$results"
-    tee -a "$work/all.log" <"$work/part.log" | tail -n 3
+    timeout -k 5 "$limit" "$@" >"$work/part.log" 2>&1 || failed+=("$title")
+    { printf '\n### %s\n\n```\n%s\n```\n' "$title" "$*"; echo; grep -E '^(\||\{|\}|  "|GSMAP|[0-9]+ (passed|failed)|=+ .*(passed|failed)|FAILED)|error' "$work/part.log"; } >>"$results"
+    tee -a "$work/all.log" <"$work/part.log" | tail -n 4
     echo "    $((SECONDS - start)) s"
 }
 
 printf '\n## %s, %s, %s\n' "$(date +%F)" "$name" "$("$python" -c 'import torch; print("torch", torch.__version__)')" >>"$results"
-part "Tests" "$python" -m pytest -q -p no:cacheprovider "${tests[@]}"
-part "Rasterizers" "$python" -m benchmarks raster "${raster[@]}"
-part "Frames per second" "$python" -m benchmarks fps "${fps[@]}"
-part "Frames per second, mixed precision" "$python" -m benchmarks fps "${fps[@]}" --fp16
-part "A training step by raster" "$python" -m benchmarks step "${memory[@]}"
-part "MiniCity" "$python" tools/create_data.py minicity --root "$work/minicity" --seed 0 "${data[@]}"
-part "Annotations" "$python" tools/create_data.py nuscenes --root "$work/minicity" --dataset minicity
-part "Protocol S" "$python" tools/compare.py "${compared[@]}" --seeds 1 --budget "$budget" --batch "$batch" --out "$work/protocol_s" \
-    --data-root "$work/minicity"
+part "Kernels" 70 "$python" -m benchmarks kernels "${kernels[@]}"
+right=$(sed -n 's/^GSMAP_TRITON_KERNELS=\([^ ]*\).*/\1/p' "$work/part.log" | tail -n 1)
+part "Frames per second" 60 "$python" -m benchmarks fps "${models[@]}" "${fps[@]}" ${graphs[0]+"${graphs[@]}"}
+[ -n "${REDUCED:-}" ] || export GSMAP_TRITON_KERNELS=$right
+part "Frames per second, kernels" 60 "$python" -m benchmarks fps "${models[@]}" "${fps[@]}" ${graphs[0]+"${graphs[@]}"}
+part "Frames per second, kernels, half precision" 60 "$python" -m benchmarks fps "${models[@]}" "${fps[@]}" --fp16 ${graphs[0]+"${graphs[@]}"}
+part "A training step, kernels" 60 "$python" -m benchmarks step "${models[@]}" "${step[@]}"
+part "A training step, kernels, bfloat16" 60 "$python" -m benchmarks step "${models[@]}" "${step[@]}" --cfg-options model.autocast=bfloat16
+part "Tests" 90 "$python" -m pytest -q -p no:cacheprovider "${tests[@]}"
+[ -n "${REDUCED:-}" ] || part "A training step, kernels, bfloat16, compiled" 150 "$python" -m benchmarks step "${models[@]}" "${step[@]}" --cfg-options \
+    model.autocast=bfloat16 model.compiled=reduce-overhead
+[ -z "${IMAGES:-}" ] || part "Samples a second" 60 "$python" -m benchmarks data images "$IMAGES" ${workers[0]+"${workers[@]}"}
+
+[ -z "$right" ] || echo "kernels that are right here: GSMAP_TRITON_KERNELS=$right" | tee -a "$results"
+if [[ " ${failed[*]-} " != *" Tests "* ]]; then
+    [ -n "${REDUCED:-}" ] || echo "captured frames equal launched ones: cuda_graphs=True (--cuda-graphs)" | tee -a "$results"
+fi
 [ ${#failed[@]} -eq 0 ] || { printf 'failed: %s\n' "${failed[@]}" | tee -a "$results"; exit 1; }
 echo "all parts ended well after $SECONDS s: $results"
