@@ -10,6 +10,7 @@ from tqdm import tqdm
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.utils.cli import run_command
+from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
 from gsmap.utils.terminal import PrintableStream, own_stream, printable
 
@@ -55,6 +56,18 @@ def test_whatever_a_command_prints_is_printable(capsys):
     assert "\x1b" not in printed.out + printed.err
     assert printed.out.count("\\x1b]0;a new title\\x07") == 3
     assert "error: \\x1b]0;a new title\\x07 is no class" in printed.err
+
+
+def say(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()
+
+
+def test_workers_print_no_control_characters_either(capfd):
+    list(ordered_map(say, [TITLE, TITLE], 2))
+    said = capfd.readouterr().err
+    assert said.count("\\x1b]0;a new title\\x07") == 2
+    assert "\x1b" not in said
 
 
 def test_a_bar_keeps_its_line_to_itself_where_texts_pass_by(monkeypatch):

@@ -9,6 +9,8 @@ from numba.core import caching, event
 
 from gsmap.utils.interrupt import is_first_rank
 
+_KEPT = " They are kept for the next runs, in __pycache__ or NUMBA_CACHE_DIR."
+
 
 class CompilationNotice(event.Listener):
     """Says once that kernels are compiled; those that numba finds in its cache say nothing."""
@@ -19,8 +21,8 @@ class CompilationNotice(event.Listener):
         """Say it."""
         if not self.told and is_first_rank():
             logging.getLogger("gsmap").warning(
-                "Kernels for the CPU are compiled, which takes up to a minute. They are kept for "
-                "the next runs, in __pycache__ or NUMBA_CACHE_DIR."
+                "Kernels for the CPU are compiled, which takes up to a minute."
+                + ("" if _FOLDER else _KEPT)
             )
         self.told = True
 
