@@ -14,7 +14,7 @@ from mmengine.evaluator import BaseMetric, Evaluator
 from mmengine.fileio import get_file_backend
 from mmengine.logging import MessageHub
 from mmengine.model import BaseModel
-from mmengine.runner import BaseLoop, Runner
+from mmengine.runner import BaseLoop
 from mmengine.runner.checkpoint import save_checkpoint
 from processes import run_python
 
@@ -22,6 +22,7 @@ import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.reading import read_checked
 from gsmap.checkpoints.safe_globals import mmengine_globals
 from gsmap.engine.checkpoint_hook import AtomicCheckpointHook, AtomicLocalBackend
+from gsmap.engine.run_log import MapRunner
 from gsmap.utils.files import SUFFIX
 from gsmap.utils.shards import digest
 
@@ -192,12 +193,14 @@ def listed(split_list: str, count: int = 1) -> Listed:
     return data
 
 
-def learn(work_dir, epochs, resume_from=None, train=None, val=None, **options) -> int:
+def learn(
+    work_dir, epochs, resume_from=None, train=None, val=None, schedule=None, **options
+) -> int:
     """Train for some epochs, with a validation after every second and the last; return how many."""
     Learner.validations = 0
     before = torch.serialization.get_safe_globals()
     data = [{"inputs": torch.ones(1)}] * 2
-    runner = Runner(
+    runner = MapRunner(
         Learner(),
         str(work_dir),
         train_dataloader=torch.utils.data.DataLoader(train or data),
@@ -206,6 +209,7 @@ def learn(work_dir, epochs, resume_from=None, train=None, val=None, **options) -
         val_cfg={},
         val_evaluator=Evaluator(Nothing()),
         optim_wrapper={"optimizer": {"type": "SGD", "lr": 0.1}},
+        param_scheduler=schedule,
         default_hooks={"checkpoint": {"type": "AtomicCheckpointHook", "interval": 1, **options}},
         load_from=resume_from and str(resume_from),
         resume=resume_from is not None,
@@ -227,6 +231,48 @@ def test_a_validation_that_a_kill_prevented_is_made_up_for(tmp_path):
     (tmp_path / "last_validation").write_text("4")  # as after a kill between epoch 3 and its end
     assert learn(tmp_path, 3, tmp_path / "epoch_3.pth") == 1
     assert learn(tmp_path, 3, tmp_path / "epoch_2.pth") == 2  # that of epoch 2, then 3's
+
+
+@pytest.mark.parametrize(
+    ("part", "values", "reason"),
+    [
+        ("", {"meta": None}, "it holds weights and no meta"),
+        ("", {"meta": None, "message_hub": None, "optimizer": 3}, "no meta and no message_hub and"),
+        ("", {"meta": [1]}, "it holds weights and no meta"),
+        ("", {"message_hub": "x"}, "no message_hub"),
+        ("meta", {"epoch": "x"}, "its epoch is 'x'"),
+        ("meta", {"epoch": 10**12}, r"its epoch is 10+, and train_cfg.max_epochs is 2"),
+        ("meta", {"epoch": True}, "its epoch is True"),
+        ("meta", {"iter": -5}, "its iter is -5"),
+        ("meta", {"iter": None}, "its iter is None"),
+        ("meta", {"seed": "x"}, "its seed is 'x'"),
+        ("meta", {"seed": 2**40}, "its seed is 1099"),
+        ("message_hub", {"runtime_info": 1}, "its message_hub has no runtime_info"),
+        ("optimizer", {"state": 1}, "its optimizer has no state and param_groups"),
+        ("optimizer", {"param_groups": [1]}, "its optimizer has no state and param_groups"),
+        ("optimizer", {"param_groups": []}, "different number of parameter groups"),
+        ("optimizer", {"param_groups": [{"params": 3}]}, r"its state does not fit \(TypeError"),
+        ("", {"param_schedulers": []}, "it has 0 schedules, and the config 1"),
+        ("", {"param_schedulers": [{"step": 5}]}, "a schedule has a state 'step'"),
+        ("", {"param_schedulers": [7]}, "are no list of states"),
+    ],
+)
+def test_a_checkpoint_that_cannot_be_resumed_from_says_why(part, values, reason, tmp_path):
+    schedule = {"type": "LinearLR", "start_factor": 0.1, "end": 5}
+    learn(tmp_path, 1, schedule=schedule)
+    with torch.serialization.safe_globals(mmengine_globals()):
+        checkpoint = torch.load(tmp_path / "epoch_1.pth", weights_only=True)
+    (checkpoint[part] if part else checkpoint).update(values)
+    torch.save(checkpoint, tmp_path / "odd.pth")
+    with pytest.raises(ValueError, match=reason):
+        learn(tmp_path, 2, tmp_path / "odd.pth", schedule=schedule)
+    assert learn(tmp_path, 2, tmp_path / "epoch_1.pth", schedule=schedule) == 1
+
+
+def test_weights_alone_cannot_be_resumed_from(tmp_path):
+    torch.save({"weight": torch.ones(1)}, tmp_path / "bare.pth")
+    with pytest.raises(ValueError, match=r"bare.pth cannot be resumed from: it holds weights and"):
+        learn(tmp_path, 2, tmp_path / "bare.pth")
 
 
 def test_data_of_another_split_is_refused_unless_allowed(tmp_path):
@@ -259,7 +305,9 @@ def test_a_test_tells_results_which_checkpoint_it_is_of_and_how_that_was_calibra
     path.write_bytes(b"weights")
     for meta, address in (({"calibration": calibration}, path), ({}, "https://host/a.pth")):
         loop = Scoring()
-        runner = SimpleNamespace(_val_loop=None, _test_loop=loop, _load_from=str(address))
+        runner = SimpleNamespace(
+            _val_loop=None, _test_loop=loop, _resume=False, _load_from=str(address)
+        )
         content = {"state_dict": {"w": torch.ones(1)}, "meta": meta}
         AtomicCheckpointHook(interval=1).after_load_checkpoint(runner, content)
         said = loop.evaluator.metrics[0].dataset_meta

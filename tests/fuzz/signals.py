@@ -124,7 +124,7 @@ def at_work(name: str, said: str, out: Path) -> bool:
     """Whether a command has done a part of its work, so that its processes are there."""
     if "train" in name:
         return (out / "last_checkpoint").exists()
-    return re.search(r"\b[1-9]\d*/\d+ ", said) is not None  # of its progress
+    return re.search(r"\b[1-9]\d*(/\d+ |samples )", said) is not None  # of its progress
 
 
 def main() -> None:

@@ -20,6 +20,7 @@ from gsmap.checkpoints.settings import IMAGE_SIZE, MODEL_SETTINGS, SIGNALS, plai
 from gsmap.checkpoints.unwrapping import unwrap
 from gsmap.engine.figures import finish_checks
 from gsmap.engine.optimizers import fit_optimizer_state
+from gsmap.engine.resuming import check_resumable
 from gsmap.engine.run_log import innermost
 from gsmap.utils.files import take_from_link, write_bytes, write_text
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, calibration_of
@@ -97,12 +98,18 @@ class AtomicCheckpointHook(CheckpointHook):
 
         Weights that another training loop wrapped are put where mmengine looks for them. Of a run
         that goes on, the optimizer's state is fitted to its groups of parameters.
+
+        Raises:
+            ValueError: If the run cannot go on from it, or it is of another split.
         """
+        if runner._resume:
+            check_resumable(checkpoint, runner, runner._load_from)
         with refusing(runner._load_from):
             state = unwrap(checkpoint).state
         if state.keys() != checkpoint.get("state_dict", {}).keys():
             checkpoint["state_dict"] = state
-        meta = checkpoint.get("meta", {})
+        meta = checkpoint.get("meta")
+        meta = meta if isinstance(meta, dict) else {}
         meta.pop("config", None)
         if "optimizer" in checkpoint and runner._resume:
             fit_optimizer_state(checkpoint, runner.optim_wrapper)

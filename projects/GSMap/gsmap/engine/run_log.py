@@ -19,6 +19,7 @@ from torch import nn
 from gsmap.engine.cpu_autocast import CPUAutocastOptimWrapper
 from gsmap.engine.launch import newest_checkpoint, rank_timeout_s
 from gsmap.engine.rank_watch import RankWatch
+from gsmap.engine.resuming import refusing_state
 from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
 
@@ -77,6 +78,15 @@ class MapRunner(Runner):
         """Test."""
         with self._watched():
             return super().test()
+
+    def resume(self, filename: str, *args: Any, **kwargs: Any) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            ValueError: If its state does not fit.
+        """
+        with refusing_state(filename):
+            super().resume(filename, *args, **kwargs)
 
     def call_hook(self, fn_name: str, **kwargs: Any) -> None:
         """Call all hooks, and note that this rank goes on."""
