@@ -198,9 +198,28 @@ def sampling_cases(reduced: bool) -> Iterator[Case]:
                     weights,
                     backend,
                 ),
-                (value, torch.rand(batch, queries, 8, 4, 2), torch.rand(batch, queries, 8, 4)),
+                (
+                    value,
+                    places_within_cells((batch, queries, 8, 4), (height, width)),
+                    torch.rand(batch, queries, 8, 4),
+                ),
                 largest_error=largest_error,
             )
+
+
+def places_within_cells(shape: tuple[int, ...], size: tuple[int, int]) -> Tensor:
+    """Random places over a map, none on the border between cells, where the gradient jumps.
+
+    Args:
+        shape: Shape of the places.
+        size: Rows and columns of the map.
+
+    Returns:
+        The places (x, y), some half a cell outside of [0, 1]. (*shape, 2)
+    """
+    cells = [torch.randint(-1, side, shape) for side in reversed(size)]
+    within = 0.02 + 0.96 * torch.rand(*shape, 2)
+    return (torch.stack(cells, -1) + within + 0.5) / torch.tensor(size).flip(0)
 
 
 def kernel_sampling_cases(reduced: bool) -> Iterator[Case]:

@@ -33,7 +33,7 @@ else
     at=(--device cuda --threads 8)
     models=("$maptr" "$gsmap") fps=("${at[@]}" --repeats 30) step=("${at[@]}" --repeats 8 --batch 4)
     kernels=(--device cuda) graphs=(--cuda-graphs) workers=(--workers 8)
-    tests=(tests/ops/test_triton_kernels.py tests/apis/test_fast_frame.py -k "gpu or captured")
+    tests=(tests/ops/test_triton_kernels.py tests/apis/test_fast_frame.py tests/datasets/transforms/test_image_steps.py -k "gpu or captured")
 fi
 
 failed=()

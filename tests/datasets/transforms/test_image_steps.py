@@ -50,13 +50,13 @@ def run_pipeline(steps, seed, **options):
     return Compose([TRANSFORMS.build(step) for step in steps])(sample_of(seed, **options))
 
 
-def collate(*items):
+def collate(*items, device="cpu"):
     data = {
         "inputs": {"img": [item["inputs"]["img"] for item in items]},
         "data_samples": [item["data_samples"] for item in items],
     }
     preprocessor = {"type": "MapDataPreprocessor", "pad_size_divisor": 32}
-    return MODELS.build(preprocessor)(data)["inputs"]["imgs"]
+    return MODELS.build(preprocessor).to(device)(data)["inputs"]["imgs"]
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -81,6 +81,15 @@ def test_a_batch_on_the_device_equals_that_of_the_host(steps):
         assert ours["data_samples"].img_shape == theirs["data_samples"].img_shape
     expected = collate(*on_host)
     torch.testing.assert_close(collate(*noted), expected, atol=GREY_LEVELS, rtol=0)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_batch_on_a_gpu_equals_that_of_the_host():
+    steps = [DISTORT, SCALE]
+    on_host = [run_pipeline([LOAD, *steps, PACK], seed) for seed in range(24)]
+    noted = [run_pipeline([ON_DEVICE, *steps, PACK], seed) for seed in range(24)]
+    found = collate(*noted, device="cuda")
+    torch.testing.assert_close(found.cpu(), collate(*on_host), atol=GREY_LEVELS, rtol=0)
 
 
 def test_every_branch_of_the_distortion_was_compared():
