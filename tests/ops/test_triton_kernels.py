@@ -9,6 +9,7 @@ from triton_cases import CASES, deformable_problem
 from triton_resources import find_ptxas, launches
 
 import gsmap
+from benchmarks import kernels
 from gsmap.ops import backends
 from gsmap.ops.deformable_sampling import deformable_sample, has_kernel
 
@@ -32,63 +33,73 @@ def test_kernels_equal_the_float64_reference_on_a_gpu(kernel, name):
     CASES[kernel][name]("cuda")
 
 
-def call_deformable_sample(module):
+def call_deformable_sample(module, one):
     """As MapTR's decoder: 1,000 queries of 8 heads on 200 x 100 cells."""
-    value = torch.zeros(1, 20000, 8, 32)
-    locations, weights = torch.zeros(1, 1000, 8, 4, 2), torch.zeros(1, 1000, 8, 4)
-    inputs = value, locations, weights, 200, 100
+    queries, heads, channels, samples = (1, 1, 1, 1) if one else (1000, 8, 32, 4)
+    height, width = (1, 1) if one else (200, 100)
+    value = torch.zeros(1, height * width, heads, channels)
+    locations = torch.zeros(1, queries, heads, samples, 2)
+    inputs = value, locations, torch.zeros(1, queries, heads, samples), height, width
     module.deformable_sample_backward(module.deformable_sample(*inputs), *inputs)
 
 
-def call_sample_kernels(module):
+def call_sample_kernels(module, one):
     """As MapTR's encoder and MapQR's: 200 x 100 cells, six cameras, 15 x 25 pixels."""
-    seen = torch.zeros(1, 6, 20000, dtype=torch.bool)
+    views, queries, height, width = (1, 1, 1, 1) if one else (6, 20000, 15, 25)
+    seen = torch.zeros(1, views, queries, dtype=torch.bool)
     for bilinear, heads, samples in ((False, 4, 15), (True, 8, 8)):
-        value = torch.zeros(1, 6, 375, heads, 256 // heads)
-        uv = torch.zeros(1, 6, 20000, heads, 2)
+        heads, samples, channels = (1, 1, 1) if one else (heads, samples, 256 // heads)
+        value = torch.zeros(1, views, height * width, heads, channels)
+        uv = torch.zeros(1, views, queries, heads, 2)
         offsets = torch.zeros(samples, 2, dtype=torch.long)
-        inputs = value, uv, torch.zeros(1, 20000, heads, samples), seen, offsets, 15, 25, bilinear
+        weights = torch.zeros(1, queries, heads, samples)
+        inputs = value, uv, weights, seen, offsets, height, width, bilinear
         module.sample_kernels_backward(module.sample_kernels(*inputs), *inputs)
 
 
-def call_render_gaussians(module):
+def call_render_gaussians(module, one):
     """As a step of four samples: 360 instances of 20 Gaussians on 200 x 100 pixels."""
-    inputs = torch.zeros(360, 20, 5), [-15.0, -30.0, 0.3, 0.3], 200, 100
+    instances, count, height, width = (1, 1, 1, 1) if one else (360, 20, 200, 100)
+    inputs = torch.zeros(instances, count, 5), [-15.0, -30.0, 0.3, 0.3], height, width
     module.render_gaussians_backward(module.render_gaussians(*inputs), *inputs)
     module.render_gaussians_in_warps_backward(module.render_gaussians_in_warps(*inputs), *inputs)
 
 
-def call_raster_loss(module):
+def call_raster_loss(module, one):
     """As a step of four samples: 360 masks of 200 x 100 pixels."""
-    inputs = torch.zeros(360, 200, 100), torch.zeros(360, 200, 100), torch.zeros(11), 1.0
+    shape, taps = ((1, 1, 1), 1) if one else ((360, 200, 100), 11)
+    inputs = torch.zeros(shape), torch.zeros(shape), torch.zeros(taps), 1.0
     module.raster_loss_sums_backward(module.raster_loss_sums(*inputs), *inputs)
 
 
-def call_polyline_raster(module):
+def call_polyline_raster(module, one):
     """As a step of four samples: 360 lines of 20 points, there and back, on 200 x 100 pixels."""
-    flags = torch.zeros(360, dtype=torch.bool)
+    lines, count, height, width = (1, 1, 1, 1) if one else (360, 40, 200, 100)
+    flags = torch.zeros(lines, dtype=torch.bool)
     for plain in (False, True):
-        inputs = torch.zeros(360, 40, 2), flags, 200, 100, [2.0, 4.0], plain
+        inputs = torch.zeros(lines, count, 2), flags, height, width, [2.0, 4.0], plain
         module.soft_rasters_backward(module.soft_rasters(*inputs), *inputs)
     frame = [-15.0, -30.0, 0.3, 0.3]
-    module.draw_polylines(torch.zeros(360, 20, 2), flags, 200, 100, frame, 0.3, 0.3)
+    module.draw_polylines(torch.zeros(lines, count, 2), flags, height, width, frame, 0.3, 0.3)
 
 
 LAUNCHES = {
+    "deformable_sampling": call_deformable_sample,
+    "gaussian_raster": call_render_gaussians,
+    "kernel_sampling": call_sample_kernels,
     "polyline_raster": call_polyline_raster,
     "raster_loss": call_raster_loss,
-    "gaussian_raster": call_render_gaussians,
-    "deformable_sampling": call_deformable_sample,
-    "kernel_sampling": call_sample_kernels,
 }
 
 
 @needs_ptxas
+@pytest.mark.parametrize("one", [False, True], ids=["published", "sizes of one"])
 @pytest.mark.parametrize("folder", LAUNCHES)
-def test_kernels_compile_for_hopper_without_spills(folder, monkeypatch):
+def test_kernels_compile_for_hopper_without_spills(folder, one, monkeypatch):
+    """A size of one is compiled in as a constant, which must fit wherever the number does."""
     module = import_module(f"gsmap.ops.{folder}.triton")
     found = launches(module, monkeypatch)
-    LAUNCHES[folder](module)
+    LAUNCHES[folder](module, one)
     assert {name for name, *_ in found} == {n for n in vars(module) if n.endswith("_kernel")}
     for name, registers, spilled in found:
         print(f"{folder} {name}: {registers} registers, {spilled} bytes spilled")
@@ -97,23 +108,24 @@ def test_kernels_compile_for_hopper_without_spills(folder, monkeypatch):
 
 
 @needs_gpu
-def test_kernels_are_captured_in_a_graph():
+@pytest.mark.parametrize("kernel", sorted(backends.TRITON_KERNELS.keys() - {"pairwise_soft_iou"}))
+def test_kernels_are_captured_in_a_graph(kernel, monkeypatch):
     """Capture forbids waits, and memory from outside of the graph's pool."""
-    leaves = [x.cuda().requires_grad_() for x in deformable_problem((21, 33), 32, 4)]
-
-    def step():
-        out = deformable_sample(leaves[0], (21, 33), *leaves[1:], backend="triton")
-        return out.detach(), *torch.autograd.grad(out.square().sum(), leaves)
-
-    stream = torch.cuda.Stream()
-    with torch.cuda.stream(stream):
-        expected = step()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        captured = step()
-    graph.replay()
-    torch.testing.assert_close(captured, expected)
+    monkeypatch.setattr(backends, "AUTO_KERNELS", {kernel})
+    own = [case for case in kernels.cases(reduced=True) if case.kernel == kernel]
+    assert own
+    for case in own:
+        inputs = [x.cuda() for x in case.inputs]
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            expected = kernels.results(case, "triton", inputs)
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            captured = kernels.results(case, "triton", inputs)
+        graph.replay()
+        torch.testing.assert_close(captured, expected)
 
 
 def test_auto_takes_a_kernel_that_is_switched_on(monkeypatch):

@@ -297,14 +297,10 @@ def loss_by(backend, settings, normalize, target):
     "raster_loss",
     *((name, 0, "both") for name in MASKS),
     ("dense", 1, "foreground"),
-    ("dense", 2, "pixels"),
     ("sparse", 3, "pixels"),
-    ("larger than a block", 0, "both"),
 )
 def losses_equal_float64(device, name, number, normalize):
-    generator = torch.Generator().manual_seed(0)
-    masks = {**MASKS, "larger than a block": torch.rand(2, 2, 29, 41, generator=generator)}
-    pred, target = masks[name]
+    pred, target = MASKS[name]
     upstream = torch.tensor([1.0, -0.5])
     out, (grad,) = values_and_gradients(
         loss_by("triton", SETTINGS[number], normalize, target), [pred.to(device)], upstream
@@ -343,11 +339,11 @@ def losses_repeat_bit_by_bit_and_twice(device):
 
 
 def random_vertices(count, spread=1.0):
-    """Return six polylines over and around 21 x 33 pixels, and which are polygons."""
+    """Return three polylines over and around 21 x 33 pixels, and which are polygons."""
     generator = torch.Generator().manual_seed(0)
-    vertices = torch.rand(6, count, 2, generator=generator) * torch.tensor([40.0, 25.0]) - 3
+    vertices = torch.rand(3, count, 2, generator=generator) * torch.tensor([40.0, 25.0]) - 3
     middle = torch.tensor([16.0, 10.0])
-    kinds = torch.tensor([True, False, True, False, False, True])
+    kinds = torch.tensor([True, False, False])
     return (vertices - middle) * spread + middle, kinds
 
 
@@ -363,7 +359,7 @@ def random_vertices(count, spread=1.0):
 )
 def soft_rasters_equal_float64(device, count, distance, spread=1.0):
     vertices, kinds = random_vertices(count, spread)
-    upstream = torch.randn(6, 21, 33, generator=torch.Generator().manual_seed(1))
+    upstream = torch.randn(3, 21, 33, generator=torch.Generator().manual_seed(1))
 
     def render(backend):
         return lambda v: soft_rasters(
@@ -372,9 +368,11 @@ def soft_rasters_equal_float64(device, count, distance, spread=1.0):
 
     out, (grad,) = values_and_gradients(render("triton"), [vertices.to(device)], upstream)
     true, (true_grad,) = values_and_gradients(render("reference"), [vertices.double()], upstream)
-    # the tolerances of the kernels on a CPU: pixels are up to 40 away at a float32 spacing of 4e-6
+    # pixels are up to 40 away at a float32 spacing of 4e-6
     torch.testing.assert_close(out, true.float(), atol=1e-5, rtol=0)
-    assert (grad - true_grad).norm() <= 1e-4 * true_grad.norm()
+    # a line's way back is 0.01 off: of tiny lines, float32 has it to a ten-thousandth alone
+    limit = 1e-4 if spread < 1 else 2e-5
+    assert (grad - true_grad).norm() <= limit * true_grad.norm()
 
 
 @case("soft_rasters")
@@ -389,7 +387,7 @@ def soft_rasters_of_nothing_and_of_no_numbers(device):
     out, (grad,) = values_and_gradients(
         lambda v: soft_rasters(v, 9, 9, kinds.to(device), backend="triton"),
         [vertices.to(device)],
-        torch.ones(6, 9, 9),
+        torch.ones(3, 9, 9),
     )
     assert out[:2].isnan().all()
     assert out[2:].isfinite().all()
@@ -417,4 +415,4 @@ def drawings_of_nothing_and_of_no_numbers(device):
     lines[1, 3, 0] = float("nan")
     mask = draw_polylines(lines.to(device), grid, backend="triton")
     assert mask[1].isnan().all()
-    assert mask[[0, 2, 3, 4, 5]].isfinite().all()
+    assert mask[[0, 2]].isfinite().all()

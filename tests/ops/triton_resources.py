@@ -33,7 +33,7 @@ def signature_of(kernel, values):
     signature, constants, attributes = {}, {}, {}
     for position, parameter in enumerate(kernel.params):
         value = values[parameter.name]
-        if parameter.is_constexpr:
+        if parameter.is_constexpr or (type(value) is int and value == 1):  # as a launch does
             signature[parameter.name], constants[parameter.name] = "constexpr", value
         elif isinstance(value, torch.Tensor):
             signature[parameter.name] = POINTERS[value.dtype]

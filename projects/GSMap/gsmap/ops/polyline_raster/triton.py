@@ -152,8 +152,10 @@ def soft_backward_kernel(
             along = offset_x * (edge_x / length2) + offset_y * (edge_y / length2)
             t = tl.minimum(tl.maximum(along, 0.0), 1.0)
             dx, dy = offset_x - t * edge_x, offset_y - t * edge_y
-            # EPS moves t off the nearest point: between the ends it has a gradient of its own
-            slip = tl.where((along >= 0) & (along <= 1), 2 * t * EPS / length2, 0.0)
+            # Between the ends t has a gradient of its own: EPS, and rounding, move it off the
+            # nearest point. As computed, and not by EPS alone, it undoes what rounding does.
+            between = (along >= 0) & (along <= 1)
+            slip = tl.where(between, 2 * (dx * edge_x + dy * edge_y) / length2, 0.0)
             own = tl.where(owner == edge, weight, 0.0)
             end_x = -2 * t * dx - slip * (offset_x - 2 * t * edge_x)
             end_y = -2 * t * dy - slip * (offset_y - 2 * t * edge_y)
