@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from gsmap.datasets.errors import BrokenSampleError
-from gsmap.datasets.image_files import decode_image, image_content, image_size
+from gsmap.datasets.image_files import decode_image, image_content, image_size, read_image
 
 COLOURS = np.full((24, 32, 3), (200, 30, 10), np.uint8)
 RAMP = np.tile(np.linspace(0, 65535, 256).astype(np.uint16), (2, 1))
@@ -94,6 +94,25 @@ def test_an_orientation_counts_behind_other_segments_of_a_jpeg():
 def test_what_stands_in_place_of_an_image_is_named(content, remedy):
     with pytest.raises(BrokenSampleError, match=rf"a\.png is not an image .*{remedy}"):
         decoded(content)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("a.jpg", "its folder is there without it: fetch it again"),
+        ("B.jpg", "but 'b.JPG' is there: rename it"),
+        ("link.jpg", "it is a link to 'gone.jpg', which is not there"),
+        ("none/a.jpg", "there is no folder .*none: paths are relative to data_root"),
+        (".", "a folder or a device is there"),
+    ],
+)
+def test_why_an_image_is_not_there_is_said(name, reason, tmp_path):
+    (tmp_path / "b.JPG").write_bytes(saved(COLOURS, "JPEG"))
+    (tmp_path / "link.jpg").symlink_to("gone.jpg")
+    with pytest.raises(FileNotFoundError, match=f"camera 'a': no image at .*; {reason}"):
+        image_size(tmp_path / name, "camera 'a'")
+    with pytest.raises(BrokenSampleError, match=f"camera 'a': no image at .*; {reason}"):
+        read_image(str(tmp_path / name), "camera 'a'")
 
 
 def test_content_to_be_copied_is_that_of_an_image(tmp_path):

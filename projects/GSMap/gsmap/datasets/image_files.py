@@ -1,5 +1,6 @@
 """Image files: their size, their pixels with every doubt about them an error, and JPEG."""
 
+import os
 import struct
 import zlib
 from io import BytesIO
@@ -39,7 +40,7 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
     Messages begin with ``where``: FileNotFoundError without the file, ValueError if it is no image.
     """
     if not file.is_file():
-        raise FileNotFoundError(f"{where}: no image at {file}; paths are relative to data_root.")
+        raise FileNotFoundError(f"{where}: no image at {file}; {_why_missing(file)}.")
     with file.open("rb") as opened:
         start = opened.read(100)
         try:
@@ -71,7 +72,7 @@ def read_image(
         return path
     file = Path(path)
     if not file.is_file():
-        raise BrokenSampleError(f"{where}: no image at {path}; is data_root right?")
+        raise BrokenSampleError(f"{where}: no image at {path}; {_why_missing(file)}.")
     return decode_image(file.read_bytes(), path, where, size)
 
 
@@ -137,6 +138,20 @@ def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
 def _format_of(content: bytes) -> str | None:
     """Return the format that a file's first bytes tell, if it is one that is read."""
     return next((kind for start, kind in _STARTS.items() if content.startswith(start)), None)
+
+
+def _why_missing(file: Path) -> str:
+    """Return why a file is not there, and the remedy."""
+    if file.is_symlink():
+        return f"it is a link to {os.readlink(file)!r}, which is not there"
+    if file.exists():
+        return "a folder or a device is there"
+    if not file.parent.is_dir():
+        return f"there is no folder {file.parent}: paths are relative to data_root, is that right?"
+    lower = file.name.lower()
+    if other := next((name for name in os.listdir(file.parent) if name.lower() == lower), None):
+        return f"but {other!r} is there: rename it"
+    return "its folder is there without it: fetch it again"
 
 
 def _no_image(where: str, path: object, content: bytes) -> str:
