@@ -64,7 +64,7 @@ def _open_folder(folder: Path, options: InputOptions) -> Source:
     """Read a folder by what lies in it."""
     if versions_in(folder):
         samples, notes = read_nuscenes(folder, options.version)
-        return Source(samples, "lidar", folder, notes=tuple(notes))
+        return Source(samples, "lidar", folder, notes=notes)
     logs = logs_in(folder)
     if logs:
         root = folder.parent if logs == [folder] else folder

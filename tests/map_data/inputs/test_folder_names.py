@@ -119,6 +119,14 @@ def test_a_folder_of_other_files_names_their_suffixes(tmp_path):
         open_input(drive)
 
 
+def test_files_that_are_no_images_are_counted(tmp_path):
+    drive = folder_of(tmp_path / "drive", {"front": ["0.png", "1.png", "1.tif"]})
+    (drive / "front/0.txt").write_text("x")
+    source = open_input(drive)
+    assert len(source.samples) == 2
+    assert source.notes[0] == "camera 'front': 2 files with ['.tif', '.txt'] not read"
+
+
 def test_images_without_a_partner_are_counted(tmp_path):
     names = {"front": ["0.png", "1.png", "2.png"], "left": ["1.png", "2.png", "x.png", "y.png"]}
     source = open_input(folder_of(tmp_path / "drive", names))

@@ -62,18 +62,19 @@ def read_image_folder(file: Path, frames_dir: Path) -> Source:
     with naming(file, "see docs/inference.md"):
         content = _calibration(file)
         ground = rigid(np.eye(3), (0, 0, float(content.get("ground_z_m", 0.0))))
-        rig, images = [], {}
+        rig, images, notes = [], {}, []
         for name, camera in content["cameras"].items():
             with naming(f"{file}, camera {name!r}", "see docs/inference.md"):
                 _require_keys(camera, _CAMERA_KEYS, "a camera")
-                images[str(name)] = _images_of(file.parent, str(name), camera)
+                images[str(name)], others = _images_of(file.parent, str(name), camera)
+                notes += others
                 rig.append(_camera(str(name), camera, ground, images[str(name)]))
         rate_hz = float(content["rate_hz"]) if "rate_hz" in content else None
         tolerance_ns = round(float(content.get("max_time_difference_ms", 50.0)) * 1e6)
         if not 0 < (_RATE_HZ if rate_hz is None else rate_hz) < np.inf or tolerance_ns < 0:
             raise ValueError("rate_hz must be > 0, and max_time_difference_ms >= 0")
         frames, time_of, assumed = _frames(images, rate_hz, tolerance_ns, file)
-        notes = [note for note in (assumed, *_notes_on(frames, images, tolerance_ns)) if note]
+        notes += [note for note in (assumed, *_notes_on(frames, images, tolerance_ns)) if note]
         poses = None
         if content.get("poses"):
             place = _below(file.parent, str(content["poses"]), "poses")
@@ -164,23 +165,27 @@ def _require_keys(value: Any, known: set[str], what: str) -> None:
         raise ValueError(f"unknown keys {unknown}; {what} may have {sorted(known)}")
 
 
-def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> list[Path]:
-    """Return a camera's images in the order of their names; hidden files are none."""
+def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> tuple[list[Path], list[str]]:
+    """Return a camera's images in the order of their names, and a note on other files.
+
+    Hidden files are neither.
+    """
     pattern = str(camera.get("images", name))
     place = _below(folder, pattern, "images")
     found = place.iterdir() if place.is_dir() else folder.glob(pattern)
     files = [path for path in found if path.is_file() and not is_hidden(path)]
     paths = sorted((p for p in files if p.suffix.lower() in _SUFFIXES), key=in_order)
+    others = sorted({path.suffix for path in files if path.suffix.lower() not in _SUFFIXES})[:5]
     if not paths:
-        others = sorted({path.suffix for path in files})
-        holds = f" It holds files with {others[:5]}, and {list(_SUFFIXES)} are read." * bool(others)
+        holds = f" It holds files with {others}, and {list(_SUFFIXES)} are read." * bool(others)
         raise FileNotFoundError(
             f"camera {name!r} has no image at {place}: `images` names a file, a folder or a "
             f"pattern, from the calibration file's folder (by default the camera's name).{holds}"
         )
     if len({path.stem for path in paths}) < len(paths):
         raise ValueError(f"two of its images at {place} have one name: rename one")
-    return paths
+    unread = counted(len(files) - len(paths), "file")
+    return paths, [f"camera {name!r}: {unread} with {others} not read"] if others else []
 
 
 def _below(folder: Path, name: str, what: str) -> Path:

@@ -287,7 +287,9 @@ def versions_in(root: Path) -> list[str]:
     return sorted(folder.name for folder in folders if not is_hidden(folder))
 
 
-def read_nuscenes(root: Path, version: str | None = None) -> tuple[list[MapSample], list[str]]:
+def read_nuscenes(
+    root: Path, version: str | None = None
+) -> tuple[list[MapSample], tuple[str, ...]]:
     """Read all samples that have a LIDAR_TOP key frame, whose frame they are in.
 
     Args:
@@ -312,4 +314,4 @@ def read_nuscenes(root: Path, version: str | None = None) -> tuple[list[MapSampl
     if not used:
         raise ValueError(f"{root}: {note}{tables.lidar}; download the tables again.")
     samples = [tables.read(record, scene) for record, scene in used]
-    return samples, [note + tables.lidar] if len(used) < len(pairs) else []
+    return samples, (note + tables.lidar,) if len(used) < len(pairs) else ()
