@@ -13,6 +13,7 @@ from functools import wraps
 from typing import Any
 
 import torch
+from mmengine.config import Config
 from mmengine.optim import build_optim_wrapper
 
 from benchmarks import model as models
@@ -70,7 +71,7 @@ class Trial:
     """A config's model on the pretended GPU, with a batch of random inputs.
 
     Args:
-        path: The config.
+        config: The config, by file, or changed.
         size: Rows and columns of the images; None takes the config's.
         batch: Samples of a step.
 
@@ -79,15 +80,15 @@ class Trial:
         model: The model.
     """
 
-    def __init__(self, path: str, size: tuple[int, int] | None, batch: int) -> None:
+    def __init__(self, config: str | Config, size: tuple[int, int] | None, batch: int) -> None:
         options = argparse.Namespace(size=size, device="cpu", threads=torch.get_num_threads())
-        self.model, inputs, self.samples = models.model_and_batch(path, options, batch)
+        self.model, inputs, self.samples = models.model_and_batch(config, options, batch)
         pixels = (inputs["imgs"] * 50 + 120).clamp(0, 255).to(torch.uint8)
         self.inputs = {"img": list(pixels)} if self.model.bev_encoder is not None else {}
         if self.model.lidar_encoder is not None:
             scale = torch.tensor([20.0, 40.0, 2.0, 1.0, 0.0])
             self.inputs["points"] = [(torch.rand(2000, 5) - 0.5) * scale for _ in range(batch)]
-        self.settings = read_config(path).optim_wrapper
+        self.settings = read_config(config).optim_wrapper
         self.gpu = PretendedGPU()
         self.wrapper: Any = None
 
