@@ -242,7 +242,7 @@ class PretendedGPU(TorchDispatchMode):
             kwargs["device"] = torch.device("cpu")
         inner, options = tree_map_only(PretendedTensor, lambda tensor: tensor.host, (args, kwargs))
         if name.startswith("gsmap."):
-            result = _by_cpu_kernel(func, name, inner)
+            result = _by_cpu_kernel(name, inner)
         else:
             result = _OWN_MATHS.get(func, func)(*inner, **options)
         if func in _READS:
@@ -446,13 +446,14 @@ def _sampled_kernels(
 _REFERENCES = {"deformable_sample": _sampled, "sample_kernels": _sampled_kernels}
 
 
-def _by_cpu_kernel(func: Any, name: str, args: Any) -> Any:
+def _by_cpu_kernel(name: str, args: Any) -> Any:
     """Compute one of the project's operators by what serves the CPU."""
     inputs = [arg.detach() if isinstance(arg, Tensor) else arg for arg in args[:-1]]
     function = name.removeprefix("gsmap.")
     reference = _REFERENCES.get(function.removesuffix("_backward"))
     if reference is None:
-        return func(*inputs, "cpu")
+        plain = getattr(torch.ops.gsmap, function.replace("_in_warps", ""))
+        return plain(*inputs, "cpu")
     if not function.endswith("_backward"):
         return reference(*inputs)
 
