@@ -4,6 +4,8 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.structures.tensors import uploaded
+
 
 @MODELS.register_module()
 class GridMask(nn.Module):
@@ -23,7 +25,8 @@ class GridMask(nn.Module):
         """Mask the images, or return them as they are. (V, 3, H, W)"""
         if torch.rand(()) >= self.prob:
             return images
-        return images * self.draw_mask(*images.shape[-2:]).to(images)
+        (mask,) = uploaded([self.draw_mask(*images.shape[-2:])], images.device)
+        return images * mask.to(images.dtype)
 
     def draw_mask(self, height: int, width: int) -> Tensor:
         """Return one where the image is kept and zero in the squares of a random grid. (H, W)"""
