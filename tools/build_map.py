@@ -127,7 +127,7 @@ def write_map(
     origin = origin_of(args, ann, drive.frames[0].sample.map_name)
     style, root = MapStyle(classes), args.data_root or args.ann.parent
     colours = [style.colour(label) for label in range(len(classes))]
-    replay = Replay(drive, elements, ann.meta.frame, colours, root)
+    replay = Replay(drive, elements, ann.meta.frame, colours, root, ann.meta.ground_z_m)
     writers = {
         "geojson": partial(write_geojson, classes=classes, origin=None),
         "osm": partial(write_lanelet2, classes=classes, origin=origin),

@@ -180,11 +180,13 @@ def require_own_samples(path: Path) -> None:
 def check_calibration(args: argparse.Namespace, source: Source) -> list[str]:
     """Print what is implausible about an input's cameras; draw them if that is asked for."""
     sample, root = source.samples[0], source.data_root or Path()
-    warnings = calibration_warnings(source.samples, source.frame) + image_warnings(sample, root)
+    warnings = calibration_warnings(source.samples, source.frame, source.ground_z_m)
+    warnings += image_warnings(sample, root)
     for line in warnings:
         print(f"calibration: {line}")
     if args.check_calibration:
-        path = save_figure(calibration_figure(sample, source.frame, root), args.check_calibration)
+        figure = calibration_figure(sample, source.frame, root, source.ground_z_m)
+        path = save_figure(figure, args.check_calibration)
         found = counted(len(warnings), "warning")
         print(f"{found}; the ground plane as the cameras should see it: {path}")
     return warnings

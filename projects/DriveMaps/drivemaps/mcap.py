@@ -34,7 +34,7 @@ def write_mcap(path: str | Path, replay: Replay) -> None:
         for moment in replay.moments():
             sample, time_ns = moment.frame.sample, moment.frame.sample.timestamp_ns
             log.transform(_GLOBAL, _FRAME, sample.global_from_frame, time_ns)
-            ground = invert_rigid(ground_from_frame(sample, replay.frame_kind))
+            ground = invert_rigid(ground_from_frame(sample, replay.frame_kind, replay.ground_z_m))
             log.transform(_FRAME, _GROUND, ground, time_ns)
             for camera in sample.cameras:
                 log.camera(camera, replay.data_root, time_ns)

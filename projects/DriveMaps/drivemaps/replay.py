@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from drivemaps.drive import Drive, DriveFrame
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
-from gsmap.structures.frames import FRAME_VIEWS, FrameView
+from gsmap.structures.frames import FrameView, frame_view
 
 SHOWN_SIGMAS = 2.0  # ellipses reach so many standard deviations
 
@@ -56,6 +56,7 @@ class Replay:
         frame_kind: The annotation frame, a key of ``FRAME_VIEWS``.
         colours: Colour of each class, ``#RRGGBB``.
         data_root: Folder that the paths of images start from; None leaves the images out.
+        ground_z_m: Height of the road in the annotation frame, as in ``AnnotationMeta``.
     """
 
     drive: Drive
@@ -63,10 +64,16 @@ class Replay:
     frame_kind: str
     colours: Sequence[str]
     data_root: Path | None = None
+    ground_z_m: float | None = None
+
+    @property
+    def view(self) -> FrameView:
+        """How the annotation frame lies."""
+        return frame_view(self.frame_kind, self.ground_z_m)
 
     def moments(self) -> Iterator[Moment]:
         """Go through the drive and let its map grow: yield what there is to see at each frame."""
-        view, drive = FRAME_VIEWS[self.frame_kind], self.drive
+        view, drive = self.view, self.drive
         views = [view.tilted(frame.sample.ego_from_frame) for frame in drive.frames]
         places = cKDTree([f.sample.global_from_frame[:2, 3] for f in drive.frames])
         lines = [shapely.linestrings(line) for line in self.elements.polylines]

@@ -6,7 +6,6 @@ import numpy as np
 
 from drivemaps.replay import Moment, Replay
 from gsmap.structures.elements import MapElements
-from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.structures.grid import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import camera_views
@@ -47,7 +46,7 @@ def _picture(moment: Moment, replay: Replay, width_px: int) -> np.ndarray:
         cameras,
         panels,
         BEVGrid(drive.x_range, drive.y_range),
-        FRAME_VIEWS[replay.frame_kind].tilted(sample.ego_from_frame),
+        replay.view.tilted(sample.ego_from_frame),
         MapStyle(classes=drive.classes),
         found,
         drive.scene,

@@ -10,7 +10,7 @@ from gsmap.datasets.annotations.record import RANGES, CameraRecord, MapSample
 from gsmap.datasets.image_files import image_size
 from gsmap.datasets.source import ground_from_frame
 from gsmap.structures.elements import MapElements
-from gsmap.structures.frames import FRAME_VIEWS
+from gsmap.structures.frames import frame_view
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid
 from gsmap.visualization.bev_view import BEVPanel
@@ -28,12 +28,15 @@ _WIDTH_PX = 3200  # six cameras of about 750 px, large enough to see an error of
 _LINES = ("ahead", "left", "every_5_m", "behind", "right", "cameras")
 
 
-def calibration_warnings(samples: Sequence[MapSample], frame: str) -> list[str]:
+def calibration_warnings(
+    samples: Sequence[MapSample], frame: str, ground_z_m: float | None = None
+) -> list[str]:
     """Say what is implausible about the cameras of samples, of each drive's first one.
 
     Args:
         samples: The samples.
         frame: Their annotation frame.
+        ground_z_m: Height of the road in it, as in ``AnnotationMeta``.
 
     Returns:
         One line a finding, without repetition.
@@ -41,12 +44,12 @@ def calibration_warnings(samples: Sequence[MapSample], frame: str) -> list[str]:
     firsts: dict[str, MapSample] = {}
     for sample in samples:
         firsts.setdefault(sample.scene, sample)
-    found = (line for sample in firsts.values() for line in _warnings(sample, frame))
+    found = (line for sample in firsts.values() for line in _warnings(sample, frame, ground_z_m))
     return list(dict.fromkeys(found))
 
 
-def _warnings(sample: MapSample, frame: str) -> Iterator[str]:
-    ground = ground_from_frame(sample, frame)
+def _warnings(sample: MapSample, frame: str, ground_z_m: float | None) -> Iterator[str]:
+    ground = ground_from_frame(sample, frame, ground_z_m)
     poses = {c.name: ground @ invert_rigid(c.cam_from_frame) for c in sample.cameras}
     places = np.array([pose[:3, 3] for pose in poses.values()]).reshape(-1, 3)
     distances = np.linalg.norm(places, axis=1)
@@ -138,18 +141,21 @@ def image_warnings(sample: MapSample, data_root: Path) -> list[str]:
     return found
 
 
-def calibration_figure(sample: MapSample, frame: str, data_root: Path) -> Figure:
+def calibration_figure(
+    sample: MapSample, frame: str, data_root: Path, ground_z_m: float | None = None
+) -> Figure:
     """Draw the ground plane, every 5 m, over a sample's images, and the cameras from above.
 
     Args:
         sample: The sample.
         frame: Its annotation frame.
         data_root: Folder that its paths start from; an image that is not there is grey.
+        ground_z_m: Height of the road in the frame, as in ``AnnotationMeta``.
 
     Returns:
         The picture: lines ahead, to the left, to the right and behind have colours of their own.
     """
-    frame_from_ground = invert_rigid(ground_from_frame(sample, frame))
+    frame_from_ground = invert_rigid(ground_from_frame(sample, frame, ground_z_m))
     lines = _ground_lines(frame_from_ground)
     wedges = [("cameras", _wedge(c, frame_from_ground)) for c in sample.cameras]
     style = MapStyle(classes=_LINES)
@@ -157,7 +163,7 @@ def calibration_figure(sample: MapSample, frame: str, data_root: Path) -> Figure
         camera_views(sample.cameras, data_root, sample.token, grey=True),
         [BEVPanel("From above", _elements([*lines, *wedges]))],
         BEVGrid(*RANGES[frame]),
-        FRAME_VIEWS[frame].tilted(sample.ego_from_frame),
+        frame_view(frame, ground_z_m).tilted(sample.ego_from_frame),
         style,
         _elements(lines),
         f"ground plane of {sample.token}",

@@ -21,14 +21,20 @@ from gsmap.datasets.annotations.record import (
 )
 from gsmap.datasets.errors import naming
 from gsmap.datasets.image_files import image_size
+from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
 from gsmap.utils.shards import WHOLE, Shard
 from mapdata.local_map import POLYGON, vertices_of
 
 _LOGGER = logging.getLogger(__name__)
 _UNMOUNTED = (
-    "record %r has no ego_from_frame: pictures will take the road to be level, 1.84 m below the "
-    "sensor (nuScenes' height), and models that lift images (MapTRv2) cannot use it."
+    "record %r has no ego_from_frame: pictures will take the road to be level, %.2f m below the "
+    "sensor (ground_z_m; nuScenes' height by default), and models that lift images (MapTRv2) "
+    "cannot use it."
+)
+_UNKNOWN_ROAD = (
+    "%s does not say how high the road is in the frame 'ego': pictures and inference will take it "
+    "to be 0.31 m below the origin (Argoverse 2's axle); AnnotationMeta(ground_z_m=...) says it."
 )
 _KEYS = sorted(field.name for field in fields(MapSample))
 Record = TypeVar("Record")
@@ -72,6 +78,8 @@ def from_records(
         FileNotFoundError: If an image is missing whose size is not given.
         ValueError: If a record is malformed; the message names its token. No file is left then.
     """
+    if meta.frame == "ego" and meta.ground_z_m is None:
+        _LOGGER.warning(_UNKNOWN_ROAD, path)
     source = ""
     if shard.count:
         records = list(records)
@@ -102,7 +110,8 @@ def _samples(
                 ]
         if sample.ego_from_frame is None and meta.frame == "lidar" and not warned:
             warned = True
-            _LOGGER.warning(_UNMOUNTED, sample.token)
+            height_m = -frame_view(meta.frame, meta.ground_z_m).ground[2]
+            _LOGGER.warning(_UNMOUNTED, sample.token, height_m)
         yield sample
 
 

@@ -147,7 +147,8 @@ def export_onnx(
         out: File to write.
         cameras: Names of the cameras, in the order of the images.
         image_size: Rows and columns of the images as the data pipeline leaves them.
-        frame: Frame of the annotations, for whoever uses the file.
+        frame: Frame of the annotations, for whoever uses the file. Where a model of ``load_model``
+            has it in the vehicle is written beside it.
 
     Raises:
         RuntimeError: If the packages of the extra ``onnx`` are not installed.
@@ -189,6 +190,10 @@ def export_onnx(
         "score_threshold": head.coder.score_threshold,
         "unfold_classes": list(head.coder.unfold_classes),
     }
+    if getattr(model, "mount", None) is not None:  # of `load_model`
+        metadata["ground_z_m"] = model.mount.ground_z_m
+        metadata["ground_from_frame"] = model.mount.matrix.tolist()
+        metadata["ego_from_frame"] = model.mount.ego_from_frame.tolist()
     if "can_bus" in exported.input_names:
         metadata["can_bus"] = CAN_BUS_RULE
     if model.temporal is not None:

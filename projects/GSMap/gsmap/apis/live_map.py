@@ -26,7 +26,7 @@ class Predictor(Protocol):
     """What a `LiveMap` needs of the `MapInferencer` that makes it."""
 
     cfg: Config
-    model: Any
+    model: Any  # with its ``mount``
 
     def dataset(self, source: Source) -> "VectorizedMapDataset":
         """Open samples as the config's test data set."""
@@ -53,8 +53,9 @@ class LiveMap:
         cam_from_frame: In the same form: from the frame to the camera (x right, y down, z ahead),
             in metres. each (4, 4)
         frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), or an annotation
-            frame: ``lidar`` (x right, y ahead, at a roof LiDAR) or ``ego`` (x ahead, y left, on the
-            rear axle, 0.31 m above the road); the config's by default.
+            frame: ``lidar`` (x right, y ahead, at a roof LiDAR) or ``ego`` (x ahead, y left, at the
+            rear axle); the config's by default. The model's own frame lies where it lay in
+            training, the other one where nuScenes and Argoverse 2 have it.
         allow_missing_cameras: Whether cameras of the model may be absent.
     """
 
@@ -139,7 +140,9 @@ class LiveMap:
 
     def _open(self, pixels: dict[str, np.ndarray]) -> None:
         """Check the calibration, and make a data set of one sample that has it."""
-        source = source_in_memory(pixels, *self._rig, self._frame)
+        mount = self._inferencer.model.mount
+        own = mount if self._frame == mount.frame else None
+        source = source_in_memory(pixels, *self._rig, self._frame, own)
         foreign = set(pixels) - set(self._config.get("cameras") or pixels)
         if foreign and foreign != set(pixels):
             raise ValueError(
@@ -150,6 +153,9 @@ class LiveMap:
         Path(dataset.ann_file).unlink()  # it is read, and a rig may be opened often
         ground_from_given = np.eye(4)
         if self._frame != VEHICLE:
-            ground_from_given = ground_from_frame(source.samples[0], source.frame)
-        ground_from_models = ground_from_frame(dataset.sample(0), dataset.metainfo["frame"])
+            ground_from_given = ground_from_frame(
+                source.samples[0], source.frame, source.ground_z_m
+            )
+        meta = dataset.metainfo
+        ground_from_models = ground_from_frame(dataset.sample(0), meta["frame"], meta["ground_z_m"])
         self._frame_from_models = invert_rigid(ground_from_given) @ ground_from_models

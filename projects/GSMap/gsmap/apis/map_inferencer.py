@@ -31,7 +31,7 @@ from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.datasets.memory import Cameras
-from gsmap.datasets.source import Source, annotated, reframed
+from gsmap.datasets.source import Mount, Source, annotated, reframed
 from gsmap.evaluation.results_json import vectors_of
 from gsmap.structures.elements import MapElements
 
@@ -183,15 +183,18 @@ class MapInferencer:
         if isinstance(source, str | Path):
             source = annotated(source, root)
         elif not isinstance(source, Source):
-            frame = self.cfg.test_dataloader.dataset.get("frame") or "lidar"
-            source = Source(source, frame, root)
+            mount = self.model.mount
+            source = Source(source, mount.frame, root, ground_z_m=mount.ground_z_m)
         settings: dict[str, Any] = dict(self.cfg.test_dataloader.dataset)
-        samples, frame = source.samples, settings.get("frame") or source.frame
-        if isinstance(samples, AnnotationFile) and source.frame == frame:
+        samples, mount = source.samples, self.model.mount
+        if not settings.get("frame"):
+            mount = Mount(source.frame, source.ground_z_m)
+        if isinstance(samples, AnnotationFile) and mount.suits(source.frame, source.ground_z_m):
             path = samples.path
         else:
-            samples = [reframed(sample, source.frame, frame) for sample in samples]
-            path = self._annotation_file(samples, frame, source.has_poses)
+            samples = [reframed(s, source.frame, mount, source.ground_z_m) for s in samples]
+            path = self._annotation_file(samples, mount, source.has_poses)
+            settings["ground_z_m"] = None
         settings |= {"ann_file": str(path.resolve()), "test_mode": True, "split": None, "dim": None}
         settings["cameras"] = self._cameras(samples)
         settings["serialize_data"] = len(samples) > 1  # costs a collection of all garbage
@@ -235,13 +238,13 @@ class MapInferencer:
             replica.bev_encoder.cams_embeds = torch.nn.Parameter(embeds)
         return dataset
 
-    def _annotation_file(self, samples: Sequence[MapSample], frame: str, has_poses: bool) -> Path:
+    def _annotation_file(self, samples: Sequence[MapSample], mount: Mount, has_poses: bool) -> Path:
         """Write samples to an annotation file that lives as long as the inferencer."""
         options = self.cfg.test_dataloader.dataset
         grid = options.get("grid") or self.cfg.model.grid
         meta = AnnotationMeta(
             dataset="samples",
-            frame=frame,
+            frame=mount.frame,
             split="test",
             classes=tuple(options.get("classes") or CLASSES),
             x_range=tuple(grid["x_range"]),
@@ -249,6 +252,7 @@ class MapInferencer:
             dim=max((i.points.shape[1] for s in samples for i in s.instances or ()), default=2),
             options={} if has_poses else {"poses": False},
             command=SAMPLES_BY,
+            ground_z_m=mount.ground_z_m,
         )
         path = Path(self._scratch.name) / f"samples{self._files}.arrow"
         write_annotations(path, meta, samples)

@@ -12,6 +12,7 @@ from gsmap.evaluation.results_json import vectors_of, write_results
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import shortest_orders
+from gsmap.structures.rigid import is_rigid
 from gsmap.structures.streams import Frame, MapStream, Scenes, StreamState
 from gsmap.utils.extras import import_extra
 
@@ -38,7 +39,9 @@ class OnnxInferencer:
         classes: Names of the classes.
         cameras: Names of the cameras, in the order in which images and matrices are given.
         image_size: Rows and columns of the images.
-        metadata: All that the file says of itself.
+        metadata: All that the file says of itself. With ``ground_from_frame`` (4, 4) it says where
+            the annotation frame lay over the ground below the rear axle (x ahead, y left, z up, in
+            metres) in training: a vehicle's calibration belongs into a frame that lies there.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -128,7 +131,8 @@ class OnnxInferencer:
             meta: ``lidar2img`` (V, 4, 4): from metres in the annotation frame to (u * d, v * d, d,
                 1) in pixels of these images. Depth-aware models (MapTRv2) also read ``lidar2cam``,
                 ``cam2img`` of the original images, ``img_aug_matrix`` (V, 4, 4) from those to
-                these, and ``lidar2ego`` (4, 4). GKT and BEVFormer read
+                these, and ``lidar2ego`` (4, 4), by default that of the training. GKT and BEVFormer
+                read
                 ``can_bus`` (18,), as a record has it; zeros if the model was trained without it.
                 With memory also ``scene``, ``timestamp_ns`` and ``lidar2global`` (4, 4), from the
                 annotation frame to the world.
@@ -160,6 +164,8 @@ class OnnxInferencer:
                 f"{self.path.name} needs can_bus, {CAN_BUS_RULE}. From poses: motion_signals of "
                 "gsmap.structures.vehicle_signals; zeros for a model that was trained without."
             )
+        if meta.get("lidar2ego") is None:
+            meta = {**meta, "lidar2ego": self.metadata.get("ego_from_frame")}
         inputs = calibration_arrays(meta, self._calibration)
         for name, array in inputs.items():
             if name != "can_bus" and array.shape != (len(self.cameras), 4, 4):
@@ -294,8 +300,17 @@ def _check_metadata(metadata: Mapping[str, Any]) -> None:
     for name in ("margin_m", "score_threshold"):
         if metadata[name] is not None and not np.isfinite(metadata[name]):
             raise ValueError(f"{name} must be a number, got {metadata[name]!r:.80}")
+    _check_poses(metadata)
     unfold = metadata.get("unfold_classes", [])
     if not (isinstance(unfold, list) and all(type(label) is int for label in unfold)):
         raise ValueError(f"unfold_classes must be class indices, got {unfold!r:.80}")
     if not 0 < metadata.get("max_gap_s", 1.0) < np.inf:
         raise ValueError(f"max_gap_s must be seconds > 0, got {metadata['max_gap_s']!r:.80}")
+
+
+def _check_poses(metadata: Mapping[str, Any]) -> None:
+    """Raise an error unless what says where the frame lies are poses, as far as it is there."""
+    for name in ("ground_from_frame", "ego_from_frame"):
+        matrix = np.asarray(metadata.get(name, np.eye(4)), np.float64)
+        if matrix.shape != (4, 4) or not is_rigid(matrix):
+            raise ValueError(f"{name} must be a pose, got {metadata[name]!r:.80}")

@@ -175,7 +175,9 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     return read_checked(path).state
 
 
-def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> list[str]:
+def adopt_settings(
+    cfg: Config, path: str | Path, cfg_options: dict | None, read: Checkpoint | None = None
+) -> list[str]:
     """Give a config the model settings that a checkpoint was trained with, and say which changed.
 
     Test images are scaled to the size that it was trained at, unless ``cfg_options`` set the scale.
@@ -188,6 +190,7 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
         cfg: The config; its ``model`` and ``test_dataloader`` change.
         path: The checkpoint, checked as in `read_checked`.
         cfg_options: Overrides that were given by hand, by dotted name; they stay.
+        read: The checkpoint, if it is read already.
 
     Returns:
         A line for each setting that the config had otherwise, and for each that is kept against the
@@ -196,7 +199,7 @@ def adopt_settings(cfg: Config, path: str | Path, cfg_options: dict | None) -> l
     Raises:
         ValueError: If the settings are no model's, or ask for more than a model (`checked`).
     """
-    checkpoint = read_checked(path)
+    checkpoint = read or read_checked(path)
     settings = checkpoint.settings
     if checkpoint.image_size and not any(n.startswith(_SCALED) for n in cfg_options or {}):
         for step in scale_steps(cfg, "test"):
@@ -265,15 +268,20 @@ def _with_elements_of(settings: dict[str, Any], config: dict[str, Any]) -> dict[
     return {**settings, "temporal": kept or None}
 
 
-def load_weights(model: nn.Module, path: str | Path) -> None:
+def load_weights(model: nn.Module, path: str | Path, read: Checkpoint | None = None) -> None:
     """Load a checkpoint, or a model's by its name; every weight must be there and fit.
+
+    Args:
+        model: Gets the weights.
+        path: The checkpoint.
+        read: The same, if it is read already.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it cannot be read or belongs to another architecture; the message lists the
             first keys that disagree.
     """
-    state = read_weights(path)
+    state = (read or read_checked(path)).state
     try:
         result = model.load_state_dict(state, strict=False)
     except (ValueError, RuntimeError) as error:

@@ -7,7 +7,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import check_samples
 from gsmap.datasets.annotations.record import AnnotationMeta, CameraRecord, MapSample
-from gsmap.datasets.source import Source, sample_in_vehicle
+from gsmap.datasets.source import Mount, Source, sample_in_vehicle
 
 VEHICLE = "vehicle"  # frame: x ahead, y left, on the road below the rear axle
 Cameras = Mapping[str, np.ndarray] | Sequence[np.ndarray] | np.ndarray
@@ -27,7 +27,11 @@ def bgr_by_name(images: Cameras) -> dict[str, np.ndarray]:
 
 
 def source_in_memory(
-    images: Mapping[str, np.ndarray], intrinsics: Cameras, cam_from_frame: Cameras, frame: str
+    images: Mapping[str, np.ndarray],
+    intrinsics: Cameras,
+    cam_from_frame: Cameras,
+    frame: str,
+    mount: Mount | None = None,
 ) -> Source:
     """Make a sample of one frame.
 
@@ -37,6 +41,7 @@ def source_in_memory(
         cam_from_frame: In the same form, in metres. each (4, 4)
         frame: ``vehicle`` (x ahead, y left, on the road below the rear axle), or an annotation
             frame.
+        mount: Where that frame lies in the vehicle; None is the usual place.
 
     Raises:
         ValueError: If an array has another shape, a matrix is none of its kind, or the cameras of
@@ -64,7 +69,10 @@ def source_in_memory(
     check_samples([sample], AnnotationMeta("memory", given, "test"))
     if frame == VEHICLE:
         sample = sample_in_vehicle("in memory", "", 0, cameras, None)
-    return Source([sample], given, None, has_poses=False)
+    elif mount is not None:
+        sample.ego_from_frame = mount.ego_from_frame
+    height = None if mount is None else mount.ground_z_m
+    return Source([sample], given, None, has_poses=False, ground_z_m=height)
 
 
 def _by_name(values: Cameras) -> dict[str, np.ndarray]:

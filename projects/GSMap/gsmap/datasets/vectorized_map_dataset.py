@@ -18,9 +18,13 @@ from gsmap.structures.calibration import NUM_CAN_BUS, without_history
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.structures.streams import Frame
+from gsmap.utils.model_facts import MOUNT
 from gsmap.utils.split_lists import SPLIT_LIST
 
 _BROKEN = ("raise", "skip")
+_OF_FILE = (
+    "classes", "x_range", "y_range", "dataset", "split", "frame", "ground_z_m", SPLIT_LIST,
+)  # fmt: skip
 _NEIGHBOUR_S = 5.0  # how far the next pose of a drive may be for its speed
 
 
@@ -50,6 +54,8 @@ class VectorizedMapDataset(BaseDataset):
             seed: what a model then still scores, it does not see in the images.
         signals_from_poses: Whether vehicle signals (``can_bus``) of samples that have none are
             computed from the poses of the drive; otherwise they are zero.
+        ground_z_m: Height of the road in the frame, as in ``AnnotationMeta``, for files that do not
+            have it; that of others must be the same.
         broken_samples: ``raise`` stops at a sample with a missing or damaged file; ``skip`` takes
             another one in its place, and counts and logs it (in training only).
         max_refetch: How many samples in a row may be skipped.
@@ -78,6 +84,7 @@ class VectorizedMapDataset(BaseDataset):
         filter_empty_gt: bool = True,
         shuffle_images_seed: int | None = None,
         signals_from_poses: bool = False,
+        ground_z_m: float | None = None,
         broken_samples: str = "raise",
         max_refetch: int = 100,
         indices: int | Sequence[int] | None = None,
@@ -113,6 +120,7 @@ class VectorizedMapDataset(BaseDataset):
         self._filter_empty_gt = filter_empty_gt and not test_mode
         self._shuffle_images_seed = shuffle_images_seed
         self._signals_from_poses = signals_from_poses
+        self._ground_z_m = ground_z_m
         super().__init__(
             ann_file,
             data_root=str(data_root),
@@ -136,11 +144,36 @@ class VectorizedMapDataset(BaseDataset):
                 f"go unnoticed until you {self.annotations.remedy}",
                 "current",
             )
-        for name in ("classes", "x_range", "y_range", "dataset", "split", "frame", SPLIT_LIST):
+        for name in _OF_FILE:
             self._metainfo[name] = getattr(self.annotations.meta, name)
+        self._metainfo["ground_z_m"] = self._height()
+        self._metainfo[MOUNT] = self._mount()
         self._metainfo["dim"] = self._dim or self.annotations.meta.dim
         self._metainfo["cameras"] = self.cameras
         return [{"row": row, "image_row": row} for row in range(len(self.annotations))]
+
+    def _mount(self) -> list[list[float]] | None:
+        """Return where the first sample's frame lies over the ground, if that is known. (4, 4)"""
+        frame, height_m = self._metainfo["frame"], self._metainfo["ground_z_m"]
+        if not len(self.annotations):
+            return None
+        sample = self.annotations[0]
+        known = height_m is not None or (frame == "lidar" and sample.ego_from_frame is not None)
+        return ground_from_frame(sample, frame, height_m).tolist() if known else None
+
+    def _height(self) -> float | None:
+        """Return the height of the road in the frame: the file's, or the config's if it has none.
+
+        Raises:
+            ValueError: If both have one, and they differ.
+        """
+        of_file = self.annotations.meta.ground_z_m
+        if None not in (of_file, self._ground_z_m) and abs(of_file - self._ground_z_m) > 1e-6:
+            raise ValueError(
+                f"{self.ann_file} has the road at z = {of_file:g} m of its frame, the config at "
+                f"{self._ground_z_m:g} m (ground_z_m): set both to one height."
+            )
+        return self._ground_z_m if of_file is None else of_file
 
     def filter_data(self) -> list[dict[str, int]]:
         """Leave out samples without elements, and shuffle images, where that is asked for."""
@@ -252,7 +285,8 @@ class VectorizedMapDataset(BaseDataset):
 
         def pose(other: MapSample) -> tuple[float, np.ndarray]:
             seconds = (other.timestamp_ns - sample.timestamp_ns) / 1e9
-            ground = ground_from_frame(other, self._metainfo["frame"])
+            frame, height_m = self._metainfo["frame"], self._metainfo["ground_z_m"]
+            ground = ground_from_frame(other, frame, height_m)
             return seconds, other.global_from_frame @ invert_rigid(ground)
 
         places = [i for i in (row - 1, row + 1) if 0 <= i < len(self.annotations)]

@@ -72,3 +72,18 @@ FRAME_VIEWS: dict[str, FrameView] = {
     "lidar": FrameView(forward="y", ground=(0.0, 0.0, -1.84), vehicle_m=(-1.59, 2.49, 1.73)),
     "ego": FrameView("x", (0.0, 0.0, -0.31), vehicle_m=(-1.10, 3.77, 1.85), ego_ground_z_m=-0.31),
 }
+
+
+def frame_view(frame: str, ground_z_m: float | None = None) -> FrameView:
+    """Return the view of an annotation frame.
+
+    Args:
+        frame: ``lidar`` or ``ego``.
+        ground_z_m: Height of the road in that frame, where a sensor's mounting does not tell it, in
+            metres; None is the frame's usual.
+    """
+    view = FRAME_VIEWS[frame]
+    if ground_z_m is None:
+        return view
+    of_vehicle = ground_z_m if frame == "ego" else view.ego_ground_z_m
+    return replace(view, ground=(0.0, 0.0, ground_z_m), ego_ground_z_m=of_vehicle)

@@ -9,7 +9,7 @@ import numpy as np
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.consistency import DriveFrame
 from gsmap.evaluation.drive_files import drive_frames
-from gsmap.structures.frames import FRAME_VIEWS
+from gsmap.structures.frames import frame_view
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.extras import import_extra
 from gsmap.utils.files import atomic_write
@@ -124,7 +124,7 @@ def _pictures(
             camera_views(sample.cameras, root, sample.token) if root is not None else [],
             [*panels, BEVPanel("Ground truth", truth)],
             BEVGrid(meta.x_range, meta.y_range),
-            FRAME_VIEWS[meta.frame].tilted(sample.ego_from_frame),
+            frame_view(meta.frame, meta.ground_z_m).tilted(sample.ego_from_frame),
             style,
             panels[0].elements,
             f"{sample.scene}, {seconds:.1f} s",

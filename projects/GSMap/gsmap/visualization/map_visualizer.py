@@ -16,7 +16,7 @@ from gsmap.datasets.image_files import read_image
 from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.elements import MapElements
-from gsmap.structures.frames import FRAME_VIEWS, FrameView
+from gsmap.structures.frames import FRAME_VIEWS, FrameView, frame_view
 from gsmap.structures.grid import BEVGrid
 from gsmap.visualization.bev_view import BEVPanel
 from gsmap.visualization.camera_view import CameraView
@@ -74,7 +74,8 @@ class MapVisualizer(Visualizer):
 
     Args:
         ground_z_m: Level ground at this z of the frame. By default the ground follows the sensor's
-            mounting (``lidar2ego`` of the sample), or else the frame's usual height.
+            mounting (``lidar2ego`` of the sample), or else the height that the annotation file
+            has, or the frame's usual one.
         score_thr: Smallest score of a drawn prediction.
         panels: Which bird's-eye views to draw, of ``PANELS``; those that a sample has no data
             for are left out.
@@ -133,7 +134,7 @@ class MapVisualizer(Visualizer):
                 f"No view is known for frame {frame!r}, only for {sorted(FRAME_VIEWS)}; "
                 "add one to gsmap.structures.frames.FRAME_VIEWS."
             )
-        view = FRAME_VIEWS[frame]
+        view = frame_view(frame, (self.dataset_meta or {}).get("ground_z_m"))
         if self.ground_z_m is not None:
             return replace(view, ground=(0.0, 0.0, self.ground_z_m))
         return view.tilted(metainfo.get("lidar2ego"))

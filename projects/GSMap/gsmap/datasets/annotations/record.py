@@ -8,6 +8,7 @@ import numpy as np
 from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
 FORMAT_VERSION = 1
+_HIGHEST_GROUND_M = 10.0
 CLASSES = ("divider", "ped_crossing", "boundary")
 RANGES = {"lidar": ((-15.0, 15.0), (-30.0, 30.0)), "ego": ((-30.0, 30.0), (-15.0, 15.0))}
 """The usual range of each annotation frame: smallest and largest x, and y, in metres."""
@@ -136,6 +137,9 @@ class AnnotationMeta:
         options: Conversion options that change the content.
         command: The command that makes the file again, for messages.
         format_version: Version of the file format.
+        ground_z_m: Height of the road in the frame, where a record's ``ego_from_frame`` does not
+            tell it, in metres; None is the frame's usual: -1.84 below nuScenes' LiDAR, -0.31 below
+            the axle of Argoverse 2.
 
     Raises:
         ValueError: If a value is out of its domain.
@@ -153,6 +157,7 @@ class AnnotationMeta:
     options: dict[str, Any] = field(default_factory=dict)
     command: str = ""
     format_version: int = FORMAT_VERSION
+    ground_z_m: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("dataset", "split", "source_fingerprint", "command"):
@@ -161,6 +166,11 @@ class AnnotationMeta:
         if not isinstance(self.options, dict):
             raise ValueError(f"options must be a dictionary, got {self.options!r:.60}.")
         checked_identity(self.split_list)
+        if self.ground_z_m is not None and not abs(float(self.ground_z_m)) < _HIGHEST_GROUND_M:
+            raise ValueError(
+                f"ground_z_m must be metres, between -{_HIGHEST_GROUND_M:g} and "
+                f"{_HIGHEST_GROUND_M:g}, got {self.ground_z_m!r}."
+            )
         if self.frame not in RANGES:
             raise ValueError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
         if self.dim not in (2, 3):

@@ -68,7 +68,10 @@ _RECORDS: dict[pa.DataType, Any] = {
 
 def schema_of(meta: AnnotationMeta) -> pa.Schema:
     """Return the file's schema with its metadata."""
-    return pa.schema(FIELDS, metadata={META_KEY: json.dumps(asdict(meta)).encode()})
+    values = asdict(meta)
+    if meta.ground_z_m is None:  # as in files that earlier versions read
+        del values["ground_z_m"]
+    return pa.schema(FIELDS, metadata={META_KEY: json.dumps(values).encode()})
 
 
 def row_of(record: Any, meta: AnnotationMeta, where: str = "") -> dict[str, Any]:

@@ -18,7 +18,7 @@ from gsmap.evaluation.file_evaluation import read_ground_truth
 from gsmap.evaluation.groups import read_groups
 from gsmap.evaluation.raster_ap import MIN_SCORE
 from gsmap.structures.elements import MapElements
-from gsmap.structures.frames import FRAME_VIEWS
+from gsmap.structures.frames import frame_view
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import write_text
 from gsmap.utils.words import counted
@@ -97,7 +97,8 @@ def page_data(
         ValueError: If a file is malformed, or does not fit the others.
     """
     file = AnnotationFile(annotations)
-    meta, view, style = file.meta, FRAME_VIEWS[file.meta.frame], MapStyle(file.meta.classes)
+    meta, style = file.meta, MapStyle(file.meta.classes)
+    view = frame_view(meta.frame, meta.ground_z_m)
     truth = read_ground_truth(annotations, meta.classes)[0] if results else {}
     rules = options.allow_mismatch, options.allow_other_split, options.law
     scored = [score_result(name, path, truth, meta, *rules) for name, path in results.items()]
