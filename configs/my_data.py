@@ -11,6 +11,7 @@ _file_size = (640, 360)  # of the image files, width and height: for benchmarks
 _scale = 0.25  # of the image files' size: to some 160 x 90 pixels, which the model that ships was trained on
 grid = dict(x_range=[-30.0, 30.0], y_range=[-15.0, 15.0])  # metres, as in the annotation files
 classes = ['divider', 'ped_crossing', 'boundary']  # as in the annotation files
+_queries = 20  # most elements that are found in a sample; `create_data.py check` says how many there are
 
 # What follows from it
 _cells = [round((b - a) / _base_.model.bev_encoder.bev_pixel_m) for a, b in (grid['y_range'], grid['x_range'])]
@@ -21,6 +22,6 @@ _targets = [_base_._targets, dict(type='MakeBEVMask', size=_cells, thickness_px=
 
 _encoder = dict(num_cams=len(_cameras), z_range=(_ground_z - 0.25, _ground_z + 1.75))
 optim_wrapper = dict(optimizer=dict(lr=3e-4))  # half of the base's, as training goes on from a trained model
-model = dict(grid=grid, classes=classes, bev_encoder=_encoder, map_head=dict(type='GSMapHead'))
+model = dict(grid=grid, classes=classes, bev_encoder=_encoder, map_head=dict(type='GSMapHead', query_groups=[dict(num=_queries)]))
 train_dataloader = dict(dataset=dict(**_data, ann_file='train.arrow', pipeline=[*_load, *_targets, _base_._pack]))
 val_dataloader = test_dataloader = dict(dataset=dict(**_data, ann_file='val.arrow', pipeline=[*_load, _base_._pack]))

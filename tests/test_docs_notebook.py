@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import cv2
+import pytest
 
 NOTEBOOK = Path(__file__).resolve().parents[1] / "docs/quickstart.ipynb"
 CELLS = json.loads(NOTEBOOK.read_text())["cells"]
@@ -15,10 +16,24 @@ def test_it_has_ten_cells_without_outputs_and_begins_with_the_installation():
     for cell in CELLS:
         assert not cell.get("outputs"), "clear the outputs before you commit"
         assert cell.get("execution_count") is None
-    assert CODE[0] == "%pip install -q ."
+    assert "%pip install -q {repository}" in CODE[0]
     assert not [
         line for code in CODE[1:] for line in code.splitlines() if line.startswith(("%", "!"))
     ]
+
+
+@pytest.mark.parametrize("folder", [".", "docs"])
+def test_the_first_cell_installs_the_repository_only_where_it_is_missing(folder, monkeypatch):
+    """From the root and from ``docs/``, where a kernel starts; an editable install stays."""
+    monkeypatch.chdir(NOTEBOOK.parents[1] / folder)
+    code = CODE[0].replace("%pip install -q {repository}", "installed.append(repository)")
+    installed: list[Path] = []
+    exec(code, {"installed": installed})
+    assert installed == []
+    with monkeypatch.context() as patch:
+        patch.setattr("importlib.util.find_spec", lambda name: None)
+        exec(code, {"installed": installed})
+    assert installed == [NOTEBOOK.parents[1]]
 
 
 def test_its_cells_make_a_picture(tmp_path, monkeypatch, capsys):

@@ -23,7 +23,7 @@ from matplotlib.lines import Line2D
 
 from drivemaps.config import MergeConfig
 from drivemaps.drive import Drive, read_drive
-from drivemaps.geodetic import MapOrigin, known_origin
+from drivemaps.geodetic import MapGrid, MapOrigin, known_origin, require_near
 from drivemaps.geojson import write_geojson
 from drivemaps.lanelet2 import write_lanelet2
 from drivemaps.mcap import write_mcap
@@ -90,6 +90,9 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         "nuScenes' and Argoverse 2's are known",
     )
     parser.add_argument(
+        "--crs", help="grid that the poses are in, such as EPSG:32650 (UTM), instead of --origin"
+    )
+    parser.add_argument(
         "--allow-other-split",
         action="store_true",
         help="score maps of a model that was trained on another split, whose places it may share",
@@ -105,17 +108,27 @@ def check_formats(args: argparse.Namespace, ann: AnnotationFile) -> None:
     for key in EXTRAS.keys() & set(args.formats):
         import_extra(*EXTRAS[key])
     origins = {name: origin_of(args, ann, name) for name in set(ann.column("map_name"))}
+    if args.crs and args.origin:
+        raise ValueError("--crs and --origin both say where the poses lie: give one of them.")
+    if any(isinstance(origin, MapOrigin) for origin in origins.values()):
+        require_near(np.array([sample.global_from_frame[:2, 3] for sample in ann]), str(args.ann))
     unknown = sorted(name for name, origin in origins.items() if origin is None)
     if "osm" in args.formats and unknown:
         raise ValueError(
             f"Lanelet2 needs longitude and latitude, and the origin of map {unknown[0]!r} is not "
-            "known: give --origin LAT LON (any place will do; nodes keep local_x and local_y)."
+            "known: give --origin LAT LON (any place will do; nodes keep local_x and local_y), or "
+            "--crs if poses are coordinates of a grid."
         )
     if {"osm", "geojson"} & set(args.formats) and len(unknown) < len(origins):
         import_extra("pyproj", "maps")
 
 
-def origin_of(args: argparse.Namespace, ann: AnnotationFile, map_name: str) -> MapOrigin | None:
+def origin_of(
+    args: argparse.Namespace, ann: AnnotationFile, map_name: str
+) -> MapOrigin | MapGrid | None:
+    """Return where the global frame lies, if that is known."""
+    if args.crs:
+        return MapGrid(args.crs)
     return MapOrigin(*args.origin) if args.origin else known_origin(ann.meta, map_name)
 
 

@@ -80,7 +80,7 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     )
     group.add_argument("--vehicle-frame", help="the vehicle's frame in a bag, such as base_link")
     group.add_argument(
-        "--vehicle-ground-z", type=float, default=0.0, help="height of the road in it, in metres"
+        "--vehicle-ground-z", type=float, help="height of the road in it, in metres (default: 0)"
     )
     group.add_argument(
         "--topics",
@@ -128,6 +128,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         parser.error("the following arguments are required: --model")
     if args.out and args.out.suffix == _SAMPLES:
         parser.error(f"--out names a JSON file, the samples go to a {_SAMPLES}: got {args.out}")
+    if args.ground_z is not None and not args.show_dir:
+        parser.error("--ground-z is for pictures: give --show-dir, too, or leave it out")
     if args.model and len(args.model) > 2:
         parser.error(f"--model takes a name, or a config and a checkpoint, got {args.model}")
     return args

@@ -209,3 +209,13 @@ def test_a_resumed_training_and_a_test_take_checkpoints_as_they_are():
     for resume, loop in ((True, object()), (False, None), (False, {})):
         runner = SimpleNamespace(_resume=resume, _train_loop=loop)
         RigFitHook().after_load_checkpoint(runner, {})  # else it would ask for the data
+
+
+def test_queries_beyond_those_of_the_start_begin_as_new():
+    model = build_small()
+    key = "map_head.instance_embedding.weight"
+    own = model.state_dict()[key].clone()
+    state = {**model.state_dict(), key: own[:-2] + 5.0}
+    lines = fit_start(state, model, Drive(), METAINFO | {"cameras": Drive.cameras})
+    assert lines == [f"{len(own) - 2} queries keep their weights, 2 begin as new."]
+    torch.testing.assert_close(state[key], torch.cat([own[:-2] + 5.0, own[-2:]]))

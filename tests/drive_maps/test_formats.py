@@ -10,7 +10,7 @@ from drive_cases import CLASSES, drive_of
 from PIL import Image
 
 from drivemaps.drive import DriveFrame
-from drivemaps.geodetic import MapOrigin, known_origin
+from drivemaps.geodetic import MapGrid, MapOrigin, known_origin, require_near
 from drivemaps.geojson import write_geojson
 from drivemaps.lanelet2 import write_lanelet2
 from drivemaps.mcap import write_mcap
@@ -271,3 +271,16 @@ def test_a_missing_extra_is_named(module, extra, write, tmp_path, monkeypatch, t
 def test_an_empty_map_is_written(tmp_path):
     write_geojson(tmp_path / "map.geojson", MapElements.from_polylines(), CLASSES, None)
     assert json.loads((tmp_path / "map.geojson").read_text())["features"] == []
+
+
+def test_poses_in_a_grid_lie_where_the_grid_says():
+    """UTM zone 50 north: 500 km east is the meridian of 117 degrees."""
+    (lon, lat) = MapGrid("EPSG:32650").lon_lat(np.array([[500_000.0, 4_429_000.0]]))[0]
+    assert lon == pytest.approx(117.0, abs=1e-9)
+    assert lat == pytest.approx(40.0, abs=0.02)
+    for wrong, reason in (("EPSG:4326", "no grid in metres"), ("EPSG:0", "no coordinate ref")):
+        with pytest.raises(ValueError, match=reason):
+            MapGrid(wrong)
+    require_near(np.array([[99_000.0, -5.0]]), "a")
+    with pytest.raises(ValueError, match=r"a: positions lie up to 4429 km.*give --crs"):
+        require_near(np.array([[500_000.0, 4_429_000.0]]), "a")

@@ -1,5 +1,8 @@
 """What mmengine tells of itself: only to whoever debugs."""
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
 from mmengine.config import Config
@@ -8,7 +11,7 @@ from mmengine.evaluator.metric import DumpResults
 from mmengine.hooks import Hook
 
 import gsmap.registered  # noqa: F401
-from gsmap.engine.run_log import MapRunner
+from gsmap.engine.run_log import MapRunner, _missed_elements
 
 
 @pytest.mark.parametrize("level", ["INFO", "DEBUG"])
@@ -54,3 +57,20 @@ def test_the_config_of_a_run_replaces_no_other_file(kind, tmp_path):
     assert source.read_text() == "a = 1  # my notes\n"
     assert (work / "mine.py").exists() == (kind != "input")
     assert kind == "input" or (work / "mine.py").read_text().strip() == "a = 1"
+
+
+def run_with(counts, queries):
+    """Return a runner whose training samples have so many elements, and its model."""
+    annotations = SimpleNamespace(instance_counts=lambda: np.array(counts))
+    loader = SimpleNamespace(dataset=SimpleNamespace(annotations=annotations))
+    head = SimpleNamespace(query_groups=[SimpleNamespace(num=queries)])
+    return SimpleNamespace(train_dataloader=loader), SimpleNamespace(map_head=head)
+
+
+def test_elements_that_no_query_is_left_for_are_counted():
+    text = _missed_elements(*run_with([3, 43, 21, -1], 20))
+    assert text.startswith(
+        "2 of 4 training samples have more elements (up to 43) than the model has queries (20): "
+        "24 elements can never be found."
+    )
+    assert _missed_elements(*run_with([3, 20, -1], 20)) is None

@@ -3,10 +3,13 @@
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.datasets.annotations.record import AnnotationMeta
 from mapdata.check import check_files
+from mapdata.custom import from_records
 
 
 def test_a_whole_data_set_is_right_and_damage_is_named(
@@ -34,3 +37,35 @@ def test_a_damaged_footer_is_found(minicity_annotations: dict[str, Path], tmp_pa
     assert len(AnnotationFile(path)) == 2
     with pytest.raises(ValueError, match="the footer, by which other programs read"):
         check_files([path], None, workers=1)
+
+
+def test_the_check_counts_elements_and_doubts_truth_and_cameras(tmp_path: Path, caplog):
+    """Truth in coordinates of the world, and matrices the wrong way round."""
+    looking = [[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, -1.2], [0, 0, 0, 1]]
+    here = {"label": "divider", "points": [[0, 1], [9, 1]]}
+    there = {"label": "divider", "points": [[448_000, 4_420_000], [448_010, 4_420_000]]}
+
+    def record(token, cam_from_frame, *instances):
+        camera = {
+            "name": "front", "path": "x.jpg", "width": 640, "height": 360,
+            "intrinsics": [[400, 0, 320], [0, 400, 180], [0, 0, 1]],
+            "cam_from_frame": cam_from_frame,
+        }  # fmt: skip
+        return {"token": token, "scene": token, "cameras": [camera], "instances": list(instances)}
+
+    meta = AnnotationMeta("mine", "ego", "train", ground_z_m=0.0)
+    right, wrong = tmp_path / "right.arrow", tmp_path / "wrong.arrow"
+    from_records(right, [record("a", looking, here, here)], meta, tmp_path)
+    assert caplog.text == ""
+    assert check_files([right], None, workers=1).splitlines()[0] == (
+        f"{right}: 2 map elements, up to 2 in a sample (a model needs at least as many queries)"
+    )
+    upside = np.linalg.inv(looking).tolist()
+    from_records(wrong, [record("b", looking, there), record("c", upside, here)], meta, tmp_path)
+    assert "1 of 2 records lose all of their elements (the first is 'b')" in caplog.text
+    text = check_files([wrong], None, workers=1)
+    assert "warning: 1 of 2 samples have no element in the range" in text
+    assert "warning: calibration: camera 'front' " in text
+    caplog.clear()
+    from_records(wrong, [record("a", looking, here)], AnnotationMeta("x", "ego", "v"), tmp_path)
+    assert "does not say how high the road is in the frame 'ego'" in caplog.text

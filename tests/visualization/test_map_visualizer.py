@@ -313,3 +313,12 @@ def test_inputs_turn_back_into_pictures():
     assert pictures[1][0, 0].tolist() == [255, 0, 200]
     with pytest.raises(ValueError, match=r"shape \(V, 3, H, W\)"):
         images_from_inputs(bgr[0])
+
+
+def test_the_road_lies_where_the_annotation_file_says():
+    visualizer = make_visualizer("own height")
+    visualizer.dataset_meta = {"frame": "ego", "ground_z_m": 0.0}
+    assert visualizer.frame_view({}).ground == (0, 0, 0)
+    assert visualizer.frame_view({"lidar2ego": np.eye(4)}).ground == (0, 0, 0)
+    visualizer.dataset_meta = {"frame": "ego"}
+    assert visualizer.frame_view({"lidar2ego": np.eye(4)}).ground == (0, 0, -0.31)

@@ -10,6 +10,8 @@ from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.structures.elements import FloatArray
 from gsmap.utils.extras import import_extra
 
+_FARTHEST_M = 100_000.0
+
 
 @dataclass(frozen=True)
 class MapOrigin:
@@ -60,6 +62,66 @@ class MapOrigin:
                 "--formats geojson without --origin writes metres."
             )
         return degrees
+
+
+@dataclass(frozen=True)
+class MapGrid:
+    """A coordinate reference system that the global frame's x and y are coordinates of.
+
+    Args:
+        crs: Its name, as pyproj takes it, such as ``EPSG:32650``; x is its easting.
+
+    Raises:
+        RuntimeError: If ``pyproj`` is missing.
+        ValueError: If there is no such system, or it is not in metres.
+    """
+
+    crs: str
+
+    def __post_init__(self) -> None:
+        crs = import_extra("pyproj", "maps").CRS
+        try:
+            found = crs.from_user_input(self.crs)
+        except Exception as error:  # pyproj's own is no ValueError
+            raise ValueError(f"{self.crs} is no coordinate reference system: {error}.") from error
+        units = {axis.unit_name for axis in found.axis_info[:2]}
+        if not found.is_projected or units != {"metre"}:
+            raise ValueError(
+                f"{self.crs} ({found.name}) is no grid in metres: give that of the poses, such as "
+                "EPSG:32650."
+            )
+
+    @cached_property
+    def _to_degrees(self) -> Any:
+        transformer = import_extra("pyproj", "maps").Transformer
+        return transformer.from_crs(self.crs, "EPSG:4326", always_xy=True)
+
+    def lon_lat(self, points: FloatArray) -> FloatArray:
+        """Return longitude and latitude, in degrees on the WGS 84 ellipsoid. (n, 2)
+
+        Points (n, >= 2) are in metres of the grid.
+        """
+        x, y = np.asarray(points)[:, :2].T
+        return np.stack(self._to_degrees.transform(x, y), axis=1)
+
+
+def require_near(positions: FloatArray, where: str) -> None:
+    """Refuse positions that are too far from an origin to be metres from it.
+
+    Args:
+        positions: Of the vehicle, in metres of the global frame. (n, >= 2)
+        where: Of which map, for the message.
+
+    Raises:
+        ValueError: If one is farther than `_FARTHEST_M`.
+    """
+    farthest_m = float(np.abs(np.asarray(positions)[:, :2]).max(initial=0.0))
+    if farthest_m > _FARTHEST_M:
+        raise ValueError(
+            f"{where}: positions lie up to {farthest_m / 1000:.0f} km from the origin, so they are "
+            "no metres from it: if they are coordinates of a grid, give --crs (such as EPSG:32650 "
+            "for UTM zone 50) instead of --origin."
+        )
 
 
 def known_origin(meta: AnnotationMeta, map_name: str) -> MapOrigin | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import shapely
 
-from drivemaps.geodetic import MapOrigin
+from drivemaps.geodetic import MapGrid, MapOrigin
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import MapElements
 from gsmap.utils.files import write_text
@@ -17,7 +17,10 @@ _CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"
 
 
 def write_geojson(
-    path: str | Path, elements: MapElements, classes: Sequence[str], origin: MapOrigin | None
+    path: str | Path,
+    elements: MapElements,
+    classes: Sequence[str],
+    origin: MapOrigin | MapGrid | None,
 ) -> None:
     """Write a map: areas as polygons, all else as line strings.
 

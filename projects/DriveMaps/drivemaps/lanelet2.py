@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
-from drivemaps.geodetic import MapOrigin
+from drivemaps.geodetic import MapGrid, MapOrigin
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import MapElements
 from gsmap.utils.files import write_bytes
@@ -20,7 +20,7 @@ TYPES = {
 
 
 def write_lanelet2(
-    path: str | Path, elements: MapElements, classes: Sequence[str], origin: MapOrigin
+    path: str | Path, elements: MapElements, classes: Sequence[str], origin: MapOrigin | MapGrid
 ) -> None:
     """Write a map that the ``lanelet2`` package loads.
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gsmap import __version__
 from gsmap.utils.cli import BAD_INPUT, CommandParser
+from gsmap.utils.faults import nearest
 from gsmap.utils.shipped import shipped
 
 
@@ -33,7 +34,8 @@ def main() -> None:
     elif name == "--version":
         sys.stdout.write(f"gsmap {__version__}\n")
     elif name not in tools:
-        sys.stderr.write(f"error: there is no command {name}; there are {', '.join(tools)}.\n")
+        hint = nearest(name, tools) or f"; there are {', '.join(tools)}."
+        sys.stderr.write(f"error: there is no command {name}{hint}\n")
         sys.exit(BAD_INPUT)
     else:
         CommandParser.program = f"gsmap {name}"

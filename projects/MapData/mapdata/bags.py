@@ -124,7 +124,7 @@ class _Content:
 def _read(bag: Bag, path: Path, options: InputOptions) -> Source:
     kinds, listing = {c.topic: c.msgtype for c in bag.connections}, _listing(bag)
     calibration, notes = options.calibration, list(bag.notes)
-    ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m))
+    ground = rigid(np.eye(3), (0, 0, options.vehicle_ground_z_m or 0.0))
     topics = chosen_topics(kinds, options.topics, listing, calibration is None)
     if calibration is None:
         topics = topics or camera_topics(kinds, listing)

@@ -12,6 +12,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
+from gsmap.datasets.plausibility import calibration_warnings
 from gsmap.utils.faults import is_of_the_machine
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress
@@ -59,6 +60,25 @@ def _broken_files(sample: MapSample, root: Path) -> list[str]:
     return problems
 
 
+def _doubts(file: AnnotationFile) -> list[str]:
+    """Count the elements, and say what is implausible about them and the cameras."""
+    counts, meta = file.instance_counts(), file.meta
+    known = counts[counts >= 0]
+    lines = []
+    if len(known):
+        lines.append(
+            f"{counted(int(known.sum()), 'map element')}, up to {known.max()} in a sample (a model "
+            "needs at least as many queries)"
+        )
+        if empty := int((known == 0).sum()):
+            lines.append(
+                f"warning: {empty} of {counted(len(known), 'sample')} have no element in the range:"
+                " are points in metres of the frame, not of the world?"
+            )
+    doubts = calibration_warnings(file, meta.frame, meta.ground_z_m)
+    return lines + [f"warning: calibration: {line}" for line in doubts]
+
+
 def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
     """Check annotation files and, with a data root, the images and sweeps that they name.
 
@@ -72,6 +92,7 @@ def check_files(paths: Sequence[Path], root: Path | None, workers: int) -> str:
     for path in paths:
         file = _open(path)
         mark = "checksum right" if file.sealed else "no checksum, as it is of an earlier version"
+        lines += [f"{path}: {line}" for line in _doubts(file)]
         lines.append(f"{path}: {counted(len(file), 'sample')}, values right, {mark}")
         if root is not None:
             samples = Progress(file, desc=path.name, unit="samples")

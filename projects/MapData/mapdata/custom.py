@@ -36,6 +36,10 @@ _UNKNOWN_ROAD = (
     "%s does not say how high the road is in the frame 'ego': pictures and inference will take it "
     "to be 0.31 m below the origin (Argoverse 2's axle); AnnotationMeta(ground_z_m=...) says it."
 )
+_LOST = (
+    "%d of %d records lose all of their elements (the first is %r), as none lies in x_range and "
+    "y_range: points must be in metres of the frame, not of the world, and not in millimetres."
+)
 _KEYS = sorted(field.name for field in fields(MapSample))
 Record = TypeVar("Record")
 
@@ -93,7 +97,7 @@ def from_records(
 def _samples(
     records: Iterable[Mapping[str, Any]], meta: AnnotationMeta, root: Path
 ) -> Iterator[MapSample]:
-    warned = False
+    warned, lost, samples = False, [], 0
     for number, record in enumerate(records):
         name = record.get("token", number) if isinstance(record, Mapping) else number
         with naming(f"record {name!r}", "correct it"):
@@ -102,17 +106,23 @@ def _samples(
                 raise ValueError(f"unknown keys {sorted(unknown)}; known are {_KEYS}.")
             sample = _sample(record, meta, root)
             check_samples([sample], meta)
+            samples += 1
+            given = len(sample.instances or ())
             if sample.instances is not None:
                 sample.instances = [
                     MapInstance(item.label, piece)
                     for item in sample.instances
                     for piece in _clipped(np.asarray(item.points, np.float64), meta)
                 ]
+        if given and not sample.instances:
+            lost.append(sample.token)
         if sample.ego_from_frame is None and meta.frame == "lidar" and not warned:
             warned = True
             height_m = -frame_view(meta.frame, meta.ground_z_m).ground[2]
             _LOGGER.warning(_UNMOUNTED, sample.token, height_m)
         yield sample
+    if lost:
+        _LOGGER.warning(_LOST, len(lost), samples, lost[0])
 
 
 def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:

@@ -18,7 +18,7 @@ class InputOptions:
             in a folder for each input.
         vehicle_frame: The vehicle's frame (x ahead, y left, z up) in a bag's transforms;
             ``base_footprint`` or ``base_link`` by default.
-        vehicle_ground_z_m: Height of the road in that frame.
+        vehicle_ground_z_m: Height of the road in that frame; None is 0.
         topics: Topics of images and camera info of a bag, by camera (``parse_topics``).
         calibration: Calibration file of a bag's cameras, in place of their infos and transforms;
             their names are those of the topics, or its ``images`` are topics.
@@ -30,6 +30,6 @@ class InputOptions:
     rate_hz: float | None = 2.0
     frames_dir: Path = Path("frames")
     vehicle_frame: str | None = None
-    vehicle_ground_z_m: float = 0.0
+    vehicle_ground_z_m: float | None = None
     topics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     calibration: Path | None = None

@@ -337,3 +337,24 @@ def test_what_is_no_input_is_named(tmp_path):
     (tmp_path / "c.txt").touch()
     with pytest.raises(ValueError, match=r"c.txt is no input"):
         open_input(tmp_path / "c.txt")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("calibration.yaml", "cameras:\n  front: {images: a}\n  front: {images: b}\n"),
+        ("calibration.json", '{"cameras": {"front": {}, "front": {}}}'),
+        ("calibration.yaml", "ground_z_m: 0\nground_z_m: 1\ncameras: {front: {}}\n"),
+    ],
+)
+def test_what_a_calibration_names_twice_is_refused(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    twice = "ground_z_m" if "ground" in text else "front"
+    with pytest.raises(ValueError, match=f"{twice} is there twice"):
+        open_input(tmp_path / name)
+
+
+def test_the_height_for_a_bag_beside_another_input_is_refused(tmp_path, minicity_annotations):
+    options = InputOptions(vehicle_ground_z_m=0.0)
+    with pytest.raises(ValueError, match="--vehicle-ground-z belongs to a bag"):
+        open_input(minicity_annotations["val"], options)

@@ -6,6 +6,8 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "MapInferencer": "map_inferencer",
+        "OnnxInferencer": "onnx_inferencer",
+        "export_onnx": "export",
         "load_model": "loading",
     },
 )

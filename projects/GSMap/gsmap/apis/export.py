@@ -16,6 +16,7 @@ from gsmap.apis.onnx_inferencer import (
     FORMAT,
     MEMORY,
     METADATA_KEY,
+    NO_SIGNALS,
     OF_STREAM,
     OnnxInferencer,
 )
@@ -195,7 +196,8 @@ def export_onnx(
         metadata["ground_from_frame"] = model.mount.matrix.tolist()
         metadata["ego_from_frame"] = model.mount.ego_from_frame.tolist()
     if "can_bus" in exported.input_names:
-        metadata["can_bus"] = CAN_BUS_RULE
+        without = getattr(model, "without_signals", False)
+        metadata["can_bus"] = NO_SIGNALS if without else CAN_BUS_RULE
     if model.temporal is not None:
         metadata["max_gap_s"] = model.temporal.max_gap_s
     onnx.helper.set_model_props(proto, {METADATA_KEY: json.dumps(metadata)})

@@ -1,5 +1,6 @@
 """A trained model on the cameras of one vehicle, whose images come frame by frame."""
 
+import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,11 +10,13 @@ import numpy as np
 from mmengine.config import Config
 
 from gsmap.datasets.memory import VEHICLE, Cameras, bgr_by_name, source_in_memory
+from gsmap.datasets.plausibility import calibration_warnings
 from gsmap.datasets.source import Source, ground_from_frame
 from gsmap.structures.elements import MapElements
 from gsmap.structures.rigid import invert_rigid
 from gsmap.structures.streams import Frame, MapStream
 
+_LOGGER = logging.getLogger(__name__)
 _ALONE = Frame("in memory", "", 0, np.eye(4))
 
 if TYPE_CHECKING:
@@ -73,6 +76,7 @@ class LiveMap:
         self._frame = frame or self._config.get("frame") or "lidar"
         self._allow_missing_cameras = allow_missing_cameras
         self._sizes: dict[str, tuple[int, ...]] = {}
+        self._said: set[str] = set()
         self._dataset: VectorizedMapDataset
 
     def __call__(
@@ -143,6 +147,10 @@ class LiveMap:
         mount = self._inferencer.model.mount
         own = mount if self._frame == mount.frame else None
         source = source_in_memory(pixels, *self._rig, self._frame, own)
+        for line in calibration_warnings(source.samples, source.frame, source.ground_z_m):
+            if line not in self._said:
+                _LOGGER.warning("calibration: %s", line)
+                self._said.add(line)
         foreign = set(pixels) - set(self._config.get("cameras") or pixels)
         if foreign and foreign != set(pixels):
             raise ValueError(

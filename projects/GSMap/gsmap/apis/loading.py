@@ -39,7 +39,9 @@ def load_model(
 
     Returns:
         The torch module, in evaluation mode; ``model.cfg`` is its config, as it was trained,
-        ``model.mount`` the place of its annotation frame in the vehicle that it was trained on.
+        ``model.mount`` the place of its annotation frame in the vehicle that it was trained on,
+        ``model.seen`` the data set, as far as it is known, and ``model.without_signals`` whether
+        that is known to have had none of the vehicle's signals.
 
     Raises:
         FileNotFoundError: If the config or the checkpoint does not exist.
@@ -58,9 +60,21 @@ def load_model(
         load_weights(model, checkpoint, read)
     model.cfg = cfg
     model.mount = _mount_of(cfg, read, checkpoint)
+    # of checkpoints that say how they were trained
+    model.without_signals = bool(read and read.settings is not None and not read.can_bus)
+    model.seen = _seen_by(read, checkpoint)
     if model.temporal is not None:
         model.temporal.name = f"{cfg.filename or 'a config'} with {checkpoint or 'initial weights'}"
     return model.to(device).eval()
+
+
+def _seen_by(read: Checkpoint | None, checkpoint: object) -> str:
+    """Return the data set that a model was trained on; the models that ship saw MiniCity."""
+    if read is None:
+        return ""
+    model = named_models().get(str(checkpoint))
+    usual = "minicity" if model is not None and not model.address else ""
+    return str(read.dataset_meta.get("dataset", usual))
 
 
 def _mount_of(cfg: Config, read: Checkpoint | None, path: object) -> Mount:

@@ -1,6 +1,7 @@
 """A trained model on recorded samples: map elements and pictures out."""
 
 import copy
+import logging
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -43,6 +44,8 @@ if TYPE_CHECKING:  # slow to import, and of no use before there is a model
     from gsmap.visualization.map_visualizer import MapVisualizer
 
 SAMPLES_BY = "tools/infer.py"  # the command that an inferencer's own annotation files name
+_GENERATED = "minicity"
+_LOGGER = logging.getLogger(__name__)
 _LOOK_AT = 100  # samples whose cameras are an input's
 
 
@@ -126,6 +129,7 @@ class MapInferencer:
     ):
         self.model = load_model(config, checkpoint, cfg_options=cfg_options)
         self.cfg: Config = self.model.cfg
+        self._generated = self.model.seen == _GENERATED
         device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         names = [device] if isinstance(device, str | torch.device) else list(device)
         self.devices = [torch.device(name) for name in names]
@@ -179,6 +183,7 @@ class MapInferencer:
             ValueError: If a file cannot be used with this config; the message says why.
         """
         self._files += 1
+        self._say_generated(source)
         root = None if data_root is None else Path(data_root)
         if isinstance(source, str | Path):
             source = annotated(source, root)
@@ -204,6 +209,19 @@ class MapInferencer:
             dataset = DATASETS.build(settings)
         self.visualizer.dataset_meta = dataset.metainfo
         return dataset
+
+    def _say_generated(self, source: Any) -> None:
+        """Say once, for what is not of the generated towns, that the model knows no other roads."""
+        if not self._generated or not isinstance(source, Source):
+            return
+        samples = source.samples
+        if isinstance(samples, AnnotationFile) and samples.meta.dataset == _GENERATED:
+            return
+        self._generated = False
+        _LOGGER.warning(
+            "the model has seen generated streets alone (MiniCity): on real images its maps are a "
+            "trial, not a result; train it on your own (docs/custom_data.md)."
+        )
 
     def _cameras(self, samples: Sequence[MapSample]) -> Sequence[str] | None:
         """Return the config's cameras, or all of the samples' if they have none of these."""

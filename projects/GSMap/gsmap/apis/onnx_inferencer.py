@@ -21,6 +21,7 @@ FORMAT = 1
 CAN_BUS_RULE = (
     "the 18 values of a sample's record; the graph itself sets entries 0 to 2 and 17 to zero"
 )
+NO_SIGNALS = "not needed: the model was trained without vehicle signals; zeros are taken"
 OF_STREAM = ("now_from_then", "seconds", "continues")  # inputs of a model with memory
 MEMORY = "memory_"  # how its further inputs start; what replaces them has new_ besides
 _PRECISIONS = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
@@ -159,7 +160,8 @@ class OnnxInferencer:
     ) -> dict[str, NDArray[np.float32]]:
         """Return the inputs of the graph; arguments and errors as of a call."""
         self._check_images(images)
-        if "can_bus" in self._calibration and meta.get("can_bus") is None:
+        told = self.metadata.get("can_bus") == NO_SIGNALS or meta.get("can_bus") is not None
+        if "can_bus" in self._calibration and not told:
             raise ValueError(
                 f"{self.path.name} needs can_bus, {CAN_BUS_RULE}. From poses: motion_signals of "
                 "gsmap.structures.vehicle_signals; zeros for a model that was trained without."

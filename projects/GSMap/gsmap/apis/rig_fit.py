@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from mmdet3d.registry import HOOKS
 from mmengine.config import Config
 from mmengine.hooks import Hook
@@ -115,6 +116,7 @@ def fit_start(
     own = model.state_dict()
     lines = _fit_cameras(state, own, dataset, origin.get("cameras"))
     lines += _fit_cells(state, own)
+    lines += _fit_queries(state, own, model)
     lines += _fit_classes(state, own, origin.get("classes"), dataset.metainfo["classes"])
     here = dataset.metainfo
     for name, note in (
@@ -172,6 +174,25 @@ def _fit_cells(state: dict[str, Tensor], own: Mapping[str, Tensor]) -> list[str]
     for side, count in zip(sides, new, strict=True):
         state[side] = interpolate(state[side].float().T[None], count, mode="linear")[0].T
     return [f"queries of {old[0]} x {old[1]} BEV cells interpolated to {new[0]} x {new[1]}."]
+
+
+def _fit_queries(
+    state: dict[str, Tensor], own: Mapping[str, Tensor], model: nn.Module
+) -> list[str]:
+    """Keep the queries of elements; those that a model with one group has beyond begin as new."""
+    key, groups = "map_head.instance_embedding.weight", _query_groups(model)
+    if key not in state or key not in own or len(groups) != 1:
+        return []
+    old, new = len(state[key]), len(own[key])
+    if old >= new:
+        return []
+    state[key] = torch.cat([state[key], own[key][old:].detach().to(state[key])])
+    return [f"{old} queries keep their weights, {new - old} begin as new."]
+
+
+def _query_groups(model: nn.Module) -> Sequence[Any]:
+    """Return a head's groups of queries, none where it has no such."""
+    return getattr(getattr(model, "map_head", None), "query_groups", ())
 
 
 def _fit_classes(

@@ -84,7 +84,8 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     _check_keys(cfg)
     _fit_loaders(cfg)
     with _naming(f"custom_imports of {cfg.filename or 'a config'}"):
-        import_modules_from_strings(**cfg.get("custom_imports", {"imports": ["gsmap.registered"]}))
+        import_modules_from_strings(["gsmap.registered"])
+        import_modules_from_strings(**cfg.get("custom_imports", {"imports": []}))
     init_default_scope(cfg.get("default_scope", "mmdet3d"))
     return cfg
 

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from mmdet3d.registry import HOOKS
 from mmengine.dist import master_only
@@ -136,12 +137,14 @@ class RunSummaryHook(Hook):
             "start": f"goes on after iteration {runner.iter}" if runner.iter else f"from {start}",
             **_data(runner),
             "length": _length(runner),
-            "runs on": f"{device}, {torch.get_num_threads()} threads; torch {torch.__version__}, "
-            f"seed {runner.seed}",
+            "runs on": f"{device}, {counted(torch.get_num_threads(), 'thread')}; "
+            f"torch {torch.__version__}, seed {runner.seed}",
             "writes to": f"{runner.work_dir} (checkpoints, the whole config), {log_dir}",
         }
         text = "".join(f"\n    {name:<12}{value}" for name, value in lines.items())
         runner.logger.info(f"This run{text}")
+        if missed := _missed_elements(runner, model):
+            runner.logger.warning(missed)
 
 
 def innermost(dataset: Any) -> Any:
@@ -170,7 +173,30 @@ def _data(runner: Runner) -> dict[str, str]:
     ranges = ("{} from {:g} to {:g} m".format(axis, *meta[f"{axis}_range"]) for axis in "xy")
     lines["cameras"] = f"{len(names)}, their files {' and '.join(sizes)}"
     lines["map"] = f"{', '.join(ranges)}; {', '.join(meta['classes'])}"
+    lines["elements"] = f"up to {_element_counts(runner.train_dataloader).max()} in a sample"
     return lines
+
+
+def _element_counts(loader: Any) -> np.ndarray:
+    """Return the number of map elements of each sample, 0 where it is not known."""
+    return np.maximum(innermost(loader.dataset).annotations.instance_counts(), 0)
+
+
+def _missed_elements(runner: Runner, model: Any) -> str | None:
+    """Say how many elements no query is left for; None if there are enough."""
+    groups = getattr(getattr(model, "map_head", None), "query_groups", None)
+    if not groups or not hasattr(innermost(runner.train_dataloader.dataset), "annotations"):
+        return None
+    counts, queries = _element_counts(runner.train_dataloader), groups[0].num
+    beyond = np.maximum(counts - queries, 0)
+    if not beyond.any():
+        return None
+    return (
+        f"{(beyond > 0).sum()} of {counted(len(counts), 'training sample')} have more elements (up "
+        f"to {counts.max()}) than the model has queries ({queries}): {beyond.sum()} elements can "
+        "never be found. Set model.map_head.query_groups=[dict(num=...)] to more (in the "
+        "template _queries), or take a smaller range."
+    )
 
 
 def _length(runner: Runner) -> str:

@@ -122,12 +122,34 @@ class _Loader(yaml.SafeLoader):
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Leave merge keys, to which an error is raised."""
 
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Make a mapping; a key that comes twice, such as a camera's name, is an error."""
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        _require_once(names)
+        return super().construct_mapping(node, deep)
+
+
+def _require_once(names: Sequence[Any]) -> None:
+    """Refuse names that come twice: the first one's values would be lost."""
+    twice = sorted(str(name) for name, count in Counter(names).items() if count > 1)
+    if twice:
+        raise ValueError(f"{', '.join(twice)} is there twice: remove or rename one")
+
+
+def _mapping_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make a mapping of JSON; a key that comes twice is an error."""
+    _require_once([name for name, _ in pairs])
+    return dict(pairs)
+
 
 def _content(file: Path) -> Any:
     """Read a calibration file's values."""
     text = read_text(file)
     try:
-        content = json.loads(text) if file.suffix == ".json" else yaml.load(text, _Loader)
+        if file.suffix == ".json":
+            content = json.loads(text, object_pairs_hook=_mapping_once)
+        else:
+            content = yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         raise ValueError(f"it is no YAML: {error}") from error
     values = [content]
