@@ -135,6 +135,21 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     return args
 
 
+def _trained_cameras(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
+    """Return the cameras that the model was trained on, nothing where it does not say."""
+    if not args.model:
+        return {}
+    from gsmap.apis.loading import trained_rig
+    from gsmap.checkpoints.reading import read_checked
+
+    return trained_rig(read_checked(chosen_checkpoint(args)))
+
+
+def chosen_checkpoint(args: argparse.Namespace) -> Path:
+    """Return the file of the model's weights."""
+    return checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
+
+
 def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
     """Open the input and say what its reader has to say; with a folder for frames, few samples."""
     all_samples = frames is None
@@ -151,6 +166,7 @@ def read_input(args: argparse.Namespace, frames: Path | None = None) -> Source:
         vehicle_ground_z_m=args.vehicle_ground_z,
         topics=parse_topics(args.topics),
         calibration=args.calibration,
+        trained=_trained_cameras(args),
     )
     source = open_input(args.input, options)
     for note in source.notes:
@@ -218,7 +234,7 @@ def about_results(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, A
     """Return what a result file says of itself: classes, model, lists of scenes where known."""
     from gsmap.checkpoints.reading import read_checked
 
-    path = checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
+    path = chosen_checkpoint(args)
     checkpoint = read_checked(path)
     about = {"classes": list(data["classes"]), CHECKPOINT: digest(path)}
     known: dict[str, Any] = {CALIBRATION: checkpoint.calibration}
@@ -229,7 +245,7 @@ def about_results(args: argparse.Namespace, data: dict[str, Any]) -> dict[str, A
 
 def run_settings(args: argparse.Namespace) -> dict[str, str]:
     """Return what decides the predictions of a run, besides its samples."""
-    checkpoint = checkpoint_for(args.model[0], args.model[1] if len(args.model) > 1 else None)
+    checkpoint = chosen_checkpoint(args)
     settings = {"model": args.model[0], "checkpoint": digest(checkpoint)}
     for name in ("cfg_options", "token", "max_samples", "allow_missing_cameras", "amp"):
         settings[name] = str(getattr(args, name))

@@ -22,7 +22,7 @@ from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.source import Mount, ground_from_frame, reframed
 from gsmap.structures.rigid import invert_rigid, rigid
-from gsmap.utils.model_facts import MOUNT
+from gsmap.utils.model_facts import MOUNT, RIG
 from mapdata.inputs import open_input
 
 TILTED = Rotation.from_euler("ZYX", [-88.0, 1.5, -1.0], degrees=True).as_matrix()
@@ -222,6 +222,18 @@ def sample_of(ego_from_frame):
     sample = Sample()
     sample.ego_from_frame = ego_from_frame
     return sample
+
+
+def test_the_cameras_of_the_training_travel_with_the_checkpoint(tmp_path):
+    _, samples, checkpoint = trained(tmp_path, "ego")
+    content = torch.load(checkpoint, weights_only=True)
+    content["meta"]["dataset_meta"][RIG]["odd"] = [1.0, "x"]
+    content["meta"]["dataset_meta"][RIG]["none"] = [0.0] * 6
+    torch.save(content, checkpoint)
+    model = MapInferencer(config_of("ego"), checkpoint, device="cpu").model
+    camera = samples[0].cameras[0]
+    assert set(model.rig) == {c.name for c in samples[0].cameras}
+    assert model.rig[camera.name] == (320, 180, 250, 250, 160, 90)
 
 
 def test_two_roof_lidars_are_taken_for_one():

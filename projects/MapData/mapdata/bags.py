@@ -20,7 +20,14 @@ from mapdata.bag_images import write_image
 from mapdata.bag_poses import FrameTree, Odometry, PoseChain, is_static_topic, odometry_poses
 from mapdata.bag_topics import camera_topics, chosen_topics, image_topics
 from mapdata.folders.images import read_rig
-from mapdata.folders.rig import RigCamera, RigFrame, nearest_images, rig_samples, rotation_of
+from mapdata.folders.rig import (
+    RigCamera,
+    RigFrame,
+    nearest_images,
+    rectify_as_trained,
+    rig_samples,
+    rotation_of,
+)
 from mapdata.options import InputOptions
 from mapdata.ros_bag import library_errors
 
@@ -146,6 +153,7 @@ def _read(bag: Bag, path: Path, options: InputOptions) -> Source:
         vehicle = _vehicle(content, options.vehicle_frame) if has_frames else ""
         rig = {topics[camera.name][0]: camera for camera, _ in given}
     content.digest.update(calibration.read_bytes() if calibration else b"")
+    content.digest.update(rectify_as_trained(list(rig.values()), options.trained))
     times = {
         camera.name: np.unique(content.images[topic].times_ns) for topic, camera in rig.items()
     }

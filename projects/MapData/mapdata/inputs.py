@@ -59,7 +59,7 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
         samples = read_info_file(path, root, options.allow_missing_cameras)
         return Source(samples, "lidar", root)
     if path.suffix in (".yaml", ".yml", ".json"):
-        return read_image_folder(path, options.frames_dir)
+        return read_image_folder(path, options.frames_dir, options.trained)
     if advice := suffix_advice(path):
         raise ValueError(f"{path} cannot be used: {advice}.")
     raise ValueError(f"{path} is no input: it must be {KINDS}.")

@@ -1,6 +1,6 @@
 """How recordings of any kind are read."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,6 +20,8 @@ class InputOptions:
             ``base_footprint`` or ``base_link`` by default.
         vehicle_ground_z_m: Height of the road in that frame; None is 0.
         topics: Topics of images and camera info of a bag, by camera (``parse_topics``).
+        trained: By camera, what a model was trained on (``load_model(...).rig``): images of
+            distorted cameras of these names are rectified to those focal lengths.
         calibration: Calibration file of a bag's cameras, in place of their infos and transforms;
             their names are those of the topics, or its ``images`` are topics.
     """
@@ -33,3 +35,4 @@ class InputOptions:
     vehicle_ground_z_m: float | None = None
     topics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     calibration: Path | None = None
+    trained: Mapping[str, Sequence[float]] = field(default_factory=dict)

@@ -358,3 +358,37 @@ def test_the_height_for_a_bag_beside_another_input_is_refused(tmp_path, minicity
     options = InputOptions(vehicle_ground_z_m=0.0)
     with pytest.raises(ValueError, match="--vehicle-ground-z belongs to a bag"):
         open_input(minicity_annotations["val"], options)
+
+
+def test_a_distorted_camera_is_rectified_to_the_focal_length_of_the_training(tmp_path):
+    """A bright spot of the distorted image lies where OpenCV puts it for the trained camera."""
+    intrinsics = np.array([[500.0, 0, 320], [0, 500, 180], [0, 0, 1]])
+    distortion, spot = [-0.25, 0.06, 0.001, -0.002], (450.0, 120.0)
+    columns, rows = np.meshgrid(np.arange(640), np.arange(360))
+    blob = 255 * np.exp(-((columns - spot[0]) ** 2 + (rows - spot[1]) ** 2) / 50)
+    (tmp_path / "front").mkdir()
+    cv2.imwrite(str(tmp_path / "front/0.png"), np.repeat(blob[..., None], 3, 2).astype(np.uint8))
+    camera = {
+        "intrinsics": [500.0, 500.0, 320.0, 180.0],
+        "distortion": distortion,
+        "position_m": [1.0, 0.0, 1.5],
+        "yaw_pitch_roll_deg": [0, 0, 0],
+    }
+    (tmp_path / "calibration.json").write_text(json.dumps({"cameras": {"front": camera}}))
+    wanted = np.array([[400.0, 0, 330], [0, 410, 170], [0, 0, 1]])
+    trained = {"front": (320, 180, 200.0, 205.0, 165.0, 85.0)}  # of images half as large
+    seen = {}
+    for name, target in (("own", {}), ("trained", trained), ("other", {"rear": trained["front"]})):
+        source = open_input(tmp_path, InputOptions(frames_dir=tmp_path / "made", trained=target))
+        (record,) = source.samples[0].cameras
+        image = cv2.imread(str(source.data_root / record.path))[..., 0].astype(float)
+        centre = [(image * at).sum() / image.sum() for at in (columns, rows)]
+        (expected,) = cv2.undistortPoints(
+            np.array([[spot]]), intrinsics, np.array(distortion), P=record.intrinsics
+        )[0]
+        np.testing.assert_allclose(centre, expected, atol=1.0)
+        seen[name] = record.intrinsics, source.data_root
+    np.testing.assert_allclose(seen["trained"][0], wanted)
+    np.testing.assert_allclose(seen["own"][0], intrinsics)
+    np.testing.assert_allclose(seen["other"][0], intrinsics)
+    assert seen["own"][1] == seen["other"][1] != seen["trained"][1]  # pictures of their own

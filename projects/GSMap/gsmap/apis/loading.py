@@ -1,6 +1,7 @@
 """A trained model by its name, or by its config and checkpoint."""
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,11 @@ from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.source import Mount
 from gsmap.engine.launch import read_config
 from gsmap.structures.rigid import is_rigid
-from gsmap.utils.model_facts import MOUNT
+from gsmap.utils.model_facts import MOUNT, RIG
 
 _LOGGER = logging.getLogger(__name__)
 _USUAL = ("nuscenes", "minicity", "av2")  # data sets whose frames lie where the usual ones do
-_FARTHEST_M = 100.0
+_FARTHEST_M, _LARGEST_PX = 100.0, 1e5
 
 
 def load_model(
@@ -40,7 +41,8 @@ def load_model(
     Returns:
         The torch module, in evaluation mode; ``model.cfg`` is its config, as it was trained,
         ``model.mount`` the place of its annotation frame in the vehicle that it was trained on,
-        ``model.seen`` the data set, as far as it is known, and ``model.without_signals`` whether
+        ``model.rig`` its cameras (width, height, fx, fy, cx, cy in pixels, by name), ``model.seen``
+        the data set, as far as it is known, and ``model.without_signals`` whether
         that is known to have had none of the vehicle's signals.
 
     Raises:
@@ -63,9 +65,26 @@ def load_model(
     # of checkpoints that say how they were trained
     model.without_signals = bool(read and read.settings is not None and not read.can_bus)
     model.seen = _seen_by(read, checkpoint)
+    model.rig = {} if read is None else trained_rig(read)
     if model.temporal is not None:
         model.temporal.name = f"{cfg.filename or 'a config'} with {checkpoint or 'initial weights'}"
     return model.to(device).eval()
+
+
+def trained_rig(read: Checkpoint) -> dict[str, tuple[float, ...]]:
+    """Return width, height, fx, fy, cx and cy of the cameras of a model's training, by name.
+
+    What is no such camera is left out: it is a stranger's word, and only spoils a picture.
+    """
+    said = read.dataset_meta.get(RIG)
+    found = {}
+    for name, values in said.items() if isinstance(said, Mapping) else ():
+        numbers = values if isinstance(values, list | tuple) else ()
+        if len(numbers) != 6 or not all(isinstance(v, int | float) for v in numbers):
+            continue
+        if all(0 < v < _LARGEST_PX for v in numbers[:4]) and np.isfinite(numbers).all():
+            found[str(name)] = tuple(float(v) for v in numbers)
+    return found
 
 
 def _seen_by(read: Checkpoint | None, checkpoint: object) -> str:

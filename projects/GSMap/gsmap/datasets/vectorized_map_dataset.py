@@ -18,7 +18,7 @@ from gsmap.structures.calibration import NUM_CAN_BUS, without_history
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import invert_rigid, rigid
 from gsmap.structures.streams import Frame
-from gsmap.utils.model_facts import MOUNT
+from gsmap.utils.model_facts import MOUNT, RIG
 from gsmap.utils.split_lists import SPLIT_LIST
 
 _BROKEN = ("raise", "skip")
@@ -150,6 +150,7 @@ class VectorizedMapDataset(BaseDataset):
         self._metainfo[MOUNT] = self._mount()
         self._metainfo["dim"] = self._dim or self.annotations.meta.dim
         self._metainfo["cameras"] = self.cameras
+        self._metainfo[RIG] = self._rig()
         return [{"row": row, "image_row": row} for row in range(len(self.annotations))]
 
     def _mount(self) -> list[list[float]] | None:
@@ -160,6 +161,17 @@ class VectorizedMapDataset(BaseDataset):
         sample = self.annotations[0]
         known = height_m is not None or (frame == "lidar" and sample.ego_from_frame is not None)
         return ground_from_frame(sample, frame, height_m).tolist() if known else None
+
+    def _rig(self) -> dict[str, list[float]]:
+        """Return size and focal lengths of the first sample's images, by camera, in pixels."""
+        cameras = self.annotations[0].cameras if len(self.annotations) else []
+        return {
+            c.name: [
+                float(v) for v in (c.width, c.height, *c.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]])
+            ]
+            for c in cameras
+            if self.cameras is None or c.name in self.cameras
+        }
 
     def _height(self) -> float | None:
         """Return the height of the road in the frame: the file's, or the config's if it has none.

@@ -6,6 +6,7 @@ from typing import Any
 CHECKPOINT = "checkpoint"  # key in results: the SHA-256 of the file of its weights
 CALIBRATION = "calibration"  # key in checkpoints and results: how the sigmas were fitted to errors
 MOUNT = "mount"  # key of metainfo: from the annotation frame to the ground below the rear axle
+RIG = "rig"  # key of metainfo: width, height, fx, fy, cx, cy of the images, by camera
 LAW_NAMES = ("normal", "laplace")  # distributions of the errors
 
 

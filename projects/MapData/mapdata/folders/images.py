@@ -29,6 +29,7 @@ from mapdata.folders.rig import (
     RigCamera,
     RigFrame,
     nearest_images,
+    rectify_as_trained,
     rig_samples,
     rotation_of,
 )
@@ -47,13 +48,16 @@ _RATE_HZ = 10.0  # where a calibration file has no rate_hz
 _MOST_VALUES = 100_000  # in a calibration file
 
 
-def read_image_folder(file: Path, frames_dir: Path) -> Source:
+def read_image_folder(
+    file: Path, frames_dir: Path, trained: Mapping[str, Sequence[float]] | None = None
+) -> Source:
     """Read the samples that a calibration file describes, in the frame ``ego``.
 
     Args:
         file: The calibration file, YAML or JSON. Its paths start from its folder.
         frames_dir: Folder for folders of images without their distortion, made where a camera has
             one; a folder is named by its images' content and the calibration.
+        trained: What they are rectified to, as ``InputOptions`` has it.
 
     Raises:
         FileNotFoundError: If a camera has no image, or there is no file of poses.
@@ -82,10 +86,11 @@ def read_image_folder(file: Path, frames_dir: Path) -> Source:
         pose_at = None if poses is None else cache(poses.at)  # asked for by frames and by images
         used, missing = _with_poses(frames, poses, pose_at)
         notes += missing
+        target = rectify_as_trained(rig, trained or {})
         scene, root = file.parent.resolve().name, file.parent
         samples = rig_samples(scene, rig, used, pose_at)
         if any(camera.is_distorted for camera in rig):
-            root = frames_dir / f"{file_name(scene)}-{_digest(file, frames)}"
+            root = frames_dir / f"{file_name(scene)}-{_digest(file, frames, target)}"
             notes += chain(*(_rectify(sample, rig, file.parent, root) for sample in samples))
         return Source(samples, "ego", root, poses is not None, tuple(notes))
 
@@ -170,9 +175,9 @@ def _calibration(file: Path) -> dict[str, Any]:
     return dict(content)
 
 
-def _digest(file: Path, frames: Sequence[RigFrame]) -> str:
-    """Return a digest of a calibration file and all images of frames."""
-    total = hashlib.sha256(file.read_bytes())
+def _digest(file: Path, frames: Sequence[RigFrame], target: bytes) -> str:
+    """Return a digest of a calibration file, all images of frames, and what they become."""
+    total = hashlib.sha256(file.read_bytes() + target)
     for frame in frames:
         for path, _ in frame.images.values():
             total.update(f"{path}\n".encode() + (file.parent / path).read_bytes())

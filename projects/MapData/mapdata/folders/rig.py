@@ -36,6 +36,8 @@ class RigCamera:
         size_px: Width and height of its images.
         distortion: OpenCV's coefficients; none for a pinhole camera. (n,)
         model: Their model, as ROS names it.
+        trained: Width, height, fx, fy, cx and cy of a camera without distortion that images are
+            rectified to, at any size; None keeps ``intrinsics``.
 
     Raises:
         ValueError: If its size is not positive, or images cannot be rectified with such
@@ -48,6 +50,16 @@ class RigCamera:
     size_px: tuple[int, int]
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     model: str = ""
+    trained: Sequence[float] | None = None
+
+    @property
+    def seen_intrinsics(self) -> np.ndarray:
+        """Pinhole matrix of the images as a model sees them, in pixels. (3, 3)"""
+        if self.trained is None or not self.is_distorted:
+            return self.intrinsics
+        width, height, fx, fy, cx, cy = self.trained
+        by_x, by_y = self.size_px[0] / width, self.size_px[1] / height
+        return np.array([[fx * by_x, 0, cx * by_x], [0, fy * by_y, cy * by_y], [0, 0, 1.0]])
 
     def __post_init__(self) -> None:
         if min(self.size_px) < 1:
@@ -97,14 +109,32 @@ class RigCamera:
         """Return an image as the camera without distortion would have seen it. (H, W, 3)"""
         if self.model in FISHEYE_MODELS:
             return cv2.fisheye.undistortImage(
-                image, self.intrinsics, self.distortion, Knew=self.intrinsics
+                image, self.intrinsics, self.distortion, Knew=self.seen_intrinsics
             )
-        return cv2.undistort(image, self.intrinsics, self.distortion)
+        return cv2.undistort(
+            image, self.intrinsics, self.distortion, newCameraMatrix=self.seen_intrinsics
+        )
 
     def write_image(self, path: Path, image: np.ndarray) -> None:
         """Write an image, BGR, as JPEG, without its distortion. (H, W, 3)"""
         image = self.rectified(image) if self.is_distorted else image
         write_bytes(path, encode_jpeg(image, 95))
+
+
+def rectify_as_trained(rig: Sequence[RigCamera], trained: Mapping[str, Sequence[float]]) -> bytes:
+    """Let images of distorted cameras be rectified to what a model was trained on, by name.
+
+    Args:
+        rig: The cameras; they are changed.
+        trained: Width, height, fx, fy, cx and cy of the model's cameras.
+
+    Returns:
+        What tells the images that are made from others; nothing where no camera is concerned.
+    """
+    concerned = [camera for camera in rig if camera.is_distorted and camera.name in trained]
+    for camera in concerned:
+        camera.trained = tuple(trained[camera.name])
+    return "".join(f"{camera.name} {camera.trained}\n" for camera in concerned).encode()
 
 
 def rotation_of(wxyz: Iterable[Any]) -> np.ndarray:
@@ -227,7 +257,9 @@ def rig_samples(
             if then is not None and pose is not None:  # the vehicle moves between the two
                 cam_from_ground = cam_from_ground @ invert_rigid(then) @ pose
             cameras.append(
-                CameraRecord(camera.name, path, *camera.size_px, camera.intrinsics, cam_from_ground)
+                CameraRecord(
+                    camera.name, path, *camera.size_px, camera.seen_intrinsics, cam_from_ground
+                )
             )
         samples.append(sample_in_vehicle(frame.token, scene, frame.time_ns, cameras, pose))
     check_samples(samples, AnnotationMeta("recording", "ego", "test"))
