@@ -265,6 +265,7 @@ def test_filters_of_class_scene_and_token(opened):
     assert len(shown(opened, ".pick")) == 1
     opened.find_element(By.ID, "token").send_keys("x")
     assert not shown(opened, ".card, .pick")
+    assert text(opened, "#totals") == "The filters leave no frame: there is nothing to score."
     scenes = [
         e.get_attribute("value") for e in opened.find_elements(By.CSS_SELECTOR, "#scene option")
     ]

@@ -318,7 +318,9 @@ function refresh() {
     card.value.textContent = values.length ? `F1 ${values.join(" | ")} %` : "";
   }
   opened.forEach(restyle);
-  byId("totals").textContent = data.results.map((name, r) => {
+  byId("totals").textContent = !state.order.length
+    ? "The filters leave no frame: there is nothing to score."
+    : data.results.map((name, r) => {
     const sum = { hits: 0, wrong: 0, missed: 0 };
     for (const i of state.order) {
       const count = counts(data.frames[i], r);
