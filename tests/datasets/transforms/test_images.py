@@ -1,5 +1,6 @@
 """Images on their way into the model: sizes and matrices worked by hand."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -75,3 +76,19 @@ def test_a_size_takes_each_image_without_its_padding():
     np.testing.assert_allclose(results["img_aug_matrix"][1], np.diag([10 / 20, 10 / 40, 1, 1]))
     with pytest.raises(ValueError, match="give scale or size"):
         ScaleImages()
+
+
+@pytest.mark.parametrize(("width", "by_area"), [(288, False), (640, True), (1920, True)])
+def test_images_that_are_far_larger_than_the_trained_ones_shrink_by_area(width, by_area):
+    """A chessboard of single pixels is grey from afar; four of its pixels are not."""
+    image = np.indices((width * 9 // 16, width)).sum(0) % 2 * np.float32(255)
+    image = np.ascontiguousarray(np.repeat(image[..., None], 3, 2))
+    image[:, : width // 2] *= np.arange(width // 2)[None, :, None] % 3 == 0  # no regular pattern
+    matrices = {key: [np.eye(4)] for key in ("lidar2img", "img_aug_matrix")}
+    step = ScaleImages(0.4, trained_size=(160, 90))
+    (found,) = step.transform({"img": [image], **matrices})["img"]
+    exact = cv2.resize(image, (160, 90), interpolation=cv2.INTER_AREA)
+    assert (abs(found - exact).max() < 1e-3) == by_area
+    (same,) = ScaleImages(160 / width).transform({"img": [image], **matrices})["img"]
+    bilinear = cv2.resize(image, (160, 90), interpolation=cv2.INTER_LINEAR)
+    np.testing.assert_allclose(same, bilinear, atol=1e-3)  # as in the training

@@ -20,6 +20,8 @@ from gsmap.datasets.transforms.image_steps import (
     take_step,
 )
 
+_MOST_SHRUNK = 2.0  # by bilinear sampling, which reads four pixels
+
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
@@ -78,7 +80,8 @@ class ScaleImages(BaseTransform):
             made them equal.
         trained_size: Width and height, in pixels, that a model was trained at: images that
             ``scale`` would make larger or smaller get the longer side of it in place of that. They
-            are neither cropped nor padded.
+            are neither cropped nor padded. Beyond a factor of 2 they shrink by area, so that no
+            pixel is left out; what ``scale`` does is that of the training.
 
     Raises:
         ValueError: If there is not one of factor and size, or it is not positive.
@@ -99,14 +102,20 @@ class ScaleImages(BaseTransform):
         if self.size is not None:
             return self._to_size(results, (int(self.size[0]), int(self.size[1])))
         height, width = shape_after_steps(results)
-        size = self.scaled(width, height)
+        size, by_area = self.scaled(width, height), False
         if self.trained_size is not None and max(size) != max(self.trained_size):
             size = _times((width, height), max(self.trained_size) / max(width, height))
-            _say_scaled((width, height), size, tuple(self.trained_size))
+            by_area = min(size) > 0 and width / size[0] > _MOST_SHRUNK
+            _say_scaled((width, height), size, tuple(self.trained_size), by_area)
         if min(size) < 1:
             raise ValueError(f"scale {self.scale} leaves nothing of a {width} x {height} image.")
         matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
-        if size != (width, height):
+        if by_area:
+            finish_on_host(results)
+            results["img"] = [
+                mmcv.imresize(img, size, interpolation="area") for img in results["img"]
+            ]
+        elif size != (width, height):
             take_step(results, Resize(size, rounded=not results.get("to_float32", True)))
         for key in ("lidar2img", "img_aug_matrix"):
             results[key] = [matrix @ m for m in results[key]]
@@ -177,14 +186,16 @@ def _times(size: tuple[int, int], scale: float) -> tuple[int, int]:
 
 
 @cache
-def _say_scaled(found: tuple[int, int], size: tuple[int, int], trained: tuple[int, ...]) -> None:
+def _say_scaled(
+    found: tuple[int, int], size: tuple[int, int], trained: tuple[int, ...], by_area: bool
+) -> None:
     """Say once that images are not scaled as the config says."""
     worker = get_worker_info()
     if worker is None or worker.id == 0:
         print_log(
-            "images of {} x {} are scaled to {} x {}, without cropping or padding, as the model "
+            "images of {} x {} are scaled to {} x {}, without cropping or padding{}, as the model "
             "was trained at {} x {}; --image-scale gives another factor.".format(
-                *found, *size, *trained
+                *found, *size, ", by area" if by_area else "", *trained
             ),
             "current",
         )
