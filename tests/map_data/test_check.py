@@ -40,10 +40,10 @@ def test_a_damaged_footer_is_found(minicity_annotations: dict[str, Path], tmp_pa
 
 
 def test_the_check_counts_elements_and_doubts_truth_and_cameras(tmp_path: Path, caplog):
-    """Truth in coordinates of the world, and matrices the wrong way round."""
+    """Truth in millimetres, and matrices the wrong way round."""
     looking = [[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, -1.2], [0, 0, 0, 1]]
     here = {"label": "divider", "points": [[0, 1], [9, 1]]}
-    there = {"label": "divider", "points": [[448_000, 4_420_000], [448_010, 4_420_000]]}
+    there = {"label": "divider", "points": [[0, 1_750], [9_000, 1_750]]}
 
     def record(token, cam_from_frame, *instances):
         camera = {
