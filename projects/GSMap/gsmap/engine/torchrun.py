@@ -72,7 +72,7 @@ if __name__ == "__main__":
         logging.getLogger(f"torch.distributed.elastic.{part}").setLevel(logging.CRITICAL)
     os.environ[LAUNCHER] = str(os.getpid())
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)  # also for the ranks
-    SubprocessContext.close = _note_and_close  # type: ignore[method-assign]
+    SubprocessContext.close = _note_and_close  # type: ignore[assignment,method-assign]
     try:
         main()
     except SignalException as error:  # the ranks have had the same signal, and rank 0 has spoken
