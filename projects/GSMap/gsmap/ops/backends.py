@@ -18,13 +18,13 @@ INSTALLED = {backend: find_spec(package) is not None for backend, package in PAC
 # The functions that have a Triton kernel, and whether "auto" takes it on a GPU: only if a GPU has
 # run it and found it equal to the reference. backend="triton" takes any of them.
 TRITON_KERNELS = {
-    "deformable_sample": False,
-    "draw_polylines": False,
+    "deformable_sample": True,
+    "draw_polylines": True,
     "pairwise_soft_iou": True,
     "raster_loss": False,
     "render_gaussians": True,
     "render_gaussians_in_warps": False,  # in place of that of render_gaussians, "triton", too
-    "sample_kernels": False,
+    "sample_kernels": True,
     "soft_rasters": False,
 }
 SWITCH = "GSMAP_TRITON_KERNELS"  # environment: further kernels for "auto", with commas, or "all"
