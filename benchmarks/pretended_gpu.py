@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
@@ -96,9 +97,9 @@ class PretendedTensor(Tensor):
             device=torch.device(DEVICE),
         )
         made.host = data
-        return made
+        return made  # type: ignore[return-value]  # torch says that it makes a Tensor
 
-    def __repr__(self, *args: Any, **kwargs: Any) -> str:
+    def __repr__(self, *, tensor_contents: Any = None) -> Any:
         return f"PretendedTensor({self.host})"
 
     def numpy(self, *args: Any, **kwargs: Any) -> Any:
@@ -124,14 +125,14 @@ class PretendedTensor(Tensor):
         return self.cpu().tolist()
 
     @classmethod
-    def __torch_dispatch__(
+    def __torch_dispatch__(  # type: ignore[override]  # torch's is no method by its types
         cls, func: Any, types: Any, args: Any = (), kwargs: dict | None = None
     ) -> Any:
         if PretendedGPU.current is None:
             raise RuntimeError(f"{func} of a tensor on {DEVICE} outside of PretendedGPU.")
         return PretendedGPU.current.run(func, args, kwargs or {})
 
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    __torch_function__: Any = torch._C._disabled_torch_function_impl
 
 
 class PretendedGPU(TorchDispatchMode):
@@ -320,7 +321,7 @@ class PretendedGPU(TorchDispatchMode):
 
 def _line_of_project() -> str:
     """Return the innermost line outside of torch and of this file, as ``file:line``."""
-    frame = sys._getframe(2)
+    frame: FrameType | None = sys._getframe(2)
     while frame is not None:
         path = Path(frame.f_code.co_filename)
         if path.is_relative_to(ROOT) and "site-packages" not in path.parts:
@@ -431,7 +432,8 @@ _OWN_MATHS: dict[Any, Callable[..., Any]] = {
 
 
 def _sampled(value: Tensor, locations: Tensor, weights: Tensor, *shape: int) -> Tensor:
-    sampled = deformable_sample(value, shape, locations, weights, "reference")
+    height, width = shape
+    sampled = deformable_sample(value, (height, width), locations, weights, "reference")
     return sampled.unflatten(2, (weights.shape[2], -1))
 
 
@@ -443,7 +445,10 @@ def _sampled_kernels(
 
 
 # operators that have no kernel for the CPU, differentiable in their first three tensors
-_REFERENCES = {"deformable_sample": _sampled, "sample_kernels": _sampled_kernels}
+_REFERENCES: dict[str, Callable[..., Tensor]] = {
+    "deformable_sample": _sampled,
+    "sample_kernels": _sampled_kernels,
+}
 
 
 def _by_cpu_kernel(name: str, args: Any) -> Any:

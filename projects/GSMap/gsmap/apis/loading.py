@@ -54,11 +54,11 @@ def load_model(
         checkpoint = str(config)
     read = None if checkpoint is None else read_checked(checkpoint)
     with building(cfg):
-        if read is not None:
+        if checkpoint is not None:
             for line in adopt_settings(cfg, checkpoint, cfg_options, read):
                 _LOGGER.warning(line)
         model = MODELS.build(cfg.model)
-    if read is not None:
+    if checkpoint is not None:
         load_weights(model, checkpoint, read)
     model.cfg = cfg
     model.mount = _mount_of(cfg, read, checkpoint)

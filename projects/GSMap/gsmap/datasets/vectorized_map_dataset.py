@@ -180,10 +180,15 @@ class VectorizedMapDataset(BaseDataset):
             ValueError: If both have one, and they differ.
         """
         of_file = self.annotations.meta.ground_z_m
-        if None not in (of_file, self._ground_z_m) and abs(of_file - self._ground_z_m) > 1e-6:
+        of_config = self._ground_z_m
+        if of_file is None or of_config is None:
+            differ = False
+        else:
+            differ = abs(of_file - of_config) > 1e-6
+        if differ:
             raise ValueError(
                 f"{self.ann_file} has the road at z = {of_file:g} m of its frame, the config at "
-                f"{self._ground_z_m:g} m (ground_z_m): set both to one height."
+                f"{of_config:g} m (ground_z_m): set both to one height."
             )
         return self._ground_z_m if of_file is None else of_file
 

@@ -131,8 +131,8 @@ class MapDetector(Base3DDetector):
             images = self.img_augment(images)
         folded, backbone = self.folded_backbone, self.img_backbone
         if self.half_backbone is not None and not torch.is_grad_enabled():
-            feats = self.half_backbone(backbone, self.img_neck, images, self.channels_last)
-            return [feat.unflatten(0, (len(imgs), -1)) for feat in feats]
+            halved = self.half_backbone(backbone, self.img_neck, images, self.channels_last)
+            return [feat.unflatten(0, (len(imgs), -1)) for feat in halved]
         if self.channels_last:
             images = images.contiguous(memory_format=torch.channels_last)
         feats = backbone(images) if folded is None else folded(backbone, images)

@@ -1,6 +1,7 @@
 """Image backbone and neck in half precision, for inference on a GPU."""
 
 import copy
+from typing import Any
 
 import torch
 from mmcv.cnn import fuse_conv_bn
@@ -47,10 +48,10 @@ class HalfBackbone:
             folds = can_be_folded(backbone)
             copied = copy.deepcopy(backbone)
             copied = fuse_conv_bn(copied) if folds else copied
-            self.backbone = copied.to(dtype=torch.float16, memory_format=memory_format)
+            self.backbone = copied.half().to(memory_format=memory_format)  # type: ignore[call-overload]
             self.neck = copy.deepcopy(neck)
             if self.neck is not None:
-                self.neck.to(dtype=torch.float16, memory_format=memory_format)
+                self.neck.half().to(memory_format=memory_format)  # type: ignore[call-overload]
             self.fuses = folds and _is_plain(copied)
             self.state = state
         images = images.to(torch.float16, memory_format=memory_format)
@@ -91,7 +92,7 @@ def fused_resnet(backbone: ResNet, images: Tensor) -> tuple[Tensor, ...]:
 
 def _convolve(conv: nn.Conv2d, x: Tensor, identity: Tensor | None = None) -> Tensor:
     """Convolution, then bias, the residual if there is one, and ReLU, as one operator."""
-    geometry = (conv.stride, conv.padding, conv.dilation, conv.groups)
+    geometry: Any = (conv.stride, conv.padding, conv.dilation, conv.groups)
     if identity is None:
         return torch.cudnn_convolution_relu(x, conv.weight, conv.bias, *geometry)
     return torch.cudnn_convolution_add_relu(x, conv.weight, identity, 1.0, conv.bias, *geometry)
