@@ -181,11 +181,7 @@ class VectorizedMapDataset(BaseDataset):
         """
         of_file = self.annotations.meta.ground_z_m
         of_config = self._ground_z_m
-        if of_file is None or of_config is None:
-            differ = False
-        else:
-            differ = abs(of_file - of_config) > 1e-6
-        if differ:
+        if of_file is not None and of_config is not None and abs(of_file - of_config) > 1e-6:
             raise ValueError(
                 f"{self.ann_file} has the road at z = {of_file:g} m of its frame, the config at "
                 f"{of_config:g} m (ground_z_m): set both to one height."

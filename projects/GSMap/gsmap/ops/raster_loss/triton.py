@@ -18,6 +18,8 @@ from gsmap.ops.raster_loss.reference import SEEN, SSIM_C1, SSIM_C2
 
 BLOCK = 256
 OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
+# A fused a - b * c is the rounding of b * c where it should be 0, as with empty masks.
+EXACT_OPTIONS = {**OPTIONS, "enable_fp_fusion": False}
 C1, C2 = tl.constexpr(SSIM_C1), tl.constexpr(SSIM_C2)
 SEEN_MEAN = tl.constexpr(SEEN)
 
@@ -198,7 +200,8 @@ def raster_loss_sums(preds, targets, window, weight):
         maps, grid = _blur_products(preds, targets, window)
         sums = torch.empty(len(preds), grid[0], 7, dtype=torch.float32, device=preds.device)
         tensors = preds, targets, window, maps, sums
-        sums_kernel[grid](*tensors, weight, height, width, TAPS=len(window), BLOCK=BLOCK, **OPTIONS)
+        sizes = {"TAPS": len(window), "BLOCK": BLOCK, **EXACT_OPTIONS}
+        sums_kernel[grid](*tensors, weight, height, width, **sizes)
     return sums.sum(1)
 
 
