@@ -15,8 +15,7 @@ _queries = 20  # most elements that are found in a sample; `create_data.py check
 
 # What follows from it
 _cells = [round((b - a) / _base_.model.bev_encoder.bev_pixel_m) for a, b in (grid['y_range'], grid['x_range'])]
-_data = dict(
-    data_root=data_root, frame=_frame, ground_z_m=_ground_z, cameras=_cameras, grid=grid, classes=classes)
+_data = dict(data_root=data_root, frame=_frame, ground_z_m=_ground_z, cameras=_cameras, grid=grid, classes=classes)
 _load = [_base_._load, dict(type='ScaleImages', scale=_scale)]
 _targets = [_base_._targets, dict(type='MakeBEVMask', size=_cells, thickness_px=1)]
 

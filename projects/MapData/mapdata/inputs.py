@@ -43,7 +43,7 @@ def open_input(path: str | Path, options: InputOptions | None = None) -> Source:
     may_be_bag = is_bag(path) or (path.is_dir() and bool(parts_in(path)))
     if not may_be_bag and (options.topics or options.calibration):
         raise ValueError(f"--topics and --calibration belong to a bag, and {path} is none.")
-    if not is_bag(path) and options.vehicle_ground_z_m is not None:
+    if not may_be_bag and options.vehicle_ground_z_m is not None:
         raise ValueError(
             f"--vehicle-ground-z belongs to a bag, and {path} is none: the height of the road is "
             "ground_z_m of a calibration file, or of an annotation file's AnnotationMeta."
