@@ -32,10 +32,11 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 from gsmap.ops import backends
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.ops.kernel_sampling.reference import sample_kernels_reference
+from gsmap.utils.shipped import shipped
 
 NAME = "pretended"
 DEVICE = f"{NAME}:0"
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = shipped()
 aten = torch.ops.aten
 
 # neither kernels nor copies, although no views by their schema
