@@ -424,10 +424,10 @@ def test_extended_classes_become_targets_that_both_metrics_score(minicity_root, 
 @pytest.mark.parametrize(
     ("name", "steps"),
     [
-        ("maptr/maptr_r50_24e", ["MultiViewWrapper", "ScaleImages"]),
-        ("maptr/maptr_r50_second_24e", ["MultiViewWrapper", "ScaleImages"]),
-        ("maptrv2/maptrv2_r50_24e", ["ScaleImages", "MultiViewWrapper"]),
-        ("maptrv2/maptrv2_r50_av2_6e", ["ScaleImages", "MultiViewWrapper"]),
+        ("maptr/maptr_r50_24e", ["DistortImages", "ScaleImages"]),
+        ("maptr/maptr_r50_second_24e", ["DistortImages", "ScaleImages"]),
+        ("maptrv2/maptrv2_r50_24e", ["ScaleImages", "DistortImages"]),
+        ("maptrv2/maptrv2_r50_av2_6e", ["ScaleImages", "DistortImages"]),
     ],
 )
 def test_colours_are_distorted_before_or_after_scaling_as_in_the_original(name, steps):

@@ -313,7 +313,7 @@ def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     pairs = SimpleNamespace(
         predictions=outputs[-1],
         truths=SimpleNamespace(
-            samples=[SimpleNamespace(pipeline_masks=own) for own in parts_drawn]
+            pipeline_masks=torch.cat(parts_drawn), counts=[len(own) for own in parts_drawn]
         ),
     )
     losses["loss_seg"] = segmentation_loss(pairs)

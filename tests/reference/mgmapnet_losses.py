@@ -1,6 +1,6 @@
 """MGMapNet: matches, all losses of the head, and their gradients."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -36,8 +36,8 @@ LOSSES = {"cls": "cls", "pts": "pts", "dir": "dir", "mean_loc": "MGA_ref"}
 class GivenMasks(ElementMasks):
     """Returns the masks that the recipe makes for the elements."""
 
-    def draw_sample(self, gt_instances: InstanceData, grid: BEVGrid) -> Tensor:
-        return gt_instances.given_masks
+    def draw_batch(self, gt_instances: Sequence[InstanceData], grid: BEVGrid) -> Tensor:
+        return torch.cat([sample.given_masks for sample in gt_instances])
 
 
 def loss_head(golden: Golden, pairing: str) -> MapHead:

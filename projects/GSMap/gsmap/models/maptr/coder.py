@@ -85,7 +85,8 @@ class MapCoder:
         Class logits (N, classes), points in metres (N, P, 2 or 3).
         """
         found = self.best(scores)
-        chosen = self.keep_mask(found.scores, pts[found.query_inds])
+        places = pts if self.margin_m is None else pts[found.query_inds]
+        chosen = self.keep_mask(found.scores, places)
         kept = chosen.nonzero()[:, 0]  # the one wait for the device
         return Detections(*(values[kept] for values in found))
 
