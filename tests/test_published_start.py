@@ -178,7 +178,7 @@ def test_a_command_of_the_pages_reaches_its_first_iteration(
     monkeypatch.chdir(REPO)
     monkeypatch.setattr(MapRunner, "call_hook", call_hook)
     monkeypatch.setattr(gsmap.engine.launch, "load_config", load_tiny)
-    monkeypatch.setattr(sys, "argv", [*words, "--work-dir", str(tmp_path)])
+    monkeypatch.setattr(sys, "argv", [*words, "--work-dir", str(tmp_path / "run")])
     monkeypatch.setitem(sys.modules, "torchvision", None)
     main = runpy.run_path(str(REPO / words[0]), run_name="tool")["main"]
     with pytest.raises(Reached):

@@ -130,7 +130,7 @@ build_map: nothing.json --ann VAL --out maps | no sample of scene
 build_map: nothing.json --ann VAL --out maps --scene a | has no scene 'a'
 analyze_run: nowhere | No vis_data/scalars.json under nowhere
 analyze_run: list.json | list.json holds no record of training
-analyze_run: bytes.py | bytes.py cannot be read: 'utf-8' codec
+analyze_run: bytes.py | bytes.py cannot be read: it is UTF-16
 analyze_run: log.json --keys los --out a.png | no run logged ['los']
 analyze_run: log.json --out a.xyz | xyz
 convert_checkpoint: nowhere.pth out.pth | There is no checkpoint nowhere.pth
