@@ -59,6 +59,7 @@ class RankWatch:
         self._name = name
 
     def _watch(self) -> None:
+        self._beat()  # a rank may hang before its first turn
         while not self._ended.wait(self._beat_s):
             self._beat()
             if time.monotonic() - self._moved_s > _PATIENCE * self._timeout_s:
