@@ -157,6 +157,9 @@ def _require_near(elements: MapElements) -> None:
     points = elements.points
     if not len(points):
         return
+    widest = 2 * float(np.abs(points).max()) * points.shape[1] ** 0.5  # no step is longer
+    if widest * len(points) <= FARTHEST_M:
+        return
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
     steps[starts[starts < len(steps)]] = 0.0
