@@ -90,7 +90,7 @@ def test_matrix_products_are_in_tf32_for_a_while():
 
 
 @torch.no_grad()
-def test_half_precision_moves_points_by_less_than_a_centimetre(tmp_path):
+def test_half_precision_keeps_three_digits_and_follows_the_weights():
     torch.manual_seed(0)
     model = MapInferencer("gsmap_r18_minicity", device="cpu").model
     images = torch.randn(1, 2, 3, 64, 96)

@@ -25,6 +25,7 @@ class HalfBackbone:
     def __init__(self) -> None:
         self.backbone: nn.Module | None = None
         self.neck: nn.Module | None = None
+        self.fuses = False  # whether blocks are fused convolutions, on a GPU
         self.state: list[tuple[int, int]] = []  # address and version of the original tensors
 
     @torch.no_grad()
