@@ -147,13 +147,3 @@ def test_centre_lines_run_inside_their_lanes(maps: dict[str, NuScenesMap]) -> No
         area = town.extract_polygon(lanes[token]["polygon_token"]).buffer(0.3)
         assert all(area.contains(Polygon([p[:2]] * 3).centroid) for p in path[1:-1])
         assert town.get_outgoing_lane_ids(token) is not None
-
-
-def test_parsing_the_image_size() -> None:
-    import argparse
-
-    from minicity.cli import image_size
-
-    assert image_size("800x450") == (800, 450)
-    with pytest.raises(argparse.ArgumentTypeError, match="WIDTHxHEIGHT"):
-        image_size("800")

@@ -2,7 +2,7 @@
 
 import argparse
 
-from minicity.config import VERSION
+from minicity.config import PRESETS, VERSION, MiniCityConfig
 from minicity.generate import generate
 
 
@@ -18,29 +18,67 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument("--root", required=True, help="output folder, in nuScenes layout")
     parser.add_argument(
-        "--scenes", type=int, required=True, help="total number of scenes, a fifth for validation"
+        "--preset",
+        choices=sorted(PRESETS),
+        help="data set of a published comparison, in place of the options of size and seed below",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of every random choice")
-    parser.add_argument("--image-size", type=image_size, default=(800, 450), metavar="WxH")
-    parser.add_argument("--samples-per-scene", type=int, default=10, help="key frames per scene")
+    parser.add_argument("--scenes", type=int, help="total number of scenes, a fifth for validation")
+    parser.add_argument("--seed", type=int, help="seed of every random choice (default: 0)")
+    parser.add_argument("--image-size", type=image_size, metavar="WxH", help="default: 800x450")
+    parser.add_argument("--samples-per-scene", type=int, help="key frames per scene (default: 10)")
     parser.add_argument(
-        "--sweeps-per-sample", type=int, default=2, help="LiDAR sweeps between key frames"
+        "--sweeps-per-sample", type=int, help="LiDAR sweeps between key frames (default: 2)"
     )
     parser.add_argument("--val-scenes", type=int, help="validation scenes, instead of a fifth")
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
 
 
+SIZE_OPTIONS = (
+    "scenes",
+    "seed",
+    "image_size",
+    "samples_per_scene",
+    "sweeps_per_sample",
+    "val_scenes",
+)
+
+
+def chosen_config(arguments: argparse.Namespace) -> MiniCityConfig:
+    """Data set of the command's arguments.
+
+    Raises:
+        ValueError: If neither a preset nor ``--scenes`` is given, if a preset is given together
+            with an option of size, or if a value is out of range.
+    """
+    given = {
+        name: getattr(arguments, name)
+        for name in SIZE_OPTIONS
+        if getattr(arguments, name) is not None
+    }
+    if arguments.preset is not None:
+        if given:
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise ValueError(f"--preset sets the size and the seed: leave out {options}.")
+        return PRESETS[arguments.preset]
+    if "scenes" not in given:
+        raise ValueError("give --scenes NUMBER, or --preset NAME for a published data set.")
+    if "image_size" in given:
+        given["image_width"], given["image_height"] = given.pop("image_size")
+    return MiniCityConfig(**given)
+
+
 def run(arguments: argparse.Namespace) -> str:
     """Generate the data set and say where it lies, and by which ``command`` it was made."""
+    config = chosen_config(arguments)
     made = generate(
-        arguments.root,
-        arguments.scenes,
-        arguments.seed,
-        arguments.image_size,
-        arguments.samples_per_scene,
-        arguments.sweeps_per_sample,
-        arguments.val_scenes,
-        arguments.workers,
+        root=arguments.root,
+        scenes=config.scenes,
+        seed=config.seed,
+        image_size=(config.image_width, config.image_height),
+        samples_per_scene=config.samples_per_scene,
+        sweeps_per_sample=config.sweeps_per_sample,
+        val_scenes=config.val_scenes,
+        workers=arguments.workers,
     )
     if not made:
         return f"MiniCity at {arguments.root} is complete already (same arguments): skipped."
