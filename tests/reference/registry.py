@@ -1,9 +1,9 @@
 """The checks, by the reference files that they recompute."""
 
 import importlib
-import pkgutil
 from collections.abc import Callable, Iterable, Iterator
 from fnmatch import fnmatchcase
+from pathlib import Path
 
 from reference import report
 from reference.golden import Golden
@@ -29,11 +29,14 @@ def check(*patterns: str) -> Callable[[Check], Check]:
     return register
 
 
+METHODS = Path(__file__).resolve().parents[1] / "methods"
+
+
 def load_checks() -> None:
-    """Import every module beside this one, so that each registers its checks."""
-    package = __name__.rpartition(".")[0]
-    for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
-        importlib.import_module(f"{package}.{module.name}")
+    """Import the methods' modules of checks, ``methods/<method>/reference*.py``."""
+    importlib.import_module("reference.maptr")
+    for path in sorted(METHODS.glob("*/reference*.py")):
+        importlib.import_module(f"methods.{path.parent.name}.{path.stem}")
 
 
 def plan(golden: Golden) -> tuple[list[tuple[str, Check]], list[str]]:

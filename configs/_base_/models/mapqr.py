@@ -1,5 +1,5 @@
 # What MapQR has in place of MapTR's parts (maptr_r50.py), as published for nuScenes: pillar heights that are learned,
-# one query per element that is scattered to its points, one-to-many queries, auxiliary masks (docs/mapqr.md).
+# one query per element that is scattered to its points, one-to-many queries, auxiliary masks (docs/methods/mapqr.md).
 _mapqr = dict(
     bev_encoder=dict(
         type='HeightQueryEncoder',

@@ -1,5 +1,5 @@
 # What MGMap changes in MapTR (maptr_r50.py), as published: an enhanced neck with four levels, masks that activate the
-# queries, a refinement by patches, mask losses (docs/mgmap.md).
+# queries, a refinement by patches, mask losses (docs/methods/mgmap.md).
 _mgmap = dict(
     map_head=dict(
         points_from_instances=True,

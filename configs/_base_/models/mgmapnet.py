@@ -1,5 +1,5 @@
 # What MGMapNet changes in MapTRv2 (maptrv2.py), as released for nuScenes: one query per element whose points share its
-# samples, two BEV levels, masks of classes and of instances (docs/mgmapnet.md).
+# samples, two BEV levels, masks of classes and of instances (docs/methods/mgmapnet.md).
 _mgmapnet = dict(
     map_head=dict(
         type='MGMapHead',

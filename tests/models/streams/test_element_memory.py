@@ -7,9 +7,9 @@ import pytest
 import shapely
 import torch
 from head_cases import GSMAP, HEAD, build_head
+from methods.vectormapnet.cases import head as line_head
 from mmengine.structures import InstanceData
 from model_cases import build_small, make_images, make_samples, small_config, straight_elements
-from vectormapnet_cases import head as line_head
 
 from gsmap.apis.export import ExportedDetector
 from gsmap.models.streams.element_memory import ElementMemory

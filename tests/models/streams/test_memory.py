@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from head_cases import ALONG_Y, GSMAP, HEAD, LANES, bev, build_head
+from methods.vectormapnet.cases import head as line_head
 from mmengine.structures import InstanceData
 from model_cases import build_small, make_images, make_samples, straight_elements
-from vectormapnet_cases import head as line_head
 
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.memory import StreamMemory, recalled
