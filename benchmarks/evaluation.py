@@ -15,10 +15,10 @@ import numpy as np
 
 from benchmarks.measure import markdown_table, publish
 from gsmap.datasets.annotations.record import CLASSES
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.results_json import write_results
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.results_json import write_results
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import read_json

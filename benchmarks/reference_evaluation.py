@@ -15,8 +15,13 @@ from pycocotools import mask as run_length
 from scipy.ndimage import grey_dilation
 from scipy.spatial.distance import cdist
 
-from gsmap.evaluation.average_precision import area_ap, interpolated_ap
-from gsmap.evaluation.raster_ap import MAX_PREDICTIONS, MIN_SCORE, RasterConfig, pixels_from_metres
+from gsmap.evaluation.core.average_precision import area_ap, interpolated_ap
+from gsmap.evaluation.core.raster_ap import (
+    MAX_PREDICTIONS,
+    MIN_SCORE,
+    RasterConfig,
+    pixels_from_metres,
+)
 from gsmap.structures.elements import MapElements
 
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth

@@ -11,10 +11,10 @@ import numpy as np
 
 from benchmarks.measure import markdown_table
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.file_evaluation import match_samples, read_ground_truth
-from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.file_evaluation import match_samples, read_ground_truth
+from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
 

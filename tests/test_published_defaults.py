@@ -16,8 +16,8 @@ from mmengine.registry import init_default_scope
 from torch import nn
 
 import gsmap.registered  # noqa: F401
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.raster_ap import MIN_SCORE, RasterConfig
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.raster_ap import MIN_SCORE, RasterConfig
 from gsmap.models.bemapnet.head import BezierHead
 from gsmap.models.bemapnet.losses import BezierLosses
 from gsmap.models.bemapnet.targets import FormatBezierTargets

@@ -35,7 +35,7 @@ from drivemaps.truth import true_map
 from drivemaps.video import write_video
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile
+from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.extras import import_extra

@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.evaluation.calibration import LAWS, fitted_factors, matched_vertices
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.file_evaluation import SamplePairs
+from gsmap.evaluation.analysis.calibration import LAWS, fitted_factors, matched_vertices
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.file_evaluation import SamplePairs
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import atomic_write
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT

@@ -9,7 +9,7 @@ Every command here reads the new file like the old one:
 import argparse
 from pathlib import Path
 
-from gsmap.evaluation.compact import compact_results
+from gsmap.evaluation.analysis.compact import compact_results
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.words import counted
 

@@ -22,29 +22,44 @@ from pathlib import Path
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, RANGES
-from gsmap.evaluation.bootstrap import Resamples, ap_differences, ap_intervals, format_intervals
-from gsmap.evaluation.calibration import (
+from gsmap.evaluation.analysis.bootstrap import (
+    Resamples,
+    ap_differences,
+    ap_intervals,
+    format_intervals,
+)
+from gsmap.evaluation.analysis.calibration import (
     LAWS,
     format_uncertainty,
     matched_vertices,
     uncertainty_report,
 )
-from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, HARD_CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.distances import DISTANCE, cut_by_distance, distance_groups
-from gsmap.evaluation.evaluator import ALL_NAMES, METRIC_NAMES, MapEvaluator
-from gsmap.evaluation.file_evaluation import (
+from gsmap.evaluation.analysis.distances import DISTANCE, cut_by_distance, distance_groups
+from gsmap.evaluation.analysis.groups import (
+    Groups,
+    ap_by_group,
+    group_report,
+    group_table,
+    read_groups,
+)
+from gsmap.evaluation.analysis.prior import evaluate_prior
+from gsmap.evaluation.core.chamfer_ap import (
+    CHAMFER_THRESHOLDS,
+    HARD_CHAMFER_THRESHOLDS,
+    ChamferConfig,
+)
+from gsmap.evaluation.core.evaluator import ALL_NAMES, METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.core.file_evaluation import (
     Evaluation,
     SamplePairs,
     evaluate_files,
     match_samples,
     scenes_of,
 )
-from gsmap.evaluation.groups import Groups, ap_by_group, group_report, group_table, read_groups
-from gsmap.evaluation.match_files import write_matches
-from gsmap.evaluation.prior import evaluate_prior
-from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.report import MetricReport, format_table, write_figures
-from gsmap.evaluation.sample_ap import METHODS
+from gsmap.evaluation.core.match_files import write_matches
+from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.report import MetricReport, format_table, write_figures
+from gsmap.evaluation.core.sample_ap import METHODS
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, output_file, run_command
@@ -280,8 +295,8 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
 
 def reports_of_pairs(args: argparse.Namespace, evaluator: MapEvaluator) -> list[MetricReport]:
     """Compute PLD, count breaks, false joints and folds, and measure heights if they count."""
-    from gsmap.evaluation.pld import pld_figures
-    from gsmap.evaluation.topology import TopologyConfig, height_figures, topology_figures
+    from gsmap.evaluation.metrics.pld import pld_figures
+    from gsmap.evaluation.metrics.topology import TopologyConfig, height_figures, topology_figures
 
     classes = evaluator.classes
     areas = tuple(label for label, name in enumerate(classes) if name in args.polygon_classes)
@@ -305,8 +320,8 @@ def reports_of_pairs(args: argparse.Namespace, evaluator: MapEvaluator) -> list[
 
 def consistency_report(args: argparse.Namespace) -> MetricReport:
     """Score the drives of a result file, and write its tracks if that is asked for."""
-    from gsmap.evaluation.consistency import ConsistencyConfig
-    from gsmap.evaluation.drive_files import evaluate_drives
+    from gsmap.evaluation.analysis.consistency import ConsistencyConfig
+    from gsmap.evaluation.analysis.drive_files import evaluate_drives
 
     if args.ground_truth.suffix.lower() == ".json":
         raise ValueError(

@@ -19,7 +19,7 @@ from gsmap.checkpoints.named_models import checkpoint_for
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.source import Source
 from gsmap.engine.arguments import add_config_options
-from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
+from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.files import own_folder, write_bytes
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT

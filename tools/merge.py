@@ -9,11 +9,11 @@ from pathlib import Path
 
 from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
 from gsmap.datasets.annotations.file import merge_annotations
-from gsmap.evaluation.match_files import SHARD_KIND as MATCHES
-from gsmap.evaluation.match_files import report_shards
-from gsmap.evaluation.report import format_table, write_figures
-from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
-from gsmap.evaluation.results_json import merge_results
+from gsmap.evaluation.core.match_files import SHARD_KIND as MATCHES
+from gsmap.evaluation.core.match_files import report_shards
+from gsmap.evaluation.core.report import format_table, write_figures
+from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
+from gsmap.evaluation.core.results_json import merge_results
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.shards import ShardFile, find_shards
 from gsmap.utils.words import counted

@@ -10,7 +10,7 @@ Examples:
 import argparse
 from pathlib import Path
 
-from gsmap.evaluation.calibration import LAWS
+from gsmap.evaluation.analysis.calibration import LAWS
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.visualization.film import write_drive_film
 from gsmap.visualization.page.page import PageOptions, is_own_page, page_data, write_page

@@ -8,8 +8,8 @@ import pytest
 
 from benchmarks import shape
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.evaluation.file_evaluation import read_ground_truth
-from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.evaluation.core.file_evaluation import read_ground_truth
+from gsmap.evaluation.core.results_json import vectors_of, write_results
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import resample
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.raster_ap import RasterConfig
 from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing", "boundary")

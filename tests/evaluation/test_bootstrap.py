@@ -8,16 +8,16 @@ import pytest
 from golden_data import CLASSES, EVALUATOR
 from test_files import annotated, command, results_of
 
-from gsmap.evaluation.average_precision import area_ap, interpolated_ap
-from gsmap.evaluation.bootstrap import (
+from gsmap.evaluation.analysis.bootstrap import (
     Resamples,
     ap_differences,
     ap_intervals,
     resampled_aps,
     resampled_figures,
 )
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.results_json import write_results
+from gsmap.evaluation.core.average_precision import area_ap, interpolated_ap
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.results_json import write_results
 from gsmap.structures.elements import MapElements
 
 HARD = replace(EVALUATOR, hard=True)

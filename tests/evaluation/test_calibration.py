@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gsmap.evaluation.calibration import (
+from gsmap.evaluation.analysis.calibration import (
     Vertices,
     fitted_factors,
     format_uncertainty,
@@ -13,7 +13,7 @@ from gsmap.evaluation.calibration import (
     uncertainty_figures,
     uncertainty_report,
 )
-from gsmap.evaluation.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
 from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing", "boundary")

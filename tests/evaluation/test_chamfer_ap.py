@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from gsmap.evaluation.chamfer_ap import (
+from gsmap.evaluation.core.chamfer_ap import (
     ChamferConfig,
     chamfer_report,
     match_chamfer,
     nearest_by_chamfer,
 )
-from gsmap.evaluation.chamfer_kernels import chamfer_distance
-from gsmap.evaluation.matches import MatchTable
-from gsmap.evaluation.report import format_table
+from gsmap.evaluation.core.chamfer_kernels import chamfer_distance
+from gsmap.evaluation.core.matches import MatchTable
+from gsmap.evaluation.core.report import format_table
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import resample_all
 

@@ -8,7 +8,7 @@ import pytest
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSample
-from gsmap.evaluation.consistency import (
+from gsmap.evaluation.analysis.consistency import (
     ConsistencyConfig,
     DriveFrame,
     by_scene,
@@ -18,8 +18,8 @@ from gsmap.evaluation.consistency import (
     track_drive,
     with_lines,
 )
-from gsmap.evaluation.drive_files import drive_frames, evaluate_drives
-from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.evaluation.analysis.drive_files import drive_frames, evaluate_drives
+from gsmap.evaluation.core.results_json import vectors_of, write_results
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid

@@ -8,15 +8,15 @@ import shapely
 from golden_data import EVALUATOR
 from test_files import annotated, command, results_of
 
-from gsmap.evaluation.distances import (
+from gsmap.evaluation.analysis.distances import (
     SHORTEST_M,
     cut_area,
     cut_by_distance,
     cut_line,
     distance_groups,
 )
-from gsmap.evaluation.groups import ap_by_group
-from gsmap.evaluation.results_json import write_results
+from gsmap.evaluation.analysis.groups import ap_by_group
+from gsmap.evaluation.core.results_json import write_results
 from gsmap.structures.elements import MapElements
 
 DISCS = [shapely.Point(0, 0).buffer(radius, quad_segs=20_000) for radius in (10, 20)]

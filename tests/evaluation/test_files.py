@@ -11,8 +11,8 @@ from processes import run_python
 
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSample
-from gsmap.evaluation.file_evaluation import evaluate_files, read_ground_truth
-from gsmap.evaluation.results_json import read_samples, vectors_of, write_results
+from gsmap.evaluation.core.file_evaluation import evaluate_files, read_ground_truth
+from gsmap.evaluation.core.results_json import read_samples, vectors_of, write_results
 from gsmap.structures.elements import MapElements
 
 REPO = Path(__file__).resolve().parents[2]
@@ -92,7 +92,7 @@ def test_prior_is_fitted_on_one_file_and_scored_on_another(files, tmp_path, caps
 
 
 def test_the_command_starts_without_torch():
-    code = "import sys, gsmap.evaluation.prior; assert 'torch' not in sys.modules"
+    code = "import sys, gsmap.evaluation.analysis.prior; assert 'torch' not in sys.modules"
     run_python("-c", code, check=True)
 
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from golden_data import CLASSES, EVALUATOR, Frame, frame_of, read, unpacked
 
-from gsmap.evaluation.chamfer_ap import (
+from gsmap.evaluation.core.chamfer_ap import (
     ChamferConfig,
     chamfer_report,
     match_chamfer,
     nearest_by_chamfer,
 )
-from gsmap.evaluation.matches import MatchTable
-from gsmap.evaluation.raster_ap import RasterConfig, match_raster, rasterize
-from gsmap.evaluation.raster_kernels import mask_ious
-from gsmap.evaluation.report import flat_metrics
+from gsmap.evaluation.core.matches import MatchTable
+from gsmap.evaluation.core.raster_ap import RasterConfig, match_raster, rasterize
+from gsmap.evaluation.core.raster_kernels import mask_ious
+from gsmap.evaluation.core.report import flat_metrics
 from gsmap.structures.elements import MapElements
 
 AP_TOLERANCE = 1e-6  # the reference computes precision and recall of AP_chamfer in float32

@@ -6,8 +6,8 @@ import pytest
 from test_bootstrap import drive, reports_of
 from test_files import annotated, command, results_of
 
-from gsmap.evaluation.groups import Groups, ap_by_group, group_table, read_groups
-from gsmap.evaluation.results_json import write_results
+from gsmap.evaluation.analysis.groups import Groups, ap_by_group, group_table, read_groups
+from gsmap.evaluation.core.results_json import write_results
 
 SCENES = [
     {"name": "s0", "description": "Night, rain, parked cars"},

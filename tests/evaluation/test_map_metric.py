@@ -16,7 +16,7 @@ from mmengine.evaluator import Evaluator  # noqa: E402
 from mmengine.structures import InstanceData  # noqa: E402
 
 from gsmap.evaluation import map_metric  # noqa: E402
-from gsmap.evaluation.results_json import read_samples  # noqa: E402
+from gsmap.evaluation.core.results_json import read_samples  # noqa: E402
 
 RANGES = {"x_range": (-15.0, 15.0), "y_range": (-30.0, 30.0)}
 

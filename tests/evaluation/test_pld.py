@@ -8,9 +8,9 @@ import pytest
 from golden_data import CLASSES
 from test_files import annotated, command, results_of
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.pld import pld_figures, sospa, spaced
-from gsmap.evaluation.results_json import write_results
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.results_json import write_results
+from gsmap.evaluation.metrics.pld import pld_figures, sospa, spaced
 from gsmap.structures.elements import MapElements
 
 CONFIG = ChamferConfig(CLASSES, (1.0,))

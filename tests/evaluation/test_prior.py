@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from gsmap.evaluation import prior as prior_module
-from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
-from gsmap.evaluation.matches import MatchTable
-from gsmap.evaluation.prior import fit_prior
+from gsmap.evaluation.analysis import prior as prior_module
+from gsmap.evaluation.analysis.prior import fit_prior
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
+from gsmap.evaluation.core.matches import MatchTable
 from gsmap.structures.elements import MapElements
 
 CHAMFER = ChamferConfig(("divider", "ped_crossing"))

@@ -4,10 +4,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.report import flat_metrics
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.report import flat_metrics
 from gsmap.structures.elements import MapElements
 
 CLASSES = ("divider", "ped_crossing")

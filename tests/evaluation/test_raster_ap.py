@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from golden_data import unpacked
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
-from gsmap.evaluation.matches import MatchTable
-from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report, rasterize
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig, match_chamfer
+from gsmap.evaluation.core.matches import MatchTable
+from gsmap.evaluation.core.raster_ap import RasterConfig, match_raster, raster_report, rasterize
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 

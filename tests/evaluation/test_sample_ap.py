@@ -14,16 +14,15 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 from test_files import annotated, command, results_of, truth_of
 
-from gsmap.evaluation.average_precision import ten_point_ap
-from gsmap.evaluation.bootstrap import Resamples, resampled_figures
-from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.evaluator import ALL_NAMES, SHRUNK_NAME, TWO_SIDED_NAME, MapEvaluator
-from gsmap.evaluation.groups import Groups, ap_by_group
-from gsmap.evaluation.map_metric import MapMetric
-from gsmap.evaluation.raster_ap import NUSCENES_GRID, RasterConfig
-from gsmap.evaluation.report import flat_metrics
-from gsmap.evaluation.results_json import write_results
-from gsmap.evaluation.sample_ap import (
+from gsmap.evaluation.analysis.bootstrap import Resamples, resampled_figures
+from gsmap.evaluation.analysis.groups import Groups, ap_by_group
+from gsmap.evaluation.core.average_precision import ten_point_ap
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.core.evaluator import ALL_NAMES, SHRUNK_NAME, TWO_SIDED_NAME, MapEvaluator
+from gsmap.evaluation.core.raster_ap import NUSCENES_GRID, RasterConfig
+from gsmap.evaluation.core.report import flat_metrics
+from gsmap.evaluation.core.results_json import write_results
+from gsmap.evaluation.core.sample_ap import (
     METHODS,
     SampleAPConfig,
     closest_pairs,
@@ -31,6 +30,7 @@ from gsmap.evaluation.sample_ap import (
     line_distances,
     match_sample_ap,
 )
+from gsmap.evaluation.map_metric import MapMetric
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from tools.merge import main as merge

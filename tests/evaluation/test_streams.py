@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from benchmarks.evaluation import CLASSES, generated_frames, write_race
-from gsmap.evaluation.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.file_evaluation import CHUNK, SamplePairs, evaluate_files
-from gsmap.evaluation.matches import MatchTable
-from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
-from gsmap.evaluation.report import flat_metrics
-from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig, chamfer_report, match_chamfer
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.file_evaluation import CHUNK, SamplePairs, evaluate_files
+from gsmap.evaluation.core.matches import MatchTable
+from gsmap.evaluation.core.raster_ap import RasterConfig, match_raster, raster_report
+from gsmap.evaluation.core.report import flat_metrics
+from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile
 
 EVALUATOR = MapEvaluator(ChamferConfig(CLASSES), RasterConfig(CLASSES))
 COUNT = 3 * CHUNK

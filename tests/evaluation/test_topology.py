@@ -7,9 +7,9 @@ import pytest
 from golden_data import CLASSES
 from test_files import annotated, command, results_of, vector
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.results_json import write_results
-from gsmap.evaluation.topology import (
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.results_json import write_results
+from gsmap.evaluation.metrics.topology import (
     TopologyConfig,
     count_folds,
     count_pieces,

@@ -25,7 +25,7 @@ import tools.train  # noqa: F401
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.engine.launch import read_config
-from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.evaluation.core.results_json import vectors_of, write_results
 
 Work = Callable[[], None]
 

@@ -11,12 +11,12 @@ from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.match_files import write_matches
-from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
-from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.match_files import write_matches
+from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
+from gsmap.evaluation.core.results_json import vectors_of, write_results
 from gsmap.utils.shards import Shard
 
 

@@ -40,9 +40,9 @@ from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.transforms.points import FEATHER_COLUMNS, read_points
 from gsmap.engine.launch import check_config, read_config
-from gsmap.evaluation.match_files import SHARD_KIND as MATCHES
-from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, vectors_of, write_results
-from gsmap.evaluation.results_json import SHARD_KIND as RESULTS
+from gsmap.evaluation.core.match_files import SHARD_KIND as MATCHES
+from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples, vectors_of, write_results
+from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
 from gsmap.structures.elements import MapElements
 from gsmap.utils.shards import Shard, digest
 from mapdata.argoverse2.samples import Argoverse2Options, read_log

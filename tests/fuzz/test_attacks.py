@@ -17,8 +17,8 @@ from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.vectorized_map_dataset import VectorizedMapDataset
 from gsmap.engine.launch import read_config
-from gsmap.evaluation.file_evaluation import evaluate_files
-from gsmap.evaluation.report import flat_metrics
+from gsmap.evaluation.core.file_evaluation import evaluate_files
+from gsmap.evaluation.core.report import flat_metrics
 
 SCRIPT = Path(__file__).with_name("attacks.py")
 HARMLESS = {"open", "system", "exec", "eval", "makedirs", "nested", "key", "tofile"}

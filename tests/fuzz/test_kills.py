@@ -12,7 +12,7 @@ from processes import REPO, run_python
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.checkpoint_hook import AtomicLocalBackend
-from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, write_results
+from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples, write_results
 from gsmap.utils.files import SUFFIX
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 

@@ -15,7 +15,7 @@ from bag_cases import Recorder, record
 
 from fuzz.mutations import damaged_column, write
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
-from gsmap.evaluation.results_json import write_results
+from gsmap.evaluation.core.results_json import write_results
 from mapdata.inputs import open_input
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 from mapdata.options import InputOptions

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CameraRecord, MapInstance, MapSample
-from gsmap.evaluation.groups import read_groups
+from gsmap.evaluation.analysis.groups import read_groups
 from gsmap.structures.rigid import invert_rigid, rigid
 from mapdata.nuscenes.occlusion import cuts_sight, hidden_share, read_boxes, word_for
 

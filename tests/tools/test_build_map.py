@@ -13,7 +13,7 @@ from drive_cases import CLASSES, drive_of
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.evaluation.core.results_json import vectors_of, write_results
 from tools.build_map import main
 
 

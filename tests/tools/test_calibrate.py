@@ -11,7 +11,7 @@ from gsmap.apis.loading import load_model
 from gsmap.checkpoints.reading import read_checked
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta, MapInstance, MapSample
-from gsmap.evaluation.results_json import (
+from gsmap.evaluation.core.results_json import (
     GROUND_TRUTH_KEY,
     read_samples,
     vectors_of,

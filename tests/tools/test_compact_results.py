@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
-from gsmap.evaluation.results_json import RESULTS_KEY, read_samples, write_results
+from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples, write_results
 from gsmap.utils.inputs import InputReplacedError
 
 REPO = Path(__file__).resolve().parents[2]

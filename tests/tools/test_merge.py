@@ -17,7 +17,7 @@ from mmdet3d.registry import MODELS
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta
 from gsmap.engine.launch import read_config
-from gsmap.evaluation.results_json import read_samples, vectors_of, write_results
+from gsmap.evaluation.core.results_json import read_samples, vectors_of, write_results
 from gsmap.structures.elements import MapElements
 from gsmap.utils.shards import WHOLE, Shard, digest
 from mapdata.custom import from_records

@@ -11,7 +11,7 @@ from mmengine.config import Config
 from mmengine.structures import InstanceData
 
 import gsmap.visualization.map_visualization_hook  # noqa: F401 (registers the hook)
-from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.visualization.figure import sample_name, sample_title
 from gsmap.visualization.map_visualizer import (

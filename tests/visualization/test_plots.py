@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from comparison.run_curves import plot_precision_recall
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.raster_ap import RasterConfig
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.raster_ap import RasterConfig
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.visualization.plots import plot_result

@@ -16,11 +16,11 @@ from comparison.run_curves import RunLog, read_run
 from gsmap.checkpoints.reading import read_weights
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.engine.launch import newest_checkpoint
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import METRIC_NAMES, MapEvaluator
-from gsmap.evaluation.file_evaluation import evaluate_files
-from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.report import MetricReport, flat_metrics
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.core.file_evaluation import evaluate_files
+from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.report import MetricReport, flat_metrics
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import read_json
 from gsmap.utils.parallel import default_workers

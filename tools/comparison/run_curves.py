@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from gsmap.evaluation.average_precision import precision_recall
-from gsmap.evaluation.report import MetricReport
+from gsmap.evaluation.core.average_precision import precision_recall
+from gsmap.evaluation.core.report import MetricReport
 from gsmap.utils.files import read_text
 from gsmap.visualization.plots import finish_panel, finish_shares, panel_grid
 from gsmap.visualization.style import RUN_COLOURS, MapStyle

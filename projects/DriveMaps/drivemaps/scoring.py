@@ -6,9 +6,9 @@ import numpy as np
 import shapely
 
 from drivemaps.drive import Drive, DriveFrame
-from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.report import flat_metrics
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.report import flat_metrics
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
 from gsmap.structures.polylines import clip_to_box

@@ -11,12 +11,12 @@ from processes import run_python
 from report_case import CLASSES, FRAMES, STRANGE, write_case
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.distances import cut_by_distance, distance_groups
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.file_evaluation import SamplePairs
-from gsmap.evaluation.groups import ap_by_group, group_table
-from gsmap.evaluation.results_json import RESULTS_KEY, read_samples
+from gsmap.evaluation.analysis.distances import cut_by_distance, distance_groups
+from gsmap.evaluation.analysis.groups import ap_by_group, group_table
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.file_evaluation import SamplePairs
+from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.frames import FRAME_VIEWS
 from gsmap.visualization.page.frames import cameras_of, choose_frames
 from gsmap.visualization.page.page import PageOptions, page_data, page_html

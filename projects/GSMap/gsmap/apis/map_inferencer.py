@@ -33,7 +33,7 @@ from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.datasets.memory import Cameras
 from gsmap.datasets.source import Mount, Source, annotated, reframed
-from gsmap.evaluation.results_json import vectors_of
+from gsmap.evaluation.core.results_json import vectors_of
 from gsmap.structures.elements import MapElements
 
 if TYPE_CHECKING:  # slow to import, and of no use before there is a model

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmap.evaluation.results_json import vectors_of, write_results
+from gsmap.evaluation.core.results_json import vectors_of, write_results
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.elements import MapElements
 from gsmap.structures.polylines import shortest_orders

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from gsmap.evaluation.results_json import write_results
+from gsmap.evaluation.core.results_json import write_results
 from gsmap.utils.files import lock, naming_file, open_to_append
 
 _SUFFIX = ".unfinished"

@@ -5,10 +5,10 @@ from gsmap.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "ChamferConfig": "chamfer_ap",
-        "MapEvaluator": "evaluator",
+        "ChamferConfig": "core.chamfer_ap",
+        "MapEvaluator": "core.evaluator",
         "MapMetric": "map_metric",
-        "RasterConfig": "raster_ap",
-        "format_table": "report",
+        "RasterConfig": "core.raster_ap",
+        "format_table": "core.report",
     },
 )

@@ -11,12 +11,12 @@ from mmengine.evaluator import BaseMetric
 from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_truth
-from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.evaluator import ALL_NAMES, METRIC_NAMES, SHRUNK_NAME, MapEvaluator
-from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.report import flat_metrics, format_table
-from gsmap.evaluation.results_json import vectors_of, write_results
-from gsmap.evaluation.sample_ap import METHODS
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.core.evaluator import ALL_NAMES, METRIC_NAMES, SHRUNK_NAME, MapEvaluator
+from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.report import flat_metrics, format_table
+from gsmap.evaluation.core.results_json import vectors_of, write_results
+from gsmap.evaluation.core.sample_ap import METHODS
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON

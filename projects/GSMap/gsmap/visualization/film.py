@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.evaluation.consistency import DriveFrame
-from gsmap.evaluation.drive_files import drive_frames
+from gsmap.evaluation.analysis.consistency import DriveFrame
+from gsmap.evaluation.analysis.drive_files import drive_frames
 from gsmap.structures.frames import frame_view
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.extras import import_extra

@@ -13,7 +13,7 @@ from mmengine.visualization import Visualizer
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_targets, elements_of_truth
 from gsmap.datasets.image_files import read_image
-from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig, match_chamfer
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import FRAME_VIEWS, FrameView, frame_view

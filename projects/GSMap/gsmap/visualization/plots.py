@@ -7,10 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gsmap.evaluation.average_precision import precision_recall, reliability
-from gsmap.evaluation.calibration import AXES, LEVELS, Vertices, sparsification
-from gsmap.evaluation.calibration import reliability as coverage
-from gsmap.evaluation.report import MetricReport
+from gsmap.evaluation.analysis.calibration import AXES, LEVELS, Vertices, sparsification
+from gsmap.evaluation.analysis.calibration import reliability as coverage
+from gsmap.evaluation.core.average_precision import precision_recall, reliability
+from gsmap.evaluation.core.report import MetricReport
 from gsmap.visualization.style import MapStyle
 
 _LINE: dict[str, Any] = {"linewidth": 1.3, "markersize": 3}

@@ -12,7 +12,7 @@ from gsmap.datasets.annotations.record import CameraRecord, MapSample
 from gsmap.datasets.elements import elements_of_instances
 from gsmap.datasets.errors import BrokenSampleError
 from gsmap.datasets.image_files import encode_jpeg, read_image
-from gsmap.evaluation.raster_ap import MIN_SCORE
+from gsmap.evaluation.core.raster_ap import MIN_SCORE
 from gsmap.structures.frames import FrameView
 from gsmap.visualization.camera_view import arrange_cameras, camera_title
 from gsmap.visualization.page.scores import ScoredResult

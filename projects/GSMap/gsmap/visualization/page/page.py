@@ -12,11 +12,11 @@ from string import Template
 from typing import Any
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.evaluation.bootstrap import Resamples
-from gsmap.evaluation.distances import DISTANCE, distance_groups
-from gsmap.evaluation.file_evaluation import read_ground_truth
-from gsmap.evaluation.groups import read_groups
-from gsmap.evaluation.raster_ap import MIN_SCORE
+from gsmap.evaluation.analysis.bootstrap import Resamples
+from gsmap.evaluation.analysis.distances import DISTANCE, distance_groups
+from gsmap.evaluation.analysis.groups import read_groups
+from gsmap.evaluation.core.file_evaluation import read_ground_truth
+from gsmap.evaluation.core.raster_ap import MIN_SCORE
 from gsmap.structures.elements import MapElements
 from gsmap.structures.frames import frame_view
 from gsmap.structures.grid import BEVGrid

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsmap.datasets.annotations.record import AnnotationMeta
-from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.distances import cut_by_distance
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.file_evaluation import mismatch_notes
-from gsmap.evaluation.matches import FrameMatches
-from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.report import MetricReport
-from gsmap.evaluation.results_json import RESULTS_KEY, THREE_D, SampleFile
+from gsmap.evaluation.analysis.distances import cut_by_distance
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.file_evaluation import mismatch_notes
+from gsmap.evaluation.core.matches import FrameMatches
+from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.report import MetricReport
+from gsmap.evaluation.core.results_json import RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import IntArray, MapElements
 from gsmap.structures.grid import BEVGrid

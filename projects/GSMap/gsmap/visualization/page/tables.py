@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.evaluation.average_precision import precision_recall
-from gsmap.evaluation.bootstrap import Interval, Resamples, ap_differences, ap_intervals
-from gsmap.evaluation.calibration import (
+from gsmap.evaluation.analysis.bootstrap import Interval, Resamples, ap_differences, ap_intervals
+from gsmap.evaluation.analysis.calibration import (
     AXES,
     COVERED,
     LEVELS,
@@ -16,10 +15,11 @@ from gsmap.evaluation.calibration import (
     matched_vertices,
     reliability,
 )
-from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.groups import Groups, ap_by_group, group_table
-from gsmap.evaluation.matches import ClassDetections
-from gsmap.evaluation.report import UNDEFINED, MetricReport, flat_metrics
+from gsmap.evaluation.analysis.groups import Groups, ap_by_group, group_table
+from gsmap.evaluation.core.average_precision import precision_recall
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
+from gsmap.evaluation.core.matches import ClassDetections
+from gsmap.evaluation.core.report import UNDEFINED, MetricReport, flat_metrics
 from gsmap.structures.elements import MapElements
 from gsmap.visualization.page.scores import ScoredResult
 from gsmap.visualization.style import MapStyle

@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
-from gsmap.evaluation.calibration import DISTANCES_M
-from gsmap.evaluation.evaluator import Sample
-from gsmap.evaluation.groups import Groups
+from gsmap.evaluation.analysis.calibration import DISTANCES_M
+from gsmap.evaluation.analysis.groups import Groups
+from gsmap.evaluation.core.evaluator import Sample
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import is_closed
 

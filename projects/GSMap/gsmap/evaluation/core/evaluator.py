@@ -6,17 +6,17 @@ from functools import cached_property
 
 import numpy as np
 
-from gsmap.evaluation.chamfer_ap import (
+from gsmap.evaluation.core.chamfer_ap import (
     CHAMFER_THRESHOLDS,
     HARD_CHAMFER_THRESHOLDS,
     ChamferConfig,
     chamfer_report,
     match_chamfer,
 )
-from gsmap.evaluation.matches import FrameMatches, MatchTable
-from gsmap.evaluation.raster_ap import RasterConfig, match_raster, raster_report
-from gsmap.evaluation.report import MetricReport, flat_metrics
-from gsmap.evaluation.sample_ap import (
+from gsmap.evaluation.core.matches import FrameMatches, MatchTable
+from gsmap.evaluation.core.raster_ap import RasterConfig, match_raster, raster_report
+from gsmap.evaluation.core.report import MetricReport, flat_metrics
+from gsmap.evaluation.core.sample_ap import (
     METHODS,
     SampleAPConfig,
     match_sample_ap,

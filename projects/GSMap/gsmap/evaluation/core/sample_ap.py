@@ -16,15 +16,15 @@ import numpy.typing as npt
 from numba import njit
 
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
-from gsmap.evaluation.average_precision import ten_point_ap
-from gsmap.evaluation.matches import (
+from gsmap.evaluation.core.average_precision import ten_point_ap
+from gsmap.evaluation.core.matches import (
     ClassDetections,
     FrameMatches,
     MatchTable,
     check_pair,
     checked_classes,
 )
-from gsmap.evaluation.report import UNDEFINED, MetricReport, distance_figures
+from gsmap.evaluation.core.report import UNDEFINED, MetricReport, distance_figures
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
 

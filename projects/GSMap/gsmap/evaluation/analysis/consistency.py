@@ -13,9 +13,9 @@ import numpy as np
 import shapely
 from scipy.optimize import linear_sum_assignment
 
-from gsmap.evaluation import chamfer_kernels as kernels
-from gsmap.evaluation.average_precision import area_ap
-from gsmap.evaluation.chamfer_ap import CHAMFER_THRESHOLDS
+from gsmap.evaluation.core import chamfer_kernels as kernels
+from gsmap.evaluation.core.average_precision import area_ap
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import resample_all

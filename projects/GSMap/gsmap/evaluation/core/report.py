@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmap.evaluation.average_precision import calibration_error
-from gsmap.evaluation.matches import ClassDetections
+from gsmap.evaluation.core.average_precision import calibration_error
+from gsmap.evaluation.core.matches import ClassDetections
 from gsmap.structures.elements import FloatArray
 from gsmap.utils.files import write_text
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 import gsmap.utils.compilation  # noqa: F401 - says that kernels are compiled
-from gsmap.evaluation.report import UNDEFINED, MetricReport
+from gsmap.evaluation.core.report import UNDEFINED, MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray
 
 _RECALL_POINTS = np.linspace(0.0, 1.0, 101)

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
-from gsmap.evaluation.evaluator import Sample
-from gsmap.evaluation.report import MetricReport
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig, match_chamfer
+from gsmap.evaluation.core.evaluator import Sample
+from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import equivalent_orders
 from gsmap.utils.model_facts import LAW_NAMES

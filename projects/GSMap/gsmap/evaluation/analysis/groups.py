@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.evaluation.bootstrap import resampled_figures
-from gsmap.evaluation.report import UNDEFINED, MetricReport
+from gsmap.evaluation.analysis.bootstrap import resampled_figures
+from gsmap.evaluation.core.report import UNDEFINED, MetricReport
 from gsmap.structures.elements import FloatArray, IntArray
 from gsmap.utils.files import read_json
 

@@ -22,7 +22,8 @@ from gsmap.utils.json_items import Place, items_of
 from gsmap.utils.shards import ShardFile
 
 RESULTS_KEY, GROUND_TRUTH_KEY = "results", "GTs"
-BEZIER = "bezier"  # in place of "pts": {"degree", "pts"}, as `gsmap.evaluation.compact` writes it
+BEZIER = "bezier"
+"""Curves in place of ``pts``: ``degree`` and ``pts``; `compact_results` writes them."""
 THREE_D = "3D"
 SHARD_KIND = "results"
 _LAST_LINE = "]}\n"

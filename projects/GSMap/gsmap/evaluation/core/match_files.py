@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import MapEvaluator, SampleMatches
-from gsmap.evaluation.matches import FrameMatches
-from gsmap.evaluation.raster_ap import RasterConfig
-from gsmap.evaluation.report import MetricReport
-from gsmap.evaluation.sample_ap import SampleAPConfig
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator, SampleMatches
+from gsmap.evaluation.core.matches import FrameMatches
+from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.report import MetricReport
+from gsmap.evaluation.core.sample_ap import SampleAPConfig
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import DAMAGED_ZIP, atomic_write
 from gsmap.utils.shards import Shard, ShardFile

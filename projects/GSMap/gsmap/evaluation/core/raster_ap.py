@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.evaluation import raster_kernels as kernels
-from gsmap.evaluation.average_precision import interpolated_ap
-from gsmap.evaluation.matches import (
+from gsmap.evaluation.core import raster_kernels as kernels
+from gsmap.evaluation.core.average_precision import interpolated_ap
+from gsmap.evaluation.core.matches import (
     FrameMatches,
     MatchTable,
     assign,
@@ -20,7 +20,7 @@ from gsmap.evaluation.matches import (
     checked_classes,
     ranked_predictions,
 )
-from gsmap.evaluation.report import UNDEFINED, MetricReport, class_figures
+from gsmap.evaluation.core.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid

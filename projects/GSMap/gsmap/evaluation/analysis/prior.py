@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
-from gsmap.evaluation.chamfer_ap import ChamferConfig, nearest_by_chamfer
-from gsmap.evaluation.evaluator import MapEvaluator
-from gsmap.evaluation.file_evaluation import Evaluation, match_samples, read_ground_truth
-from gsmap.evaluation.raster_ap import MIN_SCORE
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig, nearest_by_chamfer
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.file_evaluation import Evaluation, match_samples, read_ground_truth
+from gsmap.evaluation.core.raster_ap import MIN_SCORE
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
 from gsmap.utils.split_lists import require_same_list

@@ -8,14 +8,14 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.consistency import (
+from gsmap.evaluation.analysis.consistency import (
     ConsistencyConfig,
     DriveFrame,
     by_scene,
     consistency,
     tracks_of,
 )
-from gsmap.evaluation.results_json import RESULTS_KEY, SampleFile, vectors_of, write_results
+from gsmap.evaluation.core.results_json import RESULTS_KEY, SampleFile, vectors_of, write_results
 from gsmap.structures.elements import IntArray, MapElements
 from gsmap.utils.json_items import items_of
 

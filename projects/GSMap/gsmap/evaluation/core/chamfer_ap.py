@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmap.evaluation import chamfer_kernels as kernels
-from gsmap.evaluation.average_precision import area_ap
-from gsmap.evaluation.matches import (
+from gsmap.evaluation.core import chamfer_kernels as kernels
+from gsmap.evaluation.core.average_precision import area_ap
+from gsmap.evaluation.core.matches import (
     FrameMatches,
     MatchTable,
     assign,
@@ -22,7 +22,7 @@ from gsmap.evaluation.matches import (
     checked_classes,
     ranked_predictions,
 )
-from gsmap.evaluation.report import MetricReport, distance_figures
+from gsmap.evaluation.core.report import MetricReport, distance_figures
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
 

@@ -12,9 +12,9 @@ import numpy as np
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.evaluator import MapEvaluator, Sample, SampleMatches
-from gsmap.evaluation.report import MetricReport
-from gsmap.evaluation.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, SampleFile
+from gsmap.evaluation.core.evaluator import MapEvaluator, Sample, SampleMatches
+from gsmap.evaluation.core.report import MetricReport
+from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.elements import MapElements
 from gsmap.utils.parallel import ordered_map
 from gsmap.utils.progress import Progress

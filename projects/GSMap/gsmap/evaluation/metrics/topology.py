@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig, match_chamfer
-from gsmap.evaluation.evaluator import Sample
-from gsmap.evaluation.matches import check_pair, checked_classes
-from gsmap.evaluation.report import UNDEFINED
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig, match_chamfer
+from gsmap.evaluation.core.evaluator import Sample
+from gsmap.evaluation.core.matches import check_pair, checked_classes
+from gsmap.evaluation.core.report import UNDEFINED
 from gsmap.structures.elements import BoolArray, FloatArray, MapElements
 from gsmap.structures.polylines import arc_lengths, resample, resample_all
 

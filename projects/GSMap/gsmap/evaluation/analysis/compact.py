@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsmap.evaluation.results_json import BEZIER, RESULTS_KEY, SampleFile, write_results
+from gsmap.evaluation.core.results_json import BEZIER, RESULTS_KEY, SampleFile, write_results
 from gsmap.structures.bezier import curve_points, fit_pieces, largest_deviation
 from gsmap.structures.elements import FloatArray
 

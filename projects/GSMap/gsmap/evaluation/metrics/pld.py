@@ -11,9 +11,9 @@ from numba import njit
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from gsmap.evaluation.chamfer_ap import ChamferConfig
-from gsmap.evaluation.evaluator import Sample
-from gsmap.evaluation.matches import check_pair
+from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import Sample
+from gsmap.evaluation.core.matches import check_pair
 from gsmap.structures.elements import FloatArray
 from gsmap.structures.polylines import arc_lengths
 

@@ -1,0 +1,1 @@
+"""Analysis of results: intervals, groups, distances, calibration, consistency, the prior."""

@@ -1,0 +1,1 @@
+"""Further metrics of ``--eval``, each in a file with its name."""
