@@ -1,4 +1,4 @@
-"""How long Argoverse 2 ground truth takes: what docs/benchmarks/speed.md states."""
+"""How long Argoverse 2 ground truth takes: what results/speed.md states."""
 
 import resource
 import time

@@ -1,4 +1,4 @@
-"""Measurements behind ``docs/benchmarks/speed.md``, run by ``python -m benchmarks data``."""
+"""Measurements behind ``results/speed.md``, run by ``python -m benchmarks data``."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Loading, ground truth, pipeline: what docs/benchmarks/{data,argoverse2}.md state."""
+"""Loading, ground truth, pipeline: what results/speed.md states."""
 
 import argparse
 import json

@@ -28,11 +28,12 @@ OUTSIDE = {
     "gsmap.md": "projects/GSMap/README.md",
     "minicity.md": "projects/MiniCity/README.md",
 }
+OUTSIDE |= {f"results/{path.name}": f"results/{path.name}" for path in REPO.glob("results/*.md")}
 PAGES = {source: page for page, source in OUTSIDE.items()}
 LANGUAGES = {".py": "python", ".sh": "bash", ".json": "json"}
 # fenced and inline code are left alone
 LINK = re.compile(
-    r"```.*?```|`[^`\n]*`|\]\((?P<target>[^)\s:]+?)(?P<anchor>#[^)\s]*)?\)", re.DOTALL
+    r"```.*?```|`[^`\n]*`|\]\((?P<target>[^)\s:#]+)(?P<anchor>#[^)\s]*)?\)", re.DOTALL
 )
 MATH = re.compile(r":math:<code>(.*?)</code>", re.DOTALL)
 NAME = re.compile(r'<h3 id="([\w.]+)\.(\w+)" class="doc doc-heading">.*?</h3>', re.DOTALL)

@@ -27,6 +27,7 @@ PAGES = [
     REPO / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "models/README.md")
 ]
 PAGES += sorted([*(REPO / "docs").rglob("*.md"), *(REPO / "projects").glob("*/README.md")])
+PAGES += sorted((REPO / "results").glob("*.md"))
 PAGES += sorted((REPO / "tools").glob("*.py"))
 STAND_INS = {"CONFIG": "configs/maptr/maptr_r18_minicity.py", "ITERATIONS": "100"}
 STAND_INS |= {"COMMAND": "check", "GROUND_TRUTH": "truth.arrow"}

@@ -27,7 +27,9 @@ from report_case import write_case
 import gsmap.registered  # noqa: F401 - the configs name its classes
 
 REPO = Path(__file__).resolve().parents[1]
-PAGES = [REPO / "README.md", *sorted([*(REPO / "docs").rglob("*.md"), *REPO.glob("*/*/README.md")])]
+PAGES = [REPO / "README.md"]
+PAGES += sorted([*(REPO / "docs").rglob("*.md"), *REPO.glob("*/*/README.md")])
+PAGES += sorted((REPO / "results").glob("*.md"))
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 ROS = "import rclpy"  # the node of docs/inference.md: test_docs_library.py runs it without ROS
 WITH_BLOCKS = [page for page in dict.fromkeys(PAGES) if BLOCK.search(page.read_text())]
@@ -148,7 +150,7 @@ def towns(folder: Path, minicity: Path) -> dict[str, Any]:
 
 GIVEN: Mapping[str, Callable[[Path, Path], dict[str, Any]]] = {
     "docs/data.md": towns_in("data/minicity/gsmap_minicity_val.arrow"),
-    "docs/benchmarks/methods.md": towns_in("ROOT/gsmap_minicity_train.arrow"),
+    "results/methods.md": towns_in("ROOT/gsmap_minicity_train.arrow"),
     "docs/evaluation.md": lambda *_: {"frames": [(line(scores=[0.9]), line())]},
     "docs/inference.md": towns,
     "docs/visualization.md": samples,

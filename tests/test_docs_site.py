@@ -11,7 +11,7 @@ from mkdocs.config import load_config
 REPO = Path(__file__).resolve().parents[1]
 PAGES = [
     path
-    for folder in (REPO, REPO / "docs", REPO / "models", REPO / "projects")
+    for folder in (REPO, *(REPO / name for name in ("docs", "models", "projects", "results")))
     for path in (folder.glob("*.md") if folder == REPO else folder.rglob("*.md"))
 ]
 LOADED = re.compile(
@@ -104,3 +104,9 @@ def test_mkdocs_names_pages_that_exist():
     assert [
         p for p in named if not (REPO / "docs" / p).exists() and f'"{p}": "' not in outside
     ] == []
+
+
+def test_summary_and_changelog_are_short():
+    """The figures that count in one page; a changelog of what a user gets, not a diary."""
+    for name, words in (("docs/benchmarks.md", 1500), ("CHANGELOG.md", 600)):
+        assert len((REPO / name).read_text(encoding="utf-8").split()) <= words, name

@@ -1,7 +1,7 @@
 """Read damaged files, case by case in child processes, and count how each reader ends.
 
 ``PYTHONPATH=tests:tests/converters python -m fuzz --cases 5000`` prints the table of
-docs/benchmarks/tests.md; ``--reader NAME ...`` takes the readers whose names begin so.
+results/tests.md; ``--reader NAME ...`` takes the readers whose names begin so.
 """
 
 import argparse

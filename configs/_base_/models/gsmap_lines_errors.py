@@ -1,5 +1,5 @@
 # GSMap with strong masks for lines, points of crossings that weigh more beside them, and sigmas of the points' errors,
-# by which scores are divided (docs/benchmarks/gaussians.md). Bands are 1.5 m wide for any range.
+# by which scores are divided (results/gaussians.md). Bands are 1.5 m wide for any range.
 _gsmap_lines_errors = dict(
     map_head=dict(
         type='GSMapHead',

@@ -1,5 +1,5 @@
 # A small GSMap with other weights for lines (dividers, boundaries) than for crossings: strong, wide masks for lines;
-# for crossings MapTR's points, and masks that count only as far as they overlap (docs/benchmarks/gaussians.md).
+# for crossings MapTR's points, and masks that count only as far as they overlap (results/gaussians.md).
 _base_ = '../../../configs/maptr/maptr_r18_minicity.py'
 
 model = dict(

@@ -1,5 +1,5 @@
 # A small GSMap whose masks are strong and wide for lines (dividers, boundaries), and move no point of a crossing: its
-# points learn as MapTR's, its masks teach sigma and theta alone (docs/benchmarks/gaussians.md).
+# points learn as MapTR's, its masks teach sigma and theta alone (results/gaussians.md).
 _base_ = '../../../configs/maptr/maptr_r18_minicity.py'
 
 model = dict(

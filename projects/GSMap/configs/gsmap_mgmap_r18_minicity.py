@@ -1,5 +1,5 @@
 # Gaussians on MGMap's decoder, for MiniCity: masks that are wide for lines and move no point of a crossing, sigmas of
-# the points' errors (docs/benchmarks/gaussians.md).
+# the points' errors (results/gaussians.md).
 _base_ = '../../../configs/mgmap/mgmap_r18_minicity.py'
 
 model = dict(

@@ -30,5 +30,5 @@ class GaussianHealthHook(Hook):
                 "smallest size: their masks are dots, which teach nothing. Use "
                 "RasterLoss(normalize='both'), lower loss_raster.loss_weight until the points are "
                 "right to a metre or so, or give the masks larger pixels (map_head.masks.pixel_m): "
-                "docs/benchmarks/gaussians.md."
+                "results/gaussians.md."
             )
