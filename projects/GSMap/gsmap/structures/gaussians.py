@@ -106,12 +106,11 @@ class GaussianSpace:
         """Activate sigma: zero gives ``init_scales_m``. (..., 2) -> (..., 2) metres"""
         low, high = self.min_scale_m, self.max_scale_m
         shifted = raw + constant(raw, self._start)
-        above = {
-            "sigmoid": lambda x: (high - low) * x.sigmoid(),
-            "softplus": F.softplus,
-            "exp": torch.exp,
-        }[self.activation](shifted)
-        return (low + above).clamp(max=high)
+        if self.activation == "sigmoid":
+            span = constant(raw, self.max_scale_m - self.min_scale_m)
+            return torch.addcmul(constant(raw, self.min_scale_m), shifted.sigmoid(), span)
+        above = F.softplus(shifted) if self.activation == "softplus" else shifted.exp()
+        return (self.min_scale_m + above).clamp(max=self.max_scale_m)
 
     def _before_activation(self, scales: Tensor) -> Tensor:
         """Return s + s_0 of sigma in metres, between the smallest and the largest. (...)"""
@@ -141,29 +140,66 @@ class GaussianSpace:
         theta = gaussians.rotations[..., None] - self.heading_rad
         return torch.cat([centres, like[..., 2:-3], raw, theta], -1)
 
-    def frames(self, reference: Tensor, invariant: bool = False) -> Tensor:
-        r"""Return what turns an offset into the Gaussian's own frame, the identity at the start.
+    def frames(
+        self,
+        reference: Tensor,
+        invariant: bool = False,
+        cell_m: tuple[float, float] = (1.0, 1.0),
+    ) -> Tensor:
+        r"""Matrices that bring an offset into each Gaussian's own frame.
 
         With the stretch :math:`D = \mathrm{diag}(\sigma / \sigma_{init})` and the direction of
         travel :math:`\theta_0`, the matrix is :math:`R(\theta) D R(\theta_0)^T`. The invariant one,
-        :math:`R(\theta) D R(\theta)^T`, is the same for theta and theta + pi, which are the same
-        Gaussian. They multiply (x, y) in metres from the left. (..., D) -> (..., 2, 2)
+        :math:`R(\theta) D R(\theta)^T`, is equal for theta and theta + pi, which are one Gaussian.
+        Both are exactly the identity for the Gaussian that a query starts with.
+
+        Each operation is a launch on a GPU, six times a frame, so constants are multiplied
+        beforehand.
+
+        Args:
+            reference: Entries of the decoder's references. (..., D)
+            invariant: Whether to return the invariant matrices.
+            cell_m: Size of a cell along x and y in metres, if offsets are in cells.
+
+        Returns:
+            Matrices that multiply offsets (x, y) from the left. (..., 2, 2)
         """
-        gaussians = self.decode(reference)
-        like = gaussians.scales
+        reference = at_least_float32(reference)
+        scales = self.scales(reference[..., -3:-1])
+        if self.literal_covariance:
+            scales = scales.square()
         # computed as the scales are, so that their quotient is exactly one
-        start = kept(like, (self, "start", like.dtype), lambda: self._first_scales(like))
-        turned = _rotations(gaussians.rotations)
-        back = turned
-        if not invariant:
-            heading = constant(like, self.heading_rad)
-            back = kept(like, (self, "heading", like.dtype), lambda: _rotations(heading))
-        return (turned * (like / start)[..., None, :]) @ back.transpose(-1, -2)
+        start = kept(scales, (self, "start", scales.dtype), lambda: self._first_scales(scales))
+        stretch = scales / start
+        theta = reference[..., -1:]
+        ratio = (cell_m[0] / cell_m[1], cell_m[1] / cell_m[0])
+        along_x = self.grid.forward == "x"
+        if invariant:
+            cos, sin = self._double_angle(theta).split(1, dim=-1)
+            middle = (stretch[..., :1] + stretch[..., 1:]) / 2
+            half = (stretch[..., :1] - stretch[..., 1:]) / 2
+            aside = half * sin
+            rows = [middle + half * cos, aside * ratio[1], aside * ratio[0], middle - half * cos]
+            return torch.cat(rows, -1).unflatten(-1, (2, 2))
+        # the angle from the direction of travel; the products of both stretches with its cosine
+        # and sine are the entries of R D, which constants turn and scale
+        turn = _cos_and_sin(theta, 1.0, 0.0)
+        products = (stretch[..., :, None] * turn[..., None, :]).flatten(-2)
+        entries = (
+            [(1, 0, 0, 0), (0, 0, ratio[0], 0), (0, 0, 0, 1), (0, -ratio[1], 0, 0)]
+            if along_x
+            else [(0, 0, 0, 1), (0, -ratio[1], 0, 0), (1, 0, 0, 0), (0, 0, ratio[0], 0)]
+        )
+        return (products @ constant(products, entries)).unflatten(-1, (2, 2))
 
     def _first_scales(self, like: Tensor) -> Tensor:
-        """Return the standard deviations of the Gaussian that a query starts with. (2,)"""
+        """Standard deviations of the Gaussian that a query starts with. (2,)"""
         start = self.scales(like.new_zeros(2))
         return start.square() if self.literal_covariance else start
+
+    def _double_angle(self, theta: Tensor) -> Tensor:
+        """Cosine and sine of twice the angle from +x. (..., 1) -> (..., 2)"""
+        return _cos_and_sin(theta, 2.0, 2 * self.heading_rad)
 
     def describe(self, reference: Tensor) -> Tensor:
         """Return numbers of unit size that describe the Gaussians. (..., 5 or more) -> (..., 6)
@@ -171,9 +207,15 @@ class GaussianSpace:
         They are mu in [-1, 1], sigma before its activation, cos and sin of 2 theta, as a Gaussian
         turned by half a circle is the same.
         """
-        centre, raw_scales, theta = reference[..., :2], reference[..., -3:-1], reference[..., -1:]
-        angle = 2 * (theta + self.heading_rad)
-        return torch.cat([2 * centre - 1, raw_scales, angle.cos(), angle.sin()], -1)
+        centre = torch.add(constant(reference, -1.0), reference[..., :2], alpha=2)
+        angle = self._double_angle(reference[..., -1:])
+        return torch.cat([centre, reference[..., -3:-1], angle], -1)
+
+
+def _cos_and_sin(angle: Tensor, factor: float, shift_rad: float) -> Tensor:
+    """Cosine and sine of ``factor * angle + shift_rad`` by two operations. (..., 1) -> (..., 2)"""
+    shifts = constant(angle, (shift_rad + math.pi / 2, shift_rad))
+    return torch.addcmul(shifts, angle, constant(angle, factor)).sin()
 
 
 def covariances(gaussians: Gaussians) -> Tensor:

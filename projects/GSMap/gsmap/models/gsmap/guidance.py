@@ -8,7 +8,6 @@ from gsmap.checkpoints.strict import AddsWeights
 from gsmap.models.maptr.decoder import Guidance
 from gsmap.models.maptr.layers import mlp
 from gsmap.structures.gaussians import GaussianSpace
-from gsmap.structures.tensors import constant
 
 
 @MODELS.register_module()
@@ -69,6 +68,5 @@ class GaussianGuidance(Guidance, AddsWeights):
         if not self.sampling:
             return None
         finest = feats if isinstance(feats, Tensor) else feats[0]  # of levels
-        cell_m = constant(reference, self.space.grid.resized(*finest.shape[-2:]).pixel_size_m)
-        # The frames act on metres; brought to cells, the identity stays the identity bit by bit.
-        return self.space.frames(reference, self.invariant) * (cell_m / cell_m[:, None])
+        cell_m = self.space.grid.resized(*finest.shape[-2:]).pixel_size_m
+        return self.space.frames(reference, self.invariant, cell_m)
