@@ -104,7 +104,6 @@ class GaussianSpace:
 
     def scales(self, raw: Tensor) -> Tensor:
         """Activate sigma: zero gives ``init_scales_m``. (..., 2) -> (..., 2) metres"""
-        low, high = self.min_scale_m, self.max_scale_m
         shifted = raw + constant(raw, self._start)
         if self.activation == "sigmoid":
             span = constant(raw, self.max_scale_m - self.min_scale_m)
