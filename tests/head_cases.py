@@ -8,7 +8,7 @@ from mmengine.structures import InstanceData
 from model_cases import straight_elements
 
 import gsmap.registered  # noqa: F401
-from gsmap.models.maptr.pairs import Predictions
+from gsmap.models.base.pairs import Predictions
 from gsmap.structures.grid import BEVGrid
 
 N, P, C = 4, 5, 16

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor
 
-from gsmap.models.maptr.decoder import Decoded
-from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.pairs import MatchedPairs, Predictions
+from gsmap.models.base.decoder import Decoded
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.pairs import MatchedPairs, Predictions
 
 
 def stacked(outputs: list[Predictions]) -> SimpleNamespace:

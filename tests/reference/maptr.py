@@ -12,9 +12,9 @@ from scipy.optimize import linear_sum_assignment
 
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
 from gsmap.checkpoints.key_map import find_key_map
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.pairs import Predictions
 from gsmap.models.encoders.gkt import kernel_offsets
-from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.pairs import Predictions
 from gsmap.ops.deformable_sampling import sum_rows
 from gsmap.ops.kernel_sampling.reference import border_pixels
 from reference.golden import Golden

@@ -16,7 +16,7 @@ from processes import REPO, free_port, search_path, wait_for
 
 import tools.train
 from gsmap.engine.run_log import MapRunner
-from gsmap.models.maptr.head import MapHead
+from gsmap.models.base.head import MapHead
 from gsmap.utils.cli import run_command
 
 ENVIRONMENT = {"PYTHON": sys.executable, "OMP_NUM_THREADS": "1"}

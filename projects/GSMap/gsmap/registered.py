@@ -23,6 +23,7 @@ import gsmap.visualization.map_visualizer  # noqa: F401
 FOLDERS = (  # every module of these is imported; a method comes and goes with its folder
     "gsmap.datasets.transforms",
     "gsmap.models.encoders",
+    "gsmap.models.base",
     "gsmap.models.maptr",
     "gsmap.models.streams",
     "gsmap.models.lines",

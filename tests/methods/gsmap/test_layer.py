@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from gsmap.models.base.attention import place_samples
+from gsmap.models.base.decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.gsmap.guidance import GaussianGuidance
 from gsmap.models.gsmap.layer import GaussianDecoderLayer, guided
-from gsmap.models.maptr.attention import place_samples
-from gsmap.models.maptr.decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.maptr.references import refine_reference
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
 from gsmap.structures.gaussians import GaussianSpace

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from gsmap.checkpoints.hdmapnet_keys import HDMAPNET
 from gsmap.datasets.annotations.record import MapInstance
+from gsmap.models.base.layers import enlarged
 from gsmap.models.hdmapnet.decoder import LineMapDecoder, LineMaps
 from gsmap.models.hdmapnet.encoder import ViewTransformEncoder, sampled
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.targets import MakeLineMaps
-from gsmap.models.maptr.layers import enlarged
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import sampled as sampled_line

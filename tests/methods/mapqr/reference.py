@@ -25,10 +25,10 @@ from reference.report import (
 from torch import Tensor, nn
 
 from gsmap.checkpoints.key_map import MAPQR
+from gsmap.models.base.attention import place_samples, sample_map
+from gsmap.models.base.head import MapHead
 from gsmap.models.mapqr.decoder import sine_code
 from gsmap.models.mapqr.encoder import HeightQueryEncoder
-from gsmap.models.maptr.attention import place_samples, sample_map
-from gsmap.models.maptr.head import MapHead
 from gsmap.models.maptrv2.aux_heads import BEVMaskHead
 from gsmap.structures.grid import BEVGrid
 

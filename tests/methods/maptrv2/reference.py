@@ -19,11 +19,11 @@ from torch import Tensor
 
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakeBEVMask, MakePVMask
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.pairs import Predictions
 from gsmap.models.encoders.camera_encoder import stack_calibration
 from gsmap.models.encoders.depth_net import camera_vector
 from gsmap.models.encoders.lss import CAMERA_MATRICES
-from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.pairs import Predictions
 from gsmap.models.maptrv2.depth import depth_bins
 from gsmap.ops.bev_pool import cell_indices
 

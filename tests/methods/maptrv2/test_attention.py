@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsmap.models.maptr.attention import PointSelfAttention
+from gsmap.models.maptr.self_attention import PointSelfAttention
 from gsmap.models.maptrv2.attention import DecoupledSelfAttention
 
 N, P, C = 4, 3, 8

@@ -26,9 +26,9 @@ from torch import Tensor, nn
 from gsmap.checkpoints.key_map import MGMAP
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakeInstanceMasks
-from gsmap.models.maptr.decoder import Decoded
-from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.pairs import Predictions
+from gsmap.models.base.decoder import Decoded
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.pairs import Predictions
 from gsmap.models.mgmap.decoder import MaskedDecoded, RefinedDecoded
 from gsmap.models.mgmap.refinement import BINS, patches_around
 from gsmap.structures.grid import BEVGrid

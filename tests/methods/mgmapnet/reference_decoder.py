@@ -25,7 +25,7 @@ from reference.report import (
 from torch import Tensor
 
 from gsmap.checkpoints.key_map import MGMAPNET
-from gsmap.models.maptr.head import MapHead
+from gsmap.models.base.head import MapHead
 from gsmap.structures.grid import BEVGrid
 
 FURTHER = 24  # one-to-many queries of the training set

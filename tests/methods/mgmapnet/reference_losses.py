@@ -14,9 +14,9 @@ from reference.registry import check
 from reference.report import Row, largest_relative, relative_norm
 from torch import Tensor, nn
 
-from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.pairs import Predictions
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.masks import ElementMasks
+from gsmap.models.base.pairs import Predictions
 from gsmap.models.maptrv2.aux_heads import BEVMaskHead
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoded
 from gsmap.structures.grid import BEVGrid

@@ -20,7 +20,7 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from predictions import stacked
 
-from gsmap.models.maptr.attention import PointSelfAttention
+from gsmap.models.maptr.self_attention import PointSelfAttention
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
 from gsmap.models.mgmapnet.head import with_granularities
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from gsmap.checkpoints.key_map import STREAMMAPNET
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.map_targets import map_targets
-from gsmap.models.maptr.head import MapHead
+from gsmap.models.base.head import MapHead
 from gsmap.models.streammapnet.attention import LinePointAttention
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.memory import StreamMemory

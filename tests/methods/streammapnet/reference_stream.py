@@ -24,7 +24,7 @@ from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 from torch import Tensor
 
-from gsmap.models.maptr.head import MapHead
+from gsmap.models.base.head import MapHead
 from gsmap.models.streams.memory import StreamMemory
 from gsmap.models.streams.query_memory import Propagation
 from gsmap.structures.polylines import sampled_orders

@@ -2,7 +2,7 @@ import pytest
 import torch
 from mmengine.structures import InstanceData
 
-from gsmap.models.maptr.matching import OrderedPointsCost, order_distances
+from gsmap.models.maptr.cost import OrderedPointsCost, order_distances
 
 LINE = torch.tensor([[0.1, 0.1], [0.2, 0.1], [0.3, 0.1]])
 

@@ -6,8 +6,9 @@ import pytest
 import torch
 from predictions import pairs_of
 
+from gsmap.models.base.losses import MapLoss
 from gsmap.models.gemap.losses import EuclideanLoss
-from gsmap.models.maptr.losses import DirectionLoss, MapLoss, PointsLoss
+from gsmap.models.maptr.losses import DirectionLoss, PointsLoss
 from gsmap.models.mapvr.losses import SelfDirectionLoss
 
 

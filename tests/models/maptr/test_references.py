@@ -4,9 +4,9 @@ import pytest
 import torch
 from head_cases import ALONG_X, ALONG_Y, CLASSES
 
+from gsmap.models.base.masks import ElementMasks
 from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.statistics import gaussian_statistics
-from gsmap.models.maptr.masks import ElementMasks
 from gsmap.models.maptr.references import PointReference, refine_reference
 from gsmap.models.streammapnet.reference import LineReference
 from gsmap.ops.gaussian_raster import render_gaussians

@@ -1,13 +1,16 @@
-"""Network parts: detectors, BEV encoders, decoders, heads, losses, matching."""
+"""Network parts: detectors, BEV encoders, the frame of all heads, and a folder for each method."""
 
+from gsmap.models import moved
 from gsmap.utils.lazy import lazy_names
+
+moved.install()
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "GSMapHead": "gsmap.head",
         "MapDetector": "detector",
-        "MapHead": "maptr.head",
+        "MapHead": "base.head",
         "RasterLoss": "gsmap.losses",
     },
 )

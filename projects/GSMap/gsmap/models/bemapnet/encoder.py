@@ -8,11 +8,11 @@ from mmdet.models.layers import coordinate_to_encoding
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.models.base.layers import init_matrices
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import pixel_rays
 from gsmap.models.lines.decoder import AttentionLayer
 from gsmap.models.lines.front import ahead, centres, front_size, turned
-from gsmap.models.maptr.layers import init_matrices
 from gsmap.structures.grid import BEVGrid
 
 

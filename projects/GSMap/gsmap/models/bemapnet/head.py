@@ -10,15 +10,16 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from torch import Tensor, nn
 
+from gsmap.models.base.coder import Tensors
+from gsmap.models.base.layers import enlarged, mlp
+from gsmap.models.base.parts import PARTS
+from gsmap.models.base.references import Reference
 from gsmap.models.bemapnet.curves import Curve, control_points
 from gsmap.models.bemapnet.losses import BezierLines, BezierLosses, TrueCurves
 from gsmap.models.bemapnet.targets import check_curves
 from gsmap.models.lines.decoder import ClassLines
 from gsmap.models.lines.front import front_size
 from gsmap.models.lines.head import LineHead, LinePredictions, class_scores
-from gsmap.models.maptr.coder import Reference, Tensors
-from gsmap.models.maptr.layers import enlarged, mlp
-from gsmap.models.maptr.parts import PARTS
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
 

@@ -10,9 +10,9 @@ from mmcv.ops import point_sample
 from mmdet.models.utils import get_uncertain_point_coords_with_randomness
 from torch import Tensor
 
+from gsmap.models.base.matching import assigned
 from gsmap.models.bemapnet.curves import around, missed
 from gsmap.models.lines.losses import Case, LineLosses
-from gsmap.models.maptr.matching import assigned
 
 COSTS = ("class scores", "masks", "control points", "pieces", "curves", "recovery")
 OVERSAMPLING, UNCERTAIN = 3.0, 0.9  # of a mask's points: drawn per taken one, share of the taken

@@ -8,10 +8,10 @@ from mmdet.models.layers import LearnedPositionalEncoding
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.models.base.attention import BEVDeformableAttention
+from gsmap.models.base.layers import feed_forward, init_matrices
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import PillarProjection, pillar_points, project_pillars
-from gsmap.models.maptr.attention import BEVDeformableAttention
-from gsmap.models.maptr.layers import feed_forward, init_matrices
 from gsmap.structures.calibration import NUM_CAN_BUS
 from gsmap.structures.grid import BEVGrid
 

@@ -7,8 +7,8 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
+from gsmap.models.base.attention import SamplingAttention, sample_map
 from gsmap.models.encoders.projection import PillarProjection
-from gsmap.models.maptr.attention import SamplingAttention, sample_map
 from gsmap.structures.tensors import constant
 
 

@@ -7,10 +7,10 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.models.base.layers import init_matrices
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.depth_net import CameraAwareDepthNet, PlainDepthNet, camera_vector
 from gsmap.models.encoders.projection import frustum_points
-from gsmap.models.maptr.layers import init_matrices
 from gsmap.ops.bev_pool import bev_pool_conv3x3, cell_indices
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import num_depth_bins

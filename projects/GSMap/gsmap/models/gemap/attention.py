@@ -4,7 +4,7 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.maptr.layers import mlp
+from gsmap.models.base.layers import mlp
 
 
 class _AttentionBlock(nn.Module):

@@ -5,10 +5,10 @@ from typing import Any
 
 from mmdet3d.registry import MODELS
 
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.parts import DEFAULTS, PARTS, brought, class_of
 from gsmap.models.gemap.attention import GeometryDecoupledAttention
 from gsmap.models.gemap.losses import EuclideanLoss
-from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.parts import DEFAULTS, PARTS, brought, class_of
 
 
 @MODELS.register_module()

@@ -11,8 +11,8 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.pairs import MatchedPairs
 from gsmap.structures.tensors import check_same_shape, uploaded
 
 NORM_EPS = 1e-6  # added to the product of two lengths: an edge may be a single point

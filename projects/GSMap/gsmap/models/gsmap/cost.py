@@ -5,10 +5,10 @@ from typing import Any
 from mmdet3d.registry import TASK_UTILS
 from torch import Tensor
 
+from gsmap.models.base.matching import MapCost
+from gsmap.models.base.pairs import BuiltHead, SampleView
+from gsmap.models.base.parts import WEIGHT, weights_of
 from gsmap.models.gsmap.reference import require_gaussians
-from gsmap.models.maptr.matching import MapCost
-from gsmap.models.maptr.pairs import BuiltHead, SampleView
-from gsmap.models.maptr.parts import WEIGHT, weights_of
 from gsmap.ops.soft_iou import pairwise_dice_loss, pairwise_soft_iou
 
 

@@ -5,8 +5,8 @@ from mmengine.model import constant_init
 from torch import Tensor
 
 from gsmap.checkpoints.strict import AddsWeights
-from gsmap.models.maptr.decoder import Guidance
-from gsmap.models.maptr.layers import mlp
+from gsmap.models.base.decoder import Guidance
+from gsmap.models.base.layers import mlp
 from gsmap.structures.gaussians import GaussianSpace
 
 

@@ -6,18 +6,18 @@ from typing import Any
 from mmdet3d.registry import MODELS, TASK_UTILS
 from torch import Tensor
 
+from gsmap.models.base.coder import Detections
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.masks import ElementMasks
+from gsmap.models.base.pairs import MatchedPairs
+from gsmap.models.base.parts import DEFAULTS, PARTS, WEIGHT, brought, with_points_weight
 from gsmap.models.gsmap.cost import IoUCost
 from gsmap.models.gsmap.layer import guided
 from gsmap.models.gsmap.losses import MaskLoss, RasterLoss
 from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.statistics import gaussian_statistics
-from gsmap.models.maptr.coder import Detections
-from gsmap.models.maptr.head import MapHead
+from gsmap.models.maptr.cost import OrderedPointsCost
 from gsmap.models.maptr.losses import PointsLoss
-from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.matching import OrderedPointsCost
-from gsmap.models.maptr.pairs import MatchedPairs
-from gsmap.models.maptr.parts import DEFAULTS, PARTS, WEIGHT, brought, with_points_weight
 from gsmap.structures.gaussians import Gaussians, stretched
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant

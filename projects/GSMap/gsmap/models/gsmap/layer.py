@@ -4,9 +4,9 @@ from typing import Any
 
 from mmdet3d.registry import MODELS
 
+from gsmap.models.base.decoder import MapDecoder, MapDecoderLayer
+from gsmap.models.base.parts import PARTS, class_of
 from gsmap.models.gsmap.guidance import GaussianGuidance
-from gsmap.models.maptr.decoder import MapDecoder, MapDecoderLayer
-from gsmap.models.maptr.parts import PARTS, class_of
 
 
 @MODELS.register_module()

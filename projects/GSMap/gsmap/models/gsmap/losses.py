@@ -6,10 +6,10 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
+from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.pairs import BuiltHead, MatchedPairs
+from gsmap.models.base.parts import WEIGHT, check_weight, weights_of
 from gsmap.models.gsmap.reference import require_gaussians
-from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
-from gsmap.models.maptr.parts import WEIGHT, check_weight, weights_of
 from gsmap.ops.raster_loss import NORMALIZATIONS, raster_loss
 from gsmap.ops.soft_iou import dice_loss, soft_iou
 

@@ -10,8 +10,8 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
+from gsmap.models.base.head import MapHead
 from gsmap.models.gsmap.reference import require_gaussians
-from gsmap.models.maptr.head import MapHead
 from gsmap.models.streams.query_memory import QueryMemory
 from gsmap.structures.gaussians import fused_gaussians, moved_gaussians
 from gsmap.structures.past import Past

@@ -9,8 +9,8 @@ from mmengine.model import constant_init
 from torch import Tensor, nn
 
 from gsmap.checkpoints.strict import AddsWeights
-from gsmap.models.maptr import layers
-from gsmap.models.maptr.pairs import BuiltHead
+from gsmap.models.base import layers
+from gsmap.models.base.pairs import BuiltHead
 from gsmap.models.maptr.references import PointReference
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import Gaussians, GaussianSpace

@@ -8,11 +8,11 @@ from mmengine.model import constant_init
 from torch import Tensor, nn
 from torch.distributions import Laplace, Normal
 
+from gsmap.models.base import layers
+from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.pairs import BuiltHead, MatchedPairs
+from gsmap.models.base.parts import WEIGHT
 from gsmap.models.gsmap.reference import GaussianReference, require_gaussians
-from gsmap.models.maptr import layers
-from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
-from gsmap.models.maptr.parts import WEIGHT
 from gsmap.structures.gaussians import (
     Gaussians,
     GaussianSpace,

@@ -5,8 +5,8 @@ from typing import NamedTuple, cast
 from mmdet.models.backbones.resnet import BasicBlock
 from torch import Tensor, nn
 
+from gsmap.models.base.layers import enlarged, resnet_stages
 from gsmap.models.hdmapnet.encoder import JoinedMaps, conv_block
-from gsmap.models.maptr.layers import enlarged, resnet_stages
 
 
 class LineMaps(NamedTuple):

@@ -9,9 +9,9 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
+from gsmap.models.base.layers import enlarged
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.hdmapnet.layout import ahead_size
-from gsmap.models.maptr.layers import enlarged
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
 

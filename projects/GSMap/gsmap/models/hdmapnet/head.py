@@ -10,13 +10,13 @@ from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 from torch import Tensor
 
+from gsmap.models.base.coder import DetectionHead, Samples, Tensors
+from gsmap.models.base.layers import enlarged
+from gsmap.models.base.parts import PARTS
 from gsmap.models.hdmapnet.decoder import LineMapDecoder, LineMaps
 from gsmap.models.hdmapnet.layout import ahead_size, metres_from_pixels, turned
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.vectorizing import VectorizeConfig, vectorize
-from gsmap.models.maptr.coder import DetectionHead, Samples, Tensors
-from gsmap.models.maptr.layers import enlarged
-from gsmap.models.maptr.parts import PARTS
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import padded
 

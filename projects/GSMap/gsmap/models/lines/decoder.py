@@ -9,7 +9,7 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.models.maptr.layers import feed_forward, init_matrices, mlp
+from gsmap.models.base.layers import feed_forward, init_matrices, mlp
 
 
 class ClassLines(NamedTuple):

@@ -10,11 +10,11 @@ from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
+from gsmap.models.base.coder import DetectionHead, MapCoder, Samples, Tensors
+from gsmap.models.base.layers import enlarged
+from gsmap.models.base.parts import PARTS
 from gsmap.models.lines.front import front_size, turned
 from gsmap.models.lines.losses import LINE, Case, LineLosses
-from gsmap.models.maptr.coder import DetectionHead, MapCoder, Samples, Tensors
-from gsmap.models.maptr.layers import enlarged
-from gsmap.models.maptr.parts import PARTS
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import tensor_versions
 

@@ -7,9 +7,9 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.maptr.attention import BEVDeformableAttention
-from gsmap.models.maptr.decoder import Decoded, MapDecoder, MapDecoderLayer
-from gsmap.models.maptr.layers import mlp
+from gsmap.models.base.attention import BEVDeformableAttention
+from gsmap.models.base.decoder import Decoded, MapDecoder, MapDecoderLayer
+from gsmap.models.base.layers import mlp
 
 
 def sine_code(points: Tensor, channels: int) -> Tensor:

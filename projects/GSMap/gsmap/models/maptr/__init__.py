@@ -1,1 +1,1 @@
-"""MapTR (arXiv 2208.14437): the flow that every method uses, from queries to predictions."""
+"""MapTR (arXiv 2208.14437): points in order, each with a query of its own."""

@@ -8,8 +8,8 @@ from mmdet3d.registry import MODELS
 from mmengine.model import xavier_init
 from torch import Tensor, nn
 
-from gsmap.models.maptr.layers import init_matrices, mlp
-from gsmap.structures.gaussians import GaussianSpace
+from gsmap.models.base.layers import init_matrices, mlp
+from gsmap.models.base.references import RefinedReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32, check_same_shape, in_float32
 
@@ -28,7 +28,7 @@ def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Ten
 
 
 @MODELS.register_module()
-class PointReference(nn.Module):
+class PointReference(nn.Module, RefinedReference):
     """A point per query, [0, 1] over the map, refined by each decoder layer (MapTR).
 
     Args:
@@ -42,15 +42,7 @@ class PointReference(nn.Module):
 
     Raises:
         ValueError: If ``coords`` is not 2 or 3, a height lacks its range, or that is empty.
-
-    Attributes:
-        space: How a reference stands for a Gaussian, None for points.
-        outputs: What `decode` returns.
     """
-
-    outputs: tuple[str, ...] = ("pts",)
-
-    space: GaussianSpace | None = None
 
     def __init__(
         self,
@@ -78,7 +70,6 @@ class PointReference(nn.Module):
             self.initial = mlp(embed_dims, embed_dims, entries)
             hidden = [2 * embed_dims] * 3
         self.branches = nn.ModuleList(mlp(embed_dims, *hidden, entries) for _ in range(num_layers))
-        self.metainfo: dict[str, float] = {}  # of all predictions
 
     def by_point(self, entries: Tensor) -> Tensor:
         """Sort entries of states by point, at least float32. (..., Q, n * D) -> (..., Q * n, D)"""

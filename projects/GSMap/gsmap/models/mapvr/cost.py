@@ -6,9 +6,9 @@ import torch
 from mmdet3d.registry import TASK_UTILS
 from torch import Tensor
 
-from gsmap.models.maptr.matching import MapCost
-from gsmap.models.maptr.pairs import BuiltHead, SampleView
-from gsmap.models.maptr.parts import WEIGHT, weights_of
+from gsmap.models.base.matching import MapCost
+from gsmap.models.base.pairs import BuiltHead, SampleView
+from gsmap.models.base.parts import WEIGHT, weights_of
 from gsmap.models.mapvr.losses import ElementRenderer
 from gsmap.ops.soft_iou import pairwise_dice_loss
 

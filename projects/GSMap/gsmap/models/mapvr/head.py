@@ -5,11 +5,11 @@ from typing import Any
 
 from mmdet3d.registry import MODELS, TASK_UTILS
 
-from gsmap.models.maptr.head import MapHead
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.masks import ElementMasks
+from gsmap.models.base.parts import DEFAULTS, PARTS, brought, class_of, with_points_weight
+from gsmap.models.maptr.cost import OrderedPointsCost
 from gsmap.models.maptr.losses import DirectionLoss, PointsLoss
-from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.matching import OrderedPointsCost
-from gsmap.models.maptr.parts import DEFAULTS, PARTS, brought, class_of, with_points_weight
 from gsmap.models.mapvr.cost import RenderedDiceCost
 from gsmap.models.mapvr.losses import RenderedDiceLoss, SelfDirectionLoss
 from gsmap.structures.classes import AREA_CLASSES

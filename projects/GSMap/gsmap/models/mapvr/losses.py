@@ -7,9 +7,10 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.maptr.losses import MapLoss, turns
-from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
-from gsmap.models.maptr.parts import WEIGHT, check_classes
+from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.pairs import BuiltHead, MatchedPairs
+from gsmap.models.base.parts import WEIGHT, check_classes
+from gsmap.models.maptr.losses import turns
 from gsmap.ops.polyline_raster import DISTANCES, soft_rasters
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import constant

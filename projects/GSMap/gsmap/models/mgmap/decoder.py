@@ -8,8 +8,9 @@ from mmdet3d.registry import MODELS
 from mmengine.model import ModuleList
 from torch import Tensor, nn
 
-from gsmap.models.maptr.attention import MultiLevelAttention, mask_of_points
-from gsmap.models.maptr.decoder import Decoded, MapDecoder, Refine
+from gsmap.models.base.attention import MultiLevelAttention
+from gsmap.models.base.decoder import Decoded, MapDecoder, Refine
+from gsmap.models.maptr.self_attention import mask_of_points
 from gsmap.models.mgmap.neck import EnhancedNeck
 from gsmap.models.mgmap.refinement import (
     BINS,

@@ -8,8 +8,8 @@ from mmdet.models.losses.dice_loss import dice_loss
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
+from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.pairs import BuiltHead, MatchedPairs
 from gsmap.models.mgmap.decoder import MaskedDecoded, MGMapDecoder, RefinedDecoded
 from gsmap.structures.tensors import check_same_shape, constant
 

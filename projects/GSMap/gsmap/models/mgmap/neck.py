@@ -6,7 +6,7 @@ import torch
 from mmdet.models.backbones.resnet import BasicBlock
 from torch import Tensor, nn
 
-from gsmap.models.maptr.layers import enlarged, resnet_stages
+from gsmap.models.base.layers import enlarged, resnet_stages
 
 
 class Gates(nn.Module):

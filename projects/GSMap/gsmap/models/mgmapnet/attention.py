@@ -8,8 +8,8 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.maptr.attention import SamplingAttention, place_samples
-from gsmap.models.maptr.layers import feed_forward, mlp
+from gsmap.models.base.attention import SamplingAttention, place_samples
+from gsmap.models.base.layers import feed_forward, mlp
 from gsmap.ops.deformable_sampling import deformable_sample
 from gsmap.structures.tensors import at_least_float32
 

@@ -7,8 +7,8 @@ from typing import Any
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.maptr.decoder import Decoded, MapDecoder, MapDecoderLayer
-from gsmap.models.maptr.layers import feed_forward, mlp
+from gsmap.models.base.decoder import Decoded, MapDecoder, MapDecoderLayer
+from gsmap.models.base.layers import feed_forward, mlp
 from gsmap.models.mgmapnet.attention import Granularities
 from gsmap.models.mgmapnet.bev_pyramid import BEVPyramid
 

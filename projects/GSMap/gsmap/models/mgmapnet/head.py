@@ -7,10 +7,10 @@ from typing import Any
 from mmdet3d.registry import MODELS
 from mmengine.logging import print_log
 
-from gsmap.models.maptr.attention import BEVDeformableAttention
-from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.parts import DEFAULTS, PARTS, brought, class_of
+from gsmap.models.base.attention import BEVDeformableAttention
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.masks import ElementMasks
+from gsmap.models.base.parts import DEFAULTS, PARTS, brought, class_of
 from gsmap.models.maptrv2.attention import DecoupledSelfAttention
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder, MGMapNetDecoderLayer
 from gsmap.models.mgmapnet.losses import InstanceMaskLoss, SamplingLocationLoss

@@ -7,9 +7,9 @@ import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.maptr.layers import mlp
-from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.pairs import BuiltHead, MatchedPairs
+from gsmap.models.base.layers import mlp
+from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.pairs import BuiltHead, MatchedPairs
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoded, MGMapNetDecoder
 from gsmap.ops.soft_iou import dice_loss
 from gsmap.structures.tensors import check_same_shape

@@ -8,11 +8,11 @@ import torch.nn.functional as F
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.models.base.attention import MultiLevelAttention
+from gsmap.models.base.layers import feed_forward, init_matrices
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import project_pillars
 from gsmap.models.lines.front import centres, front_size, turned
-from gsmap.models.maptr.attention import MultiLevelAttention
-from gsmap.models.maptr.layers import feed_forward, init_matrices
 from gsmap.structures.grid import BEVGrid
 
 Shapes = Sequence[tuple[int, int]]

@@ -10,11 +10,12 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from torch import Tensor, nn
 
+from gsmap.models.base.coder import Tensors
+from gsmap.models.base.layers import mlp
+from gsmap.models.base.parts import PARTS
+from gsmap.models.base.references import Reference
 from gsmap.models.lines.decoder import ClassLines
 from gsmap.models.lines.head import LineHead, LinePredictions, class_scores
-from gsmap.models.maptr.coder import Reference, Tensors
-from gsmap.models.maptr.layers import mlp
-from gsmap.models.maptr.parts import PARTS
 from gsmap.models.pivotnet.losses import PIVOT, Lines, PivotLosses, TrueLines
 from gsmap.structures.grid import BEVGrid
 

@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsmap.models.base.matching import assigned
 from gsmap.models.lines.losses import Case, LineLosses
-from gsmap.models.maptr.matching import assigned
 from gsmap.models.pivotnet.matching import match_pivots, sequence_costs
 from gsmap.structures.tensors import constant
 

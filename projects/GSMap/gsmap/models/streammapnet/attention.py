@@ -4,7 +4,7 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.maptr.attention import BEVDeformableAttention
+from gsmap.models.base.attention import BEVDeformableAttention
 from gsmap.structures.tensors import constant
 
 

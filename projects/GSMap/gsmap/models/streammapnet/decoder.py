@@ -7,7 +7,7 @@ from mmdet.models.layers import SinePositionalEncoding
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.maptr.decoder import Decoded, MapDecoder, MapDecoderLayer
+from gsmap.models.base.decoder import Decoded, MapDecoder, MapDecoderLayer
 
 
 @MODELS.register_module()

@@ -8,9 +8,9 @@ from typing import Any
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
-from gsmap.models.maptr.coder import Detections, MapCoder
-from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.parts import PARTS
+from gsmap.models.base.coder import Detections, MapCoder
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.parts import PARTS
 from gsmap.models.streammapnet.decoder import StreamMapNetDecoder
 from gsmap.models.streammapnet.reference import LineReference
 

@@ -6,10 +6,10 @@ import torch.nn.functional as F
 from mmdet3d.registry import MODELS, TASK_UTILS
 from torch import Tensor
 
-from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.matching import OrderedPointsCost
-from gsmap.models.maptr.pairs import MatchedPairs, SampleView
-from gsmap.models.maptr.parts import weights_of
+from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.pairs import MatchedPairs, SampleView
+from gsmap.models.base.parts import weights_of
+from gsmap.models.maptr.cost import OrderedPointsCost
 from gsmap.structures.tensors import check_same_shape
 
 

@@ -9,7 +9,7 @@ from mmdet3d.registry import MODELS
 from mmengine.structures import InstanceData
 from torch import Tensor
 
-from gsmap.models.maptr.head import MapHead
+from gsmap.models.base.head import MapHead
 from gsmap.structures.gaussians import Gaussians, moved_gaussians
 from gsmap.structures.line_update import seen_again
 from gsmap.structures.past import Past

@@ -11,7 +11,7 @@ from mmengine.model import BaseModule
 from mmengine.structures import InstanceData
 from torch import Tensor
 
-from gsmap.models.maptr.head import MapHead
+from gsmap.models.base.head import MapHead
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.element_memory import PREFIX, ElementMemory
 from gsmap.models.streams.query_memory import Propagation, QueryMemory

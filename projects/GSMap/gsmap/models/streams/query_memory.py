@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from gsmap.checkpoints.strict import AddsWeights
-from gsmap.models.maptr.decoder import Queries
-from gsmap.models.maptr.head import MapHead
-from gsmap.models.maptr.pairs import MatchedPairs
+from gsmap.models.base.decoder import Queries
+from gsmap.models.base.head import MapHead
+from gsmap.models.base.pairs import MatchedPairs
 from gsmap.structures.past import Past
 
 _POSE = 12  # the first three rows of a motion

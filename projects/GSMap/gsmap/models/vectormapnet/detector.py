@@ -13,11 +13,12 @@ from mmengine.model import bias_init_with_prob
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
-from gsmap.models.maptr.attention import BEVDeformableAttention
-from gsmap.models.maptr.coder import DetectionHead, MapCoder, Reference, Samples, Tensors
-from gsmap.models.maptr.layers import classification_branch, feed_forward, init_matrices
-from gsmap.models.maptr.matching import assigned
-from gsmap.models.maptr.parts import PARTS
+from gsmap.models.base.attention import BEVDeformableAttention
+from gsmap.models.base.coder import DetectionHead, MapCoder, Samples, Tensors
+from gsmap.models.base.layers import classification_branch, feed_forward, init_matrices
+from gsmap.models.base.matching import assigned
+from gsmap.models.base.parts import PARTS
+from gsmap.models.base.references import Reference
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
@@ -123,7 +124,7 @@ class KeyPointHead(DetectionHead):
     ) -> None:
         super().__init__(init_cfg)
         self.grid, self.classes = grid, tuple(classes)
-        self.reference = KeyPointReference(Canvas(grid, **(canvas or {})))
+        self.reference: KeyPointReference = KeyPointReference(Canvas(grid, **(canvas or {})))
         choice: PARTS = {"max_num": 35, "margin_m": None, **(coder or {})}
         self.coder = MapCoder(grid, **choice)
         if self.coder.unfold_classes or self.coder.sigma_power:

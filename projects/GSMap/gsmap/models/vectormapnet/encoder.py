@@ -10,9 +10,9 @@ from mmdet.models.backbones.resnet import BasicBlock
 from mmdet3d.registry import MODELS
 from torch import Tensor, nn
 
+from gsmap.models.base.layers import enlarged, resnet_stages
 from gsmap.models.encoders.camera_encoder import CameraEncoder
 from gsmap.models.encoders.projection import PillarProjection, project_pillars
-from gsmap.models.maptr.layers import enlarged, resnet_stages
 from gsmap.structures.grid import BEVGrid
 
 

@@ -7,7 +7,7 @@ import torch
 from mmengine.model import BaseModule
 from torch import Tensor, nn
 
-from gsmap.models.maptr.layers import init_matrices
+from gsmap.models.base.layers import init_matrices
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.detector import CodedMap
 from gsmap.models.vectormapnet.layers import Cache, GatedLayer, joined, most_likely

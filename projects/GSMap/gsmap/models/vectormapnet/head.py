@@ -8,8 +8,8 @@ from mmdet3d.registry import MODELS
 from mmengine.structures import InstanceData
 from torch import Tensor
 
-from gsmap.models.maptr.coder import DetectionHead, Samples, Tensors
-from gsmap.models.maptr.parts import PARTS
+from gsmap.models.base.coder import DetectionHead, Samples, Tensors
+from gsmap.models.base.parts import PARTS
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.detector import KeyPointHead, targets_of
 from gsmap.models.vectormapnet.generator import Elements, PolylineGenerator

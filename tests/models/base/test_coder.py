@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from gsmap.models.maptr.coder import MapCoder
+from gsmap.models.base.coder import MapCoder
 from gsmap.structures.grid import BEVGrid
 
 GRID = BEVGrid((-15, 15), (-30, 30))

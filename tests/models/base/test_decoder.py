@@ -2,7 +2,7 @@ import pytest
 import torch
 
 import gsmap.registered  # noqa: F401
-from gsmap.models.maptr.decoder import MapDecoder, MapDecoderLayer
+from gsmap.models.base.decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.maptr.references import refine_reference
 
 SIZES = {"embed_dims": 8, "num_heads": 2, "num_points": 1, "ffn_dims": 16}

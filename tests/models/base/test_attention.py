@@ -2,7 +2,7 @@ import pytest
 import torch
 from mmcv.ops.multi_scale_deform_attn import multi_scale_deformable_attn_pytorch
 
-from gsmap.models.maptr.attention import BEVDeformableAttention, directional_offsets, place_samples
+from gsmap.models.base.attention import BEVDeformableAttention, directional_offsets, place_samples
 
 SHAPE = (5, 7)  # rows, columns
 

@@ -15,14 +15,14 @@ from mmengine.model import bias_init_with_prob
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
-from gsmap.models.maptr.coder import DetectionHead, MapCoder, Metas, Samples, Tensors
-from gsmap.models.maptr.decoder import Decoded, MapDecoder
-from gsmap.models.maptr.layers import classification_branch, init_matrices
-from gsmap.models.maptr.losses import MapLoss
-from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.matching import MapAssigner, MapCost
-from gsmap.models.maptr.pairs import GroundTruth, MatchedPairs, Predictions
-from gsmap.models.maptr.parts import (
+from gsmap.models.base.coder import DetectionHead, MapCoder, Metas, Samples, Tensors
+from gsmap.models.base.decoder import Decoded, MapDecoder
+from gsmap.models.base.layers import classification_branch, init_matrices
+from gsmap.models.base.losses import MapLoss
+from gsmap.models.base.masks import ElementMasks
+from gsmap.models.base.matching import MapAssigner, MapCost
+from gsmap.models.base.pairs import GroundTruth, MatchedPairs, Predictions
+from gsmap.models.base.parts import (
     PARTS,
     AuxHead,
     by_name,
@@ -31,7 +31,7 @@ from gsmap.models.maptr.parts import (
     class_of,
     refuse_twins,
 )
-from gsmap.models.maptr.references import PointReference
+from gsmap.models.base.references import RefinedReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 
@@ -129,7 +129,7 @@ class MapHead(DetectionHead):
         moves_instances = issubclass(kind, MapDecoder) and kind.moves_instances
         points_per_state = num_points if moves_instances else 1
         point = {"type": "PointReference", "grid": grid, "points_per_state": points_per_state}
-        self.reference: PointReference = MODELS.build({**point, **shared, **(reference or {})})
+        self.reference: RefinedReference = MODELS.build({**point, **shared, **(reference or {})})
         handed_on = {"num_points": num_points, "space": self.reference.space}
         self.decoder: MapDecoder = MODELS.build(
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
@@ -169,7 +169,7 @@ class MapHead(DetectionHead):
             if not isinstance(loss, MapLoss):
                 raise TypeError(
                     f"{type(loss).__name__} is no MapLoss: derive it from "
-                    "gsmap.models.maptr.losses.MapLoss (docs/add_a_method.md)."
+                    "gsmap.models.base.losses.MapLoss (docs/add_a_method.md)."
                 )
         names = ["cls", *self.losses]
         refuse_twins([*names, *self.aux_heads], "losses")

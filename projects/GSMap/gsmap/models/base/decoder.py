@@ -9,7 +9,7 @@ from mmdet3d.registry import MODELS
 from mmengine.model import BaseModule, ModuleList
 from torch import Tensor, nn
 
-from gsmap.models.maptr.layers import feed_forward
+from gsmap.models.base.layers import feed_forward
 from gsmap.structures.gaussians import GaussianSpace
 
 Refine = Callable[[int, Tensor, Tensor], Tensor]  # layer, point states, reference -> reference

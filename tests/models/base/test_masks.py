@@ -11,8 +11,8 @@ from predictions import pairs_of
 import gsmap.registered  # noqa: F401
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.map_targets import map_targets
+from gsmap.models.base.masks import ElementMasks
 from gsmap.models.gsmap.losses import RasterLoss
-from gsmap.models.maptr.masks import ElementMasks
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import GaussianSpace, gaussians_along
 from gsmap.structures.grid import BEVGrid

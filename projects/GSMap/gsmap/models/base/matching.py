@@ -1,4 +1,4 @@
-"""Assignment of predictions to annotated map elements, and MapTR's cost of points."""
+"""Assignment of predictions to annotated map elements."""
 
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -11,8 +11,8 @@ from mmdet3d.registry import TASK_UTILS
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from gsmap.models.maptr.pairs import BuiltHead, GroundTruth, MapMatches, Predictions, SampleView
-from gsmap.models.maptr.parts import WEIGHT, weights_of
+from gsmap.models.base.pairs import BuiltHead, GroundTruth, MapMatches, Predictions, SampleView
+from gsmap.models.base.parts import WEIGHT
 from gsmap.structures.tensors import uploaded
 
 
@@ -32,8 +32,8 @@ class MapAssigner:
             raise ValueError("match_costs must hold at least one cost.")
         self.match_costs = [TASK_UTILS.build(cost) for cost in match_costs]
         self.names = [type(cost).__name__ for cost in self.match_costs]
-        of_points = (cost for cost in self.match_costs if isinstance(cost, OrderedPointsCost))
-        self.between_points = next(of_points, OrderedPointsCost()).between_points
+        of_points = (cost for cost in self.match_costs if isinstance(cost, PointsCost))
+        self.between_points = next(of_points, PointsCost()).between_points
 
     @torch.no_grad()
     def assign(
@@ -190,40 +190,9 @@ class MapCost:
         raise NotImplementedError
 
 
-def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
-    """Return the summed L1 distance of every prediction to every order of every ground truth.
-
-    ValueError if the numbers of points differ. (N, P, 2), (K, S, P, 2) -> (N, K, S)
-    """
-    if pts.shape[-2:] != pts_shifts.shape[-2:]:
-        raise ValueError(
-            f"predictions of {tuple(pts.shape[-2:])} points and ground truth of "
-            f"{tuple(pts_shifts.shape[-2:])} do not fit: set the same number of points in the head "
-            "and in the pipeline."
-        )
-    num_gts, num_orders = pts_shifts.shape[:2]
-    distances = torch.cdist(pts.flatten(1), pts_shifts.flatten(0, 1).flatten(1), p=1)
-    return distances.view(len(pts), num_gts, num_orders)
-
-
-@TASK_UTILS.register_module()
-class OrderedPointsCost(MapCost):
-    """L1 distance to the closest equivalent point order (MapTR Eq. 5).
-
-    Args:
-        weight: Weight of the cost.
-    """
-
-    def __init__(self, weight: WEIGHT = 5.0) -> None:
-        super().__init__(weight)
+class PointsCost(MapCost):
+    """A matching cost of points, whose distance also chooses the point order of a matched pair."""
 
     def between_points(self, pts: Tensor, targets: Tensor) -> Tensor:
-        """Return the distance of each coordinate, which also chooses the order of a pair."""
+        """Return the distance of each coordinate. 2 x (..., P, 2 or 3) -> (..., P, 2 or 3)"""
         return (pts - targets).abs()
-
-    def __call__(
-        self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
-    ) -> Tensor:
-        """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
-        distances = order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1)
-        return distances * weights_of(self.weight, gt_instances.labels)

@@ -4,9 +4,9 @@ import pytest
 import torch
 from mmengine.structures import InstanceData
 
-from gsmap.models.maptr.decoder import Decoded
-from gsmap.models.maptr.matching import MapAssigner
-from gsmap.models.maptr.pairs import GroundTruth, Predictions
+from gsmap.models.base.decoder import Decoded
+from gsmap.models.base.matching import MapAssigner
+from gsmap.models.base.pairs import GroundTruth, Predictions
 
 LINE = torch.tensor([[0.1, 0.1], [0.2, 0.1], [0.3, 0.1]])
 NORMALISED = SimpleNamespace(coords=2, norm=lambda points: points)  # a reference

@@ -1,7 +1,6 @@
 """From class scores and points of all queries to the best detections."""
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -10,6 +9,7 @@ from mmengine.model import BaseModule
 from mmengine.structures import InstanceData
 from torch import Tensor
 
+from gsmap.models.base.references import Reference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import shortest_orders
 from gsmap.structures.tensors import constant
@@ -26,22 +26,6 @@ class Detections(NamedTuple):
     scores: Tensor  # confidence in [0, 1]
     labels: Tensor  # class index
     query_inds: Tensor  # the query of each; one may appear with several classes
-
-
-class Reference:
-    """How references of predictions stand for points.
-
-    Attributes:
-        outputs: What `decode` returns.
-        metainfo: What is said of all predictions.
-    """
-
-    outputs: tuple[str, ...] = ("pts",)
-    metainfo: Mapping[str, Any] = MappingProxyType({})
-
-    def decode(self, references: Tensor) -> Tensors:
-        """Return ``pts`` in metres (N, P, 2 or 3), and what else `outputs` names. (N, ...)"""
-        raise NotImplementedError
 
 
 class MapCoder:
@@ -144,14 +128,14 @@ class DetectionHead(BaseModule, NeedsTargets):
     """What every head shares: detections of its last layer.
 
     Attributes:
-        reference: How references of predictions stand for points (`Reference`, `PointReference`).
+        reference: How references of predictions stand for points.
         coder: The choice of detections.
         not_exported: Why there is no ONNX file of the head; empty if there is one.
     """
 
     not_exported: str = ""
 
-    reference: Any
+    reference: Reference
     coder: MapCoder
 
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:

@@ -9,16 +9,16 @@ import torch
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
-from gsmap.models.maptr.decoder import Decoded, JoinedDecoded, MapDecoder
-from gsmap.models.maptr.masks import ElementMasks
-from gsmap.models.maptr.references import PointReference
+from gsmap.models.base.decoder import Decoded, JoinedDecoded, MapDecoder
+from gsmap.models.base.masks import ElementMasks
+from gsmap.models.base.references import RefinedReference
 
 
 class BuiltHead(Protocol):
     """What a cost or a loss may ask of the head that it belongs to, once that is built."""
 
     classes: tuple[str, ...]
-    reference: PointReference
+    reference: RefinedReference
     decoder: MapDecoder
     instance_embedding: nn.Embedding
 
@@ -45,7 +45,7 @@ class Predictions:
         scores: Tensor,
         decoded: Decoded,
         bev_feats: Tensor,
-        reference: PointReference,
+        reference: RefinedReference,
         masks: ElementMasks,
     ) -> None:
         self.scores, self.decoded, self.bev_feats = scores, decoded, bev_feats
@@ -103,7 +103,7 @@ class GroundTruth:
     """
 
     def __init__(
-        self, instances: Sequence[InstanceData], reference: PointReference, masks: ElementMasks
+        self, instances: Sequence[InstanceData], reference: RefinedReference, masks: ElementMasks
     ) -> None:
         self._instances, self._reference, self._drawing = instances, reference, masks
         self.counts = [len(sample.labels_3d) for sample in instances]

@@ -7,8 +7,8 @@ from mmengine.structures import InstanceData
 from model_cases import build_small, small_config, straight_elements
 from predictions import predicted, stacked
 
-from gsmap.models.maptr.decoder import Decoded
-from gsmap.models.maptr.losses import MapLoss
+from gsmap.models.base.decoder import Decoded
+from gsmap.models.base.losses import MapLoss
 
 LINE = ((-6.0, -12.0), (6.0, 12.0))
 NUM = 8  # queries

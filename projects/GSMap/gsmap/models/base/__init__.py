@@ -1,0 +1,1 @@
+"""The frame of all map heads: queries, decoder, matching, losses, detections."""

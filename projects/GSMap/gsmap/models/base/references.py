@@ -1,0 +1,71 @@
+"""What references of predictions stand for, and what a head asks of those that layers refine."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from torch import Tensor
+
+from gsmap.structures.gaussians import GaussianSpace
+from gsmap.structures.grid import BEVGrid
+
+
+class Reference:
+    """How references of predictions stand for points.
+
+    Attributes:
+        outputs: What `decode` returns.
+        metainfo: What is said of all predictions.
+    """
+
+    outputs: tuple[str, ...] = ("pts",)
+    metainfo: Mapping[str, Any] = MappingProxyType({})
+
+    def decode(self, references: Tensor) -> dict[str, Tensor]:
+        """Return ``pts`` in metres (N, P, 2 or 3), and what else `outputs` names. (N, ...)"""
+        raise NotImplementedError
+
+
+class RefinedReference(Reference):
+    """References that decoder layers refine, one per point query.
+
+    Attributes:
+        coords: Number of coordinates of a point, the first entries of a reference: 2 or 3.
+        space: How a reference stands for a Gaussian, None for points.
+    """
+
+    coords: int
+    space: GaussianSpace | None = None
+
+    def start(self, query_pos: Tensor) -> Tensor:
+        """Return the reference that the first layer starts from. (..., Q, C) -> (..., Q * n, D)"""
+        raise NotImplementedError
+
+    def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
+        """Return the reference after a layer. (..., Q, C), (..., Q * n, D) -> (..., Q * n, D)"""
+        raise NotImplementedError
+
+    def metres(self, points: Tensor) -> Tensor:
+        """Bring normalised points to metres. (..., coords) -> (..., coords)"""
+        raise NotImplementedError
+
+    def norm(self, points_m: Tensor) -> Tensor:
+        """Bring points in metres to [0, 1] over the map. (..., coords) -> (..., coords)"""
+        raise NotImplementedError
+
+    def moved(self, references: Tensor, motion: Tensor) -> Tensor:
+        """Return references of an earlier frame as they lie now. (B, ..., D) -> (B, ..., D)
+
+        Args:
+            references: References of the earlier frame. (B, ..., D)
+            motion: Takes metres then to metres now. (B, 4, 4)
+        """
+        raise NotImplementedError
+
+    def moved_points(self, points: Tensor, motion: Tensor) -> Tensor:
+        """Return normalised points (B, ..., coords) after a motion (B, 4, 4), put onto the map."""
+        raise NotImplementedError
+
+    def render(self, references: Tensor, grid: BEVGrid) -> Tensor:
+        """Return rendered masks of what has an extent. (..., P, D) -> (..., H, W)"""
+        raise NotImplementedError

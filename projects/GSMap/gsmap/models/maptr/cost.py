@@ -1,0 +1,46 @@
+"""MapTR's matching cost of points."""
+
+from typing import Any
+
+import torch
+from mmdet3d.registry import TASK_UTILS
+from torch import Tensor
+
+from gsmap.models.base.matching import PointsCost
+from gsmap.models.base.pairs import SampleView
+from gsmap.models.base.parts import WEIGHT, weights_of
+
+
+def order_distances(pts: Tensor, pts_shifts: Tensor) -> Tensor:
+    """Return the summed L1 distance of every prediction to every order of every ground truth.
+
+    ValueError if the numbers of points differ. (N, P, 2), (K, S, P, 2) -> (N, K, S)
+    """
+    if pts.shape[-2:] != pts_shifts.shape[-2:]:
+        raise ValueError(
+            f"predictions of {tuple(pts.shape[-2:])} points and ground truth of "
+            f"{tuple(pts_shifts.shape[-2:])} do not fit: set the same number of points in the head "
+            "and in the pipeline."
+        )
+    num_gts, num_orders = pts_shifts.shape[:2]
+    distances = torch.cdist(pts.flatten(1), pts_shifts.flatten(0, 1).flatten(1), p=1)
+    return distances.view(len(pts), num_gts, num_orders)
+
+
+@TASK_UTILS.register_module()
+class OrderedPointsCost(PointsCost):
+    """L1 distance to the closest equivalent point order (MapTR Eq. 5).
+
+    Args:
+        weight: Weight of the cost.
+    """
+
+    def __init__(self, weight: WEIGHT = 5.0) -> None:
+        super().__init__(weight)
+
+    def __call__(
+        self, pred_instances: SampleView, gt_instances: SampleView, img_meta: Any = None
+    ) -> Tensor:
+        """Compare normalised ``pts`` (N, P, 2) with ``pts_shifts`` (K, S, P, 2). (N, K)"""
+        distances = order_distances(pred_instances.pts, gt_instances.pts_shifts).amin(-1)
+        return distances * weights_of(self.weight, gt_instances.labels)

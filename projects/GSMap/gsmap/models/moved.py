@@ -1,0 +1,42 @@
+"""Former names of modules, for configs and code outside this repository."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_loader
+from types import MappingProxyType, ModuleType
+
+_MAPTR, _BASE = "gsmap.models.maptr", "gsmap.models.base"
+_WHOLE = ("coder", "decoder", "head", "layers", "masks", "pairs", "parts")
+
+# former name -> the modules that hold its contents now
+MOVED: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        **{f"{_MAPTR}.{name}": (f"{_BASE}.{name}",) for name in _WHOLE},
+        f"{_MAPTR}.attention": (f"{_BASE}.attention", f"{_MAPTR}.self_attention"),
+        f"{_MAPTR}.matching": (f"{_BASE}.matching", f"{_MAPTR}.cost"),
+    }
+)
+
+
+class MovedModules(MetaPathFinder, Loader):
+    """Import a module by its former name: it holds the contents of its successors."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return a spec for the former name of a module, else None."""
+        return spec_from_loader(fullname, self) if fullname in MOVED else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Fill a module with the contents of its successors, which register their classes."""
+        for name in MOVED[module.__name__]:
+            contents = vars(import_module(name))
+            vars(module).update({k: v for k, v in contents.items() if not k.startswith("__")})
+
+
+def install() -> None:
+    """Let Python find modules by their former names, after all others."""
+    sys.meta_path.append(MovedModules())
