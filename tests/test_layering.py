@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from gsmap.methods import METHODS
+
 REPO = Path(__file__).resolve().parents[1]
 ROOTS = {
     "gsmap": REPO / "projects/GSMap/gsmap",
@@ -40,32 +42,17 @@ ALLOWED = {
         "visualization",
     },
 }  # fmt: skip
-# folder of models -> the folders of models that it may import; "" is detector.py
-MODELS = {
+# folder of models that is no method -> the folders of models that it may import; "" is detector.py
+COMMON = {
     "base": set(),
     "encoders": {"base"},
     "streams": {"base"},
     "lines": {"base"},
     "": {"encoders", "streams"},
-    "maptr": {"base"},
-    "maptrv2": {"base", "encoders"},
-    "mapvr": {"base", "encoders", "maptr"},
-    "gemap": {"base", "encoders"},
-    "mgmapnet": {"base", "encoders", "maptrv2"},  # its mask heads are MapTRv2's
-    "hdmapnet": {"base", "encoders"},
-    "mapqr": {"base", "encoders"},
-    "mgmap": {"base", "encoders", "maptr"},
-    "pivotnet": {"base", "encoders", "lines"},
-    "bemapnet": {"base", "encoders", "lines"},
-    "streammapnet": {"base", "encoders", "maptr"},
-    "vectormapnet": {"base", "encoders"},
-    "gsmap": {"base", "encoders", "maptr", "streams"},
 }
-# what the others are built on stays
-METHODS = (
-    "maptrv2", "mapvr", "gemap", "mgmapnet", "mapqr", "mgmap", "hdmapnet", "pivotnet", "bemapnet",
-    "streammapnet", "vectormapnet", "gsmap",
-)  # fmt: skip
+MODELS = COMMON | {
+    method.name: {*method.built_on, "base", "encoders", "lines", "streams"} for method in METHODS
+}
 FREE_OF_OPENMMLAB = ("structures", "ops", "utils", "minicity", "evaluation")
 
 
@@ -168,35 +155,8 @@ def test_every_folder_of_models_has_its_arrows():
     }
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_method_is_deleted_with_its_folder_its_configs_and_its_tests(method: str):
-    """What is left imports nothing of it, and names none of its classes in the code of models."""
-    registered = [
-        node.name
-        for path in (ROOTS["gsmap"] / "models" / method).glob("*.py")
-        for node in ast.parse(path.read_text()).body
-        if isinstance(node, ast.ClassDef) and node.decorator_list
-    ]
-    assert registered
-    own = {method, *(name for name, below in MODELS.items() if method in below)}
-    for root in ROOTS.values():
-        for path in sorted(root.rglob("*.py")):
-            folder = path.parent.name if path.parent.parent.name == "models" else path.parent
-            if folder in own:
-                continue
-            where = path.relative_to(REPO)
-            assert method not in model_folders(path), where
-            if ROOTS["gsmap"] / "models" in path.parents and path.stem != "__init__":
-                constants = [
-                    n.value
-                    for n in ast.walk(ast.parse(path.read_text()))
-                    if isinstance(n, ast.Constant)
-                ]
-                assert not set(registered) & set(map(str, constants)), where
-
-
-def test_every_module_of_a_listed_folder_is_registered():
-    """`registered.py` lists the folders of models; the detector and others stand beside them."""
-    text = (ROOTS["gsmap"] / "registered.py").read_text()
-    for name in MODELS:
-        assert (f'"gsmap.models.{name}"' if name else "gsmap.models.detector") in text
+def test_a_method_stands_after_those_that_it_is_built_on():
+    names = [method.name for method in METHODS]
+    assert len(set(names)) == len(names)
+    for place, method in enumerate(METHODS):
+        assert {*method.built_on} <= {*names[:place]}, method.name

@@ -24,7 +24,8 @@ from test_configs import LEAVES, REPO, annotations, load, on_minicity, shrink_im
 from test_docs_commands import PAGES, commands
 
 import gsmap.engine.launch
-from gsmap.checkpoints.hdmapnet_keys import HDMAPNET
+from gsmap.checkpoints.efficientnet_keys import efficientnet_rules
+from gsmap.checkpoints.key_rules import KeyMap
 from gsmap.checkpoints.published import WEIGHTS
 from gsmap.engine.run_log import MapRunner
 
@@ -67,8 +68,8 @@ def published_commands() -> list[list[str]]:
 def as_published(backbone: dict[str, Any], state: dict[str, torch.Tensor]) -> dict[str, Any]:
     """Return a backbone's weights in the names that their publisher gives them."""
     if backbone["type"] == "mmdet.EfficientNet":
-        theirs = {HDMAPNET.to_upstream(f"img_backbone.{key}"): v for key, v in state.items()}
-        return {str(key).removeprefix("camencode.trunk."): value for key, value in theirs.items()}
+        keys = KeyMap("efficientnet", efficientnet_rules("", ""))
+        return {str(keys.to_upstream(key)): value for key, value in state.items()}
     if backbone["type"] == "VoVNet":
         return {"model": {f"backbone.bottom_up.{key}": value for key, value in state.items()}}
     if backbone["type"] == "mmdet.SwinTransformer":

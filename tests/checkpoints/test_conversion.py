@@ -23,11 +23,12 @@ from gsmap.checkpoints.convert import (
     ours_from_upstream,
     upstream_from_ours,
 )
-from gsmap.checkpoints.key_map import KEY_MAPS, MAPTR, MAPTR_BEVFORMER, find_key_map
+from gsmap.checkpoints.key_map import find_key_map, key_maps
 from gsmap.checkpoints.reading import load_weights, read_weights
 from gsmap.checkpoints.strict import AddsWeights, adapt_state, neutral_keys
 from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.uncertainty import ErrorReference
+from gsmap.models.maptr.keys import MAPTR, MAPTR_BEVFORMER
 from gsmap.structures.grid import BEVGrid
 
 REPO = Path(__file__).resolve().parents[2]
@@ -216,7 +217,7 @@ def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch,
 
 def test_every_unused_key_is_documented():
     text = (REPO / "docs/migration.md").read_text()
-    for key_map in KEY_MAPS:
+    for key_map in key_maps():
         for key in key_map.unused:
             named = key in text or key.endswith(tuple(_suffixes(text)))
             assert named or key.startswith(tuple(_parts_without_use(text))), key
@@ -258,10 +259,10 @@ def test_the_table_of_keys_in_the_docs_is_the_table_of_the_code():
         )
         known = [
             m
-            for m in KEY_MAPS
+            for m in key_maps()
             if m.name in ARCHITECTURES.get(architectures, {architectures.lower()})
         ]
         assert {key_map.to_ours(upstream) for key_map in known} == {ours}, upstream
     shown = {(upstream.rstrip("*"), (ours or upstream).rstrip("*")) for _, upstream, ours in rows}
-    rules = {rule for key_map in KEY_MAPS if key_map.name in ALL for rule in key_map.rules}
+    rules = {rule for key_map in key_maps() if key_map.name in ALL for rule in key_map.rules}
     assert {tuple(part.replace("{i}", "N") for part in rule) for rule in rules} == shown

@@ -19,21 +19,9 @@ from mmengine.registry import init_default_scope
 from torch import Tensor
 
 from gsmap import registered  # noqa: F401
-from gsmap.checkpoints.line_keys import BEMAPNET, PIVOTNET
-from gsmap.checkpoints.vectormapnet_keys import VECTORMAPNET
+from gsmap.checkpoints.key_map import key_maps
 
 NUM_CAMS = 6
-OWN_RECIPES = (  # of another scale
-    "bemapnet", "hdmapnet", "mapqr", "mgmap", "mgmapnet", "pivotnet", "streammapnet",
-    "vectormapnet",
-)  # fmt: skip
-# recipes without a state, which make what they are asked for, and values of what they do not make
-TENSOR_BY_TENSOR: dict[str, dict[str, Tensor | None]] = {
-    "bemapnet": {**BEMAPNET.unused, **PIVOTNET.unused},
-    "hdmapnet": {},
-    "pivotnet": PIVOTNET.unused,
-    "vectormapnet": VECTORMAPNET.unused,
-}
 
 
 @dataclass(eq=False)
@@ -55,13 +43,17 @@ class Golden:
     recipes: Path | None = None
     _models: dict[str, BaseModel] = field(default_factory=dict, repr=False)
 
+    def _file(self, name: str) -> Path:
+        """Return the file of a recipe, there or not."""
+        return (self.recipes or self.folder) / f"{name}.py"
+
     def _module(self, name: str) -> ModuleType:
         """Load a recipe.
 
         Raises:
             FileNotFoundError: If the folder has no such recipe.
         """
-        path = (self.recipes or self.folder) / f"{name}.py"
+        path = self._file(name)
         if not path.is_file():
             raise FileNotFoundError(f"no {path}: give the folder of the recipes with --recipes.")
         spec = importlib.util.spec_from_file_location(f"golden_{name}", path)
@@ -114,16 +106,17 @@ class Golden:
     def upstream_state(self, name: str) -> dict[str, Tensor]:
         """Return the upstream state that the recipe makes for a state list."""
         method = name.split("_")[0]
-        recipe = self.recipe(method) if method in OWN_RECIPES else self.weights
-        if method in TENSOR_BY_TENSOR:
-            state, settings = {}, TENSOR_BY_TENSOR[method]
-            for key, shape in self.state_shapes(name).items():
-                value = recipe.tensor(key, shape, self.seed)
-                made = settings[key] if value is None else torch.from_numpy(np.asarray(value))
-                state[key] = torch.zeros(shape) if made is None else made  # a setting of its own
-            return state
-        arrays = recipe.state(self.state_shapes(name), self.seed)
-        return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}
+        recipe = self.recipe(method) if self._file(f"{method}_recipe").is_file() else self.weights
+        if hasattr(recipe, "state"):
+            arrays = recipe.state(self.state_shapes(name), self.seed)
+            return {key: torch.from_numpy(np.asarray(value)) for key, value in arrays.items()}
+        (unused,) = (key_map.unused for key_map in key_maps() if key_map.name == method)
+        state = {}
+        for key, shape in self.state_shapes(name).items():
+            value = recipe.tensor(key, shape, self.seed)
+            made = unused[key] if value is None else torch.from_numpy(np.asarray(value))
+            state[key] = torch.zeros(shape) if made is None else made  # a setting of its own
+        return state
 
     def model(self, config: str, state_list: str) -> BaseModel:
         """Build a model, load the recipe's weights in upstream's format, and set it to eval.

@@ -19,26 +19,15 @@ import gsmap.models.data_preprocessor
 import gsmap.models.detector
 import gsmap.visualization.map_visualization_hook
 import gsmap.visualization.map_visualizer  # noqa: F401
+from gsmap.methods import METHODS
 
-FOLDERS = (  # every module of these is imported; a method comes and goes with its folder
+FOLDERS = (  # every module of these is imported, and of the methods' folders
     "gsmap.datasets.transforms",
     "gsmap.models.encoders",
     "gsmap.models.base",
-    "gsmap.models.maptr",
     "gsmap.models.streams",
     "gsmap.models.lines",
-    "gsmap.models.maptrv2",
-    "gsmap.models.mapvr",
-    "gsmap.models.gemap",
-    "gsmap.models.mgmapnet",
-    "gsmap.models.hdmapnet",
-    "gsmap.models.mapqr",
-    "gsmap.models.mgmap",
-    "gsmap.models.pivotnet",
-    "gsmap.models.bemapnet",
-    "gsmap.models.streammapnet",
-    "gsmap.models.vectormapnet",
-    "gsmap.models.gsmap",
+    *(f"gsmap.models.{method.name}" for method in METHODS),
 )
 
 for folder in FOLDERS:

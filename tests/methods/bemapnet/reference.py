@@ -15,9 +15,9 @@ from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 from torch import Tensor, nn
 
-from gsmap.checkpoints.line_keys import BEMAPNET
 from gsmap.models.bemapnet.encoder import BezierBEVEncoder
 from gsmap.models.bemapnet.head import BezierHead
+from gsmap.models.bemapnet.keys import BEMAPNET
 from gsmap.models.bemapnet.neck import BiFPN
 from gsmap.models.lines.decoder import PointLineDecoder
 from gsmap.models.lines.front import turned

@@ -9,8 +9,8 @@ from reference.maptr import decoded_rows, head_loss_rows, state_rows
 from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 
-from gsmap.checkpoints.key_map import GEMAP
 from gsmap.models.gemap.attention import GeometryDecoupledAttention
+from gsmap.models.gemap.keys import GEMAP
 from gsmap.models.gemap.losses import EuclideanLoss, euclidean_relation_loss, euclidean_shape_loss
 
 CONFIG = "gemap/gemap_simple_r50_24e.py"

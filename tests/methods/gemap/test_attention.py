@@ -7,8 +7,8 @@ import torch
 
 pytest.importorskip("mmdet3d")
 
-from gsmap.checkpoints.key_map import GEMAP
 from gsmap.models.gemap.attention import GeometryDecoupledAttention
+from gsmap.models.gemap.keys import GEMAP
 
 UPSTREAM = "pts_bbox_head.transformer.decoder.layers.0.attentions.0."
 OURS = "map_head.decoder.layers.0.self_attn."

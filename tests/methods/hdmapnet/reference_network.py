@@ -16,11 +16,11 @@ from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 from torch import Tensor
 
-from gsmap.checkpoints.hdmapnet_keys import HDMAPNET
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.models.base.layers import enlarged
 from gsmap.models.hdmapnet.decoder import LineMapDecoder, LineMaps
 from gsmap.models.hdmapnet.encoder import ViewTransformEncoder, sampled
+from gsmap.models.hdmapnet.keys import HDMAPNET
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.targets import MakeLineMaps
 from gsmap.structures.calibration import calibration_arrays

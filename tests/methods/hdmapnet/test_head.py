@@ -9,13 +9,13 @@ from mmengine.registry import init_default_scope
 import gsmap.registered  # noqa: F401
 from gsmap.apis.export import ExportedDetector
 from gsmap.checkpoints.convert import ours_from_upstream
-from gsmap.checkpoints.hdmapnet_keys import HDMAPNET
 from gsmap.checkpoints.key_map import find_key_map
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.models.hdmapnet.decoder import LineMaps
 from gsmap.models.hdmapnet.encoder import ViewTransformEncoder, sampled
 from gsmap.models.hdmapnet.head import HDMapNetHead
+from gsmap.models.hdmapnet.keys import HDMAPNET
 from gsmap.models.hdmapnet.layout import metres_from_pixels, pixels_from_metres, turned
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.targets import MakeLineMaps

@@ -24,11 +24,11 @@ from reference.report import (
 )
 from torch import Tensor, nn
 
-from gsmap.checkpoints.key_map import MAPQR
 from gsmap.models.base.attention import place_samples, sample_map
 from gsmap.models.base.head import MapHead
 from gsmap.models.mapqr.decoder import sine_code
 from gsmap.models.mapqr.encoder import HeightQueryEncoder
+from gsmap.models.mapqr.keys import MAPQR
 from gsmap.models.maptrv2.aux_heads import BEVMaskHead
 from gsmap.structures.grid import BEVGrid
 

@@ -2,7 +2,9 @@
 
 import pytest
 
-from gsmap.checkpoints.key_map import MAPQR, MAPTR, find_key_map
+from gsmap.checkpoints.key_map import find_key_map
+from gsmap.models.mapqr.keys import MAPQR
+from gsmap.models.maptr.keys import MAPTR
 
 TRANSFORMER = "pts_bbox_head.transformer."
 HEIGHTS = TRANSFORMER + "encoder.layers.2.attentions.1.height_offsets.bias"

@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from gsmap.checkpoints.convert import ours_from_upstream, upstream_from_ours
-from gsmap.checkpoints.key_map import MAPTR, MAPTRV2, find_key_map
+from gsmap.checkpoints.key_map import find_key_map
+from gsmap.models.maptr.keys import MAPTR
+from gsmap.models.maptrv2.keys import MAPTRV2
 
 LAYER = "pts_bbox_head.transformer.decoder.layers.3."
 OURS = "map_head.decoder.layers.3."

@@ -23,13 +23,13 @@ from reference.report import (
 from reference.targets import X_RANGE_M, Y_RANGE_M, gt_instances
 from torch import Tensor, nn
 
-from gsmap.checkpoints.key_map import MGMAP
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakeInstanceMasks
 from gsmap.models.base.decoder import Decoded
 from gsmap.models.base.head import MapHead
 from gsmap.models.base.pairs import Predictions
 from gsmap.models.mgmap.decoder import MaskedDecoded, RefinedDecoded
+from gsmap.models.mgmap.keys import MGMAP
 from gsmap.models.mgmap.refinement import BINS, patches_around
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.polylines import clip_to_box

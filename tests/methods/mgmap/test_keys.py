@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from gsmap.checkpoints.convert import ours_from_upstream
-from gsmap.checkpoints.key_map import MAPTR, MGMAP, find_key_map
+from gsmap.checkpoints.key_map import find_key_map
+from gsmap.models.maptr.keys import MAPTR
+from gsmap.models.mgmap.keys import MGMAP
 
 HEAD = "pts_bbox_head."
 MASKS = HEAD + "transformer.decoder.ins_conv.3.bias"

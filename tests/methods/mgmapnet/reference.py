@@ -12,9 +12,9 @@ from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 from torch import Tensor, nn
 
-from gsmap.checkpoints.key_map import MGMAPNET
 from gsmap.models.mgmapnet.attention import Granularities, MultiGranularityAttention
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
+from gsmap.models.mgmapnet.keys import MGMAPNET
 
 CONFIG = "mgmapnet/mgmapnet_r50_110e.py"
 STATE = "mgmapnet_state.json"

@@ -24,8 +24,8 @@ from reference.report import (
 )
 from torch import Tensor
 
-from gsmap.checkpoints.key_map import MGMAPNET
 from gsmap.models.base.head import MapHead
+from gsmap.models.mgmapnet.keys import MGMAPNET
 from gsmap.structures.grid import BEVGrid
 
 FURTHER = 24  # one-to-many queries of the training set

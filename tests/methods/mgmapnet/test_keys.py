@@ -2,7 +2,9 @@
 
 import pytest
 
-from gsmap.checkpoints.key_map import MAPTRV2, MGMAPNET, find_key_map
+from gsmap.checkpoints.key_map import find_key_map
+from gsmap.models.maptrv2.keys import MAPTRV2
+from gsmap.models.mgmapnet.keys import MGMAPNET
 
 TRANSFORMER = "pts_bbox_head.transformer."
 ATTENTION = TRANSFORMER + "decoder.layers.3.attentions.1."

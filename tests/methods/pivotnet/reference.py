@@ -14,11 +14,11 @@ from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 from torch import Tensor, nn
 
-from gsmap.checkpoints.line_keys import PIVOTNET
 from gsmap.models.lines.front import turned
 from gsmap.models.lines.head import LinePredictions
 from gsmap.models.pivotnet.encoder import PivotBEVEncoder
 from gsmap.models.pivotnet.head import PivotHead
+from gsmap.models.pivotnet.keys import PIVOTNET
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import BEVGrid
 

@@ -16,11 +16,11 @@ from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 from torch import Tensor, nn
 
-from gsmap.checkpoints.key_map import STREAMMAPNET
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.models.base.head import MapHead
 from gsmap.models.streammapnet.attention import LinePointAttention
+from gsmap.models.streammapnet.keys import STREAMMAPNET
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.memory import StreamMemory
 from gsmap.structures.grid import BEVGrid

@@ -13,12 +13,12 @@ from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 from torch import Tensor
 
-from gsmap.checkpoints.vectormapnet_keys import VECTORMAPNET
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.detector import KeyPointHead, KeyPointPredictions
 from gsmap.models.vectormapnet.generator import Elements
 from gsmap.models.vectormapnet.head import VectorMapNetHead
+from gsmap.models.vectormapnet.keys import VECTORMAPNET
 from gsmap.models.vectormapnet.targets import FormatPolylineTargets
 from gsmap.structures.calibration import calibration_arrays
 from gsmap.structures.grid import BEVGrid

@@ -22,9 +22,10 @@ class KeyMap:
         unused: Upstream keys without a counterpart, whatever the rules say, and what upstream
             expects there, for conversion back; None where only some of its models hold the key.
         markers: Pairs of key prefixes (upstream's, ours) that, all present, tell this architecture
-            from those after it in ``KEY_MAPS``.
+            from those of the methods that it is built on.
         idle: Pattern of further upstream keys without a counterpart, which conversion back leaves
             out.
+        sign: What some keys of its release begin with, and none of ours.
     """
 
     name: str
@@ -32,6 +33,7 @@ class KeyMap:
     unused: Mapping[str, Tensor | None] = field(default_factory=dict)
     markers: Rules = (("", ""),)
     idle: str = "(?!)"
+    sign: str = "pts_bbox_head."
 
     def is_marked(self, keys: Collection[str], upstream: bool) -> bool:
         """Return whether keys, upstream's or ours, tell this architecture."""

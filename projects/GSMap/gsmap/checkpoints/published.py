@@ -22,7 +22,8 @@ import torch
 from mmengine.logging import print_log
 from torch import Tensor
 
-from gsmap.checkpoints.hdmapnet_keys import HDMAPNET
+from gsmap.checkpoints.efficientnet_keys import efficientnet_rules, unused_classifier
+from gsmap.checkpoints.key_rules import KeyMap
 from gsmap.checkpoints.reading import refusing
 from gsmap.utils.files import atomic_write, file_name
 from gsmap.utils.shards import digest
@@ -32,7 +33,7 @@ SILENCE_S = 30.0  # a server that sends nothing for so long is given up
 LIMIT_S = 3600.0  # so is a download that takes longer
 _BLOCK_BYTES = 1 << 20
 _DIGEST = re.compile(r"-([0-9a-f]{8,64})(\.\w+)?\Z")  # torch's and OpenMMLab's file names
-_TRUNK, _BACKBONE = "camencode.trunk.", "img_backbone."  # of the rules for HDMapNet's EfficientNet
+_EFFICIENTNET = KeyMap("efficientnet", efficientnet_rules("", ""), unused_classifier(""))
 _DETECTRON = "backbone.bottom_up."
 _SWIN = re.compile(r"backbone\.((layers|patch_embed|norm\d)\..+)")
 
@@ -203,8 +204,8 @@ def in_our_names(checkpoint: Any) -> Any:
     elif isinstance(checkpoint.get("model"), Mapping):
         checkpoint = state = checkpoint["model"]
     if "_conv_stem.weight" in state:
-        renamed = {HDMAPNET.to_ours(_TRUNK + key): value for key, value in state.items()}
-        return {k.removeprefix(_BACKBONE): v for k, v in renamed.items() if k is not None}
+        renamed = {_EFFICIENTNET.to_ours(key): value for key, value in state.items()}
+        return {key: value for key, value in renamed.items() if key is not None}
     if any(str(key).startswith(_DETECTRON) for key in state):
         return _part_of(state, re.compile(re.escape(_DETECTRON) + "(.+)"))
     if any(str(key).startswith("backbone.layers.0.blocks.0.attn.") for key in state):

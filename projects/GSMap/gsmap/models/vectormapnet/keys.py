@@ -6,7 +6,7 @@ from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
 
 _ELEMENTS = "head.det_net."
 _ELEMENT_LAYER = "head.det_net.transformer.decoder.layers.{i}."
-LINES = "head.gen_net."
+_LINES = "head.gen_net."
 _PLANES = torch.meshgrid(
     torch.tensor((-1.1, 0.0, 0.5, 1.1)),
     torch.linspace(-15.0, 15.0, 100),
@@ -33,14 +33,14 @@ VECTORMAPNET = KeyMap(
             "pre_branches.cls.0.=cls_branch. pre_branches.reg.0.=corner_branch.",
         ),
         *rules_of(
-            LINES + "decoder.layers.{i}.",
+            _LINES + "decoder.layers.{i}.",
             "map_head.generator.layers.{i}.",
             "self_attn. multihead_attn.=cross_attn. linear1.=ffn.0. linear2.=ffn.3. "
             "norm1.=norms.0. norm2.=norms.1. norm3.=norms.2. "
             "res_weight1=gates.0 res_weight2=gates.1 res_weight3=gates.2",
         ),
         *rules_of(
-            LINES,
+            _LINES,
             "map_head.generator.",
             "_project_to_logits.=logits. input_proj.=context.project. "
             "img_coord_embed.=context.code. label_embed.=label. coord_embed.=axis. "
@@ -52,7 +52,7 @@ VECTORMAPNET = KeyMap(
         # settings: points of the planes, pixels of the canvas, and two of the noise in training
         "backbone.bev_planes": torch.stack((_PLANES[2], _PLANES[1], _PLANES[0]), -1),
         _ELEMENTS + "canvas_size": torch.tensor((200, 100)),
-        LINES + "canvas_size": torch.tensor((200, 100)),
+        _LINES + "canvas_size": torch.tensor((200, 100)),
         "head.augmentation.canvas_size": torch.tensor((200, 100)),
         "head.augmentation.shift_scale": None,
         "head.augmentation.scaling_size": None,
@@ -60,6 +60,9 @@ VECTORMAPNET = KeyMap(
         "backbone.masked_embeds.weight": torch.zeros(()).expand(4, 128),
         **zeros(_ELEMENTS, {"transformer.level_embeds": (1, 256), "label_embed.weight": (3, 256)}),
     },
-    markers=((LINES, "map_head.generator."),),
+    markers=((_LINES, "map_head.generator."),),
     idle=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",  # further names of the branch of index 0
+    sign=_LINES,
 )
+
+KEY_MAPS = (VECTORMAPNET,)

@@ -1,0 +1,41 @@
+"""The methods of the library: the one list that everything else reads.
+
+A method is whole in ``gsmap/models/<name>``: its parts, its targets, the table of its state keys
+(``keys.py``) and its paper's numbers (``paper.json``). Beside it are only ``configs/<name>``,
+``tests/methods/<name>`` and ``docs/methods/<name>.md``.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method.
+
+    Attributes:
+        name: Name of its folders and of its page.
+        title: Its name as its authors write it.
+        built_on: Names of the methods whose parts, key tables or configs it uses.
+    """
+
+    name: str
+    title: str
+    built_on: tuple[str, ...] = ()
+
+
+METHODS = (
+    Method("maptr", "MapTR"),
+    Method("maptrv2", "MapTRv2", built_on=("maptr",)),
+    Method("mapvr", "MapVR", built_on=("maptr", "maptrv2")),
+    Method("gemap", "GeMap", built_on=("maptr", "maptrv2")),
+    Method("mgmapnet", "MGMapNet", built_on=("maptr", "maptrv2")),
+    Method("mapqr", "MapQR", built_on=("maptr", "maptrv2")),
+    Method("hdmapnet", "HDMapNet", built_on=("maptr",)),
+    Method("mgmap", "MGMap", built_on=("maptr",)),
+    Method("pivotnet", "PivotNet", built_on=("maptr",)),
+    Method("vectormapnet", "VectorMapNet", built_on=("maptr",)),
+    Method("bemapnet", "BeMapNet", built_on=("maptr",)),
+    Method("streammapnet", "StreamMapNet", built_on=("maptr",)),
+    Method("gsmap", "GSMap", built_on=("maptr",)),
+)
+"""Each stands after those that it is built on."""

@@ -1,0 +1,49 @@
+"""The table between the state keys of HDMapNet's release and ours."""
+
+from gsmap.checkpoints.efficientnet_keys import (
+    efficientnet_rules,
+    norm_shapes,
+    unused_classifier,
+)
+from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
+
+_TRUNK = "camencode.trunk."
+_BEV = "bevencode."
+_OURS = "map_head.decoder."
+_VIEWS = "view_fusion.hw_mat."
+
+
+HDMAPNET = KeyMap(
+    "hdmapnet",
+    (
+        *efficientnet_rules(_TRUNK, "img_backbone."),
+        ("camencode.up1.conv.", "img_neck.joined."),
+        (f"{_VIEWS}{{i}}.", "bev_encoder.views.{i}."),
+        *rules_of(
+            _BEV,
+            _OURS,
+            "conv1.=stem.0. bn1.=stem.1. layer1.=stages.0. layer2.=stages.1. layer3.=stages.2. "
+            "up1.conv.=joined.0. up1_embedded.conv.=joined.1. up2.1.=maps.0.0. up2.2.=maps.0.1. "
+            "up2.4.=maps.0.3. up2_embedded.1.=maps.1.0. up2_embedded.2.=maps.1.1. "
+            "up2_embedded.4.=maps.1.3. up2_direction.1.=maps.2.0. up2_direction.2.=maps.2.1. "
+            "up2_direction.4.=maps.2.3.",
+        ),
+    ),
+    {
+        **unused_classifier(_TRUNK),
+        # the directions' own first block: they take that of the embeddings
+        **zeros(
+            f"{_BEV}up1_direction.conv.",
+            {
+                "0.weight": (256, 320, 3, 3),
+                **norm_shapes("1.", 256),
+                "3.weight": (256, 256, 3, 3),
+                **norm_shapes("4.", 256),
+            },
+        ),
+    },
+    markers=((_VIEWS, "bev_encoder.views."),),
+    sign=_VIEWS,
+)
+
+KEY_MAPS = (HDMAPNET,)

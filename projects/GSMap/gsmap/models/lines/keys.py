@@ -1,0 +1,42 @@
+"""Rules between state keys that releases of lines with one query each share: their code is one."""
+
+import torch
+
+from gsmap.checkpoints.key_rules import Rules, rules_of
+
+LINE_DECODER = "ins_decoder.bev_decoder."
+"""What keys of these releases begin with, and of no other."""
+
+BEV = "bev_decoder.bev_encoder."
+LINEAR = "linear1.=ffn.layers.0.0. linear2.=ffn.layers.1. "
+_MLP = ((0, 0), (1, 2), (2, 4))  # matrices of an MLP, theirs and ours
+
+
+def mlps(theirs: str, ours: str) -> Rules:
+    """Return the rules of an MLP."""
+    return tuple((f"{theirs}layers.{old}.", f"{ours}{new}.") for old, new in _MLP)
+
+
+LINE_DECODER_RULES = (
+    *rules_of(
+        LINE_DECODER + "transformer_",
+        "map_head.decoder.layers.{i}.",
+        "cross_attention_layers.{i}.multihead_attn.=cross_attn. "
+        "cross_attention_layers.{i}.norm.=norms.0. "
+        "self_attention_layers.{i}.self_attn.=self_attn. "
+        "self_attention_layers.{i}.norm.=norms.1. "
+        "ffn_layers.{i}.linear1.=ffn.layers.0.0. ffn_layers.{i}.linear2.=ffn.layers.1. "
+        "ffn_layers.{i}.norm.=norms.2.",
+    ),
+    *rules_of(
+        LINE_DECODER,
+        "map_head.decoder.",
+        "level_embed.=level. decoder_norm.=norm.",
+    ),
+)
+HEAD_RULES = (
+    *mlps("output_head.coords_head.", "map_head.coordinates."),
+    ("output_head.semantic_heads.{i}.0.", "map_head.semantic_branches.{i}."),
+)
+# settings: class weights of a loss
+CLASS_WEIGHTS = {"post_processor.criterion.empty_weight": torch.tensor((1.0, 0.5))}

@@ -1,0 +1,32 @@
+"""The table between the state keys of MapQR's release and ours."""
+
+from gsmap.checkpoints.key_rules import KeyMap
+from gsmap.models.maptr.keys import (
+    CODE_WEIGHTS,
+    DECODER,
+    ENCODER_LAYER,
+    GRID_OFFSETS,
+    LAYER,
+    MAPTR,
+    OUR_ENCODER_LAYER,
+)
+from gsmap.models.maptrv2.keys import MASK_RULES, MASK_WEIGHTS
+
+_HEIGHTS = (
+    ENCODER_LAYER + "attentions.1.height_offsets.",
+    OUR_ENCODER_LAYER + "cross_attn.height_offsets.",
+)
+MAPQR = KeyMap(
+    "mapqr",
+    (
+        _HEIGHTS,
+        *MAPTR.rules,
+        *MASK_RULES,
+        (DECODER + "pt_pos_query_projs.{i}.", LAYER + "position_proj."),
+    ),
+    {**CODE_WEIGHTS, **MASK_WEIGHTS},
+    markers=(_HEIGHTS,),
+    idle=GRID_OFFSETS,
+)
+
+KEY_MAPS = (MAPQR,)

@@ -1,0 +1,53 @@
+"""The table between the state keys of MapTR's release and ours, with rules that others share."""
+
+import torch
+
+from gsmap.checkpoints.key_rules import KeyMap, rules_of
+
+HEAD = "pts_bbox_head."
+TRANSFORMER = "pts_bbox_head.transformer."
+ENCODER = "pts_bbox_head.transformer.encoder."
+ENCODER_LAYER = "pts_bbox_head.transformer.encoder.layers.{i}."
+DECODER = "pts_bbox_head.transformer.decoder."
+DECODER_LAYER = "pts_bbox_head.transformer.decoder.layers.{i}."
+OUR_ENCODER_LAYER = "bev_encoder.layers.{i}."
+LAYER = "map_head.decoder.layers.{i}."
+
+COMMON_RULES = (
+    *rules_of("", "", "img_backbone. img_neck."),
+    *rules_of(HEAD, "map_head.", "instance_embedding. pts_embedding. cls_branches."),
+    *rules_of(HEAD, "map_head.reference.", "reg_branches.=branches."),
+    *rules_of(TRANSFORMER, "map_head.reference.", "reference_points.=initial."),
+)
+DECODER_RULES = rules_of(
+    DECODER_LAYER,
+    LAYER,
+    "attentions.0.attn.=self_attn. attentions.1.=cross_attn. ffns.0.=ffn. norms.",
+)
+_BEV_QUERY_RULES = (
+    *COMMON_RULES,
+    *DECODER_RULES,
+    *rules_of(HEAD, "bev_encoder.", "bev_embedding. positional_encoding."),
+    *rules_of(TRANSFORMER, "bev_encoder.", "level_embeds cams_embeds can_bus_mlp."),
+    *rules_of(ENCODER_LAYER, OUR_ENCODER_LAYER, "attentions.0.=self_attn. ffns.0.=ffn. norms."),
+    *rules_of(
+        ENCODER_LAYER, OUR_ENCODER_LAYER, "attentions.1.output_proj.=cross_attn.output_proj."
+    ),
+)
+CODE_WEIGHTS = {HEAD + "code_weights": torch.ones(4)}  # of box coordinates: a loss of weight 0
+
+# the fixed offsets of the kernel, a buffer of the code that MapTR's weights were published with
+GRID_OFFSETS = (
+    r"pts_bbox_head\.transformer\.encoder\.layers\.\d+\.attentions\.1\.attention\.grid_offsets"
+)
+_KERNELS = (ENCODER_LAYER + "attentions.1.attention.", OUR_ENCODER_LAYER + "cross_attn.")
+_DEFORMABLE = ENCODER_LAYER + "attentions.1.deformable_attention."
+MAPTR = KeyMap("maptr", (*_BEV_QUERY_RULES, _KERNELS), CODE_WEIGHTS, idle=GRID_OFFSETS)
+MAPTR_BEVFORMER = KeyMap(
+    "maptr-bevformer",
+    (*_BEV_QUERY_RULES, (_DEFORMABLE, OUR_ENCODER_LAYER + "cross_attn.")),
+    CODE_WEIGHTS,
+    markers=((_DEFORMABLE, OUR_ENCODER_LAYER + "cross_attn.sampling_offsets."),),
+)
+
+KEY_MAPS = (MAPTR_BEVFORMER, MAPTR)

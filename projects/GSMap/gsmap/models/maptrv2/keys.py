@@ -1,0 +1,63 @@
+"""The table between the state keys of MapTRv2's release and ours."""
+
+import torch
+from torch import Tensor
+
+from gsmap.checkpoints.key_rules import KeyMap, rules_of, zeros
+from gsmap.models.maptr.keys import CODE_WEIGHTS, COMMON_RULES, DECODER_LAYER, ENCODER, HEAD, LAYER
+
+MASK_RULES = rules_of(HEAD, "map_head.aux_heads.", "seg_head.=seg. pv_seg_head.=pv_seg.")
+# the weight of the foreground in a mask loss, which the config says
+MASK_WEIGHTS = {
+    HEAD + "loss_seg.loss_fn.pos_weight": torch.tensor((4.0,)),
+    HEAD + "loss_pv_seg.loss_fn.pos_weight": torch.tensor((1.0,)),
+}
+
+LIFTED_RULES = (
+    *COMMON_RULES,
+    *MASK_RULES,
+    *rules_of(ENCODER, "bev_encoder.", "depth_net. downsample."),
+)
+LIFTED_UNUSED: dict[str, Tensor | None] = {
+    **CODE_WEIGHTS,
+    # parts of the encoder with learned BEV queries, which depth lifting does not run
+    **zeros(
+        HEAD,
+        {
+            "positional_encoding.row_embed.weight": (200, 128),
+            "positional_encoding.col_embed.weight": (100, 128),
+            "transformer.level_embeds": (4, 256),
+            "transformer.cams_embeds": (6, 256),
+            "transformer.can_bus_mlp.0.weight": (128, 18),
+            "transformer.can_bus_mlp.0.bias": (128,),
+            "transformer.can_bus_mlp.2.weight": (256, 128),
+            "transformer.can_bus_mlp.2.bias": (256,),
+            "transformer.can_bus_mlp.norm.weight": (256,),
+            "transformer.can_bus_mlp.norm.bias": (256,),
+        },
+    ),
+    # the grid of voxels, which the config says: size, first centre and number (x, y, z)
+    ENCODER + "dx": torch.tensor((0.15, 0.15, 20.0)),
+    ENCODER + "bx": torch.tensor((-14.925, -29.925, 0.0)),
+    ENCODER + "nx": torch.tensor((200.0, 400.0, 1.0)),
+    **MASK_WEIGHTS,
+}
+LIFTED_MARKER = (ENCODER + "depth_net.", "bev_encoder.depth_net.depth_conv.")
+
+MAPTRV2 = KeyMap(
+    "maptrv2",
+    (
+        *LIFTED_RULES,
+        *rules_of(
+            DECODER_LAYER,
+            LAYER,
+            "attentions.0.attn.=self_attn.instance_attn. attentions.1.attn.=self_attn.point_attn. "
+            "attentions.2.=cross_attn. ffns.0.=ffn. "
+            "norms.0.=self_attn.norm. norms.1.=norms.0. norms.2.=norms.1. norms.3.=norms.2.",
+        ),
+    ),
+    LIFTED_UNUSED,
+    markers=(LIFTED_MARKER,),
+)
+
+KEY_MAPS = (MAPTRV2,)

@@ -1,0 +1,59 @@
+"""The table between the state keys of PivotNet's release and ours."""
+
+import torch
+
+from gsmap.checkpoints.key_rules import KeyMap, rules_of
+from gsmap.models.lines.keys import (
+    BEV,
+    CLASS_WEIGHTS,
+    HEAD_RULES,
+    LINE_DECODER,
+    LINE_DECODER_RULES,
+    LINEAR,
+    mlps,
+)
+
+PIVOTNET = KeyMap(
+    "pivotnet",
+    (
+        ("im_backbone.bkb.", "img_backbone."),
+        *rules_of(
+            BEV + "encoder.layers.{i}.",
+            "bev_encoder.source_layers.{i}.",
+            f"self_attn.=attns.0. norm1.=norms.0. {LINEAR} norm2.=norms.1.",
+        ),
+        *rules_of(
+            BEV + "decoder.layers.{i}.",
+            "bev_encoder.bev_layers.{i}.",
+            f"self_attn.=attns.0. norm2.=norms.0. cross_attn.=attns.1. norm1.=norms.1. {LINEAR} "
+            "norm3.=norms.2.",
+        ),
+        *rules_of(
+            BEV,
+            "bev_encoder.",
+            "input_proj. t2s_reference_points.=unseen_reference. "
+            "src_pos_embed.{i}.pos_embed.=source_pos.{i}. "
+            "tgt_pos_embed.pos_embed.=bev_pos. tgt_embed.pos_embed.=bev_embedding.",
+        ),
+        *LINE_DECODER_RULES,
+        *rules_of(
+            LINE_DECODER,
+            "map_head.decoder.",
+            "query_feat=query.weight query_embed=query_pos.weight class_embed.=cls_branches.",
+        ),
+        *mlps(LINE_DECODER + "mask_embed.{i}.", "map_head.decoder.mask_branches.{i}."),
+        *mlps("output_head.im_ctr_heads.{i}.", "map_head.point_branches.{i}."),
+        *mlps("output_head.pts_cls_heads.{i}.", "map_head.kind_branches.{i}."),
+        *HEAD_RULES,
+    ),
+    {
+        **CLASS_WEIGHTS,
+        # settings: where each camera stands in the joined image, class weights of another loss
+        BEV + "image_order": torch.arange(6),
+        "post_processor.criterion.collinear_pt_weight": torch.tensor((0.2, 1.0)),
+    },
+    markers=((LINE_DECODER + "query_feat", "map_head.decoder.query.weight"),),
+    sign=LINE_DECODER,
+)
+
+KEY_MAPS = (PIVOTNET,)
