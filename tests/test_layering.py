@@ -155,8 +155,9 @@ def test_every_folder_of_models_has_its_arrows():
     }
 
 
-def test_a_method_stands_after_those_that_it_is_built_on():
-    names = [method.name for method in METHODS]
-    assert len(set(names)) == len(names)
-    for place, method in enumerate(METHODS):
-        assert {*method.built_on} <= {*names[:place]}, method.name
+def test_a_method_names_all_that_it_is_built_on():
+    built_on = {method.name: {*method.built_on} for method in METHODS}
+    assert len(built_on) == len(METHODS)
+    for name, below in built_on.items():
+        assert name not in below
+        assert all(built_on[other] <= below for other in below), name

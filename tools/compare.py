@@ -3,7 +3,7 @@ r"""Train and test several configs on the same data, seeds and budget, and write
 
 ``CONFIG`` is a file, the name of a model, or ``NAME=CONFIG[,KEY=VALUE...]``. Give a stopped command
 again to continue it; finished runs are not repeated. ``--list`` prints every row of the papers'
-tables (``configs/tables.json``) with the command that trains it.
+tables (``gsmap/models/<method>/paper.json``) with the command that trains it.
 
 Examples:
     python tools/compare.py maptr_r18_minicity gsmap_r18_minicity --seeds 3 --budget 6400 --out s
@@ -38,6 +38,7 @@ from comparison.run_curves import plot_precision_recall
 from mmengine.config import DictAction
 
 from gsmap.engine.arguments import data_root_options
+from gsmap.methods import METHODS
 from gsmap.utils.cli import CommandParser, run_command
 from gsmap.utils.files import read_json, write_text
 from gsmap.utils.progress import Progress
@@ -91,7 +92,8 @@ def read_tables(pattern: str = "*") -> list[dict[str, Any]]:
     Raises:
         ValueError: If there is none.
     """
-    tables = read_json(shipped("configs/tables.json"))
+    tables = [table for method in METHODS for table in method.paper()["tables"]]
+    tables += read_json(shipped("configs/tables.json"))  # of several methods
     chosen = [table for table in tables if fnmatchcase(table["table"], pattern)]
     if not chosen:
         raise ValueError(

@@ -6,6 +6,10 @@ A method is whole in ``gsmap/models/<name>``: its parts, its targets, the table 
 """
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsmap.utils.files import read_json
 
 
 @dataclass(frozen=True)
@@ -15,27 +19,42 @@ class Method:
     Attributes:
         name: Name of its folders and of its page.
         title: Its name as its authors write it.
-        built_on: Names of the methods whose parts, key tables or configs it uses.
+        built_on: Names of the methods whose parts, key tables or configs it uses, all of them.
     """
 
     name: str
     title: str
     built_on: tuple[str, ...] = ()
 
+    @property
+    def folder(self) -> Path:
+        """Its folder in ``gsmap/models``."""
+        return Path(__file__).parent / "models" / self.name
+
+    def paper(self) -> dict[str, Any]:
+        """Return the numbers of its paper and release, from ``paper.json``.
+
+        Returns:
+            ``arxiv``, the paper's number; ``parameters``, trainable ones by config; ``settings``,
+            published values by config and path; ``heads``, by config the queries of each group,
+            weights of losses and auxiliary heads by name, weights of costs in order; ``tables``,
+            as ``configs/tables.json`` has those of several methods.
+        """
+        return read_json(self.folder / "paper.json")
+
 
 METHODS = (
+    Method("gsmap", "GSMap", built_on=("maptr",)),
     Method("maptr", "MapTR"),
     Method("maptrv2", "MapTRv2", built_on=("maptr",)),
     Method("mapvr", "MapVR", built_on=("maptr", "maptrv2")),
     Method("gemap", "GeMap", built_on=("maptr", "maptrv2")),
     Method("mgmapnet", "MGMapNet", built_on=("maptr", "maptrv2")),
     Method("mapqr", "MapQR", built_on=("maptr", "maptrv2")),
-    Method("hdmapnet", "HDMapNet", built_on=("maptr",)),
     Method("mgmap", "MGMap", built_on=("maptr",)),
     Method("pivotnet", "PivotNet", built_on=("maptr",)),
+    Method("hdmapnet", "HDMapNet", built_on=("maptr",)),
     Method("vectormapnet", "VectorMapNet", built_on=("maptr",)),
     Method("bemapnet", "BeMapNet", built_on=("maptr",)),
     Method("streammapnet", "StreamMapNet", built_on=("maptr",)),
-    Method("gsmap", "GSMap", built_on=("maptr",)),
 )
-"""Each stands after those that it is built on."""

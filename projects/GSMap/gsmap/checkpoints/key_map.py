@@ -17,7 +17,7 @@ def key_maps() -> tuple[KeyMap, ...]:
     of its own has not.
     """
     found: tuple[KeyMap, ...] = ()
-    for method in reversed(METHODS):
+    for method in sorted(METHODS, key=lambda method: len(method.built_on), reverse=True):
         name = f"gsmap.models.{method.name}.keys"
         if find_spec(name) is not None:
             found += import_module(name).KEY_MAPS
