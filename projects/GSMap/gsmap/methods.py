@@ -52,9 +52,9 @@ METHODS = (
     Method("mgmapnet", "MGMapNet", built_on=("maptr", "maptrv2")),
     Method("mapqr", "MapQR", built_on=("maptr", "maptrv2")),
     Method("mgmap", "MGMap", built_on=("maptr",)),
-    Method("pivotnet", "PivotNet", built_on=("maptr",)),
-    Method("hdmapnet", "HDMapNet", built_on=("maptr",)),
-    Method("vectormapnet", "VectorMapNet", built_on=("maptr",)),
-    Method("bemapnet", "BeMapNet", built_on=("maptr",)),
+    Method("pivotnet", "PivotNet"),
+    Method("hdmapnet", "HDMapNet"),
+    Method("vectormapnet", "VectorMapNet"),
+    Method("bemapnet", "BeMapNet"),
     Method("streammapnet", "StreamMapNet", built_on=("maptr",)),
 )
