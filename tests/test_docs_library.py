@@ -120,10 +120,9 @@ def test_the_node_of_ros_publishes_the_map_of_its_images(monkeypatch):
         for module in (name.partition(".")[0], name):
             monkeypatch.setitem(sys.modules, module, ModuleType(module))
         vars(sys.modules[name]).update(content)
-    text = (DOCS / "inference.md").read_text()
-    (block,) = (b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "rclpy" in b)
+    script = DOCS.parent / "examples/ros_node.py"
     scope = {"__name__": "node"}
-    exec(compile(block, "inference.md", "exec"), scope)
+    exec(compile(script.read_text(), script.name, "exec"), scope)
     node = scope["MapNode"]()
     node.step()
     assert node.published == []  # no camera has spoken

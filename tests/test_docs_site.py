@@ -2,6 +2,7 @@
 
 import json
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -104,6 +105,15 @@ def test_mkdocs_names_pages_that_exist():
     assert [
         p for p in named if not (REPO / "docs" / p).exists() and f'"{p}": "' not in outside
     ] == []
+
+
+def test_the_navigation_is_one_book():
+    """At most 40,000 words: figures belong to results/, lists to pages outside the navigation."""
+    outside = runpy.run_path(str(REPO / "docs/site_hooks.py"))["OUTSIDE"]
+    pages = re.findall(r"[\w/]+\.md", str(load_config(str(REPO / "mkdocs.yml")).nav))
+    texts = [(REPO / outside.get(page, f"docs/{page}")).read_text("utf-8") for page in pages]
+    assert len(texts) > 40
+    assert sum(len(text.split()) for text in texts) <= 40_000
 
 
 def test_summary_and_changelog_are_short():

@@ -216,7 +216,7 @@ def test_the_tool_converts_files_and_refuses_to_overwrite(tmp_path, monkeypatch,
 
 
 def test_every_unused_key_is_documented():
-    text = (REPO / "docs/migration.md").read_text()
+    text = (REPO / "docs/upstream_names.md").read_text()
     for key_map in key_maps():
         for key in key_map.unused:
             named = key in text or key.endswith(tuple(_suffixes(text)))
@@ -247,7 +247,7 @@ ARCHITECTURES = {  # others are one word: the name of the map
 
 
 def test_the_table_of_keys_in_the_docs_is_the_table_of_the_code():
-    text = (REPO / "docs/migration.md").read_text()
+    text = (REPO / "docs/upstream_names.md").read_text()
     rows = re.findall(
         r"^\| ([^`|]+) \| `([\w.*]+)` \| (?:`([\w.*]+)`|the same) \|$", text, re.MULTILINE
     )

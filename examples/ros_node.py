@@ -1,0 +1,100 @@
+"""A node of ROS 2: rectified images and their CameraInfo in, markers of the map elements out.
+
+Copy this file, and name your cameras as the model does or number them as you like.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import Point
+from rclpy.node import Node
+from rclpy.time import Time
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image
+from tf2_ros import Buffer, TransformListener
+from visualization_msgs.msg import Marker, MarkerArray
+
+from gsmap import MapElements, MapInferencer
+from gsmap.structures.rigid import rigid
+
+MODEL = "gsmap_r18_minicity"
+CAMERAS = {"CAM_FRONT": "/front", "CAM_BACK": "/rear"}  # namespaces of image_rect and camera_info
+VEHICLE = "base_footprint"  # x ahead, y left, on the road below the rear axle
+MIN_SCORE = 0.3
+PERIOD_S = 0.5
+COLOURS = [(0.2, 0.6, 1.0), (1.0, 0.6, 0.1), (0.2, 0.8, 0.3)]  # divider, ped_crossing, boundary
+
+
+class MapNode(Node):
+    """Publishes the map of the newest images, twice a second."""
+
+    def __init__(self) -> None:
+        super().__init__("gsmap")
+        self.inferencer, self.live = MapInferencer(MODEL), None
+        self.images, self.infos = {}, {}
+        for name, topic in CAMERAS.items():
+            keep_image = partial(self.images.__setitem__, name)
+            keep_info = partial(self.infos.__setitem__, name)
+            self.create_subscription(Image, f"{topic}/image_rect", keep_image, 1)
+            self.create_subscription(CameraInfo, f"{topic}/camera_info", keep_info, 1)
+        self.transforms = Buffer()
+        self.listener = TransformListener(self.transforms, self)
+        self.publisher = self.create_publisher(MarkerArray, "map_elements", 1)
+        self.create_timer(PERIOD_S, self.step)
+
+    def cam_from_vehicle(self, info: Any) -> np.ndarray:
+        """Transform from the vehicle to a camera. (4, 4) A missing one is an error that names it."""
+        camera = info.header.frame_id
+        found = self.transforms.lookup_transform(camera, VEHICLE, Time()).transform
+        turn, shift = found.rotation, found.translation
+        rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+        return rigid(rotation, [shift.x, shift.y, shift.z])
+
+    def step(self) -> None:
+        """Predict and publish, once every camera has spoken."""
+        if len(self.images) < len(CAMERAS) or len(self.infos) < len(CAMERAS):
+            return
+        if self.live is None:
+            intrinsics = {
+                name: np.reshape(info.p, (3, 4))[:, :3] for name, info in self.infos.items()
+            }
+            mounting = {name: self.cam_from_vehicle(info) for name, info in self.infos.items()}
+            self.live = self.inferencer.live(
+                intrinsics, mounting, "vehicle", allow_missing_cameras=True
+            )
+        elements = self.live({name: rgb(message) for name, message in self.images.items()})
+        confident = elements.select(elements.confidence > MIN_SCORE)
+        stamp = next(iter(self.images.values())).header.stamp
+        erase = Marker(action=Marker.DELETEALL)
+        self.publisher.publish(MarkerArray(markers=[erase, *markers(confident, stamp)]))
+
+
+def rgb(message: Any) -> np.ndarray:
+    """Pixels of an image message of 8 bits. (H, W, 3)"""
+    rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
+    pixels = rows[:, : 3 * message.width].reshape(message.height, message.width, 3)
+    return pixels[..., ::-1] if message.encoding == "bgr8" else pixels
+
+
+def markers(elements: MapElements, stamp: Any) -> Iterator[Any]:
+    """A line for each element, in the vehicle's frame."""
+    for number, (line, label) in enumerate(zip(elements.polylines, elements.labels, strict=True)):
+        marker = Marker(id=number, type=Marker.LINE_STRIP)
+        marker.header.frame_id, marker.header.stamp = VEHICLE, stamp
+        marker.points = [Point(x=x, y=y, z=0.0) for x, y in line[:, :2].tolist()]
+        marker.color.r, marker.color.g, marker.color.b = COLOURS[label]
+        marker.color.a, marker.scale.x, marker.pose.orientation.w = 1.0, 0.1, 1.0
+        yield marker
+
+
+def main() -> None:
+    """Run the node until it is interrupted."""
+    rclpy.init()
+    rclpy.spin(MapNode())
+
+
+if __name__ == "__main__":
+    main()
