@@ -46,7 +46,7 @@ class MapNode(Node):
         self.create_timer(PERIOD_S, self.step)
 
     def cam_from_vehicle(self, info: Any) -> np.ndarray:
-        """Transform from the vehicle to a camera. (4, 4) A missing one is an error that names it."""
+        """Transform from the vehicle to a camera, (4, 4). One that is missing is an error."""
         camera = info.header.frame_id
         found = self.transforms.lookup_transform(camera, VEHICLE, Time()).transform
         turn, shift = found.rotation, found.translation

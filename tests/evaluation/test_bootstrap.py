@@ -146,7 +146,7 @@ def test_the_command_writes_intervals_and_differences(tmp_path, capsys):
     assert "a.json minus" in text
     found = json.loads((tmp_path / "m.json").read_text())
     assert found["chamfer/mAP/low"] <= found["chamfer/mAP"] <= found["chamfer/mAP/high"]
-    assert found["minus_other/chamfer/mAP/value"] == pytest.approx(0.5 / 3, abs=1e-9)
+    assert found["minus_other/chamfer/mAP/value"] == pytest.approx(0.5 / 2, abs=1e-9)
     with pytest.raises(ValueError, match="knows no scenes"):
         command()([words[0], str(tmp_path / "t.json"), "--bootstrap"])
 

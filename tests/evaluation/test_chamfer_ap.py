@@ -39,7 +39,7 @@ def test_hand_worked_ap():
                    AP = 1/2 * 1
         at 1.0 m:  A and B hit             precision 1, 1, 2/3     recall 1/2, 1, 1
                    AP = 1
-        boundary has no ground truth and counts as 0 in the mean over classes.
+        boundary has no ground truth and counts in no mean.
     """
     gt = MapElements.from_polylines([upright(0.0), upright(8.0)], [0, 0])
     pred = MapElements.from_polylines(
@@ -55,7 +55,8 @@ def test_hand_worked_ap():
     assert metrics["chamfer/divider/recall@0.5"] == 0.5
     assert metrics["chamfer/divider/AP"] == pytest.approx(2.5 / 3)
     assert metrics["chamfer/AP@0.5"] == 0.5  # the mean over the classes that have ground truth
-    assert metrics["chamfer/mAP"] == pytest.approx(2.5 / 6)
+    assert metrics["chamfer/mAP"] == pytest.approx(2.5 / 3)
+    assert metrics["chamfer/num_absent_classes"] == 1
     assert metrics["chamfer/divider/error_m@1.5"] == pytest.approx(0.5)  # of 0.3 and 0.7
     assert metrics["chamfer/boundary/error_m@1.5"] == -1.0
     name, titles, _, divider, *_ = format_table(report).splitlines()
@@ -64,6 +65,7 @@ def test_hand_worked_ap():
     # the scores 0.9, 0.8 and 0.7 against 1, 1 and 0 at 1.5 m: (0.1 + 0.2 + 0.7) / 3
     cells = "divider 0.8333 0.5000 1.0000 1.0000 1.0000 0.5000 0.3333 2 3"
     assert divider.split() == cells.split()
+    assert "without ground truth, and in no mean: boundary" in format_table(report)
 
 
 def test_precision_envelope_lifts_an_early_miss():

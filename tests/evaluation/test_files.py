@@ -61,13 +61,16 @@ def test_command_writes_flat_figures_of_samples_paired_by_token(files, tmp_path,
     metrics = json.loads(out.read_text())
     assert metrics["chamfer/divider/AP@0.5"] == 1.0
     assert metrics["chamfer/ped_crossing/AP"] == 0.5
-    assert metrics["chamfer/mAP"] == 0.5  # boundary has no ground truth and counts as 0
+    assert metrics["chamfer/mAP"] == 0.75  # boundary has no ground truth: in no mean
+    assert metrics["chamfer/num_absent_classes"] == metrics["raster/num_absent_classes"] == 1
     assert metrics["raster/ped_crossing/AP"] == pytest.approx(51 / 101)
     assert metrics["raster/boundary/AP"] == -1.0
     assert metrics["raster/mAP"] == pytest.approx((1 + 51 / 101) / 2)
     assert metrics["raster/num_samples"] == 8
     assert curves.read_bytes().startswith(b"\x89PNG")
-    assert "mAP_chamfer = 0.500000" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "mAP_chamfer = 0.750000" in said
+    assert said.count("without ground truth, and in no mean: boundary\n") == 2
 
 
 def test_annotation_file_and_json_give_the_same_figures(files, tmp_path):

@@ -277,3 +277,46 @@ def test_the_command_writes_a_config_that_the_tools_read(tmp_path):
     run = subprocess.run(command, cwd=REPO, text=True, capture_output=True, check=False)
     assert run.returncode == 2
     assert "error:" in run.stderr
+
+
+def test_what_only_blocks_a_kernel_or_switches_heights_off_has_no_effect(tmp_path):
+    """As in the nano configs of MapTR and the configs of GeMap on Argoverse 2."""
+    maptr = upstream_configs.maptr()
+    blocked = maptr.replace("num_levels=1)", "num_levels=1, im2col_step=192)")
+    assert blocked.count("im2col_step") == 3
+    cfg, unplaced = converted(
+        blocked.replace(
+            "'TemporalSelfAttention', embed_dims=width, num_levels=1, im2col_step=192",
+            "'TemporalSelfAttention', embed_dims=width",
+        ),
+        tmp_path,
+    )
+    assert cfg.to_dict() == converted(maptr, tmp_path)[0].to_dict()
+    assert unplaced == [BASE]
+    gemap = upstream_configs.gemap()
+    flat = with_heights(gemap, False)
+    cfg, unplaced = converted(flat, tmp_path)
+    assert cfg.to_dict() == converted(gemap, tmp_path)[0].to_dict()
+    assert unplaced == [BASE]
+    _, unplaced = converted(with_heights(gemap, True), tmp_path)
+    assert "model.pts_bbox_head.z_cfg.pred_z_flag = True" in unplaced
+
+
+def with_heights(text: str, heights: bool) -> str:
+    """Say in each place where the originals do whether points have heights."""
+    of_points = f"z_cfg=dict(pred_z_flag={heights}, gt_z_flag={heights}), "
+    for part in ("type='Assigner', ", "type='NMSFreeCoder', ", "type='PerceptionTransformer', "):
+        assert part in text
+        text = text.replace(part, part + of_points)
+    text = text.replace("Head',\n", f"Head', {of_points}\n")
+    text = text.replace("type='CustomNuScenes", f"{of_points}type='CustomNuScenes")
+    assert text.count("z_cfg") == 5
+    return text
+
+
+def test_masks_have_a_channel_for_each_class_of_the_file(tmp_path):
+    four = "'boundary', 'centerline']"
+    cfg, _ = converted(upstream_configs.maptrv2().replace("'boundary']", four), tmp_path)
+    steps = {step.type: step for step in cfg.train_dataloader.dataset.pipeline}
+    assert len(cfg.train_dataloader.dataset.classes) == 4
+    assert steps["MakeBEVMask"].num_classes == steps["MakePVMask"].num_classes == 4

@@ -1,4 +1,4 @@
-"""Annotation files, data sets, transforms and converters."""
+"""Annotation files, the data set, its transforms and samplers."""
 
 from gsmap.utils.lazy import lazy_names
 

@@ -1,4 +1,4 @@
-"""AP_chamfer and AP_raster."""
+"""Metrics of maps: AP, topology, whole maps, uncertainty, and what compares results."""
 
 from gsmap.utils.lazy import lazy_names
 

@@ -21,6 +21,7 @@ OF_THE_FILE = (
     "eval_use_same_gt_sample_num_flag padding_value queue_length box_type_3d samples_per_gpu "
     "load_interval aux_seg fixed_ptsnum_per_line"
 )
+FLAT = {"pred_z_flag": False, "gt_z_flag": False}  # z_cfg of points without height
 SCHEDULE = {
     "lr_config.warmup_iters": "param_scheduler.0.end",
     "lr_config.warmup_ratio": "param_scheduler.0.start_factor",
@@ -53,7 +54,11 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         "train_dataloader.num_workers": fields.take("data.workers_per_gpu"),
         "data_root": root,
         "z_range": z_range,
-        "steps": {"FormatMapTargets": {"num_points": train["fixed_ptsnum_per_line"]}},
+        "steps": {
+            "FormatMapTargets": {"num_points": train["fixed_ptsnum_per_line"]},
+            "MakeBEVMask": {"num_classes": len(classes)},
+            "MakePVMask": {"num_classes": len(classes)},
+        },
         "with_depth": False,
     }
     fields.drop("data", "shuffler_sampler nonshuffler_sampler")
@@ -61,7 +66,7 @@ def data_settings(fields: Fields) -> dict[str, Any]:
         own, dataset = f"data.{part}", f"{part}_dataloader.dataset."
         settings |= {dataset + name: value for name, value in shared.items()}
         settings[dataset + "data_root"] = fields.take(own + ".data_root", root)
-        fields.drop(own, OF_THE_FILE, pc_range=train["pc_range"], map_classes=classes)
+        fields.drop(own, OF_THE_FILE, pc_range=train["pc_range"], map_classes=classes, z_cfg=FLAT)
         for step in fields.items(own + ".pipeline") if "pipeline" in fields.section(own) else []:
             _place_step(fields, step, settings)
     return settings

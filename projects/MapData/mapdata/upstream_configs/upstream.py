@@ -9,7 +9,7 @@ from typing import Any
 
 from mmengine.config import Config
 
-from mapdata.upstream_configs.data import data_settings, schedule_settings
+from mapdata.upstream_configs.data import FLAT, data_settings, schedule_settings
 from mapdata.upstream_configs.fields import Fields
 
 _KEY = re.compile(r"[a-zA-Z][\w.-]*", re.ASCII)
@@ -65,11 +65,12 @@ FIXED: dict[str, dict[str, Any]] = {
     _THEIRS: {
         "query_embed_type": "instance_pts", "transform_method": "minmax",
         "gt_shift_pts_pattern": "v2", "with_box_refine": True, "as_two_stage": False,
-        "sync_cls_avg_factor": True, "code_size": 2, "dir_interval": 1,
+        "sync_cls_avg_factor": True, "code_size": 2, "dir_interval": 1, "z_cfg": FLAT,
     },
     f"{_THEIRS}.aux_seg": {"seg_classes": 1, "use_aux_seg": True},
     f"{_ENCODER}.depthnet_cfg": {"use_dcn": False, "with_cp": False},
     f"{_SPATIAL}.attention": {"dilation": 1},
+    **{section: {"z_cfg": FLAT} for section in (f"{_THEIRS}.bbox_coder", _TRANSFORMER, _COSTS)},
 }  # fmt: skip
 # parts that do nothing if this weight of theirs is zero
 WEIGHTS = {
@@ -91,8 +92,8 @@ DROPPED = {
     _PILLARS: "type operation_order",
     f"{_PILLARS}.attn_cfgs.0": "type embed_dims num_levels",
     _SPATIAL: "embed_dims pc_range num_cams",
-    f"{_SPATIAL}.attention": "type embed_dims num_levels",
-    f"{_SPATIAL}.deformable_attention": "type embed_dims num_levels",
+    f"{_SPATIAL}.attention": "type embed_dims num_levels im2col_step",
+    f"{_SPATIAL}.deformable_attention": "type embed_dims num_levels im2col_step",
     f"{_TRANSFORMER}.decoder": "type return_intermediate",
     _LAYER: "operation_order num_vec num_pts_per_vec",
 }
@@ -264,7 +265,7 @@ def _decoder_settings(fields: Fields, settings: dict[str, Any]) -> None:
     dropout = fields.section(first).get("dropout")
     for other in others:  # MapTRv2's second attention has the settings of its first
         fields.drop(other, "type embed_dims", num_heads=heads, dropout=dropout)
-    fields.drop(cross, "type embed_dims num_levels")
+    fields.drop(cross, "type embed_dims num_levels im2col_step")
     # the deformable attention's own default is not the layer's
     for part, name, default in (("self_attn", first, 0.0), ("cross_attn", cross, 0.1)):
         dropout = fields.take(name + ".dropout", default)

@@ -186,7 +186,7 @@ def resampled_figures(report: MetricReport, resamples: Weights) -> dict[str, Flo
             figures[f"{prefix}AP@{threshold}"] = means[:, t]
         if not by_area:
             figures[f"{prefix}AP"] = _mean([figures[f"{name}/AP"] for name in names])
-    figures["mAP"] = _mean([figures[f"{name}/AP"] for name in report.detections])
+    figures["mAP"] = _mean([aps.mean(axis=1) for aps in of_class.values()])
     return {f"{report.name}/{key}": values for key, values in figures.items()}
 
 

@@ -171,7 +171,8 @@ def chamfer_report(
 ) -> MetricReport:
     """Compute AP_chamfer from the matches of all samples.
 
-    A class without ground truth counts as 0 in ``mAP``, as in MapTR, but in no mean per threshold.
+    A class without ground truth counts in no mean, as in AP_raster; in MapTR it is 0 in ``mAP``.
+    ``num_absent_classes`` is the number of such classes.
 
     Args:
         matches: Matches at the thresholds of ``config``.
@@ -188,10 +189,11 @@ def chamfer_report(
         figures = distance_figures(found, aps)
         metrics |= {f"{of_class}/{key}": value for key, value in figures.items()}
     present = [of_class for of_class, found in detections.items() if found.num_gts]
-    for threshold in thresholds:
-        aps = [metrics[f"{of_class}/AP@{threshold}"] for of_class in present]
-        metrics[f"AP@{threshold}"] = float(np.mean(aps)) if aps else 0.0
-    metrics["mAP"] = float(np.mean([metrics[f"{of_class}/AP"] for of_class in classes]))
+    means = {"mAP": "AP"} | {f"AP@{threshold}": f"AP@{threshold}" for threshold in thresholds}
+    for mean, of_one in means.items():
+        aps = [metrics[f"{of_class}/{of_one}"] for of_class in present]
+        metrics[mean] = float(np.mean(aps)) if aps else 0.0
+    metrics["num_absent_classes"] = float(len(classes) - len(present))
     metrics["num_samples"] = float(len(matches))
     flat = {f"{name}/{key}": value for key, value in metrics.items()}
     return MetricReport(name, {"class": classes}, flat, detections, matches.tokens)

@@ -179,6 +179,8 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
                 metrics[f"{group}/{key}"] = _mean(figures[name][key] for name in names)
     metrics["mAP"] = _mean(found["AP"] for found in figures.values())
     metrics["mIoU"] = _mean(found["mIoU"] for found in figures.values())
+    present = sum(found.num_gts > 0 for found in detections.values())
+    metrics["num_absent_classes"] = float(len(config.classes) - present)
     metrics["num_samples"] = float(len(matches))
     flat = {f"raster/{key}": value for key, value in metrics.items()}
     return MetricReport("raster", groups, flat, detections, matches.tokens)

@@ -109,6 +109,9 @@ def format_table(report: MetricReport) -> str:
             aligned = (cell.rjust(w) for cell, w in zip(cells, widths, strict=False))
             lines.append(name.ljust(max(map(len, rows))) + "".join(aligned))
         lines.insert(-len(rows) + 1, "-" * len(lines[-2]))
+    absent = [name for name, found in report.detections.items() if not found.num_gts]
+    if absent and len(absent) < len(report.detections) and not report.sample_aps:
+        lines.append(f"without ground truth, and in no mean: {', '.join(absent)}")
     lines.append(f"mAP_{report.name} = {report.metrics[f'{report.name}/mAP']:.6f}")
     return "\n".join(lines)
 
