@@ -17,6 +17,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+from gsmap.methods import METHODS
+
 REPO = Path(__file__).resolve().parents[1]
 # page of the site -> file of the repository
 OUTSIDE = {
@@ -50,6 +52,16 @@ def links(text: str, folder: str) -> set[str]:
     targets = (match["target"] for match in LINK.finditer(text) if match["target"])
     paths = (posixpath.normpath(posixpath.join(folder, target)) for target in targets)
     return {p for p in paths if not p.startswith(("docs/", "../")) and (REPO / p).is_file()}
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Put the pages of the methods behind their comparison, in the order of their list."""
+    (models,) = (part["Models"] for part in config.nav or () if "Models" in part)
+    place = next(n for n, page in enumerate(models, start=1) if "methods.md" in page.values())
+    pages = {method.title: f"methods/{method.name}.md" for method in METHODS}
+    written = {title: page for title, page in pages.items() if (REPO / "docs" / page).is_file()}
+    models[place:place] = [{title: page} for title, page in written.items()]
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

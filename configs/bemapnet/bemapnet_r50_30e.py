@@ -1,7 +1,7 @@
 # BeMapNet on nuScenes, ResNet-50, 30 epochs, 8 x 1 samples per step, as published but for random mirroring.
 _base_ = [
-    '../_base_/datasets/nuscenes.py', '../_base_/models/bemapnet.py',
-    '../_base_/schedules/pivotnet.py', '../_base_/default_runtime.py',
+    '../_base_/datasets/nuscenes.py', './_base_/model.py',
+    '../_base_/schedules/steps.py', '../_base_/default_runtime.py',
 ]
 
 model = dict(grid=_base_.grid, classes=_base_.classes)

@@ -1,6 +1,6 @@
 # GeMap with cameras and LiDAR (SECOND) on nuScenes, simple objective, 110 epochs, 3 x 8 samples per step;
 # trains on a GPU.
-_base_ = ['../maptr/maptr_r50_second_24e.py', '../_base_/models/gemap.py']
+_base_ = ['../maptr/maptr_r50_second_24e.py', './_base_/model.py']
 _base_.model.merge(_base_._gemap)
 
 optim_wrapper = dict(optimizer=dict(weight_decay=0.03))

@@ -1,7 +1,7 @@
 # HDMapNet on nuScenes, EfficientNet-B0, cameras, 30 epochs, 4 samples per step, as published.
 _base_ = [
-    '../_base_/datasets/nuscenes_ego.py', '../_base_/models/hdmapnet.py',
-    '../_base_/schedules/hdmapnet.py', '../_base_/default_runtime.py',
+    '../_base_/datasets/nuscenes_ego.py', './_base_/model.py',
+    './_base_/schedule.py', '../_base_/default_runtime.py',
 ]
 
 classes = ['divider', 'ped_crossing', 'boundary']

@@ -1,6 +1,6 @@
 # A small HDMapNet for MiniCity, trained from scratch on two CPU cores, with pixels of 0.3 m.
 _base_ = [
-    '../_base_/datasets/minicity.py', '../_base_/models/hdmapnet.py',
+    '../_base_/datasets/minicity.py', './_base_/model.py',
     '../_base_/schedules/minicity.py', '../_base_/default_runtime.py',
 ]
 

@@ -1,6 +1,6 @@
 # MapQR on Argoverse 2 as published, 6 epochs, 4 x 8 samples per step.
 _base_ = [
-    '../_base_/datasets/av2.py', '../_base_/models/maptr_r50.py', '../_base_/models/mapqr.py',
+    '../_base_/datasets/av2.py', '../_base_/models/maptr_r50.py', './_base_/model.py',
     '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
 ]
 _base_.model.merge(_base_._mapqr)

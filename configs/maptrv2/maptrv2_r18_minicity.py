@@ -1,7 +1,7 @@
 # A small MapTRv2 for MiniCity, trained from scratch on two CPU cores with LiDAR depth.
 _base_ = [
     '../_base_/datasets/minicity.py', '../_base_/models/maptr_r50.py', '../_base_/models/minicity.py',
-    '../_base_/models/maptrv2.py',
+    './_base_/model.py',
     '../_base_/schedules/minicity.py', '../_base_/default_runtime.py',
 ]
 _base_.model.merge(_base_._minicity)

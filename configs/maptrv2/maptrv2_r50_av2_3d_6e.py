@@ -1,7 +1,7 @@
 # MapTRv2 on Argoverse 2 with points of three coordinates (64.7 mAP published), 6 epochs, 4 x 8 samples per step.
 # The annotation files are made with `--dim 3`; configs of two coordinates read them as well.
 _base_ = [
-    '../_base_/datasets/av2.py', '../_base_/models/maptr_r50.py', '../_base_/models/maptrv2.py',
+    '../_base_/datasets/av2.py', '../_base_/models/maptr_r50.py', './_base_/model.py',
     '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
 ]
 _base_.model.merge(_base_._maptrv2)

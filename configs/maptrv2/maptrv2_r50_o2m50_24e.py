@@ -1,6 +1,6 @@
 # MapTRv2 with 50 one-to-many queries, the baseline of GSMap's Table 3, which does not name k: 6 as in MapTRv2.
 _base_ = [
-    '../_base_/datasets/nuscenes.py', '../_base_/models/maptr_r50.py', '../_base_/models/maptrv2.py',
+    '../_base_/datasets/nuscenes.py', '../_base_/models/maptr_r50.py', './_base_/model.py',
     '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
 ]
 _base_.model.merge(_base_._maptrv2)

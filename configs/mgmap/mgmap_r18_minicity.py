@@ -2,7 +2,7 @@
 # not mirrored.
 _base_ = [
     '../_base_/datasets/minicity.py', '../_base_/models/maptr_r50.py', '../_base_/models/minicity.py',
-    '../_base_/models/mgmap.py', '../_base_/schedules/minicity.py', '../_base_/default_runtime.py',
+    './_base_/model.py', '../_base_/schedules/minicity.py', '../_base_/default_runtime.py',
 ]
 _base_.model.merge(_base_._minicity)
 _base_.model.merge(_base_._mgmap)

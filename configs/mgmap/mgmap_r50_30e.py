@@ -1,6 +1,6 @@
 # MGMap on nuScenes as published: ResNet-50, 30 epochs, 4 x 2 samples per step.
 _base_ = [
-    '../_base_/datasets/nuscenes.py', '../_base_/models/maptr_r50.py', '../_base_/models/mgmap.py',
+    '../_base_/datasets/nuscenes.py', '../_base_/models/maptr_r50.py', './_base_/model.py',
     '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
 ]
 _base_.model.merge(_base_._mgmap)

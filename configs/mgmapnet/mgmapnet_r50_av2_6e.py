@@ -1,7 +1,7 @@
 # MGMapNet on Argoverse 2, 6 epochs, 8 x 2 samples per step; neither epochs nor rate were published.
 _base_ = [
-    '../_base_/datasets/av2.py', '../_base_/models/maptr_r50.py', '../_base_/models/maptrv2.py',
-    '../_base_/models/mgmapnet.py',
+    '../_base_/datasets/av2.py', '../_base_/models/maptr_r50.py', '../maptrv2/_base_/model.py',
+    './_base_/model.py',
     '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
 ]
 _base_.model.merge(_base_._maptrv2)

@@ -1,7 +1,7 @@
 # A small PivotNet for MiniCity, trained from scratch on two CPU cores. Crossings are rings here, as MapTR's metric has
 # them, not the two edges of the release.
 _base_ = [
-    '../_base_/datasets/minicity.py', '../_base_/models/pivotnet.py',
+    '../_base_/datasets/minicity.py', './_base_/model.py',
     '../_base_/schedules/minicity.py', '../_base_/default_runtime.py',
 ]
 

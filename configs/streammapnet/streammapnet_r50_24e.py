@@ -1,6 +1,6 @@
 # StreamMapNet on nuScenes, 60 x 30 m, ResNet-50, 24 epochs, 8 x 4 samples per step.
 _base_ = [
-    '../_base_/datasets/nuscenes_ego.py', '../_base_/models/maptr_r50.py', '../_base_/models/streammapnet.py',
+    '../_base_/datasets/nuscenes_ego.py', '../_base_/models/maptr_r50.py', './_base_/model.py',
     '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
 ]
 _base_.model.merge(_base_._streammapnet)

@@ -1,7 +1,7 @@
 # StreamMapNet on Argoverse 2, 60 x 30 m, seven cameras of 608 x 608, 30 epochs, 8 x 4 samples per step. The annotation
 # files are made with `--rate 2hz --tag _2hz` and `--classes ped_crossing divider boundary`.
 _base_ = [
-    '../_base_/datasets/av2.py', '../_base_/models/maptr_r50.py', '../_base_/models/streammapnet.py',
+    '../_base_/datasets/av2.py', '../_base_/models/maptr_r50.py', './_base_/model.py',
     '../_base_/schedules/cosine.py', '../_base_/default_runtime.py',
 ]
 _base_.model.merge(_base_._streammapnet)

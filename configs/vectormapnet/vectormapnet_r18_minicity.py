@@ -1,7 +1,7 @@
 # A small VectorMapNet for MiniCity, trained from scratch on two CPU cores. The generator learns from right boxes with
 # right noise, sees its own output and finds its way back to metres.
 _base_ = [
-    '../_base_/datasets/minicity.py', '../_base_/models/vectormapnet.py',
+    '../_base_/datasets/minicity.py', './_base_/model.py',
     '../_base_/schedules/minicity.py', '../_base_/default_runtime.py',
 ]
 

@@ -1,7 +1,7 @@
 # VectorMapNet on nuScenes, ResNet-50, 130 epochs, 8 x 5 samples per step, in the frame of the vehicle, as published.
 _base_ = [
-    '../_base_/datasets/nuscenes_ego.py', '../_base_/models/vectormapnet.py',
-    '../_base_/schedules/vectormapnet.py', '../_base_/default_runtime.py',
+    '../_base_/datasets/nuscenes_ego.py', './_base_/model.py',
+    './_base_/schedule.py', '../_base_/default_runtime.py',
 ]
 
 model = dict(grid=_base_.grid, classes=_base_.classes)
