@@ -92,9 +92,11 @@ def test_sigma_and_theta_come_from_one_matrix_or_from_a_branch_like_the_points(m
     branch = reference.gaussian_branches[0]
     assert sum(parameter.numel() for parameter in branch.parameters()) == numbers
     reference.init_weights()
-    assert not reference.offsets(0, torch.randn(2, 8))[:, 2:].any()  # neutral at first
+    states = torch.randn(2, 8)
+    start = reference.start(torch.randn(2, 8))
+    assert torch.equal(reference.refine(0, states, start)[:, 2:], start[:, 2:])  # neutral at first
     torch.nn.init.normal_(branch[-1].weight)
-    assert reference.offsets(0, torch.randn(2, 8))[:, 2:].all()
+    assert (reference.refine(0, states, start)[:, 2:] != start[:, 2:]).all()
 
 
 def soft_iou_of_the_first_gaussians(grid, masks):

@@ -73,10 +73,11 @@ class GaussianReference(PointReference, AddsWeights):
         shapes = self.by_point(self.gaussian_init(query_pos))
         return torch.cat([super().start(query_pos), shapes], -1)
 
-    def offsets(self, layer: int, point_states: Tensor) -> Tensor:
-        """Return a layer's change of the Gaussians (Eq. 8). (..., C) -> (..., D)"""
-        shapes = self.by_point(self.gaussian_branches[layer](point_states))
-        return torch.cat([super().offsets(layer, point_states), shapes], -1)
+    def refine(self, layer: int, point_states: Tensor, reference: Tensor) -> Tensor:
+        """Return the Gaussians after a layer (Eq. 8). (..., C), (..., D) -> (..., D)"""
+        points = super().refine(layer, point_states, reference[..., : self.coords])
+        changes = self.by_point(self.gaussian_branches[layer](point_states))
+        return torch.cat([points, reference[..., self.coords :] + changes], -1)
 
     def moved(self, references: Tensor, motion: Tensor) -> Tensor:
         """Return Gaussians of an earlier frame as they lie now, turned with the vehicle."""

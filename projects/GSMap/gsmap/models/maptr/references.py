@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import torch
-from mmdet.models.layers import inverse_sigmoid
 from mmdet3d.registry import MODELS
 from mmengine.model import xavier_init
 from torch import Tensor, nn
@@ -12,6 +11,8 @@ from gsmap.models.base.layers import init_matrices, mlp
 from gsmap.models.base.references import RefinedReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32, check_same_shape, in_float32
+
+_EPS = 1e-5  # a point closer to the border moves as one at this distance
 
 
 def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Tensor:
@@ -23,8 +24,11 @@ def refine_reference(reference: Tensor, offsets: Tensor, coords: int = 2) -> Ten
     """
     check_same_shape(reference=reference, offsets=offsets)
     reference, offsets = at_least_float32(reference), at_least_float32(offsets)
-    points = inverse_sigmoid(reference[..., :coords], eps=1e-5) + offsets[..., :coords]
-    return torch.cat([points.sigmoid(), reference[..., coords:] + offsets[..., coords:]], -1)
+    inner = reference[..., :coords].clamp(_EPS, 1 - _EPS)
+    points = (inner.logit() + offsets[..., :coords]).sigmoid()
+    if reference.shape[-1] == coords:
+        return points
+    return torch.cat([points, reference[..., coords:] + offsets[..., coords:]], -1)
 
 
 @MODELS.register_module()
