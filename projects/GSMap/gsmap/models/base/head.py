@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any, cast
 
 import torch
-import torch.nn.functional as F
 from mmdet.utils import reduce_mean
 from mmdet3d.registry import MODELS
 from mmengine.logging import print_log
@@ -15,6 +14,7 @@ from mmengine.model import bias_init_with_prob
 from mmengine.structures import InstanceData
 from torch import Tensor, nn
 
+from gsmap.models.base.class_losses import ClassLoss, plain_class_loss
 from gsmap.models.base.coder import DetectionHead, MapCoder, Metas, Samples, Tensors
 from gsmap.models.base.decoder import Decoded, MapDecoder
 from gsmap.models.base.layers import classification_branch, init_matrices
@@ -81,7 +81,8 @@ class MapHead(DetectionHead):
         decoder: Config of the decoder.
         losses: Configs of the losses of matched pairs (`MapLoss`).
         match_costs: Configs of the matching costs.
-        loss_cls: Config of the classification loss, on logits and one-hot targets.
+        loss_cls: Config of the classification loss: a `ClassLoss`, or one of mmdet's form on logits
+            and one-hot targets.
         query_groups: Settings of each `QueryGroup`; the first one predicts.
         reference: Config of what the decoder refines (`PointReference`).
         masks: `ElementMasks` or their settings, for losses and costs that read masks.
@@ -186,6 +187,8 @@ class MapHead(DetectionHead):
             ("coder.unfold_classes", self.coder.unfold_classes),
         ):
             check_classes(name, given, self.classes)
+        if isinstance(self.loss_cls, ClassLoss):
+            self.loss_cls.check(self)
         for loss in cast(Any, self.losses.values()):
             loss.check(self)
             check_weight(loss, loss.loss_weight, self.classes)
@@ -378,12 +381,13 @@ class MapHead(DetectionHead):
         return losses
 
     def class_losses(self, pairs: MatchedPairs) -> Tensor:
-        """Return the classification loss of each layer. (L,)"""
-        # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
-        one_hot = F.one_hot(pairs.query_labels() + 1, len(self.classes) + 1)[..., 1:]
+        """Classification loss of each layer. (L,)"""
         scores = pairs.predictions.scores  # (B, L * N, classes)
-        each = self.loss_cls(scores.flatten(0, 1), one_hot.flatten(0, 1), reduction_override="none")
-        by_layer = each.view(len(scores), pairs.num_layers, -1).transpose(0, 1)
+        if isinstance(self.loss_cls, ClassLoss):
+            values = self.loss_cls(pairs)
+        else:
+            values = plain_class_loss(self.loss_cls, scores, pairs.query_labels())
+        by_layer = values.view(len(scores), pairs.num_layers, -1).transpose(0, 1)
         return by_layer.flatten(1).sum(1) / pairs.avg_factor
 
     def statistics(self, pairs: MatchedPairs) -> Tensors:

@@ -1,0 +1,148 @@
+"""Class losses whose targets are the quality of the predicted geometry (DAMap, ICCV 2025)."""
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch
+import torch.nn.functional as F
+from mmdet3d.registry import MODELS
+from torch import Tensor, nn
+
+from gsmap.models.base.pairs import BuiltHead, MatchedPairs
+from gsmap.models.base.parts import PARTS, check_classes
+from gsmap.structures.tensors import constant
+
+
+class ClassLoss(nn.Module):
+    """A class loss that reads the matched pairs, not only one-hot targets."""
+
+    def check(self, head: BuiltHead) -> None:
+        """Raise ValueError if a head does not fit; called when it is built."""
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Weighted loss of every logit. (B, L * N, classes)
+
+        Args:
+            pairs: Matched pairs of all L layers.
+        """
+        raise NotImplementedError
+
+
+class Quality(nn.Module):
+    """Quality of matched predictions, the target of their class scores."""
+
+    def check(self, head: BuiltHead) -> None:
+        """Raise ValueError if a head lacks an input of the quality."""
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Quality of each matched pair, 0 to 1, without gradient. (M,)"""
+        raise NotImplementedError
+
+
+@MODELS.register_module()
+class DistanceQuality(Quality):
+    r"""Quality by the distance of points: :math:`\exp(-s \sum_c \overline{|p_c - t_c|})`.
+
+    The mean is over the points of an element, the sum over coordinates c, both [0, 1] over the map
+    (DAMap).
+
+    Args:
+        scale: Factor s of the distance. DAMap takes the weight of its points loss, 5.
+    """
+
+    def __init__(self, scale: float = 5.0) -> None:
+        super().__init__()
+        self.scale = scale
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Quality of each matched pair. (M,)"""
+        distances = (pairs.pred_pts.detach() - pairs.gt_pts).abs().mean(1).sum(-1)
+        return (-self.scale * distances).exp()
+
+
+@MODELS.register_module()
+class QualityClassLoss(ClassLoss):
+    r"""Quality focal loss from the second decoder layer on, a plain loss for the first (DAMap).
+
+    For the class of a matched ground truth, with its quality q and the score s:
+    :math:`|q - s|^\beta \mathrm{BCE}(s, q)`; for every other class and query
+    :math:`s^\beta \mathrm{BCE}(s, 0)`. The points of the first layer are far off, so that q would
+    be close to 0 for all.
+
+    Args:
+        quality: Config of a `Quality`.
+        first_layer: Config of the loss of the first layer, on logits and one-hot targets.
+        beta: Exponent of the distance between score and target.
+        loss_weight: Weight of the loss.
+        classes: Indices of the classes whose targets are the quality; targets of others are 1. None
+            takes all classes.
+
+    Raises:
+        ValueError: If the head lacks one of the classes, or an input of the quality.
+    """
+
+    def __init__(
+        self,
+        quality: PARTS,
+        first_layer: PARTS,
+        beta: float = 2.0,
+        loss_weight: float = 2.0,
+        classes: Sequence[int] | None = None,
+    ) -> None:
+        super().__init__()
+        self.quality = cast(Quality, MODELS.build(quality))
+        self.first_layer = MODELS.build(first_layer)
+        self.beta = beta
+        self.loss_weight = loss_weight
+        self.classes = classes
+
+    def check(self, head: BuiltHead) -> None:
+        """Raise ValueError if a head does not fit, see the class; called when it is built."""
+        check_classes("loss_cls.classes", self.classes or (), head.classes)
+        self.quality.check(head)
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Weighted loss of every logit. (B, L * N, classes)
+
+        Args:
+            pairs: Matched pairs of all L layers.
+        """
+        scores = pairs.predictions.scores
+        targets = self.targets(pairs)
+        per_layer = scores.shape[1] // pairs.num_layers
+        plain = plain_class_loss(
+            self.first_layer, scores[:, :per_layer], pairs.query_labels()[:, :per_layer]
+        )
+        probabilities = scores[:, per_layer:].sigmoid()
+        later = targets[:, per_layer:]
+        entropies = F.binary_cross_entropy_with_logits(
+            scores[:, per_layer:], later, reduction="none"
+        )
+        focused = (later - probabilities).abs().pow(self.beta) * entropies
+        return torch.cat([plain, self.loss_weight * focused], 1)
+
+    def targets(self, pairs: MatchedPairs) -> Tensor:
+        """Targets of the scores, without gradient. (B, L * N, classes)"""
+        scores = pairs.predictions.scores
+        targets = torch.zeros_like(scores)
+        quality = self.quality(pairs).detach().to(targets)
+        if self.classes is not None:
+            chosen = [index in self.classes for index in range(scores.shape[-1])]
+            has_quality = constant(pairs.gt_labels, chosen, torch.bool)
+            quality = torch.where(has_quality[pairs.gt_labels], quality, 1.0)
+        targets[pairs.samples, pairs.query_inds, pairs.gt_labels] = quality
+        return targets
+
+
+def plain_class_loss(loss: Any, scores: Tensor, labels: Tensor) -> Tensor:
+    """Values of a loss on logits and one-hot targets. (B, N, classes)
+
+    Args:
+        loss: Built loss of mmdet's form.
+        scores: Class logits. (B, N, classes)
+        labels: Class of each query, -1 for none. (B, N)
+    """
+    # one-hot targets take the plain path of mmdet's focal loss, which needs no compiled op
+    one_hot = F.one_hot(labels + 1, scores.shape[-1] + 1)[..., 1:]
+    values = loss(scores.flatten(0, 1), one_hot.flatten(0, 1), reduction_override="none")
+    return values.view_as(scores)

@@ -1,0 +1,80 @@
+"""Qualities of matched Gaussians, for class losses with targets of quality."""
+
+from collections.abc import Sequence
+from typing import cast
+
+from mmdet3d.registry import MODELS
+from torch import Tensor, nn
+
+from gsmap.models.base.class_losses import Quality
+from gsmap.models.base.pairs import BuiltHead, MatchedPairs
+from gsmap.models.base.parts import PARTS
+from gsmap.models.gsmap.reference import GaussianReference, require_gaussians
+from gsmap.ops.soft_iou import soft_iou
+from gsmap.structures.gaussians import extents_along_line, line_errors
+
+
+@MODELS.register_module()
+class ErrorQuality(Quality):
+    r"""Quality by the sigmas of the points' errors: the mean of :math:`\exp(-d^2 / 2 \sigma^2)`.
+
+    The mean is over the points of an element; d and sigma are across its line, in metres.
+
+    Args:
+        largest_m: Sigmas above this count as this, so that a model cannot raise the quality of a
+            bad line by a large sigma.
+    """
+
+    def __init__(self, largest_m: float = 1.0) -> None:
+        super().__init__()
+        self.largest_m = largest_m
+
+    def check(self, head: BuiltHead) -> None:
+        """Raise ValueError if the head has no Gaussians."""
+        require_gaussians(self, head)
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Quality of each matched pair. (M,)"""
+        reference = cast(GaussianReference, pairs.predictions.reference)
+        gaussians = reference.errors(pairs.pred_references.detach())
+        sigma = extents_along_line(gaussians)[..., 1].clamp(max=self.largest_m)  # (M, P)
+        distance = line_errors(gaussians.means, pairs.gt_pts_m[..., :2])[..., 1]
+        return (-(distance / sigma).square() / 2).exp().mean(-1)
+
+
+@MODELS.register_module()
+class MaskQuality(Quality):
+    """Quality by the soft IoU of the rendered mask with that of the ground truth (AP_raster)."""
+
+    def check(self, head: BuiltHead) -> None:
+        """Raise ValueError if the head has no Gaussians."""
+        require_gaussians(self, head)
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Quality of each matched pair. (M,)"""
+        return soft_iou(pairs.pred_masks.detach(), pairs.gt_masks)
+
+
+@MODELS.register_module()
+class ProductQuality(Quality):
+    """Product of several qualities.
+
+    Args:
+        qualities: Configs of the factors.
+    """
+
+    def __init__(self, qualities: Sequence[PARTS]) -> None:
+        super().__init__()
+        self.qualities = nn.ModuleList(MODELS.build(quality) for quality in qualities)
+
+    def check(self, head: BuiltHead) -> None:
+        """Raise ValueError if the head lacks an input of a factor."""
+        for quality in self.qualities:
+            cast(Quality, quality).check(head)
+
+    def forward(self, pairs: MatchedPairs) -> Tensor:
+        """Quality of each matched pair. (M,)"""
+        product = self.qualities[0](pairs)
+        for quality in self.qualities[1:]:
+            product = product * quality(pairs)
+        return product
