@@ -190,8 +190,8 @@ def _reference_table(frames: list[Record], count: int, grid: BEVGrid) -> str:
     chamfer, raster = ChamferConfig(CLASSES), RasterConfig(CLASSES, grid)
     rows = []
     for name, evaluator, slow in (
-        ("chamfer", MapEvaluator(chamfer, None), lambda: reference.chamfer_map(samples, 3)),
-        ("raster", MapEvaluator(None, raster), lambda: reference.raster_map(samples, raster)),
+        ("chamfer", MapEvaluator(chamfer), lambda: reference.chamfer_map(samples, 3)),
+        ("raster", MapEvaluator(raster), lambda: reference.raster_map(samples, raster)),
     ):
         evaluator.match("warm-up", *samples[0])
         start = time.process_time()

@@ -56,7 +56,7 @@ def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
     shapes: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
     nothing = MapElements.from_polylines()
     pairs = [(token, predicted.get(token, nothing), true) for token, true in annotated.items()]
-    for matches in match_samples(pairs, MapEvaluator(config, None)):
+    for matches in match_samples(pairs, MapEvaluator(config)):
         found = matches["chamfer"]
         truths = annotated[found.token].polylines
         lines = predicted[found.token].polylines if len(found.labels) else []

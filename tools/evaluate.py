@@ -18,37 +18,19 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import CLASSES, RANGES
-from gsmap.evaluation.analysis.bootstrap import (
-    Resamples,
-    ap_differences,
-    ap_intervals,
-    format_intervals,
-)
-from gsmap.evaluation.analysis.calibration import (
-    LAWS,
-    format_uncertainty,
-    matched_vertices,
-    uncertainty_report,
-)
-from gsmap.evaluation.analysis.distances import DISTANCE, cut_by_distance, distance_groups
-from gsmap.evaluation.analysis.groups import (
-    Groups,
-    ap_by_group,
-    group_report,
-    group_table,
-    read_groups,
-)
-from gsmap.evaluation.analysis.prior import evaluate_prior
+from gsmap.evaluation.analysis import DISTANCE
 from gsmap.evaluation.core.chamfer_ap import (
     CHAMFER_THRESHOLDS,
     HARD_CHAMFER_THRESHOLDS,
     ChamferConfig,
 )
-from gsmap.evaluation.core.evaluator import ALL_NAMES, METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.core.evaluator import METRIC_NAMES, MapEvaluator
 from gsmap.evaluation.core.file_evaluation import (
     Evaluation,
     SamplePairs,
@@ -57,62 +39,119 @@ from gsmap.evaluation.core.file_evaluation import (
     scenes_of,
 )
 from gsmap.evaluation.core.match_files import write_matches
-from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.metric import MetricSettings, metric_files
 from gsmap.evaluation.core.report import MetricReport, format_table, write_figures
-from gsmap.evaluation.core.sample_ap import METHODS
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.cli import CommandParser, output_file, run_command
 from gsmap.utils.faults import nearest
-from gsmap.utils.model_facts import law_of
+from gsmap.utils.model_facts import LAW_NAMES, law_of
 from gsmap.utils.ray_shards import run_on_ray
 from gsmap.utils.shards import add_shard_options, digest, digest_of_common, read_shard
 from gsmap.utils.words import counted, markdown_table
+
+if TYPE_CHECKING:  # what only some options need is imported where it is used
+    from gsmap.evaluation.analysis.bootstrap import Resamples
+    from gsmap.evaluation.analysis.groups import Groups
 
 
 def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     parser = CommandParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    add_inputs(parser)
+    add_metrics(parser)
+    add_rules(parser)
+    add_analysis(parser)
+    add_outputs(parser)
+    add_shard_options(parser)
+    args = parser.parse_args(argv)
+    check_combinations(parser, args)
+    args.eval = metrics_from(args)
+    return args
+
+
+def add_inputs(parser: argparse.ArgumentParser) -> None:
+    """Add the files that are read, and what is said of them."""
     parser.add_argument("results", type=Path, nargs="?", help="results in MapTR's JSON form")
     parser.add_argument(
         "ground_truth", type=Path, help="annotation file (*.arrow), or JSON with a list of GTs"
     )
-    parser.add_argument(
+    group = parser.add_argument_group("inputs")
+    group.add_argument(
         "--prior",
         type=Path,
         metavar="TRAIN",
         help="score the best fixed set of elements, fitted on this ground truth",
     )
-    parser.add_argument("--prior-elements", type=int, default=50, help="elements in that set")
-    parser.add_argument(
+    group.add_argument("--prior-elements", type=int, default=50, help="elements in that set")
+    group.add_argument("--classes", nargs="+", help="default: the annotation file's, or MapTR's")
+    group.add_argument(
+        "--allow-mismatch",
+        action="store_true",
+        help="samples without results count as empty, results without ground truth are left out",
+    )
+    group.add_argument(
+        "--allow-other-split",
+        action="store_true",
+        help="the model may be trained on another split, which may hold places of this one",
+    )
+    group.add_argument("--workers", type=int, default=1, help="number of processes")
+
+
+def add_metrics(parser: argparse.ArgumentParser) -> None:
+    """Add the choice of metrics."""
+    group = parser.add_argument_group("metrics")
+    group.add_argument(
         "--eval",
         nargs="+",
         default=list(METRIC_NAMES),
-        choices=ALL_NAMES,
-        help="metrics; chamfer_hard: besides chamfer also at 0.2, 0.5 and 1.0 m, matched once; "
-        "vectormapnet, vectormapnet_shrunk, hdmapnet, bemapnet: of these methods' own evaluators, "
-        "not comparable",
+        metavar="METRIC",
+        help=f"names of metrics: {', '.join(metric_files())}; chamfer_hard: AP_chamfer at 0.2, "
+        "0.5 and 1.0 m, too; vectormapnet_shrunk. Those of methods are not comparable with others",
     )
-    parser.add_argument(
+    group.add_argument(
+        "--custom-imports",
+        nargs="+",
+        default=[],
+        metavar="MODULE",
+        help="modules with metrics of one's own, which --eval then knows",
+    )
+    group.add_argument(
+        "--topology",
+        action="store_true",
+        help="--eval topology beside the others: elements in pieces, elements joined and lines "
+        "that fold back; with --dim 3 also --eval heights",
+    )
+    group.add_argument(
+        "--pld",
+        action="store_true",
+        help="--eval pld beside the others: distance of whole maps, in which the order of points "
+        "and all scores count",
+    )
+
+
+def add_rules(parser: argparse.ArgumentParser) -> None:
+    """Add the rules that metrics follow."""
+    group = parser.add_argument_group("rules of metrics")
+    group.add_argument(
         "--thresholds", nargs="+", type=float, help="of AP_chamfer, in metres (0.5 1.0 1.5)"
     )
-    parser.add_argument(
+    group.add_argument("--hard", action="store_true", help="AP_chamfer at 0.2, 0.5 and 1.0 m")
+    group.add_argument(
         "--dim",
         type=int,
         default=2,
         choices=(2, 3),
         help="coordinates of AP_chamfer; 3 needs heights in results and ground truth",
     )
-    parser.add_argument("--hard", action="store_true", help="AP_chamfer at 0.2, 0.5 and 1.0 m")
-    parser.add_argument("--classes", nargs="+", help="default: the annotation file's, or MapTR's")
-    parser.add_argument(
+    group.add_argument(
         "--polygon-classes",
         nargs="*",
         default=list(AREA_CLASSES),
         help="classes that AP_raster fills",
     )
-    parser.add_argument(
+    group.add_argument(
         "--range",
         nargs=4,
         type=float,
@@ -120,56 +159,30 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         help="canvas of AP_raster in metres: the annotation file's, or nuScenes' -15 -30 15 30; "
         "Argoverse 2: -30 -15 30 15",
     )
-    parser.add_argument(
+    group.add_argument(
         "--gt-points", type=int, help="resample ground truth to that many points first (raw)"
     )
-    parser.add_argument(
+    group.add_argument(
         "--keep-pred-points",
         action="store_true",
         help="AP_chamfer: compare predictions at their own points, not at 100",
     )
-    parser.add_argument(
+    group.add_argument(
         "--keep-gt-points",
         action="store_true",
         help="AP_chamfer: compare ground truth at its own vertices, not at 100 points",
     )
-    parser.add_argument(
-        "--allow-mismatch",
-        action="store_true",
-        help="samples without results count as empty, results without ground truth are left out",
-    )
-    parser.add_argument(
-        "--allow-other-split",
-        action="store_true",
-        help="the model may be trained on another split, which may hold places of this one",
-    )
-    parser.add_argument(
-        "--consistency",
-        action="store_true",
-        help="C-mAP of MapTracker and jitter over drives; needs an annotation file with poses",
-    )
-    parser.add_argument(
-        "--topology",
-        action="store_true",
-        help="count elements in pieces, elements joined and lines that fold back; with --dim 3 "
-        "also measure heights",
-    )
-    parser.add_argument(
-        "--pld",
-        action="store_true",
-        help="PLD: distance of whole maps, in which the order of points and all scores count",
-    )
-    parser.add_argument(
+    group.add_argument(
         "--min-score",
         type=float,
-        help="of predictions that --topology counts (0.4), and hdmapnet and bemapnet (0: all)",
+        help="of predictions that topology counts (0.4), and hdmapnet and bemapnet (0: all)",
     )
-    parser.add_argument(
-        "--tracks",
-        type=output_file,
-        help="with --consistency: write the results again, each element with its track_id",
-    )
-    parser.add_argument(
+
+
+def add_analysis(parser: argparse.ArgumentParser) -> None:
+    """Add what is made of the metrics, and of drives and Gaussians."""
+    group = parser.add_argument_group("analysis")
+    group.add_argument(
         "--bootstrap",
         type=int,
         nargs="?",
@@ -177,39 +190,55 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         metavar="N",
         help="intervals of 95 %% of every AP, of N resamples of the scenes (1000)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the resamples")
-    parser.add_argument(
+    group.add_argument("--seed", type=int, default=0, help="of the resamples")
+    group.add_argument(
+        "--against",
+        type=Path,
+        metavar="OTHER",
+        help="second result file: what the first has more in every AP, with its interval",
+    )
+    group.add_argument(
         "--by",
         metavar="map|scene|distance|FILE",
         help="AP of each map or scene alone, of the map cut at 10 and 20 m from the vehicle, or "
         "of scenes by night and weather (FILE: scene.json of nuScenes' tables, or JSON with a word "
         "for each scene or each sample)",
     )
-    parser.add_argument(
-        "--against",
-        type=Path,
-        metavar="OTHER",
-        help="second result file: what the first has more in every AP, with its interval",
+    group.add_argument(
+        "--consistency",
+        action="store_true",
+        help="C-mAP of MapTracker and jitter over drives; needs an annotation file with poses",
     )
-    parser.add_argument(
+    group.add_argument(
+        "--tracks",
+        type=output_file,
+        help="with --consistency: write the results again, each element with its track_id",
+    )
+    group.add_argument(
         "--uncertainty",
         action="store_true",
         help="whether Gaussians say how far off matched vertices are: likelihood, coverage, ranks",
     )
-    parser.add_argument(
+    group.add_argument(
         "--law",
-        choices=LAWS,
+        choices=LAW_NAMES,
         help="with --uncertainty: distribution of the errors (that of the model's calibration, as "
         "the results say, or normal)",
     )
-    parser.add_argument(
+    group.add_argument(
         "--reliability", type=output_file, help="with --uncertainty: draw its curves"
     )
-    parser.add_argument("--workers", type=int, default=1, help="number of processes")
-    parser.add_argument("--out", type=output_file, help="write all figures as flat JSON")
-    parser.add_argument("--pr-curves", type=output_file, help="draw PR curves and calibration")
-    add_shard_options(parser)
-    args = parser.parse_args(argv)
+
+
+def add_outputs(parser: argparse.ArgumentParser) -> None:
+    """Add the files that are written."""
+    group = parser.add_argument_group("outputs")
+    group.add_argument("--out", type=output_file, help="write all figures as flat JSON")
+    group.add_argument("--pr-curves", type=output_file, help="draw PR curves and calibration")
+
+
+def check_combinations(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Refuse options that exclude each other."""
     if args.results and args.results.suffix == ".arrow":
         parser.error(f"{args.results} holds ground truth: name the result file before it")
     if (args.results is None) == (args.prior is None):
@@ -220,14 +249,6 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
         (args.reliability and not args.uncertainty, "--reliability needs --uncertainty"),
         (args.law and not args.uncertainty, "--law needs --uncertainty"),
         (args.against and args.prior, "--against compares two result files: leave out --prior"),
-        (
-            args.min_score is not None and not (args.topology or {*args.eval} & {*METHODS}),
-            "--min-score is of --topology, hdmapnet and bemapnet: leave it out",
-        ),
-        (
-            args.pr_curves and not {*args.eval} - {*METHODS},
-            "--pr-curves draws what counts predictions of all samples: name chamfer or raster",
-        ),
         (args.by == DISTANCE and args.prior, "--by distance cuts a result file: leave out --prior"),
         (args.by == DISTANCE and args.dim == 3, "--by distance is in the plane: leave out --dim 3"),
         (
@@ -241,13 +262,22 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     ):
         if refused:
             parser.error(why)
-    for name in ("consistency", "pld", "topology", "uncertainty"):
+    for name in ("consistency", "uncertainty"):
         if getattr(args, name) and (args.prior or args.shard.count):
             parser.error(f"--{name} needs a result file as a whole: leave out --prior and --shard")
-    return args
 
 
-def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
+def metrics_from(args: argparse.Namespace) -> list[str]:
+    """Return the names of the metrics that the options ask for, once each."""
+    names = [*args.eval]
+    if args.pld:
+        names.append("pld")
+    if args.topology:
+        names += ["topology", "heights"] if args.dim == 3 else ["topology"]
+    return list(dict.fromkeys(names))
+
+
+def settings_from(args: argparse.Namespace) -> MetricSettings:
     """Join the arguments with what the annotation file says."""
     classes, (x_range, y_range) = CLASSES, RANGES["lidar"]
     if args.ground_truth.suffix.lower() != ".json":
@@ -259,15 +289,37 @@ def evaluator_from(args: argparse.Namespace) -> MapEvaluator:
     if args.range:
         x_range, y_range = tuple(args.range[::2]), tuple(args.range[1::2])
     thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
-    chamfer = ChamferConfig(
+    return MetricSettings(
         classes,
-        tuple(thresholds or CHAMFER_THRESHOLDS),
+        tuple(thresholds) if thresholds else None,
+        dim=args.dim,
         resample_predictions=not args.keep_pred_points,
         resample_ground_truth=not args.keep_gt_points,
-        dim=args.dim,
+        grid=BEVGrid(x_range, y_range),
+        polygon_classes=tuple(args.polygon_classes),
+        min_score=args.min_score,
     )
-    raster = RasterConfig(classes, BEVGrid(x_range, y_range), tuple(args.polygon_classes))
-    return MapEvaluator.named(args.eval, chamfer, raster, args.gt_points, args.min_score or 0.0)
+
+
+def evaluator_from(args: argparse.Namespace, settings: MetricSettings) -> MapEvaluator:
+    """Return the metrics that are asked for.
+
+    Raises:
+        ValueError: If there is no metric of a name, or an option is of no metric of them.
+    """
+    for module in args.custom_imports:
+        import_module(module)
+    evaluator = MapEvaluator.named(args.eval, settings, args.gt_points)
+    if args.min_score is not None and not any(m.takes_min_score for m in evaluator.metrics):
+        raise ValueError("--min-score is of topology, hdmapnet and bemapnet: leave it out.")
+    if args.pr_curves and not any(metric.has_curves for metric in evaluator.metrics):
+        raise ValueError(
+            "--pr-curves draws what counts predictions of all samples: name chamfer or raster."
+        )
+    of_ap = args.by or args.bootstrap is not None or args.against
+    if of_ap and not any(metric.ranks for metric in evaluator.metrics):
+        raise ValueError("--by, --bootstrap and --against are of AP: name chamfer or raster.")
+    return evaluator
 
 
 def report(outcome: Evaluation, args: argparse.Namespace) -> None:
@@ -293,31 +345,6 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
         print(f"curves: {save_figure(plot_result(drawn), args.pr_curves)}")
 
 
-def reports_of_pairs(args: argparse.Namespace, evaluator: MapEvaluator) -> list[MetricReport]:
-    """Compute PLD, count breaks, false joints and folds, and measure heights if they count."""
-    from gsmap.evaluation.metrics.pld import pld_figures
-    from gsmap.evaluation.metrics.topology import TopologyConfig, height_figures, topology_figures
-
-    classes = evaluator.classes
-    areas = tuple(label for label, name in enumerate(classes) if name in args.polygon_classes)
-    min_score = 0.4 if args.min_score is None else args.min_score
-    config = TopologyConfig(classes, areas, min_score)
-    inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard, True
-    found = {}
-    if args.pld:
-        thresholds = HARD_CHAMFER_THRESHOLDS if args.hard else args.thresholds
-        rules = ChamferConfig(classes, tuple(thresholds or CHAMFER_THRESHOLDS))
-        found["pld"] = pld_figures(SamplePairs(*inputs), rules)
-    if args.topology:
-        found["topology"] = topology_figures(SamplePairs(*inputs), config)
-    if args.topology and evaluator.chamfer is not None and evaluator.counts_heights:
-        found["heights"] = height_figures(SamplePairs(*inputs), evaluator.chamfer)
-    return [
-        MetricReport(name, {}, {f"{name}/{key}": value for key, value in figures.items()}, {})
-        for name, figures in found.items()
-    ]
-
-
 def consistency_report(args: argparse.Namespace) -> MetricReport:
     """Score the drives of a result file, and write its tracks if that is asked for."""
     from gsmap.evaluation.analysis.consistency import ConsistencyConfig
@@ -341,12 +368,19 @@ def consistency_report(args: argparse.Namespace) -> MetricReport:
     return MetricReport("consistency", {}, figures, {})
 
 
-def report_of_gaussians(args: argparse.Namespace, evaluator: MapEvaluator) -> MetricReport:
+def report_of_gaussians(args: argparse.Namespace, settings: MetricSettings) -> MetricReport:
     """Print the scores of a result file's Gaussians; draw their curves if that is asked for."""
-    classes = evaluator.classes
+    from gsmap.evaluation.analysis.calibration import (
+        format_uncertainty,
+        matched_vertices,
+        uncertainty_report,
+    )
+
+    classes = settings.classes
+    rules = ChamferConfig.of(settings) if "chamfer" in args.eval else ChamferConfig(classes)
     inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard
     pairs = SamplePairs(*inputs, args.allow_other_split, gaussians=True)
-    vertices = matched_vertices(pairs, evaluator.chamfer or ChamferConfig(classes))
+    vertices = matched_vertices(pairs, rules)
     law = args.law or law_of(pairs.about)
     if args.reliability:
         from gsmap.visualization.figure import save_figure
@@ -359,7 +393,7 @@ def report_of_gaussians(args: argparse.Namespace, evaluator: MapEvaluator) -> Me
     return found
 
 
-def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
+def match_shard(args: argparse.Namespace, evaluator: MapEvaluator, settings: MetricSettings) -> str:
     """Match a part of the samples and keep the matches; return what was done."""
     results = args.shard.path_of(args.results)
     if args.results.exists() or not results.exists():
@@ -377,7 +411,7 @@ def match_shard(args: argparse.Namespace, evaluator: MapEvaluator) -> str:
     matches = list(match_samples(pairs, evaluator, args.workers))
     notes = pairs.notes(evaluator.counts_heights)
     source += digest(args.ground_truth)
-    path = write_matches(args.out, args.shard, matches, notes, evaluator, source)
+    path = write_matches(args.out, args.shard, matches, notes, evaluator, settings, source)
     return f"{counted(len(matches), 'sample')} matched: {path}"
 
 
@@ -393,15 +427,32 @@ def evaluate(results: Path, args: argparse.Namespace, evaluator: MapEvaluator) -
     )
 
 
+def resamples_from(args: argparse.Namespace) -> "Resamples | None":
+    """Read the scenes of samples before anything is scored; None without intervals."""
+    if args.bootstrap is None and not args.against:
+        return None
+    from gsmap.evaluation.analysis.bootstrap import Resamples
+
+    count = 1000 if args.bootstrap is None else args.bootstrap
+    return Resamples(scenes_of(args.ground_truth), count, args.seed)
+
+
 def interval_report(
-    outcome: Evaluation, resamples: Resamples, args: argparse.Namespace, evaluator: MapEvaluator
+    outcome: Evaluation, resamples: "Resamples", args: argparse.Namespace, evaluator: MapEvaluator
 ) -> MetricReport:
     """Print the intervals of every AP, and of what it has more than in another result file."""
+    from gsmap.evaluation.analysis.bootstrap import (
+        ap_differences,
+        ap_intervals,
+        format_intervals,
+    )
+
     what = f"of {resamples.count} resamples of the scenes, seed {resamples.seed}"
     found = {"": ap_intervals(outcome[0], resamples)}
     print(format_intervals(found[""], f"AP with intervals of 95 % {what}") + "\n")
     if args.against:
         others, notes = evaluate(args.against, args, evaluator)
+        others = [found for found in others if found.detections]
         outcome[1].extend(f"{args.against}: {note}" for note in notes)
         found["minus_other/"] = ap_differences(outcome[0], others, resamples)
         title = f"{args.results} minus {args.against}, {what}"
@@ -416,17 +467,29 @@ def interval_report(
     return MetricReport("intervals", {}, flat, {})
 
 
-def groups_from(args: argparse.Namespace) -> Groups | None:
+def groups_from(args: argparse.Namespace) -> "Groups | None":
     """Read the groups of samples before anything is scored; None: bands of distances, or none."""
-    return None if args.by in (None, DISTANCE) else read_groups(args.ground_truth, args.by)
+    if args.by in (None, DISTANCE):
+        return None
+    from gsmap.evaluation.analysis.groups import read_groups
+
+    return read_groups(args.ground_truth, args.by)
 
 
 def report_of_parts(
-    reports: Sequence[MetricReport], groups: Groups | None, args: argparse.Namespace
+    reports: Sequence[MetricReport],
+    groups: "Groups | None",
+    args: argparse.Namespace,
+    evaluator: MapEvaluator,
 ) -> MetricReport:
     """Print the AP of each group of samples; without groups, of the map in bands of distances."""
+    from gsmap.evaluation.analysis.groups import ap_by_group, group_report, group_table
+
     if groups is None:
-        evaluator = evaluator_from(args)
+        from gsmap.evaluation.analysis.distances import cut_by_distance, distance_groups
+
+        ranking = [metric for metric in evaluator.metrics if metric.ranks]
+        evaluator = MapEvaluator(*ranking, ground_truth_points=evaluator.ground_truth_points)
         classes = evaluator.classes
         inputs = args.results, args.ground_truth, classes, args.allow_mismatch, args.shard, True
         areas = [label for label, name in enumerate(classes) if name in args.polygon_classes]
@@ -443,32 +506,34 @@ def main(argv: list[str] | None = None) -> str:
     if args.executor:
         return run_on_ray(args, sys.argv)
     start = time.perf_counter()
-    evaluator = evaluator_from(args)
+    settings = settings_from(args)
+    evaluator = evaluator_from(args, settings)
     if args.shard.count:
-        return match_shard(args, evaluator)
+        return match_shard(args, evaluator, settings)
     groups = groups_from(args)
-    resamples = None
-    if args.bootstrap is not None or args.against:
-        count = 1000 if args.bootstrap is None else args.bootstrap
-        resamples = Resamples(scenes_of(args.ground_truth), count, args.seed)
+    resamples = resamples_from(args)
     if args.prior:
+        from gsmap.evaluation.analysis.prior import evaluate_prior
+
         how = args.prior_elements, args.allow_other_split
         outcome = evaluate_prior(args.prior, args.ground_truth, evaluator, *how)
     else:
         outcome = evaluate(args.results, args, evaluator)
+    reports, notes = outcome
+    ranked = [found for found in reports if found.detections]
+    counts = [found for found in reports if not found.detections]
+    analysis = []
     if resamples is not None:
-        outcome[0].append(interval_report(outcome, resamples, args, evaluator))
+        analysis.append(interval_report((ranked, notes), resamples, args, evaluator))
     if args.by:
-        outcome[0].append(report_of_parts(outcome[0], groups, args))
-    if args.pld or args.topology:
-        outcome[0].extend(reports_of_pairs(args, evaluator))
+        analysis.append(report_of_parts(ranked, groups, args, evaluator))
+    analysis += counts
     if args.consistency:
-        outcome[0].append(consistency_report(args))
+        analysis.append(consistency_report(args))
     if args.uncertainty:
-        outcome[0].append(report_of_gaussians(args, evaluator))
-    report(outcome, args)
-    first = outcome[0][0]
-    number = int(first.metrics[f"{first.name}/num_samples"])
+        analysis.append(report_of_gaussians(args, settings))
+    report(([*ranked, *analysis], notes), args)
+    number = len(reports[0].tokens)
     return f"{counted(number, 'sample')} in {time.perf_counter() - start:.1f} s"
 
 

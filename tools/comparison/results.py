@@ -147,14 +147,14 @@ def check_one_test_set(results: Sequence[Result]) -> None:
 def evaluator_for(annotations: Path, changes: Mapping[str, Any]) -> MapEvaluator:
     """Return the rules of both metrics for an annotation file, which says classes and range.
 
-    ``changes`` are fields of ``ChamferConfig``, ``RasterConfig`` or ``MapEvaluator``; ValueError if
-    there is no such field.
+    ``changes`` are fields of ``ChamferConfig`` or ``RasterConfig``, or ``ground_truth_points``;
+    ValueError if there is no such field.
     """
     meta = AnnotationFile(annotations).meta
     own: dict[str, Any] = {"classes": meta.classes, "grid": BEVGrid(meta.x_range, meta.y_range)}
     own |= {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
-    known = [{f.name for f in fields(c)} for c in (ChamferConfig, RasterConfig, MapEvaluator)]
-    known[-1] -= {"chamfer", "raster", "drawn"}  # rules of metrics are no settings
+    known = [{f.name for f in fields(c)} for c in (ChamferConfig, RasterConfig)]
+    known.append({"ground_truth_points"})
     unknown = own.keys() - set().union(*known)
     if unknown:
         allowed = sorted(set().union(*known))

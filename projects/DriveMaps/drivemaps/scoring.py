@@ -28,7 +28,7 @@ def chamfer_ap(
         num_points: Points that each line is resampled to.
     """
     config = ChamferConfig(tuple(classes), num_points=num_points)
-    evaluator = MapEvaluator(config, None)
+    evaluator = MapEvaluator(config)
     figures = flat_metrics(evaluator.reports([evaluator.match(*pair) for pair in pairs]))
     there = [name for name in classes if figures[f"chamfer/{name}/num_gts"]]
     found = {name: figures[f"chamfer/{name}/AP"] for name in there}

@@ -11,12 +11,11 @@ from mmengine.evaluator import BaseMetric
 from mmengine.logging import MMLogger, print_log
 
 from gsmap.datasets.elements import elements_of_predictions, elements_of_truth
-from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.core.evaluator import ALL_NAMES, METRIC_NAMES, SHRUNK_NAME, MapEvaluator
-from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS
+from gsmap.evaluation.core.evaluator import METRIC_NAMES, MapEvaluator
+from gsmap.evaluation.core.metric import MetricSettings, metric_class, metric_names
 from gsmap.evaluation.core.report import flat_metrics, format_table
 from gsmap.evaluation.core.results_json import vectors_of, write_results
-from gsmap.evaluation.core.sample_ap import METHODS
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT
 from gsmap.utils.split_lists import SPLIT_LIST, TRAINED_ON
@@ -32,9 +31,8 @@ class MapMetric(BaseMetric):
     (``classes``, ``x_range``, ``y_range``, ``dim``).
 
     Args:
-        eval: Metrics to compute: ``chamfer``, ``raster``, besides ``chamfer`` also
-            ``chamfer_hard``, ``vectormapnet`` and ``vectormapnet_shrunk``, ``hdmapnet`` and
-            ``bemapnet``; may be empty if only ``out_file`` is wanted.
+        eval: Names of the metrics to compute, as of ``tools/evaluate.py --eval``; may be empty if
+            only ``out_file`` is wanted.
         thresholds: Thresholds of AP_chamfer in metres.
         out_file: Where to write the predictions in MapTR's JSON form, or None.
         **kwargs: ``collect_device``, ``collect_dir`` and ``prefix`` of ``BaseMetric``.
@@ -53,8 +51,10 @@ class MapMetric(BaseMetric):
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
-        if set(eval) - set(ALL_NAMES) or (not eval and out_file is None):
-            raise ValueError(f"eval must name metrics of {ALL_NAMES}, got {list(eval)}.")
+        if not eval and out_file is None:
+            raise ValueError(f"eval must name metrics of {metric_names()}, got none.")
+        for name in eval:
+            metric_class(name)
         self.eval = tuple(eval)
         self.thresholds = tuple(thresholds)
         self.out_file = out_file
@@ -71,12 +71,15 @@ class MapMetric(BaseMetric):
         if not self.eval:
             return None
         classes = tuple(self._meta("classes"))
-        chamfer = ChamferConfig(classes, self.thresholds, dim=self.dataset_meta.get("dim", 2))
-        raster = None
-        if {"raster", SHRUNK_NAME, *METHODS} & set(self.eval):
-            grid = BEVGrid(self._meta("x_range"), self._meta("y_range"))
-            raster = RasterConfig(classes, grid)
-        return MapEvaluator.named(self.eval, chamfer, raster)
+        meta = self.dataset_meta
+        known = "x_range" in meta and "y_range" in meta
+        settings = MetricSettings(
+            classes,
+            self.thresholds,
+            dim=meta.get("dim", 2),
+            grid=BEVGrid(meta["x_range"], meta["y_range"]) if known else None,
+        )
+        return MapEvaluator.named(self.eval, settings)
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:
         """Match one batch and keep its matches.

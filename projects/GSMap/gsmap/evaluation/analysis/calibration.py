@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig, match_chamfer
-from gsmap.evaluation.core.evaluator import Sample
+from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import equivalent_orders

@@ -8,11 +8,10 @@ import shapely
 
 from gsmap.evaluation.analysis.calibration import DISTANCES_M
 from gsmap.evaluation.analysis.groups import Groups
-from gsmap.evaluation.core.evaluator import Sample
+from gsmap.evaluation.core.metric import Sample
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import is_closed
 
-DISTANCE = "distance"  # what asks for it
 SHORTEST_M = 1.0  # shorter pieces of lines, and areas of fewer square metres, are left out
 _SEPARATOR = " at "
 _BANDS = [
@@ -35,7 +34,7 @@ def cut_by_distance(samples: Iterable[Sample], areas: Sequence[int]) -> Iterator
     for token, predictions, truth in samples:
         sides = (_in_bands(elements, areas) for elements in (predictions, truth))
         for name, *pieces in zip(_BANDS, *sides, strict=True):
-            yield f"{token}{_SEPARATOR}{name}", *pieces
+            yield Sample(f"{token}{_SEPARATOR}{name}", *pieces)
 
 
 def distance_groups(tokens: Iterable[str]) -> Groups:

@@ -13,6 +13,7 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig, nearest_by_chamfer
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.file_evaluation import Evaluation, match_samples, read_ground_truth
+from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.raster_ap import MIN_SCORE
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
@@ -168,19 +169,22 @@ def evaluate_prior(
         train_list, truth_list = (meta.split_list for meta in metas)
         subject = f"the prior of {train_path}"
         require_same_list(train_list, truth_list, subject, "--allow-other-split")
-    chamfer = evaluator.chamfer or ChamferConfig(evaluator.classes)
+    named = {metric.name: metric for metric in evaluator.metrics}
+    chamfer = named.get("chamfer")
+    if not isinstance(chamfer, ChamferConfig):
+        chamfer = ChamferConfig(evaluator.classes)
     everything, _ = read_ground_truth(train_path, evaluator.classes)
     step = max(1, -(-len(everything) // _MAX_TRAINING_SAMPLES))
     train = dict(list(everything.items())[::step])
     truth, _ = read_ground_truth(truth_path, evaluator.classes)
     fitted = fit_prior(list(train.values()), chamfer, max_elements)
-    alone = MapEvaluator(chamfer, None)
+    alone = MapEvaluator(chamfer)
     (on_train,) = alone.reports(
-        match_samples([(token, fitted, found) for token, found in train.items()], alone)
+        match_samples([Sample(token, fitted, found) for token, found in train.items()], alone)
     )
     note = (
         f"the same {len(fitted)} elements in every sample, fitted on {len(train)} training "
         f"samples; mAP_chamfer there {on_train.metrics['chamfer/mAP']:.6f}"
     )
-    pairs = [(token, fitted, found) for token, found in truth.items()]
+    pairs = [Sample(token, fitted, found) for token, found in truth.items()]
     return evaluator.reports(match_samples(pairs, evaluator)), [note]

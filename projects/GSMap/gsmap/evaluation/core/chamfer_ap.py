@@ -7,8 +7,8 @@ heights, distances are in space, as in MapTRv2's; lines are resampled and strips
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from gsmap.evaluation.core.matches import (
     checked_classes,
     ranked_predictions,
 )
+from gsmap.evaluation.core.metric import Metric, MetricSettings, Sample, register_metric
 from gsmap.evaluation.core.report import MetricReport, distance_figures
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
 from gsmap.structures.polylines import resample_all
@@ -31,9 +32,10 @@ HARD_CHAMFER_THRESHOLDS = (0.2, 0.5, 1.0)
 STRIP_HALF_WIDTH_M = 2.0
 
 
+@register_metric
 @dataclass(frozen=True)
-class ChamferConfig:
-    """Rules of AP_chamfer.
+class ChamferConfig(Metric):
+    """AP_chamfer and its rules.
 
     Args:
         classes: Names of the classes; a label is an index into them.
@@ -46,6 +48,10 @@ class ChamferConfig:
     Raises:
         ValueError: If a value is out of its range.
     """
+
+    name: ClassVar[str] = "chamfer"
+    ranks: ClassVar[bool] = True
+    has_curves: ClassVar[bool] = True
 
     classes: tuple[str, ...]
     thresholds: tuple[float, ...] = CHAMFER_THRESHOLDS
@@ -64,6 +70,44 @@ class ChamferConfig:
             raise ValueError(f"num_points must be >= 2, got {self.num_points}.")
         if self.dim not in (2, 3):
             raise ValueError(f"dim must be 2 or 3, got {self.dim!r}.")
+
+    @classmethod
+    def of(cls, settings: MetricSettings) -> "ChamferConfig":
+        """Return the metric by the settings of a command or config."""
+        return cls(
+            settings.classes,
+            settings.thresholds or CHAMFER_THRESHOLDS,
+            resample_predictions=settings.resample_predictions,
+            resample_ground_truth=settings.resample_ground_truth,
+            dim=settings.dim,
+        )
+
+    @property
+    def counts_heights(self) -> bool:
+        """Whether distances are in space."""
+        return self.dim == 3
+
+    def match(self, sample: Sample) -> FrameMatches:
+        """Match the predictions of one sample with its ground truth (`match_chamfer`)."""
+        return _matches(sample, self)
+
+    def reports(self, table: MatchTable) -> list[MetricReport]:
+        """Compute AP_chamfer from the matches of all samples (`chamfer_report`)."""
+        return [chamfer_report(table, self)]
+
+
+@register_metric
+@dataclass(frozen=True)
+class HardChamferConfig(ChamferConfig):
+    """AP_chamfer at 0.2, 0.5 and 1.0 m beside the other thresholds."""
+
+    name: ClassVar[str] = "chamfer_hard"
+    beside: ClassVar[tuple[str, ...]] = ("chamfer",)
+
+    @classmethod
+    def of(cls, settings: MetricSettings) -> "HardChamferConfig":
+        """Return the metric by the settings of a command or config, but for the thresholds."""
+        return cls(**vars(ChamferConfig.of(settings)) | {"thresholds": HARD_CHAMFER_THRESHOLDS})
 
 
 def _lines(elements: MapElements, config: ChamferConfig, resample: bool) -> kernels.Lines:
@@ -145,12 +189,28 @@ def match_chamfer(
     Raises:
         ValueError: If heights count, and a side has none; or as of `check_pair`.
     """
+    return _matches(Sample(token, predictions, ground_truth), config)
+
+
+def _nearest(sample: Sample, config: ChamferConfig) -> tuple[IntArray, FloatArray]:
+    """Return `nearest_by_chamfer` of a sample, which metrics by the same rules share."""
+    rules = config.num_points, config.resample_predictions, config.resample_ground_truth, config.dim
+    limit = config.thresholds[-1]
+    known = sample.shared.get(rules)
+    if known is None or known[0] < limit:
+        nearest = nearest_by_chamfer(sample.predictions, sample.ground_truth, config, limit)
+        known = sample.shared[rules] = limit, nearest
+    best, distance = known[1]
+    return best, distance
+
+
+def _matches(sample: Sample, config: ChamferConfig) -> FrameMatches:
+    """Match the predictions of one sample with its ground truth."""
+    token, predictions, ground_truth = sample
     check_pair(predictions, ground_truth, config.classes, token)
     num_classes = len(config.classes)
     try:
-        best, distance = nearest_by_chamfer(
-            predictions, ground_truth, config, config.thresholds[-1]
-        )
+        best, distance = _nearest(sample, config)
     except ValueError as error:
         raise ValueError(f"sample {token!r}, AP_chamfer of dim {config.dim}: {error}") from error
     rows = ranked_predictions(predictions, num_classes)
@@ -163,12 +223,7 @@ def match_chamfer(
     return FrameMatches(token, rows, labels, scores, matched, quality, num_gts)
 
 
-def chamfer_report(
-    matches: MatchTable,
-    config: ChamferConfig,
-    thresholds: Sequence[float] | None = None,
-    name: str = "chamfer",
-) -> MetricReport:
+def chamfer_report(matches: MatchTable, config: ChamferConfig) -> MetricReport:
     """Compute AP_chamfer from the matches of all samples.
 
     A class without ground truth counts in no mean, as in AP_raster; in MapTR it is 0 in ``mAP``.
@@ -176,24 +231,21 @@ def chamfer_report(
 
     Args:
         matches: Matches at the thresholds of ``config``.
-        config: Rules that they were made by.
-        thresholds: Those of its thresholds that count; None takes all.
-        name: What the keys of the figures begin with.
+        config: Rules that they were made by; keys of figures begin with its name.
     """
-    classes, thresholds = config.classes, tuple(thresholds or config.thresholds)
+    classes = config.classes
     detections = matches.detections(dict.fromkeys(classes, config.thresholds))
-    detections = {of_class: found.at(thresholds) for of_class, found in detections.items()}
     metrics: dict[str, float] = {}
     for of_class, found in detections.items():
         aps = [area_ap(hits, found.num_gts) for hits in found.hits.T]
         figures = distance_figures(found, aps)
         metrics |= {f"{of_class}/{key}": value for key, value in figures.items()}
     present = [of_class for of_class, found in detections.items() if found.num_gts]
-    means = {"mAP": "AP"} | {f"AP@{threshold}": f"AP@{threshold}" for threshold in thresholds}
+    means = {"mAP": "AP"} | {f"AP@{threshold}": f"AP@{threshold}" for threshold in config.thresholds}
     for mean, of_one in means.items():
         aps = [metrics[f"{of_class}/{of_one}"] for of_class in present]
         metrics[mean] = float(np.mean(aps)) if aps else 0.0
     metrics["num_absent_classes"] = float(len(classes) - len(present))
     metrics["num_samples"] = float(len(matches))
-    flat = {f"{name}/{key}": value for key, value in metrics.items()}
-    return MetricReport(name, {"class": classes}, flat, detections, matches.tokens)
+    flat = {f"{config.name}/{key}": value for key, value in metrics.items()}
+    return MetricReport(config.name, {"class": classes}, flat, detections, matches.tokens)

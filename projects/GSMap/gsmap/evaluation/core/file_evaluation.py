@@ -12,7 +12,8 @@ import numpy as np
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.core.evaluator import MapEvaluator, Sample, SampleMatches
+from gsmap.evaluation.core.evaluator import MapEvaluator, SampleMatches
+from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY, RESULTS_KEY, THREE_D, SampleFile
 from gsmap.structures.elements import MapElements
@@ -216,7 +217,7 @@ class SamplePairs:
 
     def _counted(self, token: str, predictions: MapElements, truth: MapElements) -> Sample:
         self._degenerate += int((truth.num_points < 2).sum())
-        return token, predictions, truth
+        return Sample(token, predictions, truth)
 
     def notes(self, counts_heights: bool) -> list[str]:
         """Say, after the walk, what was left out: elements, heights, samples without results."""

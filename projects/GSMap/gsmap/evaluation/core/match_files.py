@@ -1,25 +1,24 @@
 """Matches of a part of the samples in a file, and the figures of all parts."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from gsmap.evaluation.core.chamfer_ap import ChamferConfig
 from gsmap.evaluation.core.evaluator import MapEvaluator, SampleMatches
-from gsmap.evaluation.core.matches import FrameMatches
-from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.metric import Matches, MetricSettings, arrays_of, matches_of
 from gsmap.evaluation.core.report import MetricReport
-from gsmap.evaluation.core.sample_ap import SampleAPConfig
 from gsmap.structures.grid import BEVGrid
 from gsmap.utils.files import DAMAGED_ZIP, atomic_write
 from gsmap.utils.shards import Shard, ShardFile
 
 SHARD_KIND = "matches"
 _FAULTS = KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError
-_FIELDS = [field.name for field in fields(FrameMatches) if field.name != "token"]
+_TOKENS, _LENGTHS = "/tokens", "/lengths"
+Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def write_matches(
@@ -28,6 +27,7 @@ def write_matches(
     matches: Sequence[SampleMatches],
     notes: Sequence[str],
     evaluator: MapEvaluator,
+    settings: MetricSettings,
     source: str,
 ) -> Path:
     """Write the matches of a shard, and its manifest.
@@ -37,7 +37,8 @@ def write_matches(
         shard: Which shard.
         matches: Its matches, one a sample.
         notes: What to say besides.
-        evaluator: Metrics and their rules.
+        evaluator: The metrics, as `MapEvaluator.named` makes them of the settings.
+        settings: Their settings.
         source: Digest of results and ground truth.
 
     Returns:
@@ -45,17 +46,27 @@ def write_matches(
     """
     arrays = {"notes": np.array(notes, str)}
     for metric in matches[0] if matches else ():
-        records = [sample[metric] for sample in matches]
-        arrays[f"{metric}/token"] = np.array([record.token for record in records])
-        arrays[f"{metric}/length"] = np.array([len(record.labels) for record in records])
-        for name in _FIELDS:
-            values = [getattr(record, name) for record in records]
-            if values[0] is not None:
-                arrays[f"{metric}/{name}"] = np.concatenate(values)
+        arrays |= _joined(metric, [sample[metric] for sample in matches])
     with atomic_write(shard.path_of(target), "wb") as file:
-        np.savez_compressed(file, **arrays)
-    shard.seal(target, SHARD_KIND, source, {"evaluator": asdict(evaluator)}, len(matches))
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+    rules = {
+        "metrics": [metric.name for metric in evaluator.metrics],
+        "settings": asdict(settings),
+        "ground_truth_points": evaluator.ground_truth_points,
+    }
+    shard.seal(target, SHARD_KIND, source, {"evaluator": rules}, len(matches))
     return shard.path_of(target)
+
+
+def _joined(metric: str, records: Sequence[Matches]) -> dict[str, npt.NDArray[Any]]:
+    """Join the arrays of all samples along their first axes."""
+    found = {f"{metric}{_TOKENS}": np.array([record.token for record in records])}
+    parts = [arrays_of(record) for record in records]
+    for name in parts[0]:
+        values = [np.atleast_1d(part[name]) for part in parts]
+        found[f"{metric}/{name}"] = np.concatenate(values)
+        found[f"{metric}/{name}{_LENGTHS}"] = np.array([len(value) for value in values])
+    return found
 
 
 def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list[str]]:
@@ -84,53 +95,45 @@ def report_shards(shards: Sequence[ShardFile]) -> tuple[list[MetricReport], list
             with np.load(shard.path) as file:
                 notes += file["notes"].tolist()
                 found = {name: file[name] for name in file.files}
-            metrics = [name.split("/")[0] for name in found if name.endswith("/token")]
-            by_metric = zip(*(_records(found, metric) for metric in metrics), strict=True)
-            records = [dict(zip(metrics, of_sample, strict=True)) for of_sample in by_metric]
-            for of_sample in records[:1]:
-                evaluator.require_fitting(of_sample)
+            matches += _samples(found, evaluator) if len(found) > 1 else ()
         except (*_FAULTS, *DAMAGED_ZIP) as error:
             raise ValueError(
                 f"{shard.path} holds no matches by the rules of its manifest ({error!r}): make "
                 "that shard again."
             ) from error
-        matches += records
     return evaluator.reports(matches), list(dict.fromkeys(notes))
 
 
-def _records(arrays: dict[str, Any], metric: str) -> Iterator[FrameMatches]:
+def _samples(arrays: Arrays, evaluator: MapEvaluator) -> list[SampleMatches]:
+    """Cut the arrays of all metrics into samples."""
+    metrics = {name.removesuffix(_TOKENS) for name in arrays if name.endswith(_TOKENS)}
+    empty = evaluator.match_empty()
+    if metrics != empty.keys():
+        raise ValueError(f"it has matches of {sorted(metrics)}, not of {sorted(empty)}")
+    columns = [_records(arrays, metric, like) for metric, like in empty.items()]
+    return [dict(zip(empty, of_sample, strict=True)) for of_sample in zip(*columns, strict=True)]
+
+
+def _records(arrays: Arrays, metric: str, like: Matches) -> Iterator[Matches]:
     """Cut the arrays of one metric into samples."""
-    tokens, ends = arrays[f"{metric}/token"], np.cumsum(arrays[f"{metric}/length"])[:-1]
+    tokens = arrays[f"{metric}{_TOKENS}"].tolist()
     columns = {}
-    for name in _FIELDS:
-        values = arrays.get(f"{metric}/{name}")
-        per_class = name in ("num_gts", "class_iou")
-        cuts = len(tokens) if per_class else ends
-        columns[name] = [None] * len(tokens) if values is None else np.split(values, cuts)
-    for token, *values in zip(tokens.tolist(), *columns.values(), strict=True):
-        yield FrameMatches(token, **dict(zip(_FIELDS, values, strict=True)))
+    for name in arrays_of(like):
+        ends = np.cumsum(arrays[f"{metric}/{name}{_LENGTHS}"])
+        values = arrays[f"{metric}/{name}"]
+        if len(ends) != len(tokens) or ends[-1] != len(values):
+            raise ValueError(f"{metric}/{name} has {len(values)} rows, its samples have {ends}")
+        columns[name] = np.split(values, ends[:-1])
+    for number, token in enumerate(tokens):
+        own = {name: values[number] for name, values in columns.items()}
+        yield matches_of(str(token), own, like)
 
 
-def _evaluator(options: dict[str, Any]) -> MapEvaluator:
+def _evaluator(options: Mapping[str, Any]) -> MapEvaluator:
     """Make the evaluator whose rules a manifest tells."""
-
-    def rules(kind: Any, values: Any) -> Any:
-        if values is None:
-            return None
-        lists = {key: tuple(v) for key, v in values.items() if isinstance(v, list)}
-        for key in {"classes", "polygon_classes"} & values.keys():
-            if not all(isinstance(name, str) for name in lists[key]):
-                raise TypeError(f"{key} must be names")
-        canvas = {"grid": BEVGrid(**values["grid"])} if "grid" in values else {}
-        return kind(**(values | lists | canvas))
-
-    shrunk = options["shrunk"]
-    return MapEvaluator(
-        rules(ChamferConfig, options["chamfer"]),
-        rules(RasterConfig, options["raster"]),
-        options["ground_truth_points"],
-        options["hard"],
-        options["two_sided"],
-        tuple(rules(SampleAPConfig, values) for values in options["drawn"]),
-        shrunk and BEVGrid(**shrunk),
-    )
+    values = options["settings"]
+    lists = {key: tuple(value) for key, value in values.items() if isinstance(value, list)}
+    canvas = {"grid": BEVGrid(**values["grid"])} if values.get("grid") else {}
+    settings = MetricSettings(**{**values, **lists, **canvas})
+    points = options["ground_truth_points"]
+    return MapEvaluator.named(options["metrics"], settings, ground_truth_points=points)

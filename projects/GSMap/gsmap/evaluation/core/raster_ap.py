@@ -7,6 +7,7 @@ than two points are dropped, and at most 100 per class and sample count.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from gsmap.evaluation.core.matches import (
     checked_classes,
     ranked_predictions,
 )
+from gsmap.evaluation.core.metric import Metric, MetricSettings, Sample, register_metric
 from gsmap.evaluation.core.report import UNDEFINED, MetricReport, class_figures
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
@@ -34,9 +36,10 @@ NUSCENES_GRID = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
 
 
+@register_metric
 @dataclass(frozen=True)
-class RasterConfig:
-    """Rules of AP_raster.
+class RasterConfig(Metric):
+    """AP_raster and its rules.
 
     Args:
         classes: Names of the classes; a label is an index into them.
@@ -48,6 +51,10 @@ class RasterConfig:
     Raises:
         ValueError: If a value is out of its range.
     """
+
+    name: ClassVar[str] = "raster"
+    ranks: ClassVar[bool] = True
+    has_curves: ClassVar[bool] = True
 
     classes: tuple[str, ...]
     grid: BEVGrid = NUSCENES_GRID
@@ -78,6 +85,19 @@ class RasterConfig:
         """Smallest IoUs of a match of each class, by its name. C x (T,)"""
         found = [POLYGON_THRESHOLDS if polygon else LINE_THRESHOLDS for polygon in self.is_polygon]
         return dict(zip(self.classes, found, strict=True))
+
+    @classmethod
+    def of(cls, settings: MetricSettings) -> "RasterConfig":
+        """Return the metric by the settings of a command or config."""
+        return cls(settings.classes, settings.canvas, settings.polygon_classes)
+
+    def match(self, sample: Sample) -> FrameMatches:
+        """Match the predictions of one sample with its ground truth (`match_raster`)."""
+        return match_raster(sample.predictions, sample.ground_truth, self, sample.token)
+
+    def reports(self, table: MatchTable) -> list[MetricReport]:
+        """Compute AP_raster from the matches of all samples (`raster_report`)."""
+        return [raster_report(table, self)]
 
 
 def pixels_from_metres(points: FloatArray, config: RasterConfig) -> IntArray:
@@ -183,4 +203,5 @@ def raster_report(matches: MatchTable, config: RasterConfig) -> MetricReport:
     metrics["num_absent_classes"] = float(len(config.classes) - present)
     metrics["num_samples"] = float(len(matches))
     flat = {f"raster/{key}": value for key, value in metrics.items()}
-    return MetricReport("raster", groups, flat, detections, matches.tokens)
+    tokens = matches.tokens
+    return MetricReport("raster", groups, flat, detections, tokens, by_distance=False)

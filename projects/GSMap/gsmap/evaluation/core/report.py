@@ -28,6 +28,7 @@ class MetricReport:
         tokens: The samples, sorted.
         sample_aps: Of a metric that is the mean over samples: the AP of each class in each sample,
             NaN where it does not count. C x (S, T)
+        by_distance: Whether thresholds are distances, of which the last is the loosest; IoU if not.
     """
 
     name: str
@@ -36,11 +37,21 @@ class MetricReport:
     detections: Mapping[str, ClassDetections]
     tokens: Sequence[str] = ()
     sample_aps: Mapping[str, FloatArray] = field(default_factory=dict)
+    by_distance: bool = True
 
-    @property
-    def by_distance(self) -> bool:
-        """Whether thresholds are distances, of which the last is the loosest."""
-        return self.name != "raster"
+    @classmethod
+    def of_figures(
+        cls, name: str, figures: Mapping[str, float], tokens: Sequence[str] = ()
+    ) -> "MetricReport":
+        """Return the report of a metric that has figures alone.
+
+        Args:
+            name: Of the metric.
+            figures: By their keys, without the name.
+            tokens: The samples, sorted.
+        """
+        flat = {f"{name}/{key}": float(value) for key, value in figures.items()}
+        return cls(name, {}, flat, {}, tokens)
 
 
 def flat_metrics(reports: Iterable[MetricReport]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""AP per sample of HDMapNet and BeMapNet: lines drawn as masks, then the mean over samples.
+"""AP per sample, as of HDMapNet and BeMapNet: lines drawn as masks, then the mean over samples.
 
 Rules (those of both released evaluators): the lines of a class and sample are drawn into one mask
 of 0.15 m pixels in the order of the file, so a later line hides what it crosses. The distance of
@@ -10,6 +10,7 @@ or ground truth of the class counts, one without both does not.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,7 @@ from gsmap.evaluation.core.matches import (
     check_pair,
     checked_classes,
 )
+from gsmap.evaluation.core.metric import Metric, MetricSettings, Sample
 from gsmap.evaluation.core.report import UNDEFINED, MetricReport, distance_figures
 from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElements
 from gsmap.structures.grid import BEVGrid
@@ -36,36 +38,15 @@ GapArray = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Method:
-    """What the evaluator of a method does in its own way.
+class SampleAP(Metric):
+    """AP per sample; a method's own is a subclass in its folder.
 
-    Args:
+    Attributes:
         line_px: Thickness of lines in pixels.
-        reports: Thresholds of a match in metres, by the name of the figures.
-    """
-
-    line_px: int
-    reports: Mapping[str, tuple[float, ...]]
-
-    @property
-    def thresholds(self) -> tuple[float, ...]:
-        """All thresholds, ascending."""
-        return tuple(sorted({t for thresholds in self.reports.values() for t in thresholds}))
-
-
-METHODS = {
-    "hdmapnet": Method(5, {"hdmapnet": (2.0, 4.0, 6.0)}),
-    "bemapnet": Method(1, {"bemapnet": (0.5, 1.0, 1.5), "bemapnet_hard": (0.2, 0.5, 1.0)}),
-}
-
-
-@dataclass(frozen=True)
-class SampleAPConfig:
-    """Rules of AP per sample.
+        report_thresholds: Thresholds of a match in metres, by the name of the figures.
 
     Args:
         classes: Names of the classes; a label is an index into them.
-        method: Whose evaluator: ``hdmapnet`` or ``bemapnet``.
         grid: Extent of the canvas; its raster is not used.
         min_score: Predictions with a lower score are left out. The released evaluators count all.
 
@@ -73,17 +54,37 @@ class SampleAPConfig:
         ValueError: If a value is out of its range.
     """
 
+    ranks: ClassVar[bool] = True
+    takes_min_score: ClassVar[bool] = True
+    line_px: ClassVar[int]
+    report_thresholds: ClassVar[Mapping[str, tuple[float, ...]]]
+
     classes: tuple[str, ...]
-    method: str
     grid: BEVGrid
     min_score: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "classes", checked_classes(self.classes))
-        if self.method not in METHODS:
-            raise ValueError(f"method must be one of {tuple(METHODS)}, got {self.method!r}.")
         if not 0 <= self.min_score <= 1:
             raise ValueError(f"min_score must be in [0, 1], got {self.min_score}.")
+
+    @classmethod
+    def of(cls, settings: MetricSettings) -> "SampleAP":
+        """Return the metric by the settings of a command or config."""
+        return cls(settings.classes, settings.canvas, settings.min_score or 0.0)
+
+    @property
+    def thresholds(self) -> tuple[float, ...]:
+        """All thresholds, ascending."""
+        return tuple(sorted({t for own in self.report_thresholds.values() for t in own}))
+
+    def match(self, sample: Sample) -> FrameMatches:
+        """Match the predictions of one sample with its ground truth (`match_sample_ap`)."""
+        return match_sample_ap(sample.predictions, sample.ground_truth, self, sample.token)
+
+    def reports(self, table: MatchTable) -> list[MetricReport]:
+        """Compute the mean of AP over the samples (`sample_ap_reports`)."""
+        return sample_ap_reports(table, self)
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -92,7 +93,7 @@ class SampleAPConfig:
         return columns, rows
 
 
-def draw_numbers(elements: MapElements, label: int, config: SampleAPConfig) -> MaskArray:
+def draw_numbers(elements: MapElements, label: int, config: SampleAP) -> MaskArray:
     """Draw the lines of a class into one mask, each with its number; later ones hide earlier ones.
 
     Points are cut to whole pixels toward zero, counted from the corner of least x and y.
@@ -114,8 +115,7 @@ def draw_numbers(elements: MapElements, label: int, config: SampleAPConfig) -> M
     pixels = np.clip(pixels, -_FAR_PX, _FAR_PX).astype(np.int32)
     for i in np.flatnonzero((elements.labels == label) & (elements.num_points >= 2)).tolist():
         line = pixels[elements.offsets[i] : elements.offsets[i + 1]]
-        thickness = METHODS[config.method].line_px
-        cv2.polylines(mask, [line], isClosed=False, color=(i + 1,), thickness=thickness)
+        cv2.polylines(mask, [line], isClosed=False, color=(i + 1,), thickness=config.line_px)
     return mask - 1
 
 
@@ -271,7 +271,7 @@ def closest_pairs(distance_m: FloatArray, limit_m: float) -> IntArray:
 
 
 def match_sample_ap(
-    predictions: MapElements, ground_truth: MapElements, config: SampleAPConfig, token: str = ""
+    predictions: MapElements, ground_truth: MapElements, config: SampleAP, token: str = ""
 ) -> FrameMatches:
     """Match the predictions of one sample with its ground truth by the distance of their masks.
 
@@ -287,7 +287,7 @@ def match_sample_ap(
         ValueError: As of `check_pair`.
     """
     check_pair(predictions, ground_truth, config.classes, token)
-    thresholds = np.array(METHODS[config.method].thresholds)
+    thresholds = np.array(config.thresholds)
     partner = np.full(len(predictions), -1)
     quality = np.full(len(predictions), np.nan)
     visible = np.zeros(len(predictions), np.bool_)
@@ -335,16 +335,16 @@ def _mean(values: FloatArray) -> float:
     return float(defined.mean()) if len(defined) else UNDEFINED
 
 
-def sample_ap_reports(matches: MatchTable, config: SampleAPConfig) -> list[MetricReport]:
+def sample_ap_reports(matches: MatchTable, config: SampleAP) -> list[MetricReport]:
     """Compute the mean of AP over the samples, at each set of thresholds of the method.
 
     Samples without predictions and ground truth of a class do not count for it; a class that
     occurs nowhere is left out of the means.
     """
-    method, classes = METHODS[config.method], config.classes
-    everything = matches.detections(dict.fromkeys(classes, method.thresholds))
+    classes = config.classes
+    everything = matches.detections(dict.fromkeys(classes, config.thresholds))
     reports = []
-    for name, thresholds in method.reports.items():
+    for name, thresholds in config.report_thresholds.items():
         detections = {of_class: found.at(thresholds) for of_class, found in everything.items()}
         aps = {of_class: sample_aps(found) for of_class, found in detections.items()}
         metrics: dict[str, float] = {}

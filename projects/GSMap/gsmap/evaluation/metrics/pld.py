@@ -4,16 +4,26 @@ Lehocine et al., "Beyond Chamfer Distance", arXiv 2605.22578; the figures are th
 (zenseact/SOSPA). Both are in [0, 1], and smaller is better.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from gsmap.evaluation.core.chamfer_ap import ChamferConfig
-from gsmap.evaluation.core.evaluator import Sample
-from gsmap.evaluation.core.matches import check_pair
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS
+from gsmap.evaluation.core.matches import check_pair, checked_classes
+from gsmap.evaluation.core.metric import (
+    Metric,
+    MetricSettings,
+    Sample,
+    SampleValues,
+    ValueTable,
+    register_metric,
+)
+from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.elements import FloatArray
 from gsmap.structures.polylines import arc_lengths
 
@@ -118,8 +128,10 @@ def _paired(
     return sums
 
 
-def pld_figures(samples: Iterable[Sample], config: ChamferConfig) -> dict[str, float]:
-    """Compute PLD, the distance of predicted maps with scores from the true ones.
+@register_metric
+@dataclass(frozen=True)
+class PLD(Metric):
+    """PLD, the distance of predicted maps with scores from the true ones.
 
     In each sample and class, predictions of score r are paired with ground truths so that the
     cost is least: r s + (1 - r) / 2 of a pair with SOSPA s, r / 2 of a prediction without partner,
@@ -127,36 +139,66 @@ def pld_figures(samples: Iterable[Sample], config: ChamferConfig) -> dict[str, f
     2 D / (M + D), with M = (sum of scores + number of ground truths) / 2, the sum without pairs.
 
     Args:
-        samples: Token, predictions and ground truth of each. Predictions of less than two points
-            are left out; ground truths of less than two have no partner.
-        config: Classes, and thresholds that are the cut-offs of SOSPA. Lines are compared in the
-            plane.
-
-    Returns:
-        ``CLASS/PLD@CUTOFF``; ``localisation``, its part that distances of paired points have, and
-        ``cardinality``, the rest, for points, lines and scores too many or too few; without cut-off
-        the mean over them, without class the mean over the classes. A class that occurs nowhere
-        has 0.
+        classes: Names of the classes; a label is an index into them.
+        cutoffs_m: Cut-offs of SOSPA in metres. Lines are compared in the plane.
     """
-    cutoffs, classes = config.thresholds, config.classes
-    sums, masses = np.zeros((len(classes), len(cutoffs), 2)), np.zeros((len(classes), 1))
-    for token, predictions, truth in samples:
-        check_pair(predictions, truth, classes, token)
+
+    name: ClassVar[str] = "pld"
+
+    classes: tuple[str, ...]
+    cutoffs_m: tuple[float, ...] = CHAMFER_THRESHOLDS
+
+    def __post_init__(self) -> None:
+        cutoffs = tuple(sorted(round(float(c), 6) for c in self.cutoffs_m))
+        object.__setattr__(self, "classes", checked_classes(self.classes))
+        object.__setattr__(self, "cutoffs_m", cutoffs)
+        if not (cutoffs and 0 < cutoffs[0] <= cutoffs[-1] < np.inf):
+            raise ValueError(f"cutoffs_m must be > 0 m, at least one, got {cutoffs}.")
+
+    @classmethod
+    def of(cls, settings: MetricSettings) -> "PLD":
+        """Return the metric by the settings of a command or config."""
+        return cls(settings.classes, settings.thresholds or CHAMFER_THRESHOLDS)
+
+    def match(self, sample: Sample) -> SampleValues:
+        """Pair the elements of one sample.
+
+        Predictions of less than two points are left out; ground truths of less than two have no
+        partner.
+        """
+        token, predictions, truth = sample
+        check_pair(predictions, truth, self.classes, token)
         kept = predictions.select(predictions.num_points >= 2)
         sides = [[spaced(line[:, :2]) for line in side.polylines] for side in (kept, truth)]
-        for label in range(len(classes)):
+        sums = np.zeros((len(self.classes), len(self.cutoffs_m), 2))
+        masses = np.zeros((len(self.classes), 1))
+        for label in range(len(self.classes)):
             found, wanted = (np.flatnonzero(s.labels == label).tolist() for s in (kept, truth))
             scores = kept.confidence[found]
-            masses[label] += (scores.sum() + len(wanted)) / 2
+            masses[label] = (scores.sum() + len(wanted)) / 2
             lines = [sides[0][i] for i in found], scores, [sides[1][i] for i in wanted]
-            sums[label] += _paired(*lines, cutoffs)
-    gains, errors = sums[..., 0], sums[..., 1]
-    whole = np.maximum(2 * masses - gains, np.finfo(float).tiny)
-    pld, localisation = 2 * (masses - gains) / whole, 2 * errors / whole  # D = M - gains
-    figures: dict[str, float] = {}
-    for part, values in zip(_PARTS, (pld, localisation, pld - localisation), strict=True):
-        for name, row in zip(classes, values, strict=True):
-            at = {f"{name}/{part}@{c}": float(v) for c, v in zip(cutoffs, row, strict=True)}
-            figures |= {**at, f"{name}/{part}": float(row.mean())}
-        figures[part] = float(values.mean())
-    return figures
+            sums[label] = _paired(*lines, self.cutoffs_m)
+        return SampleValues(token, {"sums": sums, "masses": masses})
+
+    def reports(self, table: ValueTable) -> list[MetricReport]:
+        """Compute PLD from the sums of all samples.
+
+        Figures are ``CLASS/PLD@CUTOFF``; ``localisation``, its part that distances of paired points
+        have, and ``cardinality``, the rest, for points, lines and scores too many or too few;
+        without cut-off the mean over them, without class the mean over the classes. A class that
+        occurs nowhere has 0.
+        """
+        sums = np.sum(table.column("sums"), axis=0)
+        masses = np.sum(table.column("masses"), axis=0)
+        gains, errors = sums[..., 0], sums[..., 1]
+        whole = np.maximum(2 * masses - gains, np.finfo(float).tiny)
+        pld = 2 * (masses - gains) / whole  # D = M - gains
+        localisation = 2 * errors / whole
+        figures: dict[str, float] = {}
+        for part, values in zip(_PARTS, (pld, localisation, pld - localisation), strict=True):
+            for name, row in zip(self.classes, values, strict=True):
+                for cutoff, value in zip(self.cutoffs_m, row, strict=True):
+                    figures[f"{name}/{part}@{cutoff}"] = float(value)
+                figures[f"{name}/{part}"] = float(row.mean())
+            figures[part] = float(values.mean())
+        return [MetricReport.of_figures(self.name, figures, table.tokens)]

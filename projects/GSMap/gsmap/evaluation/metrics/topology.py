@@ -1,27 +1,35 @@
-"""What AP hardly sees: elements in pieces, elements joined, lines that fold back, wrong heights."""
+"""What AP hardly sees: elements in pieces, elements joined, lines that fold back."""
 
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import shapely
 
-from gsmap.evaluation.core.chamfer_ap import ChamferConfig, match_chamfer
-from gsmap.evaluation.core.evaluator import Sample
 from gsmap.evaluation.core.matches import check_pair, checked_classes
-from gsmap.evaluation.core.report import UNDEFINED
+from gsmap.evaluation.core.metric import (
+    Metric,
+    MetricSettings,
+    Sample,
+    SampleValues,
+    ValueTable,
+    register_metric,
+)
+from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.elements import BoolArray, FloatArray, MapElements
-from gsmap.structures.polylines import arc_lengths, resample, resample_all
+from gsmap.structures.polylines import arc_lengths, resample
 
 _POINTS = 128  # that an element is looked at, at equal distances
 _FOLD_CHORD_M = 2.0  # before and after a fold
+_COUNTS = ("breaks", "false_joints", "folds", "num_gts", "num_preds")
 _FOLD_COS = -0.5  # of the angle between both chords: 120 degrees
 
 
+@register_metric
 @dataclass(frozen=True)
-class TopologyConfig:
-    """Rules of the counts.
+class Topology(Metric):
+    """Counts of breaks, false joints and folds.
 
     Args:
         classes: Names of the classes; a label is an index into them.
@@ -33,6 +41,9 @@ class TopologyConfig:
     Raises:
         ValueError: If a value is out of its range.
     """
+
+    name: ClassVar[str] = "topology"
+    takes_min_score: ClassVar[bool] = True
 
     classes: tuple[str, ...]
     area_labels: tuple[int, ...] = ()
@@ -47,6 +58,46 @@ class TopologyConfig:
                 "min_score must be in [0, 1], tolerance_m > 0 and min_piece_m more than twice "
                 f"that, got {self.min_score}, {self.tolerance_m} and {self.min_piece_m}."
             )
+
+    @classmethod
+    def of(cls, settings: MetricSettings) -> "Topology":
+        """Return the metric by the settings of a command or config."""
+        own = {} if settings.min_score is None else {"min_score": settings.min_score}
+        return cls(settings.classes, settings.areas, **own)
+
+    def match(self, sample: Sample) -> SampleValues:
+        """Count in one sample."""
+        token, predictions, truth = sample
+        check_pair(predictions, truth, self.classes, token)
+        counts = np.zeros((len(self.classes), len(_COUNTS)))
+        for label in range(len(self.classes)):
+            chosen = (predictions.labels == label) & (predictions.confidence >= self.min_score)
+            found = _lines(predictions, chosen)
+            wanted = _lines(truth, truth.labels == label)
+            is_area = label in self.area_labels
+            counts[label] = (
+                _excess_pieces(wanted, found, self),
+                _excess_pieces(found, wanted, self),
+                sum(count_folds(line, is_area) for line in found),
+                len(wanted),
+                len(found),
+            )
+        return SampleValues(token, {"counts": counts})
+
+    def reports(self, table: ValueTable) -> list[MetricReport]:
+        """Add up the counts of all samples.
+
+        Figures are, by ``CLASS/NAME``: ``breaks``, pieces beyond the first that ground truths are
+        found in; ``false_joints``, ground truths beyond the first that a prediction runs along;
+        ``folds``; ``num_gts`` and ``num_preds``.
+        """
+        totals = np.sum(table.column("counts"), axis=0)
+        figures = {
+            f"{name}/{key}": total
+            for name, of_class in zip(self.classes, totals, strict=True)
+            for key, total in zip(_COUNTS, of_class, strict=True)
+        }
+        return [MetricReport.of_figures(self.name, figures, table.tokens)]
 
 
 def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
@@ -69,7 +120,7 @@ def count_pieces(covered: BoolArray, step_m: float, min_piece_m: float) -> int:
 
 
 def _excess_pieces(
-    elements: Sequence[FloatArray], lines: Sequence[FloatArray], config: TopologyConfig
+    elements: Sequence[FloatArray], lines: Sequence[FloatArray], config: Topology
 ) -> int:
     """Return how many pieces beyond the first the elements are made up of."""
     if not lines:
@@ -111,78 +162,7 @@ def count_folds(line: FloatArray, is_area: bool) -> int:
     return int(turned[:1].sum() + (turned[1:] & ~turned[:-1]).sum())
 
 
-def topology_figures(samples: Iterable[Sample], config: TopologyConfig) -> dict[str, float]:
-    """Count breaks, false joints and folds of all samples.
-
-    Args:
-        samples: Token, predictions and ground truth of each.
-        config: Rules.
-
-    Returns:
-        By ``CLASS/NAME``: ``breaks``, pieces beyond the first that ground truths are found in;
-        ``false_joints``, ground truths beyond the first that a prediction runs along; ``folds``;
-        ``num_gts`` and ``num_preds``.
-    """
-    totals: dict[str, float] = defaultdict(float)
-    for token, predictions, truth in samples:
-        check_pair(predictions, truth, config.classes, token)
-        for label, name in enumerate(config.classes):
-            chosen = (predictions.labels == label) & (predictions.confidence >= config.min_score)
-            found = _lines(predictions, chosen)
-            wanted = _lines(truth, truth.labels == label)
-            totals[f"{name}/breaks"] += _excess_pieces(wanted, found, config)
-            totals[f"{name}/false_joints"] += _excess_pieces(found, wanted, config)
-            is_area = label in config.area_labels
-            totals[f"{name}/folds"] += sum(count_folds(line, is_area) for line in found)
-            totals[f"{name}/num_gts"] += len(wanted)
-            totals[f"{name}/num_preds"] += len(found)
-    return dict(totals)
-
-
 def _lines(elements: MapElements, chosen: BoolArray) -> list[FloatArray]:
     """Return the chosen elements of two points or more."""
     lines = elements.polylines
     return [lines[i] for i in np.flatnonzero(chosen & (elements.num_points >= 2)).tolist()]
-
-
-def height_figures(samples: Iterable[Sample], config: ChamferConfig) -> dict[str, float]:
-    """Measure the heights of predictions that match in the plane, at the loosest threshold.
-
-    Each of the 100 points of a prediction is compared with the nearest of its ground truth's.
-
-    Args:
-        samples: Token, predictions and ground truth of each, all with heights.
-        config: Rules of AP_chamfer.
-
-    Returns:
-        By ``CLASS/NAME``: ``height_error_m``, the mean absolute difference, ``height_bias_m``,
-        its mean with sign (predictions too high: > 0), ``plane_error_m``, the mean distance in
-        the plane, and ``num_matches``; -1 without matches.
-
-    Raises:
-        ValueError: If a side has no heights.
-    """
-    flat = ChamferConfig(config.classes, config.thresholds, config.num_points)
-    apart: dict[int, list[FloatArray]] = {label: [] for label in range(len(config.classes))}
-    for token, predictions, truth in samples:
-        matches = match_chamfer(predictions, truth, flat, token)
-        pred, gt = (
-            resample_all(side.with_coordinates(3).points, side.offsets, config.num_points)
-            for side in (predictions, truth)
-        )
-        matched = matches.matched_gt[:, -1]
-        for row in np.flatnonzero(matched >= 0).tolist():
-            line, other = pred[matches.pred_index[row]], gt[matched[row]]
-            distance = np.linalg.norm(line[:, None, :2] - other[None, :, :2], axis=-1)  # (P, P)
-            nearest = distance.argmin(axis=1)
-            values = line[:, 2] - other[nearest, 2], distance.min(axis=1)
-            apart[matches.labels[row]].append(np.stack(values))
-    figures: dict[str, float] = {}
-    for label, name in enumerate(config.classes):
-        heights, plane = np.concatenate([np.empty((2, 0)), *apart[label]], axis=1)
-        for key, values in (
-            ("height_error_m", abs(heights)), ("height_bias_m", heights), ("plane_error_m", plane),
-        ):  # fmt: skip
-            figures[f"{name}/{key}"] = float(values.mean()) if len(values) else UNDEFINED
-        figures[f"{name}/num_matches"] = float(len(apart[label]))
-    return figures

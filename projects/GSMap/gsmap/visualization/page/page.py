@@ -12,8 +12,9 @@ from string import Template
 from typing import Any
 
 from gsmap.datasets.annotations.file import AnnotationFile
+from gsmap.evaluation.analysis import DISTANCE
 from gsmap.evaluation.analysis.bootstrap import Resamples
-from gsmap.evaluation.analysis.distances import DISTANCE, distance_groups
+from gsmap.evaluation.analysis.distances import distance_groups
 from gsmap.evaluation.analysis.groups import read_groups
 from gsmap.evaluation.core.file_evaluation import read_ground_truth
 from gsmap.evaluation.core.raster_ap import MIN_SCORE

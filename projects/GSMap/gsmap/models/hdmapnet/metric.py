@@ -1,0 +1,18 @@
+"""HDMapNet's metric: AP per sample of lines drawn five pixels thick."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from gsmap.evaluation.core.metric import register_metric
+from gsmap.evaluation.core.sample_ap import SampleAP
+
+
+@register_metric
+@dataclass(frozen=True)
+class HDMapNetAP(SampleAP):
+    """AP per sample by the rules of HDMapNet's released evaluator."""
+
+    name: ClassVar[str] = "hdmapnet"
+    line_px: ClassVar[int] = 5
+    report_thresholds: ClassVar[Mapping[str, tuple[float, ...]]] = {"hdmapnet": (2.0, 4.0, 6.0)}
