@@ -21,10 +21,13 @@ from gsmap.evaluation.core.raster_ap import (
     MIN_SCORE,
     RasterConfig,
     pixels_from_metres,
+    rasterize,
 )
 from gsmap.structures.elements import MapElements
 
 Frame = tuple[MapElements, MapElements]  # predictions, ground truth
+FILLS_AS_RELEASED = (4, 8) <= tuple(map(int, cv2.__version__.split(".")[:2])) <= (4, 10)
+"""Whether the installed OpenCV fills polygons as those did that the released figures are of."""
 
 
 def _resampled(line: np.ndarray) -> np.ndarray:
@@ -98,7 +101,14 @@ def chamfer_map(
     return float(np.mean(aps))
 
 
-def _codes(elements: MapElements, rows: np.ndarray, polygon: bool, config: RasterConfig) -> list:
+def _codes(
+    elements: MapElements, rows: np.ndarray, polygon: bool, config: RasterConfig, by_opencv: bool
+) -> list:
+    if polygon and not by_opencv:
+        words = rasterize(elements.select(rows), config)
+        bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")
+        masks = bits[..., : config.size_px[0]]
+        return [run_length.encode(np.asfortranarray(mask)) for mask in masks]
     codes = []
     for i in rows:
         canvas = np.zeros(config.size_px[::-1], np.uint8)
@@ -124,14 +134,15 @@ def _raster_hits(ious: np.ndarray, threshold: float) -> list[bool]:
     return hits
 
 
-def raster_map(frames: Sequence[Frame], config: RasterConfig) -> float:
+def raster_map(frames: Sequence[Frame], config: RasterConfig, by_opencv: bool = True) -> float:
     """Return the mean AP_raster of some frames.
-
-    Polygons are filled by OpenCV, whose versions differ along the outline.
 
     Args:
         frames: Predictions and ground truth of each sample.
         config: Rules.
+        by_opencv: Whether the installed OpenCV fills polygons, whose versions differ along the
+            outline (``FILLS_AS_RELEASED``); else the drawing of `gsmap.evaluation` does, whose
+            pixels are those of the released figures. Lines are OpenCV's in both cases.
     """
     aps = []
     pairs = zip(config.is_polygon, config.thresholds.values(), strict=True)
@@ -141,7 +152,10 @@ def raster_map(frames: Sequence[Frame], config: RasterConfig) -> float:
             rows = _ranked(pred, label, MIN_SCORE)[:MAX_PREDICTIONS]
             truths = np.flatnonzero(gt.labels == label)
             num_gts += len(truths)
-            codes = _codes(pred, rows, polygon, config), _codes(gt, truths, polygon, config)
+            codes = (
+                _codes(pred, rows, polygon, config, by_opencv),
+                _codes(gt, truths, polygon, config, by_opencv),
+            )
             found = run_length.iou(*codes, [0] * len(truths))
             scores.append(pred.confidence[rows])
             ious.append(np.asarray(found).reshape(len(rows), len(truths)))

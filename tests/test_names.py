@@ -17,6 +17,7 @@ NAMES = [
     *("drivemaps.write_geojson", "gsmap.apis.MapInferencer", "gsmap.apis.load_model"),
     *("gsmap.datasets.VectorizedMapDataset", "gsmap.evaluation.ChamferConfig"),
     *("gsmap.evaluation.MapEvaluator", "gsmap.evaluation.RasterConfig", "drivemaps.MapOrigin"),
+    *("gsmap.evaluation.Metric", "gsmap.evaluation.SampleValues", "gsmap.evaluation.MetricReport"),
     *("gsmap.models.GSMapHead", "gsmap.models.MapDetector", "gsmap.models.RasterLoss"),
     *("gsmap.ops.render_gaussians", "gsmap.structures.BEVGrid", "gsmap.structures.MapElements"),
     *("gsmap.visualization.MapVisualizer", "gsmap.visualization.MapStyle"),

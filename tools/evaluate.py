@@ -327,11 +327,7 @@ def report(outcome: Evaluation, args: argparse.Namespace) -> None:
     for found in reports:
         if found.name in ("intervals", "by", "uncertainty"):  # printed
             continue
-        if not found.groups:
-            lines = (f"{key:<44} {value:.4f}" for key, value in found.metrics.items())
-            print("\n".join(lines) + "\n")
-        else:
-            print(format_table(found) + "\n")
+        print(format_table(found) + "\n")
     for note in notes:
         print(f"note: {note}")
     if args.out:

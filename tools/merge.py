@@ -5,6 +5,7 @@ FILE is what the command makes without ``--shard``: an annotation file, results 
 its N parts must be in the same folder. The result is identical, byte for byte (docs/scale.md).
 """
 
+from importlib import import_module
 from pathlib import Path
 
 from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
@@ -36,8 +37,18 @@ MERGE = {ANNOTATIONS: merge_annotations, RESULTS: merge_results, MATCHES: merge_
 def main(argv: list[str] | None = None) -> str:
     parser = CommandParser(description=__doc__)
     parser.add_argument("targets", metavar="FILE", type=output_file, nargs="+", help="file to make")
+    parser.add_argument(
+        "--custom-imports",
+        nargs="+",
+        default=[],
+        metavar="MODULE",
+        help="modules with metrics of one's own that the parts have",
+    )
+    args = parser.parse_args(argv)
+    for module in args.custom_imports:
+        import_module(module)
     lines = []
-    for target in parser.parse_args(argv).targets:
+    for target in args.targets:
         shards = find_shards(target)
         kind = shards[0].manifest["kind"]
         if kind not in MERGE:

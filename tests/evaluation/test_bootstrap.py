@@ -16,11 +16,14 @@ from gsmap.evaluation.analysis.bootstrap import (
     resampled_figures,
 )
 from gsmap.evaluation.core.average_precision import area_ap, interpolated_ap
+from gsmap.evaluation.core.chamfer_ap import HardChamferConfig
 from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.metric import MetricSettings
 from gsmap.evaluation.core.results_json import write_results
 from gsmap.structures.elements import MapElements
 
-HARD = replace(EVALUATOR, hard=True)
+CHAMFER, RASTER = EVALUATOR.metrics
+HARD = MapEvaluator(CHAMFER, HardChamferConfig.of(MetricSettings(CLASSES)), RASTER)
 COUNT = 20
 
 
@@ -156,8 +159,8 @@ def test_hard_thresholds_beside_the_others_are_those_of_their_own_run(tmp_path):
     both = reports_of(samples)
     assert [report.name for report in both] == ["chamfer", "chamfer_hard", "raster"]
     easy, _ = reports_of(samples, EVALUATOR)
-    alone = replace(EVALUATOR.chamfer, thresholds=(0.2, 0.5, 1.0))
-    (hard,) = reports_of(samples, MapEvaluator(alone, None))
+    alone = replace(CHAMFER, thresholds=(0.2, 0.5, 1.0))
+    (hard,) = reports_of(samples, MapEvaluator(alone))
     assert both[0].metrics == easy.metrics
     renamed = {key.replace("chamfer/", "chamfer_hard/"): v for key, v in hard.metrics.items()}
     assert both[1].metrics == renamed

@@ -8,12 +8,12 @@ import pytest
 from golden_data import CLASSES
 from test_files import annotated, command, results_of
 
-from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.results_json import write_results
-from gsmap.evaluation.metrics.pld import pld_figures, sospa, spaced
+from gsmap.evaluation.metrics.pld import PLD, sospa, spaced
 from gsmap.structures.elements import MapElements
 
-CONFIG = ChamferConfig(CLASSES, (1.0,))
+CONFIG = PLD(CLASSES, (1.0,))
 LINE = np.array([[0.0, 0.0], [0.0, 3.0]])  # 7 points
 SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [0.0, 0.0]])  # 16 points
 
@@ -30,8 +30,15 @@ def elements(lines: list, labels: list | None = None, scores: list | None = None
     return MapElements.from_polylines(lines, labels or [0] * len(lines), scores)
 
 
-def figures(found: list, scores: list, wanted: list, config: ChamferConfig = CONFIG) -> dict:
-    return pld_figures([("t", elements(found, scores=scores), elements(wanted))], config)
+def figures_of(*samples: tuple[MapElements, MapElements], config: PLD = CONFIG) -> dict:
+    evaluator = MapEvaluator(config)
+    for predictions, truth in samples:
+        evaluator.update(predictions, truth)
+    return {key.removeprefix("pld/"): value for key, value in evaluator.compute().items()}
+
+
+def figures(found: list, scores: list, wanted: list, config: PLD = CONFIG) -> dict:
+    return figures_of((elements(found, scores=scores), elements(wanted)), config=config)
 
 
 def test_points_stand_every_half_metre_and_at_the_end():
@@ -135,8 +142,8 @@ def test_pld_has_its_ends_at_equal_maps_and_at_maps_without_a_pair():
 
 def test_samples_count_by_their_elements_and_classes_apart():
     other = elements([LINE], [2], [1.0])
-    first = "a", elements([LINE], scores=[1.0]), elements([LINE])
-    found = pld_figures([first, ("b", other, elements([LINE]))], CONFIG)
+    first = elements([LINE], scores=[1.0]), elements([LINE])
+    found = figures_of(first, (other, elements([LINE])))
     # dividers: one found, one missed: D = 1/2, M = 3/2; boundaries: one that is not there
     assert found["divider/PLD"] == pytest.approx(0.5)
     assert found["boundary/PLD"] == 1
@@ -159,7 +166,7 @@ def test_pld_takes_the_best_of_all_ways_to_pair_lines(seed):
 
 
 def test_looser_cutoffs_are_averaged():
-    config = ChamferConfig(CLASSES, (0.5, 1.0))
+    config = PLD(CLASSES, (0.5, 1.0))
     found = figures([aside(0.2)], [1.0], [LINE], config)
     at = [of_lines(aside(0.2), LINE, cutoff)[0] for cutoff in (0.5, 1.0)]
     # one pair, score 1: D = s, M = 1
@@ -177,5 +184,3 @@ def test_the_command_writes_pld(tmp_path, capsys):
     # dividers are found exactly at 0.9: D = 4 * 0.1 / 2, M = 4 * 1.9 / 2
     assert found["pld/divider/PLD@0.5"] == pytest.approx(2 * 0.2 / (3.8 + 0.2))
     assert "pld/PLD " in capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        command()([*words, "--pld", "--shard", "1/2", "--out", str(tmp_path / "m.json")])

@@ -17,28 +17,36 @@ from test_files import annotated, command, results_of, truth_of
 from gsmap.evaluation.analysis.bootstrap import Resamples, resampled_figures
 from gsmap.evaluation.analysis.groups import Groups, ap_by_group
 from gsmap.evaluation.core.average_precision import ten_point_ap
-from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
-from gsmap.evaluation.core.evaluator import ALL_NAMES, SHRUNK_NAME, TWO_SIDED_NAME, MapEvaluator
-from gsmap.evaluation.core.raster_ap import NUSCENES_GRID, RasterConfig
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig, HardChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.metric import MetricSettings, metric_names
+from gsmap.evaluation.core.raster_ap import NUSCENES_GRID
 from gsmap.evaluation.core.report import flat_metrics
 from gsmap.evaluation.core.results_json import write_results
 from gsmap.evaluation.core.sample_ap import (
-    METHODS,
-    SampleAPConfig,
+    SampleAP,
     closest_pairs,
     draw_numbers,
     line_distances,
     match_sample_ap,
 )
 from gsmap.evaluation.map_metric import MapMetric
+from gsmap.models.bemapnet.metric import BeMapNetAP
+from gsmap.models.hdmapnet.metric import HDMapNetAP
+from gsmap.models.vectormapnet.metric import ShrunkVectorMapNetAP, VectorMapNetAP
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 from tools.merge import main as merge
 
-RULES = {name: SampleAPConfig(CLASSES, name, NUSCENES_GRID) for name in METHODS}
-DRAWN = MapEvaluator(None, None, drawn=tuple(RULES.values()))
-PLAIN = MapEvaluator(ChamferConfig(CLASSES), None)
-TWO_SIDED = replace(PLAIN, two_sided=True)
+RULES: dict[str, SampleAP] = {
+    metric.name: metric(CLASSES, NUSCENES_GRID) for metric in (HDMapNetAP, BeMapNetAP)
+}
+TWO_SIDED_NAME, SHRUNK_NAME = VectorMapNetAP.name, ShrunkVectorMapNetAP.name
+CHAMFER = ChamferConfig(CLASSES)
+SHRUNK = ShrunkVectorMapNetAP(CLASSES, grid=NUSCENES_GRID)
+DRAWN = MapEvaluator(*RULES.values())
+PLAIN = MapEvaluator(CHAMFER)
+TWO_SIDED = MapEvaluator(CHAMFER, VectorMapNetAP(CLASSES))
 UPRIGHT = np.array([[0.05, -20.0], [0.05, 20.0]])
 
 
@@ -59,7 +67,7 @@ NOTHING, TRUTH = elements([], []), elements(aside(0.0))
 
 
 def test_the_rules_are_those_of_the_released_evaluators():
-    assert {name: (m.line_px, *m.reports.items()) for name, m in METHODS.items()} == {
+    assert {name: (m.line_px, *m.report_thresholds.items()) for name, m in RULES.items()} == {
         "hdmapnet": (5, ("hdmapnet", (2, 4, 6))),
         "bemapnet": (1, ("bemapnet", (0.5, 1, 1.5)), ("bemapnet_hard", (0.2, 0.5, 1))),
     }
@@ -156,7 +164,7 @@ def test_hidden_far_and_short_elements_do_not_count():
 
 def test_low_scores_are_left_out_if_asked():
     found = elements(aside(0.0, 8.0), [0.9, 0.39])
-    evaluator = MapEvaluator(None, None, drawn=(replace(RULES["bemapnet"], min_score=0.4),))
+    evaluator = MapEvaluator(replace(RULES["bemapnet"], min_score=0.4))
     assert figures((found, TRUTH), evaluator=evaluator)["bemapnet/divider/AP"] == 1.0
     (matches,) = evaluator.match("t", found.select(np.array([1, 0])), TRUTH).values()
     assert matches.pred_index.tolist() == [1]
@@ -223,8 +231,8 @@ def test_figures_equal_a_plain_implementation(seed):
     truths = [random_map(rng, count, False) for count in (5, 3, 0, 12)]
     samples = [(near(truth, rng), truth) for truth in truths] + [(NOTHING, truths[0])]
     metrics, values = figures(*samples), []
-    for method in METHODS.values():
-        for name, thresholds in method.reports.items():
+    for method in RULES.values():
+        for name, thresholds in method.report_thresholds.items():
             for label, threshold in ((c, t) for c in (0, 1) for t in thresholds):
                 plain = partial(plain_ap, label=label, thickness=method.line_px, limit=threshold)
                 aps = [ap for sample in samples if (ap := plain(*sample)) is not None]
@@ -262,8 +270,8 @@ def test_looser_thresholds_and_the_truth_itself(seed):
     truth = random_map(rng, 6, False)
     metrics = figures((near(truth, rng), truth))
     itself = figures((replace(truth, scores=rng.random(6)), truth))
-    for method in METHODS.values():
-        for name, thresholds in method.reports.items():
+    for method in RULES.values():
+        for name, thresholds in method.report_thresholds.items():
             for label in CLASSES[:2]:
                 aps = [metrics[f"{name}/{label}/AP@{t}"] for t in thresholds]
                 assert aps == sorted(aps)
@@ -279,7 +287,7 @@ def sample_set() -> list[tuple[str, MapElements, MapElements]]:
     return [*found, ("t6", NOTHING, truths[0]), ("t7", NOTHING, NOTHING)]
 
 
-BOTH = replace(DRAWN, chamfer=TWO_SIDED.chamfer, two_sided=True)
+BOTH = MapEvaluator(*TWO_SIDED.metrics, *DRAWN.metrics)
 
 
 @pytest.mark.parametrize("evaluator", [DRAWN, BOTH])
@@ -306,7 +314,8 @@ def test_groups_and_resamples_are_files_of_their_samples(evaluator):
 
 def test_vectormapnets_rule_leaves_out_samples_without_either_side():
     samples = [sample[1:] for sample in sample_set()]
-    metrics = figures(*samples, evaluator=replace(TWO_SIDED, hard=True))
+    hard = HardChamferConfig.of(MetricSettings(CLASSES))
+    metrics = figures(*samples, evaluator=MapEvaluator(*TWO_SIDED.metrics, hard))
     kept = [sample for sample in samples if len(sample[0]) and len(sample[1])]
     assert len(kept) == len(samples) - 3
     rest, everything = (figures(*some, evaluator=PLAIN) for some in (kept, samples))
@@ -315,13 +324,13 @@ def test_vectormapnets_rule_leaves_out_samples_without_either_side():
             assert metrics[key.replace("chamfer", TWO_SIDED_NAME)] == pytest.approx(value), key
     assert everything.items() <= metrics.items()
     assert metrics["vectormapnet/mAP"] > metrics["chamfer/mAP"]
-    loose = replace(TWO_SIDED, chamfer=ChamferConfig(CLASSES, (3.0,)))
+    loose = MapEvaluator(ChamferConfig(CLASSES, (3.0,)), VectorMapNetAP(CLASSES))
     assert figures(*samples, evaluator=loose)["vectormapnet/mAP"] == metrics["vectormapnet/mAP"]
 
 
 def test_vectormapnets_units_shrink_a_map_as_much_as_its_canvas_is_larger():
     """0.52 m across a map of 30 m are 0.4875 m there, 0.52 m along one of 60 m 0.503 m."""
-    both = replace(TWO_SIDED, shrunk=NUSCENES_GRID)
+    both = MapEvaluator(*TWO_SIDED.metrics, SHRUNK)
     along = elements([UPRIGHT[:, ::-1]])
     samples = [
         (elements(aside(0.52), [0.9]), TRUTH),
@@ -352,7 +361,7 @@ def test_command_writes_them_under_their_own_names_also_in_shards(tmp_path, caps
     results, truth = tmp_path / "results.json", annotated(tmp_path / "val.arrow", 8, scenes=4)
     write_results(results, [*results_of(7), ("t7", [])])
     out, parts = tmp_path / "all.json", tmp_path / "parts.json"
-    words = [str(results), str(truth), "--eval", "vectormapnet", SHRUNK_NAME, *METHODS]
+    words = [str(results), str(truth), "--eval", "vectormapnet", SHRUNK_NAME, *RULES]
     assert command()([*words, "--out", str(out)]).startswith("8 samples")
     written = json.loads(out.read_text())
     assert {key.split("/")[0] for key in written} == {
@@ -371,39 +380,46 @@ def test_command_writes_them_under_their_own_names_also_in_shards(tmp_path, caps
     assert "hdmapnet divider" in capsys.readouterr().out
 
 
-def test_bad_settings_are_refused(tmp_path, capsys):
-    with pytest.raises(ValueError, match=r"method must be one of .*'hdmapnet'.*got 'other'"):
-        SampleAPConfig(CLASSES, "other", NUSCENES_GRID)
+def test_bad_settings_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"min_score must be in \[0, 1\], got 1.5"):
         replace(RULES["bemapnet"], min_score=1.5)
-    with pytest.raises(ValueError, match="drawn must have one entry for a method"):
-        replace(DRAWN, drawn=(RULES["bemapnet"], RULES["bemapnet"]))
-    with pytest.raises(ValueError, match="with the same classes"):
-        replace(DRAWN, chamfer=ChamferConfig(("divider",)))
-    for rules in (None, ChamferConfig(CLASSES, dim=3)):
-        with pytest.raises(ValueError, match="vectormapnet is AP_chamfer of lines of 100 points"):
-            replace(BOTH, chamfer=rules)
-        with pytest.raises(ValueError, match="vectormapnet is AP_chamfer of lines of 100 points"):
-            replace(DRAWN, chamfer=rules, shrunk=NUSCENES_GRID)
-    with pytest.raises(ValueError, match=r"there is no metric .*'image'"):
-        MapEvaluator.named(["image"], ChamferConfig(CLASSES), RasterConfig(CLASSES))
+    with pytest.raises(ValueError, match=r"different names, got \['bemapnet', 'bemapnet'"):
+        MapEvaluator(RULES["bemapnet"], RULES["bemapnet"])
+    with pytest.raises(ValueError, match="all have the same classes"):
+        MapEvaluator(*DRAWN.metrics, ChamferConfig(("divider",)))
+    with pytest.raises(ValueError, match="at least one metric"):
+        MapEvaluator()
+    for rules in ({"dim": 3}, {"resample_predictions": False}, {"resample_ground_truth": False}):
+        given_so = MetricSettings(CLASSES, grid=NUSCENES_GRID, **rules)
+        for name in (TWO_SIDED_NAME, SHRUNK_NAME):
+            with pytest.raises(ValueError, match="is AP_chamfer of lines of 100 points"):
+                MapEvaluator.named([name], given_so)
+    with pytest.raises(ValueError, match=r"there is no metric .*'image'.*'chamfer', .*'hdmapnet'"):
+        MapEvaluator.named(["image"], MetricSettings(CLASSES))
+    with pytest.raises(ValueError, match="need the range of the map"):
+        MapEvaluator.named(["bemapnet"], MetricSettings(CLASSES))
     with pytest.raises(ValueError, match="predictions need scores"):
         match_sample_ap(TRUTH, TRUTH, RULES["bemapnet"])
     results, truth = tmp_path / "results.json", tmp_path / "truth.json"
     write_results(results, results_of(2))
     write_results(truth, truth_of(2), key="GTs")
-    with pytest.raises(SystemExit):
-        command()([str(results), str(truth), "--eval", "bemapnet", "--pr-curves", "a.png"])
-    assert "name chamfer or raster" in capsys.readouterr().err
+    for words, message in (
+        (["--eval", "bemapnet", "--pr-curves", "a.png"], "name chamfer or raster"),
+        (["--min-score", "0.4"], "--min-score is of topology, hdmapnet and bemapnet"),
+        (["--eval", "pld", "--bootstrap"], "are of AP: name chamfer or raster"),
+        (["--eval", "chamfers"], "there is no metric .*'chamfers'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            command()([str(results), str(truth), *words])
 
 
 def test_any_canvas_and_the_metric_of_a_config():
-    wide = SampleAPConfig(CLASSES, "bemapnet", BEVGrid((-50.0, 50.0), (-25.1, 25.0)))
+    wide = BeMapNetAP(CLASSES, BEVGrid((-50.0, 50.0), (-25.1, 25.0)))
     assert wide.size_px == (667, 334)
     metric = MapMetric(eval=["bemapnet"])
     metric.dataset_meta = {"classes": CLASSES, "x_range": (-15, 15), "y_range": (-30, 30)}
-    assert metric.evaluator == MapEvaluator(None, None, drawn=(RULES["bemapnet"],))
-    assert set(ALL_NAMES) >= {"chamfer", "raster", *METHODS}
+    assert metric.evaluator == MapEvaluator(RULES["bemapnet"])
+    assert set(metric_names()) >= {"chamfer", "raster", "pld", "topology", "heights", *RULES}
     metric = MapMetric(eval=[SHRUNK_NAME])
     metric.dataset_meta = {"classes": CLASSES, "x_range": (-15, 15), "y_range": (-30, 30)}
-    assert metric.evaluator == replace(PLAIN, shrunk=BEVGrid((-15, 15), (-30, 30)))
+    assert metric.evaluator == MapEvaluator(CHAMFER, SHRUNK)

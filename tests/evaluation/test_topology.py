@@ -7,18 +7,22 @@ import pytest
 from golden_data import CLASSES
 from test_files import annotated, command, results_of, vector
 
-from gsmap.evaluation.core.chamfer_ap import ChamferConfig
+from gsmap.evaluation.core.evaluator import MapEvaluator
+from gsmap.evaluation.core.metric import Metric
 from gsmap.evaluation.core.results_json import write_results
-from gsmap.evaluation.metrics.topology import (
-    TopologyConfig,
-    count_folds,
-    count_pieces,
-    height_figures,
-    topology_figures,
-)
+from gsmap.evaluation.metrics.heights import Heights
+from gsmap.evaluation.metrics.topology import Topology, count_folds, count_pieces
 from gsmap.structures.elements import MapElements
 
-CONFIG = TopologyConfig(CLASSES, (1,))
+CONFIG = Topology(CLASSES, (1,))
+
+
+def figures_of(metric: Metric, predictions: MapElements, truth: MapElements) -> dict[str, float]:
+    """The figures of one sample, without the name of the metric."""
+    evaluator = MapEvaluator(metric)
+    evaluator.update(predictions, truth)
+    figures = evaluator.compute()
+    return {key.removeprefix(f"{metric.name}/"): value for key, value in figures.items()}
 
 
 def straight(x: float, low: float, high: float) -> np.ndarray:
@@ -32,7 +36,7 @@ def elements(lines: list, labels: int | list = 0, scores: list | None = None) ->
 
 def figures(found: list, wanted: list, scores: list | None = None, label: int = 0) -> dict:
     predictions = elements(found, label, scores or [0.9] * len(found))
-    return topology_figures([("t", predictions, elements(wanted, label))], CONFIG)
+    return figures_of(CONFIG, predictions, elements(wanted, label))
 
 
 def test_a_line_found_in_three_pieces_has_two_breaks():
@@ -57,7 +61,7 @@ def test_a_prediction_along_two_lines_joins_them_falsely():
     assert found["divider/breaks"] == 0
     other_class = elements([straight(0.2, -20, -2), straight(-0.2, 2, 20)], [0, 2])
     predictions = elements([straight(0, -20, 20)], 0, [0.9])
-    found = topology_figures([("t", predictions, other_class)], CONFIG)
+    found = figures_of(CONFIG, predictions, other_class)
     assert found["divider/false_joints"] == 0
 
 
@@ -95,9 +99,9 @@ def test_rings_are_areas_and_huge_coordinates_are_no_trouble():
 
 def test_rules_out_of_range_are_refused():
     with pytest.raises(ValueError, match="min_piece_m more than twice"):
-        TopologyConfig(CLASSES, min_piece_m=2.0)
+        Topology(CLASSES, min_piece_m=2.0)
     with pytest.raises(ValueError, match="min_score must be in"):
-        TopologyConfig(CLASSES, min_score=1.5)
+        Topology(CLASSES, min_score=1.5)
 
 
 def test_heights_are_of_predictions_that_match_in_the_plane():
@@ -105,9 +109,7 @@ def test_heights_are_of_predictions_that_match_in_the_plane():
     wanted = np.array([[0.0, -20, 0], [0, 20, 4]])
     line = np.array([[0.2, -20, 0.3], [0.2, -1e-6, 2.3], [0.2, 0, 1.9], [0.2, 20, 3.9]])
     lines = [line, np.array([[9.0, -20, 50], [9, 20, 50]])]
-    found = height_figures(
-        [("t", elements(lines, 0, [0.9, 0.8]), elements([wanted]))], ChamferConfig(CLASSES, dim=3)
-    )
+    found = figures_of(Heights(CLASSES), elements(lines, 0, [0.9, 0.8]), elements([wanted]))
     assert found["divider/num_matches"] == 1
     assert found["divider/plane_error_m"] == pytest.approx(0.2, abs=1e-3)
     assert found["divider/height_error_m"] == pytest.approx(0.2, abs=0.01)

@@ -11,12 +11,12 @@ from gsmap.datasets.annotations.file import SHARD_KIND as ANNOTATIONS
 from gsmap.datasets.annotations.file import write_annotations
 from gsmap.datasets.annotations.record import CLASSES, AnnotationMeta, MapSample
 from gsmap.datasets.elements import elements_of_instances
-from gsmap.evaluation.core.chamfer_ap import ChamferConfig
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.match_files import write_matches
-from gsmap.evaluation.core.raster_ap import RasterConfig
+from gsmap.evaluation.core.metric import MetricSettings
 from gsmap.evaluation.core.results_json import SHARD_KIND as RESULTS
 from gsmap.evaluation.core.results_json import vectors_of, write_results
+from gsmap.structures.grid import BEVGrid
 from gsmap.utils.shards import Shard
 
 
@@ -159,7 +159,8 @@ def write_shards(
     """Write a file's shards, with their manifests: annotations, results or matches of a sample."""
     elements = elements_of_instances(sample.instances)
     results = [(token, vectors_of(elements, meta.classes)) for token in "ab"]
-    evaluator = MapEvaluator(ChamferConfig(meta.classes), RasterConfig(meta.classes))
+    settings = MetricSettings(meta.classes, grid=BEVGrid(meta.x_range, meta.y_range))
+    evaluator = MapEvaluator.named(["chamfer", "raster", "pld"], settings)
     for shard in (Shard(index, count) for index in range(count)):
         own = replace(sample, token=str(shard.index))
         if kind == ANNOTATIONS:
@@ -170,4 +171,4 @@ def write_shards(
         else:
             predicted = replace(elements, scores=np.ones(len(elements)))
             matches = [evaluator.match(own.token, predicted, elements)]
-            write_matches(target, shard, matches, [], evaluator, "")
+            write_matches(target, shard, matches, [], evaluator, settings, "")

@@ -218,9 +218,12 @@ def test_results_of_different_ground_truth_are_refused(tmp_path):
 
 def test_rules_of_both_metrics_may_change(minicity_annotations):
     path = minicity_annotations["val"]
-    config = evaluator_for(path, {"thresholds": [0.2, 0.5], "polygon_classes": []})
-    assert config.chamfer.thresholds == (0.2, 0.5)
-    assert config.raster.polygon_classes == ()
-    assert config.raster.grid.y_range == (-30.0, 30.0)
+    changes = {"thresholds": [0.2, 0.5], "polygon_classes": [], "ground_truth_points": 20}
+    evaluator = evaluator_for(path, changes)
+    chamfer, raster = evaluator.metrics
+    assert evaluator.ground_truth_points == 20
+    assert chamfer.thresholds == (0.2, 0.5)
+    assert raster.polygon_classes == ()
+    assert raster.grid.y_range == (-30.0, 30.0)
     with pytest.raises(ValueError, match=r"no metric has the setting \['threshold'\]"):
         evaluator_for(path, {"threshold": 1})

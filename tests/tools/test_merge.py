@@ -197,12 +197,13 @@ GRID = {"x_range": [-15, 15], "y_range": [-30, 30]}
 @pytest.mark.parametrize(
     ("rules", "message"),
     [
-        ({"chamfer": None, "raster": None}, "tells no rules of metrics .*at least one"),
-        ({"chamfer": {"classes": [["a"]]}}, "tells no rules of metrics .*classes must be names"),
-        ({"chamfer": []}, "tells no rules of metrics"),
-        ({"chamfer": {"classes": ["divider"]}}, "holds no matches by the rules .*shapes"),
-        ({"chamfer": {"classes": list(CLASSES), "thresholds": [1]}}, "holds no matches by the"),
-        ({"raster": {"classes": list(CLASSES), "grid": GRID}}, "holds no matches .*'raster'"),
+        ({"metrics": []}, "tells no rules of metrics .*at least one"),
+        ({"settings": {"classes": [["a"]]}}, "tells no rules of metrics .*classes must be names"),
+        ({"settings": []}, "tells no rules of metrics"),
+        ({"metrics": ["os"]}, "tells no rules of metrics .*there is no metric"),
+        ({"settings": {"classes": ["divider"]}}, "holds no matches by the rules .*shapes"),
+        ({"settings": {"classes": list(CLASSES), "thresholds": [1]}}, "holds no matches by the"),
+        ({"metrics": ["chamfer", "raster"]}, "holds no matches .*'raster'"),
     ],
 )
 def test_forged_rules_of_figures_are_refused(rules, message, scored, tmp_path):

@@ -161,7 +161,7 @@ def test_the_map_near_and_far_has_a_table_that_equals_the_commands(case):
     tables = page_data(path, results, replace(NO_IMAGES, by="distance"))["tables"]
     (table,) = (t for t in tables if "by distance, good" in t["caption"])
     classes = AnnotationFile(path).meta.classes
-    evaluator = MapEvaluator(ChamferConfig(classes), None)
+    evaluator = MapEvaluator(ChamferConfig(classes))
     pieces = cut_by_distance(SamplePairs(results["good"], path, classes), areas=[1])
     reports = evaluator.reports(evaluator.match(*sample) for sample in pieces)
     groups = distance_groups(reports[0].tokens)

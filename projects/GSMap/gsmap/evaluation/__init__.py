@@ -8,7 +8,13 @@ __getattr__, __dir__, __all__ = lazy_names(
         "ChamferConfig": "core.chamfer_ap",
         "MapEvaluator": "core.evaluator",
         "MapMetric": "map_metric",
+        "Metric": "core.metric",
+        "MetricReport": "core.report",
+        "MetricSettings": "core.metric",
         "RasterConfig": "core.raster_ap",
+        "Sample": "core.metric",
+        "SampleValues": "core.metric",
         "format_table": "core.report",
+        "register_metric": "core.metric",
     },
 )

@@ -24,7 +24,14 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 LAUNCHER = "GSMAP_LAUNCHER"  # variable with the number of torchrun's process, for its ranks
 _interpreter_flags = util._args_from_interpreter_flags  # type: ignore[attr-defined]
-_PRCTL = ctypes.CDLL(None).prctl  # found before a fork, which may happen within a lock
+
+
+def _found_prctl() -> Callable[..., Any] | None:
+    """Return the function of Linux by which a process dies with its parent; None elsewhere."""
+    return ctypes.CDLL(None).prctl if sys.platform == "linux" else None
+
+
+_PRCTL = _found_prctl()  # before a fork, which may happen within a lock
 
 
 def _safe_interpreter_flags() -> list[str]:
@@ -47,7 +54,12 @@ def default_workers() -> int:
 
 
 def die_with_parent(parent: int) -> None:
-    """Have Linux kill this process when its parent, of that number, dies, however it dies."""
+    """Have Linux kill this process when its parent, of that number, dies, however it dies.
+
+    Other systems have no such order: there only the workers of `ordered_map` end with their parent.
+    """
+    if _PRCTL is None:
+        return
     _PRCTL(1, signal.SIGKILL)
     if os.getppid() != parent:  # it is dead already
         os.kill(os.getpid(), signal.SIGKILL)

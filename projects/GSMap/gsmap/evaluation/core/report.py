@@ -97,8 +97,10 @@ def format_table(report: MetricReport) -> str:
     """Return the table of a metric: a row per class, a column per threshold, the means below.
 
     Classes with the same thresholds stand together; the recall, the error and the calibration are
-    those at the loosest threshold.
+    those at the loosest threshold. A metric that ranks no predictions has a row per figure.
     """
+    if not report.groups:
+        return "\n".join(f"{key:<44} {value:.4f}" for key, value in report.metrics.items())
     chamfer = report.by_distance
     unit, quality = ("m", "error m") if chamfer else ("IoU", "mIoU")
     lines = [f"AP_{report.name}"]
