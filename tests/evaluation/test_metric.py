@@ -68,9 +68,9 @@ def own_module(tmp_path, monkeypatch):
     """The metric as a module that can be imported, and that no other test knows."""
     (tmp_path / "own_metric.py").write_text(OWN_METRIC)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(metric_module, "_REGISTERED", dict(metric_module._REGISTERED))
     yield "own_metric"
     sys.modules.pop("own_metric", None)
+    metric_module._REGISTERED.pop("lengths", None)
 
 
 @pytest.fixture
