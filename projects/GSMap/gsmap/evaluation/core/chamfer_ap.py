@@ -241,7 +241,9 @@ def chamfer_report(matches: MatchTable, config: ChamferConfig) -> MetricReport:
         figures = distance_figures(found, aps)
         metrics |= {f"{of_class}/{key}": value for key, value in figures.items()}
     present = [of_class for of_class, found in detections.items() if found.num_gts]
-    means = {"mAP": "AP"} | {f"AP@{threshold}": f"AP@{threshold}" for threshold in config.thresholds}
+    means = {"mAP": "AP"} | {
+        f"AP@{threshold}": f"AP@{threshold}" for threshold in config.thresholds
+    }
     for mean, of_one in means.items():
         aps = [metrics[f"{of_class}/{of_one}"] for of_class in present]
         metrics[mean] = float(np.mean(aps)) if aps else 0.0

@@ -6,9 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
+from gsmap.evaluation.core.matches import MatchTable
 from gsmap.evaluation.core.metric import (
     Matches,
-    MatchTable,
     Metric,
     MetricSettings,
     Sample,

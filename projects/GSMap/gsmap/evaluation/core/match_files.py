@@ -48,7 +48,7 @@ def write_matches(
     for metric in matches[0] if matches else ():
         arrays |= _joined(metric, [sample[metric] for sample in matches])
     with atomic_write(shard.path_of(target), "wb") as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(file, **arrays)
     rules = {
         "metrics": [metric.name for metric in evaluator.metrics],
         "settings": asdict(settings),
