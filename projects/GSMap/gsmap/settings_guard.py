@@ -1,15 +1,18 @@
-"""Keeps files of the working folder from setting up libraries.
+"""Keeps files of the working folder from setting up libraries, and one library from others' imports.
 
 matplotlib and numba read ``matplotlibrc`` and ``.numba_config.yaml`` of the working folder when
 they are imported, and numba again when it compiles; numba's can name a folder of compiled kernels,
 which are pickles. OpenCV prepends its folder to ``LD_LIBRARY_PATH`` so that an empty part is left,
 by which every program that is started later looks for libraries in the working folder first. That
-folder may be a stranger's data set. ``gsmap/__init__.py`` puts `SettingsGuard` in place.
+folder may be a stranger's data set. mmdet imports scikit-learn, which takes as long as torch, for
+a tracker and a head of two-dimensional boxes. ``gsmap/__init__.py`` puts `SettingsGuard` in place.
 """
 
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from importlib import import_module
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
@@ -47,11 +50,44 @@ def _with_library_path_kept(_: ModuleType) -> Iterator[None]:
             os.environ[_LIBRARIES] = before
 
 
+_SKLEARN = ("sklearn", "sklearn.gaussian_process", "sklearn.gaussian_process.kernels", "sklearn.mixture")
+
+
+class _DeferredModule(ModuleType):
+    """Stands for a module whose names are only called: each is looked up when it is called."""
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return lambda *args, **options: getattr(import_module(self.__name__), name)(*args, **options)
+
+
+@contextmanager
+def _with_sklearn_deferred(_: ModuleType) -> Iterator[None]:
+    """Import scikit-learn only when a name is called that a module takes from it."""
+    if _SKLEARN[0] in sys.modules:
+        yield
+        return
+    deferred = {name: _DeferredModule(name) for name in _SKLEARN}
+    for name, module in deferred.items():
+        parent, _, child = name.rpartition(".")
+        if parent:
+            setattr(deferred[parent], child, module)
+    sys.modules.update(deferred)
+    try:
+        yield
+    finally:
+        for name in deferred:
+            del sys.modules[name]
+
+
 _Guard = Callable[[ModuleType], AbstractContextManager[None]]
 _GUARDS: dict[str, _Guard] = {
     "matplotlib": _without_relative_files,
     "numba.core.config": _without_relative_files,
     "cv2": _with_library_path_kept,
+    "mmdet.models.task_modules.tracking.interpolation": _with_sklearn_deferred,
+    "mmdet.models.dense_heads.paa_head": _with_sklearn_deferred,
 }
 
 

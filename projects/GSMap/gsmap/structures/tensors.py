@@ -1,7 +1,9 @@
 """Small helpers of tensors that every room uses."""
 
+import functools
+import sys
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +13,28 @@ _ALIGNMENT = 64  # bytes, more than any type or kernel wants
 _LARGE = 2**20  # bytes that a copy of its own is worth
 _MOST_CONSTANTS = 4096  # of a process; further ones are made anew each time
 _constants: dict[Hashable, Tensor] = {}
+_Params = ParamSpec("_Params")
+_Result = TypeVar("_Result")
+
+
+def uncompiled(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
+    """Decorate a function that ``torch.compile`` must leave as it is.
+
+    It is ``torch.compiler.disable`` from the moment that the compiler is there: importing it takes
+    a second.
+    """
+
+    @functools.cache
+    def disabled() -> Callable[_Params, _Result]:
+        return torch.compiler.disable(function)
+
+    @functools.wraps(function)
+    def wrapped(*args: _Params.args, **kwargs: _Params.kwargs) -> _Result:
+        if "torch._dynamo" in sys.modules:
+            return disabled()(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return wrapped
 
 
 def constant(like: Tensor, values: Any, dtype: torch.dtype | None = None) -> Tensor:

@@ -9,10 +9,10 @@ from mmengine.model import BaseModule
 from torch import Tensor
 
 from gsmap.structures.calibration import calibration_arrays
-from gsmap.structures.tensors import uploaded
+from gsmap.structures.tensors import uncompiled, uploaded
 
 
-@torch.compiler.disable  # numpy's float64 is not for compilers
+@uncompiled  # numpy's float64 is not for compilers
 def stack_calibration(
     img_metas: Sequence[dict[str, Any]], names: Sequence[str], device: torch.device
 ) -> dict[str, Tensor]:
