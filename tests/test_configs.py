@@ -140,8 +140,9 @@ def test_one_word_makes_a_gsmap_of_any_config(path):
 def small(cfg: Config) -> Config:
     """Keep a config's structure, with two decoder layers and no weights from elsewhere.
 
-    Images of a fixed size become a quarter as large, and so do feature maps whose pixels all attend
-    to each other: at full size a step takes gigabytes and minutes.
+    There are few queries, and cells of the features of the map are twice as wide.
+    Images of a fixed size become a quarter as large, others half as large, and with them feature
+    maps whose pixels all attend to each other: at full size a step takes gigabytes and minutes.
     """
     for part in (cfg.model.get("img_backbone"), cfg.model.get("img_neck")):
         if part:
@@ -154,16 +155,41 @@ def small(cfg: Config) -> Config:
         cfg.train_dataloader.dataset.pipeline[2].pixel_m = 0.6
     else:
         head.get("detector", head).decoder.num_layers = 2
+        shrink_queries(cfg.model)
+        shrink_cells(cfg)
     if "num_cams" in (cfg.model.get("bev_encoder") or {}):
         cfg.model.bev_encoder.num_cams = 6  # MiniCity's
     shrink_images(cfg)
     return cfg
 
 
+def shrink_queries(model: ConfigDict) -> None:
+    """Keep a dozen queries of each group, some of which streams remember."""
+    for group in model.map_head.get("query_groups", []):
+        group.num = min(group.num, 12)
+    remembered = (model.get("temporal") or {}).get("queries")
+    if remembered:
+        remembered.num = min(remembered.num, 4)
+
+
+def shrink_cells(cfg: Config) -> None:
+    """Make fine cells of cameras' features of the map twice as wide, with the masks of that size."""
+    encoder = cfg.model.get("bev_encoder") or {}
+    if encoder.get("bev_pixel_m", 1.0) >= 1.0 or "lidar_encoder" in cfg.model:
+        return
+    encoder.bev_pixel_m *= 2
+    cells = BEVGrid(**cfg.grid).rasterized(encoder.bev_pixel_m)
+    for step in cfg.train_dataloader.dataset.pipeline:
+        if step.type == "MakeBEVMask":
+            step.size = (cells.height, cells.width)
+
+
 def shrink_images(cfg: Config) -> None:
-    """Make images of a fixed size a quarter as large."""
+    """Make images of a fixed size a quarter as large, and others half as large."""
     for part in ("train", "test"):
         for step in cfg[f"{part}_dataloader"].dataset.pipeline:
+            if step.type == "ScaleImages" and "scale" in step:
+                step.scale /= 2
             if step.type == "ScaleImages" and "size" in step:
                 width, height = step.size = tuple(side // 4 for side in step.size)
                 if cfg.model.bev_encoder.type in TIED:
