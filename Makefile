@@ -5,8 +5,8 @@ PY := $(VENV)/bin/python
 
 help:
 	@echo "make setup   build the environment in $(VENV) (again: a second)"
-	@echo "make test    set up if needed, then run every test"
-	@echo "make test-faults  the tests of signals, kills, workers and ranks alone"
+	@echo "make test    set up if needed, then run every test but those of faults; ARGS=tests/FOLDER: some"
+	@echo "make test-faults  the tests of signals, kills, workers, ranks and damaged files, one after another"
 	@echo "make demo    set up if needed, then a trained GSMap drawn on MiniCity, and one of your own that starts from MapTR"
 	@echo "make lint    ruff, ruff format, codespell, mypy"
 	@echo "make format  let ruff fix what it can"
@@ -18,17 +18,17 @@ setup:
 setup-dev:
 	@GSMAP_DEV=1 tools/setup_env.sh $(VENV)
 
-# One process of one thread per core: threads that wait for each other cost more than they give. A file stays in one process,
-# in the order of the folders: by numbers of tests, as pytest-xdist has it, files of one long test would come last.
-test: setup-dev
-	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder $(ARGS)
+# Python and the kernels for the CPU leave compiled files behind for the next run. One thread per process: threads that
+# wait for each other cost more than they give.
+PYTEST = env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PY) -m pytest
 
-FAULTS = tests/fuzz/test_kills.py tests/fuzz/test_signals.py tests/utils/test_cli.py tests/utils/test_interrupt.py \
-	tests/utils/test_parallel.py tests/utils/test_faults.py tests/utils/test_files.py tests/tools/test_run_ends.py \
-	tests/tools/test_compare_runs.py tests/tools/test_train_and_test.py tests/engine/test_torchrun.py \
-	tests/engine/test_checkpoint_hook.py tests/map_data/test_command_line.py tests/mini_city/test_generate.py
-test-faults:
-	$(MAKE) test ARGS="$(FAULTS) $(ARGS)"
+# One process per core; one that is done takes tests from the end of another's list.
+test: setup-dev
+	$(PYTEST) -n auto --dist worksteal $(ARGS)
+
+# One process, so that no test disturbs another: ARGS=--count=30 runs each thirty times.
+test-faults: setup-dev
+	$(PYTEST) -m faults $(ARGS)
 
 lint: setup-dev
 	$(PY) -m ruff check .

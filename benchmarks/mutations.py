@@ -184,7 +184,7 @@ def _run_tests(module: str, source: str, tests: Sequence[str]) -> None:
     import pytest
 
     options = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(REPO)]
-    sys.exit(pytest.main([*options, *tests]))
+    sys.exit(pytest.main([*options, "-m", "", *tests]))  # those of faults, too
 
 
 class _Finder:

@@ -14,6 +14,10 @@ import gsmap  # noqa: F401 - before mmcv.ops, which may need its stand-in
 
 REPO = Path(__file__).resolve().parents[1]
 
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+    # A new process that imports mmdet compiles 900 modules, if none before it has left them
+    os.environ["PYTHONPYCACHEPREFIX"] = str(REPO / ".pytest_cache/bytecode")
+
 # The same examples each time, however slow the machine is
 settings.register_profile(
     "steady", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
@@ -24,6 +28,24 @@ TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
 STATM = Path("/proc/self/statm")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 resident = {"bytes": 0}  # after the last trim
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--count", type=int, default=1, help="run each test so many times")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Make further cases of a test that is to be run several times."""
+    count = metafunc.config.getoption("count")
+    if count > 1:
+        metafunc.fixturenames.append("repetition")
+        metafunc.parametrize("repetition", range(count), indirect=True)
+
+
+@pytest.fixture
+def repetition(request: pytest.FixtureRequest) -> int:
+    """Which of the repetitions of ``--count`` this is."""
+    return request.param
 
 
 def pytest_runtest_setup() -> None:

@@ -15,9 +15,8 @@ from mmengine.registry import init_default_scope
 from scipy.spatial.transform import Rotation
 
 import gsmap.registered  # noqa: F401
-from gsmap.apis.export import export_onnx
+from gsmap.apis.export import ExportedDetector, graph_metadata
 from gsmap.apis.map_inferencer import MapInferencer
-from gsmap.apis.onnx_inferencer import OnnxInferencer
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.datasets.source import Mount, ground_from_frame, reframed
@@ -128,8 +127,7 @@ def test_the_place_of_the_frame_travels_with_the_checkpoint_and_the_onnx_file(fr
     inferencer = MapInferencer(config_of(frame), checkpoint, device="cpu")
     wanted = ground_from_frame(samples[0], frame, meta.ground_z_m)
     np.testing.assert_allclose(inferencer.model.mount.matrix, wanted)
-    export_onnx(inferencer.model, tmp_path / "m.onnx", ["a", "b"], (96, 160), frame)
-    said = OnnxInferencer(tmp_path / "m.onnx").metadata
+    said = graph_metadata(ExportedDetector(inferencer.model), ["a", "b"], (96, 160), frame)
     np.testing.assert_allclose(said["ground_from_frame"], wanted)
     assert said["ground_z_m"] == meta.ground_z_m
     own = np.eye(4) if CASES[frame][1] is None else CASES[frame][1]

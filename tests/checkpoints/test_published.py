@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from mmengine.model import BaseModule
-from processes import run_python
+from processes import run_tool
 
 from gsmap.checkpoints import published
 from gsmap.checkpoints.published import (
@@ -207,10 +207,13 @@ def test_weights_of_others_keep_their_values_in_our_names():
 
 
 def test_readmes_first_training_command_ends_in_one_line_without_a_network(
-    minicity_annotations, minicity_root, tmp_path
+    minicity_annotations, minicity_root, tmp_path, monkeypatch
 ):
     """A fresh machine: no torchvision, nothing fetched before, and no network."""
-    done = run_python(
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")  # nobody answers there
+    monkeypatch.setenv("GSMAP_WEIGHTS", "")
+    done = run_tool(
         "tools/train.py", "projects/GSMap/configs/gsmap_maptr_r50_24e.py",
         "--data-root", minicity_root, "--work-dir", tmp_path / "work",
         "--cfg-options",
@@ -218,11 +221,6 @@ def test_readmes_first_training_command_ends_in_one_line_without_a_network(
           for part, name in (("train", "train"), ("val", "val"), ("test", "val"))),
         "train_dataloader.num_workers=0", "train_dataloader.persistent_workers=False",
         "val_dataloader.num_workers=0", "val_dataloader.persistent_workers=False",
-        env={
-            "TORCH_HOME": str(tmp_path / "home"),
-            "https_proxy": "http://127.0.0.1:9",  # nobody answers there
-            "GSMAP_WEIGHTS": "",
-        },
     )  # fmt: skip
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr

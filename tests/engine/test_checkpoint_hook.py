@@ -34,6 +34,7 @@ def safe_globals():
         yield
 
 
+@pytest.mark.faults
 def test_an_import_changes_nothing_of_mmengine_and_torch():
     code = (
         "import torch\n"
@@ -62,6 +63,7 @@ def test_the_hook_writes_through_the_atomic_backend_and_lets_torch_read():
         torch.serialization.add_safe_globals(before)
 
 
+@pytest.mark.faults
 def test_a_fetched_checkpoint_runs_no_code(monkeypatch, tmp_path):
     """What ``load_from`` and ``init_cfg`` name by an address is read by torch's own hub."""
     code = (
@@ -135,6 +137,7 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(tmp_path):
     assert os.listdir(tmp_path) == ["epoch_1.pth"]
 
 
+@pytest.mark.faults
 def test_a_killed_writer_leaves_the_old_file_whole(tmp_path):
     path = tmp_path / "last.pth"
     path.write_bytes(b"whole")

@@ -62,6 +62,7 @@ def test_of_equal_ends_the_earlier_is_the_cause(monkeypatch):
     assert torchrun.reason(failed(2, 3, at_s=(1001, 1000)))[1] == 3
 
 
+@pytest.mark.faults
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 def test_two_ends_that_torchrun_sees_at_once_are_told_apart(tmp_path):
     (tmp_path / "ends.py").write_text(ENDS_WHILE_TORCHRUN_IS_STOPPED)

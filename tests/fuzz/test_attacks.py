@@ -20,6 +20,8 @@ from gsmap.engine.launch import read_config
 from gsmap.evaluation.core.file_evaluation import evaluate_files
 from gsmap.evaluation.core.report import flat_metrics
 
+pytestmark = pytest.mark.faults
+
 SCRIPT = Path(__file__).with_name("attacks.py")
 HARMLESS = {"open", "system", "exec", "eval", "makedirs", "nested", "key", "tofile"}
 BUILT = {  # settings that do nothing if mmengine builds them

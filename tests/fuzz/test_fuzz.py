@@ -4,7 +4,10 @@ import os
 import re
 from pathlib import Path
 
+import pytest
 from processes import run_python
+
+pytestmark = pytest.mark.faults
 
 TESTS = Path(__file__).resolve().parents[1]
 

@@ -16,6 +16,8 @@ from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples, write_
 from gsmap.utils.files import SUFFIX
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
+pytestmark = pytest.mark.faults
+
 SPLITS = [f"gsmap_minicity_{split}.arrow" for split in ("train", "val")]
 
 
@@ -116,7 +118,6 @@ def test_two_conversions_at_once_make_what_one_makes(minicity_root, tmp_path):
         assert (both / name).read_bytes() == (one / name).read_bytes()
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1800)  # several trainings
 def test_commands_that_are_killed_leave_what_they_leave_unkilled(
     minicity_root, minicity_annotations, tiny_config

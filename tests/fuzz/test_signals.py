@@ -3,10 +3,11 @@
 import pytest
 from processes import REPO, run_python, search_path
 
+pytestmark = pytest.mark.faults
+
 ENDS = "Ctrl-C", "Ctrl-C twice", "kill", "kill -9", "terminal closed"
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1800)  # five runs of a command
 @pytest.mark.parametrize("command", ["check", "evaluate", "infer", "train, two ranks"])
 def test_nothing_of_a_command_is_left_after_any_signal(

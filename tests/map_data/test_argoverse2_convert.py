@@ -19,7 +19,7 @@ from argoverse2_road import (
     write_map,
     write_poses,
 )
-from processes import run_python
+from processes import run_tool
 
 from benchmarks.argoverse2 import measure_extraction
 from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
@@ -255,7 +255,7 @@ def test_nothing_left_to_write_is_an_error_that_says_why(tmp_path):
 def test_the_tool_converts_and_names_its_command(tmp_path):
     write_log(tmp_path / "val" / "log-a")
     words = "--split", "val", "--rate", "2hz", "--dim", 3, "--workers", 1
-    done = run_python("tools/create_data.py", "av2", "--root", tmp_path, *words)
+    done = run_tool("tools/create_data.py", "av2", "--root", tmp_path, *words)
     assert done.returncode == 0, done.stderr
     assert "samples: val 2" in done.stdout
     meta = AnnotationFile(tmp_path / "gsmap_av2_val.arrow").meta

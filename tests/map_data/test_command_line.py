@@ -65,6 +65,7 @@ def check_interrupted(done: subprocess.CompletedProcess) -> None:
     assert done.stderr.splitlines()[-1] == "interrupted: nothing half-written is left"
 
 
+@pytest.mark.faults
 def test_ctrl_c_while_workers_render_leaves_nothing_half_written(tmp_path):
     """The rendered picture of either log is there when the signal comes, and gone afterwards."""
     out = tmp_path / "out"
@@ -89,6 +90,7 @@ def has_starting_worker(pid: int) -> bool:
         return False
 
 
+@pytest.mark.faults
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 def test_ctrl_c_while_workers_start_brings_no_traceback_of_theirs(tmp_path):
     write_log(tmp_path / "val" / "log-a", seconds=20.0)

@@ -1,7 +1,5 @@
 """Configs in the form of the original repositories become ours, and what has no place is named."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -9,6 +7,7 @@ import torch
 import upstream_configs
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
+from processes import run_tool
 
 from gsmap.engine.launch import check_config, read_config
 from mapdata.upstream_configs.reader import read_assignments
@@ -258,13 +257,14 @@ def test_maptr_on_depth_pooled_features_stays_maptr(tmp_path):
 def test_the_command_writes_a_config_that_the_tools_read(tmp_path):
     source, target = tmp_path / "theirs.py", tmp_path / "new/ours.py"
     source.write_text(upstream_configs.gemap().replace("dir_interval=1", "dir_interval=2"))
-    command = [sys.executable, "tools/convert_config.py", str(source), str(target)]
-    run = subprocess.run(command, cwd=REPO, text=True, capture_output=True, check=False)
+    words = ["tools/convert_config.py", source, target]
+    run = run_tool(*words)
     assert run.returncode == 2
     assert "another model: 1 of its settings have no counterpart, model.pts_bbox_h" in run.stderr
     assert not target.exists()
-    command.append("--allow-changes")
-    run = subprocess.run(command, cwd=REPO, text=True, capture_output=True, check=True)
+    words.append("--allow-changes")
+    run = run_tool(*words)
+    assert run.returncode == 0, run.stderr
     assert "configs/maptr/maptr_r50_24e.py" in run.stdout
     of_model, others = run.stdout.split("not placed")
     assert "another model, without" in of_model
@@ -274,7 +274,7 @@ def test_the_command_writes_a_config_that_the_tools_read(tmp_path):
     check_config(cfg)
     assert cfg.model.map_head.type == "GeMapHead"
     source.write_text("import os\n")
-    run = subprocess.run(command, cwd=REPO, text=True, capture_output=True, check=False)
+    run = run_tool(*words)
     assert run.returncode == 2
     assert "error:" in run.stderr
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from processes import run_python
+from processes import run_tool
 
 from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
 from gsmap.datasets.annotations.record import MapSample
@@ -302,10 +302,10 @@ def test_extended_classes_are_closed_rings(options: NuScenesOptions, tmp_path: P
 
 def test_the_command_reports_and_fails_in_words(minicity_root: Path, tmp_path: Path):
     tool = "tools/create_data.py", "nuscenes", "--root"
-    done = run_python(*tool, minicity_root, "--out-dir", tmp_path, "--workers", 1)
+    done = run_tool(*tool, minicity_root, "--out-dir", tmp_path, "--workers", 1)
     assert "samples: " in done.stdout
     assert AnnotationFile(tmp_path / "gsmap_minicity_val.arrow").meta.command.startswith("python ")
-    failed = run_python(*tool, tmp_path)
+    failed = run_tool(*tool, tmp_path)
     assert failed.returncode != 0
     assert failed.stderr.startswith("error: no version")
     assert "Traceback" not in failed.stderr

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from processes import run_python
+from processes import run_tool
 from scipy.spatial.transform import Rotation
 
 from gsmap.datasets.annotations.file import AnnotationFile
@@ -107,9 +107,9 @@ def test_the_command_writes_a_group_for_each_sample(
 ):
     tool, truth = ("tools/create_data.py", "occlusion"), minicity_annotations["val"]
     words = *tool, truth, minicity_root / "v1.0-trainval", tmp_path / "o.json"
-    done = run_python(*words, "--limits", 1, 50)
+    done = run_tool(*words, "--limits", 1, 50)
     assert "% hidden: " in done.stdout
     groups = read_groups(truth, str(tmp_path / "o.json")).group_of
     assert set(groups) == set(AnnotationFile(truth).column("token"))
-    refused = run_python(*words, "--limits", 50, 1)
+    refused = run_tool(*words, "--limits", 50, 1)
     assert refused.stderr.startswith("error: --limits must rise")

@@ -112,6 +112,7 @@ def test_annotated_boxes_hold_the_lidar_points_that_they_claim(nusc: NuScenes) -
     assert checked > 20
 
 
+@pytest.mark.faults
 def test_same_bytes_in_one_process_and_in_two(tmp_path: Path) -> None:
     generate(tmp_path / "a", 3, seed=4, workers=0, **TINY)
     generate(tmp_path / "b", 3, seed=4, workers=2, **TINY)
@@ -169,12 +170,14 @@ def test_a_failing_scene_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monk
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.faults
 def test_an_error_in_a_worker_reaches_the_caller(tmp_path: Path) -> None:
     config = MiniCityConfig(2, 0, 128, 72, 1, 0)
     with pytest.raises(KeyError, match="singapore-onenorth"):
         generate_module._run_scenes(tmp_path, config, plan_scenes(config), {}, 2, False)
 
 
+@pytest.mark.faults
 def test_workers_that_cannot_start_end_the_run(tmp_path: Path) -> None:
     """A program read from standard input cannot be imported by a new process, which dies."""
     root = tmp_path / "root"
@@ -189,6 +192,7 @@ generate(root=Path({str(root)!r}), scenes=2, seed=0, image_size=(64, 36), sample
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.faults
 def test_a_second_run_into_the_same_root_is_refused(tmp_path: Path) -> None:
     partial = tmp_path / "root.gsmap-partial"
     partial.mkdir()
@@ -201,6 +205,7 @@ def test_a_second_run_into_the_same_root_is_refused(tmp_path: Path) -> None:
         os.close(handle)
 
 
+@pytest.mark.faults
 def test_a_killed_run_leaves_no_root_and_the_next_one_completes(tmp_path: Path) -> None:
     root, partial = tmp_path / "root", tmp_path / "root.gsmap-partial"
     script = (

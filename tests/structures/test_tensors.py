@@ -1,8 +1,11 @@
 """Constants on a device, and copies to it."""
 
+import sys
+
+import pytest
 import torch
 
-from gsmap.structures.tensors import constant, kept, uploaded
+from gsmap.structures.tensors import constant, kept, uncompiled, uploaded
 
 
 def test_nothing_is_copied_on_the_host():
@@ -53,3 +56,23 @@ def test_constants_are_bounded(monkeypatch):
     like = torch.zeros(1)
     assert constant(like, [0.123]) is not constant(like, [0.123])
     assert constant(like, [0.123]) == torch.tensor(0.123)
+
+
+def test_a_function_that_is_left_as_it_is_never_meets_the_compiler(monkeypatch):
+    """With the compiler and before it is imported, as part of what is compiled and alone."""
+    seen = []
+
+    @uncompiled
+    def noted(x: torch.Tensor, factor: float) -> torch.Tensor:
+        seen.append(torch.compiler.is_compiling())
+        return x * factor
+
+    x = torch.tensor([2.0])
+    monkeypatch.delitem(sys.modules, "torch._dynamo", raising=False)
+    assert noted(x, 3.0) == 6.0
+    monkeypatch.undo()
+    compiled = torch.compile(lambda x: noted(x + 1, 2.0) - 1, backend="eager")
+    assert [compiled(x).item() for _ in range(2)] == [5.0, 5.0]
+    assert seen == [False, False, False]
+    with pytest.raises(torch._dynamo.exc.Unsupported):
+        torch.compile(lambda x: noted(x, 2.0), backend="eager", fullgraph=True)(x)

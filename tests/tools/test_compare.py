@@ -8,7 +8,7 @@ import pytest
 import torch
 from mmdet3d.registry import MODELS, TRANSFORMS
 from mmengine.config import Config
-from processes import run_python
+from processes import run_tool
 
 from gsmap.engine.arguments import add_config_options
 from gsmap.engine.launch import check_config, read_config
@@ -119,9 +119,9 @@ def test_commands_and_figures_of_a_row_by_hand():
 
 def test_the_command_lists_and_names_what_there_is():
     words = "tools/compare.py", "--list", "--tables"
-    run = run_python(*words, "GeMap Table A3*", check=True)
+    run = run_tool(*words, "GeMap Table A3*")
     assert "  12: chamfer/mAP 47.9" in run.stdout
     assert "model.map_head.decoder.num_layers=12" in run.stdout
-    bad = run_python(*words, "X")
+    bad = run_tool(*words, "X")
     assert bad.returncode == 2
     assert "no table is named 'X': compare.py --list names all" in bad.stderr

@@ -14,6 +14,8 @@ import pytest
 from processes import run_python, search_path, wait_for
 from waiting import waiting_config
 
+pytestmark = pytest.mark.faults
+
 REPO = Path(__file__).resolve().parents[2]
 
 
@@ -42,7 +44,6 @@ def ranks(folder: Path) -> list[int]:
     return found
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1800)  # several trainings
 def test_a_comparison_is_killed_goes_on_and_names_the_run_that_failed(tiny_config, tmp_path):
     config, waits = waiting_config(tiny_config, tmp_path)

@@ -19,6 +19,8 @@ from gsmap.engine.run_log import MapRunner
 from gsmap.models.base.head import MapHead
 from gsmap.utils.cli import run_command
 
+pytestmark = pytest.mark.faults
+
 ENVIRONMENT = {"PYTHON": sys.executable, "OMP_NUM_THREADS": "1"}
 LONG = ["--cfg-options", "train_cfg.max_epochs=500", "train_cfg.val_interval=500"]
 

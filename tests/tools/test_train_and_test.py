@@ -18,6 +18,8 @@ from waiting import waiting_config
 from gsmap.checkpoints.reading import read_checked
 from tools.train import main as train
 
+pytestmark = pytest.mark.faults
+
 REPO = Path(__file__).resolve().parents[2]
 DIST_TRAIN = "tools/dist_train.sh"
 

@@ -129,6 +129,7 @@ def traps(tmp_path) -> Traps:
     return Traps(tmp_path / "traps")
 
 
+@pytest.mark.faults
 def test_the_traps_work(traps):
     assert traps.run(sys.executable, "-c", "import multiprocessing").returncode == 1
     assert traps.opened() == {"multiprocessing.py"}
@@ -137,7 +138,7 @@ def test_the_traps_work(traps):
     assert traps.opened() == {"matplotlibrc", ".numba_config.yaml"}
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_nothing_of_the_working_folder_is_opened_whatever_is_imported(traps, tmp_path):
     program = tmp_path / "everything.py"
     program.write_text(EVERYTHING)
@@ -147,7 +148,7 @@ def test_nothing_of_the_working_folder_is_opened_whatever_is_imported(traps, tmp
     assert not (traps.folder / "numba_cache").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_no_command_opens_a_file_of_the_working_folder(traps):
     tools = sorted((REPO / "tools").glob("*.py"))
     assert len(tools) > 15
@@ -160,7 +161,7 @@ def test_no_command_opens_a_file_of_the_working_folder(traps):
         assert (done.returncode, traps.opened()) == (0, set()), done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("name", CALLED_SO)
 def test_no_worker_and_no_rank_opens_a_file_of_the_working_folder(
     name, traps, tiny_config, minicity_root, minicity_annotations, tmp_path

@@ -171,6 +171,7 @@ def test_where_a_command_is_to_write_is_checked_before_its_work(tmp_path):
         output_file(str(tmp_path / "file/a.json"))
 
 
+@pytest.mark.faults
 def test_errors_of_workers_are_told_apart_too(capsys):
     with pytest.raises(SystemExit):
         run_command(lambda: in_worker(bad_check, "x"))
@@ -189,6 +190,7 @@ def test_ctrl_c_is_one_line_and_130(capsys):
     assert capsys.readouterr().err == "interrupted: nothing half-written is left\n"
 
 
+@pytest.mark.faults
 def test_impatience_does_not_cut_the_clean_up_off(tmp_path):
     """Ctrl-C, five times: the half-written file goes all the same, and there is one line."""
     program = f"""
@@ -225,6 +227,7 @@ cli.run_command(command)
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.faults
 @pytest.mark.parametrize(("heed_kill", "code", "left"), [(True, 143, 0), (False, -15, 1)])
 def test_kill_runs_the_clean_up_where_that_is_wanted(heed_kill, code, left, tmp_path):
     program = f"""
@@ -268,6 +271,7 @@ def test_ctrl_c_that_arrives_while_an_error_is_told_is_one_line(capsys, monkeypa
     assert capsys.readouterr().err == "interrupted: nothing half-written is left\n"
 
 
+@pytest.mark.faults
 def test_ctrl_c_is_one_line_with_forked_workers_and_none_from_other_ranks(tmp_path):
     """A terminal sends it to the whole group: workers of a data loader, all ranks of a machine."""
     program = """

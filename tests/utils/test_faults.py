@@ -107,6 +107,7 @@ class Broken(torch.utils.data.Dataset):
         raise self.error
 
 
+@pytest.mark.faults
 @pytest.mark.parametrize(
     ("error", "text"),
     [
@@ -129,6 +130,7 @@ class Shortened(torch.utils.data.Dataset):
         os.kill(os.getpid(), signal.SIGBUS)
 
 
+@pytest.mark.faults
 def test_a_bus_error_of_a_worker_is_no_want_of_memory():
     text = said(lambda: next(iter(DataLoader(Shortened(), num_workers=1))))
     assert not text.startswith("out of memory")  # torch misses the signal now and then

@@ -92,6 +92,7 @@ def leftovers(folder: Path) -> list[str]:
     return [name for name in os.listdir(folder) if name.endswith(SUFFIX)]
 
 
+@pytest.mark.faults
 def test_what_a_killed_writer_left_goes_with_the_next_write_and_nothing_else(tmp_path):
     path = tmp_path / "a"
     with writing(path) as writer:
@@ -118,6 +119,7 @@ def test_what_a_killed_writer_left_goes_with_the_next_write_and_nothing_else(tmp
     assert set(os.listdir(tmp_path)) == {"a", "d", *others}
 
 
+@pytest.mark.faults
 def test_containers_of_one_name_leave_each_others_files_alone(tmp_path):
     """In a process namespace of its own a writer's number means nothing here."""
     space = ["unshare", "--user", "--map-root-user", "--pid", "--fork", "--kill-child"]
@@ -159,6 +161,7 @@ def test_a_file_that_is_removed_before_it_is_locked_is_made_again(tmp_path, monk
         assert left == made[1] != made[0]
 
 
+@pytest.mark.faults
 def test_a_folder_is_for_one_process_and_says_whose(tmp_path):
     here, (said, says) = tmp_path / "new", os.pipe()
     here.mkdir()

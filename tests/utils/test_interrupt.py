@@ -8,6 +8,8 @@ import sys
 import pytest
 from processes import REPO, run_python, search_path
 
+pytestmark = pytest.mark.faults
+
 LINE = "interrupted: nothing half-written is left\n"
 LOST = """
 import ctypes, os, signal, sys, time
@@ -141,7 +143,6 @@ COMMANDS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "numbers"),
     [("train", (1, 50, 500, 2000)), ("build_map", (1, 100)), ("torchrun", (1, 200))],

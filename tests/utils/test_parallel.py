@@ -16,6 +16,8 @@ from processes import run_python
 from gsmap.utils import parallel
 from gsmap.utils.parallel import ordered_map
 
+pytestmark = pytest.mark.faults
+
 
 def wait_a_little(value: int) -> int:
     time.sleep(0.01 * (value % 3))

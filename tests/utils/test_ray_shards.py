@@ -60,6 +60,7 @@ def make(folder: Path, monkeypatch, bad: int) -> str:
     return run_on_ray(arguments(5, WHOLE), [*words, "--per-shard", "num_cpus=1"], patience_s=2.0)
 
 
+@pytest.mark.faults
 def test_a_killed_worker_a_killed_shard_and_a_hanging_one_lose_nothing(
     cluster, tmp_path, monkeypatch
 ):
@@ -69,6 +70,7 @@ def test_a_killed_worker_a_killed_shard_and_a_hanging_one_lose_nothing(
     assert [file.path.read_text() for file in found] == list("01234")
 
 
+@pytest.mark.faults
 def test_a_shard_that_fails_is_named_and_the_others_are_made(cluster, tmp_path, monkeypatch):
     for index in range(5):
         (tmp_path / f"tried{index}").touch()

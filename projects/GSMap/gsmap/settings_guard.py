@@ -50,7 +50,12 @@ def _with_library_path_kept(_: ModuleType) -> Iterator[None]:
             os.environ[_LIBRARIES] = before
 
 
-_SKLEARN = ("sklearn", "sklearn.gaussian_process", "sklearn.gaussian_process.kernels", "sklearn.mixture")
+_SKLEARN = (
+    "sklearn",
+    "sklearn.gaussian_process",
+    "sklearn.gaussian_process.kernels",
+    "sklearn.mixture",
+)
 
 
 class _DeferredModule(ModuleType):
@@ -59,7 +64,9 @@ class _DeferredModule(ModuleType):
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("__"):
             raise AttributeError(name)
-        return lambda *args, **options: getattr(import_module(self.__name__), name)(*args, **options)
+        return lambda *args, **options: getattr(import_module(self.__name__), name)(
+            *args, **options
+        )
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from processes import run_python
+from processes import run_tool
 from report_case import CLASSES, FRAMES, STRANGE, write_case
 
 from gsmap.datasets.annotations.file import AnnotationFile, write_annotations
@@ -276,19 +276,15 @@ def test_gaussians_are_read_where_all_vectors_have_them(case, tmp_path):
     assert some["t1"].has_gaussians
 
 
-def run_report(*arguments):
-    return run_python("tools/report.py", *arguments)
-
-
 def test_the_command_writes_the_page_and_says_its_size(case, tmp_path):
     path, results = case
     out = tmp_path / "report.html"
     both = [results["good"], "--compare", results[STRANGE], "--ann", path, "--out", out]
-    done = run_report(*both, "--names", "GSMap", "MapTR")
+    done = run_tool("tools/report.py", *both, "--names", "GSMap", "MapTR")
     assert done.returncode == 0, done.stderr
     assert re.fullmatch(rf"6 frames, 0\.\d MB: {out}\n", done.stdout)
     assert "<title>case val: GSMap and MapTR</title>" in out.read_text()
-    failed = run_report(*both, "--names", "GSMap")
+    failed = run_tool("tools/report.py", *both, "--names", "GSMap")
     assert failed.returncode == 2
     assert "--names must give 2 different names" in failed.stderr
 

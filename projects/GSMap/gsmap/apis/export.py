@@ -178,8 +178,18 @@ def export_onnx(
     proto = program.model_proto
     for part in (proto.graph, *proto.graph.node):  # stack traces of the machine that exported
         del part.metadata_props[:]
-    head = model.map_head
-    metadata: dict[str, Any] = {  # for `OnnxInferencer`
+    metadata = graph_metadata(exported, cameras, image_size, frame)
+    onnx.helper.set_model_props(proto, {METADATA_KEY: json.dumps(metadata)})
+    onnx.checker.check_model(proto)
+    write_bytes(out, proto.SerializeToString())
+
+
+def graph_metadata(
+    exported: ExportedDetector, cameras: Sequence[str], image_size: tuple[int, int], frame: str
+) -> dict[str, Any]:
+    """Facts about a model that a file of `export_onnx` carries for `OnnxInferencer`."""
+    model, head = exported.model, exported.model.map_head
+    metadata: dict[str, Any] = {
         "format": FORMAT,
         "image_size": list(image_size),
         "classes": list(head.classes),
@@ -200,9 +210,7 @@ def export_onnx(
         metadata["can_bus"] = NO_SIGNALS if without else CAN_BUS_RULE
     if model.temporal is not None:
         metadata["max_gap_s"] = model.temporal.max_gap_s
-    onnx.helper.set_model_props(proto, {METADATA_KEY: json.dumps(metadata)})
-    onnx.checker.check_model(proto)
-    write_bytes(out, proto.SerializeToString())
+    return metadata
 
 
 def halve_onnx(path: str | Path, out: str | Path) -> None:

@@ -24,15 +24,17 @@ def uncompiled(function: Callable[_Params, _Result]) -> Callable[_Params, _Resul
     a second.
     """
 
-    @functools.cache
-    def disabled() -> Callable[_Params, _Result]:
-        return torch.compiler.disable(function)
+    disabled: list[
+        Callable[_Params, _Result]
+    ] = []  # no cache of functools: the compiler warns of it
 
     @functools.wraps(function)
     def wrapped(*args: _Params.args, **kwargs: _Params.kwargs) -> _Result:
-        if "torch._dynamo" in sys.modules:
-            return disabled()(*args, **kwargs)
-        return function(*args, **kwargs)
+        if "torch._dynamo" not in sys.modules:
+            return function(*args, **kwargs)
+        if not disabled:
+            disabled.append(torch.compiler.disable(function))
+        return disabled[0](*args, **kwargs)
 
     return wrapped
 
