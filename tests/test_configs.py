@@ -173,7 +173,7 @@ def shrink_queries(model: ConfigDict) -> None:
 
 
 def shrink_cells(cfg: Config) -> None:
-    """Make fine cells of the cameras' features of the map, and masks of their size, twice as wide."""
+    """Make fine cells of features of the map, and masks of their size, twice as wide."""
     encoder = cfg.model.get("bev_encoder") or {}
     if encoder.get("bev_pixel_m", 1.0) >= 1.0 or "lidar_encoder" in cfg.model:
         return

@@ -98,3 +98,20 @@ def test_the_inferencer_is_imported_without_what_only_a_model_needs():
     slow = {"mmdet3d.structures", "mmdet3d.models", "mmcv.ops", "mmengine.runner", "matplotlib"}
     slow |= {"numba", "av2", "scipy", "shapely", "pandas"}
     assert not slow & modules_after("from gsmap import MapInferencer")
+
+
+def test_what_is_slow_to_import_waits_for_its_use():
+    """scikit-learn, of which mmdet takes names that it only calls, and torch's compiler."""
+    assert not {"sklearn", "pandas", "torch._dynamo"} & modules_after("import gsmap.registered")
+    code = """
+import gsmap.registered, sys
+from mmdet.models.dense_heads import paa_head
+from mmdet.models.task_modules.tracking import interpolation
+assert "sklearn" not in sys.modules
+assert paa_head.skm.GaussianMixture(2).n_components == 2
+regressor = interpolation.GPR(interpolation.RBF(3.0))
+from sklearn.gaussian_process import GaussianProcessRegressor
+assert type(regressor) is GaussianProcessRegressor
+assert regressor.kernel.length_scale == 3.0
+"""
+    assert "sklearn.mixture" in modules_after(code)

@@ -1,4 +1,4 @@
-"""Keeps files of the working folder from setting up libraries, and one library from others' imports.
+"""Keeps files of the working folder from setting up libraries, and slow imports from others.
 
 matplotlib and numba read ``matplotlibrc`` and ``.numba_config.yaml`` of the working folder when
 they are imported, and numba again when it compiles; numba's can name a folder of compiled kernels,
