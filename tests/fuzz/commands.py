@@ -1,5 +1,6 @@
 """Commands on tiny data, in forks of a process that has imported everything."""
 
+import faulthandler
 import os
 import pty
 import runpy
@@ -45,6 +46,7 @@ def start(work: Work) -> tuple[int, int]:
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+        faulthandler.enable(sys.__stderr__)
         work()
         code = 0
     except SystemExit as end:

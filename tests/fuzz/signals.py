@@ -84,6 +84,18 @@ def read_some(terminal: int) -> str:
         return ""
 
 
+def last_words(pids: list[int], terminal: int) -> str:
+    """End processes that did not end, and return where their threads stood (`faulthandler`)."""
+    for pid in pids:
+        os.kill(pid, signal.SIGABRT)
+    said, begun_s = "", time.monotonic()
+    while any(pid in descendants() for pid in pids) and time.monotonic() < begun_s + 10:
+        said += read_some(terminal)
+    for pid in descendants():
+        os.kill(pid, signal.SIGKILL)
+    return said
+
+
 def case(name: str, end: str, data: "Data", limit_s: float) -> str:  # noqa: F821
     """Start a command, end it in the midst of its work, and say what is wrong then."""
     from fuzz.commands import start
@@ -103,8 +115,7 @@ def case(name: str, end: str, data: "Data", limit_s: float) -> str:  # noqa: F82
         if code is None and (found := os.waitpid(pid, os.WNOHANG))[0]:
             code = os.waitstatus_to_exitcode(found[1])
         left = descendants()
-    for other in left:
-        os.kill(other, signal.SIGKILL)
+    said += last_words(list(left), terminal)
     if terminal >= 0:
         os.close(terminal)
     if code is None:
@@ -117,7 +128,7 @@ def case(name: str, end: str, data: "Data", limit_s: float) -> str:  # noqa: F82
     # Python's thread that hands a worker's tensors over may speak when its partner is gone
     others = [text for text in said.split("Traceback")[1:] if "resource_sharer.py" not in text]
     wrong += ["a traceback"] * bool(others)
-    return "; ".join(wrong) + f": {said[-1500:]}" * bool(wrong)
+    return "; ".join(wrong) + f": {said[-4000:]}" * bool(wrong)
 
 
 def at_work(name: str, said: str, out: Path) -> bool:

@@ -156,7 +156,7 @@ def test_a_signal_that_another_thread_is_given_waits_until_processes_have_starte
     steps, before = [], signal.signal(signal.SIGINT, signal.default_int_handler)  # or ignored
 
     def start():
-        with parallel._signals_later():
+        with parallel.signals_later():
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.2)
             steps.append("started")
@@ -170,3 +170,44 @@ def test_a_signal_that_another_thread_is_given_waits_until_processes_have_starte
         signal.signal(signal.SIGINT, before)
         done.set()
         other.join()
+
+
+LOCKED = """
+import signal, sys, threading
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from gsmap.utils.cli import run_command
+from gsmap.utils.parallel import result_of, signals_later
+
+enter, left = threading.Condition.__enter__, [int(sys.argv[1])]
+
+def interrupted(condition):
+    taken = enter(condition)
+    if threading.current_thread() is threading.main_thread():
+        left[0] -= 1
+        if left[0] == 0:
+            signal.raise_signal(signal.SIGTERM)
+    return taken
+
+def command():
+    go = threading.Event()
+    threading.Timer(0.1, go.set).start()
+    with ThreadPoolExecutor(1) as pool:
+        with signals_later():
+            future = pool.submit(go.wait)
+        threading.Condition.__enter__ = interrupted
+        WAIT
+        left[0] = 0
+    return "no lock was taken"
+
+run_command(command)
+"""
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_a_signal_that_comes_when_a_lock_is_taken_ends_the_command(number):
+    """With the lock left taken, the pool's thread and this process would wait for each other."""
+    done = run_python("-c", LOCKED.replace("WAIT", "result_of(future)"), number)
+    if number < 3:
+        assert (done.returncode, done.stderr) == (143, "")
+    else:  # the lock is taken twice: to ask to be told, and to read the result
+        assert (done.returncode, done.stdout) == (0, "no lock was taken\n")

@@ -35,6 +35,7 @@ from gsmap.datasets.memory import Cameras
 from gsmap.datasets.source import Mount, Source, annotated, reframed
 from gsmap.evaluation.core.results_json import vectors_of
 from gsmap.structures.elements import MapElements
+from gsmap.utils.parallel import result_of, signals_later
 
 if TYPE_CHECKING:  # slow to import, and of no use before there is a model
     from matplotlib.figure import Figure
@@ -348,11 +349,12 @@ class MapInferencer:
                     on_broken(frame)
                 if batch is not None:
                     turn = number % len(pools)
-                    pending.append(pools[turn].submit(self._step, turn, batch, stream))
+                    with signals_later():  # a pool has locks, see `result_of`
+                        pending.append(pools[turn].submit(self._step, turn, batch, stream))
                 if len(pending) > ahead:
-                    yield from pending.popleft().result()
+                    yield from result_of(pending.popleft())
             while pending:
-                yield from pending.popleft().result()
+                yield from result_of(pending.popleft())
 
     def new_stream(self) -> Any:
         """Return the empty memory of a drive, for `predict`: its frames must come in order.

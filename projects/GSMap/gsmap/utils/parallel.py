@@ -14,6 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import util
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
@@ -176,8 +177,8 @@ def ordered_map(
 
 
 @contextmanager
-def _signals_later() -> Iterator[None]:
-    """Hold signals back while processes start: a half-started one answers with a traceback.
+def signals_later() -> Iterator[None]:
+    """Hold signals back, as while processes start: a half-started one answers with a traceback.
 
     The mask is for this thread and the new processes. Another thread may be given the signal, whose
     Python handler the main thread then runs at once: so that one waits, too.
@@ -200,15 +201,39 @@ def _signals_later() -> Iterator[None]:
             signal.raise_signal(late)
 
 
+def result_of(future: "Future[Result]", timeout_s: float | None = None) -> Result:
+    """Wait for a future's result, in a way that a signal can end.
+
+    ``future.result`` takes a lock. A signal's handler that raises right then leaves it taken: the
+    thread that brings the result waits for it for ever, and the end of the pool for that thread.
+
+    Args:
+        future: Of a pool of threads or processes.
+        timeout_s: Longest time to wait, in seconds; None for any.
+
+    Raises:
+        TimeoutError: If there is no result by then.
+    """
+    done: SimpleQueue[Future[Result]] = SimpleQueue()  # it waits in C, with no lock to leave taken
+    with signals_later():
+        future.add_done_callback(done.put)
+    try:
+        done.get(timeout=timeout_s)
+    except Empty:
+        raise TimeoutError from None
+    with signals_later():
+        return future.result()
+
+
 def _in_order(
     pool: ProcessPoolExecutor, tasks: Iterable[Any], limit: int, timeout_s: float | None
 ) -> Iterator[Any]:
     """Keep at most ``limit`` tasks in the pool and yield the oldest one's result."""
     pending: deque[Future[Any]] = deque()
     for task in tasks:
-        with _signals_later():
+        with signals_later():
             pending.append(pool.submit(_work, task))
         if len(pending) == limit:
-            yield pending.popleft().result(timeout_s)
+            yield result_of(pending.popleft(), timeout_s)
     while pending:
-        yield pending.popleft().result(timeout_s)
+        yield result_of(pending.popleft(), timeout_s)
