@@ -77,8 +77,8 @@ def _with_sklearn_deferred(_: ModuleType) -> Iterator[None]:
         return
     deferred = {name: _DeferredModule(name) for name in _SKLEARN}
     for name, module in deferred.items():
-        parent, _, child = name.rpartition(".")
-        if parent:
+        if "." in name:
+            parent, child = name.rsplit(".", 1)
             setattr(deferred[parent], child, module)
     sys.modules.update(deferred)
     try:
