@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Merge the predictions of each drive into one map, score it, and write it for other tools.
+r"""Merge the predictions of each drive into one map, score it, and write it for other tools.
 
 Examples:
     python tools/build_map.py results.json --ann data/minicity/gsmap_minicity_val.arrow --out maps

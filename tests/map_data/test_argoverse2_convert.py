@@ -131,7 +131,7 @@ def test_every_nth_pose_needs_neither_sensors_nor_calibration(tmp_path):
     assert file[0].cameras == []
     assert file[0].lidar is None
     write_vectors([file.path], tmp_path / "out.json")
-    frames = json.loads((tmp_path / "out.json").read_text())["frames"]
+    frames = json.loads((tmp_path / "out.json").read_text())["GTs"]
     assert [(f["log"], f["row"]) for f in frames] == [("log-a", 0), ("log-a", 10), ("log-a", 20)]
     assert sorted(v["label"] for v in frames[0]["vectors"]) == [0, 1, 2, 2]
 

@@ -1,6 +1,8 @@
 """Own data: the documented example runs, and mistakes are named."""
 
+import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +10,11 @@ import pytest
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import AnnotationMeta
+from gsmap.evaluation import ChamferConfig, MapEvaluator
+from gsmap.evaluation.core.file_evaluation import evaluate_files
 from gsmap.structures.frames import FRAME_VIEWS
 from mapdata.custom import from_records
+from mapdata.vectors_json import write_vectors
 
 REPO = Path(__file__).resolve().parents[2]
 DOC = REPO / "docs/custom_data.md"
@@ -126,3 +131,65 @@ def test_a_missing_or_broken_image_is_named(tmp_path: Path):
     (tmp_path / "a.jpg").write_text("no picture")
     with pytest.raises(ValueError, match="not an image"):
         from_records(tmp_path / "a.arrow", [bare], META, tmp_path)
+
+
+def test_a_map_in_pieces_is_joined_on_request(tmp_path: Path):
+    """Two tiles meet at x = 0, 5 cm apart; the second line of the east runs west.
+
+    .. code-block:: text
+
+        y = 2:  -20 ---- 0 | 0 ---- 20     one line
+        y = -2: -20 ---- 0, then a fork to (20, -2) and (20, -6): three lines stay
+        a crossing stays a ring, a boundary is no divider
+    """
+    ring = [[8, -4], [11, -4], [11, 4], [8, 4], [8, -4]]
+    pieces = [
+        {"label": 0, "points": [[-20, 2], [0, 2]]},
+        {"label": 0, "points": [[20, 2], [0.04, 2.03]]},
+        {"label": 0, "points": [[-20, -2], [0, -2]]},
+        {"label": 0, "points": [[0, -2], [20, -2]]},
+        {"label": 0, "points": [[0, -2], [20, -6]]},
+        {"label": 1, "points": ring},
+        {"label": 2, "points": [[0, 2], [0, 10]]},
+    ]
+    assert len(elements(tmp_path, *pieces)) == 7
+    from_records(tmp_path / "j.arrow", [record(instances=pieces)], META, tmp_path, join=True)
+    found = AnnotationFile(tmp_path / "j.arrow")[0].instances
+    assert sorted(item.label for item in found) == [0, 0, 0, 0, 1, 2]
+    (whole,) = [item.points for item in found if np.ptp(item.points[:, 0]) > 30]
+    assert sorted(whole[:, 0].tolist()) == [-20, 0, 20]
+    (crossing,) = [item.points for item in found if item.label == 1]
+    np.testing.assert_array_equal(crossing, ring)
+
+
+def test_joined_pieces_keep_their_heights(tmp_path: Path):
+    pieces = [
+        {"label": 0, "points": [[-5, 0, 1.0], [0, 0, 2.0]]},
+        {"label": 0, "points": [[0, 0.05, 2.5], [5, 0, 3.0]]},
+    ]
+    meta = replace(META, dim=3)
+    from_records(tmp_path / "j.arrow", [record(instances=pieces)], meta, tmp_path, join=True)
+    (line,) = AnnotationFile(tmp_path / "j.arrow")[0].instances
+    assert sorted(line.points[:, 2].tolist()) == [1.0, 2.0, 3.0]
+    short = [{"label": 0, "points": [[0, 0], [0.03, 0]]}]
+    from_records(tmp_path / "s.arrow", [record(instances=short)], META, tmp_path, join=True)
+    assert len(AnnotationFile(tmp_path / "s.arrow")[0].instances) == 1
+
+
+def test_an_exported_file_is_ground_truth_for_the_evaluation(tmp_path: Path):
+    line = {"label": "boundary", "points": [[-20, 2], [0, 2], [20, 3]]}
+    from_records(tmp_path / "a.arrow", [record(instances=[line])], META, tmp_path)
+    assert write_vectors([tmp_path / "a.arrow"], tmp_path / "a.json") == 1
+    found = {"pts": line["points"], "cls_name": "boundary", "confidence_level": 0.9}
+    results = {"results": [{"sample_token": "t", "vectors": [found]}]}
+    (tmp_path / "r.json").write_text(json.dumps(results))
+    evaluator = MapEvaluator(ChamferConfig(META.classes), None)
+    (report,), _ = evaluate_files(tmp_path / "r.json", tmp_path / "a.json", evaluator)
+    assert report.metrics["chamfer/boundary/AP"] == 1.0
+
+
+def test_the_reader_and_the_writer_are_names_of_the_package():
+    import mapdata
+
+    assert mapdata.from_records is from_records
+    assert {"from_records", "open_input"} <= set(dir(mapdata))

@@ -147,7 +147,7 @@ def test_vectors_equal_the_reference(
     assert dict(summary.samples) == {"mini_train": 32, "mini_val": 32}
     files = [tmp_path / f"gsmap_nuscenes_{split}.arrow" for split in ("mini_train", "mini_val")]
     assert write_vectors(files, tmp_path / "out.json") == 64
-    frames = json.loads((tmp_path / "out.json").read_text())["frames"]
+    frames = json.loads((tmp_path / "out.json").read_text())["GTs"]
     wanted = vector_set(json.loads((golden_dir / "data/E6_A.json").read_text())["frames"])
     found = vector_set(frames)
     assert found.keys() == wanted.keys()

@@ -30,6 +30,7 @@ CONTENTS = {
     "open.py": b"model = dict(\n",
     "zero.py": b"\nx = 1 / 0\n",
     "base.py": b"_base_ = './nowhere.py'\n",
+    "scope.py": b"_base_ = 'gsmap::maptr/maptr_r50_24e.py'\n",
     "bytes.py": b"\xff\xfe",
     "empty.py": b"",
     "plain.txt": b"hello",
@@ -41,6 +42,7 @@ infer: VAL --model gsmap_r18_minicit K --out out.json | did you mean gsmap_r18_m
 infer: VAL --model open.py K --out out.json | open.py cannot be used: SyntaxError
 infer: VAL --model zero.py K --out out.json | zero.py, line 2, cannot be used: ZeroDivisionError
 infer: VAL --model base.py K --out out.json | base.py cannot be used: FileNotFoundError
+infer: VAL --model scope.py K --out out.json | scope.py cannot be used: ValueError: 'gsmap::' is not read in _base_; write a path below
 infer: VAL --model bytes.py K --out out.json | bytes.py cannot be used: UnicodeDecodeError
 infer: VAL --model plain.txt K --out out.json | plain.txt cannot be used: OSError: Only py
 infer: VAL --model empty.py K --out out.json | empty.py: a setting is missing:

@@ -1,5 +1,6 @@
 """The ways to start the tools: ``gsmap NAME``, TensorBoard, and the demo's steps."""
 
+import ast
 import os
 import runpy
 import sys
@@ -103,3 +104,12 @@ def test_the_demo_trains_on_from_maptr_and_from_scratch_if_asked(tmp_path):
     command = next(iter(demo["training_steps"](scratch, tmp_path, budget))).command
     assert {"train_cfg.max_epochs=11", "train_cfg.val_interval=2"} <= set(command)
     assert not start & set(command)
+
+
+@pytest.mark.parametrize("path", sorted((REPO / "tools").glob("*.py")), ids=lambda path: path.stem)
+def test_no_line_of_a_help_text_is_folded_into_the_one_before(path: Path):
+    """A backslash at the end of a line of a text joins two lines, unless the text is raw."""
+    text = ast.get_docstring(ast.parse(path.read_text())) or ""
+    assert max(map(len, text.splitlines())) <= 100
+    examples = [line for line in text.splitlines() if line.endswith("\\")]
+    assert not examples or text.count("\\\n") == len(examples)

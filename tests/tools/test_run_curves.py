@@ -1,9 +1,20 @@
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from comparison.run_curves import plot_runs, plot_series, read_run, smoothed, summary_table
+from comparison.results import plot_iterations
+from comparison.run_curves import (
+    plot_precision_recall,
+    plot_runs,
+    plot_series,
+    read_run,
+    smoothed,
+    summary_table,
+)
 
+from gsmap.evaluation import ChamferConfig, MapEvaluator
+from gsmap.structures.elements import MapElements
 from gsmap.visualization.figure import figure_to_rgb
 
 
@@ -72,6 +83,12 @@ def test_chosen_figures_have_a_panel_each(tmp_path):
         plot_series([first], ["floor"])
 
 
+def test_a_figure_that_is_always_zero_has_an_axis_that_can_be_read(tmp_path):
+    log = [{"loss": 1.0, "at_floor": 0.0, "step": step} for step in (1, 2)]
+    (panel,) = plot_series([read_run(write_log(tmp_path, "a", log), "a")], ["at_floor"]).axes
+    assert max(panel.get_ylim()) >= 1.0
+
+
 def test_values_that_are_not_finite_are_left_out(tmp_path):
     path = write_log(tmp_path, "a", [{"loss": float("nan"), "step": 1}, {"loss": 2.0, "step": 2}])
     assert read_run(path, "x").series("loss")[0].tolist() == [2]
@@ -113,3 +130,24 @@ def test_missing_log_and_no_runs(tmp_path):
         read_run(tmp_path)
     with pytest.raises(ValueError, match="at least one run that logged"):
         plot_runs([])
+
+
+def test_only_metrics_that_were_measured_have_a_panel(tmp_path):
+    log = [
+        {"loss": 1.0, "step": 1, "epoch": 1},
+        {"chamfer/mAP": 0.5, "step": 1},
+    ]
+    run = read_run(write_log(tmp_path, "a", log), "a")
+    result = SimpleNamespace(name="a", log=run)
+    (panel,) = plot_iterations([result]).axes
+    assert panel.get_title(loc="left") == "mAP_chamfer (%)"
+
+
+def test_a_class_without_ground_truth_says_so_in_its_panel():
+    gt = MapElements.from_polylines([[[0, 0], [0, 10]]], [0])
+    pred = MapElements.from_polylines([[[0, 0], [0, 10]]], [0], [0.9])
+    evaluator = MapEvaluator(ChamferConfig(("divider", "boundary")), None)
+    reports = evaluator.reports([evaluator.match("a", pred, gt)])
+    first, second = plot_precision_recall({"a": reports}).axes
+    assert [text.get_text() for text in first.texts] == []
+    assert [text.get_text() for text in second.texts] == ["no ground truth"]

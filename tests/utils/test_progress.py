@@ -16,6 +16,16 @@ def test_a_file_gets_a_line_at_the_start_and_one_at_the_end(capsys, monkeypatch)
     assert lines == ["towns: 0 of 500 images, 00:00", "towns: 500 of 500 images, 00:00"]
 
 
+def test_a_total_that_is_not_known_yet_is_not_asked_for(capsys, monkeypatch):
+    bar = Progress(unit="samples")
+    monkeypatch.setattr(bar, "_time", lambda: bar.start_t)
+    bar.total = 30
+    bar.update(30)
+    bar.close()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["0 samples, 00:00", "30 of 30 samples, 00:00"]
+
+
 def test_a_file_gets_a_line_each_minute(capsys, monkeypatch):
     now = iter(range(0, 10_000, 10))
     bar = Progress(total=30, unit="images")

@@ -264,8 +264,9 @@ def plot_iterations(results: Sequence[Result]) -> Figure | None:
     runs = [r for r in results if r.log and r.log.val and r.log.train]
     if not runs:
         return None
-    figure, axes = panel_grid(1, len(METRIC_NAMES))
-    for panel, metric in zip(axes[0], METRIC_NAMES, strict=True):
+    drawn = [m for m in METRIC_NAMES if any(f"{m}/mAP" in r.log.metrics for r in runs if r.log)]
+    figure, axes = panel_grid(1, max(len(drawn), 1))
+    for panel, metric in zip(axes[0], drawn, strict=False):
         for name, colour in zip(dict.fromkeys(r.name for r in runs), RUN_COLOURS * 9, strict=False):
             for index, run in enumerate(r for r in runs if r.name == name):
                 assert run.log is not None

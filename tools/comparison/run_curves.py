@@ -147,7 +147,7 @@ def _finish(ax: Axes, title: str, x_label: str = "iteration") -> None:
         ax.yaxis.set_major_formatter("{x:g}")
         ax.yaxis.set_minor_formatter(NullFormatter())
     elif len(values) and values.min() >= 0:
-        ax.set_ylim(0, 1.08 * max(values.max(), 1e-9))
+        ax.set_ylim(0, 1.08 * (values.max() or 1.0))
     finish_panel(ax, title, x_label, legend={"loc": "upper left", "bbox_to_anchor": (1, 1)})
 
 
@@ -211,6 +211,8 @@ def plot_precision_recall(reports: Mapping[str, Sequence[MetricReport]]) -> Figu
                 of_class = of_run[index].detections[name]
                 curve = precision_recall(of_class.hits[:, middle], of_class.num_gts)
                 row[label].plot(*curve, color=colour, linewidth=1.3)
+            if not found.num_gts:
+                row[label].text(0.5, 0.5, "no ground truth", ha="center", fontsize=8)
             unit = " m" if first[index].name == "chamfer" else " IoU"
             title = f"{style.title(label)}, {found.thresholds[middle]:g}{unit}"
             y_label = "" if label else "precision"

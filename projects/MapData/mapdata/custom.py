@@ -2,7 +2,7 @@
 
 import hashlib
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -40,6 +40,7 @@ _LOST = (
     "%d of %d records lose all of their elements (the first is %r), as none lies in x_range and "
     "y_range: points must be in metres of the frame, not of the world, and not in millimetres."
 )
+_MEETING_M = 0.1  # ends of lines that are so near are one place
 _KEYS = sorted(field.name for field in fields(MapSample))
 Record = TypeVar("Record")
 
@@ -50,6 +51,7 @@ def from_records(
     meta: AnnotationMeta,
     data_root: str | Path,
     shard: Shard = WHOLE,
+    join: bool = False,
 ) -> int:
     """Write an annotation file from plain records.
 
@@ -74,6 +76,7 @@ def from_records(
         meta: Frame, classes and range of the data.
         data_root: Folder that image and LiDAR paths are relative to.
         shard: Which part of the records to take, such as ``Shard.parse("3/16")``.
+        join: Join lines of a class whose ends meet, for maps that come in pieces (`join_lines`).
 
     Returns:
         How many samples were written.
@@ -90,12 +93,12 @@ def from_records(
         tokens = "\n".join(str(r.get("token") if isinstance(r, Mapping) else r) for r in records)
         source = hashlib.sha256(tokens.encode()).hexdigest()
         records = shard.part(records)
-    samples = _samples(records, meta, Path(data_root))
+    samples = _samples(records, meta, Path(data_root), join)
     return write_annotations(path, meta, samples, shard, source)
 
 
 def _samples(
-    records: Iterable[Mapping[str, Any]], meta: AnnotationMeta, root: Path
+    records: Iterable[Mapping[str, Any]], meta: AnnotationMeta, root: Path, join: bool
 ) -> Iterator[MapSample]:
     warned, lost, samples = False, [], 0
     for number, record in enumerate(records):
@@ -109,9 +112,10 @@ def _samples(
             samples += 1
             given = len(sample.instances or ())
             if sample.instances is not None:
+                whole = join_lines(sample.instances) if join else sample.instances
                 sample.instances = [
                     MapInstance(item.label, piece)
-                    for item in sample.instances
+                    for item in whole
                     for piece in _clipped(np.asarray(item.points, np.float64), meta)
                 ]
         if given and not sample.instances:
@@ -123,6 +127,47 @@ def _samples(
         yield sample
     if lost:
         _LOGGER.warning(_LOST, len(lost), samples, lost[0])
+
+
+def join_lines(instances: Sequence[MapInstance]) -> list[MapInstance]:
+    """Join lines of one class whose ends meet, as where a map is cut into tiles.
+
+    Ends within 0.1 m of each other in the plane meet. Lines are joined where two of them do; where
+    three or more meet, as at a fork, they stay apart. A line may be turned round. Rings stay.
+
+    Args:
+        instances: Elements in metres.
+
+    Returns:
+        The rings as they are, then the joined lines of each class.
+    """
+    rings = [item for item in instances if is_closed(np.asarray(item.points))]
+    joined = list(rings)
+    for label in sorted({item.label for item in instances}):
+        lines = [
+            np.array(item.points, np.float64)
+            for item in instances
+            if item.label == label and not is_closed(np.asarray(item.points))
+        ]
+        _let_ends_meet(lines)
+        if lines:
+            parts = shapely.get_parts(shapely.line_merge(shapely.MultiLineString(lines)))
+            pieces = vertices_of(parts, lines[0].shape[1])
+            joined += [MapInstance(label, piece) for piece in pieces]
+    return joined
+
+
+def _let_ends_meet(lines: Sequence[Points]) -> None:
+    """Move ends of lines that are near each other to one place, in place. each (n, dim)"""
+    places: list[np.ndarray] = []
+    for line in lines:
+        for end in (0, -1):
+            near = (p for p in places if np.linalg.norm(p[:2] - line[end, :2]) <= _MEETING_M)
+            place = next(near, None)
+            if place is None:
+                places.append(line[end].copy())
+            elif not (line[-1 - end] == place).all():  # a line as short as that stays one
+                line[end] = place
 
 
 def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:

@@ -1,4 +1,4 @@
-"""Annotation files as JSON, for comparison by other tools."""
+"""Annotation files as JSON, in MapTR's form: ground truth for ``tools/evaluate.py`` and others."""
 
 import argparse
 import json
@@ -13,6 +13,7 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
+from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY
 from gsmap.utils.cli import output_file
 from gsmap.utils.files import atomic_write
 from gsmap.utils.words import counted
@@ -25,6 +26,7 @@ def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
     pose = sample.global_from_frame
     if row is not None:
         return {
+            "sample_token": sample.token,
             "log": sample.scene,
             "row": row,
             "timestamp_ns": sample.timestamp_ns,
@@ -57,7 +59,7 @@ def write_vectors(annotations: Sequence[Path], target: Path) -> int:
         file.require(**same)
     head = {**same, "split": [file.meta.split for file in files], "versions": meta.versions}
     with atomic_write(target) as out:
-        out.write(f'{{"meta": {json.dumps(head)}, "frames": [')
+        out.write(f'{{"meta": {json.dumps(head)}, "{GROUND_TRUTH_KEY}": [')
         for number, record in enumerate(chain.from_iterable(_records(file) for file in files)):
             out.write(",\n" if number else "\n")
             json.dump(record, out)
@@ -76,8 +78,12 @@ def _records(file: AnnotationFile) -> Iterator[dict[str, Any]]:
         row = int(stride[1]) * position[sample.scene] if stride else None
         position[sample.scene] += 1
         vectors = [
-            {"label": i.label, "pts": i.points.astype(np.float64).round(_DECIMALS).tolist()}
-            for i in sample.instances
+            {
+                "label": instance.label,
+                "cls_name": file.meta.classes[instance.label],
+                "pts": instance.points.astype(np.float64).round(_DECIMALS).tolist(),
+            }
+            for instance in sample.instances
         ]
         yield {**_identity(sample, row), "vectors": vectors}
 

@@ -184,6 +184,7 @@ def test_distorted_images_are_rectified_into_a_folder_of_their_own(tmp_path):
     board = (np.indices((180, 320)).sum(0) // 20 % 2 * 255).astype(np.uint8)
     cv2.imwrite(str(drive / "front/a.png"), cv2.merge([board] * 3))
     (drive / "front/b.png").write_bytes(b"no image")
+    cv2.imwrite(str(drive / "front/c.jpg"), cv2.merge([board] * 3))
     camera = {
         "intrinsics": [200, 200, 160, 90], "distortion": [-0.3, 0.1, 0, 0],
         "position_m": [1, 0, 1.5], "yaw_pitch_roll_deg": [0, 0, 0],
@@ -191,7 +192,8 @@ def test_distorted_images_are_rectified_into_a_folder_of_their_own(tmp_path):
     (drive / "calibration.yaml").write_text(yaml.safe_dump({"cameras": {"front": camera}}))
     source = open_input(drive, InputOptions(frames_dir=frames))
     assert source.data_root.parent == frames
-    assert [s.cameras[0].path for s in source.samples] == ["front/a.png.jpg", "front/b.png.jpg"]
+    names = [sample.cameras[0].path for sample in source.samples]
+    assert names == ["front/a.png.jpg", "front/b.png.jpg", "front/c.jpg"]
     matrix = np.array([[200.0, 0, 160], [0, 200, 90], [0, 0, 1]])
     expected = cv2.undistort(cv2.merge([board] * 3), matrix, np.array([-0.3, 0.1, 0, 0]))
     written = cv2.imread(str(source.data_root / "front/a.png.jpg"))

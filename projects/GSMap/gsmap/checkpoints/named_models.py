@@ -65,7 +65,7 @@ def list_models() -> list[str]:
 @cache
 def named_configs() -> dict[str, Path]:
     """Return the configs that ship, by the names of their files, without those to inherit from."""
-    patterns = ("configs/[!_]*/*.py", "projects/GSMap/configs/*.py")
+    patterns = ("configs/*.py", "configs/[!_]*/*.py", "projects/GSMap/configs/*.py")
     return {path.stem: path for pattern in patterns for path in sorted(shipped().glob(pattern))}
 
 

@@ -29,6 +29,7 @@ from gsmap.engine.rank_watch import TIMEOUT_S
 from gsmap.utils.faults import nearest, registered
 from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
+from gsmap.utils.shipped import shipped
 from gsmap.utils.targets import NeedsTargets
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
@@ -132,6 +133,10 @@ def _naming(what: object) -> Iterator[None]:
         place = f", line {lines[-1]}," if lines else ""
         reason = error.__context__ if isinstance(error, ImportError) else None
         reason = reason or error  # mmengine's own does not say why an import failed
+        if "load gsmap config" in str(reason):  # the scopes that it knows are fixed
+            reason = ValueError(
+                f"'gsmap::' is not read in _base_; write a path below {shipped('configs')} instead"
+            )
         raise ValueError(
             f"{what}{place} cannot be used: {type(reason).__name__}: {reason}."
         ) from error

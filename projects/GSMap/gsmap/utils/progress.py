@@ -9,6 +9,7 @@ from gsmap.utils.terminal import own_stream
 
 _PLAIN = {"mininterval": 60.0, "maxinterval": 60.0}
 _FORMAT = "{desc}{n_fmt} of {total_fmt} {unit}, {elapsed}"
+_UNKNOWN_TOTAL = "{desc}{n_fmt} {unit}, {elapsed}"
 
 
 class Progress(tqdm):
@@ -21,6 +22,14 @@ class Progress(tqdm):
         else:
             kwargs.setdefault("file", own_stream(sys.stderr))  # it moves the cursor
         super().__init__(*args, **kwargs)
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        """What a line is made of; one whose total is not known yet does not ask for it."""
+        values: dict[str, Any] = super().format_dict
+        if values["bar_format"] == _FORMAT and values["total"] is None:
+            values["bar_format"] = _UNKNOWN_TOTAL
+        return values
 
 
 class _Lines:

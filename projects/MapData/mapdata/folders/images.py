@@ -386,7 +386,8 @@ def _rectify(sample: MapSample, rig: Sequence[RigCamera], root: Path, target: Pa
     unusable, by_name = [], {camera.name: camera for camera in rig}
     for record in sample.cameras:
         camera, source = by_name[record.name], root / record.path
-        record.path = f"{file_name(record.name)}/{file_name(source.name)}.jpg"
+        ending = "" if source.suffix.lower() == ".jpg" else ".jpg"
+        record.path = f"{file_name(record.name)}/{file_name(source.name)}{ending}"
         if (target / record.path).is_file():
             continue
         try:
