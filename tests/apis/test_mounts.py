@@ -237,3 +237,34 @@ def test_the_cameras_of_the_training_travel_with_the_checkpoint(tmp_path):
 def test_two_roof_lidars_are_taken_for_one():
     sample = sample_of(None)
     assert reframed(sample, "lidar", Mount("lidar", None, CASES["lidar"][1])) is sample
+
+
+def test_models_of_generated_streets_say_so_once_on_other_recordings(tmp_path, caplog):
+    samples = make_samples(tmp_path, 1)
+    for name in ("minicity", "mine"):
+        meta = AnnotationMeta(name, "lidar", "val", x_range=(-15, 15), y_range=(-30, 30))
+        write_annotations(tmp_path / f"{name}.arrow", meta, samples)
+    inferencer = MapInferencer("gsmap_r18_minicity", device="cpu")
+    with caplog.at_level(logging.WARNING):
+        inferencer.dataset(tmp_path / "minicity.arrow")
+        assert "generated streets alone" not in caplog.text
+        inferencer.dataset(tmp_path / "mine.arrow")
+        inferencer.dataset(open_input(tmp_path / "mine.arrow"))
+    assert caplog.text.count("the model has seen generated streets alone (MiniCity)") == 1
+
+
+def test_a_model_that_lifts_images_sees_live_what_it_sees_of_files(tmp_path):
+    """In the frame of the LiDAR, the default, and with the place of that frame in the vehicle."""
+    (sample,) = make_samples(tmp_path, 1)
+    sample.lidar, sample.ego_from_frame = None, ground_from_frame(sample, "lidar")
+    for camera in sample.cameras:  # a file that holds the very pixels
+        image = cv2.imread(str(tmp_path / camera.path))
+        camera.path = f"{camera.name}.png"
+        cv2.imwrite(str(tmp_path / camera.path), image)
+    inferencer = MapInferencer("gsmap_mgmapnet_r18_minicity", device="cpu")
+    dataset = inferencer.dataset([sample], tmp_path)
+    (expected,) = inferencer.predict(dataset, allow_missing_cameras=True)
+    images, *rig = in_memory(sample, tmp_path, np.eye(4))
+    live = inferencer.live(*rig, allow_missing_cameras=True)
+    found = live.predict(images).pred_instances_3d
+    torch.testing.assert_close(found.pts, expected.pred_instances_3d.pts, atol=1e-4, rtol=0)

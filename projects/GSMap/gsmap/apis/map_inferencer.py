@@ -184,11 +184,11 @@ class MapInferencer:
             ValueError: If a file cannot be used with this config; the message says why.
         """
         self._files += 1
-        self._say_generated(source)
         root = None if data_root is None else Path(data_root)
         if isinstance(source, str | Path):
             source = annotated(source, root)
-        elif not isinstance(source, Source):
+        self._say_generated(source)
+        if not isinstance(source, Source):
             mount = self.model.mount
             source = Source(source, mount.frame, root, ground_z_m=mount.ground_z_m)
         settings: dict[str, Any] = dict(self.cfg.test_dataloader.dataset)
