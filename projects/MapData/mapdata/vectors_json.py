@@ -13,12 +13,12 @@ import numpy as np
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
-from gsmap.evaluation.core.results_json import GROUND_TRUTH_KEY
 from gsmap.utils.cli import output_file
 from gsmap.utils.files import atomic_write
 from gsmap.utils.words import counted
 
 _DECIMALS = 6
+_GROUND_TRUTH = "GTs"  # of a JSON file that `tools/evaluate.py` reads
 
 
 def _identity(sample: MapSample, row: int | None) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def write_vectors(annotations: Sequence[Path], target: Path) -> int:
         file.require(**same)
     head = {**same, "split": [file.meta.split for file in files], "versions": meta.versions}
     with atomic_write(target) as out:
-        out.write(f'{{"meta": {json.dumps(head)}, "{GROUND_TRUTH_KEY}": [')
+        out.write(f'{{"meta": {json.dumps(head)}, "{_GROUND_TRUTH}": [')
         for number, record in enumerate(chain.from_iterable(_records(file) for file in files)):
             out.write(",\n" if number else "\n")
             json.dump(record, out)
