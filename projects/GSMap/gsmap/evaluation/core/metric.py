@@ -31,13 +31,7 @@ class _Sides(NamedTuple):
 
 
 class Sample(_Sides):
-    """Token, predictions and ground truth of a sample, in metres in the annotation frame.
-
-    Args:
-        token: Name of the sample.
-        predictions: Its predictions. (N,)
-        ground_truth: Its ground truth. (K,)
-    """
+    """Token, predictions (N,) and ground truth (K,) of a sample, in metres in its frame."""
 
     @cached_property
     def shared(self) -> dict[Any, Any]:
