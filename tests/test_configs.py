@@ -157,8 +157,11 @@ def small(cfg: Config) -> Config:
         head.get("detector", head).decoder.num_layers = 2
         shrink_queries(cfg.model)
         shrink_cells(cfg)
-    if "num_cams" in (cfg.model.get("bev_encoder") or {}):
-        cfg.model.bev_encoder.num_cams = 6  # MiniCity's
+    encoder = cfg.model.get("bev_encoder") or {}
+    if encoder.get("type") in ("PivotBEVEncoder", "BezierBEVEncoder"):
+        encoder.num_layers = (1, 1)  # over the cameras, and of the features of the map
+    if "num_cams" in encoder:
+        encoder.num_cams = 6  # MiniCity's
     shrink_images(cfg)
     return cfg
 

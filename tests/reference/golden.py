@@ -42,6 +42,7 @@ class Golden:
     seed: str = "A"
     recipes: Path | None = None
     _models: dict[str, BaseModel] = field(default_factory=dict, repr=False)
+    _states: dict[str, dict[str, Tensor]] = field(default_factory=dict, repr=False)
 
     def _file(self, name: str) -> Path:
         """Return the file of a recipe, there or not."""
@@ -104,7 +105,13 @@ class Golden:
         return {key: tuple(entry["shape"]) for key, entry in self.read_json(name)["state"].items()}
 
     def upstream_state(self, name: str) -> dict[str, Tensor]:
-        """Return the upstream state that the recipe makes for a state list."""
+        """Return the upstream state that the recipe makes for a state list; the last is kept."""
+        if name not in self._states:
+            self._states = {name: self._make_state(name)}
+        return dict(self._states[name])
+
+    def _make_state(self, name: str) -> dict[str, Tensor]:
+        """Have the recipe make the weights of a state list."""
         method = name.split("_")[0]
         recipe = self.recipe(method) if self._file(f"{method}_recipe").is_file() else self.weights
         if hasattr(recipe, "state"):
