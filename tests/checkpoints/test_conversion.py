@@ -266,3 +266,10 @@ def test_the_table_of_keys_in_the_docs_is_the_table_of_the_code():
     shown = {(upstream.rstrip("*"), (ours or upstream).rstrip("*")) for _, upstream, ours in rows}
     rules = {rule for key_map in key_maps() if key_map.name in ALL for rule in key_map.rules}
     assert {tuple(part.replace("{i}", "N") for part in rule) for rule in rules} == shown
+
+
+def test_tables_that_need_no_marker_come_after_all_others():
+    """They take any keys: BeMapNet's would be MapTR's."""
+    unmarked = [key_map.markers == KeyMap.markers for key_map in key_maps()]
+    assert unmarked == sorted(unmarked)
+    assert any(unmarked)

@@ -11,7 +11,7 @@ from gsmap.methods import METHODS
 
 @cache
 def key_maps() -> tuple[KeyMap, ...]:
-    """Return the tables of all methods, the most special first; the last needs no marker.
+    """Return the tables of all methods, the most special first; the last are known by no marker.
 
     Each is in ``KEY_MAPS`` of ``gsmap/models/<method>/keys.py``, which a method without a release
     of its own has not.
@@ -21,7 +21,7 @@ def key_maps() -> tuple[KeyMap, ...]:
         name = f"gsmap.models.{method.name}.keys"
         if find_spec(name) is not None:
             found += import_module(name).KEY_MAPS
-    return found
+    return tuple(sorted(found, key=lambda key_map: key_map.markers == KeyMap.markers))
 
 
 def is_upstream(keys: Iterable[str]) -> bool:
