@@ -24,6 +24,7 @@ from gsmap.checkpoints.convert import (
     upstream_from_ours,
 )
 from gsmap.checkpoints.key_map import find_key_map, key_maps
+from gsmap.checkpoints.key_rules import KeyMap
 from gsmap.checkpoints.reading import load_weights, read_weights
 from gsmap.checkpoints.strict import AddsWeights, adapt_state, neutral_keys
 from gsmap.models.gsmap.reference import GaussianReference
