@@ -35,6 +35,26 @@ assert min(figures["chamfer/mAP"], figures["raster/mAP"]) > 0.999
 """
 
 
+ELSEWHERE = """
+import ctypes, os, signal, sys
+sys.platform = "{platform}"
+for name in ("fcntl", "pwd", "grp", "resource", "termios"):
+    sys.modules[name] = None  # importing it is an ImportError
+for place, name in (
+    (os, "sched_getaffinity"), (os, "register_at_fork"), (signal, "pthread_sigmask"),
+    (signal, "SIGHUP"),
+):
+    delattr(place, name)
+load = ctypes.CDLL
+def found(name, *arguments, **options):
+    if name is None:
+        raise {error}
+    return load(name, *arguments, **options)
+ctypes.CDLL = found
+"""
+"""What other systems lack, taken away; `ctypes.CDLL(None)` is where Linux has ``prctl``."""
+
+
 def modules_after(code: str) -> set[str]:
     """Return what is imported once a program has run."""
     done = run_python("-c", f"{code}\nimport sys; print(*sys.modules)")
@@ -115,3 +135,17 @@ assert type(regressor) is GaussianProcessRegressor
 assert regressor.kernel.length_scale == 3.0
 """
     assert "sklearn.mixture" in modules_after(code)
+
+
+@pytest.mark.parametrize(
+    ("platform", "error"),
+    [("darwin", "AttributeError('prctl')"), ("win32", "TypeError('None')")],
+)
+def test_metrics_run_where_there_is_no_linux(platform, error):
+    """Also what scores files; the commands and their workers need Linux."""
+    hidden = ELSEWHERE.format(platform=platform, error=error)
+    python_itself = "import concurrent.futures.process, multiprocessing.connection, numpy, numba"
+    files = "import gsmap.evaluation.core.file_evaluation"
+    code = "\n".join([python_itself, hidden, METRIC, files])
+    done = run_python("-c", code)
+    assert not done.returncode, done.stderr

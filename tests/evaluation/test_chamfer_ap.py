@@ -7,7 +7,7 @@ from gsmap.evaluation.core.chamfer_ap import (
     match_chamfer,
     nearest_by_chamfer,
 )
-from gsmap.evaluation.core.chamfer_kernels import chamfer_distance
+from gsmap.evaluation.core.chamfer_kernels import chamfer_distance, resampled
 from gsmap.evaluation.core.matches import MatchTable
 from gsmap.evaluation.core.report import format_table
 from gsmap.structures.elements import MapElements
@@ -252,3 +252,23 @@ def test_without_heights_a_metric_in_space_is_refused():
     assert match_chamfer(high, nothing, IN_SPACE).matched_gt.tolist() == [[-1, -1, -1]]
     with pytest.raises(ValueError, match="dim must be 2 or 3, got 4"):
         ChamferConfig(CONFIG.classes, dim=4)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("num_points", [2, 7, 100])
+def test_compiled_resampling_equals_the_plain_one_bit_by_bit(dim, num_points):
+    """Also lines of no, one and equal vertices, vertices that occur twice, and tiny steps."""
+    rng = np.random.default_rng(0)
+    lines = [rng.normal(0, 10, (n, dim)) for n in (0, 1, 2, 3, 20, 57)]
+    lines += [np.ones((4, dim)), np.repeat(rng.normal(0, 5, (5, dim)), 3, axis=0)]
+    lines += [np.cumsum(rng.exponential(1e-9, (6, dim)), 0), 1e6 * rng.normal(size=(9, dim))]
+    straight = np.zeros((11, dim))
+    straight[:, 0] = np.arange(11.0)  # points fall on vertices
+    lines.append(straight)
+    points = np.concatenate(lines)
+    offsets = np.cumsum([0, *map(len, lines)])
+    plain = resample_all(points, offsets, num_points)  # (N, P, D)
+    rows = resampled(points, offsets, num_points)
+    assert rows.shape == (3, len(lines) * num_points)
+    np.testing.assert_array_equal(rows[:dim].T.reshape(plain.shape), plain)
+    assert not rows[dim:].any()

@@ -1,7 +1,6 @@
 """Files that are whole or absent, whatever stops their writer."""
 
 import codecs
-import fcntl
 import hashlib
 import io
 import json
@@ -23,6 +22,11 @@ from pathlib import Path
 from typing import IO, Any, Literal
 
 from gsmap.utils.inputs import forget_output, require_no_input
+
+try:
+    import fcntl
+except ImportError:  # Windows, where files are not locked
+    fcntl = None  # type: ignore[assignment]
 
 SUFFIX = ".gsmap-partial"  # no other program's name
 _BOOT = Path("/proc/sys/kernel/random/boot_id")  # the same for all containers of a machine
@@ -320,6 +324,8 @@ def try_lock(file: IO[Any] | int) -> bool | None:
     Returns:
         False if another process has locked it, None if the file system has no locks.
     """
+    if fcntl is None:
+        return None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -25,7 +25,6 @@ from gsmap.evaluation.core.matches import (
 from gsmap.evaluation.core.metric import Metric, MetricSettings, Sample, register_metric
 from gsmap.evaluation.core.report import MetricReport, distance_figures
 from gsmap.structures.elements import FloatArray, IntArray, MapElements
-from gsmap.structures.polylines import resample_all
 
 CHAMFER_THRESHOLDS = (0.5, 1.0, 1.5)
 HARD_CHAMFER_THRESHOLDS = (0.2, 0.5, 1.0)
@@ -114,8 +113,8 @@ def _lines(elements: MapElements, config: ChamferConfig, resample: bool) -> kern
     """Resample, or keep, the lines of one sample."""
     points, offsets = elements.with_coordinates(config.dim).points, elements.offsets
     if resample:
-        points = resample_all(points, offsets, config.num_points).reshape(-1, config.dim)
-        offsets = np.arange(len(elements) + 1) * config.num_points
+        rows = kernels.resampled(np.ascontiguousarray(points), offsets, config.num_points)
+        return rows, np.arange(len(elements) + 1) * config.num_points, elements.labels
     rows = np.zeros((3, len(points)))
     rows[: config.dim] = points.T
     return rows, offsets, elements.labels

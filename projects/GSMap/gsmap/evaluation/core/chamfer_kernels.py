@@ -17,6 +17,41 @@ _NO_NAN = {"nnan", "nsz"}  # minima vectorise; the order of additions stays as i
 _BOUND_SLACK = 1.0 - 1e-12  # a lower bound may be too large by the rounding of its sum
 
 
+@njit(cache=True, error_model="numpy")
+def resampled(points: FloatArray, offsets: IntArray, num_points: int) -> FloatArray:
+    """Resample lines at equal arc length in the plane, as `polylines.resample_all` does, bit by bit.
+
+    Args:
+        points: Vertices of all lines in metres. (M, D)
+        offsets: Line i has the vertices ``offsets[i]:offsets[i + 1]``, zeros if none. (N + 1,)
+        num_points: Points P of each result, >= 2.
+
+    Returns:
+        Coordinates in rows; z is 0 in the plane. (3, N * P)
+    """
+    rows = np.zeros((3, (len(offsets) - 1) * num_points))
+    for i in range(len(offsets) - 1):
+        line = points[offsets[i] : offsets[i + 1]]
+        if not len(line):
+            continue
+        along = np.zeros(len(line))
+        for k in range(1, len(line)):
+            dx, dy = line[k, 0] - line[k - 1, 0], line[k, 1] - line[k - 1, 1]
+            along[k] = along[k - 1] + math.sqrt(dx * dx + dy * dy)
+        step, k = along[-1] / (num_points - 1), 0
+        for p in range(num_points):
+            at = p * step if p < num_points - 1 else along[-1]
+            while k + 1 < len(line) and along[k + 1] <= at:
+                k += 1
+            for axis in range(line.shape[1]):
+                value = line[k, axis]
+                if k + 1 < len(line) and along[k] != at:  # as `np.interp` computes it
+                    slope = (line[k + 1, axis] - value) / (along[k + 1] - along[k])
+                    value = slope * (at - along[k]) + value
+                rows[axis, i * num_points + p] = value
+    return rows
+
+
 @njit(cache=True, fastmath=_NO_NAN)
 def chamfer_distance(first: FloatArray, second: FloatArray) -> float:
     """Return the mean of both directed mean nearest-neighbour distances. (3, P), (3, Q) metres"""
