@@ -19,7 +19,7 @@ _BOUND_SLACK = 1.0 - 1e-12  # a lower bound may be too large by the rounding of 
 
 @njit(cache=True, error_model="numpy")
 def resampled(points: FloatArray, offsets: IntArray, num_points: int) -> FloatArray:
-    """Resample lines at equal arc length in the plane, as `polylines.resample_all` does, bit by bit.
+    """Resample lines at equal arc length in the plane, bit by bit as `resample_all` does.
 
     Args:
         points: Vertices of all lines in metres. (M, D)
