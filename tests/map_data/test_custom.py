@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -183,7 +184,7 @@ def test_an_exported_file_is_ground_truth_for_the_evaluation(tmp_path: Path):
     found = {"pts": line["points"], "cls_name": "boundary", "confidence_level": 0.9}
     results = {"results": [{"sample_token": "t", "vectors": [found]}]}
     (tmp_path / "r.json").write_text(json.dumps(results))
-    evaluator = MapEvaluator(ChamferConfig(META.classes), None)
+    evaluator = MapEvaluator(ChamferConfig(META.classes))
     (report,), _ = evaluate_files(tmp_path / "r.json", tmp_path / "a.json", evaluator)
     assert report.metrics["chamfer/boundary/AP"] == 1.0
 
@@ -193,3 +194,51 @@ def test_the_reader_and_the_writer_are_names_of_the_package():
 
     assert mapdata.from_records is from_records
     assert {"from_records", "open_input"} <= set(dir(mapdata))
+
+
+def test_a_map_in_global_coordinates_is_moved_into_each_frame(tmp_path: Path):
+    """The vehicle stands at (500000, 4000000) and looks north: north is ahead, west is left."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    pose[:3, 3] = 500_000, 4_000_000, 30
+    line = {"label": "divider", "points": [[499_998, 3_999_000], [499_998, 4_001_000]]}
+    whole = {"global_instances": [line], "global_from_frame": pose}
+    from_records(tmp_path / "g.arrow", [record(**whole)], META, tmp_path)
+    (found,) = AnnotationFile(tmp_path / "g.arrow")[0].instances
+    np.testing.assert_allclose(sorted(found.points.tolist()), [[-30, 2], [30, 2]], atol=1e-6)
+    with_height = {"label": 0, "points": [[499_998, 4_000_000, 29], [499_998, 4_000_010, 28.5]]}
+    meta = replace(META, dim=3)
+    record_3d = record(global_instances=[with_height], global_from_frame=pose)
+    from_records(tmp_path / "h.arrow", [record_3d], meta, tmp_path)
+    (found,) = AnnotationFile(tmp_path / "h.arrow")[0].instances
+    np.testing.assert_allclose(found.points, [[0, 2, -1], [10, 2, -1.5]], atol=1e-6)
+    for changes, message in (
+        ({"global_instances": [line]}, "need global_from_frame"),
+        ({**whole, "instances": []}, "not both"),
+    ):
+        with pytest.raises(ValueError, match=f"record 't'.*{message}"):
+            from_records(tmp_path / "w.arrow", [record(**changes)], META, tmp_path)
+
+
+def test_images_of_a_distorted_camera_are_rectified_once(tmp_path: Path):
+    board = (np.indices((90, 160)).sum(0) // 10 % 2 * 255).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), cv2.merge([board] * 3))
+    matrix = np.array([[100.0, 0, 80], [0, 100, 45], [0, 0, 1]])
+    camera = {"name": "front", "path": "a.png", "intrinsics": matrix, "cam_from_frame": np.eye(4)}
+    camera["distortion"] = [-0.3, 0.1, 0, 0]
+    distorted = {"token": "t", "cameras": [camera]}
+    from_records(tmp_path / "d.arrow", [distorted], META, tmp_path)
+    (seen,) = AnnotationFile(tmp_path / "d.arrow")[0].cameras
+    expected = cv2.undistort(cv2.merge([board] * 3), matrix, np.array([-0.3, 0.1, 0, 0]))
+    written = cv2.imread(str(tmp_path / seen.path))
+    assert np.abs(written.astype(int) - expected).mean() < 3  # JPEG's loss
+    np.testing.assert_array_equal(seen.intrinsics, matrix)
+    first = (tmp_path / seen.path).stat().st_mtime_ns
+    from_records(tmp_path / "d.arrow", [distorted], META, tmp_path)
+    assert (tmp_path / seen.path).stat().st_mtime_ns == first
+    camera["distortion"] = [-0.2, 0.1, 0, 0]  # another calibration, another folder
+    from_records(tmp_path / "d.arrow", [distorted], META, tmp_path)
+    assert AnnotationFile(tmp_path / "d.arrow")[0].cameras[0].path != seen.path
+    camera["distortion"] = [-0.2, 0.1]
+    with pytest.raises(ValueError, match="takes 4 or 5 or 8 or 12 or 14 numbers"):
+        from_records(tmp_path / "d.arrow", [distorted], META, tmp_path)

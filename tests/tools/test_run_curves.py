@@ -146,7 +146,7 @@ def test_only_metrics_that_were_measured_have_a_panel(tmp_path):
 def test_a_class_without_ground_truth_says_so_in_its_panel():
     gt = MapElements.from_polylines([[[0, 0], [0, 10]]], [0])
     pred = MapElements.from_polylines([[[0, 0], [0, 10]]], [0], [0.9])
-    evaluator = MapEvaluator(ChamferConfig(("divider", "boundary")), None)
+    evaluator = MapEvaluator(ChamferConfig(("divider", "boundary")))
     reports = evaluator.reports([evaluator.match("a", pred, gt)])
     first, second = plot_precision_recall({"a": reports}).axes
     assert [text.get_text() for text in first.texts] == []

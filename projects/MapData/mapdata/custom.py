@@ -20,10 +20,12 @@ from gsmap.datasets.annotations.record import (
     SweepRecord,
 )
 from gsmap.datasets.errors import naming
-from gsmap.datasets.image_files import image_size
+from gsmap.datasets.image_files import image_size, read_image
 from gsmap.structures.frames import frame_view
 from gsmap.structures.polylines import Points, clip_to_box, is_closed
+from gsmap.utils.files import file_name
 from gsmap.utils.shards import WHOLE, Shard
+from mapdata.folders.rig import RigCamera
 from mapdata.local_map import POLYGON, vertices_of
 
 _LOGGER = logging.getLogger(__name__)
@@ -41,7 +43,8 @@ _LOST = (
     "y_range: points must be in metres of the frame, not of the world, and not in millimetres."
 )
 _MEETING_M = 0.1  # ends of lines that are so near are one place
-_KEYS = sorted(field.name for field in fields(MapSample))
+_GLOBAL = "global_instances"
+_KEYS = sorted([*(field.name for field in fields(MapSample)), _GLOBAL])
 Record = TypeVar("Record")
 
 
@@ -60,10 +63,13 @@ def from_records(
     - ``token``: unique name;
     - ``cameras``: mappings with ``name``, ``path`` (relative to ``data_root``), ``intrinsics``
       (3, 3) in pixels, ``cam_from_frame`` (4, 4), and, unless the image is to be asked, ``width``
-      and ``height``;
+      and ``height``. With ``distortion`` (OpenCV's coefficients, and ``distortion_model`` as in
+      docs/inference.md) the image is rectified into ``rectified/`` of the data root;
     - ``instances`` (absent: no ground truth is known): mappings with ``label`` (name or index) and
       ``points`` (n, 2 or 3) in metres, a ring's last equal to its first. What lies outside the
       range of ``meta`` is cut off; rings stay rings;
+    - ``global_instances``: instead, the same in the global frame, such as a whole map. Position and
+      yaw of ``global_from_frame`` place them, or with heights all of it;
     - ``lidar``: mapping with ``path``, ``frame_from_lidar`` (4, 4) and ``sweeps``, mappings with
       ``path``, ``timestamp_ns``, ``frame_from_lidar``;
     - ``ego_from_frame`` (4, 4): where the frame ``lidar`` stands on the vehicle, whose z = 0 is the
@@ -173,6 +179,8 @@ def _let_ends_meet(lines: Sequence[Points]) -> None:
 def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapSample:
     """Return a record as a sample; what it holds is still to be checked."""
     token = record["token"]
+    if record.get(_GLOBAL) is not None:
+        record = _in_frame(record, meta)
     given = {name: value for name, value in record.items() if value is not None}
     given["cameras"] = [_camera(camera, token, root) for camera in record["cameras"]]
     if "lidar" in given:
@@ -190,6 +198,27 @@ def _sample(record: Mapping[str, Any], meta: AnnotationMeta, root: Path) -> MapS
     return MapSample(**{**absent, **given})
 
 
+def _in_frame(record: Mapping[str, Any], meta: AnnotationMeta) -> dict[str, Any]:
+    """Return a record whose elements are moved from the global frame to its own."""
+    if record.get("instances") is not None:
+        raise ValueError(f"give instances, in the frame, or {_GLOBAL}, not both.")
+    if record.get("global_from_frame") is None:
+        raise ValueError(f"{_GLOBAL} need global_from_frame, the pose of the frame. (4, 4)")
+    pose = np.array(record["global_from_frame"], np.float64)
+    if meta.dim == 2:  # as of published data sets: roll, pitch and height have no effect
+        yaw = np.arctan2(pose[1, 0], pose[0, 0])
+        turn = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    else:
+        turn = pose[:3, :3]
+    instances = []
+    for item in record[_GLOBAL]:
+        points = np.array(item["points"], np.float64)[:, : meta.dim]
+        points = (points - pose[: points.shape[1], 3]) @ np.array(turn)
+        instances.append({**item, "points": points})
+    moved = {name: value for name, value in record.items() if name != _GLOBAL}
+    return {**moved, "instances": instances}
+
+
 def _record(kind: type[Record], values: Mapping[str, Any]) -> Record:
     """Return a mapping as a record of its kind; other keys are left alone."""
     return kind(**{field.name: values[field.name] for field in fields(kind)})  # type: ignore[arg-type]
@@ -200,7 +229,29 @@ def _camera(camera: Mapping[str, Any], token: str, root: Path) -> CameraRecord:
         where = f"sample {token!r}, camera {camera['name']!r}"
         width, height = image_size(root / camera["path"], where)
         camera = {**camera, "width": width, "height": height}
+    if np.any(camera.get("distortion", ())):
+        camera = {**camera, "path": _rectified(camera, root)}
     return _record(CameraRecord, camera)
+
+
+def _rectified(camera: Mapping[str, Any], root: Path) -> str:
+    """Write a camera's image without its distortion and return its path below the data root."""
+    rig = RigCamera(
+        str(camera["name"]),
+        np.array(camera["intrinsics"], np.float64),
+        np.eye(4),
+        (int(camera["width"]), int(camera["height"])),
+        np.array(camera["distortion"], np.float64),
+        str(camera.get("distortion_model", "")),
+    )
+    calibration = repr((rig.intrinsics.tolist(), rig.distortion.tolist(), rig.model))
+    digest = hashlib.sha256(calibration.encode()).hexdigest()[:12]
+    path = f"rectified/{file_name(rig.name)}-{digest}/{file_name(camera['path'])}.jpg"
+    if not (root / path).is_file():
+        image = read_image(str(root / camera["path"]), f"camera {rig.name!r}", rig.size_px)
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        rig.write_image(root / path, image)
+    return path
 
 
 def _label(label: Any, meta: AnnotationMeta) -> int:
