@@ -207,14 +207,14 @@ def _in_frame(record: Mapping[str, Any], meta: AnnotationMeta) -> dict[str, Any]
     pose = np.array(record["global_from_frame"], np.float64)
     if meta.dim == 2:  # as of published data sets: roll, pitch and height have no effect
         yaw = np.arctan2(pose[1, 0], pose[0, 0])
-        turn = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     else:
         turn = pose[:3, :3]
     instances = []
     for item in record[_GLOBAL]:
         points = np.array(item["points"], np.float64)[:, : meta.dim]
-        points = (points - pose[: points.shape[1], 3]) @ np.array(turn)
-        instances.append({**item, "points": points})
+        apart = points - pose[: points.shape[1], 3]
+        instances.append({**item, "points": apart @ turn})
     moved = {name: value for name, value in record.items() if name != _GLOBAL}
     return {**moved, "instances": instances}
 
