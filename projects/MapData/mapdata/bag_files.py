@@ -13,6 +13,8 @@ from mapdata.ros_bag import RosBag
 Bag = RosBag | McapBag
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
+_MOST_BYTES = 300_000  # of metadata; reading a thousand bytes takes some milliseconds
+_ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", re.MULTILINE)
 _PACKED = (".zstd", ".zst", ".lz4", ".gz", ".bz2", ".xz", ".zip", ".tar")
 _STARTS = {".mcap": MAGIC, ".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0"}
 
@@ -78,12 +80,29 @@ def _bag_of(parts: Sequence[Path], notes: list[str]) -> Bag:
 
 def _listed_parts(folder: Path) -> list[Path]:
     """Return the files in a folder that its metadata name."""
-    text = (folder / _METADATA).read_text(encoding="utf-8", errors="replace")
+    text = _metadata(folder / _METADATA)
     return [
         part
         for part in parts_in(folder)
         if re.search(rf"(?<![\w.-]){re.escape(part.name)}(?![\w.-])", text)
     ]
+
+
+def _metadata(file: Path) -> str:
+    """Return the text of a bag's metadata.
+
+    Raises:
+        ValueError: If its values may be far more than its letters: it is too long, or its values
+            stand for others (aliases and merge keys of YAML), which rosbag2 does not write.
+    """
+    if file.stat().st_size > _MOST_BYTES:
+        raise ValueError(
+            f"{file.name} has more than {_MOST_BYTES} bytes: `ros2 bag convert` writes fewer parts"
+        )
+    text = file.read_text(encoding="utf-8", errors="replace")
+    if "<<" in text or _ALIAS.search(text):
+        raise ValueError(f"{file.name} has aliases of YAML: `ros2 bag reindex` writes it anew")
+    return text
 
 
 def _check_parts(parts: Sequence[Path]) -> None:
@@ -126,7 +145,7 @@ def damage_in(path: Path) -> str | None:
 def _listed_names(file: Path) -> list[str] | None:
     """Return the names of the files in metadata, or None if they cannot be read."""
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        content = yaml.safe_load(_metadata(file))
         paths = content["rosbag2_bagfile_information"]["relative_file_paths"]
         return [Path(str(path)).name for path in paths]
     except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from gsmap.datasets.image_files import decode_image
+from gsmap.datasets.image_files import FORMATS, decode_image
 from gsmap.utils.files import write_bytes
 from mapdata.folders.rig import RigCamera
 
@@ -49,7 +49,7 @@ def image_size(message: Any) -> tuple[int, int] | None:
         return int(message.width), int(message.height)
     content = np.asarray(message.data, np.uint8).tobytes()
     try:
-        with Image.open(BytesIO(content)) as picture:
+        with Image.open(BytesIO(content), formats=FORMATS) as picture:
             return picture.size
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return None

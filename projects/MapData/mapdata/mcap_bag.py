@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from gsmap.utils.extras import import_extra
+from mapdata.decompression import begin_bag, import_bounded
 from mapdata.foxglove_messages import ROS_TYPES, foxglove_parser
 from mapdata.ros_bag import Parser, RosTypes, library_errors
 
@@ -39,7 +40,7 @@ def is_plain_ros2(path: Path) -> bool:
             return True
         file.seek(0)
         with library_errors():
-            reader = import_extra("mcap.reader", "bags").make_reader(file)
+            reader = import_bounded("mcap.reader").make_reader(file)
             if reader.get_header().profile != "ros2":
                 return False
             summary = reader.get_summary()
@@ -67,6 +68,7 @@ class McapBag:
 
     def open(self) -> None:
         """Read which topics there are; ValueError if that fails."""
+        begin_bag()
         self._types = RosTypes()
         for path in self.paths:
             with library_errors(), path.open("rb") as file:
@@ -91,7 +93,7 @@ class McapBag:
         topics = sorted({connection.topic for connection in chosen})
         for path in self.paths:
             with path.open("rb") as file:
-                reader = import_extra("mcap.reader", "bags").make_reader(file)
+                reader = import_bounded("mcap.reader").make_reader(file)
                 summary = reader.get_summary()
                 # without an index, messages in order would all lie in memory
                 has_index = summary is not None and bool(summary.chunk_indexes)
@@ -113,14 +115,14 @@ class McapBag:
 
 def _contents(file: Any) -> tuple[dict[int, Any], dict[int, Any], dict[int, int]]:
     """Return the channels and schemas of an MCAP by their number, and each channel's messages."""
-    summary = import_extra("mcap.reader", "bags").make_reader(file).get_summary()
+    summary = import_bounded("mcap.reader").make_reader(file).get_summary()
     if summary is not None and summary.channels:
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
         return summary.channels, summary.schemas, counts
     records = import_extra("mcap.records", "bags")
     channels, schemas, counted = {}, {}, Counter[int]()
     file.seek(0)
-    for record in import_extra("mcap.stream_reader", "bags").StreamReader(file).records:
+    for record in import_bounded("mcap.stream_reader").StreamReader(file).records:
         if isinstance(record, records.Message):
             counted[record.channel_id] += 1
         elif isinstance(record, records.Channel):

@@ -1,6 +1,6 @@
 """Bags of ROS 1 and ROS 2 as rosbags reads them, each topic by itself."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -10,6 +10,10 @@ from types import SimpleNamespace
 from typing import Any
 
 from gsmap.utils.extras import import_extra
+from mapdata.decompression import begin_bag, import_bounded
+
+_MOST_FIELDS = 10_000  # of the types of a bag; rosbags makes some lines of code for each
+_MOST_LETTERS = 100_000  # of a definition
 
 Parser = Callable[[bytes], Any]
 
@@ -36,6 +40,7 @@ class RosTypes:
     def __init__(self) -> None:
         self._typesys = import_extra("rosbags.typesys", "bags")
         self._common = self._empty()
+        self._fields = 0
 
     def _empty(self) -> Any:
         return self._typesys.get_typestore(self._typesys.Stores.EMPTY)
@@ -63,7 +68,10 @@ class RosTypes:
         """Return a store that has a type."""
         if not definition:
             return _standard_store()
+        if len(definition) > _MOST_LETTERS:
+            raise ValueError(f"its definition has {len(definition)} letters, not {_MOST_LETTERS}")
         types = _types(self._typesys, msgtype, definition, is_idl)
+        self._count_fields(types)
         try:
             self._common.register(types)
             return self._common
@@ -71,6 +79,47 @@ class RosTypes:
             store = self._empty()
             store.register(types)
             return store
+
+    def _count_fields(self, types: Mapping[str, Any]) -> None:
+        """Refuse types that take too long to make readers of, or whose messages have no size.
+
+        Raises:
+            ValueError: If they have too many fields, or arrays of values without any.
+        """
+        sizes: dict[str, int] = {}
+        known = self._common.fielddefs | types
+
+        def size_of(kind: Any, of_kind: Any) -> int:
+            """Return how many values a field has at least."""
+            nodes = self._typesys.base.Nodetype
+            if kind == nodes.BASE:
+                return 1
+            if kind == nodes.NAME:
+                return size_of_type(of_kind)
+            item, count = of_kind
+            values = size_of(*item)
+            if not values:
+                raise ValueError("it has an array of values without any field")
+            is_plain = item[0] == nodes.BASE and item[1][0] != "string"
+            return 1 if kind == nodes.SEQUENCE or is_plain else values * count
+
+        def size_of_type(name: str) -> int:
+            if name not in known:
+                return 1  # which rosbags says
+            if name not in sizes:
+                sizes[name] = 1  # a type of itself, which rosbags refuses
+                constants, fields = known[name]
+                values = sum(size_of(*of_field) for _, of_field in fields)
+                sizes[name] = values
+                self._fields += len(constants) + values
+                if self._fields > _MOST_FIELDS:
+                    raise ValueError(
+                        f"the types of the bag have more than {_MOST_FIELDS} fields, arrays counted"
+                    )
+            return sizes[name]
+
+        for name in types:
+            size_of_type(name)
 
 
 @cache
@@ -112,10 +161,11 @@ class RosBag:
 
     def open(self) -> None:
         """Read which topics there are; ValueError if that fails."""
+        begin_bag()
         self._types = RosTypes()
         self._is_ros1 = self.paths[0].suffix == ".bag"
         module = "rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2"
-        reader_type = import_extra(module, "bags").Reader
+        reader_type = import_bounded(module).Reader
         for path in self.paths:
             with library_errors():
                 reader = reader_type(path)

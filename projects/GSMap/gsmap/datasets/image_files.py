@@ -21,6 +21,9 @@ _JPEG_START = b"\xff\xd8"
 _EXIF = b"Exif\0\0"
 _ORIENTATION = 0x0112  # EXIF's tag
 _TURNED = range(2, 9)  # 1 is upright, 0 is not set, others mean nothing
+_MOST_PIXELS = 10**8  # of an image; a decoder takes memory for all that its header says
+_MOST_SCANS = 100  # of a JPEG, each of which may cost as much as the whole image
+_SCAN = b"\xff\xda"
 _DIM = 1 << 14  # of 16 bits; what stays below has 14 bits or fewer, and would be next to black
 # what pillow and simplejpeg raise on files that make no sense
 _DAMAGE = (
@@ -45,7 +48,10 @@ def image_size(file: Path, where: str) -> tuple[int, int]:
         start = opened.read(100)
         try:
             with Image.open(opened, formats=FORMATS) as image:
+                _require_moderate(image.size)
                 return image.size
+        except _UnfitError as error:
+            raise ValueError(f"{where}: {file} cannot be used: {error}.") from error
         except _DAMAGE as error:
             if getattr(error, "errno", None):
                 raise
@@ -169,6 +175,9 @@ def _decoded_jpeg(
     height, width = simplejpeg.decode_jpeg_header(content)[:2]
     if size not in (None, (width, height)):
         return (width, height), None
+    _require_moderate((width, height))
+    if (scans := content.count(_SCAN)) > _MOST_SCANS:
+        raise _UnfitError(f"it has {scans} scans, more than {_MOST_SCANS}: save it anew")
     return (width, height), simplejpeg.decode_jpeg(content, colorspace="BGR")
 
 
@@ -179,11 +188,21 @@ def _decoded_other(
     with Image.open(BytesIO(content), formats=FORMATS) as picture:
         if size not in (None, picture.size):
             return picture.size, None
+        _require_moderate(picture.size)
         picture.load()  # a PNG may say only behind its pixels how it is turned
         _require_upright(picture)
         if picture.mode.startswith("I"):
             return picture.size, _from_deep_grey(np.asarray(picture))
         return picture.size, np.ascontiguousarray(np.asarray(picture.convert("RGB"))[:, :, ::-1])
+
+
+def _require_moderate(size: tuple[int, int]) -> None:
+    """Refuse an image of more pixels than cameras have."""
+    if size[0] * size[1] > _MOST_PIXELS:
+        raise _UnfitError(
+            f"it has {size[0]} x {size[1]} pixels, more than {_MOST_PIXELS / 1e6:g} million: make "
+            "it smaller, with its calibration"
+        )
 
 
 def _require_upright(picture: Image.Image) -> None:

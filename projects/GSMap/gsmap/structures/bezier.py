@@ -3,8 +3,9 @@
 A curve of k pieces of degree d has ``k * d + 1`` control points: joint, inner points, joint, ...
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
+from itertools import pairwise
 from math import comb
 
 import numpy as np
@@ -14,6 +15,7 @@ from gsmap.structures.polylines import Points, resample
 
 MAX_DEGREE = 5
 SAMPLES = 100  # points of a piece that a fit looks at, both ends included
+_WORK = 2000  # points that the search for joints may look at, for each vertex of a line
 
 Float = NDArray[np.float64]
 Deviation = Callable[[Float, Float], float]
@@ -107,14 +109,84 @@ def largest_deviation(line: Float, curve: Float) -> float:
     Both directions count, in the plane: the given points of the curve, the vertices of the line,
     and 100 equidistant points of it.
     """
-    import shapely
+    from gsmap.structures.curve_kernels import largest_deviation as compiled  # reading needs none
 
-    sides = np.concatenate([line, resample(line, SAMPLES)]), curve
-    apart = [
-        shapely.distance(shapely.points(points[:, :2]), shapely.linestrings(other[:, :2]))
-        for points, other in zip(sides, (curve, line), strict=True)
-    ]
-    return float(np.concatenate(apart).max())
+    return compiled(_in_plane(line), _in_plane(curve), SAMPLES, np.inf)
+
+
+def _in_plane(points: Float) -> Float:
+    return np.ascontiguousarray(points[:, :2], np.float64)
+
+
+def _fits(degree: int, max_error_m: float, deviation: Deviation) -> Callable[[Float], bool]:
+    """Return what says whether one piece is near enough to a line (n, D)."""
+    if deviation is not largest_deviation:
+        return lambda part: (
+            deviation(part, curve_points(fit_piece(part, degree), degree)) < max_error_m
+        )
+    from gsmap.structures.curve_kernels import deviation_of_fit
+
+    settings = _inverse(degree), bernstein(degree), max_error_m
+    return lambda part: deviation_of_fit(_in_plane(part), *settings) < max_error_m
+
+
+def fit_joints(
+    points: Points,
+    degree: int = 3,
+    max_error_m: float = 0.1,
+    deviation: Deviation = largest_deviation,
+) -> list[int]:
+    """Return the vertices of a line at which the pieces of its curve meet, both ends included.
+
+    Each piece reaches as far as the error allows. Lines for which that search takes too long, such
+    as long ones that turn at each vertex, are searched on by twice the reach as long as that fits.
+
+    Args:
+        points: Vertices in metres. (n >= 2, D)
+        degree: Of the pieces, 1 to ``MAX_DEGREE``.
+        max_error_m: A piece is accepted below this deviation, in metres.
+        deviation: Takes the vertices of a part of the line (n, D) and points of its curve (m, D).
+
+    Raises:
+        ValueError: If the line has fewer than two points, or a setting is out of range.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if max_error_m <= 0:
+        raise ValueError(f"max_error_m must be more than 0, got {max_error_m}.")
+    if len(points) < 2:
+        raise ValueError(f"a line has two points or more, got {len(points)}.")
+    fits = _fits(degree, max_error_m, deviation)
+    last, work = len(points) - 1, _WORK * len(points)
+    joints = [0]
+    while joints[-1] < last:
+        start, end = joints[-1], last
+        while end > start + 1 and work > 0:
+            work -= end - start + SAMPLES
+            if fits(points[start : end + 1]):
+                break
+            end -= 1
+        if work <= 0:
+            end, farther = start + 1, min(start + 2, last)
+            while end < farther and fits(points[start : farther + 1]):
+                end, farther = farther, min(2 * farther - start, last)
+        joints.append(end)
+    return joints
+
+
+def controls_between(points: Points, joints: Sequence[int], degree: int) -> Float:
+    """Return the control points of pieces that meet at some vertices of a line.
+
+    Args:
+        points: Vertices in metres. (n >= 2, D)
+        joints: Numbers of the vertices, rising, with both ends. (k + 1,)
+        degree: Of the pieces.
+
+    Returns:
+        Control points in metres. (k * degree + 1, D)
+    """
+    points = np.asarray(points, dtype=np.float64)
+    pieces = [fit_piece(points[a : b + 1], degree)[1:] for a, b in pairwise(joints)]
+    return np.concatenate([points[:1], *pieces])
 
 
 def fit_pieces(
@@ -125,8 +197,8 @@ def fit_pieces(
 ) -> Float:
     """Fit a line with few pieces: each reaches as far as the error allows.
 
-    Joints are vertices of the line. A piece between neighbouring vertices is exact, so that there
-    is always a fit. BeMapNet's own fits are those with ``deviation=mean_deviation``.
+    Joints are vertices of the line (`fit_joints`). A piece between neighbouring vertices is exact,
+    so that there is always a fit. BeMapNet's own fits are those with ``deviation=mean_deviation``.
 
     Args:
         points: Vertices in metres. (n >= 2, D)
@@ -140,18 +212,4 @@ def fit_pieces(
     Raises:
         ValueError: If the line has fewer than two points, or a setting is out of range.
     """
-    points = np.asarray(points, dtype=np.float64)
-    if max_error_m <= 0:
-        raise ValueError(f"max_error_m must be more than 0, got {max_error_m}.")
-    if len(points) < 2:
-        raise ValueError(f"a line has two points or more, got {len(points)}.")
-    start, controls = 0, points[:1]
-    while start < len(points) - 1:
-        for end in range(len(points) - 1, start, -1):
-            part = points[start : end + 1]
-            piece = fit_piece(part, degree)
-            curve = curve_points(piece, degree)
-            if end == start + 1 or deviation(part, curve) < max_error_m:
-                break
-        controls, start = np.concatenate([controls, piece[1:]]), end
-    return controls
+    return controls_between(points, fit_joints(points, degree, max_error_m, deviation), degree)

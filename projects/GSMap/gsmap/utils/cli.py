@@ -19,6 +19,7 @@ from types import FrameType
 from typing import Any
 
 from gsmap.utils.faults import in_words
+from gsmap.utils.handover import tell_lost_batches
 from gsmap.utils.inputs import declare_files, inputs_kept
 from gsmap.utils.interrupt import SAID, is_first_rank
 from gsmap.utils.parallel import have_forks_die_too
@@ -134,6 +135,7 @@ def _listen(end: "_End", heed_kill: bool) -> None:
     if getattr(sys.unraisablehook, "func", None) is not _drop_in_silence:
         sys.unraisablehook = partial(_drop_in_silence, sys.unraisablehook)
     have_forks_die_too()
+    tell_lost_batches()
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as in a shell's background
         signal.signal(signal.SIGINT, end)
     signal.signal(signal.SIGTERM, end if heed_kill else signal.SIG_DFL)

@@ -37,6 +37,7 @@ _REMEDIES = {
 _NO_MEMORY = re.compile(
     r"out of memory|(can't|Cannot|cannot) allocate memory|not enough memory|DataLoader worker \(pid"
 )
+_NO_HANDLES = re.compile("Too many open files. Communication with the workers")  # torch's words
 _NO_DEVICE = re.compile(
     "not compiled with CUDA|no NVIDIA driver|No CUDA GPUs|invalid device ordinal|device string"
 )
@@ -125,6 +126,8 @@ def _of_the_machine(error: BaseException, text: str) -> str | None:
         and "signal:" not in signals
     ):
         return f"{reason}, by a signal unknown: out of memory ({_LESS}), or {_SHORTENED}."
+    if isinstance(error, RuntimeError) and _NO_HANDLES.match(text):
+        return f"too many open files: raise their limit (ulimit -n), or {_FEWER}."
     speaks = isinstance(error, (RuntimeError, OSError)) and _NO_MEMORY.search(text)
     if isinstance(error, MemoryError) or speaks:
         return f"out of memory ({reason}): {_LESS}."

@@ -45,6 +45,8 @@ _CAMERA_KEYS = {
 # A camera's axes (right, down, ahead) in a vehicle's (ahead, left, up).
 _AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 _RATE_HZ = 10.0  # where a calibration file has no rate_hz
+_ANY_TWICE = ("**", "**")
+_MOST_ANY = 2  # ``**`` of a pattern, each of which takes the time times the depth of folders
 _MOST_VALUES = 100_000  # in a calibration file
 
 
@@ -199,7 +201,7 @@ def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> tuple[list
     """
     pattern = str(camera.get("images", name))
     place = _below(folder, pattern, "images")
-    found = place.iterdir() if place.is_dir() else folder.glob(pattern)
+    found = place.iterdir() if place.is_dir() else folder.glob(_moderate(pattern))
     files = [path for path in found if path.is_file() and not is_hidden(path)]
     paths = sorted((p for p in files if p.suffix.lower() in _SUFFIXES), key=in_order)
     others = sorted({path.suffix for path in files if path.suffix.lower() not in _SUFFIXES})[:5]
@@ -213,6 +215,15 @@ def _images_of(folder: Path, name: str, camera: Mapping[str, Any]) -> tuple[list
         raise ValueError(f"two of its images at {place} have one name: rename one")
     unread = counted(len(files) - len(paths), "file")
     return paths, [f"camera {name!r}: {unread} with {others} not read"] if others else []
+
+
+def _moderate(pattern: str) -> str:
+    """Return a pattern of files without ``**`` that say nothing; many others take for ever."""
+    parts = Path(pattern).parts
+    kept = [p for p, after in zip(parts, (*parts[1:], ""), strict=True) if (p, after) != _ANY_TWICE]
+    if kept.count("**") > _MOST_ANY:
+        raise ValueError(f"`images` has more than {_MOST_ANY} `**`: name the folders")
+    return str(Path(*kept))
 
 
 def _below(folder: Path, name: str, what: str) -> Path:

@@ -1,13 +1,19 @@
 """Result files of few numbers: Bezier curves in place of points, within an error in metres."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gsmap.evaluation.core.results_json import BEZIER, RESULTS_KEY, SampleFile, write_results
-from gsmap.structures.bezier import curve_points, fit_pieces, largest_deviation
+from gsmap.structures.bezier import (
+    controls_between,
+    curve_points,
+    fit_joints,
+    largest_deviation,
+)
 from gsmap.structures.elements import FloatArray
 
 _DECIMALS = 3  # control points are written in whole millimetres
@@ -51,10 +57,10 @@ def compact_results(
         vectors = []
         for vector, points in zip(item["vectors"], elements.polylines, strict=True):
             if len(points) > 1:
-                controls = fit_pieces(points, degree, max_error_m - _ROUNDING_M)
-                vector = _with_curve(vector, controls.round(_DECIMALS), degree)
-                error = largest_deviation(points, curve_points(vector[BEZIER]["pts"], degree))
-                total = _added(total, points, controls, error)
+                joints = fit_joints(points, degree, max_error_m - _ROUNDING_M)
+                controls = controls_between(points, joints, degree).round(_DECIMALS)
+                vector = _with_curve(vector, controls, degree)
+                total = _added(total, points, controls, _error(points, joints, controls, degree))
             vectors.append(vector)
         samples.append((token, vectors))
     write_results(out, samples, {**file.about, "bezier_max_error_m": max_error_m})
@@ -65,6 +71,16 @@ def _with_curve(vector: Mapping[str, Any], controls: FloatArray, degree: int) ->
     """Return a vector with a curve in place of its points."""
     kept = {key: value for key, value in vector.items() if key not in _REPLACED}
     return {**kept, BEZIER: {"degree": degree, "pts": np.asarray(controls).tolist()}}
+
+
+def _error(points: FloatArray, joints: list[int], controls: FloatArray, degree: int) -> float:
+    """Return the largest distance of a curve's pieces from their parts of a line, in metres."""
+    return max(
+        largest_deviation(
+            points[a : b + 1], curve_points(controls[i * degree : (i + 1) * degree + 1], degree)
+        )
+        for i, (a, b) in enumerate(pairwise(joints))
+    )
 
 
 def _added(total: Compaction, points: FloatArray, controls: FloatArray, error: float) -> Compaction:
