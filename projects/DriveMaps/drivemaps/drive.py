@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
+from scipy.spatial import cKDTree
 
 from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.datasets.annotations.record import MapSample
@@ -13,6 +14,7 @@ from gsmap.structures.elements import BoolArray, FloatArray, IntArray, MapElemen
 MIN_LENGTH_M = 2.0
 MIN_AREA_M2 = 1.0
 SIMPLIFY_M = 0.02
+_SLACK_M = 1e-3  # for the rounding of frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,11 @@ class DriveFrame:
     elements: MapElements
 
     @property
+    def origin(self) -> FloatArray:
+        """Where the annotation frame's origin lies in the global frame, in metres. (2,)"""
+        return self.sample.global_from_frame[:2, 3]
+
+    @property
     def rotation(self) -> FloatArray:
         """Turn by the pose's yaw, from the annotation frame to the global frame. (2, 2)"""
         cos, sin = self.sample.global_from_frame[:2, 0]
@@ -40,11 +47,11 @@ class DriveFrame:
 
     def to_global(self, points: FloatArray) -> FloatArray:
         """Move points from the annotation frame to the global frame, in the plane. (..., 2)"""
-        return points @ self.rotation.T + self.sample.global_from_frame[:2, 3]
+        return points @ self.rotation.T + self.origin
 
     def to_frame(self, points: FloatArray) -> FloatArray:
         """Move points from the global frame to the annotation frame, in the plane. (..., 2)"""
-        return (points - self.sample.global_from_frame[:2, 3]) @ self.rotation
+        return (points - self.origin) @ self.rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +78,28 @@ class Drive:
         local = frame.to_frame(points)
         return ((local >= low) & (local <= high)).all(axis=1)
 
+    @property
+    def reach_m(self) -> float:
+        """How far from a frame's origin the farthest corner of its range is, in metres."""
+        return float(np.hypot(np.abs(self.x_range).max(), np.abs(self.y_range).max())) + _SLACK_M
+
     def times_seen(self, points: FloatArray) -> IntArray:
         """Count the frames that have points, (M, 2) in metres, in their range. (M,)"""
-        return np.sum([self.sees(frame, points) for frame in self.frames], axis=0)
+        counts, tree = np.zeros(len(points), np.int64), cKDTree(points)
+        for frame in self.frames:
+            near = tree.query_ball_point(frame.origin, self.reach_m)
+            counts[near] += self.sees(frame, points[near])
+        return counts
+
+    def nearby(self, frame: DriveFrame, elements: MapElements) -> MapElements:
+        """Return the elements, in the global frame, whose boxes come near a frame's range."""
+        long = np.flatnonzero(elements.num_points)
+        if not len(long):
+            return elements
+        starts, points = elements.offsets[long], elements.points[:, :2]
+        low, high = (f.reduceat(points, starts) for f in (np.minimum, np.maximum))
+        near = (low <= frame.origin + self.reach_m) & (high >= frame.origin - self.reach_m)
+        return elements.select(long[near.all(axis=1)])
 
     def footprint(self, frame: DriveFrame) -> shapely.Polygon:
         """Return a frame's range in the global frame."""

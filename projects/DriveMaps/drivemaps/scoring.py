@@ -73,7 +73,7 @@ def cut_to_frame(elements: MapElements, drive: Drive, frame: DriveFrame) -> MapE
     box = shapely.box(x0, y0, x1, y1)
     scores: list[float] = []
     lines, labels = [], []
-    for line, label, score in elements.rows:
+    for line, label, score in drive.nearby(frame, elements).rows:
         local = frame.to_frame(line)
         if drive.classes[label] in AREA_CLASSES and len(local) > 3:
             areas = shapely.get_parts(shapely.make_valid(shapely.Polygon(local)) & box)

@@ -86,18 +86,13 @@ class ResultLog:
 
     def _is_frame(self, frame: Any, same: bool) -> bool:
         """Whether a line is a frame's, of this run if it is of the same settings, and no second."""
-        if not isinstance(frame, dict):
+        if not isinstance(frame, dict) or not isinstance(frame.get("sample_token"), str):
             return False
-        token, vectors = frame.get("sample_token"), frame.get("vectors", [])
+        token, vectors = frame["sample_token"], frame.get("vectors", [])
         known = not same or self._tokens is None or token in self._tokens
         vectors_fit = isinstance(vectors, list) and all(isinstance(v, dict) for v in vectors)
         reason_fits = isinstance(frame.get("broken", ""), str)
-        return (
-            isinstance(token, str)
-            and known
-            and token not in self.done
-            and (vectors_fit and reason_fits)
-        )
+        return known and token not in self.done and vectors_fit and reason_fits
 
     def _require(self, good: bool, number: int) -> None:
         if not good:

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gsmap.checkpoints.efficientnet_keys import efficientnet_rules, unused_classifier
 from gsmap.checkpoints.key_rules import KeyMap
-from gsmap.checkpoints.reading import refusing
+from gsmap.checkpoints.reading import refusing, require_unpacked
 from gsmap.utils.files import atomic_write, file_name
 from gsmap.utils.shards import digest
 
@@ -59,6 +59,7 @@ def load_published(
     path = find_weights(address)
     try:
         with refusing(address):
+            require_unpacked(path)
             checkpoint = torch.load(path, map_location=map_location, weights_only=True)
     except ValueError as error:
         if path != cache_file(address):
@@ -79,6 +80,7 @@ def load_from_file(path: str, map_location: Any = "cpu") -> Any:
     if not file.is_file():
         raise FileNotFoundError(f"there are no weights at {file}: check the path.")
     with refusing(file):
+        require_unpacked(file)
         return in_our_names(torch.load(file, map_location=map_location, weights_only=True))
 
 

@@ -110,6 +110,19 @@ def _asks_for_more(error: BaseException, path: Path) -> bool:
     return asked is not None and path.is_file() and int(asked[1]) > path.stat().st_size
 
 
+def require_unpacked(path: Path) -> None:
+    """Refuse an archive with packed parts, which torch does not write: their sizes have no bound.
+
+    Raises:
+        ValueError: If there is one.
+    """
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            packed = [part for part in archive.infolist() if part.compress_type]
+        if packed:
+            raise ValueError(f"{packed[0].filename!r:.60} in it is packed, as torch packs nothing")
+
+
 def read_checked(path: str | Path) -> Checkpoint:
     """Read a checkpoint without running code from it, and check its weights.
 
@@ -122,6 +135,7 @@ def read_checked(path: str | Path) -> Checkpoint:
     """
     path = find_checkpoint(path)
     with refusing(path):
+        require_unpacked(path)
         with torch.serialization.safe_globals(mmengine_globals()):
             checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
         unwrapped = _unwrapped(path, checkpoint)

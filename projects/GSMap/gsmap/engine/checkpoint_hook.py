@@ -22,7 +22,7 @@ from gsmap.engine.figures import finish_checks
 from gsmap.engine.optimizers import fit_optimizer_state
 from gsmap.engine.resuming import check_resumable
 from gsmap.engine.run_log import innermost
-from gsmap.utils.files import take_from_link, write_bytes, write_text
+from gsmap.utils.files import read_text, take_from_link, write_bytes, write_text
 from gsmap.utils.model_facts import CALIBRATION, CHECKPOINT, calibration_of
 from gsmap.utils.shards import digest
 from gsmap.utils.split_lists import (
@@ -167,7 +167,7 @@ class AtomicCheckpointHook(CheckpointHook):
         by_epoch = isinstance(loop, EpochBasedTrainLoop)
         done, end = (loop.epoch, loop.max_epochs) if by_epoch else (loop.iter, loop.max_iters)
         due = done >= max(loop.val_begin, 1) and (done % loop.val_interval == 0 or done == end)
-        validated = marker.exists() and marker.read_text() == str(runner.iter)
+        validated = marker.exists() and read_text(marker) == str(runner.iter)
         if due and runner.val_loop is not None and not validated:
             runner.logger.info("The run was cut off before its validation, which is made up for.")
             runner.val_loop.run()

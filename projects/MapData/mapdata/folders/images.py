@@ -47,6 +47,7 @@ _AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 _RATE_HZ = 10.0  # where a calibration file has no rate_hz
 _ANY_TWICE = ("**", "**")
 _MOST_ANY = 2  # ``**`` of a pattern, each of which takes the time times the depth of folders
+_MOST_BYTES = 300_000  # of a calibration file; YAML takes some milliseconds for a thousand
 _MOST_VALUES = 100_000  # in a calibration file
 
 
@@ -151,6 +152,8 @@ def _mapping_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _content(file: Path) -> Any:
     """Read a calibration file's values."""
+    if file.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"it has more than {_MOST_BYTES} bytes, which no calibration takes")
     text = read_text(file)
     try:
         if file.suffix == ".json":
