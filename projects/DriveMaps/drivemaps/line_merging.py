@@ -6,6 +6,7 @@ ones are kept, others add what these do not cover, and ends that meet are joined
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import shapely
@@ -20,6 +21,7 @@ from gsmap.structures.polylines import arc_lengths
 _REACH_M = 1.5  # how far across its line a vertex looks for the same line in another frame
 _MAX_TURN_DEG = 30.0  # between two lines that may be the same
 _STEP_M = 1.0  # largest distance between vertices while lines are merged
+_AT_ONCE = 2000  # vertices whose crossings are looked for together; memory grows with them
 _ROUNDS = 3  # how many times vertices move to the mean
 
 
@@ -41,12 +43,12 @@ class _Strands:
     scores: FloatArray
     weights: FloatArray
 
-    @property
+    @cached_property
     def owners(self) -> IntArray:
         """Line of each vertex. (M,)"""
         return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
 
-    @property
+    @cached_property
     def inner(self) -> IntArray:
         """Vertices that a segment starts at. (S,)"""
         return np.setdiff1d(np.arange(len(self.points)), self.offsets[1:] - 1)
@@ -141,13 +143,33 @@ def _crossings(strands: _Strands) -> _Crossings:
     frame has a line that is nearer to it: lines of one frame are different things.
     """
     normals, inner, points = _normals(strands), strands.inner, strands.points
-    reach, ends = _REACH_M * normals, np.stack([points[inner], points[inner + 1]])
+    ends = np.stack([points[inner], points[inner + 1]])
     low, high = ends.min(axis=0), ends.max(axis=0)
     tree = shapely.STRtree(shapely.box(*low.T, *high.T))
-    across = shapely.box(*(points - np.abs(reach)).T, *(points + np.abs(reach)).T)
+    found = [
+        _crossings_of(np.arange(start, min(start + _AT_ONCE, len(points))), strands, normals, tree)
+        for start in range(0, len(points), _AT_ONCE)
+    ]
+    vertices, segments, distances = map(np.concatenate, zip(*found, strict=True))
+    return _Crossings(vertices, segments, distances, normals)
+
+
+def _crossings_of(
+    chosen: IntArray, strands: _Strands, normals: FloatArray, tree: shapely.STRtree
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return vertices, segments and distances of the crossings of some vertices. (C,) each
+
+    Args:
+        chosen: The vertices, one after another. (m,)
+        strands: The lines.
+        normals: Direction to the left at every vertex. (M, 2)
+        tree: Boxes of the segments, in the order of ``strands.inner``.
+    """
+    points, owners = strands.points, strands.owners
+    reach = np.abs(_REACH_M * normals[chosen])
+    across = shapely.box(*(points[chosen] - reach).T, *(points[chosen] + reach).T)
     vertices, segments = tree.query(across)
-    segments = inner[segments]
-    owners = strands.owners
+    vertices, segments = chosen[vertices], strands.inner[segments]
     other = owners[vertices] != owners[segments]
     vertices, segments = vertices[other], segments[other]
     n, here = normals[vertices], points[vertices]
@@ -164,13 +186,14 @@ def _crossings(strands: _Strands) -> _Crossings:
     )
     vertices, segments, distances = vertices[kept], segments[kept], distances[kept]
     same_frame = strands.frames[vertices] == strands.frames[segments]
-    mutual = ~same_frame & _nearer(vertices, distances, same_frame, len(points))
+    nearer = _nearer(vertices - chosen[0], distances, same_frame, len(chosen))
+    mutual = ~same_frame & nearer
     vertices, segments, distances = vertices[mutual], segments[mutual], distances[mutual]
     order = np.lexsort((segments, np.abs(distances), strands.frames[segments], vertices))
     key = np.stack([vertices, strands.frames[segments]])[:, order]
-    first = np.append(True, (key[:, 1:] != key[:, :-1]).any(axis=0))[: len(order)]
-    best = order[first]
-    return _Crossings(vertices[best], segments[best], distances[best], normals)
+    new = np.append(True, (key[:, 1:] != key[:, :-1]).any(axis=0))[: len(order)]
+    best = order[new]
+    return vertices[best], segments[best], distances[best]
 
 
 def _nearer(

@@ -30,6 +30,8 @@ def annotated(results: Mapping[str, Any], transform: object) -> Sequence[Any]:
 
 FARTHEST_M = 1e5
 """How far from the vehicle a point of a map around it may lie, and how long a line may be."""
+MOST_M = 1e6
+"""How long all lines of a map around a vehicle may be together."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gsmap.structures.bezier import curve_points
-from gsmap.structures.elements import FARTHEST_M, MapElements
+from gsmap.structures.elements import FARTHEST_M, MOST_M, MapElements
 from gsmap.utils.files import atomic_write
 from gsmap.utils.json_items import Place, items_of
 from gsmap.utils.shards import ShardFile
@@ -164,7 +164,11 @@ def _require_near(elements: MapElements) -> None:
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
     steps[starts[starts < len(steps)]] = 0.0
-    if np.abs(points).max() > FARTHEST_M or steps.sum() > FARTHEST_M:
+    if (total := steps.sum()) > MOST_M:
+        raise ValueError(
+            f"lines of {total:.3g} m in all: at most {MOST_M / 1000:g} km of a sample are read"
+        )
+    if np.abs(points).max() > FARTHEST_M or total > FARTHEST_M:
         lengths = [steps[a:b].sum() for a, b in pairwise(elements.offsets)]
         if (worst := max(np.abs(points).max(), *lengths)) > FARTHEST_M:
             raise ValueError(

@@ -28,6 +28,7 @@ from gsmap.structures.elements import FloatArray
 from gsmap.structures.polylines import arc_lengths
 
 _STEP_M = 0.5  # between the points that are compared
+_MOST_STEPS = 2000  # of a line; the work grows with the square
 _CLOSED_M = 0.1  # largest gap between the ends of a ring
 _PARTS = ("PLD", "localisation", "cardinality")
 
@@ -35,13 +36,16 @@ _PARTS = ("PLD", "localisation", "cardinality")
 def spaced(line: FloatArray) -> FloatArray:
     """Return the points of a line at every half metre, and its end; none of a single point.
 
+    A line of more than a kilometre has 2,001 points.
+
     Args:
         line: Vertices in metres. (n, D)
     """
     if len(line) < 2:
         return line[:0]
     along = arc_lengths(line)
-    at = np.append(np.arange(0.0, max(along[-1], np.finfo(float).tiny), _STEP_M), along[-1])
+    step_m = max(_STEP_M, along[-1] / _MOST_STEPS)
+    at = np.append(np.arange(0.0, max(along[-1], np.finfo(float).tiny), step_m), along[-1])
     return np.stack([np.interp(at, along, column) for column in line.T], axis=-1)
 
 
