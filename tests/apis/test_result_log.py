@@ -37,6 +37,7 @@ FRAME = '{"sample_token":"t0","vectors":[{}]}'
         [HEAD, FRAME, FRAME],
         [HEAD, FRAME, '{"sample_token":"of another file","vectors":[]}'],
         [HEAD, '{"sample_token":1,"vectors":[]}'],
+        [HEAD, '{"sample_token":["t0"],"vectors":[]}'],
         [HEAD, '{"sample_token":"t0","vectors":[1]}'],
         [HEAD, '{"sample_token":"t0","broken":2}'],
         [HEAD, '["sample_token"]'],

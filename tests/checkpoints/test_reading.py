@@ -1,4 +1,5 @@
 import json
+import zipfile
 
 import pytest
 import torch
@@ -7,6 +8,7 @@ from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from torch import nn
 
+from gsmap.checkpoints.published import load_from_file
 from gsmap.checkpoints.reading import (
     adopt_settings,
     load_weights,
@@ -253,3 +255,20 @@ def test_differences_of_other_kinds_are_named_whole():
     assert differences({"a": [1]}, {"a": {"b": 1}}) == {"a": ([1], {"b": 1})}
     assert differences({"a": None}, {"a": {"b": 1}}) == {"a": (None, {"b": 1})}
     assert differences([1, 2], [1, 2, 3], "x") == {"x.2": (None, 3)}
+
+
+def test_a_checkpoint_with_packed_parts_is_refused(tmp_path):
+    """Zeros of 2 GB are 2 MB packed; torch packs nothing."""
+    plain_file = save(tmp_path / "a.pth", {"state_dict": {"x": torch.ones(1)}})
+    assert read_checked(plain_file).state["x"] == 1
+    packed = tmp_path / "b.pth"
+    with (
+        zipfile.ZipFile(plain_file) as source,
+        zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target,
+    ):
+        for name in source.namelist():
+            target.writestr(name, source.read(name))
+    with pytest.raises(ValueError, match=r"b.pth .*is packed, as torch packs nothing"):
+        read_checked(packed)
+    with pytest.raises(ValueError, match=r"b.pth .*is packed, as torch packs nothing"):
+        load_from_file(str(packed))

@@ -1,6 +1,7 @@
 """Images of the formats and pixels that cameras leave: read, or named with the cause."""
 
 import struct
+import zlib
 from io import BytesIO
 
 import cv2
@@ -9,7 +10,13 @@ import pytest
 from PIL import Image
 
 from gsmap.datasets.errors import BrokenSampleError
-from gsmap.datasets.image_files import decode_image, image_content, image_size, read_image
+from gsmap.datasets.image_files import (
+    decode_image,
+    encode_jpeg,
+    image_content,
+    image_size,
+    read_image,
+)
 
 COLOURS = np.full((24, 32, 3), (200, 30, 10), np.uint8)
 RAMP = np.tile(np.linspace(0, 65535, 256).astype(np.uint16), (2, 1))
@@ -123,3 +130,46 @@ def test_content_to_be_copied_is_that_of_an_image(tmp_path):
     (tmp_path / "a.jpg").write_bytes(saved(COLOURS, "BMP"))
     content, found = image_content(tmp_path / "a.jpg", "a", (32, 24))
     assert (content[:2], found) == (b"\xff\xd8", "jpeg")
+
+
+def png_of_zeros(width: int, height: int) -> bytes:
+    """A black PNG of one bit a pixel: a thousandth of its pixels, in bytes."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        check = struct.pack(">I", zlib.crc32(kind + content))
+        return struct.pack(">I", len(content)) + kind + content + check
+
+    head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    pixels = zlib.compress(bytes(1 + (width + 7) // 8) * height, 9)
+    parts = (b"IHDR", head), (b"IDAT", pixels), (b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+
+
+def jpeg_of_size(width: int, height: int) -> bytes:
+    content = encode_jpeg(np.zeros((8, 8, 3), np.uint8), 50)
+    at = content.index(b"\xff\xc0") + 5
+    return content[:at] + struct.pack(">HH", height, width) + content[at + 4 :]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("a.png", png_of_zeros(10_001, 10_000)), ("a.jpg", jpeg_of_size(20_000, 5_001))],
+)
+def test_an_image_of_more_than_a_hundred_million_pixels_is_refused(name, content, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=r"cannot be used: it has .* more than 100 million"):
+        image_size(tmp_path / name, "here")
+    with pytest.raises(BrokenSampleError, match=r"cannot be used: it has .* more than 100 million"):
+        decode_image(content, name, "here")
+    assert decode_image(png_of_zeros(1000, 100), name, "here").shape == (100, 1000, 3)
+
+
+def test_a_jpeg_of_many_scans_is_refused():
+    buffer = BytesIO()
+    Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(buffer, "JPEG", progressive=True)
+    content = buffer.getvalue()
+    assert decode_image(content, "a.jpg", "here").shape == (16, 16, 3)
+    last = content.rindex(b"\xff\xda")
+    bomb = content[:last] + content[last:-2] * 100 + content[-2:]
+    with pytest.raises(BrokenSampleError, match=r"it has 1.. scans, more than 100"):
+        decode_image(bomb, "a.jpg", "here")

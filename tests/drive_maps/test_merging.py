@@ -3,15 +3,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
-from drive_cases import CLASSES, drive_of, street
+from drive_cases import CLASSES, X_RANGE, Y_RANGE, drive_of, street
 
+from drivemaps import line_merging
 from drivemaps.area_merging import merge_areas
 from drivemaps.config import MergeConfig
-from drivemaps.drive import DriveFrame
+from drivemaps.drive import Drive, DriveFrame
 from drivemaps.merging import confident, merge, suppress
-from drivemaps.scoring import map_figures, near_and_total_m
+from drivemaps.scoring import cut_to_frame, map_figures, near_and_total_m
 from drivemaps.stitching import stitch
 from drivemaps.truth import polygons_of, true_map
+from gsmap.datasets.annotations.record import MapSample
 from gsmap.structures.elements import MapElements
 
 
@@ -190,3 +192,73 @@ def test_lines_a_metre_apart_or_less_are_suppressed():
     elements = MapElements.from_polylines(lines, [0] * 3, [0.9, 0.8, 0.7])
     drive = replace(drive, frames=[DriveFrame(drive.frames[0].sample, elements)])
     assert suppress(drive).scores.tolist() == [0.9, 0.7]
+
+
+def straight(count: int) -> Drive:
+    """A drive along a straight street, with what each of its frames sees of it."""
+    x0, x1 = X_RANGE
+    frames = []
+    for number in range(count):
+        pose = np.eye(4)
+        pose[0, 3] = 10.0 * number
+        sample = MapSample(f"t{number}", "scene", "town", number * 10**9, [], pose)
+        lines = [np.array([[x0, y], [x1, y]]) for y in (-3.0, 3.0)]
+        area = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 2.0], [0.0, 2.0], [0.0, 0.0]])
+        empty = DriveFrame(sample, MapElements.from_polylines())
+        own = [empty.to_global(line) for line in [*lines, area]]
+        labels = [CLASSES.index(name) for name in ("divider", "boundary", "ped_crossing")]
+        frames.append(DriveFrame(sample, MapElements.from_polylines(own, labels, [0.9] * 3)))
+    return Drive("scene", CLASSES, X_RANGE, Y_RANGE, frames)
+
+
+def test_the_work_grows_with_the_frames_of_a_drive(monkeypatch):
+    """Points that are moved into frames: twice the frames, twice the points."""
+    moved = []
+    to_frame = DriveFrame.to_frame
+
+    def counted(self, points):
+        moved.append(np.size(points))
+        return to_frame(self, points)
+
+    monkeypatch.setattr(DriveFrame, "to_frame", counted)
+    work = []
+    for count in (40, 80):
+        drive = straight(count)
+        pieces = [DriveFrame(f.sample, f.elements) for f in drive.frames]
+        apart = MapElements.from_polylines(
+            [line for f in pieces for line in f.elements.polylines],
+            [label for f in pieces for label in f.elements.labels],
+            [0.9] * 3 * count,
+        )
+        moved.clear()
+        merge(drive)
+        for frame in drive.frames:
+            cut_to_frame(apart, drive, frame)
+        work.append(sum(moved))
+    assert work[1] < 2.3 * work[0]
+
+
+def test_what_a_frame_sees_and_how_often_is_that_of_all_elements_looked_at():
+    drive = drive_of(0.1, scored=True)
+    found = suppress(drive)
+    points = found.points + np.random.default_rng(0).normal(0, 20, found.points.shape)
+    expected = np.sum([drive.sees(frame, points) for frame in drive.frames], axis=0)
+    np.testing.assert_array_equal(drive.times_seen(points), expected)
+    low, high = np.array([drive.x_range, drive.y_range]).T
+    for frame in drive.frames:
+        near = drive.nearby(frame, found)
+        kept = {line.tobytes() for line in near.polylines}
+        for line in found.polylines:
+            local = frame.to_frame(line)
+            meets = shapely.LineString(local).intersects(shapely.box(*low, *high))
+            assert line.tobytes() in kept or not meets
+
+
+@pytest.mark.parametrize("at_once", [7, 100])
+def test_crossings_that_are_looked_for_in_parts_are_the_same(at_once, monkeypatch):
+    drive = drive_of(0.3, scored=True)
+    whole = merge(drive)
+    monkeypatch.setattr(line_merging, "_AT_ONCE", at_once)
+    parts = merge(drive)
+    np.testing.assert_array_equal(whole.points, parts.points)
+    np.testing.assert_array_equal(whole.scores, parts.scores)

@@ -217,6 +217,14 @@ def test_heights_count_in_chamfer_if_asked_and_never_in_raster(tmp_path):
             + '], "cls_name": "divider", "confidence_level": 1}]}]}',
             "t0.*a line of 4.5e\\+05 m",
         ),
+        (  # each line is short enough, all of them are too much
+            '{"results": [{"sample_token": "t0", "vectors": ['
+            + ", ".join(
+                ['{"pts": [[0, 0], [9e4, 0]], "cls_name": "divider", "confidence_level": 1}'] * 12
+            )
+            + "]}]}",
+            "t0.*lines of 1.08e\\+06 m in all: at most 1000 km",
+        ),
         (  # names of two kinds could not be sorted in the notes
             '{"results": [{"sample_token": "t0", "vectors": [{"pts": [[0, 0], [1, 1]],'
             '"cls_name": null, "confidence_level": 1}, {"pts": [[0, 0], [1, 1]],'

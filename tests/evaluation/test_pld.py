@@ -49,6 +49,13 @@ def test_points_stand_every_half_metre_and_at_the_end():
     assert spaced(LINE[:1]).shape == (0, 2)
 
 
+def test_lines_of_kilometres_have_two_thousand_steps():
+    for length_m, count in ((1000.0, 2001), (1001.0, 2001), (100_000.0, 2001), (999.5, 2000)):
+        points = spaced(np.array([[0.0, 0.0], [length_m, 0.0]]))
+        assert len(points) in (count, count + 1)  # the end may be there by a rounding
+        np.testing.assert_array_equal(points[-1], [length_m, 0])
+
+
 def test_a_shifted_line_costs_its_shift_at_every_point():
     # C = 7 * 0.2, G = 0.5 * 14: 2 * 1.4 / 8.4, all of it between paired points
     assert of_lines(aside(0.2), LINE) == pytest.approx((1 / 3, 1 / 3), abs=1e-12)

@@ -1,5 +1,7 @@
 """Piecewise Bezier curves: scipy's values, exact lines, the error that was asked for."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import shapely
@@ -7,7 +9,9 @@ from scipy.interpolate import BPoly
 
 from gsmap.structures.bezier import (
     bernstein,
+    controls_between,
     curve_points,
+    fit_joints,
     fit_piece,
     fit_pieces,
     largest_deviation,
@@ -67,6 +71,57 @@ def test_deviations_are_distances():
     dense = resample(line, 1000)
     assert mean_deviation(line, dense + np.array([0, 0.5])) == pytest.approx(0.5, abs=1e-3)
     assert mean_deviation(line, dense + np.array([0, 0.04])) == 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_largest_deviations_are_shapelys(seed):
+    line, curve = np.random.default_rng(seed).normal(size=(2, 30, 3))
+    line[3], line[7] = line[2], line[6]  # steps of no length
+    sides = np.concatenate([line, resample(line, 100)]), curve
+    apart = [
+        shapely.distance(shapely.points(points[:, :2]), shapely.linestrings(other[:, :2])).max()
+        for points, other in zip(sides, (curve, line), strict=True)
+    ]
+    assert largest_deviation(line, curve) == pytest.approx(max(apart), abs=1e-12)
+
+
+@pytest.mark.parametrize("deviation", [largest_deviation, mean_deviation])
+def test_joints_are_the_farthest_ends_that_fit(deviation):
+    line = np.cumsum(np.random.default_rng(0).normal([1.0, 0], 0.2, (20, 2)), axis=0)
+    joints = fit_joints(line, 3, 0.1, deviation)
+    for start, end in pairwise(joints):
+        fits = [
+            deviation(part, curve_points(fit_piece(part, 3), 3)) < 0.1
+            for part in (line[start : other + 1] for other in range(end, 20))
+        ]
+        assert fits[0] or end == start + 1
+        assert not any(fits[1:])
+
+
+def zigzag(count: int) -> np.ndarray:
+    return np.stack([np.tile([-15.0, 15.0], count // 2), np.linspace(-30, 30, count)], axis=1)
+
+
+@pytest.mark.parametrize("count", [100, 400, 1600])
+def test_the_search_for_joints_is_bounded_by_the_number_of_vertices(count):
+    """Without the bound it looks at a third of the cube of their number."""
+    looked_at = []
+
+    def deviation(part, curve):
+        looked_at.append(len(part) + 100)
+        return 0.0 if len(part) == 2 else 9.0
+
+    assert fit_joints(zigzag(count), 3, 0.1, deviation) == list(range(count))
+    assert sum(looked_at) <= (2000 + 2 * 103) * count
+
+
+def test_a_zigzag_keeps_its_error_within_the_bound():
+    line = zigzag(3000)
+    joints = fit_joints(line, 3, 0.1)
+    controls = controls_between(line, joints, 3)
+    for number, (start, end) in enumerate(pairwise(joints)):
+        piece = curve_points(controls[3 * number : 3 * number + 4], 3)
+        assert largest_deviation(line[start : end + 1], piece) < 0.1
 
 
 @pytest.mark.parametrize(

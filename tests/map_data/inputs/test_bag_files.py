@@ -217,3 +217,21 @@ def test_a_topic_whose_type_cannot_be_read_costs_itself_and_is_named(tmp_path):
     assert not source.has_poses
     assert len(source.samples) == 11
     assert source.notes[0].startswith("'/tf' is left out: Could not parse")
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "mcap", "ros1"])
+@pytest.mark.parametrize("name", ["a#b", "a?b=c", "a b&c", "a%20b"])
+def test_a_folder_may_have_signs_of_addresses_in_its_name(kind, name, tmp_path):
+    recorder = Recorder(tmp_path / "drive", kind)
+    with recorder:
+        recorder.send("/x", "std_msgs/msg/String", 5, data="hello")
+    (tmp_path / name).mkdir()
+    path = recorder.path.rename(tmp_path / name / recorder.path.name)
+    if kind == "sqlite" and "%" in name:
+        with pytest.raises(ValueError, match=r"its path has a % with two digits.*rename that"):
+            open_input(path, options(tmp_path))
+        return
+    bag = bag_at(path)
+    bag.open()
+    assert [time_ns for _, time_ns, _ in bag.messages(bag.connections)] == [5]
+    bag.close()

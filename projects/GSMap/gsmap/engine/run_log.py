@@ -21,7 +21,7 @@ from gsmap.engine.cpu_autocast import CPUAutocastOptimWrapper
 from gsmap.engine.launch import newest_checkpoint, rank_timeout_s
 from gsmap.engine.rank_watch import RankWatch
 from gsmap.engine.resuming import refusing_state
-from gsmap.utils.files import write_text
+from gsmap.utils.files import naming_file, write_text
 from gsmap.utils.words import counted
 
 # How mmengine's long records begin, and those that say nothing about the run
@@ -70,14 +70,14 @@ class MapRunner(Runner):
             FloatingPointError: If they are not.
         """
         try:
-            with self._watched():
+            with naming_file(Path(self.work_dir)), self._watched():
                 return super().train()
         except FloatingPointError as error:
             raise FloatingPointError(f"{error} {_what_to_lower(self)}") from error
 
     def test(self) -> dict:
         """Test."""
-        with self._watched():
+        with naming_file(Path(self.work_dir)), self._watched():
             return super().test()
 
     def resume(self, filename: str, *args: Any, **kwargs: Any) -> None:

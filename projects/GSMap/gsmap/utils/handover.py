@@ -1,4 +1,4 @@
-"""A batch that a data loader's worker cannot hand over ends the command, which would wait for it."""
+"""A batch that a worker cannot hand over ends its command, which would wait for it for ever."""
 
 from multiprocessing import queues
 from typing import Any

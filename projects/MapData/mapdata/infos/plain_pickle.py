@@ -17,6 +17,7 @@ _STAND_INS: dict[str, Callable[..., Any]] = {
     "__builtin__.bytes": lambda: b"",
     "builtins.bytes": lambda: b"",
 }
+_KEY_BITS, _KEY_PARTS = 60, 8
 _KEYS = (str, bytes, int, float, np.generic, type(None))
 _CONTAINERS = (list, tuple, dict, set, frozenset)
 _MAX_DEPTH = 50
@@ -98,6 +99,12 @@ def _key(value: Any) -> Hashable:
     parts = value if isinstance(value, tuple) else (value,)
     if not all(isinstance(part, _KEYS) for part in parts):
         raise pickle.UnpicklingError(f"a key is a {type(value).__name__}")
+    # such keys may all have one hash, and a dict of them takes the square of their number
+    is_wide = any(isinstance(part, int) and part.bit_length() > _KEY_BITS for part in parts)
+    if is_wide or (len(parts) > 1 and any(isinstance(part, float) for part in parts)):
+        raise pickle.UnpicklingError(f"a key is a number of more than {_KEY_BITS} bits")
+    if len(parts) > _KEY_PARTS:
+        raise pickle.UnpicklingError(f"a key has {len(parts)} parts")
     return value
 
 

@@ -164,10 +164,7 @@ def _require_near(elements: MapElements) -> None:
     steps = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
     starts = elements.offsets[:-1]
     steps[starts[starts < len(steps)]] = 0.0
-    if (total := steps.sum()) > MOST_M:
-        raise ValueError(
-            f"lines of {total:.3g} m in all: at most {MOST_M / 1000:g} km of a sample are read"
-        )
+    total = steps.sum()
     if np.abs(points).max() > FARTHEST_M or total > FARTHEST_M:
         lengths = [steps[a:b].sum() for a, b in pairwise(elements.offsets)]
         if (worst := max(np.abs(points).max(), *lengths)) > FARTHEST_M:
@@ -175,6 +172,10 @@ def _require_near(elements: MapElements) -> None:
                 f"a line of {worst:.3g} m, or that far from the vehicle: at most "
                 f"{FARTHEST_M / 1000:g} km are read"
             )
+    if total > MOST_M:
+        raise ValueError(
+            f"lines of {total:.3g} m in all: at most {MOST_M / 1000:g} km of a sample are read"
+        )
 
 
 def _points_of(vector: Mapping[str, Any]) -> Any:
