@@ -1,5 +1,6 @@
 """What mmengine tells of itself: only to whoever debugs."""
 
+import errno
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ from mmengine.config import Config
 from mmengine.evaluator import Evaluator
 from mmengine.evaluator.metric import DumpResults
 from mmengine.hooks import Hook
+from mmengine.runner import Runner
 
 import gsmap.registered  # noqa: F401
 from gsmap.engine.run_log import MapRunner, _missed_elements
@@ -74,3 +76,18 @@ def test_elements_that_no_query_is_left_for_are_counted():
         "24 elements can never be found."
     )
     assert _missed_elements(*run_with([3, 20, -1], 20)) is None
+
+
+@pytest.mark.parametrize("loop", ["train", "test"])
+def test_a_full_disk_is_named_by_the_folder_of_the_run(loop, tmp_path, monkeypatch):
+    """mmengine's writers say no file."""
+
+    def full(_runner):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Runner, loop, full)
+    runner = MapRunner.__new__(MapRunner)
+    runner._work_dir, runner._world_size = str(tmp_path), 1
+    with pytest.raises(OSError, match="No space left") as caught:
+        getattr(runner, loop)()
+    assert caught.value.filename == str(tmp_path)

@@ -9,6 +9,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.rosbag1 import Reader as Reader1
 
+from mapdata.bag_files import bag_at
 from mapdata.inputs import open_input
 
 PROTOBUF = ("vendor.Health", "protobuf", b"\x0a\x00", "/health", "protobuf")
