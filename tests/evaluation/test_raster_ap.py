@@ -228,3 +228,7 @@ def test_bad_configuration_is_refused():
         RasterConfig(CLASSES, dilation_px=4)
     with pytest.raises(ValueError, match="at least one pixel"):
         RasterConfig(CLASSES, px_per_m=0.01)
+    with pytest.raises(
+        ValueError, match=r"at most 2e\+07 pixels, not 800000 x 800000: give --range"
+    ):
+        RasterConfig(CLASSES, BEVGrid((-5e4, 5e4), (-5e4, 5e4)))

@@ -33,6 +33,7 @@ MIN_SCORE = 0.05
 MAX_PREDICTIONS = 100  # of a class and sample
 RECALL_LIMITS = (1, 10, 100)
 NUSCENES_GRID = BEVGrid((-15.0, 15.0), (-30.0, 30.0))
+_MOST_PX = 2e7  # of a canvas: 560 m by 560 m at 8 pixels per metre
 _FAR_PX = 2.0**20  # farther points are pulled in, so that they fit the integers of the drawing
 
 
@@ -66,6 +67,12 @@ class RasterConfig(Metric):
         object.__setattr__(self, "classes", checked_classes(self.classes))
         if self.px_per_m <= 0 or min(self.size_px) < 1:
             raise ValueError(f"px_per_m must give at least one pixel, got {self.px_per_m}.")
+        if np.prod(self.size_px, dtype=np.float64) > _MOST_PX:
+            columns, rows = self.size_px
+            raise ValueError(
+                f"a canvas of AP_raster has at most {_MOST_PX:.0e} pixels, not {columns} x {rows}: "
+                "give --range, or leave that metric out with --eval chamfer"
+            )
         if self.dilation_px < 1 or self.dilation_px % 2 == 0:
             raise ValueError(f"dilation_px must be odd and >= 1, got {self.dilation_px}.")
 
