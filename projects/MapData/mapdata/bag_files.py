@@ -14,7 +14,6 @@ Bag = RosBag | McapBag
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"
 _MOST_BYTES = 300_000  # of metadata; reading a thousand bytes takes some milliseconds
-_CODE = re.compile("%[0-9A-Fa-f]{2}")
 _ALIAS = re.compile(r"(^|[\s\[{,:-])\*\w", re.MULTILINE)
 _PACKED = (".zstd", ".zst", ".lz4", ".gz", ".bz2", ".xz", ".zip", ".tar")
 _STARTS = {".mcap": MAGIC, ".db3": b"SQLite format 3\0", ".bag": b"#ROSBAG V2.0"}
@@ -128,8 +127,6 @@ def _notes_on(parts: Sequence[Path]) -> list[str]:
 
 def damage_in(path: Path) -> str | None:
     """Say how the files of a bag are damaged, and how to mend them; None if nothing is found."""
-    if _CODE.search(str(path)) and any(p.suffix == ".db3" for p in _files_of(path)):
-        return "its path has a % with two digits, which SQLite takes for a letter: rename that"
     if not path.is_dir():
         return _damage_of(path)
     file = path / _METADATA
@@ -143,11 +140,6 @@ def damage_in(path: Path) -> str | None:
         )
     found = ((part.name, _damage_of(part)) for part in parts_in(path))
     return next((f"{name}: {damage}" for name, damage in found if damage), None)
-
-
-def _files_of(path: Path) -> list[Path]:
-    """Return the files of a bag, or the file that it is."""
-    return parts_in(path) if path.is_dir() else [path]
 
 
 def _listed_names(file: Path) -> list[str] | None:

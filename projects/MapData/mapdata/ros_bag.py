@@ -31,6 +31,13 @@ def library_errors() -> Iterator[None]:
         raise ValueError(str(error) or type(error).__name__) from error
 
 
+class _AddressedPath(type(Path())):  # type: ignore[misc]
+    """A path that rosbags can put into an address of SQLite, whatever signs it has."""
+
+    def __format__(self, _: str) -> str:
+        return str(self).replace("%", "%25").replace("?", "%3f").replace("#", "%23")
+
+
 class RosTypes:
     """The types of a bag's messages, made as they are needed.
 
@@ -168,7 +175,7 @@ class RosBag:
         reader_type = import_bounded(module).Reader
         for path in self.paths:
             with library_errors():
-                reader = reader_type(path)
+                reader = reader_type(_AddressedPath(path))
                 reader.open()
             self._readers.append(reader)
             self.connections += reader.connections

@@ -228,10 +228,6 @@ def test_a_folder_may_have_signs_of_addresses_in_its_name(kind, name, tmp_path):
         recorder.send("/x", "std_msgs/msg/String", 5, data="hello")
     (tmp_path / name).mkdir()
     path = recorder.path.rename(tmp_path / name / recorder.path.name)
-    if kind == "sqlite" and "%" in name:
-        with pytest.raises(ValueError, match=r"its path has a % with two digits.*rename that"):
-            open_input(path, options(tmp_path))
-        return
     bag = bag_at(path)
     bag.open()
     assert [time_ns for _, time_ns, _ in bag.messages(bag.connections)] == [5]
