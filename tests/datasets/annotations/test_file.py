@@ -214,6 +214,8 @@ def test_meta_refuses_bad_values():
         AnnotationMeta("x", "ego", "val", classes=("a", "a"))
     with pytest.raises(ValueError, match="classes must be names"):
         AnnotationMeta("x", "ego", "val", classes="abc")
+    with pytest.raises(ValueError, match="at most 1000 classes, not 1001"):
+        AnnotationMeta("x", "ego", "val", classes=[f"class {i}" for i in range(1001)])
     with pytest.raises(ValueError, match="dataset must be a text"):
         AnnotationMeta(3, "ego", "val")
 

@@ -9,6 +9,7 @@ from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
 FORMAT_VERSION = 1
 _HIGHEST_GROUND_M = 10.0
+_MOST_CLASSES = 1000
 CLASSES = ("divider", "ped_crossing", "boundary")
 RANGES = {"lidar": ((-15.0, 15.0), (-30.0, 30.0)), "ego": ((-30.0, 30.0), (-15.0, 15.0))}
 """The usual range of each annotation frame: smallest and largest x, and y, in metres."""
@@ -179,6 +180,8 @@ class AnnotationMeta:
         named = all(isinstance(name, str) and name for name in names)
         if not (named and 0 < len(names) == len(set(names))):
             raise ValueError(f"classes must be names, different ones, got {self.classes!r}.")
+        if len(names) > _MOST_CLASSES:
+            raise ValueError(f"there are at most {_MOST_CLASSES} classes, not {len(names)}.")
         object.__setattr__(self, "classes", tuple(names))
         for name, usual in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):
             given = getattr(self, name)
