@@ -120,6 +120,17 @@ class MapSample:
     ego_from_frame: np.ndarray | None = None
 
 
+def _names(classes: Any) -> tuple[str, ...]:
+    """Return the names of classes; ValueError if they are none."""
+    names = classes if isinstance(classes, (list, tuple)) else ()
+    named = all(isinstance(name, str) and name for name in names)
+    if not (named and 0 < len(names) == len(set(names))):
+        raise ValueError(f"classes must be names, different ones, got {classes!r}.")
+    if len(names) > _MOST_CLASSES:
+        raise ValueError(f"there are at most {_MOST_CLASSES} classes, not {len(names)}.")
+    return tuple(names)
+
+
 @dataclass(frozen=True)
 class AnnotationMeta:
     """What holds for a whole annotation file; stored in its schema.
@@ -176,13 +187,7 @@ class AnnotationMeta:
             raise ValueError(f"frame must be one of {tuple(RANGES)}, got {self.frame!r}.")
         if self.dim not in (2, 3):
             raise ValueError(f"dim must be 2 or 3, got {self.dim!r}.")
-        names = self.classes if isinstance(self.classes, (list, tuple)) else ()
-        named = all(isinstance(name, str) and name for name in names)
-        if not (named and 0 < len(names) == len(set(names))):
-            raise ValueError(f"classes must be names, different ones, got {self.classes!r}.")
-        if len(names) > _MOST_CLASSES:
-            raise ValueError(f"there are at most {_MOST_CLASSES} classes, not {len(names)}.")
-        object.__setattr__(self, "classes", tuple(names))
+        object.__setattr__(self, "classes", _names(self.classes))
         for name, usual in zip(("x_range", "y_range"), RANGES[self.frame], strict=True):
             given = getattr(self, name)
             low, high = (float(v) for v in (usual if given is None else given))
