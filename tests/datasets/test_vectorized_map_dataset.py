@@ -98,11 +98,48 @@ def test_a_speed_comes_from_the_pose_and_the_time_of_the_sample_beside(
         np.testing.assert_allclose(velocity, [6, 0, 0], atol=1e-6)
 
 
+def test_signals_of_the_pose_alone_are_those_of_maptr_on_argoverse_2(
+    build, minicity_root, minicity_annotations
+):
+    """Quaternion of the vehicle, ones, and its yaw in [0, 2 pi), whatever the sample has."""
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root)
+    dataset = build(**config, pose_only_signals=True)
+    for row, sample in enumerate(AnnotationFile(minicity_annotations["train"])):
+        found = dataset.get_data_info(row)["can_bus"]
+        ego = sample.global_from_frame @ np.linalg.inv(sample.ego_from_frame)
+        w, x, y, z = found[3:7]
+        turned = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+        np.testing.assert_allclose(turned, ego[:3, 0], atol=1e-6)  # its x axis in the world
+        assert np.linalg.norm(found[3:7]) == pytest.approx(1)
+        np.testing.assert_array_equal(found[7:16], 1)
+        assert found[16] == pytest.approx(np.arctan2(ego[1, 0], ego[0, 0]) % (2 * np.pi))
+        np.testing.assert_array_equal(found[[0, 1, 2, 17]], 0)
+    assert dataset.has_signals()
+
+
 @pytest.fixture(scope="module")
 def with_heights(minicity_annotations, tmp_path_factory) -> Path:
     """MiniCity's training file with points of three coordinates: z = 0.1 x - 1.8."""
     path = tmp_path_factory.mktemp("heights") / "gsmap_minicity_train.arrow"
     return write_raised(minicity_annotations["train"], path)
+
+
+def test_heights_of_a_file_are_handed_on_beside_points_of_two_coordinates(
+    build, minicity_root, with_heights, minicity_annotations
+):
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root)
+    info = build(**{**config, "ann_file": str(with_heights)}).get_data_info(0)
+    assert {e.points.shape[1] for e in info["map_instances"]} == {2}
+    for element, heights in zip(info["map_instances"], info["map_heights"], strict=True):
+        np.testing.assert_allclose(heights, 0.1 * element.points[:, 0] - 1.8, atol=1e-5)
+    assert build(**config).get_data_info(0)["map_heights"] is None
+
+
+def test_another_rule_of_the_crossings_is_refused(build, minicity_root, minicity_annotations):
+    config = dataset_config(MINICITY, "train_dataloader", minicity_root)
+    assert len(build(**config, crossings="united"))
+    with pytest.raises(ValueError, match=r"made with crossings united, .* asks for edges: change"):
+        build(**config, crossings="edges")
 
 
 def test_two_coordinates_of_a_file_of_three_are_those_of_a_file_of_two(

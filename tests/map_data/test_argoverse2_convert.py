@@ -122,6 +122,36 @@ def test_training_takes_every_sweep_and_tests_take_every_fourth(split, every, tm
     assert file.meta.options["rate_hz"] == 10 / every
 
 
+def test_samples_of_a_whole_split_thin_out_by_time_over_all_logs(tmp_path):
+    """Three logs of n samples each: every fourth of 3 n, wherever a log begins."""
+    names = ("log-a", "log-b", "log-c")
+    for name in names:
+        write_log(tmp_path / "val" / name)
+    for image in (tmp_path / "val/log-b/sensors/cameras/ring_side_left").iterdir():
+        if int(image.stem) < START_NS + 100_000_000:
+            image.unlink()  # its first sample cannot be made, and does not count
+    sweeps = Argoverse2Log(tmp_path / "val/log-a").lidar_timestamps_ns.tolist()
+    usable = [(t, n) for t in sweeps for n in names if (t, n) != (sweeps[0], "log-b")]
+    wanted = {f"{name}_{time}" for time, name in sorted(usable)[::4]}
+    summary, file = convert(tmp_path, rate_hz=2.5, thin_over="split")
+    assert {s.token for s in file} == wanted
+    assert "1 x sample left out: no image of ring_side_left" in summary
+    assert file.meta.options["thin_over"] == "split"
+    _, each = convert(tmp_path, rate_hz=2.5, tag="_each")
+    assert {s.token for s in each} != wanted
+    assert "thin_over" not in each.meta.options
+
+
+def test_a_log_that_cannot_be_read_leaves_the_others_their_turn(tmp_path):
+    for name in ("log-a", "log-b"):
+        write_log(tmp_path / "val" / name)
+    (tmp_path / "val/log-a/city_SE3_egovehicle.feather").unlink()
+    summary, file = convert(tmp_path, rate_hz=2.5, thin_over="split")
+    sweeps = Argoverse2Log(tmp_path / "val/log-b").lidar_timestamps_ns
+    assert [s.timestamp_ns for s in file] == sweeps[::4].tolist()
+    assert "no poses at" in summary
+
+
 def test_every_nth_pose_needs_neither_sensors_nor_calibration(tmp_path):
     times = START_NS + 5_000_000 * np.arange(25)
     write_map(tmp_path / "val" / "log-a")
@@ -288,6 +318,9 @@ def test_bad_rates_are_refused(text):
         ({"compat": "v3"}, "compat must be one of"),
         ({"classes": ("lamp",)}, "classes must be among"),
         ({"dim": 4}, "dim must be 2 or 3"),
+        ({"thin_over": "year"}, "thin_over must be one of"),
+        ({"thin_over": "split", "rate_hz": None}, "give a rate"),
+        ({"thin_over": "split", "at": "poses:5"}, "give a rate"),
     ],
 )
 def test_bad_options_are_refused(wrong, message):

@@ -9,12 +9,8 @@ from argoverse2_road import bow_tie, crossing, pose, road_map, write_map
 from av2.geometry.geometry import quat_to_mat
 
 from mapdata.argoverse2.map import Argoverse2Map
-from mapdata.argoverse2.rules import (
-    cut_rings,
-    drop_duplicates,
-    merge_parallel,
-    merge_until_stable,
-)
+from mapdata.argoverse2.rules import drop_duplicates, merge_until_stable
+from mapdata.crossings import cut_rings, merge_parallel
 from mapdata.local_map import LocalPatch, rings_of
 
 

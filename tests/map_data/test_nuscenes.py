@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 from processes import run_tool
 
 from gsmap.datasets.annotations.file import AnnotationFile, AnnotationWriter
@@ -35,13 +36,15 @@ def square(x: float, y: float, size: float) -> shapely.Polygon:
     return shapely.box(x, y, x + size, y + size)
 
 
-def local_map(classes: tuple[str, ...], **layers: list) -> NuScenesLocalMap:
+def local_map(
+    classes: tuple[str, ...], crossings: str = "united", **layers: list
+) -> NuScenesLocalMap:
     lines = layers.pop("road_divider", [])
     polygons = {name: np.array(geometries, object) for name, geometries in layers.items()}
     for name in classes:
         if name not in ("divider", "boundary"):
             polygons.setdefault(name, np.empty(0, object))
-    return NuScenesLocalMap(MapLayers(lines, polygons, Counter()), classes)
+    return NuScenesLocalMap(MapLayers(lines, polygons, Counter()), classes, crossings=crossings)
 
 
 def pose(x: float, y: float, yaw_deg: float) -> np.ndarray:
@@ -64,6 +67,71 @@ def test_overlapping_crossings_unite_and_close_at_the_patch():
     assert shapely.Polygon(found.points).area == pytest.approx(4 * 2 + 3 * 10)
     assert found.points[:, 0].max() == pytest.approx(15)
     assert not shapely.is_ccw(shapely.LinearRing(found.points))
+
+
+def crossing_lines(rule: str, crossings: list[shapely.Polygon], *at: float) -> list[np.ndarray]:
+    """Return the lines of crossings by a rule, at a pose (x, y, degrees)."""
+    town = local_map(("ped_crossing",), crossings=rule, ped_crossing=crossings)
+    return [instance.points for instance in town.instances(pose(*at))]
+
+
+def test_edges_are_the_two_longest_of_each_crossing_and_never_united():
+    """Two crossings overlap; the second is cut by the patch at x = 15.
+
+    ::
+
+        y = 3   +-----------+   +----|--+      the edges of 8 m and of 9 m,
+        y = 0   +-----------+---+----|--+      each cut at x = 15
+                2          10   9   15  18
+    """
+    lines = crossing_lines("edges", [shapely.box(2, 0, 10, 3), shapely.box(9, 0, 18, 3)], 0, 0, 0)
+    found = {tuple(sorted(map(tuple, line.round(6).tolist()))) for line in lines}
+    assert found == {
+        ((2, 0), (10, 0)), ((2, 3), (10, 3)), ((9, 0), (15, 0)), ((9, 3), (15, 3)),
+    }  # fmt: skip
+    assert all(len(line) == 2 for line in lines)
+
+
+def test_edges_turn_with_the_frame_and_the_longer_one_comes_second():
+    slanted = shapely.Polygon([(0, 0), (6, 0), (5, 2), (0, 2)])
+    first, second = crossing_lines("edges", [slanted], 0, 0, 90)
+    np.testing.assert_allclose(sorted(first.round(6).tolist()), [[2, -5], [2, 0]])
+    np.testing.assert_allclose(sorted(second.round(6).tolist()), [[0, -6], [0, 0]])
+
+
+def test_parallel_crossings_unite_and_stay_open_where_the_patch_cuts_them():
+    """Two halves of one crossing become one ring; one across the edge ends 0.2 m inside.
+
+    ::
+
+        y = 2   +-----+-----+      +---|--+
+                |     |     |      |   |         open at x = 14.8
+        y = 0   +-----+-----+      +---|--+
+                0     3     6     12  15  20
+    """
+    halves = [shapely.box(0, 0, 3, 2), shapely.box(3, 0, 6, 2), shapely.box(12, 0, 20, 2)]
+    whole, cut = sorted(crossing_lines("parallel", halves, 0, 0, 0), key=lambda p: p[:, 0].min())
+    np.testing.assert_array_equal(whole[0], whole[-1])
+    assert shapely.Polygon(whole).area == pytest.approx(12)
+    assert shapely.is_ccw(shapely.LinearRing(whole))
+    np.testing.assert_allclose(sorted(cut[[0, -1]].round(6).tolist()), [[14.8, 0], [14.8, 2]])
+    assert len(cut) == 4
+
+
+def test_crossings_at_right_angles_stay_two_by_the_rule_of_parallel_ones():
+    two = [shapely.box(0, 0, 8, 2), shapely.box(3, -6, 5, 1)]
+    assert len(crossing_lines("parallel", two, 0, 0, 0)) == 2
+    assert len(crossing_lines("united", two, 0, 0, 0)) == 1
+    turned = [shapely.box(0, 0, 8, 2), shapely.affinity.rotate(shapely.box(6, 0, 14, 2), 9)]
+    assert len(crossing_lines("parallel", turned, 0, 0, 0)) == 2  # beyond 8 degrees
+
+
+def test_no_crossing_near_gives_no_line_and_an_unknown_rule_is_refused():
+    for rule in ("united", "edges", "parallel"):
+        assert crossing_lines(rule, [square(90, 90, 4)], 0, 0, 0) == []
+        assert crossing_lines(rule, [], 0, 0, 0) == []
+    with pytest.raises(ValueError, match=r"crossings must be one of .*got 'round'"):
+        crossing_lines("round", [], 0, 0, 0)
 
 
 def test_a_boundary_is_the_outline_of_road_and_lanes_without_the_patch_s_edges():
@@ -218,6 +286,27 @@ def test_the_vehicle_s_frame_holds_the_same_world(
             # pitch and roll of the roof shorten the plane by less than 5 cm
             assert own.intersection(both).difference(other.buffer(0.05)).is_empty
             assert other.intersection(both).difference(own.buffer(0.05)).is_empty
+
+
+def test_the_rule_of_the_crossings_is_an_option_that_the_file_names(
+    minicity_root: Path, minicity_annotations: dict, tmp_path: Path
+):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    words = f"--root {minicity_root} --out-dir {tmp_path} --crossings edges --tag _edges"
+    run(parser.parse_args([*words.split(), "--workers", "1"]))
+    file = AnnotationFile(tmp_path / "gsmap_minicity_train_edges.arrow")
+    assert file.meta.crossings == "edges"
+    united = AnnotationFile(minicity_annotations["train"])
+    assert united.meta.crossings == "united"
+    assert "crossings" not in united.meta.options
+    for edges, rings in zip(file, united, strict=True):
+        lines = [i.points for i in edges.instances if i.label == 1]
+        assert lines
+        assert {len(line) for line in lines} == {2}
+        for label in (0, 2):
+            own, other = ([i.points for i in s.instances if i.label == label] for s in (edges, rings))
+            assert all(map(np.array_equal, own, other))
 
 
 def of_label(sample: MapSample, label: int, ego_from_frame: np.ndarray) -> shapely.MultiLineString:

@@ -8,6 +8,7 @@ from mmcv.transforms import Compose
 from mmdet3d.registry import MODELS, TRANSFORMS
 from mmengine.config import ConfigDict
 from mmengine.registry import init_default_scope
+from PIL import Image
 
 import gsmap.registered  # noqa: F401
 from gsmap.datasets.transforms.image_steps import CropTop, Distortion, Resize
@@ -81,6 +82,53 @@ def test_a_batch_on_the_device_equals_that_of_the_host(steps):
         assert ours["data_samples"].img_shape == theirs["data_samples"].img_shape
     expected = collate(*on_host)
     torch.testing.assert_close(collate(*noted), expected, atol=GREY_LEVELS, rtol=0)
+
+
+def test_bicubic_scaling_is_pillows():
+    """As released code scales: antialiased, so that no pixel is left out, to whole grey levels."""
+    scale = {"type": "ScaleImages", "size": (21, 8), "kernel": "bicubic"}
+    images = sample_of(3)["images"]
+    wanted = [
+        np.asarray(Image.fromarray(camera["img_path"]).resize((21, 8)))  # Pillow's own default
+        for camera in images.values()
+    ]
+    for load in ({**LOAD, "to_float32": False}, LOAD):  # floats that are whole
+        found = run_pipeline([load, scale, PACK], 3)["inputs"]["img"]  # (V, 3, H, W)
+        assert np.array_equal(found.permute(0, 2, 3, 1).numpy(), np.stack(wanted))
+    bilinear = run_pipeline([LOAD, {**scale, "kernel": "bilinear"}, PACK], 3)["inputs"]["img"]
+    noise = images["CAM_0"]["img_path"].astype(float)
+    assert bilinear[0].std() > 0.4 * noise.std() > wanted[0].std()  # pixels left out keep noise
+
+
+@pytest.mark.parametrize("size", [(21, 8), (200, 111), (96, 54), (40, 100)])
+def test_bicubic_scaling_on_the_device_equals_pillows_to_a_grey_level(size):
+    scale = {"type": "ScaleImages", "size": size, "kernel": "bicubic"}
+    on_host = collate(*[run_pipeline([LOAD, scale, PACK], seed) for seed in range(4)])
+    noted = collate(*[run_pipeline([ON_DEVICE, scale, PACK], seed) for seed in range(4)])
+    apart = (noted - on_host).abs()
+    assert apart.max() <= 1.0  # a tie between two levels; Pillow rounds its weights to 22 bits
+    assert (apart > 0).float().mean() < 0.01
+
+
+def test_an_unknown_kernel_is_refused():
+    with pytest.raises(ValueError, match="kernel must be one of .*bicubic.*got 'lanczos'"):
+        TRANSFORMS.build({"type": "ScaleImages", "scale": 0.5, "kernel": "lanczos"})
+
+
+def test_channels_stay_where_no_swap_is_asked_for():
+    """Only the swap goes: all other numbers are those that are drawn with it."""
+    for seed in range(8):
+        swapped, kept = (
+            run_pipeline([ON_DEVICE, {**DISTORT, **options}, PACK], seed)["data_samples"]
+            .image_steps[0].numbers
+            for options in ({}, {"swap_channels": False})
+        )  # fmt: skip
+        for with_swap, without in zip(swapped, kept, strict=True):
+            assert without[5] == 0
+            assert repr(with_swap[:5] + with_swap[6:]) == repr(without[:5] + without[6:])
+    found = run_pipeline([LOAD, {**DISTORT, "swap_channels": False}, PACK], 0)
+    wanted = run_pipeline([ON_DEVICE, {**DISTORT, "swap_channels": False}, PACK], 0)
+    torch.testing.assert_close(collate(wanted), collate(found), atol=GREY_LEVELS, rtol=0)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

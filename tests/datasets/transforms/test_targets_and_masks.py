@@ -128,6 +128,26 @@ def test_a_camera_mask_draws_what_lies_in_front():
     assert mask[0, 0].nonzero().tolist() == [[6, col] for col in (3, 4, 5, 6)]
 
 
+def test_a_camera_mask_lies_at_the_heights_of_the_file_if_that_is_asked_for(caplog):
+    """The line of the test above, 1.4 m higher at its right end: row 5.2 in place of 6.6 there."""
+    lidar2img = np.array([[100, 50, 0, 0], [0, 50, -100, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+    ahead = MapInstance(0, np.array([[-1.9, 10], [1.9, 10]]))
+    flat = {"map_instances": [ahead], "lidar2img": [lidar2img], "img_shape": (100, 100)}
+    raised = {**flat, "map_heights": [np.array([-1.6, -0.2])]}
+
+    def rows(results: dict, **options: bool) -> list[int]:
+        step = MakePVMask(stride=10, pad_size_divisor=20, **options)
+        mask = step.transform(dict(results))["gt_pv_seg"][0, 0]
+        return sorted({row for row, _ in mask.nonzero().tolist()})
+
+    assert rows(raised, heights=True) == [5, 6]
+    assert rows(raised) == rows(flat) == [6]
+    with caplog.at_level("INFO"):
+        assert rows(flat, heights=True) == rows(flat, heights=True) == [6]
+    said = [record for record in caplog.messages if "flat ground at z = -1.6 m" in record]
+    assert len(said) <= 1  # once a process; another test may have been first
+
+
 def test_each_class_can_have_a_channel(golden_dir: Path):
     """Together the channels are the one mask of all elements; a class has its own elements only."""
     instances = golden_instances(golden_dir, "many")

@@ -47,6 +47,8 @@ class VectorizedMapDataset(BaseDataset):
         dim: Coordinates per point of the ground truth, 2 or 3; None takes the file's. A file with
             heights also serves 2, which drops them; one without is refused for 3.
         rate_hz: Samples per second of a drive that the file must have; None takes any.
+        crossings: Rule of the crossings that the file must follow (``--crossings`` of
+            ``tools/create_data.py nuscenes``); None takes any.
         cameras: Names of the cameras to use, in order; None takes all of each sample.
         test_mode: Whether every sample is delivered, in order, ground truth or not.
         filter_empty_gt: Whether training leaves out samples without any map element.
@@ -54,6 +56,8 @@ class VectorizedMapDataset(BaseDataset):
             seed: what a model then still scores, it does not see in the images.
         signals_from_poses: Whether vehicle signals (``can_bus``) of samples that have none are
             computed from the poses of the drive; otherwise they are zero.
+        pose_only_signals: Whether vehicle signals are those that MapTR's code for Argoverse 2 makes
+            of the pose (`vehicle_signals.pose_only_signals`), whatever a sample has.
         ground_z_m: Height of the road in the frame, as in ``AnnotationMeta``, for files that do not
             have it; that of others must be the same.
         broken_samples: ``raise`` stops at a sample with a missing or damaged file; ``skip`` takes
@@ -79,11 +83,13 @@ class VectorizedMapDataset(BaseDataset):
         frame: str | None = None,
         dim: int | None = 2,
         rate_hz: float | None = None,
+        crossings: str | None = None,
         cameras: Sequence[str] | None = None,
         test_mode: bool = False,
         filter_empty_gt: bool = True,
         shuffle_images_seed: int | None = None,
         signals_from_poses: bool = False,
+        pose_only_signals: bool = False,
         ground_z_m: float | None = None,
         broken_samples: str = "raise",
         max_refetch: int = 100,
@@ -114,12 +120,14 @@ class VectorizedMapDataset(BaseDataset):
             "split": split,
             "frame": frame,
             "dim": 3 if dim == 3 else None,
+            "crossings": crossings,
         }
         self._dim = dim
         self._rate_hz = rate_hz
         self._filter_empty_gt = filter_empty_gt and not test_mode
         self._shuffle_images_seed = shuffle_images_seed
         self._signals_from_poses = signals_from_poses
+        self._pose_only_signals = pose_only_signals
         self._ground_z_m = ground_z_m
         super().__init__(
             ann_file,
@@ -249,10 +257,14 @@ class VectorizedMapDataset(BaseDataset):
         It has the keys of mmdet3d's multi-view pipelines (``images``, ``lidar_points``,
         ``lidar_sweeps``, ``timestamp``), those of the packed metainfo, ``dim`` and
         ``map_instances``: the elements at full resolution with ``dim`` coordinates per point.
+        ``map_heights`` has the heights of their points (n,), if the file has any.
         """
         entry = super().get_data_info(idx)
         sample = self.annotations[entry["row"]]
         dim, instances = self._metainfo["dim"], sample.instances
+        heights = None
+        if instances is not None and self.annotations.meta.dim == 3:
+            heights = [instance.points[:, 2] for instance in instances]
         if instances is not None:
             instances = [MapInstance(i.label, i.points[:, :dim]) for i in instances]
         info: dict[str, Any] = {
@@ -266,6 +278,7 @@ class VectorizedMapDataset(BaseDataset):
             "can_bus": self._vehicle_signals(sample, entry["row"]),
             "images": self._images(sample, entry),
             "map_instances": instances,
+            "map_heights": heights,
             "eval_ann_info": None,
         }
         info["cam_names"] = list(info["images"])
@@ -290,6 +303,14 @@ class VectorizedMapDataset(BaseDataset):
     def _vehicle_signals(self, sample: MapSample, row: int) -> np.ndarray:
         """Return ``can_bus`` without history; of poses, or zero, where a sample has none. (18,)"""
         signals = sample.can_bus if self.can_bus_in_memory is None else self.can_bus_in_memory
+        if self._pose_only_signals and self.can_bus_in_memory is None:
+            from gsmap.structures.vehicle_signals import pose_only_signals
+
+            ego_from_frame = sample.ego_from_frame
+            pose_of_ego = sample.global_from_frame
+            if ego_from_frame is not None:
+                pose_of_ego = pose_of_ego @ invert_rigid(ego_from_frame)
+            return without_history(pose_only_signals(pose_of_ego))
         if signals is not None:
             return without_history(signals)
         if not self._signals_from_poses or not self._has_poses:
@@ -307,6 +328,10 @@ class VectorizedMapDataset(BaseDataset):
         poses = [p for p in map(pose, beside) if 0 < abs(p[0]) <= _NEIGHBOUR_S]
         before, after = (next((p for p in poses if p[0] * s > 0), None) for s in (-1, 1))
         return without_history(motion_signals(pose(sample), before, after))
+
+    def has_signals(self) -> bool:
+        """Return whether samples have vehicle signals that are not computed from several poses."""
+        return self._pose_only_signals or self.sample(0).can_bus is not None
 
     def _images(self, sample: MapSample, entry: dict[str, int]) -> dict[str, dict[str, Any]]:
         """Return path and calibration of each camera; paths may come from another sample."""

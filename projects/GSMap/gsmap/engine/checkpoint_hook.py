@@ -138,7 +138,7 @@ class AtomicCheckpointHook(CheckpointHook):
         dataset = innermost(runner.train_dataloader.dataset)
         if hasattr(dataset, "scaled_image_size"):
             checkpoint["meta"][IMAGE_SIZE] = list(dataset.scaled_image_size())
-            checkpoint["meta"][SIGNALS] = dataset.sample(0).can_bus is not None
+            checkpoint["meta"][SIGNALS] = dataset.has_signals()
 
     def _save_checkpoint_with_step(self, runner: Runner, step: int, meta: dict) -> None:
         """Save a checkpoint; the file that tells of the newest is never written through a link."""

@@ -27,6 +27,17 @@ def pose_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float
     return values
 
 
+def pose_only_signals(global_from_ego: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Return the signals that MapTR's code for Argoverse 2 makes of a pose. (4, 4) -> (18,).
+
+    They are those of `pose_signals`, but with ones for acceleration, rotation rate and velocity,
+    which are not known there.
+    """
+    values = pose_signals(global_from_ego)
+    values[7:16] = 1.0
+    return values
+
+
 def motion_signals(
     now: Pose, before: Pose | None = None, after: Pose | None = None
 ) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Convert Argoverse 2 logs to an annotation file: seven ring cameras, ego frame, 60 x 30 m."""
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +16,14 @@ from gsmap.utils.progress import Progress
 from gsmap.utils.split_lists import SPLIT_LIST
 from mapdata.argoverse2.log import BROKEN_LOGS, MAP_CHANGE_LOGS, find_all_logs, find_logs
 from mapdata.argoverse2.map import COMPAT_MODES
-from mapdata.argoverse2.samples import Argoverse2Options, LogSamples, read_log
+from mapdata.argoverse2.samples import (
+    THIN_OVER,
+    Argoverse2Options,
+    LogSamples,
+    read_log,
+    spread_over_split,
+    usable_times,
+)
 from mapdata.command_line import (
     add_file_options,
     add_log_options,
@@ -48,12 +55,14 @@ def convert_argoverse2(options: Argoverse2Options) -> ConversionSummary:
         log_dirs = _listed_logs(wanted, options, summary)
     log_dirs = _drop_listed(log_dirs, options.keep_map_changes, summary)
     identity = OFFICIAL if wanted is None else wanted.identity
+    passed = _passed_over(log_dirs, options)
     meta, log_dirs = _meta(options, log_dirs, identity), options.shard.part(log_dirs)
     offsets_ns: list[int] = []
     bar = Progress(log_dirs, desc=f"av2 {options.split}", unit="logs")
     with bar as logs, AnnotationWriter(target, meta, options.shard) as writer:
         workers = min(options.workers, max(len(log_dirs), 1))
-        results = ordered_map(partial(_try_log, options=options), log_dirs, workers)
+        jobs = [(log_dir, passed.get(log_dir.name, ())) for log_dir in log_dirs]
+        results = ordered_map(partial(_try_log, options=options), jobs, workers)
         for log_dir, result in zip(logs, results, strict=True):
             if isinstance(result, str):
                 summary.add_problem(f"log left out: {result}", log_dir.name)
@@ -102,10 +111,27 @@ def _listed_logs(
     return chosen
 
 
-def _try_log(log_dir: Path, options: Argoverse2Options) -> LogSamples | str:
-    """Read a log; return the reason where that fails (a bug of ours still stops everything)."""
+def _passed_over(log_dirs: list[Path], options: Argoverse2Options) -> dict[str, set[int]]:
+    """Return the times of each log that samples of the whole split leave out, by its name."""
+    if options.thin_over == "log":
+        return {}
+    assert options.rate_hz is not None  # checked by the options
+    workers = min(options.workers, max(len(log_dirs), 1))
+    found = ordered_map(partial(usable_times, options=options), log_dirs, workers)
+    names = [log_dir.name for log_dir in log_dirs]
+    return spread_over_split(dict(zip(names, found, strict=True)), options.rate_hz)
+
+
+def _try_log(
+    job: tuple[Path, Collection[int]], options: Argoverse2Options
+) -> LogSamples | str:
+    """Read a log; return the reason where that fails (a bug of ours still stops everything).
+
+    The job is its folder, with the times that are passed over.
+    """
+    log_dir, passed_ns = job
     try:
-        return read_log(log_dir, options)
+        return read_log(log_dir, options, passed_ns=passed_ns)
     except (OSError, ValueError, shapely.errors.ShapelyError) as error:
         return str(error)
 
@@ -135,6 +161,8 @@ def _meta(options: Argoverse2Options, log_dirs: Iterable[Path], identity: str) -
     }
     versions = {name: version(name) for name in ("av2", "shapely")}
     made_with = {name: getattr(options, name) for name in ("at", "rate_hz", "compat")}
+    if options.thin_over != "log":
+        made_with["thin_over"] = options.thin_over
     return options.meta(
         "av2",
         "ego",
@@ -154,6 +182,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--at", default="auto",
         help="times: lidar, cameras, auto (sweeps where there are some, else images) "
         "or poses:N, every N-th row of the pose table without sensor data (default: %(default)s)",
+    )  # fmt: skip
+    add(
+        "--thin-over", default="log", choices=THIN_OVER,
+        help="what --rate thins out: each log alone, or the samples of all logs sorted by time, "
+        "as MapTR and MapTRv2 validate (default: %(default)s)",
     )  # fmt: skip
     add("--dim", type=int, default=2, choices=(2, 3), help="coordinates per point")
     add(

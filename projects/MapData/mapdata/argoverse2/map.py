@@ -16,14 +16,12 @@ from gsmap.datasets.annotations.record import RANGES
 from gsmap.datasets.errors import naming
 from mapdata.argoverse2.map_file import read_map_file
 from mapdata.argoverse2.rules import (
-    EDGE_MARGIN_M,
     clip_lines,
     clip_polygons,
-    cut_rings,
     drop_duplicates,
-    merge_parallel,
     merge_until_stable,
 )
+from mapdata.crossings import EDGE_MARGIN_M, cut_rings, open_outlines
 from mapdata.lane_graph import ROUND_DECIMALS, LanePaths, link_lanes
 from mapdata.local_map import GeometryLayer, LocalPatch, rings_of, vertices_of
 
@@ -163,15 +161,7 @@ class Argoverse2Map:
     def _merged_crossings(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Crossings, parallel neighbours united, open where the patch cuts them (MapTRv2)."""
         pieces, owner = clip_polygons(self._crossings.near(patch), patch)
-        exteriors = shapely.get_exterior_ring(merge_parallel(pieces, owner))
-        turn = ~shapely.is_ccw(exteriors)
-        exteriors[turn] = shapely.reverse(exteriors[turn])
-        lines, owner = cut_rings(exteriors, patch.box(-EDGE_MARGIN_M))
-        points, line = shapely.get_coordinates(lines, include_z=True, return_index=True)
-        if len(points) == 0:
-            return lines
-        # the pieces of one crossing stay one instance
-        return shapely.linestrings(points, indices=np.unique(owner, return_inverse=True)[1][line])
+        return open_outlines(pieces, owner, patch)
 
     def _crossing_rings(self, patch: LocalPatch, lanes: np.ndarray) -> np.ndarray:
         """Each crossing by itself, closed along the patch's edge (MapTR)."""

@@ -2,7 +2,8 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from mapdata.argoverse2.log import (
 from mapdata.argoverse2.map import Argoverse2Map, check_rules, find_map
 from mapdata.command_line import FileOptions
 
+THIN_OVER = ("log", "split")
 _NEEDS_NONE = "`create_data.py av2 --at poses:10` needs none"
 
 
@@ -36,13 +38,15 @@ class Argoverse2Options(FileOptions):
 
     Of ``rate_hz`` samples per second, None takes all. The default is as published: every LiDAR
     sweep (10 Hz) of ``train``, every fourth of the others. ``poses:N`` of ``at`` needs no sensor
-    data.
+    data. ``thin_over`` says over what samples thin out: each ``log`` alone, or the whole ``split``,
+    whose samples are sorted by time (`spread_over_split`).
     """
 
     _: KW_ONLY
     split: str = "val"
     at: str = "auto"
     rate_hz: float | None = "published"  # type: ignore[assignment]  # a number once it is made
+    thin_over: str = "log"
     compat: str = "maptrv2"
     dim: int = 2
     logs: Sequence[str] = ()
@@ -57,6 +61,13 @@ class Argoverse2Options(FileOptions):
             object.__setattr__(self, "rate_hz", 10.0 if self.split == "train" else 2.5)
         if self.rate_hz is not None and not self.rate_hz > 0:
             raise ValueError(f"rate_hz must be > 0, got {self.rate_hz}.")
+        if self.thin_over not in THIN_OVER:
+            raise ValueError(f"thin_over must be one of {THIN_OVER}, got {self.thin_over!r}.")
+        if self.thin_over == "split" and (self.rate_hz is None or self.pose_stride is not None):
+            raise ValueError(
+                "thin_over='split' keeps every N-th sample of all logs: give a rate, and times of "
+                "sensors (--at)."
+            )
         if self.dim not in (2, 3):
             raise ValueError(f"dim must be 2 or 3, got {self.dim}.")
         check_rules(self.classes, self.compat)
@@ -85,20 +96,26 @@ class LogSamples:
     elements: dict[str, Sequence[str]] = field(default_factory=dict)
 
 
-def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -> LogSamples:
+def read_log(
+    log_dir: Path,
+    options: Argoverse2Options,
+    with_map: bool = True,
+    passed_ns: Collection[int] = (),
+) -> LogSamples:
     """Make the samples of one log.
 
     Args:
         log_dir: Folder of the log.
         options: What a sample is: rate, frame, range, classes.
         with_map: Whether to add the ground truth.
+        passed_ns: Times that are passed over, as `spread_over_split` says.
 
     Raises:
         FileNotFoundError: If the map or the poses are missing.
         ValueError: If a file is damaged, or sensor data that ``options.at`` needs are missing.
     """
     log, result = Argoverse2Log(log_dir), LogSamples()
-    times = sample_times(log, options).tolist()
+    times = [time for time in sample_times(log, options).tolist() if time not in passed_ns]
     log_map = Argoverse2Map.from_log(log_dir) if with_map else None
     if log_map is not None:
         result.invalid = +Counter(log_map.invalid_counts)  # those that are not zero
@@ -110,6 +127,40 @@ def read_log(log_dir: Path, options: Argoverse2Options, with_map: bool = True) -
         except _LeftOut as reason:
             result.left_out[str(reason)] += 1
     return result
+
+
+def usable_times(log_dir: Path, options: Argoverse2Options) -> list[int]:
+    """Return when a log has a sample, in nanoseconds, ascending; nothing if it cannot be read."""
+    log = Argoverse2Log(log_dir)
+    times = []
+    try:
+        for timestamp_ns in sample_times(log, options).tolist():
+            with suppress(_LeftOut):
+                _sample(log, None, timestamp_ns, options)
+                times.append(timestamp_ns)
+    except (OSError, ValueError):  # the conversion itself says so
+        return []
+    return times
+
+
+def spread_over_split(times: Mapping[str, Sequence[int]], rate_hz: float) -> dict[str, set[int]]:
+    """Choose every N-th of all logs' samples, sorted by time, as MapTR and MapTRv2 do.
+
+    Args:
+        times: When each log has samples, ascending, in nanoseconds.
+        rate_hz: Samples per second that stay; N is how often the usual step goes into its period.
+
+    Returns:
+        The times that are passed over, by log.
+    """
+    steps = np.concatenate([np.diff(own) for own in times.values()] or [[]])
+    every = max(round(1e9 / (rate_hz * np.median(steps))), 1) if len(steps) else 1
+    ordered = sorted((time, name) for name, own in times.items() for time in own)
+    passed: dict[str, set[int]] = {name: set() for name in times}
+    for number, (time, name) in enumerate(ordered):
+        if number % every:
+            passed[name].add(time)
+    return passed
 
 
 def read_logs(
@@ -156,7 +207,7 @@ def sample_times(log: Argoverse2Log, options: Argoverse2Options) -> np.ndarray:
         times, kind = log.image_timestamps_ns[RING_CAMERAS[0]], f"images of {RING_CAMERAS[0]}"
     if len(times) == 0:
         raise ValueError(f"no {kind} ({_NEEDS_NONE})")
-    return thin_out(times, options.rate_hz)
+    return times if options.thin_over == "split" else thin_out(times, options.rate_hz)
 
 
 def thin_out(times_ns: np.ndarray, rate_hz: float | None) -> np.ndarray:

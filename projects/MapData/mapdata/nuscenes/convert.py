@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 
 from gsmap.datasets.annotations.file import AnnotationWriter
-from gsmap.datasets.annotations.record import CLASSES, MapInstance, MapSample
+from gsmap.datasets.annotations.record import CLASSES, UNITED, MapInstance, MapSample
 from gsmap.datasets.errors import naming
 from gsmap.utils.files import is_hidden
 from gsmap.utils.parallel import ordered_map
@@ -28,6 +28,7 @@ from mapdata.command_line import (
     fingerprint,
     options_from,
 )
+from mapdata.crossings import CROSSINGS
 from mapdata.nuscenes.map import (
     MAP_CLASSES,
     NuScenesLocalMap,
@@ -69,6 +70,7 @@ class NuScenesOptions(FileOptions):
     dataset: str = "nuscenes"
     max_sweeps: int = 10
     frame: str = "lidar"
+    crossings: str = UNITED
 
     @property
     def versions(self) -> tuple[str, ...]:
@@ -202,7 +204,9 @@ class _Conversion:
         layers = open_layers(options.root, location, options.classes)
         for reason, count in layers.skipped.items():
             self.summary.add_problem(f"{reason} left out", location, count)
-        local_map = NuScenesLocalMap(layers, options.classes, options.x_range, options.y_range)
+        local_map = NuScenesLocalMap(
+            layers, options.classes, options.x_range, options.y_range, options.crossings
+        )
         frames = sum(scene["nbr_samples"] for scene, _ in scenes)
         workers = max(1, min(options.workers, len(scenes), frames // _FRAMES_PER_WORKER))
         samples, ahead = tee(map(self._scene_samples, scenes))
@@ -261,6 +265,7 @@ def convert_nuscenes(options: NuScenesOptions) -> ConversionSummary:
         "options": {
             "version": "+".join(options.versions),
             "max_sweeps": options.max_sweeps,
+            **({} if options.crossings == UNITED else {"crossings": options.crossings}),
             **({SPLIT_LIST: conversion.identity} if conversion.identity else {}),
         },
     }
@@ -303,6 +308,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--frame", choices=("lidar", "ego"), default="lidar",
         help="annotation frame: the roof LiDAR or the vehicle (default: %(default)s)",
+    )  # fmt: skip
+    add(
+        "--crossings", choices=CROSSINGS, default=UNITED,
+        help="rule of the crossings: rings that are united where they overlap, the two longest "
+        "edges of each, or outlines of parallel neighbours, open where the patch cuts them "
+        "(default: %(default)s)",
     )  # fmt: skip
     add_file_options(parser, "lidar", max_sweeps=10)
 

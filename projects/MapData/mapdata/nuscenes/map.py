@@ -18,6 +18,13 @@ from gsmap.datasets.errors import naming
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.polylines import Points
 from gsmap.utils.files import is_hidden
+from mapdata.crossings import (
+    CROSSINGS,
+    EDGES,
+    UNITED,
+    long_edges,
+    open_outlines,
+)
 from mapdata.lane_graph import LaneLinks, LanePaths, link_lanes
 from mapdata.local_map import (
     POLYGON,
@@ -34,6 +41,7 @@ if TYPE_CHECKING:
 LINE_LAYERS = ("road_divider", "lane_divider")
 SURFACE_LAYERS = ("road_segment", "lane")
 MAP_CLASSES = ("divider", "ped_crossing", "boundary", *AREA_CLASSES[1:4], "centerline")
+CROSSING = "ped_crossing"
 OUTLINE_MARGIN_M = 0.2
 CENTERLINE_STEP_M = 0.5
 
@@ -172,9 +180,14 @@ class NuScenesLocalMap:
 
     Args:
         layers: The map's geometries.
-        classes: Names out of ``MAP_CLASSES``, in label order; ValueError for others.
+        classes: Names out of ``MAP_CLASSES``, in label order.
         x_range: Smallest and largest x of the patch in metres.
         y_range: Smallest and largest y of the patch in metres.
+        crossings: Rule of the crossings, one of ``CROSSINGS``: ``united`` as above, ``edges``
+            (`long_edges`) or ``parallel`` (`open_outlines`).
+
+    Raises:
+        ValueError: If a class or the rule is unknown.
     """
 
     def __init__(
@@ -183,9 +196,13 @@ class NuScenesLocalMap:
         classes: Sequence[str],
         x_range: tuple[float, float] = RANGES["lidar"][0],
         y_range: tuple[float, float] = RANGES["lidar"][1],
+        crossings: str = UNITED,
     ) -> None:
         check_classes(classes)
+        if crossings not in CROSSINGS:
+            raise ValueError(f"crossings must be one of {CROSSINGS}, got {crossings!r}.")
         self.classes = tuple(classes)
+        self._crossings = crossings
         self.x_range, self.y_range = x_range, y_range
         self._lines = GeometryLayer(layers.lines)
         areas = set(AREA_CLASSES) & set(classes)
@@ -212,6 +229,8 @@ class NuScenesLocalMap:
     def _polylines(self, name: str, patch: LocalPatch) -> list[Points]:
         if name == "boundary":
             return self._outlines.cut(patch, OUTLINE_MARGIN_M)
+        if name == CROSSING and self._crossings != UNITED:
+            return self._open_crossings(patch)
         if name in self._areas:
             pieces = shapely.intersection(self._areas[name].near(patch), patch.polygon)
             merged = shapely.get_parts(shapely.union_all(patch.to_local(pieces)))
@@ -222,3 +241,16 @@ class NuScenesLocalMap:
             near = np.sort(self._lane_tree.query(patch.polygon, predicate="intersects"))
             lines = shapely.force_2d(self._lane_paths.simplified(near.tolist()))
         return vertices_of(patch.to_local(patch.lines_inside(lines)), 2)
+
+    def _open_crossings(self, patch: LocalPatch) -> list[Points]:
+        """Return the lines of the crossings around a patch, in its frame. each (n, 2)"""
+        near = self._areas[CROSSING].near(patch)
+        if self._crossings == EDGES:
+            lines = patch.lines_inside(long_edges(near))
+            return vertices_of(patch.to_local(lines), 2)
+        pieces, owner = shapely.get_parts(
+            shapely.intersection(near, patch.polygon), return_index=True
+        )
+        keep = shapely.get_type_id(pieces) == POLYGON
+        local = patch.to_local(pieces[keep])
+        return vertices_of(open_outlines(local, owner[keep], patch), 2)

@@ -8,6 +8,7 @@ import numpy as np
 from gsmap.utils.split_lists import SPLIT_LIST, checked_identity
 
 FORMAT_VERSION = 1
+UNITED = "united"  # rule of the crossings in files that name none
 _HIGHEST_GROUND_M = 10.0
 _MOST_CLASSES = 1000
 CLASSES = ("divider", "ped_crossing", "boundary")
@@ -199,3 +200,8 @@ class AnnotationMeta:
     def split_list(self) -> str:
         """Name and digest of the list of scenes that splits were made by; empty if unknown."""
         return self.options.get(SPLIT_LIST, "")
+
+    @property
+    def crossings(self) -> str:
+        """Rule that the crossings follow, see ``tools/create_data.py nuscenes --help``."""
+        return self.options.get("crossings", UNITED)

@@ -71,24 +71,40 @@ def finish_on_host(results: dict[str, Any]) -> None:
         results["img"] = step.on_host(results["img"])
 
 
+FILTERS = ("bilinear", "bicubic")
+
+
 @dataclass(frozen=True)
 class Resize:
-    """Bilinear resizing.
+    """Resizing.
 
     Args:
         size: Width and height after it, in pixels.
         rounded: Whether whole grey levels stay whole, as those of uint8 do.
+        kernel: Of ``FILTERS``: ``bilinear`` is OpenCV's, which reads four pixels; ``bicubic`` is
+            Pillow's, antialiased, whose results are whole grey levels.
     """
 
     size: tuple[int, int]
     rounded: bool = False
+    kernel: str = "bilinear"
 
     def on_host(self, images: list[np.ndarray]) -> list[np.ndarray]:
         """See `ImageStep`."""
-        return [mmcv.imresize(image, self.size) for image in images]
+        if self.kernel == "bilinear":
+            return [mmcv.imresize(image, self.size) for image in images]
+        whole = [np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in images]
+        scaled = [
+            mmcv.imresize(image, self.size, interpolation="bicubic", backend="pillow")
+            for image in whole
+        ]
+        return [new.astype(old.dtype) for new, old in zip(scaled, images, strict=True)]
 
     def on_device(self, images: Tensor) -> Tensor:
         """See `ImageStep`."""
+        if self.kernel == "bicubic":
+            wide = _bicubic(images, (images.shape[2], self.size[0]))  # rows last, as Pillow does
+            return _bicubic(wide, self.size[::-1])
         whole = self.rounded and not images.is_floating_point()
         scaled = F.interpolate(
             images.float(), self.size[::-1], mode="bilinear", align_corners=False
@@ -98,6 +114,14 @@ class Resize:
     def joined(self, others: "Sequence[Any]") -> "Resize | None":
         """See `ImageStep`."""
         return self if all(other == self for other in others) else None
+
+
+def _bicubic(images: Tensor, size: tuple[int, int]) -> Tensor:
+    """Resize to rows and columns with an antialiased bicubic kernel, to whole grey levels."""
+    scaled = F.interpolate(
+        images.float(), size, mode="bicubic", align_corners=False, antialias=True
+    )
+    return (scaled.clamp(0, 255) + 0.5).to(torch.uint8)
 
 
 @dataclass(frozen=True)
@@ -210,11 +234,24 @@ class DistortImages(PhotoMetricDistortion3D):
     """Photometric distortion of all images, each by numbers of its own.
 
     It draws and computes what ``MultiViewWrapper`` of mmdet3d's ``PhotoMetricDistortion3D`` with
-    ``override_aug_config=False`` does (MapTR). Arguments are those of the latter.
+    ``override_aug_config=False`` does (MapTR).
+
+    Args:
+        swap_channels: Whether half of the images get their channels in a random order.
+        kwargs: Further arguments of ``PhotoMetricDistortion3D``.
     """
+
+    _SWAP = 5  # place of the flag among the numbers
+
+    def __init__(self, swap_channels: bool = True, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.swap_channels = swap_channels
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Distort ``results['img']``."""
-        numbers = tuple(tuple(self._random_flags()) for _ in results["img"])
-        take_step(results, Distortion(numbers))
+        numbers = [list(self._random_flags()) for _ in results["img"]]
+        if not self.swap_channels:
+            for of_image in numbers:
+                of_image[self._SWAP] = 0
+        take_step(results, Distortion(tuple(map(tuple, numbers))))
         return results

@@ -13,6 +13,7 @@ from torch.utils.data import get_worker_info
 
 from gsmap.datasets.image_files import read_image
 from gsmap.datasets.transforms.image_steps import (
+    FILTERS,
     CropTop,
     Resize,
     finish_on_host,
@@ -82,16 +83,21 @@ class ScaleImages(BaseTransform):
             ``scale`` would make larger or smaller get the longer side of it in place of that. They
             are neither cropped nor padded. Beyond a factor of 2 they shrink by area, so that no
             pixel is left out; what ``scale`` does is that of the training.
+        kernel: ``bilinear`` or ``bicubic``, see `Resize`.
 
     Raises:
-        ValueError: If there is not one of factor and size, or it is not positive.
+        ValueError: If there is not one of factor and size, it is not positive, or the kernel is
+            unknown.
     """
 
     scale: float | None = None
     size: tuple[int, int] | None = None
     trained_size: tuple[int, int] | None = None
+    kernel: str = "bilinear"
 
     def __post_init__(self) -> None:
+        if self.kernel not in FILTERS:
+            raise ValueError(f"kernel must be one of {FILTERS}, got {self.kernel!r}.")
         if (self.scale is None) == (self.size is None):
             raise ValueError(f"give scale or size, got {self.scale} and {self.size}.")
         if not min(self.size or (cast(float, self.scale),)) > 0:
@@ -116,24 +122,32 @@ class ScaleImages(BaseTransform):
                 mmcv.imresize(img, size, interpolation="area") for img in results["img"]
             ]
         elif size != (width, height):
-            take_step(results, Resize(size, rounded=not results.get("to_float32", True)))
+            take_step(results, self._resize(results, size))
         for key in ("lidar2img", "img_aug_matrix"):
             results[key] = [matrix @ m for m in results[key]]
         results["img_shape"] = results["pad_shape"] = size[::-1]
         results["scale_factor"] = size[0] / width
         return results
 
-    @staticmethod
-    def _to_size(results: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
+    def _resize(self, results: dict[str, Any], size: tuple[int, int]) -> Resize:
+        """Return the step that brings all images to a size (width, height)."""
+        return Resize(size, rounded=not results.get("to_float32", True), kernel=self.kernel)
+
+    def _to_size(self, results: dict[str, Any], size: tuple[int, int]) -> dict[str, Any]:
         """Bring each image, as large as it was loaded, to a size (width, height)."""
+        step = self._resize(results, size)
         if len(set(results["raw_shapes"])) > 1:
             finish_on_host(results)
-            results["img"] = [
-                mmcv.imresize(img[:height, :width], size)
-                for img, (height, width) in zip(results["img"], results["raw_shapes"], strict=True)
-            ]
+            results["img"] = step.on_host(
+                [
+                    img[:height, :width]
+                    for img, (height, width) in zip(
+                        results["img"], results["raw_shapes"], strict=True
+                    )
+                ]
+            )
         else:
-            take_step(results, Resize(size, rounded=not results.get("to_float32", True)))
+            take_step(results, step)
         for view, (height, width) in enumerate(results["raw_shapes"]):
             matrix = np.diag([size[0] / width, size[1] / height, 1.0, 1.0])
             for key in ("lidar2img", "img_aug_matrix"):

@@ -1,6 +1,8 @@
 """Segmentation targets: map elements drawn in BEV and in each camera's feature map."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import cv2
@@ -8,6 +10,8 @@ import numpy as np
 import torch
 from mmcv.transforms import BaseTransform
 from mmdet3d.registry import TRANSFORMS
+from mmengine.logging import print_log
+from torch.utils.data import get_worker_info
 
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.structures.elements import annotated
@@ -115,7 +119,8 @@ class MakeInstanceMasks(BaseTransform):
 class MakePVMask(BaseTransform):
     """Add ``gt_pv_seg``: elements projected into each camera's feature map. (V, channels, h, w)
 
-    Comes after the images have their final scale. Two-dimensional elements lie at one height.
+    Comes after the images have their final scale. Two-dimensional elements lie at one height, or
+    at the heights that their file has.
 
     Args:
         stride: Image pixels per feature pixel.
@@ -123,6 +128,8 @@ class MakePVMask(BaseTransform):
         ground_z_m: Height of the ground in the annotation frame, in metres.
         thickness_px: Width of the lines in feature pixels.
         num_classes: Number of channels; None draws all elements in one.
+        heights: Whether two-dimensional elements of a file with heights lie at these, as published
+            for Argoverse 2. A file without heights is said once.
 
     Raises:
         ValueError: If a number is not positive.
@@ -133,6 +140,7 @@ class MakePVMask(BaseTransform):
     ground_z_m: float = -1.6
     thickness_px: int = 1
     num_classes: int | None = None
+    heights: bool = False
 
     def __post_init__(self) -> None:
         check_positive(stride=self.stride, pad_size_divisor=self.pad_size_divisor)
@@ -144,6 +152,18 @@ class MakePVMask(BaseTransform):
         height = line[:, 2:3] if line.shape[1] == 3 else np.full((len(line), 1), self.ground_z_m)
         return np.concatenate([line[:, :2], height, np.ones((len(line), 1))], -1)
 
+    def _elements(self, results: dict[str, Any]) -> Iterator[tuple[MapInstance, np.ndarray]]:
+        """Yield each element with the points that are drawn, (n, 2) or (n, 3)."""
+        elements = annotated(results, self)
+        heights = results.get("map_heights") if self.heights else None
+        if self.heights and heights is None and any(e.points.shape[1] == 2 for e in elements):
+            _say_flat(self.ground_z_m)
+        for number, element in enumerate(elements):
+            points = element.points
+            if heights is not None:
+                points = np.column_stack([points[:, :2], heights[number]])
+            yield element, points
+
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
         """Draw the masks; ValueError if the sample has no ground truth."""
         height, width = padded_size(results["img_shape"], self.pad_size_divisor)
@@ -151,8 +171,8 @@ class MakePVMask(BaseTransform):
         views = results["lidar2img"]
         masks = np.zeros((len(views), self.num_classes or 1, *size), np.uint8)
         lines = [
-            (channel_of(instance, self.num_classes), self._points(instance.points))
-            for instance in annotated(results, self)
+            (channel_of(instance, self.num_classes), self._points(points))
+            for instance, points in self._elements(results)
         ]
         shrink = np.diag([1 / self.stride, 1 / self.stride, 1.0, 1.0])
         for view, lidar2img in zip(masks, views, strict=True):
@@ -174,3 +194,16 @@ def channel_of(instance: MapInstance, num_classes: int | None) -> int:
     if not 0 <= instance.label < num_classes:
         raise ValueError(f"label {instance.label} of an element, but num_classes={num_classes}.")
     return instance.label
+
+
+@cache
+def _say_flat(ground_z_m: float) -> None:
+    """Say once that masks of the cameras lie on flat ground, though heights are asked for."""
+    worker = get_worker_info()
+    if worker is None or worker.id == 0:
+        print_log(
+            f"camera masks of elements lie on flat ground at z = {ground_z_m:g} m: the annotation "
+            "file has no heights. Make it with `python tools/create_data.py av2 ... --dim 3` for "
+            "those of the published systems, or set heights=False in MakePVMask.",
+            "current",
+        )

@@ -100,6 +100,9 @@ class BEVQueryEncoder(CameraEncoder):
         num_cams: Number of cameras V.
         with_can_bus: Whether the queries know the vehicle's motion.
         num_levels: Levels of image features that are used, at most 4.
+        uniform_positions: Whether the positional encoding starts from [0, 1), as BEVFormer's code
+            means to; in MapTR and its successors it starts from N(0, 1), because nothing
+            initialises it after it is made.
     """
 
     layer_class: ClassVar[type[BEVEncoderLayer]] = BEVEncoderLayer
@@ -116,6 +119,7 @@ class BEVQueryEncoder(CameraEncoder):
         num_cams: int = 6,
         with_can_bus: bool = True,
         num_levels: int = 1,
+        uniform_positions: bool = False,
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
@@ -123,7 +127,14 @@ class BEVQueryEncoder(CameraEncoder):
         self.z_range = (float(z_range[0]), float(z_range[1]))
         self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)
         self.positional_encoding = LearnedPositionalEncoding(
-            embed_dims // 2, self.grid.height, self.grid.width
+            embed_dims // 2,
+            self.grid.height,
+            self.grid.width,
+            init_cfg={
+                "type": "Uniform" if uniform_positions else "Normal",
+                "layer": "Embedding",
+                **({} if uniform_positions else {"std": 1.0}),
+            },
         )
         self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))  # only the first is used
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))

@@ -34,6 +34,9 @@ class GeometryKernelAttention(nn.Module):
         bilinear: Sample between pixels (MapQR), in place of rounding to one; zero outside the map.
         released_cells: Let each camera serve the cells that it sees in the first sample of the
             batch, as released; a sample's result then depends on its batch.
+        equal_weights: Start from equal weights over the kernel, as GKT's code means to; in MapTR
+            and its successors they start from Xavier's law, because the transformer around them
+            initialises all matrices later.
     """
 
     offsets: Tensor
@@ -46,6 +49,7 @@ class GeometryKernelAttention(nn.Module):
         kernel_size: tuple[int, int] = (3, 5),
         bilinear: bool = False,
         released_cells: bool = False,
+        equal_weights: bool = False,
     ) -> None:
         super().__init__()
         if not bilinear and any(size % 2 == 0 for size in kernel_size):
@@ -56,6 +60,7 @@ class GeometryKernelAttention(nn.Module):
             )
         self.num_heads = self.num_heights = num_heads
         self.bilinear, self.released_cells = bilinear, released_cells
+        self.equal_weights = equal_weights
         self.register_buffer("offsets", kernel_offsets(kernel_size), persistent=False)
         self.attention_weights = nn.Linear(embed_dims, num_heads * len(self.offsets))
         self.value_proj = nn.Linear(embed_dims, embed_dims)
@@ -63,8 +68,11 @@ class GeometryKernelAttention(nn.Module):
         self.init_weights()
 
     def init_weights(self) -> None:
-        """Start from equal weights over the kernel."""
-        constant_init(self.attention_weights, 0.0)
+        """Initialise all matrices (Xavier), those of the kernel's weights unless they are equal."""
+        if self.equal_weights:
+            constant_init(self.attention_weights, 0.0)
+        else:
+            xavier_init(self.attention_weights, distribution="uniform")
         xavier_init(self.value_proj, distribution="uniform")
         xavier_init(self.output_proj, distribution="uniform")
 
