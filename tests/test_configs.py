@@ -232,7 +232,7 @@ def annotations(minicity_root: Path, tmp_path_factory) -> Callable[[ConfigDict],
 def on_minicity(dataset: ConfigDict, root: Path, annotations: Callable[[ConfigDict], Path]) -> None:
     """Let a data set's config read MiniCity."""
     dataset.update(data_root=str(root), ann_file=str(annotations(dataset)))
-    dataset.update(frame="lidar", cameras=None, rate_hz=None)
+    dataset.update(frame="lidar", cameras=None, rate_hz=None, crossings=None)
 
 
 def check_gradients(model: torch.nn.Module, losses: dict[str, torch.Tensor]) -> None:

@@ -1,4 +1,5 @@
-# BeMapNet on nuScenes, ResNet-50, 30 epochs, 8 x 1 samples per step, as published but for random mirroring.
+# BeMapNet on nuScenes, ResNet-50, 30 epochs, 8 x 1 samples per step, as published but for random mirroring. The
+# annotation files are made with `--crossings edges --tag _edges`.
 _base_ = [
     '../_base_/datasets/nuscenes.py', './_base_/model.py',
     '../_base_/schedules/steps.py', '../_base_/default_runtime.py',
@@ -7,10 +8,16 @@ _base_ = [
 model = dict(grid=_base_.grid, classes=_base_.classes)
 _cameras = [
     'CAM_FRONT_LEFT', 'CAM_FRONT', 'CAM_FRONT_RIGHT', 'CAM_BACK_LEFT', 'CAM_BACK', 'CAM_BACK_RIGHT']
-_images = [_base_._load, dict(type='ScaleImages', size=(896, 512)), dict(type='CropImages', top=128)]
+_data = dict(cameras=_cameras, crossings='edges')
+_scale = dict(type='ScaleImages', size=(896, 512), kernel='bicubic')
+_images = [_base_._load_bytes, _scale, dict(type='CropImages', top=128)]
 _steps = [*_images, dict(type='FormatBezierTargets'), _base_._pack]
-train_dataloader = dict(batch_size=1, dataset=dict(cameras=_cameras, pipeline=_steps))
-val_dataloader = dict(dataset=dict(cameras=_cameras, pipeline=[*_images, _base_._pack]))
+train_dataloader = dict(
+    batch_size=1,
+    dataset=dict(**_data, ann_file='gsmap_nuscenes_train_edges.arrow', filter_empty_gt=False, pipeline=_steps))
+val_dataloader = dict(
+    dataset=dict(**_data, ann_file='gsmap_nuscenes_val_edges.arrow', pipeline=[*_images, _base_._pack]))
 test_dataloader = val_dataloader
+optim_wrapper = dict(paramwise_cfg=dict(custom_keys=dict(img_neck=dict(lr_mult=0.25))))
 param_scheduler = [dict(type='MultiStepLR', by_epoch=True, milestones=[21, 27], gamma=1 / 3)]
 sync_bn = 'torch'

@@ -13,4 +13,4 @@ model = dict(
     map_head=dict(query_groups=[dict(num=50)]))
 train_dataloader = dict(dataset=dict(pipeline=_base_._depth_seg))
 optim_wrapper = dict(optimizer=dict(weight_decay=0.03))
-train_cfg = dict(max_epochs=110)
+train_cfg = dict(max_epochs=110, val_interval=1)

@@ -7,3 +7,4 @@ _base_.model.merge(_base_._gemap)
 
 model = dict(grid=_base_.grid, classes=_base_.classes)
 optim_wrapper = dict(optimizer=dict(weight_decay=0.03))
+train_cfg = dict(val_interval=1)

@@ -12,3 +12,4 @@ model = dict(
 optim_wrapper = dict(optimizer=dict(weight_decay=0.03))
 param_scheduler = [dict(_base_.param_scheduler[0], end=200), _base_.param_scheduler[1]]
 train_dataloader = dict(batch_size=4)
+train_cfg = dict(val_interval=1)

@@ -5,5 +5,5 @@ _base_.model.merge(_base_._gemap)
 
 optim_wrapper = dict(optimizer=dict(weight_decay=0.03))
 train_dataloader = dict(batch_size=3)
-train_cfg = dict(max_epochs=110)
+train_cfg = dict(max_epochs=110, val_interval=1)
 auto_scale_lr = dict(base_batch_size=24)

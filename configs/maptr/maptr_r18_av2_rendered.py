@@ -9,13 +9,14 @@ _base_ = [
 _base_.model.merge(_base_._minicity)
 
 data_root = 'data/av2_rendered/'
+_own = dict(data_root=data_root, pose_only_signals=False)
 _file_size = (512, 512)  # of the image files, width and height, with the padding
 _load = [dict(type='LoadCameraImages', to_float32=False), dict(type='ScaleImages', scale=0.25)]
 _mask = dict(type='MakeBEVMask', size=(25, 50), thickness_px=1)
 _steps = [*_load, _base_._photometric, _base_._targets, _mask, _base_._pack]
 train_dataloader = dict(
-    batch_size=4, num_workers=1, dataset=dict(data_root=data_root, rate_hz=None, pipeline=_steps))  # of any rate
-val_dataloader = dict(num_workers=1, dataset=dict(data_root=data_root, pipeline=[*_load, _base_._pack]))
+    batch_size=4, num_workers=1, dataset=dict(**_own, rate_hz=None, pipeline=_steps))  # of any rate
+val_dataloader = dict(num_workers=1, dataset=dict(**_own, pipeline=[*_load, _base_._pack]))
 test_dataloader = val_dataloader
 model = dict(
     grid=_base_.grid, classes=_base_.classes,

@@ -15,4 +15,5 @@ model = dict(
 train_dataloader = dict(batch_size=4, dataset=dict(dim=3, pipeline=_base_._seg))
 val_dataloader = dict(dataset=dict(dim=3))
 test_dataloader = val_dataloader
-train_cfg = dict(max_epochs=6)
+param_scheduler = [dict(_base_.param_scheduler[0], end=200), _base_.param_scheduler[1]]
+train_cfg = dict(max_epochs=6, val_interval=1)

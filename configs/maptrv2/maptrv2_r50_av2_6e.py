@@ -10,4 +10,5 @@ model = dict(
     bev_encoder=dict(z_range=(-5.0, 3.0)),
     map_head=dict(aux_heads=_base_._maptrv2.map_head.aux_heads[:2]))
 train_dataloader = dict(batch_size=4, dataset=dict(pipeline=_base_._seg))
-train_cfg = dict(max_epochs=6)
+param_scheduler = [dict(_base_.param_scheduler[0], end=200), _base_.param_scheduler[1]]
+train_cfg = dict(max_epochs=6, val_interval=1)

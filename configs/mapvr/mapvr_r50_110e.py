@@ -3,3 +3,4 @@ _base_ = '../maptr/maptr_r50_110e.py'
 
 model = dict(
     bev_encoder=dict(layer_cfg=dict(dropout=0.0)), map_head=dict(type='MapVRHead'))
+train_cfg = dict(val_interval=10)

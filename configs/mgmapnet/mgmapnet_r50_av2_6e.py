@@ -14,4 +14,5 @@ model = dict(
 train_dataloader = dict(batch_size=2, dataset=dict(pipeline=_base_._seg))
 optim_wrapper = dict(optimizer=dict(lr=4e-4))
 auto_scale_lr = dict(base_batch_size=16)
-train_cfg = dict(max_epochs=6)
+param_scheduler = [dict(_base_.param_scheduler[0], end=200), _base_.param_scheduler[1]]
+train_cfg = dict(max_epochs=6, val_interval=1)

@@ -9,3 +9,4 @@ _base_.optim_wrapper.merge(_base_._optim_wrapper)
 model = dict(grid=_base_.grid, classes=_base_.classes)
 param_scheduler = _base_._param_scheduler
 sync_bn = 'torch'  # of several ranks
+train_cfg = dict(val_interval=4)

@@ -9,7 +9,8 @@ _base_.optim_wrapper.merge(_base_._optim_wrapper)
 classes = ['ped_crossing', 'divider', 'boundary']
 model = dict(grid=_base_.grid, classes=classes, bev_encoder=dict(num_cams=7))
 _scale = dict(type='ScaleImages', size=(608, 608))
-_train = [_base_._load, _base_._photometric, _scale, dict(_base_._targets, orders_of='points'), _base_._pack]
+_photometric = dict(type='DistortImages', swap_channels=False)
+_train = [_base_._load, _photometric, _scale, dict(_base_._targets, orders_of='points'), _base_._pack]
 _test = dict(classes=classes, ann_file='gsmap_av2_val_2hz.arrow', pipeline=[_base_._load, _scale, _base_._pack])
 train_dataloader = dict(
     batch_size=4, sampler=dict(_delete_=True, type='StreamTrainSampler', slots=4, single_frame_iters=3750),
@@ -18,4 +19,4 @@ val_dataloader = dict(sampler=dict(_delete_=True, type='StreamTestSampler'), dat
 test_dataloader = val_dataloader
 param_scheduler = _base_._param_scheduler
 sync_bn = 'torch'  # of several ranks
-train_cfg = dict(max_epochs=30)
+train_cfg = dict(max_epochs=30, val_interval=5)

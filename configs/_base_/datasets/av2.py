@@ -1,6 +1,7 @@
 # Argoverse 2, seven ring cameras at 0.3 of their size (padded to one size first), ground truth of
 # 60 x 30 m in the ego frame. `python tools/create_data.py av2 --root data/av2 --split train`, and the same for val,
-# make the annotation files: every sweep (10 Hz) for training, every fourth for validation, as in the published systems.
+# make the annotation files: every sweep (10 Hz) for training, every fourth for validation, as in the published systems;
+# with `--dim 3`, masks of the cameras lie at true heights. Vehicle signals are made of the pose, as there.
 data_root = 'data/av2/'
 _file_size = (2048, 2048)  # of the image files, width and height, with the padding
 # the one place of range and classes: leaves hand them to the model
@@ -15,7 +16,7 @@ _pack = dict(type='PackMapInputs')
 
 _workers = dict(num_workers='cores', persistent_workers=True)
 _dataset = dict(
-    type='VectorizedMapDataset', data_root=data_root, classes=classes, grid=grid, frame='ego',
+    type='VectorizedMapDataset', data_root=data_root, classes=classes, grid=grid, frame='ego', pose_only_signals=True,
     cameras=[
         'ring_front_center', 'ring_front_right', 'ring_front_left', 'ring_rear_right', 'ring_rear_left',
         'ring_side_right', 'ring_side_left'
@@ -42,7 +43,7 @@ test_dataloader = val_dataloader
 # the LiDAR sweep that each sample names (docs/data.md).
 _masks = [
     dict(type='MakeBEVMask', size=(100, 200), num_classes=3),
-    dict(type='MakePVMask', stride=32, ground_z_m=-0.3, num_classes=3),  # the origin is the rear axle
+    dict(type='MakePVMask', stride=32, ground_z_m=-0.3, num_classes=3, heights=True),  # the origin is the rear axle
 ]
 _seg = [_load, _scale, _photometric, _targets, *_masks, _pack]
 _depth_seg = [

@@ -1,6 +1,6 @@
 # nuScenes in the frame of the vehicle (x forward, y left), six cameras of 800 x 480, drives in order: what StreamMapNet
 # takes. `python tools/create_data.py nuscenes --root data/nuscenes --frame ego --tag _ego --x-range -30 30
-# --y-range -15 15` makes the annotation files.
+# --y-range -15 15 --classes ped_crossing divider boundary` makes the annotation files.
 data_root = 'data/nuscenes/'
 _file_size = (1600, 900)  # of the image files, width and height
 # the one place of range and classes: leaves hand them to the model
@@ -10,7 +10,7 @@ classes = ['ped_crossing', 'divider', 'boundary']
 _load = dict(type='LoadCameraImages')
 _load_bytes = dict(type='LoadCameraImages', to_float32=False)  # before a step that converts anyway
 _scale = dict(type='ScaleImages', size=(800, 480))
-_photometric = dict(type='DistortImages')  # each camera its own, as in MapTR
+_photometric = dict(type='DistortImages', swap_channels=False)  # each camera its own
 _targets = dict(type='FormatMapTargets', num_points=20, orders_of='points')
 _pack = dict(type='PackMapInputs')
 

@@ -23,6 +23,8 @@ _minicity = dict(
         embed_dims=_dim,
         bev_pixel_m=1.2,
         z_range=(-2.09, -0.09),  # the lowest pillar height is the ground
+        uniform_positions=True,
+        cross_attn=dict(equal_weights=True),
         layer_cfg=dict(num_heads=4, ffn_dims=2 * _dim, dropout=0.0)),
     map_head=dict(
         query_groups=[dict(num=20)],

@@ -20,3 +20,12 @@ model = dict(
     img_neck=dict(type='BiFPN'),
     bev_encoder=dict(type='BezierBEVEncoder'),
     map_head=dict(type='BezierHead', decoder=dict(num_layers=6)))
+
+# of a segmentation model (UperNet on ADE20K), as in the release
+_swin = 'https://github.com/SwinTransformer/storage/releases/download/v1.0.1/upernet_swin_tiny_patch4_window7_512x512.pth'
+_swin_t = dict(  # what Swin-T changes
+    img_backbone=dict(
+        _delete_=True, type='mmdet.SwinTransformer', embed_dims=96, depths=(2, 2, 6, 2), num_heads=(3, 6, 12, 24),
+        window_size=7, drop_path_rate=0.3, out_indices=(1, 2, 3), convert_weights=True,
+        init_cfg=dict(type='Pretrained', checkpoint=_swin)),
+    img_neck=dict(in_channels=(192, 384, 768)))

@@ -21,10 +21,10 @@ model = dict(
     map_head=dict(type='PivotHead', queries=((20, 10), (25, 2), (15, 30)), decoder=dict(num_layers=6)))
 
 # of a segmentation model (UperNet on ADE20K), as in the release
-_swin = 'https://github.com/SwinTransformer/storage/releases/download/v1.0.1/upernet_swin_tiny_patch4_window7_512.pth'
+_swin = 'https://github.com/SwinTransformer/storage/releases/download/v1.0.1/upernet_swin_tiny_patch4_window7_512x512.pth'
 _swin_t = dict(  # what Swin-T changes
     img_backbone=dict(
         _delete_=True, type='mmdet.SwinTransformer', embed_dims=96, depths=(2, 2, 6, 2), num_heads=(3, 6, 12, 24),
-        window_size=7, drop_path_rate=0.1, out_indices=(2, 3), convert_weights=True,
+        window_size=7, drop_path_rate=0.3, out_indices=(2, 3), convert_weights=True,
         init_cfg=dict(type='Pretrained', checkpoint=_swin)),
     bev_encoder=dict(in_channels=(384, 768)))

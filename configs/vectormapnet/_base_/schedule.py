@@ -17,7 +17,7 @@ param_scheduler = [
     dict(type='LinearLR', start_factor=0.1, by_epoch=False, begin=0, end=400),
     dict(type='MultiStepLR', by_epoch=True, milestones=[100, 120], gamma=0.1),
 ]
-train_cfg = dict(type='EpochBasedTrainLoop', max_epochs=130, val_interval=10)
+train_cfg = dict(type='EpochBasedTrainLoop', max_epochs=130, val_interval=1)
 val_cfg = dict()
 test_cfg = dict()
 auto_scale_lr = dict(enable=False, base_batch_size=40)

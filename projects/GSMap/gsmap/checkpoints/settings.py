@@ -10,7 +10,10 @@ from mmengine.config import Config, ConfigDict
 
 MODEL_SETTINGS = "model_settings"  # key of a checkpoint's meta: JSON, as a config's text is code
 # settings of a training alone; those of its start may load files
-STARTS = {"init_cfg", "pretrained", "allow_untrained", "autocast", "compiled"}
+STARTS = {
+    "init_cfg", "pretrained", "equal_weights", "uniform_positions", "allow_untrained", "autocast",
+    "compiled",
+}  # fmt: skip
 IMAGE_SIZE = "image_size"  # key of a checkpoint's meta: width and height that images are scaled to
 SIGNALS = "can_bus"  # key of a checkpoint's meta: whether training samples had vehicle signals
 # what a checkpoint names and later versions replace by a part with the same arguments

@@ -65,6 +65,7 @@ class HeightKernelAttention(GeometryKernelAttention):
         accumulate_heights: Start from the heights of the layer before, as released, or from the
             evenly spaced ones.
         released_cells: As in `GeometryKernelAttention`.
+        equal_weights: As there; MapQR's do start equal.
     """
 
     def __init__(
@@ -74,8 +75,9 @@ class HeightKernelAttention(GeometryKernelAttention):
         kernel_size: tuple[int, int] = (2, 4),
         accumulate_heights: bool = True,
         released_cells: bool = False,
+        equal_weights: bool = True,
     ) -> None:
-        super().__init__(embed_dims, num_heads, kernel_size, True, released_cells)
+        super().__init__(embed_dims, num_heads, kernel_size, True, released_cells, equal_weights)
         self.accumulate_heights = accumulate_heights
         self.height_offsets = nn.Linear(embed_dims, num_heads)
         constant_init(self.height_offsets, 0.0)
