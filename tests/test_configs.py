@@ -20,6 +20,7 @@ from mmengine.structures import InstanceData
 
 import gsmap.registered  # noqa: F401
 from gsmap.checkpoints.strict import neutral_keys
+from gsmap.datasets.annotations.record import UNITED
 from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.engine.launch import check_config, read_config
 from gsmap.structures.grid import BEVGrid, padded_size
@@ -208,19 +209,22 @@ def shrink_images(cfg: Config) -> None:
 def annotations(minicity_root: Path, tmp_path_factory) -> Callable[[ConfigDict], Path]:
     """Find the annotation file that fits a data set's range, classes, split and coordinates.
 
-    Each is MiniCity converted as the data set's own data would be, once per range and class list.
+    Each is MiniCity converted as the data set's own data would be, once per range, class list and
+    rule of the crossings.
     """
     folders: dict[tuple, Path] = {}
 
     def find(dataset: ConfigDict) -> Path:
         x_range, y_range = tuple(dataset.grid.x_range), tuple(dataset.grid.y_range)
-        wanted = x_range, y_range, tuple(dataset.classes)
+        rule = dataset.get("crossings") or UNITED
+        wanted = x_range, y_range, tuple(dataset.classes), rule
         if wanted not in folders:
             folders[wanted] = tmp_path_factory.mktemp("annotations")
             options = NuScenesOptions(
                 minicity_root, "v1.0-trainval", dataset="minicity", out_dir=folders[wanted]
             )
-            convert_nuscenes(replace(options, x_range=x_range, y_range=y_range, classes=wanted[2]))
+            ranges = {"x_range": x_range, "y_range": y_range}
+            convert_nuscenes(replace(options, **ranges, classes=wanted[2], crossings=rule))
         flat = folders[wanted] / f"gsmap_minicity_{dataset.split}.arrow"
         if dataset.get("dim", 2) == 2:
             return flat
@@ -232,7 +236,7 @@ def annotations(minicity_root: Path, tmp_path_factory) -> Callable[[ConfigDict],
 def on_minicity(dataset: ConfigDict, root: Path, annotations: Callable[[ConfigDict], Path]) -> None:
     """Let a data set's config read MiniCity."""
     dataset.update(data_root=str(root), ann_file=str(annotations(dataset)))
-    dataset.update(frame="lidar", cameras=None, rate_hz=None, crossings=None)
+    dataset.update(frame="lidar", cameras=None, rate_hz=None)
 
 
 def check_gradients(model: torch.nn.Module, losses: dict[str, torch.Tensor]) -> None:
