@@ -1,6 +1,5 @@
 # MapTR nano on nuScenes, 110 epochs, as published: ResNet-18 with trained BatchNorm, images at 0.2 of their size, BEV
-# 80 x 40, 100 instances, two decoder layers of four heads, AdamW 4e-3 for 24 x 8 samples per step. Published with
-# SyncBN; here BatchNorm, so that it runs without GPUs.
+# 80 x 40, 100 instances, two decoder layers of four heads, AdamW 4e-3 for 24 x 8 samples per step.
 _base_ = './maptr_r50_24e.py'
 
 model = dict(
@@ -18,3 +17,4 @@ test_dataloader = val_dataloader
 optim_wrapper = dict(optimizer=dict(lr=4e-3), clip_grad=dict(max_norm=50))
 train_cfg = dict(max_epochs=110)
 auto_scale_lr = dict(base_batch_size=192)
+sync_bn = 'torch'  # of several ranks

@@ -16,7 +16,7 @@ model = dict(
         norm_cfg=dict(type='BN', requires_grad=True),
         norm_eval=True,
         style='pytorch',
-        init_cfg=dict(type='Pretrained', checkpoint='https://download.pytorch.org/models/resnet50-19c8e357.pth')),
+        init_cfg=dict(type='Pretrained', checkpoint='https://download.pytorch.org/models/resnet50-0676ba61.pth')),
     img_neck=dict(type='BiFPN'),
     bev_encoder=dict(type='BezierBEVEncoder'),
     map_head=dict(type='BezierHead', decoder=dict(num_layers=6)))
@@ -28,4 +28,5 @@ _swin_t = dict(  # what Swin-T changes
         _delete_=True, type='mmdet.SwinTransformer', embed_dims=96, depths=(2, 2, 6, 2), num_heads=(3, 6, 12, 24),
         window_size=7, drop_path_rate=0.3, out_indices=(1, 2, 3), convert_weights=True,
         init_cfg=dict(type='Pretrained', checkpoint=_swin)),
-    img_neck=dict(in_channels=(192, 384, 768)))
+    img_neck=dict(in_channels=(192, 384, 768), channels=128),
+    bev_encoder=dict(in_channels=640))

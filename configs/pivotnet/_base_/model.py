@@ -16,7 +16,7 @@ model = dict(
         norm_cfg=dict(type='BN', requires_grad=True),
         norm_eval=True,
         style='pytorch',
-        init_cfg=dict(type='Pretrained', checkpoint='https://download.pytorch.org/models/resnet50-19c8e357.pth')),
+        init_cfg=dict(type='Pretrained', checkpoint='https://download.pytorch.org/models/resnet50-0676ba61.pth')),
     bev_encoder=dict(type='PivotBEVEncoder'),
     map_head=dict(type='PivotHead', queries=((20, 10), (25, 2), (15, 30)), decoder=dict(num_layers=6)))
 

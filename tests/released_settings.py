@@ -1,0 +1,268 @@
+"""Training settings of the releases: one row a config, to be held against ours.
+
+Each row says where its release has them; numbers of the papers where there is no release. Equal
+settings of MapTR's family stand in ``MAPTR`` once.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from mmengine.config import Config
+from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
+
+REPO = Path(__file__).resolve().parents[1]
+IMAGE_STEPS = {"DistortImages": "distort", "ScaleImages": "scale", "CropImages": "crop"}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a training.
+
+    Args:
+        rates: Learning rate of each group of parameters, by the part of the model.
+        decay: Weight decay.
+        clip: Largest norm of the gradients; None does not clip.
+        warm_up: Iterations, and the share of the rate at the first.
+        schedule: Kind of the scheduler after it, with its numbers.
+        epochs: Number of epochs.
+        batch: Samples per GPU.
+        evaluated: Epochs between two validations.
+        images: What is done to images before they are packed, in its order.
+        grid_mask: Whether training hides a grid of each image.
+        drop_path: Stochastic depth of the backbone.
+        batch_norm: Of the backbone, in training: ``fixed``, ``statistics fixed`` (its scales
+            learn), ``learns``, or ``none``.
+        frozen: First stages of the backbone that do not learn.
+        synchronized: Whether batch norms that learn share statistics over GPUs.
+        weights: File that the backbone starts from.
+        left_out: Whether training leaves out samples without elements.
+    """
+
+    rates: dict[str, float] = field(
+        default_factory=lambda: {"img_backbone": 6e-5, "the rest": 6e-4}
+    )
+    decay: float = 0.01
+    clip: float | None = 35
+    warm_up: tuple[int, float] | None = (500, 1 / 3)
+    schedule: tuple[Any, ...] = ("CosineAnnealingLR", 1e-3)
+    epochs: int = 24
+    batch: int = 4
+    evaluated: int = 2
+    images: str = "distort scale"
+    grid_mask: bool = True
+    drop_path: float = 0.0
+    batch_norm: str = "fixed"
+    frozen: int = 1
+    synchronized: bool = False
+    weights: str = "resnet50-19c8e357.pth"
+    left_out: bool = True
+
+
+MAPTR = Settings()
+FOUR_E4 = {"img_backbone": 4e-5, "the rest": 4e-4}
+GEMAP = replace(MAPTR, decay=0.03, epochs=110, evaluated=1)
+GEMAP_FULL = replace(GEMAP, images="scale distort", frozen=-1)
+V2_99 = replace(GEMAP_FULL, batch=3, batch_norm="statistics fixed")
+STREAM = Settings(
+    rates={"img_backbone": 5e-5, "the rest": 5e-4},
+    schedule=("CosineAnnealingLR", 3e-3),
+    evaluated=4,
+    batch_norm="statistics fixed",
+    frozen=-1,
+    synchronized=True,
+    weights="resnet50_msra-5891d200.pth",
+)
+LINES = Settings(
+    rates={"img_backbone": 5e-5, "the rest": 2e-4},
+    clip=None,
+    warm_up=None,
+    schedule=("MultiStepLR", (21, 27), 0.2),
+    epochs=30,
+    batch=1,
+    evaluated=5,  # the releases evaluate afterwards, by another command
+    images="scale",
+    grid_mask=False,
+    batch_norm="statistics fixed",
+    frozen=-1,
+    synchronized=True,
+    weights="resnet50-0676ba61.pth",
+    left_out=False,
+)
+BEMAPNET = replace(
+    LINES,
+    rates={"img_backbone": 5e-5, "img_neck": 5e-5, "the rest": 2e-4},
+    schedule=("MultiStepLR", (21, 27), 1 / 3),
+    images="scale crop",  # the release mirrors at random besides
+    frozen=1,
+)
+UPERNET = {
+    "drop_path": 0.3,
+    "batch_norm": "none",
+    "frozen": -1,
+    "weights": "upernet_swin_tiny_patch4_window7_512x512.pth",
+}
+EFFICIENT = {
+    "drop_path": 0.2 * 15 / 16,  # of the last of 16 blocks
+    "batch_norm": "learns",
+    "frozen": -1,
+    "weights": "efficientnet-b0-355c32eb.pth",
+}
+
+RELEASED: dict[str, Settings] = {
+    # the paper, section 4.1; its batch as its README reads it
+    "projects/GSMap/configs/gsmap_maptr_r50_24e.py": replace(MAPTR, batch=2),
+    # hustvl/MapTR, projects/configs/maptr
+    "configs/maptr/maptr_r50_24e.py": MAPTR,
+    "configs/maptr/maptr_r50_110e.py": replace(MAPTR, epochs=110),
+    "configs/maptr/maptr_r50_second_24e.py": MAPTR,
+    "configs/maptr/maptr_r50_av2_6e.py": replace(
+        MAPTR, epochs=6, batch=6, images="scale distort"  # 6 epochs: papers; 24 in the release
+    ),
+    "configs/maptr/maptr_r18_nano_110e.py": replace(
+        MAPTR, rates={"img_backbone": 4e-4, "the rest": 4e-3}, clip=50, epochs=110, batch=24,
+        batch_norm="learns", frozen=-1, synchronized=True, weights="resnet18-f37072fd.pth",
+    ),
+    # hustvl/MapTR (branch maptrv2), projects/configs/maptrv2
+    "configs/maptrv2/maptrv2_r50_24e.py": replace(MAPTR, images="scale distort"),
+    "configs/maptrv2/maptrv2_r50_av2_3d_6e.py": replace(
+        MAPTR, warm_up=(200, 1 / 3), epochs=6, evaluated=1, images="scale distort"
+    ),
+    # ZhangGongjie/MapVR, projects/configs/maptr/exp_tiny_r50_*
+    "configs/mapvr/mapvr_r50_24e.py": replace(MAPTR, batch=8, evaluated=6),
+    "configs/mapvr/mapvr_r50_110e.py": replace(MAPTR, epochs=110, evaluated=10),
+    # cnzzx/GeMap, projects/configs/gemap
+    "configs/gemap/gemap_simple_r50_110e.py": GEMAP,
+    "configs/gemap/gemap_simple_r50_av2_24e.py": replace(
+        GEMAP, warm_up=(200, 1 / 3), epochs=24, images="scale distort", frozen=-1
+    ),
+    "configs/gemap/gemap_full_swint_110e.py": replace(
+        GEMAP_FULL, rates=FOUR_E4, batch=3, drop_path=0.1, batch_norm="none",
+        weights="swin_tiny_patch4_window7_224.pth",
+    ),
+    "configs/gemap/gemap_full_v299_110e.py": replace(
+        V2_99, weights="vovnet99_ese_detectron2.pth"
+    ),
+    "configs/gemap/gemap_full_v299_dd3d_110e.py": replace(
+        V2_99, batch=4, frozen=1,
+        weights="depth_pretrained_v99-3jlw0p36-20210423_010520-model_final-remapped.pth",
+    ),
+    # HXMap/MapQR, projects/configs/mapqr
+    "configs/mapqr/mapqr_r50_24e.py": replace(MAPTR, evaluated=4, images="scale distort"),
+    "configs/mapqr/mapqr_r50_av2_6e.py": replace(
+        MAPTR, warm_up=(200, 1 / 3), epochs=6, evaluated=1, images="scale distort"
+    ),
+    # Tongji-MIC-Lab/MGMapNet, projects/configs/MGA/100query_class3_110epoch.py
+    "configs/mgmapnet/mgmapnet_r50_110e.py": replace(
+        MAPTR, rates=FOUR_E4, epochs=110, batch=2, evaluated=5, images="scale distort"
+    ),
+    # xiaolul2/MGMap, projects/configs/mgmap/mgmap_cam_r50_30e.py
+    "configs/mgmap/mgmap_r50_30e.py": replace(
+        MAPTR, rates={"img_backbone": 3e-5, "the rest": 3e-4}, epochs=30, evaluated=6
+    ),
+    # yuantianyuan01/StreamMapNet, plugin/configs
+    "configs/streammapnet/streammapnet_r50_24e.py": STREAM,
+    "configs/streammapnet/streammapnet_r50_av2_30e.py": replace(STREAM, epochs=30, evaluated=5),
+    # wenjie710/PivotNet, configs
+    "configs/pivotnet/pivotnet_r50_30e.py": LINES,
+    "configs/pivotnet/pivotnet_swint_30e.py": replace(LINES, **UPERNET),
+    "configs/pivotnet/pivotnet_effb0_30e.py": replace(LINES, **EFFICIENT),
+    # er-muyue/BeMapNet, configs
+    "configs/bemapnet/bemapnet_r50_30e.py": BEMAPNET,
+    "configs/bemapnet/bemapnet_swint_30e.py": replace(BEMAPNET, **UPERNET),
+    "configs/bemapnet/bemapnet_effb0_30e.py": replace(BEMAPNET, **EFFICIENT),
+    # Mrmoore98/VectorMapNet_code, configs/vectormapnet.py
+    "configs/vectormapnet/vectormapnet_r50_130e.py": Settings(
+        rates={
+            "img_backbone": 1e-4, "img_neck": 1e-4, "bev_encoder.upsampling": 1e-4,
+            "bev_encoder.reduction": 1e-4, "the rest": 1e-3,
+        },
+        clip=0.5, warm_up=(400, 0.1), schedule=("MultiStepLR", (100, 120), 0.1), epochs=130,
+        batch=5, evaluated=1, images="scale", grid_mask=False, batch_norm="statistics fixed",
+        frozen=-1, weights="resnet50_msra-5891d200.pth",
+    ),
+    # Tsinghua-MARS-Lab/HDMapNet, train.py
+    "configs/hdmapnet/hdmapnet_effb0_30e.py": Settings(
+        rates={"the rest": 1e-3}, decay=1e-7, clip=5, warm_up=None, schedule=("StepLR", 10, 0.1),
+        epochs=30, evaluated=5,  # the release takes IoUs after each epoch, no AP
+        images="scale", grid_mask=False, left_out=False, **EFFICIENT,
+    ),
+}  # fmt: skip
+
+
+def rates_of(model: nn.Module, groups: list[dict], parts: tuple[str, ...]) -> dict[str, float]:
+    """Return the learning rate of the parameters of each part, and of the rest.
+
+    Args:
+        model: The model.
+        groups: Groups of its optimizer.
+        parts: Beginnings of the names of parameters.
+
+    Raises:
+        AssertionError: If a part has several rates, or its parameters are in no group.
+    """
+    rate = {id(p): g["initial_lr"] if "initial_lr" in g else g["lr"] for g in groups for p in g["params"]}
+    found: dict[str, set[float]] = {}
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad:
+            part = next((p for p in parts if name.startswith(f"{p}.")), "the rest")
+            found.setdefault(part, set()).add(round(rate[id(parameter)], 12))
+    assert all(len(rates) == 1 for rates in found.values()), found
+    return {part: rates.pop() for part, rates in found.items()}
+
+
+def batch_norm_of(backbone: nn.Module) -> str:
+    """Return how the batch norms of a backbone that is trained behave, but in frozen stages."""
+    norms = [m for m in backbone.modules() if isinstance(m, _BatchNorm)]
+    if not norms:
+        return "none"
+    last = norms[-1]
+    learns = last.weight is not None and last.weight.requires_grad
+    if last.training:
+        return "learns" if learns else "statistics learn"
+    return "statistics fixed" if learns else "fixed"
+
+
+def settings_of(cfg: Config, model: nn.Module, groups: list[dict]) -> Settings:
+    """Return the settings of a config.
+
+    Args:
+        cfg: The config.
+        model: Its model, in training.
+        groups: Groups of its optimizer.
+    """
+    name = Path(cfg.filename).resolve().relative_to(REPO).as_posix()
+    parts = tuple(part for part in RELEASED[name].rates if part != "the rest")
+    first, *others = cfg.param_scheduler
+    warm_up = None
+    if first.type == "LinearLR":
+        assert not first.by_epoch
+        warm_up = first.end, first.start_factor
+    last = others[-1] if others else first
+    numbers: tuple[Any, ...] = tuple(
+        tuple(last[key]) if isinstance(last[key], list) else last[key]
+        for key in ("eta_min_ratio", "milestones", "step_size", "gamma")
+        if key in last
+    )
+    data, backbone = cfg.train_dataloader, cfg.model.img_backbone
+    return Settings(
+        rates=rates_of(model, groups, parts),
+        decay=cfg.optim_wrapper.optimizer.weight_decay,
+        clip=(cfg.optim_wrapper.get("clip_grad") or {}).get("max_norm"),
+        warm_up=warm_up,
+        schedule=(last.type, *numbers),
+        epochs=cfg.train_cfg.max_epochs,
+        batch=data.batch_size,
+        evaluated=cfg.train_cfg.val_interval,
+        images=" ".join(
+            IMAGE_STEPS[step.type] for step in data.dataset.pipeline if step.type in IMAGE_STEPS
+        ),
+        grid_mask=(cfg.model.get("img_augment") or {}).get("type") == "GridMask",
+        drop_path=backbone.get("drop_path_rate", 0.0),
+        batch_norm=batch_norm_of(model.img_backbone),
+        frozen=backbone.get("frozen_stages", -1),
+        synchronized=cfg.get("sync_bn") == "torch",
+        weights=Path(backbone.init_cfg.checkpoint).name,
+        left_out=data.dataset.get("filter_empty_gt", True),
+    )
