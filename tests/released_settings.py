@@ -78,7 +78,7 @@ LINES = Settings(
     rates={"img_backbone": 5e-5, "the rest": 2e-4},
     clip=None,
     warm_up=None,
-    schedule=("MultiStepLR", (21, 27), 0.2),
+    schedule=("MultiStepLR", 21, 27, 0.2),
     epochs=30,
     batch=1,
     evaluated=5,  # the releases evaluate afterwards, by another command
@@ -93,7 +93,7 @@ LINES = Settings(
 BEMAPNET = replace(
     LINES,
     rates={"img_backbone": 5e-5, "img_neck": 5e-5, "the rest": 2e-4},
-    schedule=("MultiStepLR", (21, 27), 1 / 3),
+    schedule=("MultiStepLR", 21, 27, 1 / 3),
     images="scale crop",  # the release mirrors at random besides
     frozen=1,
 )
@@ -116,7 +116,7 @@ RELEASED: dict[str, Settings] = {
     # hustvl/MapTR, projects/configs/maptr
     "configs/maptr/maptr_r50_24e.py": MAPTR,
     "configs/maptr/maptr_r50_110e.py": replace(MAPTR, epochs=110),
-    "configs/maptr/maptr_r50_second_24e.py": MAPTR,
+    "configs/maptr/maptr_r50_bevpool_24e.py": MAPTR,
     "configs/maptr/maptr_r50_av2_6e.py": replace(
         MAPTR, epochs=6, batch=6, images="scale distort"  # 6 epochs: papers; 24 in the release
     ),
@@ -178,7 +178,7 @@ RELEASED: dict[str, Settings] = {
             "img_backbone": 1e-4, "img_neck": 1e-4, "bev_encoder.upsampling": 1e-4,
             "bev_encoder.reduction": 1e-4, "the rest": 1e-3,
         },
-        clip=0.5, warm_up=(400, 0.1), schedule=("MultiStepLR", (100, 120), 0.1), epochs=130,
+        clip=0.5, warm_up=(400, 0.1), schedule=("MultiStepLR", 100, 120, 0.1), epochs=130,
         batch=5, evaluated=1, images="scale", grid_mask=False, batch_norm="statistics fixed",
         frozen=-1, weights="resnet50_msra-5891d200.pth",
     ),
@@ -202,7 +202,7 @@ def rates_of(model: nn.Module, groups: list[dict], parts: tuple[str, ...]) -> di
     Raises:
         AssertionError: If a part has several rates, or its parameters are in no group.
     """
-    rate = {id(p): g["initial_lr"] if "initial_lr" in g else g["lr"] for g in groups for p in g["params"]}
+    rate = {id(p): g.get("initial_lr", g["lr"]) for g in groups for p in g["params"]}
     found: dict[str, set[float]] = {}
     for name, parameter in model.named_parameters():
         if parameter.requires_grad:
@@ -240,11 +240,10 @@ def settings_of(cfg: Config, model: nn.Module, groups: list[dict]) -> Settings:
         assert not first.by_epoch
         warm_up = first.end, first.start_factor
     last = others[-1] if others else first
-    numbers: tuple[Any, ...] = tuple(
-        tuple(last[key]) if isinstance(last[key], list) else last[key]
-        for key in ("eta_min_ratio", "milestones", "step_size", "gamma")
-        if key in last
-    )
+    numbers = [
+        *last.get("milestones", ()),
+        *(last[key] for key in ("eta_min_ratio", "step_size", "gamma") if key in last),
+    ]
     data, backbone = cfg.train_dataloader, cfg.model.img_backbone
     return Settings(
         rates=rates_of(model, groups, parts),

@@ -13,14 +13,15 @@ from gsmap.models.encoders.gkt import GeometryKernelAttention
 from gsmap.models.mapqr.encoder import HeightKernelAttention
 from gsmap.structures.grid import BEVGrid
 
-NEEDS_VALUES = ("mmdet.SwinTransformer", "mmdet.EfficientNet")  # of numbers when they are built
+NEEDS_VALUES = ("mmdet.SwinTransformer", "mmdet.EfficientNet", "GSMapHead")  # when it is built
 
 
 @pytest.mark.parametrize("name", RELEASED, ids=lambda name: name.rpartition("/")[2])
 def test_settings_are_those_of_the_release(name):
     """Without the values of weights: models are built on the device that has none."""
     cfg = load(REPO / name)
-    device = "cpu" if cfg.model.img_backbone.type in NEEDS_VALUES else "meta"
+    kinds = {cfg.model.img_backbone.type, cfg.model.map_head.type}
+    device = "cpu" if kinds & set(NEEDS_VALUES) else "meta"
     with torch.device(device):
         model = MODELS.build(cfg.model).train()
     groups = build_optim_wrapper(model, cfg.optim_wrapper).optimizer.param_groups
@@ -44,7 +45,7 @@ def test_the_table_notices_a_change():
 
 
 def test_kernels_and_positions_start_as_released():
-    """Xavier's law and N(0, 1) in MapTR, equal weights in MapQR; small models of MiniCity as ever."""
+    """Xavier's law and N(0, 1) in MapTR, equal weights in MapQR; MiniCity as ever."""
     published = load(REPO / "configs/maptr/maptr_r50_24e.py").model.bev_encoder
     small = load(REPO / "configs/maptr/maptr_r18_minicity.py").model.bev_encoder
     grid = load(REPO / "configs/maptr/maptr_r50_24e.py").grid
@@ -60,4 +61,3 @@ def test_kernels_and_positions_start_as_released():
         assert not built.layers[0].cross_attn.attention_weights.bias.any()
     assert GeometryKernelAttention(16, 4).attention_weights.weight.any()
     assert not HeightKernelAttention(16, 4).attention_weights.weight.any()
-

@@ -305,7 +305,9 @@ def test_the_rule_of_the_crossings_is_an_option_that_the_file_names(
         assert lines
         assert {len(line) for line in lines} == {2}
         for label in (0, 2):
-            own, other = ([i.points for i in s.instances if i.label == label] for s in (edges, rings))
+            own, other = (
+                [i.points for i in s.instances if i.label == label] for s in (edges, rings)
+            )
             assert all(map(np.array_equal, own, other))
 
 

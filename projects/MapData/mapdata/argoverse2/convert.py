@@ -122,9 +122,7 @@ def _passed_over(log_dirs: list[Path], options: Argoverse2Options) -> dict[str, 
     return spread_over_split(dict(zip(names, found, strict=True)), options.rate_hz)
 
 
-def _try_log(
-    job: tuple[Path, Collection[int]], options: Argoverse2Options
-) -> LogSamples | str:
+def _try_log(job: tuple[Path, Collection[int]], options: Argoverse2Options) -> LogSamples | str:
     """Read a log; return the reason where that fails (a bug of ours still stops everything).
 
     The job is its folder, with the times that are passed over.
