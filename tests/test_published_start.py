@@ -20,6 +20,7 @@ from mmengine.config import Config
 from mmengine.registry import DefaultScope
 from mmengine.runner import CheckpointLoader
 from mmengine.runner import checkpoint as mmengine_checkpoint
+from released_settings import RELEASED, rates_of
 from test_configs import LEAVES, REPO, annotations, load, on_minicity, shrink_images  # noqa: F401
 from test_docs_commands import PAGES, commands
 
@@ -185,6 +186,10 @@ def test_a_command_of_the_pages_reaches_its_first_iteration(
     with pytest.raises(Reached):
         main()
     (runner,) = at_first
+    if words[1] in RELEASED and len(words) == 2:
+        rates = RELEASED[words[1]].rates
+        groups = runner.optim_wrapper.optimizer.param_groups
+        assert rates_of(runner.model, groups, tuple(rates)) == pytest.approx(rates)
     if runner.cfg.load_from:
         return  # what it loads takes the place of the backbone's weights
     start = runner.model.img_backbone.state_dict()

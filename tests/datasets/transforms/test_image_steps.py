@@ -111,7 +111,7 @@ def test_bicubic_scaling_on_the_device_equals_pillows_to_a_grey_level(size):
 
 
 def test_an_unknown_kernel_is_refused():
-    with pytest.raises(ValueError, match="kernel must be one of .*bicubic.*got 'lanczos'"):
+    with pytest.raises(ValueError, match=r"kernel must be one of .*bicubic.*got 'lanczos'"):
         TRANSFORMS.build({"type": "ScaleImages", "scale": 0.5, "kernel": "lanczos"})
 
 
