@@ -188,7 +188,9 @@ def test_a_model_is_tested_with_the_settings_of_its_checkpoint(small, tmp_path):
         f"{of_losses}.2: {{'type': 'EuclideanLoss'}}, as {path} was trained; the config has None",
     ]
     assert adopt_settings(small, path, None) == trained
-    del settings["img_backbone"]["init_cfg"]  # never loaded: the checkpoint has all weights
+    del settings["img_backbone"]["init_cfg"]  # how weights start: the checkpoint has all of them
+    del settings["bev_encoder"]["uniform_positions"]
+    del settings["bev_encoder"]["cross_attn"]["equal_weights"]
     assert small.model.to_dict() == {**settings, "allow_untrained": False}
     options = {f"{of_losses}.0.loss_weight": 5.0, "model.img_backbone.init_cfg": None}
     small.merge_from_dict(options)

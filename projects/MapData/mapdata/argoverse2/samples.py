@@ -153,7 +153,7 @@ def spread_over_split(times: Mapping[str, Sequence[int]], rate_hz: float) -> dic
     Returns:
         The times that are passed over, by log.
     """
-    steps = np.concatenate([np.diff(own) for own in times.values()] or [[]])
+    steps = np.concatenate([np.zeros(0), *(np.diff(own) for own in times.values())])
     every = max(round(1e9 / (rate_hz * np.median(steps))), 1) if len(steps) else 1
     ordered = sorted((time, name) for name, own in times.items() for time in own)
     passed: dict[str, set[int]] = {name: set() for name in times}
