@@ -410,7 +410,8 @@ def test_any_head_can_remember_the_features_of_the_map(path, minicity_root, anno
             data = model.data_preprocessor(pseudo_collate([again]), mode == "loss")
             with model.over_time(
                 model.extract_feat(data["inputs"], data["data_samples"]), data["data_samples"]
-            ) as outputs:
+            ) as batch:
+                outputs = batch.outputs
                 found.append(outputs["bev_feats"].detach())
                 if mode == "loss":
                     check_gradients(model, model.map_head.loss(outputs, data["data_samples"]))

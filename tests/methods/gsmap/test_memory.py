@@ -41,8 +41,8 @@ def with_memory(**queries):
 
 def step(head, memory, number: int):
     """Predict a frame; return the last layer's predictions, and the memory in the batch."""
-    with torch.no_grad(), memory.over({"bev_feats": features(number)}, [meta(number)]) as outputs:
-        return head(outputs)[-1], outputs["query_memory"]
+    with torch.no_grad(), memory.over({"bev_feats": features(number)}, [meta(number)]) as batch:
+        return head(batch.outputs, **batch.hooks)[-1], batch.propagation
 
 
 def past(seconds: float = 0.5, motion=None) -> Past:
@@ -137,8 +137,8 @@ def test_a_gaussian_that_left_the_map_is_not_fused():
 def test_fused_predictions_train_the_decoder():
     head, memory = with_memory()
     step(head, memory, 0)
-    with memory.over({"bev_feats": features(1)}, [meta(1)]) as outputs:
-        head(outputs)[-1].references[:, :2].square().sum().backward()
+    with memory.over({"bev_feats": features(1)}, [meta(1)]) as batch:
+        head(batch.outputs, **batch.hooks)[-1].references[:, :2].square().sum().backward()
     for branches in (head.reference.branches, head.reference.gaussian_branches):
         gradient = torch.cat([p.grad.flatten() for p in branches[-1].parameters()])
         assert gradient.isfinite().all()

@@ -80,10 +80,10 @@ class Recorder:
             return pairs
 
         self.head.match = match  # type: ignore[method-assign]
-        with self.memory.over({"bev_feats": flipped(bev)}, metas) as outputs:
-            memory = outputs["query_memory"]
-            predictions = self.head(outputs)
-            losses = self.head.loss_by_feat(predictions, gts, metas, memory)
+        with self.memory.over({"bev_feats": flipped(bev)}, metas) as batch:
+            memory = batch.propagation
+            predictions = self.head(batch.outputs, **batch.hooks)
+            losses = self.head.loss_by_feat(predictions, gts, metas, [memory])
             trans = memory.loss(self.head)
         hook.remove()
         self.head.match = own_match  # type: ignore[method-assign]

@@ -51,8 +51,8 @@ def with_memory(**settings):
 def step(head, memory, *metas: dict, feats: torch.Tensor | None = None) -> torch.Tensor:
     """Predict one batch and return the points of the last layer."""
     outputs = {"bev_feats": bev(len(metas))["bev_feats"] if feats is None else feats}
-    with torch.no_grad(), memory.over(outputs, metas) as outputs:
-        return head(outputs)[-1].pts
+    with torch.no_grad(), memory.over(outputs, metas) as batch:
+        return head(batch.outputs, **batch.hooks)[-1].pts
 
 
 def features(number: int) -> torch.Tensor:
@@ -289,10 +289,10 @@ def test_training_gives_every_weight_a_gradient_and_later_frames_a_loss():
     head.train(), memory.train()
     losses, shares = [], []
     for number in range(2):
-        with memory.over({"bev_feats": features(number)}, [meta(number)]) as outputs:
+        with memory.over({"bev_feats": features(number)}, [meta(number)]) as batch:
             sample = make_samples(LANES)[0]
             sample.set_metainfo(meta(number))
-            each = head.loss(outputs, [sample])
+            each = head.loss(batch.outputs, [sample], **batch.hooks)
         losses.append(each["loss_trans"])
         shares.append(sum(value for name, value in each.items() if "loss" in name))
     assert float(losses[0]) == 0
@@ -311,13 +311,13 @@ def test_a_query_that_has_moved_as_the_vehicle_has_no_loss(config):
     head, memory = with_memory(**config)
     head.train(), memory.train()
     start, turned = (meta(n, lidar2global=pose(0.0, n * math.pi)) for n in range(2))
-    with memory.over({"bev_feats": features(0)}, [start]) as outputs:
+    with memory.over({"bev_feats": features(0)}, [start]) as batch:
         (sample,) = make_samples(LANES)
-        head.loss(outputs, [sample])
+        head.loss(batch.outputs, [sample], **batch.hooks)
     past = recalled([Frame.of(turned)], memory.streams.states, torch.device("cpu"))
-    outputs = memory.enter({"bev_feats": features(1)}, past)
-    head(outputs)
-    propagation = outputs["query_memory"]
+    batch = memory.enter({"bev_feats": features(1)}, past)
+    head(batch.outputs, **batch.hooks)
+    propagation = batch.propagation
     assert float(propagation.loss(head)) > 0.1
     state, _, reference = (leaf.flatten(1, 2) for leaf in propagation.handed_on)
     predicted = head.reference.refine(0, state, reference)[..., :2].detach()
@@ -332,11 +332,11 @@ def test_further_query_groups_keep_their_queries():
     head, memory = with_memory(query_groups=groups)
     head.train(), memory.train()
     for number in range(2):
-        with memory.over({"bev_feats": features(number)}, [meta(number)]) as outputs:
-            head(outputs)
-            propagation = outputs["query_memory"]
+        with memory.over({"bev_feats": features(number)}, [meta(number)]) as batch:
+            head(batch.outputs, **batch.hooks)
+            propagation = batch.propagation
             if number == 0:
-                propagation.targets = torch.zeros(1, 10, 5, 2)
+                propagation.matched = torch.zeros(1, 10, 5, 2)
     order = propagation.order(torch.zeros(1, 4), total=10)
     assert order[0, :2].tolist() == [0, 1]
     assert sorted(order[0, 2:4].tolist()) < [6, 6]

@@ -19,7 +19,7 @@ from gsmap.checkpoints.strict import adapt_state, neutral_keys
 from gsmap.models.encoders.folded_backbone import FoldedBackbone
 from gsmap.models.encoders.half_backbone import HalfBackbone
 from gsmap.models.loss_check import LossCheck
-from gsmap.models.streams.memory import StreamMemory
+from gsmap.models.streams.memory import Remembering, StreamMemory
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
 
@@ -170,17 +170,17 @@ class MapDetector(Base3DDetector):
 
     def over_time(
         self, outputs: dict[str, Any], batch_data_samples: Samples
-    ) -> AbstractContextManager[dict[str, Any]]:
+    ) -> AbstractContextManager[Remembering]:
         """Return a context in which a batch has its memory, if the model has any."""
         if self.temporal is None:
-            return nullcontext(outputs)
+            return nullcontext(Remembering(outputs))
         return self.temporal.over(outputs, [sample.metainfo for sample in batch_data_samples])
 
     def loss(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return all losses as scalars; FloatingPointError if one is not finite (`LossCheck`)."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
-        with self.over_time(outputs, batch_data_samples) as outputs:
-            losses = self.map_head.loss(outputs, batch_data_samples)
+        with self.over_time(outputs, batch_data_samples) as batch:
+            losses = self.map_head.loss(batch.outputs, batch_data_samples, **batch.hooks)
         losses = {name: loss.mean() if loss.dim() else loss for name, loss in losses.items()}
         tokens = [sample.metainfo.get("token", "unknown") for sample in batch_data_samples]
         self.loss_check.start(losses, tokens)
@@ -194,17 +194,17 @@ class MapDetector(Base3DDetector):
     def predict(self, batch_inputs: Inputs, batch_data_samples: Samples) -> list[Det3DDataSample]:
         """Add ``pred_instances_3d``, as the head's ``predict`` returns them, to the samples."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
-        with self.over_time(outputs, batch_data_samples) as outputs:
-            results = self.map_head.predict(outputs, batch_data_samples)
+        with self.over_time(outputs, batch_data_samples) as batch:
+            results = self.map_head.predict(batch.outputs, batch_data_samples, **batch.hooks)
             if self.temporal is not None:
-                results = self.temporal.updated(outputs, results)
+                results = self.temporal.updated(batch, results)
         return self.add_pred_to_datasample(batch_data_samples, results)
 
     def _forward(self, batch_inputs: Inputs, batch_data_samples: Samples) -> dict[str, Tensor]:
         """Return the head's raw outputs."""
         outputs = self.extract_feat(batch_inputs, batch_data_samples)
-        with self.over_time(outputs, batch_data_samples) as outputs:
-            return self.map_head(outputs)
+        with self.over_time(outputs, batch_data_samples) as batch:
+            return self.map_head(batch.outputs, **batch.hooks)
 
     def _dump_init_info(self) -> None:
         """Log how each weight was initialised, which takes hundreds of lines, to debug only."""

@@ -2,8 +2,6 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
 from typing import Any, cast
 
 import torch
@@ -16,12 +14,14 @@ from torch import Tensor, nn
 
 from gsmap.models.base.class_losses import ClassLoss, plain_class_loss
 from gsmap.models.base.coder import DetectionHead, MapCoder, Metas, Samples, Tensors
-from gsmap.models.base.decoder import Decoded, MapDecoder
+from gsmap.models.base.decoder import Decoded, MapDecoder, Queries
+from gsmap.models.base.groups import QueryGroup
+from gsmap.models.base.hooks import FlowHook, FlowPart, FlowStart
 from gsmap.models.base.layers import classification_branch, init_matrices
 from gsmap.models.base.losses import MapLoss
 from gsmap.models.base.masks import ElementMasks
 from gsmap.models.base.matching import MapAssigner, MapCost
-from gsmap.models.base.pairs import GroundTruth, MatchedPairs, Predictions
+from gsmap.models.base.pairs import GroundTruth, MapMatches, MatchedPairs, Predictions
 from gsmap.models.base.parts import (
     PARTS,
     AuxHead,
@@ -37,34 +37,6 @@ from gsmap.structures.tensors import at_least_float32
 
 _PRIOR_PROBABILITY = 0.01
 Instances = Sequence[InstanceData]
-
-
-@dataclass(frozen=True)
-class QueryGroup:
-    """Instance queries that are matched together; no group attends to another.
-
-    Args:
-        num: Instance queries.
-        name: Suffix of its losses; empty for the group that predicts.
-        repeats: How often each ground truth may be matched (k in MapTRv2).
-        weight: Weight of its losses (lambda in MapTRv2).
-        losses: Names of the losses that it has; None means all.
-
-    Raises:
-        ValueError: If a number is not positive.
-    """
-
-    num: int
-    name: str = ""
-    repeats: int = 1
-    weight: float = 1.0
-    losses: tuple[str, ...] | None = None
-
-    def __post_init__(self) -> None:
-        if self.num < 1 or self.repeats < 1:
-            raise ValueError(
-                f"a query group needs num >= 1 and repeats >= 1, got {self.num} and {self.repeats}."
-            )
 
 
 @MODELS.register_module()
@@ -87,6 +59,8 @@ class MapHead(DetectionHead):
         reference: Config of what the decoder refines (`PointReference`).
         masks: `ElementMasks` or their settings, for losses and costs that read masks.
         aux_heads: Configs of heads that only help training.
+        flow_parts: Configs of parts that take part in the flow in training, such as queries made of
+            the ground truth (`FlowPart`).
         coder: Settings of `MapCoder`.
         num_points: Points per instance P.
         embed_dims: Channels C.
@@ -113,6 +87,7 @@ class MapHead(DetectionHead):
         reference: PARTS | None = None,
         masks: ElementMasks | PARTS | None = None,
         aux_heads: Sequence[PARTS] = (),
+        flow_parts: Sequence[PARTS] = (),
         coder: PARTS | None = None,
         num_points: int = 20,
         embed_dims: int = 256,
@@ -155,6 +130,8 @@ class MapHead(DetectionHead):
         self.aux_heads = by_name(
             [MODELS.build({"embed_dims": embed_dims, **head}) for head in aux_heads]
         )
+        own = {"embed_dims": embed_dims, "num_classes": len(self.classes)}
+        self.flow_parts = by_name([MODELS.build({**own, **part}) for part in flow_parts])
         self.assigner = MapAssigner(match_costs)
         self.coder = MapCoder(grid=grid, **(coder or {}))
         if self.coder.sigma_power and "scales" not in self.reference.outputs:
@@ -173,7 +150,7 @@ class MapHead(DetectionHead):
                     "gsmap.models.base.losses.MapLoss (docs/add_a_method.md)."
                 )
         names = ["cls", *self.losses]
-        refuse_twins([*names, *self.aux_heads], "losses")
+        refuse_twins([*names, *self.aux_heads, *self.flow_parts], "losses")
         refuse_twins([group.name for group in self.query_groups], "query groups")
         for group in self.query_groups:
             unknown = sorted(set(group.losses or ()) - set(names))
@@ -248,46 +225,77 @@ class MapHead(DetectionHead):
             logging.WARNING,
         )
 
-    def forward(self, bev_outputs: dict[str, Any]) -> list[Predictions]:
+    def forward(
+        self, bev_outputs: dict[str, Any], hooks: Sequence[FlowHook] = ()
+    ) -> list[Predictions]:
         """Predict the elements after every decoder layer.
 
         Args:
-            bev_outputs: What the BEV encoder returns: ``bev_feats`` (B, C, H, W) is read, and with
-                memory ``query_memory``, the queries of the frames before (`Propagation`).
+            bev_outputs: What the BEV encoder returns: ``bev_feats`` (B, C, H, W) is read.
+            hooks: What takes part in the flow, such as the memory of the frames before.
 
         Returns:
             The predictions of each layer, scores in float32 at least.
         """
         feats = bev_outputs["bev_feats"]
         query_pos, query = (part.expand(len(feats), -1, -1) for part in self.queries())
-        start, mask = self.reference.start(query_pos), self.attention_mask()
-        memory = bev_outputs.get("query_memory")
-        refine, between = self.reference.refine, None
-        if memory is not None:
-            refine, between = partial(memory.refine, self), partial(memory.between, self)
-        layers = self.decoder(query, query_pos, start, feats, refine, mask, between)
+        queries = Queries(query, query_pos, self.reference.start(query_pos))
+        start = FlowStart(queries, self.attention_mask())
+        for hook in hooks:
+            start = hook.start(self, start)
+
+        def refine(layer: int, states: Tensor, reference: Tensor) -> Tensor:
+            refined = self.reference.refine(layer, states, reference)
+            for hook in hooks:
+                refined = hook.refine(self, layer, refined)
+            return refined
+
+        def between(layer: int, queries: Queries) -> Queries:
+            for hook in hooks:
+                queries = hook.between(self, layer, queries)
+            return queries
+
+        state, position, reference = start.queries
+        layers = self.decoder(state, position, reference, feats, refine, start.mask, between)
         outputs = [
             self.predictions(
                 at_least_float32(self.cls_branches[number](layer.instance_states)), layer, feats
             )
             for number, layer in zip(self.decoder.branches, layers, strict=True)
         ]
-        if memory is not None:
-            memory.choose(self, outputs[-1].scores)
+        for hook in reversed(hooks):
+            outputs = hook.outputs(self, outputs)
         return outputs
 
     def predictions(self, scores: Tensor, decoded: Decoded, bev_feats: Tensor) -> Predictions:
         """Return the predictions of a layer, with what decodes and renders them."""
         return Predictions(scores, decoded, bev_feats, self.reference, self.masks)
 
-    def loss(self, bev_outputs: dict[str, Any], batch_data_samples: Samples) -> Tensors:
-        """Run the head and return its losses, those of the auxiliary heads included."""
+    def predict(
+        self,
+        bev_outputs: dict[str, Any],
+        batch_data_samples: Samples,
+        hooks: Sequence[FlowHook] = (),
+    ) -> list[InstanceData]:
+        """Run the head and return its detections; hooks as in `forward`."""
+        metas = [sample.metainfo for sample in batch_data_samples]
+        return self.predict_by_feat(self(bev_outputs, hooks), metas)
+
+    def loss(
+        self,
+        bev_outputs: dict[str, Any],
+        batch_data_samples: Samples,
+        hooks: Sequence[FlowHook] = (),
+    ) -> Tensors:
+        """Run the head and return all losses, also of auxiliary heads, flow parts and hooks."""
         gts = [sample.gt_instances_3d for sample in batch_data_samples]
         metas = [sample.metainfo for sample in batch_data_samples]
-        memory = bev_outputs.get("query_memory")
-        losses = self.loss_by_feat(self(bev_outputs), gts, metas, memory)
-        if memory is not None:
-            losses["loss_trans"] = memory.loss(self)
+        truths = self.prepare_gts(gts)
+        parts = cast(Sequence[FlowPart], self.flow_parts.values())
+        hooks = (*(part.hook(self, truths) for part in parts), *hooks)
+        losses = self.losses_by_feat(self(bev_outputs, hooks), truths, metas, hooks)
+        for hook in hooks:
+            losses.update(hook.losses(self, truths))
         for name, head in self.aux_heads.items():
             losses[f"loss_{name}"] = cast(AuxHead, head).loss(bev_outputs, batch_data_samples)
         return losses
@@ -297,7 +305,7 @@ class MapHead(DetectionHead):
         outputs: Sequence[Predictions],
         batch_gt_instances: Instances,
         batch_img_metas: Metas,
-        memory: Any = None,
+        hooks: Sequence[FlowHook] = (),
     ) -> Tensors:
         """Prepare the ground truth and return the losses of every decoder layer and query group.
 
@@ -308,20 +316,53 @@ class MapHead(DetectionHead):
             outputs: Predictions of each layer, of all query groups.
             batch_gt_instances: Ground truth of each sample, as `GroundTruth` takes it.
             batch_img_metas: Meta dict of each sample.
-            memory: The `Propagation` that keeps what the predicting queries were matched to.
+            hooks: They read what the predicting queries were matched to.
 
         Raises:
             FloatingPointError: If a matching cost is not finite.
         """
+        truths = self.prepare_gts(batch_gt_instances)
+        return self.losses_by_feat(outputs, truths, batch_img_metas, hooks)
+
+    def losses_by_feat(
+        self,
+        outputs: Sequence[Predictions],
+        truths: GroundTruth,
+        metas: Metas,
+        hooks: Sequence[FlowHook] = (),
+    ) -> Tensors:
+        """Return the losses of every decoder layer and query group, see `loss_by_feat`."""
         losses: Tensors = {}
         with torch.autocast(outputs[-1].scores.device.type, enabled=False):
-            truths = self.prepare_gts(batch_gt_instances)
             for group, layers in self.split_groups(outputs):
-                pairs = self.match(layers, truths, batch_img_metas, group.repeats)
-                if memory is not None and group is self.query_groups[0]:
-                    memory.keep_targets(pairs.layer(-1))
+                pairs = self.match(layers, truths, metas, group.repeats)
+                for hook in hooks if group is self.query_groups[0] else ():
+                    hook.targets(self, pairs.layer(-1))
                 losses.update(self.group_losses(group, pairs))
         return losses
+
+    def known_losses(
+        self,
+        group: QueryGroup,
+        layers: Sequence[Predictions],
+        truths: GroundTruth,
+        matches: Sequence[tuple[Tensor, Tensor]],
+    ) -> Tensors:
+        """Return the losses of a group of queries whose matches are known.
+
+        All ranks call it in each step, for the number of pairs is averaged over them.
+
+        Args:
+            group: Name, weight and losses of the group.
+            layers: Predictions of its queries, of each layer.
+            truths: The ground truth of the batch.
+            matches: Of each sample the numbers of its matched queries, increasing, and of the
+                ground truth of each, on the CPU. 2 x (m,)
+        """
+        predictions = Predictions.joined([layer.of_queries(slice(None)) for layer in layers])
+        with torch.autocast(predictions.scores.device.type, enabled=False):
+            known = self.assigner.known(predictions, truths, matches)
+            return self.group_losses(group, self.pairs(predictions, truths, *known))
 
     def split_groups(
         self, outputs: Sequence[Predictions]
@@ -335,7 +376,8 @@ class MapHead(DetectionHead):
 
     def prepare_gts(self, batch_gt_instances: Instances) -> GroundTruth:
         """Return the ground truth of a batch as costs and losses read it."""
-        return GroundTruth(batch_gt_instances, self.reference, self.masks)
+        with torch.autocast(self.instance_embedding.weight.device.type, enabled=False):
+            return GroundTruth(batch_gt_instances, self.reference, self.masks)
 
     def match(
         self,
@@ -347,6 +389,23 @@ class MapHead(DetectionHead):
         """Match every sample's predictions of each layer with its ground truth."""
         predictions = Predictions.joined(layers)
         matches, counts = self.assigner.assign(predictions, truths, metas, repeats)
+        return self.pairs(predictions, truths, matches, counts)
+
+    def pairs(
+        self,
+        predictions: Predictions,
+        truths: GroundTruth,
+        matches: MapMatches,
+        counts: Sequence[int],
+    ) -> MatchedPairs:
+        """Return matches as pairs, with their number averaged over the ranks.
+
+        Args:
+            predictions: Predictions of the matched layers.
+            truths: The ground truth of the batch.
+            matches: What is matched.
+            counts: Number of pairs of each sample, in one layer.
+        """
         count = torch.full((), float(sum(counts)), device=predictions.scores.device)
         avg_factor = reduce_mean(count).clamp(min=1.0)
         return MatchedPairs(predictions, truths, matches, counts, avg_factor)

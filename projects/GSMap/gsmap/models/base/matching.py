@@ -61,18 +61,64 @@ class MapAssigner:
         """
         layers = len(predictions.layers)
         num_queries = predictions.scores.shape[1] // layers
-        first_query = num_queries * torch.arange(layers)[:, None]
-        matches = []
-        counts = []
+        pairs = []
         of_samples, labels = self.costs(predictions, truths, metas)
         for index, costs in enumerate(of_samples):
             by_layer = costs.unflatten(1, (layers, num_queries)).unbind(1)
-            pairs = [assigned(own, self.names, metas[index], repeats) for own in by_layer]
-            query, gt = (torch.stack(part) for part in zip(*pairs, strict=True))  # (L, m)
-            counts.append(query.shape[1])
+            found = [assigned(own, self.names, metas[index], repeats) for own in by_layer]
+            query, gt = (torch.stack(part) for part in zip(*found, strict=True))  # (L, m)
+            pairs.append((query, gt))
+        return self.ordered(predictions, truths, pairs, labels)
+
+    @torch.no_grad()
+    def known(
+        self,
+        predictions: Predictions,
+        truths: GroundTruth,
+        pairs: Sequence[tuple[Tensor, Tensor]],
+    ) -> tuple[MapMatches, list[int]]:
+        """Return matches that are known before the decoder runs, in the closest point order.
+
+        Args:
+            predictions: Predictions of L layers, N queries each.
+            truths: Ground truth.
+            pairs: Of each sample the numbers of its matched queries, increasing, and the number of
+                the ground truth of each, on the CPU. 2 x (m,)
+
+        Returns:
+            As `assign`.
+        """
+        layers = len(predictions.layers)
+        by_layer = [tuple(part.expand(layers, -1) for part in sample) for sample in pairs]
+        return self.ordered(predictions, truths, by_layer, truths.labels.cpu())
+
+    def ordered(
+        self,
+        predictions: Predictions,
+        truths: GroundTruth,
+        pairs: Sequence[tuple[Tensor, ...]],
+        labels: Tensor,
+    ) -> tuple[MapMatches, list[int]]:
+        """Return pairs as matches, each in the point order that is closest.
+
+        Args:
+            predictions: Predictions of L layers, N queries each.
+            truths: Ground truth.
+            pairs: Of each sample the numbers of queries and of ground truths, on the CPU. 2 x
+                (L, m)
+            labels: Classes of all ground truth, on the CPU. (T,)
+
+        Returns:
+            As `assign`.
+        """
+        layers = len(predictions.layers)
+        first_query = predictions.scores.shape[1] // layers * torch.arange(layers)[:, None]
+        matches = []
+        for index, (query, gt) in enumerate(pairs):
             sample = torch.full_like(query, index)
             row = gt + truths.first[index]
             matches.append(torch.stack([sample, query, query + first_query, gt, row]))
+        counts = [query.shape[1] for query, _ in pairs]
         on_host = torch.cat(matches, 2)  # (5, L, M)
         (packed,) = uploaded([on_host], predictions.scores.device)
         samples, queries, joined, gts, rows = packed.unbind(0)

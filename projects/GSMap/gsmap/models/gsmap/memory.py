@@ -10,7 +10,7 @@ import torch
 from mmdet3d.registry import MODELS
 from torch import Tensor
 
-from gsmap.models.base.head import MapHead
+from gsmap.models.base.hooks import FlowHead
 from gsmap.models.gsmap.reference import require_gaussians
 from gsmap.models.streams.query_memory import QueryMemory
 from gsmap.structures.gaussians import fused_gaussians, moved_gaussians
@@ -52,12 +52,12 @@ class GaussianMemory(QueryMemory):
         self.covariance = covariance
         self.noise_m, self.noise_rad = noise_m, math.radians(noise_deg)
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: FlowHead) -> None:
         """Raise ValueError also if the head has no Gaussians."""
         require_gaussians(self, head)
         super().check(head)
 
-    def moved(self, head: MapHead, references: Tensor, past: Past) -> Tensor:
+    def moved(self, head: FlowHead, references: Tensor, past: Past) -> Tensor:
         """Return Gaussians of the frame before as they lie now. (B, K, P, D)"""
         points = super().moved(head, references, past)
         if self.covariance == "points":
@@ -73,7 +73,7 @@ class GaussianMemory(QueryMemory):
             )
             return space.encode(gaussians, points)
 
-    def fused(self, refined: Tensor, before: Tensor, head: MapHead) -> Tensor:
+    def fused(self, refined: Tensor, before: Tensor, head: FlowHead) -> Tensor:
         """Return refined Gaussians fused with those before, but where these left the map."""
         if self.covariance != "fused":
             return refined

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from mmengine.structures import InstanceData
 from torch import Tensor
 
 from gsmap.models.base.head import MapHead
+from gsmap.models.base.hooks import FlowHook
 from gsmap.models.streams.bev_memory import BEVMemory
 from gsmap.models.streams.element_memory import PREFIX, ElementMemory
 from gsmap.models.streams.query_memory import Propagation, QueryMemory
@@ -21,6 +23,28 @@ from gsmap.structures.tensors import uploaded
 
 # beginnings of names: half precision would move a point by centimetres
 _EXACT = ("references", "targets", PREFIX)
+
+
+@dataclass
+class Remembering:
+    """A batch of a detector with memory, from its encoder to what it leaves.
+
+    Args:
+        outputs: What the encoder returns, ``bev_feats`` of all frames so far. (B, C, H, W)
+        past: What the streams have left, None without memory.
+        propagation: The memory of queries, None without.
+        elements_left: What the detections leave, by name. (B, ...) each
+    """
+
+    outputs: dict[str, Any]
+    past: Past | None = None
+    propagation: Propagation | None = None
+    elements_left: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def hooks(self) -> dict[str, tuple[FlowHook, ...]]:
+        """The argument ``hooks`` of a head, none for a head without memory of queries."""
+        return {} if self.propagation is None else {"hooks": (self.propagation,)}
 
 
 class StreamMemory(BaseModule):
@@ -115,7 +139,7 @@ class StreamMemory(BaseModule):
     @contextmanager
     def over(
         self, outputs: dict[str, Any], metas: Sequence[Mapping[str, Any]]
-    ) -> Iterator[dict[str, Any]]:
+    ) -> Iterator[Remembering]:
         """Give a batch its memory, and keep what it leaves if nothing fails.
 
         Args:
@@ -123,16 +147,16 @@ class StreamMemory(BaseModule):
             metas: Metainfo of each sample.
 
         Yields:
-            The outputs, with ``bev_feats`` of all frames so far and ``query_memory`` for the head.
+            The batch with its memory.
         """
         if self.training and self.bev is None and self.queries is None:
-            yield outputs  # elements take no part in training, which needs no poses for them
+            yield Remembering(outputs)  # elements take no part in training, so need no poses
             return
         frames = [Frame.of(meta) for meta in metas]
         before = self.streams.previous(frames)
-        outputs = self.enter(outputs, recalled(frames, before, outputs["bev_feats"].device))
-        yield outputs
-        left = self.left(outputs)
+        batch = self.enter(outputs, recalled(frames, before, outputs["bev_feats"].device))
+        yield batch
+        left = self.left(batch)
         self.streams.keep(
             [
                 StreamState(frame, {name: values[index] for name, values in left.items()})
@@ -140,34 +164,32 @@ class StreamMemory(BaseModule):
             ]
         )
 
-    def enter(self, outputs: dict[str, Any], past: Past) -> dict[str, Any]:
-        """Return a batch's outputs with its memory, as `over` yields them."""
-        outputs = {**outputs, "past": past}
+    def enter(self, outputs: dict[str, Any], past: Past) -> Remembering:
+        """Return a batch with its memory, as `over` yields it."""
         feats = outputs["bev_feats"]
         if self.bev is not None:
             with torch.autocast(feats.device.type, enabled=False):
-                outputs["bev_feats"] = self.bev(feats.float(), past)
-        if self.queries is not None:
-            outputs["query_memory"] = Propagation(self.queries, past)
-        return outputs
+                feats = self.bev(feats.float(), past)
+        propagation = None if self.queries is None else Propagation(self.queries, past)
+        return Remembering({**outputs, "bev_feats": feats}, past, propagation)
 
     def updated(
-        self, outputs: dict[str, Any], results: Sequence[InstanceData]
+        self, batch: Remembering, results: Sequence[InstanceData]
     ) -> Sequence[InstanceData]:
         """Return a batch's detections, updated by those of the frame before, which they replace."""
-        if self.elements is None:
+        if self.elements is None or batch.past is None:
             return results
-        results = self.elements.updated(results, outputs["past"])
-        outputs["elements_left"] = self.elements.left(results)
+        results = self.elements.updated(results, batch.past)
+        batch.elements_left = self.elements.left(results)
         return results
 
-    def left(self, outputs: dict[str, Any]) -> dict[str, Tensor]:
+    def left(self, batch: Remembering) -> dict[str, Tensor]:
         """Return what a batch leaves after its head, by name, without gradient. (B, ...) each"""
-        left: dict[str, Tensor] = dict(outputs.get("elements_left", {}))
+        left = dict(batch.elements_left)
         if self.bev is not None:
-            left["bev_feats"] = self.bev.kept(outputs["bev_feats"])
-        if self.queries is not None:
-            left |= outputs["query_memory"].left()
+            left["bev_feats"] = self.bev.kept(batch.outputs["bev_feats"])
+        if batch.propagation is not None:
+            left |= batch.propagation.left()
         return {
             name: values.half() if self.half and not name.startswith(_EXACT) else values
             for name, values in left.items()

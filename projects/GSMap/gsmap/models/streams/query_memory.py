@@ -11,8 +11,8 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from gsmap.checkpoints.strict import AddsWeights
 from gsmap.models.base.decoder import Queries
-from gsmap.models.base.head import MapHead
-from gsmap.models.base.pairs import MatchedPairs
+from gsmap.models.base.hooks import FlowHead, FlowHook
+from gsmap.models.base.pairs import GroundTruth, MatchedPairs, Predictions
 from gsmap.structures.past import Past
 
 _POSE = 12  # the first three rows of a motion
@@ -54,7 +54,7 @@ class QueryMemory(BaseModule, AddsWeights):
             if isinstance(layer, nn.Linear):
                 nn.init.zeros_(layer.weight)
 
-    def check(self, head: MapHead) -> None:
+    def check(self, head: FlowHead) -> None:
         """Raise ValueError if the head predicts with too few queries, or in one layer."""
         if len(head.decoder.layers) < 2:
             raise ValueError(
@@ -73,11 +73,11 @@ class QueryMemory(BaseModule, AddsWeights):
         code = motion[:, :3].flatten(1).to(states).view(len(states), *[1] * (states.dim() - 2), -1)
         return states + self.fc(torch.cat([states, code.expand(*states.shape[:-1], -1)], -1))
 
-    def moved(self, head: MapHead, references: Tensor, past: Past) -> Tensor:
+    def moved(self, head: FlowHead, references: Tensor, past: Past) -> Tensor:
         """Return references of the frame before as they lie now. (B, K, P, D)"""
         return head.reference.moved(references, past.now_from_then)
 
-    def fused(self, refined: Tensor, before: Tensor, head: MapHead) -> Tensor:
+    def fused(self, refined: Tensor, before: Tensor, head: FlowHead) -> Tensor:
         """Return the last layer's references of queries that were handed on. (B, K, P, D)
 
         ``refined`` is what the decoder has made of ``before``, what `moved` has returned.
@@ -100,7 +100,7 @@ def pick(values: Tensor, order: Tensor) -> Tensor:
     return values[torch.arange(len(order), device=order.device)[:, None], order]
 
 
-class Propagation:
+class Propagation(FlowHook):
     """The memory of queries in one batch: what enters the decoder, and what is kept of it.
 
     Args:
@@ -114,12 +114,11 @@ class Propagation:
         self.last: Queries | None = None
         self.total = 0  # queries N
         self.chosen: Tensor | None = None  # (B, K)
-        self.targets: Tensor | None = None  # (B, N, P, 2 or 3)
+        self.matched: Tensor | None = None  # (B, N, P, 2 or 3)
 
-    def refine(self, head: MapHead, number: int, point_states: Tensor, reference: Tensor) -> Tensor:
-        """Return the references after a layer, as `PointReference.refine`. (B, N * P, D)"""
-        refined = head.reference.refine(number, point_states, reference)
-        if number < len(head.decoder.layers) - 1 or self.handed_on is None:
+    def refine(self, head: FlowHead, layer: int, refined: Tensor) -> Tensor:
+        """Return the references after a layer, see `FlowHook`. (B, N * P, D)"""
+        if layer < len(head.decoder.layers) - 1 or self.handed_on is None:
             return refined
         lines, before = head.decoder.by_instance(refined), self.handed_on.reference
         own = lines[:, : self.memory.num]
@@ -127,15 +126,15 @@ class Propagation:
         first = torch.where(self.past.continues.view(-1, 1, 1, 1), fused, own)
         return torch.cat([first, lines[:, self.memory.num :]], 1).flatten(1, 2)
 
-    def between(self, head: MapHead, number: int, queries: Queries) -> Queries:
+    def between(self, head: FlowHead, layer: int, queries: Queries) -> Queries:
         """Let the memory enter after the first layer, and keep what the last layer returns."""
-        if number == len(head.decoder.layers) - 1:
+        if layer == len(head.decoder.layers) - 1:
             self.last = queries
-        elif number == 0 and self.past.memory:
+        elif layer == 0 and self.past.memory:
             return self.insert(head, queries)
         return queries
 
-    def insert(self, head: MapHead, queries: Queries) -> Queries:
+    def insert(self, head: FlowHead, queries: Queries) -> Queries:
         """Return the queries with those of the memory first, in place of the weakest.
 
         A stream that starts keeps its queries as they are. Further query groups, of training, keep
@@ -172,7 +171,7 @@ class Propagation:
         further = torch.arange(num + own, num + total, device=scores.device)
         return torch.cat([order, further.expand(len(scores), -1)], 1)
 
-    def moved(self, head: MapHead, queries: Queries) -> Queries:
+    def moved(self, head: FlowHead, queries: Queries) -> Queries:
         """Update states and references of an earlier frame by the vehicle's motion."""
         dims = head.embed_dims
         leaves, form = tree_flatten(queries.state)
@@ -186,17 +185,23 @@ class Propagation:
         reference = self.memory.moved(head, queries.reference, self.past)
         return Queries(state, queries.position, reference)
 
-    def choose(self, head: MapHead, scores: Tensor) -> None:
-        """Choose what is handed on by the last layer's class logits. (B, N, classes)"""
+    def outputs(self, head: FlowHead, layers: list[Predictions]) -> list[Predictions]:
+        """Choose what is handed on by the class logits of the last layer."""
+        scores = layers[-1].scores  # (B, N, classes)
         self.total = scores.shape[1]
         own = scores[:, : head.query_groups[0].num].detach()
         self.chosen = own.amax(-1).topk(self.memory.num).indices
+        return layers
 
-    def keep_targets(self, pairs: MatchedPairs) -> None:
-        """Keep what the last layer's queries are matched to."""
+    def targets(self, head: FlowHead, pairs: MatchedPairs) -> None:
+        """Keep what the queries of the last layer are matched to."""
         targets = torch.zeros_like(pairs.predictions.pts)
         targets[pairs.samples, pairs.query_inds] = pairs.gt_pts.to(targets)
-        self.targets = targets
+        self.matched = targets
+
+    def losses(self, head: FlowHead, truths: GroundTruth) -> dict[str, Tensor]:
+        """Return the loss of the updated queries."""
+        return {"loss_trans": self.loss(head)}
 
     def left(self) -> dict[str, Tensor]:
         """Return what the streams hand on, best first, by name. (B, K, rows, ...) each"""
@@ -208,11 +213,11 @@ class Propagation:
             for name, leaf in zip(leaf_names(len(leaves)), leaves, strict=True)
             if isinstance(leaf, Tensor)
         }
-        if self.targets is not None:
-            left["targets"] = pick(self.targets.detach(), self.chosen)
+        if self.matched is not None:
+            left["targets"] = pick(self.matched.detach(), self.chosen)
         return left
 
-    def loss(self, head: MapHead) -> Tensor:
+    def loss(self, head: FlowHead) -> Tensor:
         """Return the loss of the updated queries, 0 with a gradient of 0 if no stream continues."""
         stored = self.past.memory.get("targets")  # (B, K, P, 2 or 3)
         if self.handed_on is None or stored is None:
