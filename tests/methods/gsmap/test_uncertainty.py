@@ -4,10 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from head_cases import GSMAP, HEAD, LANES, N, P, bev, build_head, losses_of, train_a_step
+from head_cases import ALONG_Y, GSMAP, HEAD, LANES, N, P, bev, build_head, losses_of, train_a_step
 from mmdet3d.structures import Det3DDataSample
 from predictions import pairs_of
 
+from gsmap.models.gsmap.coder import GaussianCoder
 from gsmap.models.gsmap.uncertainty import GaussianNLLLoss
 from gsmap.structures.gaussians import Gaussians, extents_along_line
 
@@ -143,5 +144,18 @@ def test_scores_weighed_by_sigma_are_those_of_the_same_elements():
     torch.testing.assert_close(sigma, same)
     assert sigma.std() > 0
     torch.testing.assert_close(now, was / sigma, rtol=1e-3, atol=0)
-    with pytest.raises(ValueError, match="sigma_power needs Gaussians, got PointReference"):
+    with pytest.raises(
+        ValueError, match=r"coder\.sigma_power is no setting of MapCoder, the coder of"
+    ):
         build_head(HEAD, coder={"sigma_power": 1.0})
+    with pytest.raises(ValueError, match="sigma_power must be >= 0, got nan"):
+        build_head(GSMAP, coder={"sigma_power": float("nan")})
+
+
+def test_odds_are_divided_by_the_smaller_sigma():
+    """Odds of 3 and 2; the geometric means of the smaller sigmas are 1 and 0.5 m."""
+    scores = torch.tensor([[3.0], [2.0]]).log()
+    scales = torch.tensor([[[0.5, 9.0], [2.0, 2.0]], [[7.0, 0.25], [1.0, 1.0]]])
+    for power, odds in ((0.0, [3, 2]), (1.0, [3, 4]), (2.0, [3, 8])):
+        found = GaussianCoder(ALONG_Y, sigma_power=power).weighed(scores, {"scales": scales})
+        torch.testing.assert_close(found.exp()[:, 0], torch.tensor(odds).float())

@@ -48,18 +48,7 @@ def test_points_of_lines_are_unfolded_with_all_that_belongs_to_them():
     assert MapCoder(GRID).unfolded(fields, torch.tensor([2, 2])) is fields
 
 
-def test_odds_are_divided_by_the_smaller_sigma():
-    """Odds of 3 and 2; the geometric means of the smaller sigmas are 1 and 0.5 m."""
-    scores = torch.tensor([[3.0], [2.0]]).log()
-    scales = torch.tensor([[[0.5, 9.0], [2.0, 2.0]], [[7.0, 0.25], [1.0, 1.0]]])
-    for power, odds in ((0.0, [3, 2]), (1.0, [3, 4]), (2.0, [3, 8])):
-        found = MapCoder(GRID, sigma_power=power).weighed(scores, {"scales": scales})
-        torch.testing.assert_close(found.exp()[:, 0], torch.tensor(odds).float())
-
-
 def test_wrong_settings_are_refused():
-    with pytest.raises(ValueError, match="sigma_power must be >= 0, got nan"):
-        MapCoder(GRID, sigma_power=float("nan"))
     with pytest.raises(ValueError, match="max_num must be >= 1, got 0"):
         MapCoder(GRID, max_num=0)
     with pytest.raises(ValueError, match="margin_m must be > 0, got -1"):

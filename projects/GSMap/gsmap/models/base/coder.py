@@ -38,9 +38,6 @@ class MapCoder:
         score_threshold: Smallest score to keep; None keeps all.
         unfold_classes: Class indices of lines whose points are put in the order of a short way
             through them (`shortest_orders`), for masks do not see when a line runs back and forth.
-        sigma_power: With Gaussians, the odds of a score are divided by the smaller sigma, in metres
-            (geometric mean of the points), to this power, >= 0: what is sure of its place counts
-            more.
     """
 
     def __init__(
@@ -50,15 +47,11 @@ class MapCoder:
         margin_m: float | None = 5.0,
         score_threshold: float | None = None,
         unfold_classes: Sequence[int] = (),
-        sigma_power: float = 0.0,
     ) -> None:
         if max_num < 1:
             raise ValueError(f"max_num must be >= 1, got {max_num}.")
         if margin_m is not None and margin_m <= 0:
             raise ValueError(f"margin_m must be > 0, got {margin_m}.")
-        if not sigma_power >= 0:
-            raise ValueError(f"sigma_power must be >= 0, got {sigma_power}.")
-        self.sigma_power = sigma_power
         self.grid, self.max_num = grid, max_num
         self.margin_m, self.score_threshold = margin_m, score_threshold
         self.unfold_classes = tuple(unfold_classes)
@@ -94,11 +87,13 @@ class MapCoder:
         return keep
 
     def weighed(self, scores: Tensor, fields: Tensors) -> Tensor:
-        """Weigh class logits (N, classes) by ``scales``, sigmas in metres (N, P, 2), if wanted."""
-        if not self.sigma_power:
-            return scores
-        sigma = fields["scales"].amin(-1).log().mean(-1, keepdim=True)
-        return scores.float() - self.sigma_power * sigma
+        """Return class logits by which detections are chosen. (N, classes) -> (N, classes)
+
+        Args:
+            scores: Class logits. (N, classes)
+            fields: What the reference decodes. (N, ...) each
+        """
+        return scores
 
     def best(self, scores: Tensor) -> Detections:
         """Return the best pairs of query and class, wherever they lie. (N, classes)"""

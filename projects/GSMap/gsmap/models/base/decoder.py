@@ -144,14 +144,11 @@ class MapDecoder(BaseModule):
 
     Attributes:
         point_queries: Whether it takes point queries (B, N * P, C), or instance queries (B, N, C).
-        moves_instances: Whether a state and a first reference belong to all points of an instance,
-            `point_states` (B, N, C), or each to its point.
         layer_class: Class of its layers, where their config names none.
         branches: For each output, the number of the branches that read it.
     """
 
     point_queries = True
-    moves_instances = False
     layer_class: ClassVar[type[MapDecoderLayer]] = MapDecoderLayer
 
     def __init__(
@@ -167,6 +164,15 @@ class MapDecoder(BaseModule):
         layer = {"type": self.layer_class, "num_points": num_points, **shared, **layer}
         self.layers = ModuleList(MODELS.build(layer) for _ in range(num_layers))
         self.branches = list(range(num_layers))
+
+    @classmethod
+    def reference_settings(cls, num_points: int) -> dict[str, Any]:
+        """Return settings of the reference that follow from what the states stand for.
+
+        Args:
+            num_points: Points per instance P.
+        """
+        return {}
 
     def start(self, query: Tensor, reference: Tensor, bev_feats: Tensor) -> tuple[Any, Tensor, Any]:
         """Return queries, reference and features as the layers take them."""

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
+from inspect import signature
 from typing import Any, cast
 
 import torch
@@ -31,6 +32,7 @@ from gsmap.models.base.parts import (
     class_of,
     refuse_twins,
 )
+from gsmap.models.base.queries import PointTable, added_settings
 from gsmap.models.base.references import RefinedReference
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import at_least_float32
@@ -64,8 +66,9 @@ class MapHead(DetectionHead):
         coder: Settings of `MapCoder`.
         num_points: Points per instance P.
         embed_dims: Channels C.
-        points_from_instances: Let a matrix make the embeddings of an instance's points of its own
-            (MGMap), in place of a table for all instances.
+        point_queries: Config of what makes the points' embeddings, built with ``num_points`` and
+            ``embed_dims``; None means a table for all instances (`PointTable`).
+        settings: Settings that methods add to every head (`head_setting`).
 
     Raises:
         TypeError: If a loss is no `MapLoss`.
@@ -91,10 +94,12 @@ class MapHead(DetectionHead):
         coder: PARTS | None = None,
         num_points: int = 20,
         embed_dims: int = 256,
-        points_from_instances: bool = False,
+        point_queries: PARTS | None = None,
         init_cfg: dict | None = None,
+        **settings: Any,
     ) -> None:
         super().__init__(init_cfg)
+        point_queries = added_settings(settings).get("point_queries", point_queries)
         self.grid, self.classes = grid, tuple(classes)
         self.num_points, self.embed_dims = num_points, embed_dims
         self.masks = ElementMasks.of(grid, masks)
@@ -102,25 +107,26 @@ class MapHead(DetectionHead):
         num_instances = sum(group.num for group in self.query_groups)
         shared = {"embed_dims": embed_dims, "num_layers": decoder["num_layers"]}
         kind = class_of(decoder) or MapDecoder
-        moves_instances = issubclass(kind, MapDecoder) and kind.moves_instances
-        points_per_state = num_points if moves_instances else 1
-        point = {"type": "PointReference", "grid": grid, "points_per_state": points_per_state}
+        point = {"type": "PointReference", "grid": grid}
+        if issubclass(kind, MapDecoder):
+            point |= kind.reference_settings(num_points)
         self.reference: RefinedReference = MODELS.build({**point, **shared, **(reference or {})})
         handed_on = {"num_points": num_points, "space": self.reference.space}
         self.decoder: MapDecoder = MODELS.build(
             {"type": "MapDecoder", "layer": {}, **shared, **handed_on, **decoder}
         )
-        if points_from_instances and not self.decoder.point_queries:
+        if point_queries is not None and not self.decoder.point_queries:
             raise ValueError(
                 f"{type(self.decoder).__name__} has queries of instances, no embeddings of points: "
-                "leave out points_from_instances."
+                f"leave out {', '.join(settings) or 'point_queries'}."
             )
         self.instance_embedding = nn.Embedding(num_instances, 2 * embed_dims)
-        self.pts_embedding: nn.Linear | nn.Embedding | None = None
-        if points_from_instances:
-            self.pts_embedding = nn.Linear(2 * embed_dims, num_points * 2 * embed_dims)
+        self.pts_embedding: nn.Module | None = None
+        sizes = {"num_points": num_points, "embed_dims": embed_dims}
+        if point_queries is not None:
+            self.pts_embedding = MODELS.build({**sizes, **point_queries})
         elif self.decoder.point_queries:
-            self.pts_embedding = nn.Embedding(num_points, 2 * embed_dims)
+            self.pts_embedding = PointTable(**sizes)
         self.cls_branches = nn.ModuleList(
             classification_branch(embed_dims, len(self.classes))
             for _ in range(decoder["num_layers"])
@@ -133,13 +139,29 @@ class MapHead(DetectionHead):
         own = {"embed_dims": embed_dims, "num_classes": len(self.classes)}
         self.flow_parts = by_name([MODELS.build({**own, **part}) for part in flow_parts])
         self.assigner = MapAssigner(match_costs)
-        self.coder = MapCoder(grid=grid, **(coder or {}))
-        if self.coder.sigma_power and "scales" not in self.reference.outputs:
-            raise ValueError(
-                f"coder.sigma_power needs Gaussians, got {type(self.reference).__name__}: take "
-                "GSMapHead, or leave it out."
-            )
+        self.coder = self.build_coder(coder or {})
         self.check_parts()
+
+    def build_coder(self, settings: PARTS) -> MapCoder:
+        """Return the coder that goes with the reference.
+
+        Args:
+            settings: Its settings.
+
+        Raises:
+            ValueError: If it has no such setting.
+        """
+        kind = self.reference.coder_class or MapCoder
+        known = {name for base in kind.__mro__ for name in signature(base).parameters}
+        unknown = sorted(set(settings) - known)
+        if unknown:
+            raise ValueError(
+                f"coder.{unknown[0]} is no setting of {kind.__name__}, the coder of "
+                f"{type(self.reference).__name__}: leave it out, or take a head whose reference "
+                "has a coder with it."
+            )
+        coder: MapCoder = kind(grid=self.grid, **settings)
+        return coder
 
     def check_parts(self) -> None:
         """Refuse parts that do not fit together, see the class."""
@@ -190,11 +212,8 @@ class MapHead(DetectionHead):
         both = self.instance_embedding.weight
         if not self.training:
             both = both[: self.query_groups[0].num]
-        if isinstance(self.pts_embedding, nn.Linear):
-            points = self.pts_embedding(both).unflatten(1, (self.num_points, -1))
-            both = (both[:, None] + points).flatten(0, 1)
-        elif self.pts_embedding is not None:
-            both = (both[:, None] + self.pts_embedding.weight).flatten(0, 1)
+        if self.pts_embedding is not None:
+            both = self.pts_embedding(both).flatten(0, 1)
         return both[:, : self.embed_dims], both[:, self.embed_dims :]
 
     def attention_mask(self) -> Tensor | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -32,10 +32,12 @@ class RefinedReference(Reference):
     Attributes:
         coords: Number of coordinates of a point, the first entries of a reference: 2 or 3.
         space: How a reference stands for a Gaussian, None for points.
+        coder_class: Class of the coder of its detections, None for `MapCoder`.
     """
 
     coords: int
     space: GaussianSpace | None = None
+    coder_class: ClassVar[type[Any] | None] = None
 
     def start(self, query_pos: Tensor) -> Tensor:
         """Return the reference that the first layer starts from. (..., Q, C) -> (..., Q * n, D)"""

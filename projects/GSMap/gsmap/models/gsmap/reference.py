@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from gsmap.checkpoints.strict import AddsWeights
 from gsmap.models.base import layers
 from gsmap.models.base.pairs import BuiltHead
+from gsmap.models.gsmap.coder import GaussianCoder
 from gsmap.models.maptr.references import PointReference
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import Gaussians, GaussianSpace
@@ -31,6 +32,7 @@ class GaussianReference(PointReference, AddsWeights):
     """
 
     space: GaussianSpace
+    coder_class = GaussianCoder
     neutral_keys: tuple[str, ...] = ("gaussian_init.", "gaussian_branches.")
 
     outputs = ("pts", "scales", "rotations")

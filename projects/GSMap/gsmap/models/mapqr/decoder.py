@@ -134,11 +134,15 @@ class MapQRDecoder(MapDecoder):
     """
 
     point_queries = False
-    moves_instances = True
     layer_class = MapQRDecoderLayer
 
     def __init__(self, layer: dict[str, Any] | None = None, **kwargs: Any) -> None:
         super().__init__(layer or {}, **kwargs)
+
+    @classmethod
+    def reference_settings(cls, num_points: int) -> dict[str, Any]:
+        """Return that all points of an instance start from one query and move by one state."""
+        return {"points_per_state": num_points}
 
     def read(self, state: Tensor, references: Tensor) -> Decoded:
         """Return a layer's output: the points share the state of their instance. (B, N, C)"""

@@ -127,11 +127,8 @@ class KeyPointHead(DetectionHead):
         self.reference: KeyPointReference = KeyPointReference(Canvas(grid, **(canvas or {})))
         choice: PARTS = {"max_num": 35, "margin_m": None, **(coder or {})}
         self.coder = MapCoder(grid, **choice)
-        if self.coder.unfold_classes or self.coder.sigma_power:
-            raise ValueError(
-                "coder.unfold_classes and coder.sigma_power have no effect on boxes: leave "
-                "them out."
-            )
+        if self.coder.unfold_classes:
+            raise ValueError("coder.unfold_classes has no effect on boxes: leave it out.")
         settings: PARTS = {"num_layers": 6, "num_heads": 8, "ffn_dims": 512, "dropout": 0.1}
         settings |= decoder or {}
         num_layers = settings.pop("num_layers")
