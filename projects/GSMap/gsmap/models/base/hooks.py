@@ -96,7 +96,7 @@ class FlowHook(Protocol):
         """
 
     def losses(self, head: FlowHead, truths: GroundTruth) -> dict[str, Tensor]:
-        """Return further losses by name, which begins with ``loss_``.
+        """Return further losses by name, in which ``loss`` occurs.
 
         Args:
             head: The head.
