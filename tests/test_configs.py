@@ -23,6 +23,7 @@ from gsmap.checkpoints.strict import neutral_keys
 from gsmap.datasets.annotations.record import UNITED
 from gsmap.datasets.transforms.map_targets import map_targets
 from gsmap.engine.launch import check_config, read_config
+from gsmap.engine.targets import share_settings
 from gsmap.structures.grid import BEVGrid, padded_size
 from mapdata.nuscenes.convert import NuScenesOptions, convert_nuscenes
 
@@ -44,7 +45,9 @@ names = pytest.mark.parametrize("path", LEAVES, ids=lambda path: path.stem)
 
 @cache
 def read(path: Path) -> Config:
-    return Config.fromfile(path)
+    cfg = Config.fromfile(path)
+    share_settings(cfg)
+    return cfg
 
 
 def load(path: Path) -> Config:

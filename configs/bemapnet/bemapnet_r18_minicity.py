@@ -16,8 +16,7 @@ model = dict(
     map_head=dict(
         queries=(10, 16, 10), pieces=(3, 7, 7), embed_dims=_dim, mask_pixel_m=0.46875, bev_pixel_m=0.9375, to_end=True,
         losses=dict(mask_points=None, redrawn_in_px=False), decoder=dict(num_layers=2, num_heads=4, ffn_dims=2 * _dim)))
-_targets = dict(
-    type='FormatBezierTargets', pieces=(3, 7, 7), edge_classes=(), pixel_m=0.46875, thickness_px=2, sort_rings=True)
+_targets = dict(type='FormatBezierTargets', edge_classes=(), thickness_px=2, sort_rings=True)
 _scale = dict(type='ScaleImages', size=(320, 192))  # whatever the size of the files
 train_dataloader = dict(batch_size=2, dataset=dict(pipeline=[_base_._load, _scale, _targets, _base_._pack]))
 val_dataloader = test_dataloader = dict(dataset=dict(pipeline=[_base_._load, _scale, _base_._pack]))

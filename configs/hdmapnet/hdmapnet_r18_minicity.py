@@ -15,6 +15,6 @@ model = dict(
         pixel_m=0.3, decoder=dict(base_channels=_width),
         vectorizing=dict(min_area_px=30, min_neighbours=15, step_px=5, jump_px=25)))
 _scale = dict(type='ScaleImages', size=(320, 192))  # whatever the size of the files
-_targets = dict(type='MakeLineMaps', pixel_m=0.3, thickness_px=3, gap_px=5)
+_targets = dict(type='MakeLineMaps', thickness_px=3, gap_px=5)
 train_dataloader = dict(batch_size=2, dataset=dict(pipeline=[_base_._load, _scale, _targets, _base_._pack]))
 val_dataloader = test_dataloader = dict(dataset=dict(pipeline=[_base_._load, _scale, _base_._pack]))

@@ -16,8 +16,7 @@ model = dict(
     map_head=dict(
         queries=((10, 10), (16, 10), (10, 16)), embed_dims=_dim, mask_pixel_m=0.46875,
         decoder=dict(num_layers=2, num_heads=4, ffn_dims=2 * _dim)))
-_targets = dict(
-    type='FormatPivotTargets', num_points=(10, 10, 16), edge_classes=(), pixel_m=0.46875, thickness_px=2, sort_rings=True)
+_targets = dict(type='FormatPivotTargets', edge_classes=(), thickness_px=2, sort_rings=True)
 _scale = dict(type='ScaleImages', size=(320, 192))  # whatever the size of the files
 train_dataloader = dict(batch_size=2, dataset=dict(pipeline=[_base_._load, _scale, _targets, _base_._pack]))
 val_dataloader = test_dataloader = dict(dataset=dict(pipeline=[_base_._load, _scale, _base_._pack]))

@@ -11,7 +11,7 @@ classes = ['divider', 'ped_crossing', 'boundary']
 _load = dict(type='LoadCameraImages')
 _scale = dict(type='ScaleImages', scale=0.3)
 _photometric = dict(type='DistortImages')  # each camera its own, as in MapTR
-_targets = dict(type='FormatMapTargets', num_points=20)
+_targets = dict(type='FormatMapTargets')
 _pack = dict(type='PackMapInputs')
 
 _workers = dict(num_workers='cores', persistent_workers=True)

@@ -10,7 +10,7 @@ classes = ['divider', 'ped_crossing', 'boundary']
 _load = dict(type='LoadCameraImages', to_float32=False)
 _scale = dict(type='ScaleImages', scale=0.4)
 _photometric = dict(type='DistortImages')  # each camera its own, as in MapTR
-_targets = dict(type='FormatMapTargets', num_points=20)
+_targets = dict(type='FormatMapTargets')
 _pack = dict(type='PackMapInputs')
 
 _workers = dict(num_workers=1, persistent_workers=True)

@@ -10,7 +10,7 @@ _load = dict(type='LoadCameraImages')
 _load_bytes = dict(type='LoadCameraImages', to_float32=False)  # before a step that converts anyway
 _scale = dict(type='ScaleImages', scale=0.5)
 _photometric = dict(type='DistortImages')  # each camera its own, as in MapTR
-_targets = dict(type='FormatMapTargets', num_points=20)
+_targets = dict(type='FormatMapTargets')
 _pack = dict(type='PackMapInputs')
 
 _workers = dict(num_workers='cores', persistent_workers=True)

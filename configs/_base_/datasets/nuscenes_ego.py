@@ -11,7 +11,7 @@ _load = dict(type='LoadCameraImages')
 _load_bytes = dict(type='LoadCameraImages', to_float32=False)  # before a step that converts anyway
 _scale = dict(type='ScaleImages', size=(800, 480))
 _photometric = dict(type='DistortImages', swap_channels=False)  # each camera its own
-_targets = dict(type='FormatMapTargets', num_points=20, orders_of='points')
+_targets = dict(type='FormatMapTargets', orders_of='points')
 _pack = dict(type='PackMapInputs')
 
 _workers = dict(num_workers='cores', persistent_workers=True)

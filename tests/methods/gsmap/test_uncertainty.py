@@ -144,9 +144,7 @@ def test_scores_weighed_by_sigma_are_those_of_the_same_elements():
     torch.testing.assert_close(sigma, same)
     assert sigma.std() > 0
     torch.testing.assert_close(now, was / sigma, rtol=1e-3, atol=0)
-    with pytest.raises(
-        ValueError, match=r"coder\.sigma_power is no setting of MapCoder"
-    ):
+    with pytest.raises(ValueError, match=r"coder\.sigma_power is no setting of MapCoder"):
         build_head(HEAD, coder={"sigma_power": 1.0})
     with pytest.raises(ValueError, match="sigma_power must be >= 0, got nan"):
         build_head(GSMAP, coder={"sigma_power": float("nan")})

@@ -12,25 +12,24 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import cache
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import torch
-from mmdet3d.registry import DATA_SAMPLERS, MODELS, OPTIMIZERS, RUNNERS, TRANSFORMS
+from mmdet3d.registry import DATA_SAMPLERS, OPTIMIZERS, RUNNERS
 from mmengine.config import Config
 from mmengine.logging import print_log
-from mmengine.registry import Registry, init_default_scope
+from mmengine.registry import init_default_scope
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.checkpoints.named_models import find_config
 from gsmap.checkpoints.settings import pipeline_steps, scale_steps
 from gsmap.engine.rank_watch import TIMEOUT_S
+from gsmap.engine.targets import check_targets, class_of_type, share_settings
 from gsmap.utils.faults import nearest, registered
 from gsmap.utils.files import DAMAGED_ZIP
 from gsmap.utils.parallel import LAUNCHER, die_with_parent
 from gsmap.utils.shipped import shipped
-from gsmap.utils.targets import NeedsTargets
 
 # mmengine accepts a misspelt top-level key in silence: only these mean something.
 _COPIED = ("backend_args", "classes", "data_root", "grid", "vis_backends")  # read by no runner
@@ -88,6 +87,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
         import_modules_from_strings(["gsmap.registered"])
         import_modules_from_strings(**cfg.get("custom_imports", {"imports": []}))
     init_default_scope(cfg.get("default_scope", "mmdet3d"))
+    share_settings(cfg)
     return cfg
 
 
@@ -237,7 +237,7 @@ def check_config(cfg: Config) -> None:
             such optimizer or runner, the pipeline lacks a transform that the head needs, or a
             loader tears the streams of a model with memory apart.
     """
-    _check_targets(cfg)
+    check_targets(cfg)
     _check_streams(cfg)
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
     for scheduler in cfg.get("param_scheduler") or []:
@@ -297,86 +297,6 @@ def _check_keys(cfg: Config) -> None:
         raise ValueError(f"{cfg.filename}: unknown top-level key {key!r}{hint}")
 
 
-def needed_targets(cfg: Config) -> dict[str, Any]:
-    """Return which transforms make the targets of a config's head and of its parts.
-
-    Returns:
-        Names of transforms (``transforms`` of the classes), each with the type that needs it.
-    """
-    head = (cfg.get("model") or {}).get("map_head") or {}
-    heads = [head, head["detector"]] if head.get("detector") else [head]  # of two stages
-    lists = [own.get(name) for own in heads for name in ("losses", "aux_heads")]
-    parts = chain(heads, *(part for part in lists if isinstance(part, list)))
-    kinds = [part.get("type") for part in parts if isinstance(part, dict)]
-    return {name: kind for kind in kinds for name in _needs(kind).transforms}
-
-
-def _needs(kind: Any) -> type[NeedsTargets]:
-    """Return the class of a part, for what it needs; a part of a stranger needs nothing."""
-    found = _class(kind)
-    return found if found and issubclass(found, NeedsTargets) else NeedsTargets
-
-
-def _class(kind: Any, registry: Registry = MODELS) -> type | None:
-    """Return the class of a type, itself or its name; None if it names none."""
-    found = registry.get(kind) if isinstance(kind, str) else kind
-    return found if isinstance(found, type) else None
-
-
-def _check_targets(cfg: Config) -> None:
-    """Refuse a training pipeline without the transforms that `needed_targets` names."""
-    dataset = (cfg.get("train_dataloader") or {}).get("dataset") or {}
-    for steps in _pipelines(dataset):
-        made = [_class(kind, TRANSFORMS) for kind in _step_types(steps)]
-        bases = {base.__name__ for kind in made for base in inspect.getmro(kind or object)}
-        for name, kind in needed_targets(cfg).items():
-            if name not in bases:
-                raise ValueError(
-                    f"{cfg.filename}: {kind} needs the targets of {name}: add it to the pipeline "
-                    "of train_dataloader.dataset."
-                )
-        _check_shared(cfg, steps)
-
-
-def _check_shared(cfg: Config, steps: list[Any]) -> None:
-    """Refuse a transform that has another value of a setting than the head (its ``shared``)."""
-    head = (cfg.get("model") or {}).get("map_head") or {}
-    kind = _needs(head.get("type"))
-    for step in steps if kind.shared else ():
-        transform = _class(step.get("type"), TRANSFORMS)
-        if transform is None or transform.__name__ not in kind.transforms:
-            continue
-        for name in kind.shared:
-            own, other = _setting(kind, head, name), _setting(transform, step, name)
-            if own != other:
-                raise ValueError(
-                    f"{cfg.filename}: {name} of {head['type']} is {own}, that of {step['type']} "
-                    f"{other}: set both to one value."
-                )
-
-
-def _setting(kind: Any, part: dict[str, Any], name: str) -> Any:
-    """Return a setting of a part, or the default of its class."""
-    return part.get(name, inspect.signature(kind).parameters[name].default)
-
-
-def _pipelines(dataset: dict[str, Any]) -> list[list[Any]]:
-    """Return the steps of a data set, or of each one that it wraps; none without a data set."""
-    own = list(dataset.get("pipeline") or ())
-    wrapped = [dataset["dataset"]] if dataset.get("dataset") else dataset.get("datasets") or []
-    if wrapped:
-        return [[*steps, *own] for part in wrapped for steps in _pipelines(part)]
-    return [own] if dataset else []
-
-
-def _step_types(steps: Any) -> Iterator[Any]:
-    """Yield the types of a pipeline's steps, and of those that they wrap."""
-    for step in steps:
-        if isinstance(step, dict):
-            yield step.get("type")
-            yield from _step_types(step.get("transforms") or ())
-
-
 def _check_streams(cfg: Config) -> None:
     """Refuse loaders that would not hand a model with memory the frames of each scene in order."""
     temporal = (cfg.get("model") or {}).get("temporal")
@@ -389,7 +309,7 @@ def _check_streams(cfg: Config) -> None:
         loader = cfg.get(f"{part}_dataloader") or {}
         sampler = loader.get("sampler") or {}
         kind = sampler.get("type")
-        found = _class(kind, DATA_SAMPLERS)
+        found = class_of_type(kind, DATA_SAMPLERS)
         if loader and wanted not in [base.__name__ for base in inspect.getmro(found or object)]:
             raise ValueError(
                 f"{cfg.filename}: {part}_dataloader.sampler is {kind!r}, which tears scenes apart "

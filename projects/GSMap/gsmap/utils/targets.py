@@ -1,15 +1,23 @@
 """What a part of a model needs of the training pipeline."""
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 
 class NeedsTargets:
-    """A head, loss or auxiliary head that says which transforms make its targets.
+    """A head, loss or auxiliary head that names the transforms that make its targets.
 
     Attributes:
         transforms: Names of the transforms; a training pipeline without one is refused.
-        shared: Settings that have one value in the part and in these transforms.
     """
 
     transforms: ClassVar[tuple[str, ...]] = ()
-    shared: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of these transforms that follow from those of the part.
+
+        Args:
+            settings: Settings of the part, defaults included.
+        """
+        return {}

@@ -1,7 +1,7 @@
 """The map head, composed of parts: queries, predictions of every layer, matching, losses."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from inspect import signature
 from typing import Any, cast
 
@@ -141,6 +141,11 @@ class MapHead(DetectionHead):
         self.assigner = MapAssigner(match_costs)
         self.coder = self.build_coder(coder or {})
         self.check_parts()
+
+    @classmethod
+    def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of the transform that follow from those of the head."""
+        return {"num_points": settings["num_points"]}
 
     def build_coder(self, settings: PARTS) -> MapCoder:
         """Return the coder that goes with the reference.

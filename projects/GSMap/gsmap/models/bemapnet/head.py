@@ -1,6 +1,6 @@
 """BeMapNet's head: lines as Bezier curves of several pieces."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -100,6 +100,12 @@ class BezierHead(LineHead):
                 [k for _, k in shapes],
             )
         )
+
+    @classmethod
+    def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of the transform that follow from those of the head."""
+        curves = {name: settings[name] for name in ("degrees", "pieces")}
+        return {**curves, **super().target_settings(settings)}
 
     def predictions(self, layer: Sequence[ClassLines], mean: Tensor) -> LinePredictions:
         """Return the curves and scores of a layer's lines of all classes."""

@@ -1,7 +1,7 @@
 """HDMapNet's head: a segmentation of any BEV features, and lines of its pixels."""
 
 import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -45,7 +45,6 @@ class HDMapNetHead(DetectionHead):
     """
 
     transforms = ("MakeLineMaps",)
-    shared = ("pixel_m", "num_directions")  # settings that have one value there and here
     not_exported = (
         "its lines are clustered and traced pixel by pixel, which ONNX has no operator for"
     )
@@ -79,6 +78,11 @@ class HDMapNetHead(DetectionHead):
             )
         sizes = embed_dims, len(classes), embedding_dims, num_directions
         self.decoder = LineMapDecoder(*sizes, **(decoder or {}))
+
+    @classmethod
+    def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of the transform that follow from those of the head."""
+        return {name: settings[name] for name in ("pixel_m", "num_directions")}
 
     def forward(self, bev_outputs: Tensors) -> LineMaps:
         """Return maps of all pixels, from ``bev_feats`` (B, C, H, W)."""

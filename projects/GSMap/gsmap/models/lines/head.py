@@ -1,6 +1,6 @@
 """A head of lines whose classes have queries of their own: scores, masks, losses."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -98,6 +98,11 @@ class LineHead(DetectionHead):
         convs = [nn.Conv2d(*pair, 1) for pair in dims]
         self.coordinates = nn.Sequential(convs[0], nn.ReLU(), convs[1], nn.ReLU(), convs[2])
         self._kept: tuple[Any, Tensor] | None = None  # state of the weights, their feature
+
+    @classmethod
+    def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of the transform that follow from those of the head."""
+        return {"pixel_m": settings["mask_pixel_m"]}
 
     def forward(self, bev_outputs: Tensors) -> list[LinePredictions]:
         """Predict the lines after every decoder layer, from ``bev_feats`` (B, C, H, W)."""

@@ -1,6 +1,6 @@
 """PivotNet's head: points of lines, of which those that are pivots make the map."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,6 +99,12 @@ class PivotHead(LineHead):
         dims, both = [embed_dims] * 3, 2 * self.point_dims
         self.point_branches = nn.ModuleList(mlp(*dims, both) for _ in classes)
         self.kind_branches = nn.ModuleList(mlp(both, both, both, 2) for _ in classes)
+
+    @classmethod
+    def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of the transform that follow from those of the head."""
+        points = tuple(points for _, points in settings["queries"])
+        return {"num_points": points, **super().target_settings(settings)}
 
     def predictions(self, layer: Sequence[ClassLines], mean: Tensor) -> LinePredictions:
         """Return the points, kinds and scores of a layer's lines."""

@@ -1,8 +1,8 @@
 """VectorMapNet's element detector: elements as key points, the corners of their boxes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -152,6 +152,11 @@ class KeyPointHead(DetectionHead):
         for part in (self.layers, self.context, self.initial):
             init_matrices(part)
         nn.init.constant_(self.cls_branch.bias, bias_init_with_prob(0.01))
+
+    @classmethod
+    def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of the transform that follow from those of the canvas."""
+        return dict(settings["canvas"] or {})
 
     def forward(self, bev_outputs: Tensors) -> list[KeyPointPredictions]:
         """Predict the elements after every layer, from ``bev_feats`` (B, C', H, W)."""

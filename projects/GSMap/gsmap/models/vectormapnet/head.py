@@ -2,6 +2,7 @@
 
 import zlib
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from mmdet3d.registry import MODELS
@@ -71,6 +72,11 @@ class VectorMapNetHead(DetectionHead):
             )
         second: PARTS = {"canvas": self.canvas, "num_classes": len(classes), **(generator or {})}
         self.generator = PolylineGenerator(**second)
+
+    @classmethod
+    def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of the transform that follow from those of the canvas."""
+        return dict(settings["canvas"] or {})
 
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
         """Fit a checkpoint's state to the detector's, in place."""
