@@ -1,5 +1,6 @@
 """The tables between the state keys of releases and ours, of all methods."""
 
+from collections import Counter
 from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
@@ -17,7 +18,10 @@ def key_maps() -> tuple[KeyMap, ...]:
     of its own has not.
     """
     found: tuple[KeyMap, ...] = ()
-    for method in sorted(METHODS, key=lambda method: len(method.built_on), reverse=True):
+    users = Counter(name for method in METHODS for name in method.built_on)
+    # what others are built on comes after them, what is built on none before those that are
+    rank = {m.name: (users[m.name], bool(m.built_on), -len(m.built_on)) for m in METHODS}
+    for method in sorted(METHODS, key=lambda method: rank[method.name]):
         name = f"gsmap.models.{method.name}.keys"
         if find_spec(name) is not None:
             found += import_module(name).KEY_MAPS
