@@ -143,18 +143,6 @@ def test_targets_are_found_in_wrapped_data_sets_and_steps_and_by_their_base_clas
         check_config(cfg)
 
 
-@pytest.mark.parametrize("side", ["head", "transform"])
-def test_a_setting_that_head_and_transform_share_has_one_value(side):
-    cfg = read_config("configs/hdmapnet/hdmapnet_r18_minicity.py")
-    steps = cfg.train_dataloader.dataset.pipeline
-    (step,) = [step for step in steps if step.type == "MakeLineMaps"]
-    (cfg.model.map_head if side == "head" else step).num_directions = 72
-    with pytest.raises(ValueError, match=r"num_directions of HDMapNetHead is .*: set both to one"):
-        check_config(cfg)
-    cfg.model.map_head.num_directions = step.num_directions = 72
-    check_config(cfg)
-
-
 STREAMS = {"type": "StreamTrainSampler", "slots": 2}
 WITH_MEMORY = {
     "model": {"temporal": {"bev": {}}},
