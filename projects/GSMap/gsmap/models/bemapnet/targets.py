@@ -18,8 +18,8 @@ class FormatBezierTargets(FormatLineTargets):
     """Add ``gt_instances_3d`` with the control points of lines, from ``map_instances``.
 
     Args:
-        degrees: Degrees of the pieces of each class, as in the head.
-        pieces: Most pieces of each class, as in the head; as released, further ones are lost.
+        degrees: Degrees of the pieces of each class; a config has them in the head.
+        pieces: Most pieces of each class, likewise; as released, further ones are lost.
         max_error_m: A piece is accepted below this mean deviation, in metres.
 
     Other settings, and what the targets are, are those of `FormatLineTargets`. ValueError if a

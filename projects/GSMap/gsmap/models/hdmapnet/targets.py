@@ -31,11 +31,11 @@ class MakeLineMaps(BaseTransform):
 
     Args:
         num_classes: Number of classes.
-        pixel_m: Side of a pixel in metres, as in the head.
+        pixel_m: Side of a pixel in metres; a config has it in the head.
         thickness_px: Width of the lines.
         gap_px: Width around lines of later classes in which earlier ones are erased.
         step_m: Lines are sampled at this distance first.
-        num_directions: Directions K, as in the head.
+        num_directions: Directions K, likewise.
         forward: Axis of the direction of travel, by default the longer side, as in `BEVGrid`.
 
     Raises:

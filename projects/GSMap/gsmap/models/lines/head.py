@@ -55,7 +55,7 @@ class LineHead(DetectionHead):
         numbers: Lines of each class.
         decoder: Settings of `PointLineDecoder`; ValueError if there are more layers than weights.
         losses: The losses of one class.
-        mask_pixel_m: Side of a pixel of the losses' masks in metres, as in the targets.
+        mask_pixel_m: Side of a pixel of the losses' masks in metres; the targets take it.
         score_threshold: Lines of at most this score are dropped: 0.5 as long as there are just
             lines and none.
         embed_dims: Channels C.

@@ -63,7 +63,7 @@ class FormatLineTargets(BaseTransform):
 
     Args:
         edge_classes: Class indices whose rings become their two longest edges.
-        pixel_m: Side of a pixel of the masks in metres.
+        pixel_m: Side of a pixel of the masks in metres; a config has it in the head.
         thickness_px: Width of lines in them.
         step_m: Lines are sampled at this distance first.
         sort_rings: Whether rings start at their rearmost vertex and run clockwise; by default they

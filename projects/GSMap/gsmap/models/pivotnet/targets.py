@@ -44,8 +44,9 @@ class FormatPivotTargets(FormatLineTargets):
     """Add ``gt_instances_3d`` with the pivots of lines, from ``map_instances``.
 
     Args:
-        num_points: Most pivots P of a line of each class, as in the head; the other settings, and
-            what the targets are, are those of `FormatLineTargets`.
+        num_points: Most pivots P of a line of each class, which a config has in the head's
+            queries; the other settings, and what the targets are, are those of
+            `FormatLineTargets`.
         min_area_m2: A point is a pivot if its triangle is at least as large.
         keep_end: Whether a line of too many pivots keeps the most significant ones; by default the
             first, as released, so that its end is lost.
