@@ -19,9 +19,8 @@ def key_maps() -> tuple[KeyMap, ...]:
     """
     found: tuple[KeyMap, ...] = ()
     users = Counter(name for method in METHODS for name in method.built_on)
-    # what others are built on comes after them, what is built on none before those that are
-    rank = {m.name: (users[m.name], bool(m.built_on), -len(m.built_on)) for m in METHODS}
-    for method in sorted(METHODS, key=lambda method: rank[method.name]):
+    # what others are built on comes after them; of the others a later one is more special
+    for method in sorted(reversed(METHODS), key=lambda method: users[method.name]):
         name = f"gsmap.models.{method.name}.keys"
         if find_spec(name) is not None:
             found += import_module(name).KEY_MAPS
