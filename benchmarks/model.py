@@ -17,7 +17,8 @@ from benchmarks.measure import Cost, in_own_process, markdown_table
 from gsmap.checkpoints.building import building
 from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.transforms.masks import MakePVMask
-from gsmap.engine.targets import needed_targets, read_config
+from gsmap.engine.launch import read_config
+from gsmap.engine.targets import needed_targets
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.rigid import rigid
 
