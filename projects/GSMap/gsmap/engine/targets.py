@@ -76,8 +76,9 @@ def _steps_of(settings: Any, names: tuple[str, ...]) -> Iterator[dict[str, Any]]
 def _defaults(kind: type | None) -> dict[str, Any]:
     """Return the settings of a class that have defaults, those of its bases included."""
     found: dict[str, Any] = {}
-    for base in reversed(kind.__mro__ if kind else ()):
-        for name, parameter in inspect.signature(base.__init__).parameters.items():
+    makers = [vars(base).get("__init__") for base in reversed(kind.__mro__ if kind else ())]
+    for maker in filter(None, makers):
+        for name, parameter in inspect.signature(maker).parameters.items():
             if parameter.default is not parameter.empty:
                 found[name] = parameter.default
     return found
