@@ -6,6 +6,7 @@ along its ground truth scores as well as one that follows it.
 
 import argparse
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from gsmap.datasets.annotations.file import AnnotationFile
 from gsmap.evaluation.core.chamfer_ap import ChamferConfig
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.file_evaluation import match_samples, read_ground_truth
+from gsmap.evaluation.core.matches import FrameMatches
+from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.results_json import RESULTS_KEY, read_samples
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import FloatArray, MapElements
@@ -55,9 +58,11 @@ def line_shapes(results: Path, truth: Path) -> dict[str, FloatArray]:
     names = [name for name in config.classes if name not in AREA_CLASSES]
     shapes: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
     nothing = MapElements.from_polylines()
-    pairs = [(token, predicted.get(token, nothing), true) for token, true in annotated.items()]
+    pairs = [
+        Sample(token, predicted.get(token, nothing), true) for token, true in annotated.items()
+    ]
     for matches in match_samples(pairs, MapEvaluator(config)):
-        found = matches["chamfer"]
+        found = cast(FrameMatches, matches["chamfer"])
         truths = annotated[found.token].polylines
         lines = predicted[found.token].polylines if len(found.labels) else []
         for index, label, score, matched in zip(

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 from gsmap.datasets.annotations.record import AnnotationMeta
 from gsmap.evaluation.analysis.distances import cut_by_distance
@@ -10,6 +11,7 @@ from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
 from gsmap.evaluation.core.evaluator import MapEvaluator
 from gsmap.evaluation.core.file_evaluation import mismatch_notes
 from gsmap.evaluation.core.matches import FrameMatches
+from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.raster_ap import RasterConfig
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.evaluation.core.results_json import RESULTS_KEY, THREE_D, SampleFile
@@ -93,7 +95,8 @@ def score_result(
     notes += [f"{n} predictions of class {c!r} are not scored" for c, n in sorted(others.items())]
     evaluator, nothing = _evaluator(meta), MapElements.from_polylines()
     found = [evaluator.match(t, predictions.get(t, nothing), gt) for t, gt in truth.items()]
-    matches = {sample["chamfer"].token: sample["chamfer"] for sample in found}
+    chamfer = [cast(FrameMatches, sample["chamfer"]) for sample in found]
+    matches = {frame.token: frame for frame in chamfer}
     reports, law = evaluator.reports(found), law or law_of(file.about)
     return ScoredResult(name, predictions, matches, reports, notes, law)
 
@@ -109,7 +112,9 @@ def scored_by_distance(
         meta: Classes and range.
     """
     evaluator, nothing = _evaluator(meta), MapElements.from_polylines()
-    samples = ((token, result.predictions.get(token, nothing), gt) for token, gt in truth.items())
+    samples = (
+        Sample(token, result.predictions.get(token, nothing), gt) for token, gt in truth.items()
+    )
     areas = [label for label, name in enumerate(meta.classes) if name in AREA_CLASSES]
     found = (evaluator.match(*pieces) for pieces in cut_by_distance(samples, areas))
     return replace(result, reports=evaluator.reports(found))

@@ -19,6 +19,7 @@ from gsmap.evaluation.analysis.groups import Groups, ap_by_group, group_table
 from gsmap.evaluation.core.average_precision import precision_recall
 from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
 from gsmap.evaluation.core.matches import ClassDetections
+from gsmap.evaluation.core.metric import Sample
 from gsmap.evaluation.core.report import UNDEFINED, MetricReport, flat_metrics
 from gsmap.structures.elements import MapElements
 from gsmap.visualization.page.scores import ScoredResult
@@ -208,7 +209,8 @@ def _vertices(
     matched = any((matches.matched_gt >= 0).any() for matches in result.matches.values())
     if not matched or any(elements.scales is None for elements in some):
         return None
-    pairs = ((t, result.predictions[t], gt) for t, gt in truth.items() if t in result.predictions)
+    predictions = result.predictions
+    pairs = (Sample(t, predictions[t], gt) for t, gt in truth.items() if t in predictions)
     return matched_vertices(pairs, ChamferConfig(tuple(style.classes)))
 
 
