@@ -11,6 +11,7 @@ from gsmap.mmcv_ext import MmcvExtFinder
 from gsmap.settings_guard import SettingsGuard
 from gsmap.utils.interrupt import leave_at_once_on_ctrl_c, starts_a_command
 from gsmap.utils.lazy import lazy_names
+from gsmap.utils.moved import MovedModules
 
 __version__ = "0.1.0"
 
@@ -18,6 +19,7 @@ if starts_a_command():
     leave_at_once_on_ctrl_c()  # the imports that follow take seconds
 sys.meta_path.insert(0, SettingsGuard)
 sys.meta_path.append(MmcvExtFinder)  # last: mmcv's own compiled module comes first
+sys.meta_path.append(MovedModules())
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,

@@ -1,9 +1,6 @@
 """Network parts: detectors, BEV encoders, the frame of all heads, and a folder for each method."""
 
-from gsmap.models import moved
 from gsmap.utils.lazy import lazy_names
-
-moved.install()
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,

@@ -10,6 +10,33 @@ from types import MappingProxyType, ModuleType
 
 _MAPTR, _BASE = "gsmap.models.maptr", "gsmap.models.base"
 _WHOLE = ("coder", "decoder", "head", "layers", "masks", "pairs", "parts")
+_EVALUATION = {
+    "core": (
+        "average_precision",
+        "chamfer_ap",
+        "chamfer_kernels",
+        "evaluator",
+        "file_evaluation",
+        "match_files",
+        "matches",
+        "raster_ap",
+        "raster_kernels",
+        "report",
+        "results_json",
+        "sample_ap",
+    ),
+    "metrics": ("pld", "topology"),
+    "analysis": (
+        "bootstrap",
+        "calibration",
+        "compact",
+        "consistency",
+        "distances",
+        "drive_files",
+        "groups",
+        "prior",
+    ),
+}
 
 # former name -> the modules that hold its contents now
 MOVED: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -17,6 +44,11 @@ MOVED: Mapping[str, tuple[str, ...]] = MappingProxyType(
         **{f"{_MAPTR}.{name}": (f"{_BASE}.{name}",) for name in _WHOLE},
         f"{_MAPTR}.attention": (f"{_BASE}.attention", f"{_MAPTR}.self_attention"),
         f"{_MAPTR}.matching": (f"{_BASE}.matching", f"{_MAPTR}.cost"),
+        **{
+            f"gsmap.evaluation.{name}": (f"gsmap.evaluation.{room}.{name}",)
+            for room, names in _EVALUATION.items()
+            for name in names
+        },
     }
 )
 
@@ -35,8 +67,3 @@ class MovedModules(MetaPathFinder, Loader):
         for name in MOVED[module.__name__]:
             contents = vars(import_module(name))
             vars(module).update({k: v for k, v in contents.items() if not k.startswith("__")})
-
-
-def install() -> None:
-    """Let Python find modules by their former names, after all others."""
-    sys.meta_path.append(MovedModules())

@@ -8,7 +8,7 @@ from mmdet3d.registry import MODELS, TASK_UTILS
 from mmengine.config import Config
 
 import gsmap.registered  # noqa: F401
-from gsmap.models.moved import MOVED
+from gsmap.utils.moved import MOVED
 
 # registered classes and what the docs named, by the module of before
 NAMED = {
@@ -37,10 +37,20 @@ def test_a_class_is_found_by_the_name_of_its_former_module(module: str, names: t
 
 
 def test_every_former_module_is_tested_and_has_successors():
-    assert {name.rpartition(".")[2] for name in MOVED} <= NAMED.keys()
+    models = {name for name in MOVED if name.startswith("gsmap.models.maptr.")}
+    assert {name.rpartition(".")[2] for name in models} <= NAMED.keys()
     for successors in MOVED.values():
         for name in successors:
             assert import_module(name).__spec__.origin.endswith(".py"), name
+
+
+@pytest.mark.parametrize("name", sorted(set(MOVED) - {f"gsmap.models.maptr.{n}" for n in NAMED}))
+def test_a_former_module_of_evaluation_has_the_contents_of_the_one_of_today(name: str):
+    (successor,) = MOVED[name]
+    former, today = import_module(name), import_module(successor)
+    public = [key for key in vars(today) if not key.startswith("__")]
+    assert public
+    assert all(getattr(former, key) is getattr(today, key) for key in public)
 
 
 def test_custom_imports_take_a_former_module(tmp_path, monkeypatch):
