@@ -1,6 +1,5 @@
 """Former names of modules, for configs and code outside this repository."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
