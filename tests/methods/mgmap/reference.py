@@ -144,7 +144,8 @@ def check_decoder(golden: Golden, name: str) -> Iterator[Row]:
     features = decoder.instance_features(fused, masks)
     states = torch.stack([o.decoded.point_states.flatten(1, 2) for o in outputs[:LAYERS]])
     references = torch.stack([o.decoded.references.flatten(1, 2) for o in outputs[:LAYERS]])
-    points = head.pts_embedding(head.instance_embedding.weight).unflatten(1, (P, -1))
+    instances = head.instance_embedding.weight
+    points = head.pts_embedding(instances) - instances[:, None]  # without the instance itself
     ours = {
         "init_reference": (head.reference.start(head.queries()[0]), 1e-5),
         "pts_embed_sub": (points[::10, ::5], 1e-5),
