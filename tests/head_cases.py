@@ -99,3 +99,16 @@ def train_a_step(head: torch.nn.Module, gt: InstanceData) -> dict[str, torch.Ten
     assert all(gradient.isfinite().all() for gradient in gradients)
     torch.optim.SGD(head.parameters(), 1e-3).step()
     return losses
+
+
+def assert_neighbours_stay_apart_in_bfloat16(reference: torch.nn.Module) -> None:
+    """Check a reference of 8 channels and one layer on neighbouring points."""
+    torch.manual_seed(0)
+    reference.eval()
+    states = (5 * torch.randn(1, 8) + torch.linspace(0, 1e-3, 20)[:, None])[None]
+    start = reference.start(states)
+    expected = reference.refine(0, states, start)[..., :2]
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(reference.start(states)[..., :2], start[..., :2])
+        assert torch.equal(reference.refine(0, states, start)[..., :2], expected)
+    assert len(expected.flatten(0, 1).unique(dim=0)) > 10

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from methods.pivotnet.reference import CAMERAS
 from mmdet.models.layers import coordinate_to_encoding
 from reference.golden import Golden
+from reference.lines import CAMERAS
 from reference.maptr import state_rows
 from reference.parts import GoldenParts
 from reference.registry import check

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 from methods.bemapnet.reference import small_head
-from methods.pivotnet.reference_losses import elements
 from mmcv.ops import point_sample
 from mmdet3d.structures import Det3DDataSample
 from mmengine.registry import init_default_scope
 from mmengine.structures import InstanceData
 from reference.golden import Golden
+from reference.lines import elements
 from reference.registry import check
 from reference.report import Row, largest_difference
 

@@ -131,3 +131,8 @@ def test_bad_arguments_are_named():
     for loss in (euclidean_shape_loss, lambda p, t: euclidean_relation_loss(p, t, [3])):
         with pytest.raises(ValueError, match=r"target must have shape \(3, 4, 2\) of pred"):
             loss(pred, pred[:2])
+
+
+def test_it_has_no_weight_of_each_class():
+    with pytest.raises(TypeError, match="EuclideanLoss is no sum over pairs: give one loss_weight"):
+        EuclideanLoss(loss_weight=(1.0, 5.0, 3.0))

@@ -10,7 +10,6 @@ from gsmap.models.base.decoder import MapDecoder, MapDecoderLayer
 from gsmap.models.gsmap.guidance import GaussianGuidance
 from gsmap.models.gsmap.layer import GaussianDecoderLayer, guided
 from gsmap.models.maptr.references import refine_reference
-from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
 from gsmap.structures.gaussians import GaussianSpace
 from gsmap.structures.grid import BEVGrid
 
@@ -106,15 +105,8 @@ def test_guidance_without_gaussians_is_refused():
         GaussianDecoderLayer()
 
 
-def test_a_decoder_with_layers_of_its_own_keeps_them():
-    """MapTR's take the layer that is guided; those of MGMapNet are guided by a part."""
+def test_a_decoder_takes_the_layer_that_is_guided():
+    """MapTR's take the layer that is guided."""
     for decoder in ({}, {"type": MapDecoder}):
         layer = {"type": GaussianDecoderLayer, "ffn_dims": 4}
         assert guided({**decoder, "layer": {"ffn_dims": 4}}) == {**decoder, "layer": layer}
-    layer = {"ffn_dims": 4, "guidance": {"type": GaussianGuidance, "embed_hidden_dims": 2}}
-    own = {"ffn_dims": 4, "guidance": {"embed_hidden_dims": 2}}
-    found = guided({"type": MGMapNetDecoder, "layer": own})
-    assert found == {"type": MGMapNetDecoder, "layer": layer}
-    assert guided({"type": MGMapNetDecoder, "layer": {"guidance": None}})["layer"] == {
-        "guidance": None
-    }

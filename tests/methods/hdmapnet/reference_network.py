@@ -10,6 +10,7 @@ import torch
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from reference.golden import Golden
+from reference.lines import CAMERAS
 from reference.maptr import state_rows
 from reference.parts import GoldenParts
 from reference.registry import check
@@ -29,7 +30,6 @@ from gsmap.structures.polylines import sampled as sampled_line
 
 CONFIG = "hdmapnet/hdmapnet_effb0_30e.py"
 STATE = "hdmapnet_state.json"
-CAMERAS = ("FRONT_LEFT", "FRONT", "FRONT_RIGHT", "BACK_LEFT", "BACK", "BACK_RIGHT")
 GRID = BEVGrid((-30.0, 30.0), (-15.0, 15.0))
 SETS = ("closed", "many", "hand")
 OWN_BLOCK = ("bevencode.up1_direction.conv.", "map_head.decoder.joined.2.")  # not used by default

@@ -1,7 +1,9 @@
 """Parts of HDMapNet as its paper or release prints them; paper.json has further numbers."""
 
+import pytest
 from paper_cases import head_of
 
+from gsmap.engine.launch import check_config, read_config
 from gsmap.models.hdmapnet.encoder import ViewTransformEncoder
 from gsmap.models.hdmapnet.losses import LineMapLosses
 from gsmap.models.hdmapnet.targets import MakeLineMaps
@@ -16,3 +18,15 @@ def test_hdmapnet_weighs_and_draws_as_released():
     assert (targets.pixel_m, targets.thickness_px, targets.gap_px) == (0.15, 5, 9)
     assert (targets.step_m, targets.num_directions) == (1.0, 36)
     assert ViewTransformEncoder(head.grid, num_cams=0).released_units
+
+
+@pytest.mark.parametrize("side", ["head", "transform"])
+def test_a_setting_that_head_and_transform_share_has_one_value(side):
+    cfg = read_config("configs/hdmapnet/hdmapnet_r18_minicity.py")
+    steps = cfg.train_dataloader.dataset.pipeline
+    (step,) = [step for step in steps if step.type == "MakeLineMaps"]
+    (cfg.model.map_head if side == "head" else step).num_directions = 72
+    with pytest.raises(ValueError, match=r"num_directions of HDMapNetHead is .*: set both to one"):
+        check_config(cfg)
+    cfg.model.map_head.num_directions = step.num_directions = 72
+    check_config(cfg)

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import torch
 from methods.maptrv2.reference import all_queries
-from methods.mgmapnet.reference_losses import GROUPS, REPEATS, match_rows
 from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from mmengine.config import Config
 from mmengine.structures import InstanceData
 from predictions import predicted, stacked
 from reference.golden import NUM_CAMS, Golden
+from reference.groups import GROUPS, REPEATS, match_rows
 from reference.maptr import decoded_rows, state_rows
 from reference.parts import GoldenParts
 from reference.registry import check
@@ -26,10 +26,10 @@ from torch import Tensor, nn
 
 from gsmap.models.base.attention import place_samples, sample_map
 from gsmap.models.base.head import MapHead
+from gsmap.models.base.mask_heads import BEVMaskHead
 from gsmap.models.mapqr.decoder import sine_code
 from gsmap.models.mapqr.encoder import HeightQueryEncoder
 from gsmap.models.mapqr.keys import MAPQR
-from gsmap.models.maptrv2.aux_heads import BEVMaskHead
 from gsmap.structures.grid import BEVGrid
 
 CONFIG = "mapqr/mapqr_r50_24e.py"

@@ -1,6 +1,6 @@
 """Parts of MapQR as its paper or release prints them; paper.json has further numbers."""
 
-from paper_cases import head_of
+from paper_cases import head_of, require_target
 
 
 def test_mapqr_scatters_and_masks_as_published():
@@ -18,3 +18,8 @@ def test_mapqr_scatters_and_masks_as_published():
 def test_each_element_is_matched_six_times_by_the_further_queries():
     first, further = head_of("configs/mapqr/mapqr_r50_24e.py").query_groups
     assert (first.repeats, further.repeats, further.weight) == (1, 6, 1.0)
+
+
+def test_a_pipeline_without_targets_is_refused():
+    require_target("configs/mapqr/mapqr_r18_minicity.py", "MakeBEVMask", "BEVMaskHead")
+    require_target("configs/mapqr/mapqr_r18_minicity.py", "MakePVMask", "PVMaskHead")

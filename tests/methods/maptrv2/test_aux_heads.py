@@ -7,8 +7,8 @@ import torch
 from head_cases import GSMAP, HEAD, N, P, along_y, bev, build_head, elements, with_layer
 from mmdet3d.structures import Det3DDataSample
 
-from gsmap.models.maptrv2.aux_heads import BEVMaskHead, DepthSupervision, PVMaskHead
-from gsmap.models.mgmapnet.aux_heads import NormedPVMaskHead
+from gsmap.models.base.mask_heads import BEVMaskHead, PVMaskHead
+from gsmap.models.maptrv2.aux_heads import DepthSupervision
 
 HEADS = [
     {"type": "BEVMaskHead", "loss_weight": 1.0, "pos_weight": 4.0},
@@ -56,16 +56,14 @@ def test_mask_losses_by_hand():
 def test_masks_of_each_class_by_hand():
     """Logits 0; one of ten rows of the first of three classes is drawn: p = 1/2 on 150 cells."""
     gt = Det3DDataSample(metainfo={"token": "a"})
-    gt.gt_seg, gt.gt_pv_seg = torch.zeros(3, 10, 5), torch.zeros(2, 3, 3, 4)
+    gt.gt_seg = torch.zeros(3, 10, 5)
     gt.gt_seg[0, 2] = 1
     settings = {"num_masks": 3, "loss_weight": 2.0, "pos_weight": 1.0, "dice_weight": 3.0}
-    head, camera = BEVMaskHead(16, **settings), NormedPVMaskHead(16, **settings)
-    for parameter in [*head.parameters(), *camera.parameters()]:
+    head = BEVMaskHead(16, **settings)
+    for parameter in head.parameters():
         torch.nn.init.zeros_(parameter)
     dice = 1 - (2 * 5 / 2 + 1) / (150 / 2 + 5 + 1)
     assert head.loss(bev(), [gt]).item() == pytest.approx(2 * math.log(2) + 3 * dice)
-    dice = 1 - 1 / (36 / 2 + 1)  # of each camera, without truth
-    assert camera.loss(bev(), [gt]).item() == pytest.approx(2 * math.log(2) + 3 * dice)
 
 
 def test_one_mask_takes_all_classes_together():

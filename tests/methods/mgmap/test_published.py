@@ -1,6 +1,6 @@
 """Parts of MGMap as its paper or release prints them; paper.json has further numbers."""
 
-from paper_cases import head_of
+from paper_cases import head_of, require_target
 
 
 def test_mgmaps_masks_and_refinement_weigh_as_published():
@@ -11,3 +11,7 @@ def test_mgmaps_masks_and_refinement_weigh_as_published():
     attention, stage = head.decoder.layers[0].cross_attn, head.decoder.refinements[0].layer
     assert (attention.num_parts, attention.num_points, attention.num_heads) == (4, 16, 8)
     assert (stage.linear1.out_features, stage.self_attn.num_heads) == (1024, 8)
+
+
+def test_a_pipeline_without_targets_is_refused():
+    require_target("configs/mgmap/mgmap_r18_minicity.py", "FormatMapTargets", "MapHead")

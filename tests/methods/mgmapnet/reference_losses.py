@@ -8,21 +8,20 @@ from methods.mgmapnet.reference import BEV, B, MGMapNetParts
 from methods.mgmapnet.reference_decoder import build_head
 from mmdet3d.structures import Det3DDataSample
 from mmengine.structures import InstanceData
-from predictions import predicted, triples
+from predictions import predicted
 from reference.golden import Golden
+from reference.groups import GROUPS, REPEATS, match_rows
 from reference.registry import check
 from reference.report import Row, largest_relative, relative_norm
 from torch import Tensor, nn
 
 from gsmap.models.base.head import MapHead
+from gsmap.models.base.mask_heads import BEVMaskHead
 from gsmap.models.base.masks import ElementMasks
-from gsmap.models.base.pairs import Predictions
-from gsmap.models.maptrv2.aux_heads import BEVMaskHead
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoded
 from gsmap.structures.grid import BEVGrid
 
-GROUPS = {"o2o": 20, "o2m": 60}  # the file's names and their queries
-REPEATS, LAYERS = 3, 6
+LAYERS = 6
 LOSS, LOSS_GRAD = 1e-4, 1e-3
 OUTPUTS = {  # ours and the file's
     "scores": "all_cls_scores",
@@ -116,25 +115,6 @@ def check_losses(golden: Golden, name: str) -> Iterator[Row]:
     total.backward()
     yield from gradient_rows(name, data, saved)
     yield from matched_rows(name, data, saved, loss_head(golden, "matched"), gts)
-
-
-def match_rows(
-    name: str,
-    data: Mapping[str, np.ndarray],
-    head: MapHead,
-    outputs: list[Predictions],
-    gts: list[InstanceData],
-) -> Iterator[Row]:
-    """Compare the matches of both groups; copies of one ground truth stand for each other."""
-    prepared = head.prepare_gts(gts)
-    for label, (group, own) in zip(GROUPS, head.split_groups(outputs), strict=True):
-        wrong = 0
-        pairs = head.match(own, prepared, [{}] * B, group.repeats)
-        for layer, matches in enumerate(triples(pairs)):
-            for sample, match in enumerate(matches):
-                listed = data[f"match_{label}_l{layer}_b{sample}"]
-                wrong += len(set(map(tuple, match.tolist())) ^ set(map(tuple, listed.tolist())))
-        yield Row(name, f"{label}: matches that differ", wrong, 0)
 
 
 def class_mask_rows(

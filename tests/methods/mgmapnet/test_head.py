@@ -20,6 +20,8 @@ from mmdet3d.registry import MODELS
 from mmdet3d.structures import Det3DDataSample
 from predictions import stacked
 
+from gsmap.models.gsmap.guidance import GaussianGuidance
+from gsmap.models.gsmap.layer import guided
 from gsmap.models.maptr.self_attention import PointSelfAttention
 from gsmap.models.mgmapnet.decoder import MGMapNetDecoder
 from gsmap.models.mgmapnet.head import with_granularities
@@ -193,3 +195,13 @@ def test_points_with_height_are_codes_and_predictions_of_three_numbers():
 def test_a_loss_of_samples_needs_a_decoder_that_tells_them():
     with pytest.raises(ValueError, match=r"SamplingLocationLoss needs .* got MapDecoder"):
         build_head(HEAD, losses=[{"type": "SamplingLocationLoss"}])
+
+
+def test_layers_of_the_decoder_are_guided_by_a_part_and_stay():
+    layer = {"ffn_dims": 4, "guidance": {"type": GaussianGuidance, "embed_hidden_dims": 2}}
+    own = {"ffn_dims": 4, "guidance": {"embed_hidden_dims": 2}}
+    found = guided({"type": MGMapNetDecoder, "layer": own})
+    assert found == {"type": MGMapNetDecoder, "layer": layer}
+    assert guided({"type": MGMapNetDecoder, "layer": {"guidance": None}})["layer"] == {
+        "guidance": None
+    }

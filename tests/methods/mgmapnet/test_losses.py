@@ -8,7 +8,7 @@ import torch
 from predictions import pairs_of
 from torch import nn
 
-from gsmap.models.maptrv2.aux_heads import class_mask_losses
+from gsmap.models.base.mask_heads import class_mask_losses
 from gsmap.models.mgmapnet.losses import (
     InstanceMaskLoss,
     SamplingLocationLoss,

@@ -8,6 +8,7 @@ import torch
 from mmdet3d.registry import MODELS
 from mmengine.config import Config
 from reference.golden import Golden
+from reference.lines import CAMERAS
 from reference.maptr import state_rows
 from reference.parts import GoldenParts
 from reference.registry import check
@@ -26,7 +27,6 @@ CONFIG = "pivotnet/pivotnet_r50_30e.py"
 STATE = "pivotnet_state.json"
 CLASSES = ("divider", "crossing", "boundary")
 B, C, BEV = 2, 256, (64, 32)
-CAMERAS = ("FRONT_LEFT", "FRONT", "FRONT_RIGHT", "BACK_LEFT", "BACK", "BACK_RIGHT")
 
 
 class PivotParts(GoldenParts):

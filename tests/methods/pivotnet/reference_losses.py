@@ -9,11 +9,11 @@ import torch
 from methods.pivotnet.reference import PivotParts, decoded_rows
 from mmdet3d.structures import Det3DDataSample
 from reference.golden import Golden
+from reference.lines import elements
 from reference.registry import check
 from reference.report import Row, largest_difference, largest_relative, relative_norm
 from scipy.ndimage import binary_dilation
 
-from gsmap.datasets.annotations.record import MapInstance
 from gsmap.models.lines.head import LinePredictions
 from gsmap.models.pivotnet.head import PivotHead, packed
 from gsmap.models.pivotnet.losses import Lines
@@ -51,12 +51,6 @@ def check_matching(golden: Golden, name: str) -> Iterator[Row]:
         finite = np.isfinite(wanted)
         off = max(off, largest_relative(ours[finite], wanted[finite]))
     yield Row(name, "costs (relative)", off, 1e-6)
-
-
-def elements(golden: Golden, name: str) -> list[MapInstance]:
-    """Return the elements of a set of ground truth, by class."""
-    found = sorted(golden.gt_sets[name], key=lambda element: element["label"])
-    return [MapInstance(element["label"], np.array(element["pts"])) for element in found]
 
 
 @check("pivotnet_pivots_{variant}.npz")

@@ -2,10 +2,20 @@
 
 import pytest
 import torch
-from head_cases import ALONG_X, HEAD, LANES, bev, build_head, losses_of
+from head_cases import (
+    ALONG_X,
+    ALONG_Y,
+    HEAD,
+    LANES,
+    assert_neighbours_stay_apart_in_bfloat16,
+    bev,
+    build_head,
+    losses_of,
+)
 
 from gsmap.models.streammapnet.encoder import StreamMapNetEncoderLayer
 from gsmap.models.streammapnet.losses import SmoothPointsCost
+from gsmap.models.streammapnet.reference import LineReference
 
 STREAM = {
     **HEAD,
@@ -64,3 +74,7 @@ def test_the_mirrored_row_is_a_switch():
     )
     assert right[0, 0].tolist() == pytest.approx([0.25, 0.125])
     assert released[0, 0].tolist() == pytest.approx([0.25, 0.875])
+
+
+def test_neighbouring_points_stay_apart_in_bfloat16():
+    assert_neighbours_stay_apart_in_bfloat16(LineReference(ALONG_Y, 8, 1))

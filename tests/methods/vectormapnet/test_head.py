@@ -26,6 +26,7 @@ from gsmap.datasets.annotations.record import MapInstance
 from gsmap.datasets.elements import elements_of_predictions
 from gsmap.datasets.transforms.map_targets import FormatMapTargets, map_targets
 from gsmap.engine.launch import check_config, read_config
+from gsmap.models.streams.memory import StreamMemory
 from gsmap.models.vectormapnet.detector import KeyPointHead, KeyPointPredictions
 from gsmap.models.vectormapnet.encoder import HeightPlanesEncoder
 
@@ -225,3 +226,10 @@ def test_the_published_model_has_the_published_parameters():
     assert found + idle == 36_734_549
     assert isinstance(model.map_head.detector, KeyPointHead)
     assert FormatMapTargets().num_points == 20
+
+
+def test_it_has_no_memory_of_queries_or_elements():
+    with pytest.raises(ValueError, match="VectorMapNetHead can have no memory of queries"):
+        StreamMemory(head(), queries={"num": 2})
+    with pytest.raises(ValueError, match="needs a head with Gaussians, got VectorMapNetHead"):
+        StreamMemory(head(), elements={})

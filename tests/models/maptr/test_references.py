@@ -2,13 +2,12 @@
 
 import pytest
 import torch
-from head_cases import ALONG_X, ALONG_Y, CLASSES
+from head_cases import ALONG_X, ALONG_Y, CLASSES, assert_neighbours_stay_apart_in_bfloat16
 
 from gsmap.models.base.masks import ElementMasks
 from gsmap.models.gsmap.reference import GaussianReference
 from gsmap.models.gsmap.statistics import gaussian_statistics
 from gsmap.models.maptr.references import PointReference, refine_reference
-from gsmap.models.streammapnet.reference import LineReference
 from gsmap.ops.gaussian_raster import render_gaussians
 from gsmap.structures.gaussians import Gaussians
 
@@ -36,19 +35,10 @@ def test_refinement_is_float32_under_mixed_precision():
     assert refined.dtype == torch.float32
 
 
-@pytest.mark.parametrize("reference", [PointReference, GaussianReference, LineReference])
+@pytest.mark.parametrize("reference", [PointReference, GaussianReference])
 def test_neighbouring_points_stay_apart_in_bfloat16(reference):
     """Rounded onto each other, their edges have no direction, and gradients of thousands."""
-    torch.manual_seed(0)
-    reference = reference(ALONG_Y, 8, 1)
-    reference.eval()
-    states = (5 * torch.randn(1, 8) + torch.linspace(0, 1e-3, 20)[:, None])[None]
-    start = reference.start(states)
-    expected = reference.refine(0, states, start)[..., :2]
-    with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(reference.start(states)[..., :2], start[..., :2])
-        assert torch.equal(reference.refine(0, states, start)[..., :2], expected)
-    assert len(expected.flatten(0, 1).unique(dim=0)) > 10
+    assert_neighbours_stay_apart_in_bfloat16(reference(ALONG_Y, 8, 1))
 
 
 def test_refinement_refuses_other_shapes():

@@ -7,7 +7,6 @@ import pytest
 import shapely
 import torch
 from head_cases import GSMAP, HEAD, build_head
-from methods.vectormapnet.cases import head as line_head
 from mmengine.structures import InstanceData
 from model_cases import build_small, make_images, make_samples, small_config, straight_elements
 
@@ -214,8 +213,6 @@ def test_the_defaults_are_those_of_the_measured_figures():
 def test_settings_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match=r"temporal.elements needs a head with Gaussians"):
         StreamMemory(build_head(HEAD), elements={})
-    with pytest.raises(ValueError, match="needs a head with Gaussians, got VectorMapNetHead"):
-        StreamMemory(line_head(), elements={})
     with pytest.raises(ValueError, match="gate_m > 0"):
         memory(gate_m=0.0)
     with pytest.raises(ValueError, match="temporal needs bev"):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from head_cases import ALONG_Y, GSMAP, HEAD, LANES, bev, build_head
-from methods.vectormapnet.cases import head as line_head
 from mmengine.structures import InstanceData
 from model_cases import build_small, make_images, make_samples, straight_elements
 
@@ -353,8 +352,6 @@ def test_a_memory_that_does_not_fit_is_refused():
         StreamMemory(head, bev={"kept_dims": 17}, embed_dims=16)
     with pytest.raises(ValueError, match=r"max_gap_s must be seconds > 0, got 0"):
         StreamMemory(head, bev={}, max_gap_s=0)
-    with pytest.raises(ValueError, match="VectorMapNetHead can have no memory of queries"):
-        StreamMemory(line_head(), queries={"num": 2})
     wide = StreamMemory(head, bev={}, embed_dims=32)
     with pytest.raises(ValueError, match=r"have 16 channels, their memory 32: set temporal\.embed"):
         step(head, wide.eval(), meta(0))

@@ -3,7 +3,7 @@
 from mmdet3d.registry import MODELS
 from torch import nn
 
-from gsmap.models.maptrv2.aux_heads import PVMaskHead
+from gsmap.models.base.mask_heads import PVMaskHead
 
 
 @MODELS.register_module()

@@ -1,0 +1,194 @@
+"""A method comes and goes with its folder, its configs, its tests, its page and its list entry.
+
+What GSMap itself is built on stays. A method goes with those that are built on it and with the
+configs of GSMap that combine it.
+"""
+
+import ast
+import os
+import re
+import shutil
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mmengine.config import Config
+from processes import run_python
+
+from gsmap.methods import METHODS
+
+REPO = Path(__file__).resolve().parents[1]
+MODELS = Path("projects/GSMap/gsmap/models")
+COMBINATIONS = Path("projects/GSMap/configs")
+PACKAGES = ("GSMap", "MapData", "DriveMaps", "MiniCity")
+STAYS = {"gsmap", *next(method.built_on for method in METHODS if method.name == "gsmap")}
+DELETED = [method.name for method in METHODS if method.name not in STAYS]
+BUILD = """
+import sys
+import torch
+from mmdet3d.registry import MODELS
+import gsmap.registered
+from gsmap.engine.launch import check_config, read_config
+assert gsmap.__file__.startswith(sys.argv[1]), gsmap.__file__
+for path in sys.argv[2:]:
+    cfg = read_config(path)
+    check_config(cfg)
+    for part in ("img_backbone", "img_neck"):
+        if cfg.model.get(part):
+            cfg.model[part].init_cfg = None
+    try:
+        with torch.device("meta"):
+            MODELS.build(cfg.model)
+    except (NotImplementedError, RuntimeError):  # a part computes while it is built
+        MODELS.build(cfg.model)
+"""
+
+
+def gone_with(name: str) -> set[str]:
+    """Return a method and those that are built on it."""
+    return {name, *(method.name for method in METHODS if name in method.built_on)}
+
+
+def places(name: str) -> list[Path]:
+    """Return a method's folders and its page, from the repository's root."""
+    folders = [MODELS / name, Path("configs") / name, Path("tests/methods") / name]
+    return [*folders, Path(f"docs/methods/{name}.md")]
+
+
+@cache
+def names_in(path: Path) -> frozenset[str]:
+    """Return the full names that a file imports, within functions too."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    plain = {alias.name for n in nodes if isinstance(n, ast.Import) for alias in n.names}
+    return frozenset(plain).union(
+        f"{n.module}.{alias.name}"
+        for n in nodes
+        if isinstance(n, ast.ImportFrom)
+        for alias in n.names
+    )
+
+
+@cache
+def registered(name: str) -> frozenset[str]:
+    """Return the classes that a method registers."""
+    return frozenset(
+        node.name
+        for path in (REPO / MODELS / name).glob("*.py")
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ClassDef) and node.decorator_list
+    )
+
+
+def leaves() -> list[Path]:
+    """Return all configs but the bases, from the repository's root."""
+    files = [*(REPO / "configs").rglob("*.py"), *(REPO / COMBINATIONS).rglob("*.py")]
+    return sorted(path.relative_to(REPO) for path in files if "_base_" not in path.parts)
+
+
+def chain(path: Path) -> set[Path]:
+    """Return a config and all that it inherits from, from the repository's root."""
+    bases = Config._get_base_files(str(REPO / path))
+    below = [Path(os.path.normpath(path.parent / base)) for base in bases]
+    return {path}.union(*map(chain, below))
+
+
+def types_of(value: Any) -> set[str]:
+    """Return the registry names in a config's value."""
+    if isinstance(value, dict):
+        own = {str(value["type"])} if "type" in value else set()
+        return own.union(*map(types_of, value.values()))
+    if isinstance(value, (list, tuple)):
+        return set().union(*map(types_of, value))
+    return set()
+
+
+@cache
+def used_by(path: Path) -> frozenset[str]:
+    """Return the methods that a config uses: by its bases, or by the types of its parts."""
+    bases = {base.parts[1] for base in chain(path) if base.parts[0] == "configs"}
+    types = types_of(Config.fromfile(REPO / path, import_custom_modules=False).to_dict())
+    return frozenset(
+        method.name for method in METHODS if method.name in bases or types & registered(method.name)
+    )
+
+
+@pytest.mark.parametrize("name", [method.name for method in METHODS])
+def test_a_method_has_its_places(name):
+    there = [path for path in places(name) if (REPO / path).exists()]
+    missing = {path.parts[0] for path in places(name)} - {path.parts[0] for path in there}
+    # GSMap has a project of its own, with its configs and its page; docs/migration.md is MapTR's
+    assert missing == {"gsmap": {"configs", "docs"}, "maptr": {"docs"}}.get(name, set())
+    assert registered(name)
+
+
+@pytest.mark.parametrize("name", DELETED)
+def test_what_is_left_imports_nothing_of_a_method(name):
+    gone = gone_with(name)
+    assert not gone & STAYS
+    for path in sorted(REPO.glob("*/**/*.py")):
+        where = path.relative_to(REPO)
+        if where.parts[0] not in ("projects", "tools", "benchmarks", "tests", "docs"):
+            continue
+        if any(where.is_relative_to(place) for method in gone for place in places(method)):
+            continue
+        found = {
+            match[1]
+            for full in names_in(path)
+            if (match := re.match(r"(?:gsmap\.models|methods)\.(\w+)(?:\.|$)", full))
+        }
+        assert not found & gone, where
+
+
+@pytest.mark.parametrize("path", leaves(), ids=str)
+def test_a_config_uses_only_what_its_method_is_built_on(path):
+    """Configs of GSMap combine methods; each goes with any of those."""
+    if path.is_relative_to(COMBINATIONS) or len(path.parts) == 2:
+        return
+    (method,) = (method for method in METHODS if method.name == path.parts[1])
+    assert used_by(path) <= {method.name, *method.built_on}
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> Path:
+    """A copy of the repository in which only GSMap and what it is built on are left."""
+    root = tmp_path_factory.mktemp("deleted")
+    unneeded = shutil.ignore_patterns("__pycache__", "*.pth", "*.egg-info", "*.jpg", "*.png")
+    for path in REPO.iterdir():
+        if path.name in ("projects", "configs", "tests", "tools", "benchmarks", "docs", "models"):
+            shutil.copytree(path, root / path.name, ignore=unneeded, symlinks=True)
+        elif path.is_file() and path.name != ".git":
+            shutil.copy(path, root)
+    combined = [path for path in leaves() if used_by(path) & {*DELETED}]
+    for path in [*combined, *(place for name in DELETED for place in places(name))]:
+        if (root / path).is_dir():
+            shutil.rmtree(root / path)
+        else:
+            (root / path).unlink(missing_ok=True)
+    listed = root / "projects/GSMap/gsmap/methods.py"
+    entry = re.compile(rf'^    Method\("({"|".join(DELETED)})",.*\n', re.MULTILINE)
+    text, number = entry.subn("", listed.read_text())
+    assert number == len(DELETED)
+    listed.write_text(text)
+    return root
+
+
+def run_in(root: Path, *words: object) -> Any:
+    """Run Python in a copy, with its packages before those that are installed."""
+    folders = [*(root / "projects" / name for name in PACKAGES), root, root / "tools"]
+    path = os.pathsep.join(map(str, [*folders, root / "tests"]))
+    return run_python(*words, cwd=root, env={"PYTHONPATH": path})
+
+
+def test_without_all_further_methods_the_rest_imports_and_its_configs_build(copy):
+    left = [path for path in leaves() if (copy / path).is_file()]
+    assert len(left) > 20
+    done = run_in(copy, "-c", BUILD, copy, *left)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_without_all_further_methods_the_other_tests_are_collected(copy):
+    words = ("-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider", "tests")
+    done = run_in(copy, *words)
+    assert done.returncode == 0, done.stdout[-3000:]
+    assert not re.search(rf"tests/methods/({'|'.join(DELETED)})/", done.stdout)
