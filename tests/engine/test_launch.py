@@ -117,7 +117,7 @@ def test_targets_are_found_in_wrapped_data_sets_and_steps_and_by_their_base_clas
     class Own(FormatMapTargets):
         pass
 
-    cfg = read_config("configs/maptr/maptr_r18_minicity.py")
+    cfg = read_config("configs/maptr/maptr_r50_24e.py")
     plain = cfg.train_dataloader.dataset.to_dict()
     bare = {**plain, "pipeline": [s for s in plain["pipeline"] if s["type"] != "FormatMapTargets"]}
     repeated = {"type": "RepeatDataset", "times": 2, "dataset": plain}

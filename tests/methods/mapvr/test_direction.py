@@ -8,9 +8,11 @@ from predictions import pairs_of
 from gsmap.models.mapvr.losses import SelfDirectionLoss
 
 
-def self_direction(pred_m: torch.Tensor, avg_factor: float) -> torch.Tensor:
+def self_direction(
+    pred_m: torch.Tensor, avg_factor: float, loss_weight: float = 1.0
+) -> torch.Tensor:
     """Return the loss of points in metres."""
-    return SelfDirectionLoss()(pairs_of(pred_pts_m=pred_m, avg_factor=avg_factor))
+    return SelfDirectionLoss(loss_weight)(pairs_of(pred_pts_m=pred_m, avg_factor=avg_factor))
 
 
 def test_self_direction_by_hand():
@@ -30,7 +32,7 @@ def test_self_direction_equals_the_golden_one(golden_dir, case):
     for layer, pred in enumerate(torch.from_numpy(preds)):
         query = golden[f"match_l{layer}"][:, 0]
         points_m = pred[query] * torch.tensor([30.0, 60.0]) - torch.tensor([15.0, 30.0])
-        value = self_direction(points_m, len(query))
+        value = self_direction(points_m, len(query), loss_weight=0.002)
         name = f"loss/d{layer}.loss_dir" if layer < 5 else "loss/loss_dir"
         assert value.item() == pytest.approx(float(golden[name]), rel=1e-4)
 
