@@ -10,7 +10,6 @@ from released_settings import RELEASED, REPO, settings_of
 from test_configs import load
 
 from gsmap.models.encoders.gkt import GeometryKernelAttention
-from gsmap.models.mapqr.encoder import HeightKernelAttention
 from gsmap.structures.grid import BEVGrid
 
 NEEDS_VALUES = ("mmdet.SwinTransformer", "mmdet.EfficientNet", "GSMapHead")  # when it is built
@@ -45,7 +44,7 @@ def test_the_table_notices_a_change():
 
 
 def test_kernels_and_positions_start_as_released():
-    """Xavier's law and N(0, 1) in MapTR, equal weights in MapQR; MiniCity as ever."""
+    """Xavier's law and N(0, 1) in MapTR; MiniCity as ever."""
     published = load(REPO / "configs/maptr/maptr_r50_24e.py").model.bev_encoder
     small = load(REPO / "configs/maptr/maptr_r18_minicity.py").model.bev_encoder
     grid = load(REPO / "configs/maptr/maptr_r50_24e.py").grid
@@ -60,4 +59,3 @@ def test_kernels_and_positions_start_as_released():
         assert float(weights.abs().max()) == pytest.approx(bound, rel=0.01)
         assert not built.layers[0].cross_attn.attention_weights.bias.any()
     assert GeometryKernelAttention(16, 4).attention_weights.weight.any()
-    assert not HeightKernelAttention(16, 4).attention_weights.weight.any()

@@ -4,6 +4,7 @@
 import json
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -17,9 +18,9 @@ from test_files import annotated, command, results_of, truth_of
 from gsmap.evaluation.analysis.bootstrap import Resamples, resampled_figures
 from gsmap.evaluation.analysis.groups import Groups, ap_by_group
 from gsmap.evaluation.core.average_precision import ten_point_ap
-from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig, HardChamferConfig
+from gsmap.evaluation.core.chamfer_ap import CHAMFER_THRESHOLDS, ChamferConfig
 from gsmap.evaluation.core.evaluator import MapEvaluator
-from gsmap.evaluation.core.metric import MetricSettings, metric_names
+from gsmap.evaluation.core.metric import MetricSettings
 from gsmap.evaluation.core.raster_ap import NUSCENES_GRID
 from gsmap.evaluation.core.report import flat_metrics
 from gsmap.evaluation.core.results_json import write_results
@@ -30,23 +31,31 @@ from gsmap.evaluation.core.sample_ap import (
     line_distances,
     match_sample_ap,
 )
-from gsmap.evaluation.map_metric import MapMetric
-from gsmap.models.bemapnet.metric import BeMapNetAP
-from gsmap.models.hdmapnet.metric import HDMapNetAP
-from gsmap.models.vectormapnet.metric import ShrunkVectorMapNetAP, VectorMapNetAP
 from gsmap.structures.elements import MapElements
-from gsmap.structures.grid import BEVGrid
 from tools.merge import main as merge
 
+
+class ThickLines(SampleAP):
+    """Lines of five pixels."""
+
+    name = "thick"
+    line_px = 5
+    report_thresholds = MappingProxyType({"thick": (2.0, 4.0, 6.0)})
+
+
+class ThinLines(SampleAP):
+    """Lines of one pixel, at two sets of thresholds."""
+
+    name = "thin"
+    line_px = 1
+    report_thresholds = MappingProxyType({"thin": (0.5, 1.0, 1.5), "thin_hard": (0.2, 0.5, 1.0)})
+
+
 RULES: dict[str, SampleAP] = {
-    metric.name: metric(CLASSES, NUSCENES_GRID) for metric in (HDMapNetAP, BeMapNetAP)
+    metric.name: metric(CLASSES, NUSCENES_GRID) for metric in (ThickLines, ThinLines)
 }
-TWO_SIDED_NAME, SHRUNK_NAME = VectorMapNetAP.name, ShrunkVectorMapNetAP.name
 CHAMFER = ChamferConfig(CLASSES)
-SHRUNK = ShrunkVectorMapNetAP(CLASSES, grid=NUSCENES_GRID)
 DRAWN = MapEvaluator(*RULES.values())
-PLAIN = MapEvaluator(CHAMFER)
-TWO_SIDED = MapEvaluator(CHAMFER, VectorMapNetAP(CLASSES))
 UPRIGHT = np.array([[0.05, -20.0], [0.05, 20.0]])
 
 
@@ -66,26 +75,18 @@ def figures(*samples: tuple[MapElements, MapElements], evaluator=DRAWN) -> dict[
 NOTHING, TRUTH = elements([], []), elements(aside(0.0))
 
 
-def test_the_rules_are_those_of_the_released_evaluators():
-    assert {name: (m.line_px, *m.report_thresholds.items()) for name, m in RULES.items()} == {
-        "hdmapnet": (5, ("hdmapnet", (2, 4, 6))),
-        "bemapnet": (1, ("bemapnet", (0.5, 1, 1.5)), ("bemapnet_hard", (0.2, 0.5, 1))),
-    }
-    assert RULES["bemapnet"].size_px == (200, 400)
-
-
 def test_lines_are_drawn_with_their_numbers_and_later_ones_hide_earlier_ones():
     """A line upright in column 100 (0.05 m), one across it in row 200, one of another class."""
     across = np.array([[-2.95, 0.05], [3.05, 0.05]])
     both = MapElements.from_polylines([UPRIGHT, across, UPRIGHT + 5], [0, 0, 1])
-    mask = draw_numbers(both, 0, RULES["bemapnet"])
+    mask = draw_numbers(both, 0, RULES["thin"])
     assert mask.shape == (400, 200)
     rows, columns = np.nonzero(mask == 0)
     assert set(columns) == {100}
     assert sorted(rows) == [*range(66, 200), *range(201, 334)]  # -20 m is row 66.7, 20 m 333.3
     assert np.argwhere(mask == 1).tolist() == [[200, c] for c in range(80, 121)]
     assert (mask == 2).sum() == 0
-    thick = draw_numbers(both.select(np.array([0])), 0, RULES["hdmapnet"])
+    thick = draw_numbers(both.select(np.array([0])), 0, RULES["thick"])
     wanted = cv2.polylines(
         np.zeros((400, 200), np.uint8), [np.array([[100, 66], [100, 333]])], 0, 1, 5
     )
@@ -98,27 +99,27 @@ def test_a_match_is_strictly_below_the_threshold(shift_px, tens):
     """Lines apart by 0.45, 0.6, 1.05 and 1.5 m; all their pixels are equally far."""
     found = figures((elements(aside(shift_px * 0.15), [0.5]), TRUTH))
     for threshold, mark in zip(CHAMFER_THRESHOLDS, tens, strict=True):
-        assert found[f"bemapnet/divider/AP@{threshold}"] == (mark == "o")
-    assert found["hdmapnet/divider/AP"] == 1.0
+        assert found[f"thin/divider/AP@{threshold}"] == (mark == "o")
+    assert found["thick/divider/AP"] == 1.0
     if "o" in tens:
-        error = found["bemapnet/divider/error_m@1.5"]
+        error = found["thin/divider/error_m@1.5"]
         assert error == pytest.approx(0.15 * shift_px, abs=1e-12)
 
 
 def test_predictions_count_in_the_order_of_rising_scores():
     hit, miss = aside(0.15, 8.0)
     right = figures((elements([hit, miss], [0.9, 0.2]), TRUTH))
-    assert right["bemapnet/divider/AP@0.5"] == 0.5  # the miss is first
+    assert right["thin/divider/AP@0.5"] == 0.5  # the miss is first
     wrong = figures((elements([hit, miss], [0.2, 0.9]), TRUTH))
-    assert wrong["bemapnet/divider/AP@0.5"] == 1.0
+    assert wrong["thin/divider/AP@0.5"] == 1.0
     equal = figures((elements([miss, hit], [0.5, 0.5]), TRUTH))
-    assert equal["bemapnet/divider/AP@0.5"] == 1.0  # matches go first
+    assert equal["thin/divider/AP@0.5"] == 1.0  # matches go first
 
 
 def test_the_closest_pair_matches_whatever_its_score():
     """Two predictions 0.3 and 0.15 m off one line: the closer one takes it."""
     found = MapElements.from_polylines(aside(0.3, -0.15), [0, 0], [0.9, 0.1])
-    matches = match_sample_ap(found, TRUTH, RULES["bemapnet"])
+    matches = match_sample_ap(found, TRUTH, RULES["thin"])
     assert matches.pred_index.tolist() == [0, 1]
     assert matches.matched_gt.tolist() == [[-1] * 4, [0] * 4]
     distance = np.array([[1.0, 2.0], [0.5, 1.5]])
@@ -137,18 +138,18 @@ def test_recalls_are_ten_and_exact():
 def test_samples_of_one_side_are_zero_and_of_none_do_not_count():
     right = elements(aside(0.0), [0.5])
     found = figures((right, TRUTH), (NOTHING, TRUTH), (right, elements([])), (NOTHING, NOTHING))
-    for name in ("hdmapnet", "bemapnet", "bemapnet_hard"):
+    for name in ("thick", "thin", "thin_hard"):
         assert found[f"{name}/divider/AP"] == pytest.approx(1 / 3)
         assert found[f"{name}/divider/num_samples"] == 3
         assert found[f"{name}/mAP"] == pytest.approx(1 / 3)  # the other classes occur nowhere
         assert (
             found[f"{name}/ped_crossing/AP"] == found[f"{name}/boundary/AP@1.0"]
-            if (name != "hdmapnet")
+            if (name != "thick")
             else found[f"{name}/boundary/AP@2.0"] == -1
         )
         assert found[f"{name}/num_samples"] == 4
     empty = figures((NOTHING, NOTHING))
-    assert empty["bemapnet/mAP"] == empty["bemapnet/AP@0.5"] == -1
+    assert empty["thin/mAP"] == empty["thin/AP@0.5"] == -1
 
 
 def test_hidden_far_and_short_elements_do_not_count():
@@ -156,16 +157,16 @@ def test_hidden_far_and_short_elements_do_not_count():
     beyond = np.array([[0.05, -1e9], [0.05, 1e9]])
     found = elements([*aside(0.0, 0.0), far, point], [0.9, 0.5, 0.8, 0.7])
     metrics = figures((found, elements([UPRIGHT, far, point])))
-    assert metrics["bemapnet/divider/num_preds"] == metrics["bemapnet/divider/num_gts"] == 1
-    assert metrics["bemapnet/divider/AP"] == 1.0
-    drawn = draw_numbers(elements([beyond]), 0, RULES["bemapnet"])
+    assert metrics["thin/divider/num_preds"] == metrics["thin/divider/num_gts"] == 1
+    assert metrics["thin/divider/AP"] == 1.0
+    drawn = draw_numbers(elements([beyond]), 0, RULES["thin"])
     assert (drawn[:, 100] == 0).all()
 
 
 def test_low_scores_are_left_out_if_asked():
     found = elements(aside(0.0, 8.0), [0.9, 0.39])
-    evaluator = MapEvaluator(replace(RULES["bemapnet"], min_score=0.4))
-    assert figures((found, TRUTH), evaluator=evaluator)["bemapnet/divider/AP"] == 1.0
+    evaluator = MapEvaluator(replace(RULES["thin"], min_score=0.4))
+    assert figures((found, TRUTH), evaluator=evaluator)["thin/divider/AP"] == 1.0
     (matches,) = evaluator.match("t", found.select(np.array([1, 0])), TRUTH).values()
     assert matches.pred_index.tolist() == [1]
 
@@ -287,11 +288,11 @@ def sample_set() -> list[tuple[str, MapElements, MapElements]]:
     return [*found, ("t6", NOTHING, truths[0]), ("t7", NOTHING, NOTHING)]
 
 
-BOTH = MapEvaluator(*TWO_SIDED.metrics, *DRAWN.metrics)
+BOTH = MapEvaluator(CHAMFER, *DRAWN.metrics)
 
 
-@pytest.mark.parametrize("evaluator", [DRAWN, BOTH])
-def test_groups_and_resamples_are_files_of_their_samples(evaluator):
+def check_groups_and_resamples(evaluator: MapEvaluator) -> None:
+    """Compare figures of groups and of resamples with those of files of their samples."""
     samples = sample_set()
     reports = evaluator.reports(evaluator.match(*sample) for sample in samples)
     group_of = {token: f"g{i % 3}" for i, (token, *_) in enumerate(samples)}
@@ -312,64 +313,32 @@ def test_groups_and_resamples_are_files_of_their_samples(evaluator):
                     assert values[b] == pytest.approx(wanted, abs=1e-12, nan_ok=True), key
 
 
-def test_vectormapnets_rule_leaves_out_samples_without_either_side():
-    samples = [sample[1:] for sample in sample_set()]
-    hard = HardChamferConfig.of(MetricSettings(CLASSES))
-    metrics = figures(*samples, evaluator=MapEvaluator(*TWO_SIDED.metrics, hard))
-    kept = [sample for sample in samples if len(sample[0]) and len(sample[1])]
-    assert len(kept) == len(samples) - 3
-    rest, everything = (figures(*some, evaluator=PLAIN) for some in (kept, samples))
-    for key, value in rest.items():
-        if not key.endswith("num_samples"):
-            assert metrics[key.replace("chamfer", TWO_SIDED_NAME)] == pytest.approx(value), key
-    assert everything.items() <= metrics.items()
-    assert metrics["vectormapnet/mAP"] > metrics["chamfer/mAP"]
-    loose = MapEvaluator(ChamferConfig(CLASSES, (3.0,)), VectorMapNetAP(CLASSES))
-    assert figures(*samples, evaluator=loose)["vectormapnet/mAP"] == metrics["vectormapnet/mAP"]
-
-
-def test_vectormapnets_units_shrink_a_map_as_much_as_its_canvas_is_larger():
-    """0.52 m across a map of 30 m are 0.4875 m there, 0.52 m along one of 60 m 0.503 m."""
-    both = MapEvaluator(*TWO_SIDED.metrics, SHRUNK)
-    along = elements([UPRIGHT[:, ::-1]])
-    samples = [
-        (elements(aside(0.52), [0.9]), TRUTH),
-        (
-            elements([UPRIGHT[:, ::-1] + [0.0, 0.52]], [0.8], 1),
-            replace(along, labels=along.labels + 1),
-        ),
-        (NOTHING, TRUTH),  # left out
-    ]
-    metrics = figures(*samples, evaluator=both)
-    names = CLASSES[:2]
-    assert [metrics[f"{SHRUNK_NAME}/{name}/AP@0.5"] for name in names] == [1, 0]
-    assert [metrics[f"{SHRUNK_NAME}/{name}/AP@1.0"] for name in names] == [1, 1]
-    assert [metrics[f"{TWO_SIDED_NAME}/{name}/AP@0.5"] for name in names] == [0, 0]
-    rest = {key: value for key, value in metrics.items() if not key.startswith(SHRUNK_NAME)}
-    assert rest == figures(*samples, evaluator=TWO_SIDED)
-    samples = [sample[1:] for sample in sample_set()]
-    factors = np.array([30 / 32, 60 / 62])
-    scaled = [[replace(e, points=e.points * factors) for e in sample] for sample in samples]
-    found, wanted = figures(*samples, evaluator=both), figures(*scaled, evaluator=TWO_SIDED)
-    keys = [key for key in found if key.startswith(f"{SHRUNK_NAME}/")]
-    for key in keys:
-        assert found[key] == wanted[key.replace(SHRUNK_NAME, TWO_SIDED_NAME)], key
-    assert len(keys) > 10
+@pytest.mark.parametrize("evaluator", [DRAWN, BOTH])
+def test_groups_and_resamples_are_files_of_their_samples(evaluator):
+    check_groups_and_resamples(evaluator)
 
 
 def test_command_writes_them_under_their_own_names_also_in_shards(tmp_path, capsys):
     results, truth = tmp_path / "results.json", annotated(tmp_path / "val.arrow", 8, scenes=4)
     write_results(results, [*results_of(7), ("t7", [])])
     out, parts = tmp_path / "all.json", tmp_path / "parts.json"
-    words = [str(results), str(truth), "--eval", "vectormapnet", SHRUNK_NAME, *RULES]
+    words = [
+        str(results),
+        str(truth),
+        "--eval",
+        "vectormapnet",
+        "vectormapnet_shrunk",
+        "hdmapnet",
+        "bemapnet",
+    ]
     assert command()([*words, "--out", str(out)]).startswith("8 samples")
     written = json.loads(out.read_text())
     assert {key.split("/")[0] for key in written} == {
-        "chamfer", "vectormapnet", SHRUNK_NAME, "hdmapnet", "bemapnet", "bemapnet_hard",
+        "chamfer", "vectormapnet", "vectormapnet_shrunk", "hdmapnet", "bemapnet", "bemapnet_hard",
     }  # fmt: skip
     assert written["bemapnet/divider/AP"] == written["hdmapnet/divider/AP"] == 7 / 8
     assert written["vectormapnet/divider/AP"] == 1 > written["chamfer/divider/AP"]
-    assert written[f"{SHRUNK_NAME}/divider/AP"] == 1
+    assert written["vectormapnet_shrunk/divider/AP"] == 1
     assert "mAP_bemapnet_hard = 0.6" in capsys.readouterr().out
     for part in ("0/2", "1/2"):
         command()([*words, "--out", str(parts), "--shard", part])
@@ -382,16 +351,16 @@ def test_command_writes_them_under_their_own_names_also_in_shards(tmp_path, caps
 
 def test_bad_settings_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"min_score must be in \[0, 1\], got 1.5"):
-        replace(RULES["bemapnet"], min_score=1.5)
-    with pytest.raises(ValueError, match=r"different names, got \['bemapnet', 'bemapnet'"):
-        MapEvaluator(RULES["bemapnet"], RULES["bemapnet"])
+        replace(RULES["thin"], min_score=1.5)
+    with pytest.raises(ValueError, match=r"different names, got \['thin', 'thin'"):
+        MapEvaluator(RULES["thin"], RULES["thin"])
     with pytest.raises(ValueError, match="all have the same classes"):
         MapEvaluator(*DRAWN.metrics, ChamferConfig(("divider",)))
     with pytest.raises(ValueError, match="at least one metric"):
         MapEvaluator()
     for rules in ({"dim": 3}, {"resample_predictions": False}, {"resample_ground_truth": False}):
         given_so = MetricSettings(CLASSES, grid=NUSCENES_GRID, **rules)
-        for name in (TWO_SIDED_NAME, SHRUNK_NAME):
+        for name in ("vectormapnet", "vectormapnet_shrunk"):
             with pytest.raises(ValueError, match="is AP_chamfer of lines of 100 points"):
                 MapEvaluator.named([name], given_so)
     with pytest.raises(ValueError, match=r"there is no metric .*'image'.*'chamfer', .*'hdmapnet'"):
@@ -399,7 +368,7 @@ def test_bad_settings_are_refused(tmp_path):
     with pytest.raises(ValueError, match="need the range of the map"):
         MapEvaluator.named(["bemapnet"], MetricSettings(CLASSES))
     with pytest.raises(ValueError, match="predictions need scores"):
-        match_sample_ap(TRUTH, TRUTH, RULES["bemapnet"])
+        match_sample_ap(TRUTH, TRUTH, RULES["thin"])
     results, truth = tmp_path / "results.json", tmp_path / "truth.json"
     write_results(results, results_of(2))
     write_results(truth, truth_of(2), key="GTs")
@@ -411,15 +380,3 @@ def test_bad_settings_are_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             command()([str(results), str(truth), *words])
-
-
-def test_any_canvas_and_the_metric_of_a_config():
-    wide = BeMapNetAP(CLASSES, BEVGrid((-50.0, 50.0), (-25.1, 25.0)))
-    assert wide.size_px == (667, 334)
-    metric = MapMetric(eval=["bemapnet"])
-    metric.dataset_meta = {"classes": CLASSES, "x_range": (-15, 15), "y_range": (-30, 30)}
-    assert metric.evaluator == MapEvaluator(RULES["bemapnet"])
-    assert set(metric_names()) >= {"chamfer", "raster", "pld", "topology", "heights", *RULES}
-    metric = MapMetric(eval=[SHRUNK_NAME])
-    metric.dataset_meta = {"classes": CLASSES, "x_range": (-15, 15), "y_range": (-30, 30)}
-    assert metric.evaluator == MapEvaluator(CHAMFER, SHRUNK)

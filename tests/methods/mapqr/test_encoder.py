@@ -131,3 +131,7 @@ def test_every_parameter_but_the_idle_levels_learns():
 def test_a_cross_attention_that_moves_no_heights_is_refused():
     with pytest.raises(TypeError, match="needs HeightKernelAttention, got GeometryKernelAttention"):
         small_encoder(type="GeometryKernelAttention")
+
+
+def test_kernels_start_with_equal_weights_as_released():
+    assert not HeightKernelAttention(16, 4).attention_weights.weight.any()
