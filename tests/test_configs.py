@@ -174,6 +174,9 @@ def shrink_queries(model: ConfigDict) -> None:
     """Keep a dozen queries of each group, some of which streams remember."""
     for group in model.map_head.get("query_groups", []):
         group.num = min(group.num, 12)
+    decoder = model.map_head.get("decoder") or {}
+    if "num_masks" in decoder:  # MGMap's: one of each query
+        decoder.num_masks = sum(group.num for group in model.map_head.query_groups)
     remembered = (model.get("temporal") or {}).get("queries")
     if remembered:
         remembered.num = min(remembered.num, 4)
@@ -187,7 +190,7 @@ def shrink_cells(cfg: Config) -> None:
     encoder.bev_pixel_m *= 2
     cells = BEVGrid(**cfg.grid).rasterized(encoder.bev_pixel_m)
     for step in cfg.train_dataloader.dataset.pipeline:
-        if step.type == "MakeBEVMask":
+        if step.type in ("MakeBEVMask", "MakeInstanceMasks") and "size" in step:
             step.size = (cells.height, cells.width)
 
 

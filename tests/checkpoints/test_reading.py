@@ -222,7 +222,7 @@ def test_the_memory_of_elements_is_the_configs_for_it_is_not_trained(small, tmp_
     ("part", "value", "message"),
     [
         ("img_backbone", {"type": "mmdet.SwinTransformer"}, "img_backbone.type is 'mmdet.Swin"),
-        ("map_head", {"type": "MapHead", "num": 1}, "MapHead has no setting 'num'"),
+        ("map_head", {"type": "MapHead", "num": 1}, "missing 4 required .* 'decoder'"),
         ("map_head", None, "'NoneType' object is not a mapping"),
         ("bev_encoder", {"type": "BEVQueryEncoder"}, "missing 1 required .* 'cross_attn'"),
     ],
