@@ -77,13 +77,13 @@ def test_a_file_without_a_group_for_each_scene_is_refused(content, message, tmp_
 
 
 def test_the_command_prints_and_writes_the_ap_of_each_group(tmp_path, capsys):
-    truth = annotated(tmp_path / "val.arrow", 8, scenes=2)  # rings are found in the second scene
+    truth = annotated(tmp_path / "val.arrow", 8, scenes=2)  # rings are found in s1; no boundaries
     write_results(tmp_path / "a.json", results_of(8))
     words = [str(tmp_path / "a.json"), str(truth), "--out", str(tmp_path / "m.json")]
     command()([*words, "--by", "scene", "--eval", "chamfer", "--against", words[0]])
     text = capsys.readouterr().out
-    assert "| s0 | 4 | 33.3 | 100.0 | 0.0 | 0.0 |" in text
-    assert "| s1 | 4 | 66.7 | 100.0 | 100.0 | 0.0 |" in text
+    assert "| s0 | 4 | 50.0 | 100.0 | 0.0 | 0.0 |" in text
+    assert "| s1 | 4 | 100.0 | 100.0 | 100.0 | 0.0 |" in text
     found = json.loads((tmp_path / "m.json").read_text())
     assert found["by/s1/chamfer/ped_crossing/AP"] == 1.0
     assert found["by/s0/chamfer/ped_crossing/AP"] == 0.0
