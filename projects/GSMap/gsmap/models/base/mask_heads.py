@@ -21,7 +21,20 @@ Samples = Sequence[Det3DDataSample]
 
 
 def stack_targets(head: Any, samples: Samples, name: str, device: torch.device) -> Tensor:
-    """Stack a training target of all samples, which must have it. (B, ...)"""
+    """Training target of all samples, stacked.
+
+    Args:
+        head: Auxiliary head, for the name of its transform in the error.
+        samples: Samples of the batch, each with the target.
+        name: Field of the target.
+        device: Device of the result.
+
+    Returns:
+        The targets. (B, ...)
+
+    Raises:
+        ValueError: If a sample lacks the target.
+    """
     for sample in samples:
         if name not in sample:
             raise ValueError(
