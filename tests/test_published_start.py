@@ -103,12 +103,14 @@ class Weights:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.states: dict[str, dict[str, torch.Tensor]] = {}
+        self.kinds: dict[str, dict[str, Any]] = {}  # settings of the backbone of each state
 
     def of(self, cfg: Config) -> dict[str, torch.Tensor]:
         """Return the weights of a config's image backbone, in our names."""
         backbone = cfg.model.img_backbone.to_dict()
         address = backbone["init_cfg"]["checkpoint"]
-        if address not in self.states:
+        kind = {key: value for key, value in backbone.items() if key != "init_cfg"}
+        if self.kinds.get(address) != kind:  # such as one of other stages
             torch.manual_seed(0)
             state = MODELS.build({**backbone, "init_cfg": None}).state_dict()
             state = {
@@ -116,7 +118,7 @@ class Weights:
                 for key, value in state.items()
                 if "offset" not in key  # of deformable convolutions, which nobody publishes
             }
-            self.states[address] = state
+            self.states[address], self.kinds[address] = state, kind
             torch.save(as_published(backbone, state), self.folder / Path(address).name)
         return self.states[address]
 

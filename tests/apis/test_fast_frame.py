@@ -10,10 +10,7 @@ import torch.nn.functional as F
 from inferencer_cases import NAMES, make_config, make_remembering, make_samples
 from mmdet.models.backbones import ResNet
 from mmengine.dataset import pseudo_collate
-from model_cases import IMAGE_SHAPE, NUM_CAMS
 
-from benchmarks import pretended_gpu
-from benchmarks.model import ring_of_cameras
 from gsmap.apis.fast_frame import (
     FastFrames,
     StaticFrame,
@@ -25,26 +22,6 @@ from gsmap.models.encoders.folded_backbone import FoldedBackbone
 from gsmap.models.encoders.half_backbone import fused_resnet
 
 REPO = Path(__file__).resolve().parents[2]
-MAPTR = REPO / "configs/maptr/maptr_r18_minicity.py"
-ENCODERS = {
-    "GKT": {},
-    "BEVFormer": {
-        "cross_attn": {
-            "_delete_": True,
-            "type": "SpatialCrossAttention",
-            "num_heads": 4,
-            "num_points": 8,
-            "num_heights": 4,
-        }
-    },
-    "LSS": {
-        "_delete_": True,
-        "type": "LSSEncoder",
-        "bev_pixel_m": 1.2,
-        "embed_dims": 128,
-        "camera_aware": False,
-    },
-}
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
 
@@ -187,29 +164,3 @@ def test_half_precision_on_a_gpu(tmp_path):
         count = min(len(half), len(exact))
         apart = np.abs(half.scores_3d[:count].numpy() - exact.scores_3d[:count].numpy())
         assert apart.max() < 2e-3
-
-
-@pytest.mark.skipif(not pretended_gpu.available(), reason="torch has no backends in Python")
-@pytest.mark.parametrize("encoder", ENCODERS)
-@torch.no_grad()
-def test_a_static_frame_never_waits_for_the_gpu(encoder):
-    options = {f"model.bev_encoder.{key}": value for key, value in ENCODERS[encoder].items()}
-    if "_delete_" in ENCODERS[encoder]:
-        options = {"model.bev_encoder": ENCODERS[encoder]}
-    model = MapInferencer(MAPTR, None, "cpu", options).model
-    images = torch.randint(0, 255, (1, NUM_CAMS, 3, *IMAGE_SHAPE), dtype=torch.uint8)
-    matrices = torch.from_numpy(ring_of_cameras(NUM_CAMS, *IMAGE_SHAPE)).float()[None]
-    known = {"can_bus": torch.zeros(1, 18), "img_from_frame": matrices}
-    known["frame_from_img"] = torch.linalg.inv(matrices)
-    frame = StaticFrame(model)
-    calibration = [known[name] for name in frame.names]
-    expected = frame(images, *calibration)
-    with pretended_gpu.PretendedGPU() as gpu:
-        frame.to(pretended_gpu.DEVICE)
-        inputs = [x.to(pretended_gpu.DEVICE) for x in (images, *calibration)]
-        frame(*inputs)  # keeps constants
-        gpu.clear()
-        found = frame(*inputs)
-        assert gpu.launches.total() > 100
-        assert not gpu.waits
-        torch.testing.assert_close(found.cpu(), expected)

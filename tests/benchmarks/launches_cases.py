@@ -9,10 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 from mmengine.config import Config
+from model_cases import IMAGE_SHAPE, NUM_CAMS
 from torch import nn
 
 from benchmarks.launches import Trial
+from benchmarks.model import ring_of_cameras
 from benchmarks.pretended_gpu import DEVICE, NAME, PretendedGPU, available
+from gsmap.apis.fast_frame import StaticFrame
+from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.ops import backends
 from gsmap.structures.tensors import LateValues, constant, uploaded
 
@@ -28,6 +32,27 @@ SMALL = sorted(
 )
 GSMAP = REPO / "projects/GSMap/configs/gsmap_maptr_r18_minicity.py"
 MAPTR = REPO / "configs/maptr/maptr_r18_minicity.py"
+
+
+ENCODERS = {
+    "GKT": {},
+    "BEVFormer": {
+        "cross_attn": {
+            "_delete_": True,
+            "type": "SpatialCrossAttention",
+            "num_heads": 4,
+            "num_points": 8,
+            "num_heights": 4,
+        }
+    },
+    "LSS": {
+        "_delete_": True,
+        "type": "LSSEncoder",
+        "bev_pixel_m": 1.2,
+        "embed_dims": 128,
+        "camera_aware": False,
+    },
+}
 
 
 @pytest.fixture
@@ -164,3 +189,28 @@ def test_launches_and_waits_stay_within_their_budgets(path, monkeypatch):
         trial.frame()
         assert trial.gpu.launches.total() <= most_in_frame
         assert trial.gpu.waits.total() <= 2
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+@torch.no_grad()
+def test_a_static_frame_never_waits_for_the_gpu(encoder):
+    options = {f"model.bev_encoder.{key}": value for key, value in ENCODERS[encoder].items()}
+    if "_delete_" in ENCODERS[encoder]:
+        options = {"model.bev_encoder": ENCODERS[encoder]}
+    model = MapInferencer(str(MAPTR), None, "cpu", options).model
+    images = torch.randint(0, 255, (1, NUM_CAMS, 3, *IMAGE_SHAPE), dtype=torch.uint8)
+    matrices = torch.from_numpy(ring_of_cameras(NUM_CAMS, *IMAGE_SHAPE)).float()[None]
+    known = {"can_bus": torch.zeros(1, 18), "img_from_frame": matrices}
+    known["frame_from_img"] = torch.linalg.inv(matrices)
+    frame = StaticFrame(model)
+    calibration = [known[name] for name in frame.names]
+    expected = frame(images, *calibration)
+    with PretendedGPU() as gpu:
+        frame.to(DEVICE)
+        inputs = [x.to(DEVICE) for x in (images, *calibration)]
+        frame(*inputs)  # keeps constants
+        gpu.clear()
+        found = frame(*inputs)
+        assert gpu.launches.total() > 100
+        assert not gpu.waits
+        torch.testing.assert_close(found.cpu(), expected)

@@ -91,7 +91,7 @@ lr_config = dict(
     policy='CosineAnnealing', warmup='linear', warmup_iters=500, warmup_ratio=1.0 / 3,
     min_lr_ratio=1e-3)
 total_epochs = {epochs}
-evaluation = dict(interval=2, pipeline=test_pipeline, metric='chamfer')
+evaluation = dict(interval={evaluate}, pipeline=test_pipeline, metric='chamfer')
 runner = dict(type='EpochBasedRunner', max_epochs=total_epochs)
 checkpoint_config = dict(interval=1)
 {more}
@@ -135,6 +135,7 @@ NUSCENES = {
     "range_m": "[-15.0, -30.0, -2.0, 15.0, 30.0, 2.0]", "rows": 200, "cols": 100,
     "limits": "[-20, -35, -20, -35, 20, 35, 20, 35]", "root": "data/nuscenes/", "cameras": "",
     "dataset": "CustomNuScenesLocalMapDataset", "scale": 0.5, "batch": 4, "epochs": 24,
+    "evaluate": 2,
     "frozen": 1, "decay": 0.01, "dropout": 0.1, "keys": "['img']", "queries": "num_vec=50,",
     "more": "",
 }  # fmt: skip
@@ -188,7 +189,7 @@ def gemap() -> str:
     """Return GeMap with its simple objective."""
     losses = LOSSES.format(pts=5.0, dir=0.005) + GEOMETRY
     layer = _layer("GeometryDecoupledAttention", 0.1)
-    return maptr(model="GeMap", layer=layer, losses=losses, decay=0.03)
+    return maptr(model="GeMap", layer=layer, losses=losses, decay=0.03, evaluate=1)
 
 
 def maptrv2() -> str:
@@ -206,7 +207,7 @@ def maptrv2() -> str:
 def gemap_full() -> str:
     """Return GeMap with its full objective."""
     return maptr(**LIFTED | {
-        "model": "GeMapFull", "frozen": -1, "decay": 0.03, "epochs": 110,
+        "model": "GeMapFull", "frozen": -1, "decay": 0.03, "epochs": 110, "evaluate": 1,
         "layer": _layer("GeometryDecoupledAttention", 0.1),
         "losses": LOSSES.format(pts=5.0, dir=0.005) + GEOMETRY + SEGMENTATION,
     })  # fmt: skip

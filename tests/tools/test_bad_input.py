@@ -117,7 +117,6 @@ evaluate: nothing.json VAL --bootstrap 1 | intervals need two scenes, two resamp
 evaluate: nothing.json nothing.json --against nothing.json | nothing.json knows no scenes
 evaluate: nothing.json VAL --shard 0/2 --out o.json --bootstrap | need all samples: leave out --shard
 evaluate: nothing.json VAL --by weather | --by takes scene, map or a JSON file
-evaluate: nothing.json VAL --topology --shard 0/2 --out o.json | leave out --prior and --shard
 evaluate: VAL --prior nowhere.arrow | no annotation file at nowhere.arrow
 report: damaged.json --ann VAL | damaged.json is empty or holds no complete list
 report: nothing.json --ann VAL | nothing.json: 2 samples have no results

@@ -11,13 +11,14 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+import gsmap
 from gsmap.evaluation.core.matches import FrameMatches, MatchTable, checked_classes
 from gsmap.evaluation.core.report import MetricReport
 from gsmap.structures.classes import AREA_CLASSES
 from gsmap.structures.elements import MapElements
 from gsmap.structures.grid import BEVGrid
 
-PACKAGE = Path(__file__).parents[2]
+PACKAGE = Path(gsmap.__file__).parent
 _CORE = {
     "chamfer": "gsmap.evaluation.core.chamfer_ap",
     "raster": "gsmap.evaluation.core.raster_ap",

@@ -13,7 +13,7 @@ from gsmap.models.base.pairs import BuiltHead, GroundTruth, MatchedPairs, Predic
 class FlowStart(NamedTuple):
     """What the first decoder layer takes.
 
-    Args:
+    Attributes:
         queries: States, positions and references of all instance queries N, as
             `MapDecoder.forward` takes them: (B, N * P, ...) for a decoder of point queries.
         mask: True where an instance (row) may not attend to another (column), or None. (N, N)
