@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,9 +29,11 @@ from gsmap.apis.export import (
     halve_onnx,
     largest_differences,
     quantize_onnx,
+    signals_rule,
 )
 from gsmap.apis.map_inferencer import MapInferencer
 from gsmap.apis.onnx_inferencer import OnnxInferencer
+from gsmap.engine.launch import read_config
 from gsmap.structures.elements import MapElements
 
 for _package in ("onnx", "onnxscript", "onnxruntime"):
@@ -184,6 +187,19 @@ def test_vehicle_signals_follow_one_rule(shipped):
     assert "entries 0 to 2 and 17 to zero" in exported.metadata["can_bus"]
     with pytest.raises(ValueError, match=r"needs can_bus, the 18 values .* From poses: motion_sig"):
         exported.prepare(images, {**meta, "can_bus": None})
+
+
+def test_a_model_of_argoverse_2_says_that_its_signals_are_made_of_the_pose(shipped, monkeypatch):
+    cfg = read_config("configs/maptr/maptr_r50_av2_6e.py")
+    rule = signals_rule(SimpleNamespace(cfg=cfg))
+    assert "pose_only_signals of gsmap.structures.vehicle_signals" in rule
+    _, dataset, exported = shipped
+    monkeypatch.setitem(exported.metadata, "can_bus", rule)
+    packed = dataset[0]
+    images = packed["inputs"]["img"].permute(0, 2, 3, 1).numpy()
+    meta = {**packed["data_samples"].metainfo, "can_bus": None}
+    with pytest.raises(ValueError, match=r"needs can_bus, .* pose_only_signals"):
+        exported.prepare(images, meta)
 
 
 def test_files_hold_standard_operators_and_no_word_of_the_machine(shipped):

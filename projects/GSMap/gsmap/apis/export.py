@@ -18,6 +18,7 @@ from gsmap.apis.onnx_inferencer import (
     METADATA_KEY,
     NO_SIGNALS,
     OF_STREAM,
+    POSE_ONLY_RULE,
     OnnxInferencer,
 )
 from gsmap.structures.calibration import NUM_CAN_BUS, OF_ONE_FRAME
@@ -208,11 +209,20 @@ def graph_metadata(
         metadata["ground_from_frame"] = model.mount.matrix.tolist()
         metadata["ego_from_frame"] = model.mount.ego_from_frame.tolist()
     if "can_bus" in exported.input_names:
-        without = getattr(model, "without_signals", False)
-        metadata["can_bus"] = NO_SIGNALS if without else CAN_BUS_RULE
+        metadata["can_bus"] = signals_rule(model)
     if model.temporal is not None:
         metadata["max_gap_s"] = model.temporal.max_gap_s
     return metadata
+
+
+def signals_rule(model: Any) -> str:
+    """Values of ``can_bus`` that a model of `load_model` was trained with, in words."""
+    if getattr(model, "without_signals", False):
+        return NO_SIGNALS
+    cfg = getattr(model, "cfg", None)
+    loader = {} if cfg is None else cfg.get("test_dataloader") or {}
+    pose_only = loader.get("dataset", {}).get("pose_only_signals", False)
+    return POSE_ONLY_RULE if pose_only else CAN_BUS_RULE
 
 
 def halve_onnx(path: str | Path, out: str | Path) -> None:

@@ -21,6 +21,10 @@ FORMAT = 1
 CAN_BUS_RULE = (
     "the 18 values of a sample's record; the graph itself sets entries 0 to 2 and 17 to zero"
 )
+POSE_ONLY_RULE = (
+    "the 18 values that pose_only_signals of gsmap.structures.vehicle_signals makes of the pose of "
+    "the vehicle, as the model was trained"
+)
 NO_SIGNALS = "not needed: the model was trained without vehicle signals; zeros are taken"
 OF_STREAM = ("now_from_then", "seconds", "continues")  # inputs of a model with memory
 MEMORY = "memory_"  # how its further inputs start; what replaces them has new_ besides
@@ -162,6 +166,8 @@ class OnnxInferencer:
         self._check_images(images)
         told = self.metadata.get("can_bus") == NO_SIGNALS or meta.get("can_bus") is not None
         if "can_bus" in self._calibration and not told:
+            if self.metadata.get("can_bus") == POSE_ONLY_RULE:
+                raise ValueError(f"{self.path.name} needs can_bus, {POSE_ONLY_RULE}.")
             raise ValueError(
                 f"{self.path.name} needs can_bus, {CAN_BUS_RULE}. From poses: motion_signals of "
                 "gsmap.structures.vehicle_signals; zeros for a model that was trained without."
