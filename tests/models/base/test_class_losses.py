@@ -97,6 +97,12 @@ def test_qualities_are_between_0_and_1_and_1_for_the_truth():
     assert torch.equal(DistanceQuality()(exact), torch.ones(len(pairs.gt_labels)))
 
 
+def test_defaults_are_those_of_the_release():
+    loss = QualityClassLoss(DISTANCE, FOCAL)
+    assert (loss.beta, loss.loss_weight, loss.classes) == (2.0, 2.0, None)
+    assert loss.quality.scale == 5.0
+
+
 def test_a_certain_score_of_a_perfect_line_costs_nothing():
     loss, pairs, _ = loss_and_pairs([[0.0, 0.0, 0.0], [40.0, -40.0, -40.0]], 0, 1)
     loss.quality = FixedQuality(1.0)

@@ -86,14 +86,15 @@ class ExportedDetector(nn.Module):
     def step(
         self, images: Tensor, given: dict[str, Tensor]
     ) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
-        """Return the map elements of a frame, and what it leaves, by name."""
+        """Map elements of a frame, and the new state of the memory, by name."""
         # a tensor of four axes is normalised and padded image by image
         images = self.model.data_preprocessor({"inputs": {"img": images}})["inputs"]["imgs"]
         feats = self.model.bev_encoder.levels(self.model.extract_img_feats(images[None]))
         if "can_bus" in given:  # `without_history`
             given["can_bus"] = nn.functional.pad(given["can_bus"][OF_ONE_FRAME], (3, 1))
         named = {name: value[None] for name, value in given.items()}
-        head, temporal = self.model.map_head, self.model.temporal
+        head = self.model.map_head
+        temporal = self.model.temporal
         outputs = self.model.bev_encoder.encode(feats, named, tuple(images.shape[-2:]))
         if temporal is None:
             predictions = head(outputs)
@@ -190,8 +191,19 @@ def export_onnx(
 def graph_metadata(
     exported: ExportedDetector, cameras: Sequence[str], image_size: tuple[int, int], frame: str
 ) -> dict[str, Any]:
-    """Facts about a model that a file of `export_onnx` carries for `OnnxInferencer`."""
-    model, head = exported.model, exported.model.map_head
+    """Facts about a model that a file of `export_onnx` carries for `OnnxInferencer`.
+
+    Args:
+        exported: The model in its exported form.
+        cameras: Names of the cameras, in the order of the images.
+        image_size: Rows and columns of the images, in pixels.
+        frame: Annotation frame: ``"lidar"`` or ``"ego"``.
+
+    Returns:
+        The facts, as JSON can hold them.
+    """
+    model = exported.model
+    head = model.map_head
     metadata: dict[str, Any] = {
         "format": FORMAT,
         "image_size": list(image_size),
@@ -244,11 +256,14 @@ def halve_onnx(path: str | Path, out: str | Path) -> None:
         for name in node.input[1:]:
             half = numpy_helper.to_array(weights[name]).astype(np.float16)
             weights[name].CopyFrom(numpy_helper.from_array(half, name))
-        (image, *parameters), (result,) = node.input, node.output
-        names = f"{result}_half_in", f"{result}_half_out"
-        node.input[:], node.output[:] = [names[0], *parameters], [names[1]]
-        before = helper.make_node("Cast", [image], [names[0]], to=TensorProto.FLOAT16)
-        after = helper.make_node("Cast", [names[1]], [result], to=TensorProto.FLOAT)
+        image, *parameters = node.input
+        (result,) = node.output
+        half_input = f"{result}_half_in"
+        half_output = f"{result}_half_out"
+        node.input[:] = [half_input, *parameters]
+        node.output[:] = [half_output]
+        before = helper.make_node("Cast", [image], [half_input], to=TensorProto.FLOAT16)
+        after = helper.make_node("Cast", [half_output], [result], to=TensorProto.FLOAT)
         model.graph.node.extend([before, node, after])
     onnx.checker.check_model(model)
     write_bytes(out, model.SerializeToString())
@@ -350,7 +365,7 @@ def largest_differences(
 
 
 def _translations() -> dict[Any, Any]:
-    """Say how torch's operators are written in ONNX where the exporter knows no good way."""
+    """Translations of torch's operators to ONNX that replace those of the exporter."""
     from onnxscript import opset18
 
     op: Any = opset18  # its types know tensors by element type, which no value here has yet
@@ -380,7 +395,7 @@ def _translations() -> dict[Any, Any]:
 
 
 def _reason(error: BaseException) -> str:
-    """Say what could not be exported."""
+    """Message of the first cause of a failed export."""
     while error.__cause__ is not None:
         error = error.__cause__
     if type(error) is ValueError:  # the model's own word, for instance of a number of cameras

@@ -149,7 +149,7 @@ class MapInferencer:
     def _open_fast_frames(
         self, model: Any, device: torch.device, cuda_graphs: bool | None
     ) -> FastFrames | None:
-        """Return what replays frames on a GPU; None leaves them to ``test_step``."""
+        """Replayer of frames on a GPU, or None if ``test_step`` runs them."""
         if device.type != "cuda":
             if cuda_graphs:
                 raise ValueError(f"cuda_graphs=True needs a GPU, got {device}: leave it out.")
@@ -212,7 +212,7 @@ class MapInferencer:
         return dataset
 
     def _say_generated(self, source: Any) -> None:
-        """Say once, for what is not of the generated towns, that the model knows no other roads."""
+        """Warn once, on other images, that the model was trained on generated streets alone."""
         if not self._generated or not isinstance(source, Source):
             return
         samples = source.samples
@@ -399,11 +399,21 @@ class MapInferencer:
         allow_missing_cameras: bool = False,
         can_bus: np.ndarray | None = None,
     ) -> "Det3DDataSample":
-        """Run the model on one frame that lies in memory; ``live`` is faster for many.
+        """Run the model on one frame in memory; ``live`` is faster for many frames.
 
-        Arguments, result and errors are those of ``LiveMap`` and its ``predict``. Each argument of
-        cameras maps their names to arrays, or lists arrays: then a camera is taken for the model's
-        that looks most like it, as one of another name is.
+        Errors are those of `LiveMap`.
+
+        Args:
+            images: Image of each camera, (H, W, 3) in uint8, by name. An unnamed camera in a list,
+                or one of another name, stands for the camera of the model that it resembles most.
+            intrinsics: Intrinsic matrix of each camera, in pixels. (3, 3)
+            cam_from_frame: Pose of the frame in each camera, in metres. (4, 4)
+            frame: Frame of the poses, as `LiveMap` takes it.
+            allow_missing_cameras: Whether cameras of the model may be absent.
+            can_bus: Signals of the vehicle (18,), or None.
+
+        Returns:
+            The prediction.
         """
         live = self.live(intrinsics, cam_from_frame, frame, allow_missing_cameras)
         return live.predict(images, can_bus)
@@ -415,7 +425,14 @@ class MapInferencer:
         frame: str | None = None,
         allow_missing_cameras: bool = False,
     ) -> LiveMap:
-        """Return a function from each frame's images to its map; arguments as in ``LiveMap``."""
+        """Function from the images of each frame to its map.
+
+        Args:
+            intrinsics: Intrinsic matrix of each camera, in pixels. (3, 3)
+            cam_from_frame: Pose of the frame in each camera, in metres. (4, 4)
+            frame: Frame of the poses, as `LiveMap` takes it.
+            allow_missing_cameras: Whether cameras of the model may be absent.
+        """
         return LiveMap(self, intrinsics, cam_from_frame, frame, allow_missing_cameras)
 
     def elements(self, data_sample: "Det3DDataSample") -> MapElements:

@@ -162,7 +162,16 @@ class OnnxInferencer:
         meta: Mapping[str, Any],
         stream: Scenes | None = None,
     ) -> dict[str, NDArray[np.float32]]:
-        """Return the inputs of the graph; arguments and errors as of a call."""
+        """Inputs of the graph for one frame; errors as of a call.
+
+        Args:
+            images: One image of each camera, (H, W, 3) in uint8.
+            meta: Calibration and pose of the frame, as a call takes them.
+            stream: Drive of the frame, for a model with memory.
+
+        Returns:
+            The inputs by their names, in float32.
+        """
         self._check_images(images)
         told = self.metadata.get("can_bus") == NO_SIGNALS or meta.get("can_bus") is not None
         if "can_bus" in self._calibration and not told:
@@ -189,7 +198,7 @@ class OnnxInferencer:
         return {"images": pixels, **inputs}
 
     def _of_stream(self, meta: Mapping[str, Any], stream: Scenes | None) -> dict[str, Any]:
-        """Return what the frame before has left, and the motion since."""
+        """State after the previous frame, and the motion since then."""
         if stream is None or not self.has_memory:
             self.new_stream()  # says so if there is no memory
             raise ValueError(
@@ -212,12 +221,18 @@ class OnnxInferencer:
     def remember(
         self, stream: Scenes, meta: Mapping[str, Any], outputs: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Bring a stream forward by a frame whose outputs `run` has returned."""
+        """Advance a stream by one frame.
+
+        Args:
+            stream: Drive of the frame.
+            meta: Pose and time of the frame, as a call takes them.
+            outputs: Outputs of `run` for the frame.
+        """
         left = {name: outputs[f"new_{name}"] for name in self._empty}
         stream.keep([StreamState(Frame.of(meta), left)])
 
     def _check_images(self, images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
-        """Raise if the images are not those of the file's cameras."""
+        """Raise ValueError if the number or the form of the images is not that of the cameras."""
         if len(images) != len(self.cameras):
             raise ValueError(
                 f"{self.path.name} takes {len(self.cameras)} cameras, {', '.join(self.cameras)}, "
@@ -317,7 +332,7 @@ def _check_metadata(metadata: Mapping[str, Any]) -> None:
 
 
 def _check_poses(metadata: Mapping[str, Any]) -> None:
-    """Raise an error unless what says where the frame lies are poses, as far as it is there."""
+    """Raise ValueError if a mount in the metadata is no rigid pose."""
     for name in ("ground_from_frame", "ego_from_frame"):
         matrix = np.asarray(metadata.get(name, np.eye(4)), np.float64)
         if matrix.shape != (4, 4) or not is_rigid(matrix):

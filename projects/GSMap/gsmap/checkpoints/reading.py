@@ -49,7 +49,7 @@ _REMEDY = "if you trust its origin, save its state_dict alone and give that file
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What is read of a checkpoint.
+    """Contents of a checkpoint.
 
     Attributes:
         state: Its weights.
@@ -96,7 +96,7 @@ def refusing(path: object) -> Iterator[None]:
 
 
 def _advice(path: object, otherwise: str) -> str:
-    """Return what to do about a file that cannot be read, by what it starts with."""
+    """Advice for a file that cannot be read, by its first bytes."""
     file = Path(str(path))
     if not file.is_file():
         return otherwise
@@ -170,7 +170,7 @@ def _checked_size(size: Any) -> tuple[int, int] | None:
 
 
 def _unwrapped(path: Path, content: Any) -> Unwrapped:
-    """Return the weights of a checkpoint, and say once what else is not used."""
+    """Weights of a checkpoint; entries that are not used are named once."""
     unwrapped = unwrap(content)
     if unwrapped.left_out:
         _say_left_out(path, tuple(unwrapped.left_out.items()))
@@ -179,7 +179,7 @@ def _unwrapped(path: Path, content: Any) -> Unwrapped:
 
 @cache
 def _say_left_out(path: Path, left_out: tuple[tuple[str, int], ...]) -> None:
-    """Say once what of a checkpoint is not used."""
+    """Name the entries of a checkpoint that are not used, once."""
     text = ", ".join(f"{count} {what}" for what, count in left_out)
     print_log(f"{path}: {text} left out")
 
@@ -192,7 +192,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
 def adopt_settings(
     cfg: Config, path: str | Path, cfg_options: dict | None, read: Checkpoint | None = None
 ) -> list[str]:
-    """Give a config the model settings that a checkpoint was trained with, and say which changed.
+    """Adopt the model settings of a checkpoint's training in a config, and list the changes.
 
     Test images are scaled to the size that it was trained at, unless ``cfg_options`` set the scale.
     If it was trained with vehicle signals, those of samples without are computed from their poses.

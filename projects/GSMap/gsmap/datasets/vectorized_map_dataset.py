@@ -163,7 +163,8 @@ class VectorizedMapDataset(BaseDataset):
 
     def _mount(self) -> list[list[float]] | None:
         """Return where the first sample's frame lies over the ground, if that is known. (4, 4)"""
-        frame, height_m = self._metainfo["frame"], self._metainfo["ground_z_m"]
+        frame = self._metainfo["frame"]
+        height_m = self._metainfo["ground_z_m"]
         if not len(self.annotations):
             return None
         sample = self.annotations[0]
@@ -261,7 +262,8 @@ class VectorizedMapDataset(BaseDataset):
         """
         entry = super().get_data_info(idx)
         sample = self.annotations[entry["row"]]
-        dim, instances = self._metainfo["dim"], sample.instances
+        dim = self._metainfo["dim"]
+        instances = sample.instances
         heights = None
         if instances is not None and self.annotations.meta.dim == 3:
             heights = [instance.points[:, 2] for instance in instances]
@@ -319,7 +321,8 @@ class VectorizedMapDataset(BaseDataset):
 
         def pose(other: MapSample) -> tuple[float, np.ndarray]:
             seconds = (other.timestamp_ns - sample.timestamp_ns) / 1e9
-            frame, height_m = self._metainfo["frame"], self._metainfo["ground_z_m"]
+            frame = self._metainfo["frame"]
+            height_m = self._metainfo["ground_z_m"]
             ground = ground_from_frame(other, frame, height_m)
             return seconds, other.global_from_frame @ invert_rigid(ground)
 
@@ -347,7 +350,8 @@ class VectorizedMapDataset(BaseDataset):
                     "the cameras that all samples have (`cameras=[...]`), or train with "
                     "broken_samples='skip'."
                 )
-            image, cam2img = images[name], np.eye(4)
+            image = images[name]
+            cam2img = np.eye(4)
             cam2img[:3, :3] = cameras[name].intrinsics
             found[name] = {
                 "img_path": self.images_in_memory.get(name, str(Path(self.data_root, image.path))),
@@ -362,7 +366,8 @@ class VectorizedMapDataset(BaseDataset):
         sweeps = []
         for sweep in lidar.sweeps:
             # mmdet3d computes points @ R - t with R, t out of "lidar2sensor"
-            rotation, shift = sweep.frame_from_lidar[:3, :3], sweep.frame_from_lidar[:3, 3]
+            rotation = sweep.frame_from_lidar[:3, :3]
+            shift = sweep.frame_from_lidar[:3, 3]
             path = str(Path(self.data_root, sweep.path))
             points = {"lidar_path": path, "lidar2sensor": rigid(rotation.T, -shift)}
             sweeps.append({"lidar_points": points, "timestamp": sweep.timestamp_ns / 1e9})

@@ -124,7 +124,7 @@ def _fit_loaders(cfg: Config) -> None:
 
 @contextmanager
 def _naming(what: object) -> Iterator[None]:
-    """Say whose fault it is where a config, which is Python, ends with whatever it likes."""
+    """Name the config in any error that its Python code raises."""
     try:
         yield
     except Exception as error:
