@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gsmap.checkpoints.efficientnet_keys import efficientnet_rules, unused_classifier
 from gsmap.checkpoints.key_rules import KeyMap
-from gsmap.checkpoints.reading import refusing, require_unpacked
+from gsmap.checkpoints.reading import load_tensors, refusing
 from gsmap.utils.files import atomic_write, file_name
 from gsmap.utils.shards import digest
 
@@ -59,8 +59,7 @@ def load_published(
     path = find_weights(address)
     try:
         with refusing(address):
-            require_unpacked(path)
-            checkpoint = torch.load(path, map_location=map_location, weights_only=True)
+            checkpoint = load_tensors(path, map_location)
     except ValueError as error:
         if path != cache_file(address):
             raise ValueError(f"{error} The file is {path}.") from error
@@ -80,8 +79,7 @@ def load_from_file(path: str, map_location: Any = "cpu") -> Any:
     if not file.is_file():
         raise FileNotFoundError(f"there are no weights at {file}: check the path.")
     with refusing(file):
-        require_unpacked(file)
-        return in_our_names(torch.load(file, map_location=map_location, weights_only=True))
+        return in_our_names(load_tensors(file, map_location))
 
 
 def load_from_torchvision(name: str, map_location: Any = "cpu") -> Any:

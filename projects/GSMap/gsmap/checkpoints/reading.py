@@ -49,16 +49,16 @@ _REMEDY = "if you trust its origin, save its state_dict alone and give that file
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Contents of a checkpoint.
+    """Contents of a checkpoint that loading and testing use.
 
     Attributes:
-        state: Its weights.
-        settings: The model's settings in training, not checked yet; None if they are not there.
-        image_size: Width and height that images were scaled to in training, or None.
-        can_bus: Whether the training samples had vehicle signals, as far as it says.
-        trained_on: The training's data set and its list of scenes, empty where it does not say.
-        dataset_meta: What it says of the training's data set, not checked.
-        calibration: Law and interval that its sigmas were fitted by; empty if they were not.
+        state: Weights, by state key.
+        settings: Settings of the model in training, not checked yet; None if it has none.
+        image_size: Width and height in pixels that images were scaled to in training, or None.
+        can_bus: Whether the training samples had vehicle signals; False if that is not recorded.
+        trained_on: Data set of the training and identity of its list of scenes, empty if unknown.
+        dataset_meta: Metadata of the training's data set, not checked.
+        calibration: Law and interval that the sigmas were fitted by; empty if they were not.
     """
 
     state: dict[str, Tensor]
@@ -70,14 +70,21 @@ class Checkpoint:
     calibration: dict[str, Any] = field(default_factory=dict)
 
     def list_of(self, dataset: object) -> str:
-        """Return the list of scenes it was trained on; nothing if that is of another data set."""
+        """Return the identity of the training's list of scenes; empty for another data set."""
         own, identity = self.trained_on
         return identity if own == dataset else ""
 
 
 @contextmanager
 def refusing(path: object) -> Iterator[None]:
-    """Say in a line which checkpoint cannot be read, and why."""
+    """Turn errors of reading a checkpoint into one line with its path, the reason and a remedy.
+
+    Args:
+        path: File or address of the checkpoint.
+
+    Raises:
+        ValueError: If the block raises an error that the contents of the file cause.
+    """
     try:
         yield
     except UnfitError as error:
@@ -96,7 +103,7 @@ def refusing(path: object) -> Iterator[None]:
 
 
 def _advice(path: object, otherwise: str) -> str:
-    """Advice for a file that cannot be read, by its first bytes."""
+    """Return a remedy for a file that cannot be read, by its first bytes."""
     file = Path(str(path))
     if not file.is_file():
         return otherwise
@@ -105,22 +112,33 @@ def _advice(path: object, otherwise: str) -> str:
 
 
 def _asks_for_more(error: BaseException, path: Path) -> bool:
-    """Whether more memory was asked for than a file has bytes, whatever tensors it tells of."""
+    """Whether more memory was asked for than a file has bytes, so that its sizes are wrong."""
     asked = re.search(r"allocate (\d+) bytes", str(error))
     return asked is not None and path.is_file() and int(asked[1]) > path.stat().st_size
 
 
-def require_unpacked(path: Path) -> None:
-    """Refuse an archive with packed parts, which torch does not write: their sizes have no bound.
+def load_tensors(path: str | Path, map_location: Any = "cpu") -> Any:
+    """Load a file of ``torch.save`` without running code from it.
+
+    Args:
+        path: The file.
+        map_location: Device of the tensors, as ``torch.load`` takes it.
+
+    Returns:
+        Its contents: tensors and plain data.
 
     Raises:
-        ValueError: If there is one.
+        ValueError: If it is an archive with compressed parts, whose sizes in memory have no bound;
+            torch writes none.
+        UnpicklingError: If it holds more than tensors and plain data.
     """
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            packed = [part for part in archive.infolist() if part.compress_type]
-        if packed:
-            raise ValueError(f"{packed[0].filename!r:.60} in it is packed, as torch packs nothing")
+            for part in archive.infolist():
+                if part.compress_type != zipfile.ZIP_STORED:
+                    name = f"{part.filename!r:.60}"
+                    raise ValueError(f"{name} in it is packed, as torch packs nothing")
+    return torch.load(path, map_location=map_location, weights_only=True)
 
 
 def read_checked(path: str | Path) -> Checkpoint:
@@ -135,29 +153,42 @@ def read_checked(path: str | Path) -> Checkpoint:
     """
     path = find_checkpoint(path)
     with refusing(path):
-        require_unpacked(path)
         with torch.serialization.safe_globals(mmengine_globals()):
-            checkpoint: Any = torch.load(path, map_location="cpu", weights_only=True)
-        unwrapped = _unwrapped(path, checkpoint)
+            content = load_tensors(path)
+        unwrapped = _unwrapped(path, content)
         meta = (unwrapped.holder or {}).get("meta") or {}
         if not isinstance(meta, Mapping):
             raise TypeError(f"meta must be a dictionary, got {meta!r:.60}")
         settings = json.loads(meta[MODEL_SETTINGS]) if MODEL_SETTINGS in meta else None
-        named = next((vars(m) for m in named_models().values() if m.file == path), {})
-        size = _checked_size({**named, **meta}.get(IMAGE_SIZE))
-        signals = {**named, **meta}.get(SIGNALS) is True
-        said = meta.get("dataset_meta")
-        said = said if isinstance(said, Mapping) else {}
-        trained_on = str(said.get("dataset", "")), checked_identity(said.get(SPLIT_LIST))
-        calibration = calibration_of(meta)
-        state = unwrapped.state
-        broken = [key for key, value in state.items() if not bool(value.isfinite().all())]
+        facts = {**_facts_of_named(path), **meta}
+        dataset_meta = meta.get("dataset_meta")
+        if not isinstance(dataset_meta, Mapping):
+            dataset_meta = {}
+        scenes = checked_identity(dataset_meta.get(SPLIT_LIST))
+        checkpoint = Checkpoint(
+            state=unwrapped.state,
+            settings=settings,
+            image_size=_checked_size(facts.get(IMAGE_SIZE)),
+            can_bus=facts.get(SIGNALS) is True,
+            trained_on=(str(dataset_meta.get("dataset", "")), scenes),
+            dataset_meta=dataset_meta,
+            calibration=calibration_of(meta),
+        )
+        broken = [key for key, value in unwrapped.state.items() if not value.isfinite().all()]
     if broken:
         raise ValueError(
             f"{path} holds NaN or infinite weights ({listed(broken)}): the training that wrote it "
             "had failed; use an earlier epoch's."
         )
-    return Checkpoint(state, settings, size, signals, trained_on, said, calibration)
+    return checkpoint
+
+
+def _facts_of_named(path: Path) -> dict[str, Any]:
+    """Return the facts about a model that ships, by its file; none of another file."""
+    for model in named_models().values():
+        if model.file == path:
+            return vars(model)
+    return {}
 
 
 def _checked_size(size: Any) -> tuple[int, int] | None:
@@ -170,7 +201,7 @@ def _checked_size(size: Any) -> tuple[int, int] | None:
 
 
 def _unwrapped(path: Path, content: Any) -> Unwrapped:
-    """Weights of a checkpoint; entries that are not used are named once."""
+    """Return the weights of a checkpoint, and log once which other contents are left out."""
     unwrapped = unwrap(content)
     if unwrapped.left_out:
         _say_left_out(path, tuple(unwrapped.left_out.items()))
@@ -179,7 +210,7 @@ def _unwrapped(path: Path, content: Any) -> Unwrapped:
 
 @cache
 def _say_left_out(path: Path, left_out: tuple[tuple[str, int], ...]) -> None:
-    """Name the entries of a checkpoint that are not used, once."""
+    """Log the contents of a checkpoint that are not used, once."""
     text = ", ".join(f"{count} {what}" for what, count in left_out)
     print_log(f"{path}: {text} left out")
 
@@ -192,7 +223,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
 def adopt_settings(
     cfg: Config, path: str | Path, cfg_options: dict | None, read: Checkpoint | None = None
 ) -> list[str]:
-    """Adopt the model settings of a checkpoint's training in a config, and list the changes.
+    """Give a config the model settings that a checkpoint was trained with, and list the changes.
 
     Test images are scaled to the size that it was trained at, unless ``cfg_options`` set the scale.
     If it was trained with vehicle signals, those of samples without are computed from their poses.
@@ -215,7 +246,8 @@ def adopt_settings(
     """
     checkpoint = read or read_checked(path)
     settings = checkpoint.settings
-    if checkpoint.image_size and not any(n.startswith(_SCALED) for n in cfg_options or {}):
+    given = cfg_options or {}
+    if checkpoint.image_size and not any(name.startswith(_SCALED) for name in given):
         for step in scale_steps(cfg, "test"):
             step.trained_size = checkpoint.image_size
     if checkpoint.can_bus:
@@ -226,20 +258,18 @@ def adopt_settings(
         return []
     options = {
         name: value
-        for name, value in (cfg_options or {}).items()
+        for name, value in given.items()
         if name.startswith("model.") and not _is_start(name)
     }
-    own, model = _model_of(path, settings, config, options)
+    own, model = _model_of(path, settings, config=config, options=options)
     used = plain(model.to_dict())
     lines = [
         f"{name}: {theirs}, as {path} was trained; the config has {mine}"
         for name, (theirs, mine) in differences(used, config, "model").items()
         if not _is_start(name)
     ]
-    lines += [
-        f"{name}: {given}, as asked for; {path} was trained with {theirs}"
-        for name, (given, theirs) in differences(used, own, "model").items()
-    ]
+    for name, (asked, theirs) in differences(used, own, "model").items():
+        lines.append(f"{name}: {asked}, as asked for; {path} was trained with {theirs}")
     if lines:
         cfg.model = model
         cfg.model.allow_untrained = allowed
@@ -247,14 +277,14 @@ def adopt_settings(
 
 
 def _is_start(name: str) -> bool:
-    """Whether a dotted name is one of a setting of how training starts."""
+    """Whether a dotted name is that of a setting of the start of training."""
     return not STARTS.isdisjoint(name.split("."))
 
 
 def _model_of(
     path: str | Path, settings: Any, config: dict[str, Any], options: dict[str, Any]
 ) -> tuple[dict[str, Any], ConfigDict]:
-    """Return a checkpoint's settings, checked, and with overrides; a model can be built of both."""
+    """Return a checkpoint's settings, checked, and these with overrides; a model builds of both."""
     try:
         settings = _with_elements_of(checked(settings, config), config)
         own = Config({"model": settings})
@@ -276,7 +306,8 @@ def _with_elements_of(settings: dict[str, Any], config: dict[str, Any]) -> dict[
     temporal = settings.get("temporal") or {}
     if not isinstance(temporal, dict) or temporal.get("elements") == elements:
         return settings
-    kept = {name: value for name, value in temporal.items() if name != "elements"}
+    kept = dict(temporal)
+    kept.pop("elements", None)
     if elements is not None:
         kept["elements"] = elements
     return {**settings, "temporal": kept or None}

@@ -19,7 +19,7 @@ import torch
 from mmdet3d.registry import DATA_SAMPLERS, OPTIMIZERS, RUNNERS
 from mmengine.config import Config
 from mmengine.logging import print_log
-from mmengine.registry import init_default_scope
+from mmengine.registry import Registry, init_default_scope
 from mmengine.utils import import_modules_from_strings
 
 from gsmap.checkpoints.named_models import find_config
@@ -76,11 +76,7 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     with _naming(f"--cfg-options of {cfg.filename or 'a config'}"):
         cfg.merge_from_dict(options)
     if factor is not None:
-        steps = scale_steps(cfg, "train", "val", "test")
-        if not steps:
-            raise ValueError(f"--image-scale: no pipeline of {cfg.filename} has ScaleImages.")
-        for step in steps:
-            step.update(scale=factor, size=None)
+        _scale_images(cfg, factor)
     _check_keys(cfg)
     _fit_loaders(cfg)
     with _naming(f"custom_imports of {cfg.filename or 'a config'}"):
@@ -91,12 +87,25 @@ def read_config(config: str | Path | Config, cfg_options: dict | None = None) ->
     return cfg
 
 
+def _scale_images(cfg: Config, factor: float) -> None:
+    """Set the factor by which all pipelines of a config scale their images, in place.
+
+    Raises:
+        ValueError: If no pipeline scales images.
+    """
+    steps = scale_steps(cfg, "train", "val", "test")
+    if not steps:
+        raise ValueError(f"--image-scale: no pipeline of {cfg.filename} has ScaleImages.")
+    for step in steps:
+        step.update(scale=factor, size=None)
+
+
 def _fit_loaders(cfg: Config) -> None:
     """Fit the data loaders of a config to the machine, in place.
 
     ``num_workers='cores'`` is the number of cores that a process has, at most 16. With
-    ``images_on_device`` pixels go to the device as they were decoded, from pinned memory, and what
-    the pipelines do to them is done there.
+    ``images_on_device``, images are copied to the device as they were decoded, from pinned memory,
+    and the steps of the pipelines on pixels run there.
 
     Raises:
         ValueError: If a transform of another library reads the pixels before they are packed.
@@ -124,15 +133,25 @@ def _fit_loaders(cfg: Config) -> None:
 
 @contextmanager
 def _naming(what: object) -> Iterator[None]:
-    """Name the config in any error that its Python code raises."""
+    """Name the config in any error that it raises while it runs, for a config is Python.
+
+    Args:
+        what: Path of the config, or words for the part of it that runs.
+
+    Raises:
+        ValueError: If the block raises an exception.
+    """
     try:
         yield
     except Exception as error:
-        frames = traceback.extract_tb(error.__traceback__)
-        lines = [f.lineno for f in frames if f.filename == str(Path(str(what)).absolute())]
-        place = f", line {lines[-1]}," if lines else ""
-        reason = error.__context__ if isinstance(error, ImportError) else None
-        reason = reason or error  # mmengine's own does not say why an import failed
+        file = str(Path(str(what)).absolute())
+        place = ""
+        for frame in traceback.extract_tb(error.__traceback__):
+            if frame.filename == file:
+                place = f", line {frame.lineno},"  # the innermost one counts
+        reason: BaseException = error
+        if isinstance(error, ImportError) and error.__context__ is not None:
+            reason = error.__context__  # mmengine's own does not say why an import failed
         if "load gsmap config" in str(reason):  # the scopes that it knows are fixed
             reason = ValueError(
                 f"'gsmap::' is not read in _base_; write a path below {shipped('configs')} instead"
@@ -157,8 +176,9 @@ def load_config(args: argparse.Namespace) -> Config:
     elif cfg.get("work_dir") is None:
         cfg.work_dir = str(Path("work_dirs") / Path(args.config).stem)
     check_config(cfg)
-    for name in [name for name in cfg if name.startswith("_")]:
-        cfg.pop(name)  # a config's own values have done their work
+    for name in list(cfg):
+        if name.startswith("_"):
+            cfg.pop(name)  # a config's own values have done their work
     if args.launcher == "pytorch":
         # torchrun killed with SIGKILL cannot stop its ranks
         die_with_parent(int(os.environ.pop(LAUNCHER, os.getppid())))
@@ -192,17 +212,20 @@ def rank_timeout_s(cfg: Config) -> float:
 def newest_checkpoint(
     work_dir: str | Path, read: Callable[[Path], object] | None = None
 ) -> Path | None:
-    """Return the newest good checkpoint of a run, or None; others are named and left.
+    """Return the newest good checkpoint of a run; a warning names each one that is passed over.
 
     Args:
-        work_dir: Its work folder.
-        read: Raises ``ValueError`` for a checkpoint that is whole but cannot be used.
+        work_dir: Folder of the run.
+        read: Function that raises ``ValueError`` for a whole checkpoint that cannot be used.
+
+    Returns:
+        The path of the checkpoint, None if there is no good one.
     """
-    numbers = {
-        path: int(match[1])
-        for path in Path(work_dir).glob("*.pth")
-        if (match := re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name))
-    }
+    numbers: dict[Path, int] = {}
+    for path in Path(work_dir).glob("*.pth"):
+        match = re.fullmatch(r"(?:epoch|iter)_(\d+)\.pth", path.name)
+        if match:
+            numbers[path] = int(match[1])
     for path in sorted(numbers, key=numbers.__getitem__, reverse=True):
         reason = f"{path} is damaged and is passed over."
         try:
@@ -239,22 +262,32 @@ def check_config(cfg: Config) -> None:
     """
     check_targets(cfg)
     _check_streams(cfg)
+    _check_schedule(cfg)
+    optimizer = ((cfg.get("optim_wrapper") or {}).get("optimizer") or {}).get("type")
+    _check_registered(cfg, "optimizer", OPTIMIZERS, optimizer)  # mmengine goes on without it
+    _check_registered(cfg, "runner", RUNNERS, cfg.get("runner_type", "Runner"))
+
+
+def _check_schedule(cfg: Config) -> None:
+    """Refuse a cosine schedule that ends at another epoch than the training."""
     end = (cfg.get("train_cfg") or {}).get("max_epochs")
+    if end is None:
+        return
     for scheduler in cfg.get("param_scheduler") or []:
         last = scheduler.get("T_max")
-        if end is not None and last is not None and scheduler.get("by_epoch", True) and last != end:
+        if last is not None and scheduler.get("by_epoch", True) and last != end:
             raise ValueError(
                 f"{cfg.filename}: training lasts {end} epochs but the cosine schedule {last}: set "
                 "both train_cfg.max_epochs and param_scheduler's T_max (a schedule is one base "
                 "file)."
             )
-    optimizer = ((cfg.get("optim_wrapper") or {}).get("optimizer") or {}).get("type")
-    runner = cfg.get("runner_type", "Runner")
-    # mmengine goes on without an optimizer that it does not know
-    for what, registry, kind in (("optimizer", OPTIMIZERS, optimizer), ("runner", RUNNERS, runner)):
-        if isinstance(kind, str) and registry.get(kind) is None:
-            close = nearest(kind, registered(registry)) or "."
-            raise ValueError(f"{cfg.filename}: there is no {what} of type {kind!r}{close}")
+
+
+def _check_registered(cfg: Config, what: str, registry: Registry, kind: Any) -> None:
+    """Refuse a name of a class that a registry does not have."""
+    if isinstance(kind, str) and registry.get(kind) is None:
+        close = nearest(kind, registered(registry)) or "."
+        raise ValueError(f"{cfg.filename}: there is no {what} of type {kind!r}{close}")
 
 
 def _check_effect(cfg: Config, name: str) -> None:
@@ -265,9 +298,12 @@ def _check_effect(cfg: Config, name: str) -> None:
     value: Any = cfg.get(top)
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
-    last = [top.removeprefix("_"), *keys][-1]
-    settings = {k: v for k, v in cfg.items() if k not in _COPIED and not k.startswith("_")}
-    copies = ["--data-root DIR"] if name == "data_root" else [*_places(settings, last, value, "")]
+    last = keys[-1] if keys else top.removeprefix("_")
+    if name == "data_root":
+        copies = ["--data-root DIR"]
+    else:
+        settings = {k: v for k, v in cfg.items() if k not in _COPIED and not k.startswith("_")}
+        copies = list(_places(settings, name=last, value=value, path=""))
     remedy = f"give {', '.join(copies)}, or edit" if copies else "edit"
     raise ValueError(
         f"--cfg-options {name} changes nothing: the other settings have copies of it, made when "
@@ -287,6 +323,7 @@ def _places(settings: Any, name: str, value: Any, path: str) -> Iterator[str]:
 
 
 def _check_keys(cfg: Config) -> None:
+    """Refuse top-level keys that no code reads, and sections that are no dictionaries."""
     for key, value in cfg.items():
         known = key in _known_keys()
         if known and key.endswith(_SECTIONS) and not isinstance(value, dict | None):
@@ -309,14 +346,16 @@ def _check_streams(cfg: Config) -> None:
         loader = cfg.get(f"{part}_dataloader") or {}
         sampler = loader.get("sampler") or {}
         kind = sampler.get("type")
-        found = class_of_type(kind, DATA_SAMPLERS)
-        if loader and wanted not in [base.__name__ for base in inspect.getmro(found or object)]:
+        found = class_of_type(kind, DATA_SAMPLERS) or object
+        bases = {base.__name__ for base in found.__mro__}
+        if loader and wanted not in bases:
             raise ValueError(
                 f"{cfg.filename}: {part}_dataloader.sampler is {kind!r}, which tears scenes apart "
                 "(several ranks take turns with their frames), so model.temporal would remember "
                 f"other frames than the last: set its type to '{wanted}', or model.temporal=None."
             )
-        slots, size = sampler.get("slots"), loader.get("batch_size")
+        slots = sampler.get("slots")
+        size = loader.get("batch_size")
         if part == "train" and slots != size:
             raise ValueError(
                 f"{cfg.filename}: train_dataloader.batch_size is {size} and sampler.slots is "
