@@ -115,19 +115,27 @@ def largest_deviation(line: Float, curve: Float) -> float:
 
 
 def _in_plane(points: Float) -> Float:
+    """Return x and y of points, as the kernels take them. (n, D) -> (n, 2)"""
     return np.ascontiguousarray(points[:, :2], np.float64)
 
 
 def _fits(degree: int, max_error_m: float, deviation: Deviation) -> Callable[[Float], bool]:
-    """Return what says whether one piece is near enough to a line (n, D)."""
+    """Return a test of whether one piece is near enough to a part of a line (n, D)."""
+
+    def fits(part: Float) -> bool:
+        return deviation(part, curve_points(fit_piece(part, degree), degree)) < max_error_m
+
+    def fits_compiled(part: Float) -> bool:
+        apart_m = deviation_of_fit(_in_plane(part), inverse, weights, max_error_m)
+        return bool(apart_m < max_error_m)
+
     if deviation is not largest_deviation:
-        return lambda part: (
-            deviation(part, curve_points(fit_piece(part, degree), degree)) < max_error_m
-        )
+        return fits
     from gsmap.structures.curve_kernels import deviation_of_fit
 
-    settings = _inverse(degree), bernstein(degree), max_error_m
-    return lambda part: deviation_of_fit(_in_plane(part), *settings) < max_error_m
+    inverse = _inverse(degree)
+    weights = bernstein(degree)
+    return fits_compiled
 
 
 def fit_joints(
@@ -168,7 +176,8 @@ def fit_joints(
         if work <= 0:
             end, farther = start + 1, min(start + 2, last)
             while end < farther and fits(points[start : farther + 1]):
-                end, farther = farther, min(2 * farther - start, last)
+                end = farther
+                farther = min(2 * farther - start, last)
         joints.append(end)
     return joints
 

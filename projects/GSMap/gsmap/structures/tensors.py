@@ -23,9 +23,8 @@ def uncompiled(function: Callable[_Params, _Result]) -> Callable[_Params, _Resul
     It is ``torch.compiler.disable`` from the moment that the compiler is there: importing it takes
     a second.
     """
-    disabled: list[
-        Callable[_Params, _Result]
-    ] = []  # no cache of functools: the compiler warns of it
+    # no cache of functools: the compiler warns of it
+    disabled: list[Callable[_Params, _Result]] = []
 
     @functools.wraps(function)
     def wrapped(*args: _Params.args, **kwargs: _Params.kwargs) -> _Result:

@@ -11,7 +11,7 @@ from gsmap.models.base.pairs import BuiltHead, GroundTruth, MatchedPairs, Predic
 
 
 class FlowStart(NamedTuple):
-    """What the first decoder layer takes.
+    """Input of the first decoder layer.
 
     Attributes:
         queries: States, positions and references of all instance queries N, as
@@ -24,7 +24,7 @@ class FlowStart(NamedTuple):
 
 
 class FlowHead(BuiltHead, Protocol):
-    """What a hook may ask of the head whose flow it takes part in."""
+    """Interface of a head to the hooks that take part in its flow."""
 
     embed_dims: int
     num_points: int
@@ -42,15 +42,15 @@ class FlowHead(BuiltHead, Protocol):
         ...
 
 
-class FlowHook(Protocol):
-    """Takes part in the flow of a head for one batch; a method that is not overridden does nothing.
+class FlowHook:
+    """Base class of hooks into the flow of a head for one batch; its own methods do nothing.
 
-    A class derives from it and overrides what it needs. Hooks are called in their order, `outputs`
-    in the reverse order, so that each one takes back what it has appended.
+    Hooks are called in their order, `outputs` in the reverse order, so that each one removes the
+    queries that it has appended.
     """
 
     def start(self, head: FlowHead, start: FlowStart) -> FlowStart:
-        """Return what the first decoder layer takes; further queries are appended.
+        """Return the input of the first decoder layer; further queries are appended.
 
         Args:
             head: The head.
@@ -64,7 +64,7 @@ class FlowHook(Protocol):
         Args:
             head: The head.
             layer: Number of the layer.
-            refined: What the head's reference has made of them. (B, N * P, D)
+            refined: References that the head has refined. (B, N * P, D)
         """
         return refined
 
@@ -74,7 +74,7 @@ class FlowHook(Protocol):
         Args:
             head: The head.
             layer: Number of the layer that has just run, the last one included.
-            queries: What it leaves.
+            queries: Queries after it.
         """
         return queries
 
@@ -88,7 +88,7 @@ class FlowHook(Protocol):
         return layers
 
     def targets(self, head: FlowHead, pairs: MatchedPairs) -> None:
-        """Read what the predicting queries of the last layer are matched to.
+        """Read the matches of the predicting queries in the last layer.
 
         Args:
             head: The head.

@@ -1,4 +1,4 @@
-"""What references of predictions stand for, and what a head asks of those that layers refine."""
+"""Interfaces of references: geometry that predictions stand for, refined by decoder layers."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -11,18 +11,18 @@ from gsmap.structures.grid import BEVGrid
 
 
 class Reference:
-    """How references of predictions stand for points.
+    """Decoding of references to points.
 
     Attributes:
-        outputs: What `decode` returns.
-        metainfo: What is said of all predictions.
+        outputs: Names of the fields that `decode` returns.
+        metainfo: Metadata of all predictions.
     """
 
     outputs: tuple[str, ...] = ("pts",)
     metainfo: Mapping[str, Any] = MappingProxyType({})
 
     def decode(self, references: Tensor) -> dict[str, Tensor]:
-        """Return ``pts`` in metres (N, P, 2 or 3), and what else `outputs` names. (N, ...)"""
+        """Return ``pts`` in metres (N, P, 2 or 3), and the other fields of `outputs`. (N, ...)"""
         raise NotImplementedError
 
 
@@ -69,5 +69,5 @@ class RefinedReference(Reference):
         raise NotImplementedError
 
     def render(self, references: Tensor, grid: BEVGrid) -> Tensor:
-        """Return rendered masks of what has an extent. (..., P, D) -> (..., H, W)"""
+        """Return the masks of references with an extent. (..., P, D) -> (..., H, W)"""
         raise NotImplementedError

@@ -126,15 +126,14 @@ class BEVQueryEncoder(CameraEncoder):
         self.grid = grid.rasterized(bev_pixel_m)
         self.z_range = (float(z_range[0]), float(z_range[1]))
         self.bev_embedding = nn.Embedding(self.grid.height * self.grid.width, embed_dims)
+        start: dict[str, Any] = {"type": "Normal", "layer": "Embedding", "std": 1.0}
+        if uniform_positions:
+            start = {"type": "Uniform", "layer": "Embedding"}
         self.positional_encoding = LearnedPositionalEncoding(
             embed_dims // 2,
             self.grid.height,
             self.grid.width,
-            init_cfg={
-                "type": "Uniform" if uniform_positions else "Normal",
-                "layer": "Embedding",
-                **({} if uniform_positions else {"std": 1.0}),
-            },
+            init_cfg=start,
         )
         self.level_embeds = nn.Parameter(torch.empty(4, embed_dims))  # only the first is used
         self.cams_embeds = nn.Parameter(torch.empty(num_cams, embed_dims))

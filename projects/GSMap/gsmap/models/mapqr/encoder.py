@@ -77,7 +77,14 @@ class HeightKernelAttention(GeometryKernelAttention):
         released_cells: bool = False,
         equal_weights: bool = True,
     ) -> None:
-        super().__init__(embed_dims, num_heads, kernel_size, True, released_cells, equal_weights)
+        super().__init__(
+            embed_dims,
+            num_heads,
+            kernel_size,
+            bilinear=True,
+            released_cells=released_cells,
+            equal_weights=equal_weights,
+        )
         self.accumulate_heights = accumulate_heights
         self.height_offsets = nn.Linear(embed_dims, num_heads)
         constant_init(self.height_offsets, 0.0)
