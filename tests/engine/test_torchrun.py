@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from processes import REPO, free_port
+from torch.distributed.elastic.multiprocessing import SignalException
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError, ProcessFailure
 
 from gsmap.engine import torchrun
@@ -29,37 +30,50 @@ sys.exit(2)
 """
 
 
-def failed(*codes: int, at_s: tuple[int, ...] | None = None) -> ChildFailedError:
+def failed(*codes: int, at_s: tuple[int, ...] = (0, 0)) -> ChildFailedError:
     """Make the error of ranks 0, 1, ..., whose processes are 100, 101, ..."""
     failures = {}
     for rank, code in enumerate(codes):
         failures[rank] = ProcessFailure(rank, 100 + rank, code, "")
-        failures[rank].timestamp = at_s[rank] if at_s else 1000
+        failures[rank].timestamp = 1000 + at_s[rank]
     return ChildFailedError("train.py", failures)
 
 
 @pytest.mark.parametrize(
-    ("codes", "stopped", "rank", "code"),
+    ("codes", "at_s", "rank", "code"),
     [
-        ((2, -9), set(), 1, 137),  # rank 0 has lost its peer
-        ((-9, 2), set(), 0, 137),
-        ((2, 130), set(), 1, 130),  # Ctrl-C, and rank 0 hears of it from its peer
-        ((-15, -11), {100}, 1, 139),  # the first was ended by torchrun
-        ((2, -9), {101}, 0, 2),  # so was the second, which did not heed SIGTERM
-        ((-1, 2), set(), 0, 129),
-        ((2, 2), set(), 0, 2),
+        ((2, -9), (0, 0), 1, 137),  # rank 0 has lost its peer
+        ((-9, 2), (0, 0), 0, 137),
+        ((2, 130), (0, 0), 1, 130),  # Ctrl-C, and rank 0 hears of it from its peer
+        ((-15, -11), (0, 0), 1, 139),  # the first was ended by torchrun
+        ((2, -9), (0, 30), 0, 2),  # so was the second, which did not heed SIGTERM
+        ((2, -9), (0, 29), 0, 2),
+        ((-9, -9), (30, 0), 1, 137),
+        ((-1, 2), (0, 0), 0, 129),
+        ((2, 2), (0, 0), 0, 2),
+        ((2, 3), (1, 0), 1, 3),  # of equal ends the earlier
+        ((-15, -15), (1, 0), 1, 143),
     ],
 )
-def test_the_cause_is_named_and_not_what_follows_from_it(codes, stopped, rank, code, monkeypatch):
-    monkeypatch.setattr(torchrun, "_stopped", {pid for pid in stopped})
-    said, found = torchrun.reason(failed(*codes))
+def test_the_cause_is_named_and_not_what_follows_from_it(codes, at_s, rank, code):
+    said, found = torchrun.reason(failed(*codes, at_s=at_s))
     assert said.startswith(f"rank {rank} ")
     assert found == code
 
 
-def test_of_equal_ends_the_earlier_is_the_cause(monkeypatch):
-    monkeypatch.setattr(torchrun, "_stopped", set())
-    assert torchrun.reason(failed(2, 3, at_s=(1001, 1000)))[1] == 3
+def test_a_signal_is_found_behind_the_errors_that_follow_from_it():
+    heard = SignalException("", signal.SIGINT)
+    try:
+        try:
+            raise heard
+        finally:
+            undefined  # noqa: B018, F821 as torch's own wrapper does when it is interrupted
+    except NameError as error:
+        assert torchrun.signal_behind(error) is heard
+        with pytest.raises(ChildFailedError) as raised:
+            raise failed(2) from error
+        assert torchrun.signal_behind(raised.value) is heard
+    assert torchrun.signal_behind(failed(2)) is None
 
 
 @pytest.mark.faults

@@ -7,14 +7,13 @@ import logging
 import os
 import signal
 import sys
-from typing import Any
 
 from gsmap.utils.interrupt import leave_at_once_on_ctrl_c
 
 if __name__ == "__main__":
     leave_at_once_on_ctrl_c()  # until torchrun's own answer, the import of torch takes seconds
 # isort: split
-from torch.distributed.elastic.multiprocessing.api import SignalException, SubprocessContext
+from torch.distributed.elastic.multiprocessing import SignalException
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError, ProcessFailure
 from torch.distributed.run import main
 
@@ -22,35 +21,39 @@ from gsmap.utils.cli import ENDING
 from gsmap.utils.parallel import LAUNCHER
 
 INTERRUPTED = 128 + signal.SIGINT
-_stopped: set[int] = set()  # processes of ranks that torchrun itself ended
-
-
-_close = SubprocessContext.close
-
-
-def _note_and_close(ranks: SubprocessContext, *args: Any, **options: Any) -> None:
-    """End the ranks that are left, and note which these were."""
-    processes = [handler.proc for handler in ranks.subprocess_handlers.values()]
-    _stopped.update(process.pid for process in processes if process.poll() is None)
-    _close(ranks, *args, **options)
+STOP_TIMEOUT_S = 30  # torchrun ends ranks with SIGTERM, and after this time with SIGKILL
 
 
 def _cause(error: ChildFailedError) -> tuple[int, ProcessFailure]:
-    """Return the rank whose end is behind the others', and how it ended.
+    """Return the rank whose end caused the others' ends, and its failure.
 
-    torch times failures in whole seconds and counts the ranks that it ends itself among them. Of
-    ranks that ended by themselves, one that was killed comes before one that was interrupted, and
-    that before one that met an error: a rank that loses its peers ends with an error.
+    torch counts the ranks that it stops itself among the failures, and times all failures in whole
+    seconds. Of ranks that ended by themselves, one that was killed comes before one that was
+    interrupted, and that before one that met an error: a rank that loses its peers ends with an
+    error.
     """
+    first_s = min(failure.timestamp for failure in error.failures.values())
 
     def order(rank: int) -> tuple[bool, bool, bool, float, int]:
         failure = error.failures[rank]
         code = failure.exitcode
-        ended = failure.pid in _stopped
-        return ended, code >= 0, code != INTERRUPTED, failure.timestamp, rank
+        late = failure.timestamp - first_s >= STOP_TIMEOUT_S - 1
+        stopped = code == -signal.SIGTERM or (code == -signal.SIGKILL and late)
+        return stopped, code >= 0, code != INTERRUPTED, failure.timestamp, rank
 
     first = min(error.failures, key=order)
     return first, error.failures[first]
+
+
+def signal_behind(error: BaseException | None) -> SignalException | None:
+    """Return the signal that led to an exception, if any.
+
+    torchrun answers a signal by an exception wherever it stands, and code that it interrupts may
+    raise another one on top of it.
+    """
+    while error is not None and not isinstance(error, SignalException):
+        error = error.__cause__ or error.__context__
+    return error
 
 
 def reason(error: ChildFailedError) -> tuple[str, int]:
@@ -72,12 +75,14 @@ if __name__ == "__main__":
         logging.getLogger(f"torch.distributed.elastic.{part}").setLevel(logging.CRITICAL)
     os.environ[LAUNCHER] = str(os.getpid())
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)  # also for the ranks
-    SubprocessContext.close = _note_and_close  # type: ignore[assignment,method-assign]
     try:
         main()
-    except SignalException as error:  # the ranks have had the same signal, and rank 0 has spoken
-        sys.exit(128 + signal.Signals(error.sigval))
-    except ChildFailedError as error:
+    except Exception as error:
+        stopped_by = signal_behind(error)
+        if stopped_by is not None:  # the ranks have had this signal too, and rank 0 has spoken
+            sys.exit(128 + signal.Signals(stopped_by.sigval))
+        if not isinstance(error, ChildFailedError):
+            raise
         text, code = reason(error)
         sys.stderr.write(f"error: {text}\n")
         sys.exit(code)
