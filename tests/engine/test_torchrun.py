@@ -62,17 +62,21 @@ def test_the_cause_is_named_and_not_what_follows_from_it(codes, at_s, rank, code
 
 
 def test_a_signal_is_found_behind_the_errors_that_follow_from_it():
-    heard = SignalException("", signal.SIGINT)
-    try:
+    interrupt = SignalException("", signal.SIGINT)
+
+    def fail_on_the_way_out() -> None:
+        """Raise as torch's own wrapper does when a signal meets it before its first line."""
         try:
-            raise heard
+            raise interrupt
         finally:
-            undefined  # noqa: B018, F821 as torch's own wrapper does when it is interrupted
-    except NameError as error:
-        assert torchrun.signal_behind(error) is heard
-        with pytest.raises(ChildFailedError) as raised:
-            raise failed(2) from error
-        assert torchrun.signal_behind(raised.value) is heard
+            raise UnboundLocalError
+
+    with pytest.raises(UnboundLocalError) as first:
+        fail_on_the_way_out()
+    assert torchrun.signal_behind(first.value) is interrupt
+    with pytest.raises(ChildFailedError) as second:
+        raise failed(2) from first.value
+    assert torchrun.signal_behind(second.value) is interrupt
     assert torchrun.signal_behind(failed(2)) is None
 
 
