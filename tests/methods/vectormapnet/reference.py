@@ -83,7 +83,7 @@ def check_targets(golden: Golden, name: str) -> Iterator[Row]:
         ours, lines = targets_of(data, tag)
         canvas, transform = Canvas(GRID), FormatPolylineTargets()
         wanted = split(data, f"{tag}_vec_f64", f"{tag}_vec_count")
-        found = [canvas.norm_from_metres(transform.simplified(line)) for line in lines]
+        found = [canvas.norm_from_metres(transform.simplify(line)) for line in lines]
         off = max(largest_difference(*pair) for pair in zip(found, wanted, strict=True))
         yield Row(name, f"{tag}: simplified lines", off, 1e-12)
         off = largest_difference(ours.keypoints, data[f"{tag}_keypoint"])
@@ -104,7 +104,7 @@ def check_targets(golden: Golden, name: str) -> Iterator[Row]:
     for key, by_x in (("bbox", True), ("poly", False)):
         before, after = (torch.from_numpy(data[f"aug_{key}_{w}"]).long() for w in ("in", "out"))
         noise = after - before  # of the numbers that the release drew
-        moved = generator.moved(before, noise, by_x)
+        moved = generator.shift(before, noise, by_x)
         if key == "poly":  # what is behind a line stays 0
             moved = moved.where(before > 0, 0)
         yield Row(name, f"noise of aug_{key}", largest_difference(moved, after), 0)
@@ -221,7 +221,7 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     images = torch.from_numpy(golden.inputs.images(*size, NUM_CAMS, golden.seed))
     levels = model.extract_img_feats(images[None])
     encoder, head = model.bev_encoder, model.map_head
-    feats = encoder.joined(levels)
+    feats = encoder.merge_levels(levels)
     cameras = [golden.cameras["cameras"][key] for key in golden.cameras["camera_order"]]
     matrices = [
         np.diag([0.2, 0.2, 1, 1])
@@ -241,8 +241,8 @@ def check_forward(golden: Golden, name: str) -> Iterator[Row]:
     yield Row(name, "cam_uv_sub, where seen", off, 1e-3)
     any_seen = np.unpackbits(data["ipm_any"]).astype(bool)
     yield Row(name, "ipm_any", (visible.any(0) ^ any_seen).mean(), 1e-4)
-    planes = encoder.sampled(feats, seen)
-    bev = encoder.flattened(planes)
+    planes = encoder.sample_planes(feats, seen)
+    bev = encoder.flatten_planes(planes)
     neck = encoder.neck(bev)
     whole = torch.cat([planes[0], encoder.planes])
     outputs = head({"bev_feats": neck})

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.generator import Elements, PolylineGenerator, causal_mask
-from gsmap.models.vectormapnet.layers import most_likely
+from gsmap.models.vectormapnet.layers import keep_most_likely
 
 MAX_POINTS = 24
 
@@ -48,15 +48,15 @@ def check_generator(golden: Golden, name: str) -> Iterator[Row]:
         for i, feats in enumerate(bev):
             own = of_image == i
             elements, given = Elements(labels[own], boxes[own]), tokens[own, :-1]
-            condition = generator.condition(elements)
-            inputs = torch.cat([condition, generator.points(given)], 1)
+            condition = generator.embed_condition(elements)
+            inputs = torch.cat([condition, generator.embed_points(given)], 1)
             rows["condition"].append(condition)
             rows["inputs"].append(inputs[..., ::16])
             states = generator.states(feats, elements, given)
             rows["layers"].append(torch.stack(states)[:, :, ::4, ::16].transpose(1, 2))
             rows["law"].append(generator.log_probs(feats, elements, given))
             if i == 0:
-                raw = generator.allowed(generator.logits(states[-1][:1, 4:]))[0, valid[0]]
+                raw = generator.mask_forbidden(generator.logits(states[-1][:1, 4:]))[0, valid[0]]
                 yield Row(
                     name,
                     "raw_logits_line0",
@@ -142,7 +142,7 @@ def check_decoding(golden: Golden, name: str) -> Iterator[Row]:
     data, parts = golden.read_arrays(name), VectorParts(golden)
     logits = torch.from_numpy(data["topp_in"])
     for key, share in (("05", 0.5), ("09", 0.9), ("0", 0.0)):
-        off = largest_difference(most_likely(logits, share), data[f"topp_{key}"])
+        off = largest_difference(keep_most_likely(logits, share), data[f"topp_{key}"])
         yield Row(name, f"topp_{key}", off, 1e-6)
     generator = generator_of(parts)
     bev = parts.normal("vm_gen_bev", (2, 128, 5, 10))

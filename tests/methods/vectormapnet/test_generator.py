@@ -6,7 +6,7 @@ from methods.vectormapnet.cases import GRID, bev, generator
 
 from gsmap.models.vectormapnet.canvas import Canvas
 from gsmap.models.vectormapnet.generator import Elements, PolylineGenerator, causal_mask
-from gsmap.models.vectormapnet.layers import most_likely
+from gsmap.models.vectormapnet.layers import keep_most_likely
 
 ELEMENTS = Elements(
     torch.tensor([0, 1, 2]), torch.tensor([[3, 4, 90, 60], [5, 5, 9, 9], [100, 50, 199, 99]])
@@ -92,14 +92,16 @@ def test_no_line_stops_between_x_and_y_nor_leaves_the_canvas():
 
 def test_on_a_narrow_map_x_is_limited_too():
     narrow = PolylineGenerator(Canvas(type(GRID)((-15.0, 15.0), (-30.0, 30.0))), 3)
-    logits = narrow.allowed(torch.zeros(1, 2, 201))
+    logits = narrow.mask_forbidden(torch.zeros(1, 2, 201))
     assert (logits[0, 0] == 0).sum() == 101
     assert (logits[0, 1] == 0).sum() == 200
 
 
 def test_the_tail_is_cut_where_the_mass_before_exceeds_the_share():
     law = torch.tensor([[0.2, 0.5, 0.3]])
-    kept = {share: (most_likely(law.log(), share) > -1e8)[0].tolist() for share in (0, 0.4, 0.6, 1)}
+    kept = {
+        share: (keep_most_likely(law.log(), share) > -1e8)[0].tolist() for share in (0, 0.4, 0.6, 1)
+    }
     assert kept[0] == [False, True, False]
     assert kept[0.4] == [False, True, False]
     assert kept[0.6] == [False, True, True]
@@ -129,13 +131,13 @@ def test_noise_moves_some_numbers_and_stays_on_the_canvas():
     built = generator(noise_share=0.5)
     tokens = torch.tensor([[199, 99]]).repeat(1000, 1)
     torch.manual_seed(0)
-    moved = built.noisy(tokens)
+    moved = built.add_noise(tokens)
     assert moved[:, 0].max() <= 200
     assert moved[:, 1].max() <= 100
     shares = (moved != tokens).float().mean(0)
     assert ((shares > 0.2) & (shares < 0.5)).all()
-    assert built.moved(torch.tensor([[139, 54]]), torch.tensor([[-2, 1]])).tolist() == [[137, 55]]
-    by_x = built.moved(torch.tensor([[139, 54]]), torch.tensor([[-2, 1]]), by_x=True)
+    assert built.shift(torch.tensor([[139, 54]]), torch.tensor([[-2, 1]])).tolist() == [[137, 55]]
+    by_x = built.shift(torch.tensor([[139, 54]]), torch.tensor([[-2, 1]]), by_x=True)
     assert by_x.tolist() == [[137, 100]]
 
 

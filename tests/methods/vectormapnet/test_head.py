@@ -143,7 +143,7 @@ def test_levels_of_odd_sizes_are_added_and_all_are_needed():
     torch.manual_seed(0)
     encoder = HeightPlanesEncoder(GRID, (0.0,), 7.5, embed_dims=4, num_levels=3, neck_dims=4)
     feats = [torch.randn(1, 2, 4, *size) for size in ((9, 15), (5, 8), (3, 4))]
-    assert encoder.joined(feats).shape == (1, 2, 4, 9, 15)
+    assert encoder.merge_levels(feats).shape == (1, 2, 4, 9, 15)
     even = [torch.randn(1, 1, 4, 12 >> i, 20 >> i) for i in range(3)]
     whole = even[0].flatten(0, 1)
     for level, blocks in zip(even[1:], encoder.upsampling, strict=True):
@@ -153,9 +153,9 @@ def test_levels_of_odd_sizes_are_added_and_all_are_needed():
                 block(image), scale_factor=2.0, mode="bilinear", align_corners=True
             )
         whole = whole + image
-    torch.testing.assert_close(encoder.joined(even)[0], whole, rtol=0, atol=1e-6)
+    torch.testing.assert_close(encoder.merge_levels(even)[0], whole, rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match="built for 3 levels of image features, got 2"):
-        encoder.joined(feats[:2])
+        encoder.merge_levels(feats[:2])
 
 
 def test_the_graph_of_two_stages_is_refused_with_the_reason():
@@ -208,13 +208,13 @@ def test_a_point_is_seen_where_it_projects_to_and_no_camera_gives_zero():
     matrix[0, 0, 0, 0], matrix[0, 0, 0, 3], matrix[0, 0, 1, 3] = 8 / 60, 4.0, 2.0
     matrix[0, 0, 2, 3] = 1.0
     seen = encoder.project(matrix, (4, 8))
-    planes = encoder.sampled(columns, seen)
+    planes = encoder.sample_planes(columns, seen)
     u = 8 * (encoder.planes[0] + 30) / 60
     inside = (u > 0) & (u < 8)
     torch.testing.assert_close(planes[0, 0][inside], (u - 0.5)[inside])
     assert (planes[0, 0][~inside] == 0).all()
     matrix[0, 0, 2, 3] = -1.0
-    assert (encoder.sampled(columns, encoder.project(matrix, (4, 8))) == 0).all()
+    assert (encoder.sample_planes(columns, encoder.project(matrix, (4, 8))) == 0).all()
 
 
 def test_the_published_model_has_the_published_parameters():

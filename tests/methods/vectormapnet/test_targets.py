@@ -6,21 +6,21 @@ import torch
 from methods.vectormapnet.cases import GRID, transformed
 
 from gsmap.datasets.transforms.map_targets import FormatMapTargets
-from gsmap.models.vectormapnet.canvas import Canvas, tokens_of
+from gsmap.models.vectormapnet.canvas import Canvas, tokenize_points
 from gsmap.models.vectormapnet.targets import (
     FormatPolylineTargets,
     StretchToPadding,
+    bounding_box,
     edge_weights,
     even_weights,
-    grown_box,
 )
 
 
 def test_a_box_without_height_grows_on_all_sides():
     line = np.array([[0.2, 0.5], [0.6, 0.5]])
-    np.testing.assert_allclose(grown_box(line, 0.02), [0.19, 0.49, 0.61, 0.51], atol=1e-12)
+    np.testing.assert_allclose(bounding_box(line, 0.02), [0.19, 0.49, 0.61, 0.51], atol=1e-12)
     square = np.array([[0.2, 0.5], [0.6, 0.9]])
-    np.testing.assert_allclose(grown_box(square, 0.02), [0.2, 0.5, 0.6, 0.9])
+    np.testing.assert_allclose(bounding_box(square, 0.02), [0.2, 0.5, 0.6, 0.9])
 
 
 def test_points_weigh_as_long_as_their_edges():
@@ -36,7 +36,7 @@ def test_tokens_count_pixels_from_one_and_stop_with_zero():
     assert (canvas.size, canvas.num_tokens) == ((200, 100), 201)
     points = canvas.norm_from_metres(np.array([[-30.0, -15.0], [32.0, 17.0], [1.0, 1.0]]))
     np.testing.assert_allclose(points, [[0, 0], [1, 1], [0.5, 0.5]], atol=1e-12)
-    assert tokens_of(points, canvas.steps).tolist() == [1, 1, 200, 100, 100, 50, 0]
+    assert tokenize_points(points, canvas.steps).tolist() == [1, 1, 200, 100, 100, 50, 0]
     np.testing.assert_allclose(canvas.metres_from_norm(points)[2], [1.0, 1.0])
 
 

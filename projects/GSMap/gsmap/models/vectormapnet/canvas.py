@@ -1,4 +1,4 @@
-"""VectorMapNet's canvas: where points lie as whole numbers, the tokens of a sequence."""
+"""VectorMapNet's canvas, the raster that turns coordinates into tokens."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,15 +11,18 @@ from gsmap.structures.grid import Array, BEVGrid
 
 @dataclass(frozen=True)
 class Canvas:
-    """A raster of W x H pixels over the map and a margin; tokens are 0 (stop) and coordinates + 1.
+    """Raster of W x H pixels over the map and a margin at its upper edges.
+
+    A coordinate is the token of its pixel number plus one; token 0 ends a sequence.
 
     Args:
-        grid: The map's extent.
-        pixel_m: Side of a pixel in metres, with the extent in place of that with the margin.
-        margin_m: Metres beyond the upper edges of the map that the canvas covers too.
+        grid: Extent of the map, in metres.
+        pixel_m: Side of a pixel in metres, > 0. The number of pixels is that of the extent without
+            the margin.
+        margin_m: Width in metres, >= 0, of the margin beyond the upper edges of the map.
 
     Raises:
-        ValueError: If the pixels do not divide the extent, or the margin is negative.
+        ValueError: If the pixels do not divide the extent, or if the margin is negative.
     """
 
     grid: BEVGrid
@@ -39,34 +42,47 @@ class Canvas:
 
     @property
     def steps(self) -> tuple[int, int]:
-        """Steps from the first coordinate to the last along x and y."""
+        """Steps from the first pixel to the last along x and y."""
         return self.size[0] - 1, self.size[1] - 1
 
     @property
     def num_tokens(self) -> int:
-        """Size of the vocabulary, one for x and y."""
+        """Size of the vocabulary, shared by x and y."""
         return max(self.size) + 1
 
     @property
     def settings(self) -> tuple[float, ...]:
-        """What targets and head must agree on."""
+        """Settings that must be equal in the targets and in the head."""
         return self.pixel_m, self.margin_m, *self.grid.x_range, *self.grid.y_range
 
     @cached_property
-    def _covered(self) -> BEVGrid:
-        low, high = np.transpose([self.grid.x_range, self.grid.y_range])
-        x_range, y_range = np.transpose([low, high + self.margin_m]).tolist()
-        return replace(self.grid, x_range=x_range, y_range=y_range)
+    def _grid_with_margin(self) -> BEVGrid:
+        x_low, x_high = self.grid.x_range
+        y_low, y_high = self.grid.y_range
+        return replace(
+            self.grid,
+            x_range=(x_low, x_high + self.margin_m),
+            y_range=(y_low, y_high + self.margin_m),
+        )
 
     def norm_from_metres(self, points: Array) -> Array:
         """Map metres to [0, 1] over the canvas. (..., 2)"""
-        return self._covered.norm_from_metres(points)
+        return self._grid_with_margin.norm_from_metres(points)
 
     def metres_from_norm(self, points: Array) -> Array:
         """Map [0, 1] over the canvas to metres. (..., 2)"""
-        return self._covered.metres_from_norm(points)
+        return self._grid_with_margin.metres_from_norm(points)
 
 
-def tokens_of(points: np.ndarray, steps: Sequence[int]) -> np.ndarray:
-    """Return points, [0, 1] over the canvas, as tokens x, y, x, y, ... and a stop. (2 n + 1,)"""
-    return np.append((points * steps).astype(np.int64) + 1, 0)
+def tokenize_points(points: np.ndarray, steps: Sequence[int]) -> np.ndarray:
+    """Turn points into the tokens x, y, x, y, ... and a stop token.
+
+    Args:
+        points: Points in [0, 1] over the canvas. (n, 2)
+        steps: Steps of the canvas along x and y (`Canvas.steps`).
+
+    Returns:
+        Tokens, the last of which is 0. (2 n + 1,)
+    """
+    pixels = (points * steps).astype(np.int64)
+    return np.append(pixels + 1, 0)

@@ -1,4 +1,4 @@
-"""VectorMapNet's element detector: elements as key points, the corners of their boxes."""
+"""VectorMapNet's element detector: map elements as key points, the corners of their boxes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,59 +26,89 @@ from gsmap.structures.tensors import constant
 _CORNERS = 2
 
 
-class CodedMap(nn.Module):
-    """BEV features in other channels, plus a code of their row and column."""
+class BEVEmbedding(nn.Module):
+    """Linear projection of BEV features plus an embedding of each cell's row and column.
+
+    Args:
+        in_channels: Channels C' of the BEV features.
+        embed_dims: Channels C of the result.
+    """
 
     def __init__(self, in_channels: int, embed_dims: int) -> None:
         super().__init__()
-        self.project = nn.Conv2d(in_channels, embed_dims, 1)
+        self.project = nn.Conv2d(in_channels, embed_dims, kernel_size=1)
         self.code = nn.Linear(2, embed_dims)
 
     def forward(self, bev_feats: Tensor) -> Tensor:
-        """Return the coded map. (B, C', H, W) -> (B, C, H, W)"""
-        axes = (torch.linspace(-1, 1, n, device=bev_feats.device) for n in bev_feats.shape[-2:])
-        places = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
-        return self.project(bev_feats) + self.code(places).permute(2, 0, 1)
+        """Embed BEV features. (B, C', H, W) -> (B, C, H, W)"""
+        height, width = bev_feats.shape[-2:]
+        rows = torch.linspace(-1, 1, height, device=bev_feats.device)
+        columns = torch.linspace(-1, 1, width, device=bev_feats.device)
+        cells = torch.stack(torch.meshgrid(rows, columns, indexing="ij"), dim=-1)  # (H, W, 2)
+        return self.project(bev_feats) + self.code(cells).permute(2, 0, 1)
 
 
 class KeyPointLayer(nn.Module):
-    """Self-attention of all key points, attention to the map, feed-forward network; pre-norm."""
+    """Decoder layer: self-attention of key points, attention to the map, feed-forward; pre-norm.
+
+    Args:
+        embed_dims: Channels C of the key points and of the map.
+        num_heads: Number of attention heads.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Probability of setting a value to zero in training, in [0, 1].
+    """
 
     def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float) -> None:
         super().__init__()
-        self.self_attn = nn.MultiheadAttention(embed_dims, num_heads, dropout, batch_first=True)
+        self.self_attn = nn.MultiheadAttention(
+            embed_dims, num_heads, dropout=dropout, batch_first=True
+        )
         self.dropout = nn.Dropout(dropout)
         self.cross_attn = BEVDeformableAttention(embed_dims, num_heads, dropout=dropout)
-        self.ffn = feed_forward(embed_dims, ffn_dims, dropout)
+        self.ffn = feed_forward(embed_dims, ffn_dims, dropout=dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(embed_dims) for _ in range(3))
 
     def forward(self, states: Tensor, pos: Tensor, reference: Tensor, context: Tensor) -> Tensor:
-        """Update the key points. (B, Q, C)"""
+        """Update the states of the key points.
+
+        Args:
+            states: States of the Q key points. (B, Q, C)
+            pos: Positional embeddings. (B, Q, C)
+            reference: Reference points in [0, 1] over the canvas. (B, Q, 2)
+            context: Embedded BEV features. (B, C, H, W)
+
+        Returns:
+            Updated states. (B, Q, C)
+        """
         value = self.norms[0](states)
         query = value + pos
-        shared, _ = self.self_attn(query, query, value, need_weights=False)
-        states = states + self.dropout(shared)
+        attended, _ = self.self_attn(query, query, value, need_weights=False)
+        states = states + self.dropout(attended)
         states = states + self.cross_attn(self.norms[1](states) + pos, reference, context)
         return self.ffn(self.norms[2](states), states)
 
 
 @dataclass(frozen=True)
 class KeyPointReference(Reference):
-    """What key points are: corners of boxes on the canvas, in pixels."""
+    """References of key points: box corners in pixels of the canvas.
+
+    Args:
+        canvas: Raster of the pixels.
+    """
 
     canvas: Canvas
 
     def decode(self, references: Tensor) -> Tensors:
-        """Return ``pts``, both corners in metres. (N, 2, 2)"""
+        """Decode corners in pixels (N, 2, 2) to ``pts``, both corners in metres. (N, 2, 2)"""
         return {"pts": self.canvas.metres_from_norm(references / self.size(references))}
 
     def size(self, like: Tensor) -> Tensor:
-        """Return the numbers of pixels. (2,)"""
+        """Return the numbers of pixels along x and y with the device and type of a tensor. (2,)"""
         return constant(like, self.canvas.size)
 
 
 class KeyPointPredictions(NamedTuple):
-    """What the detector says after a layer."""
+    """Predictions of one decoder layer of `KeyPointHead`."""
 
     scores: Tensor  # class logits (B, N, classes)
     references: Tensor  # corners in pixels of the canvas (B, N, 2, 2)
@@ -86,23 +116,26 @@ class KeyPointPredictions(NamedTuple):
 
 @MODELS.register_module()
 class KeyPointHead(DetectionHead):
-    """Detect map elements as two corners of their boxes (VectorMapNet's first stage).
+    """Head that detects map elements as two corners of their boxes (VectorMapNet's first stage).
 
-    Its detections are lines from one corner to the other. The targets are those of
-    `FormatPolylineTargets`.
+    A detection is a line from one corner to the other. `FormatPolylineTargets` adds the targets.
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map, in metres.
         classes: Names of the classes.
-        num_queries: Number of elements N.
-        in_channels: Channels of the BEV features.
+        num_queries: Number N of elements.
+        in_channels: Channels C' of the BEV features.
         embed_dims: Channels C of the key points.
-        decoder: ``num_layers``, ``num_heads``, ``ffn_dims``, ``dropout``.
+        decoder: Settings ``num_layers``, ``num_heads``, ``ffn_dims`` and ``dropout`` of the layers.
         canvas: Settings of `Canvas`.
-        cls_weight: Weight of the classes, in matching and losses.
-        box_weight: Weight of the corners, whose distances are in pixels.
+        cls_weight: Weight of the classification term in matching and loss.
+        box_weight: Weight of the corner distances, in pixels, in matching and loss.
         giou_weight: Weight of the generalised IoU in matching.
         coder: Settings of `MapCoder`.
+        init_cfg: Initialisation config of mmengine.
+
+    Raises:
+        ValueError: If ``coder`` sets ``unfold_classes``, which has no effect on boxes.
     """
 
     transforms = ("FormatPolylineTargets",)
@@ -123,117 +156,188 @@ class KeyPointHead(DetectionHead):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.grid, self.classes = grid, tuple(classes)
+        self.grid = grid
+        self.classes = tuple(classes)
         self.reference: KeyPointReference = KeyPointReference(Canvas(grid, **(canvas or {})))
-        choice: PARTS = {"max_num": 35, "margin_m": None, **(coder or {})}
-        self.coder = MapCoder(grid, **choice)
+        coder_settings: PARTS = {"max_num": 35, "margin_m": None, **(coder or {})}
+        self.coder = MapCoder(grid, **coder_settings)
         if self.coder.unfold_classes:
             raise ValueError("coder.unfold_classes has no effect on boxes: leave it out.")
-        settings: PARTS = {"num_layers": 6, "num_heads": 8, "ffn_dims": 512, "dropout": 0.1}
-        settings |= decoder or {}
-        num_layers = settings.pop("num_layers")
-        self.context = CodedMap(in_channels, embed_dims)
+        layer_settings: PARTS = {"num_heads": 8, "ffn_dims": 512, "dropout": 0.1, "num_layers": 6}
+        layer_settings |= decoder or {}
+        num_layers = layer_settings.pop("num_layers")
+        self.context = BEVEmbedding(in_channels, embed_dims)
         self.elements = nn.Embedding(num_queries, 2 * embed_dims)
         self.corners = nn.Embedding(_CORNERS, 2 * embed_dims)
         self.initial = nn.Linear(embed_dims, 2)
         self.layers = nn.ModuleList(
-            KeyPointLayer(embed_dims, **settings) for _ in range(num_layers)
+            KeyPointLayer(embed_dims, **layer_settings) for _ in range(num_layers)
         )
         self.cls_branch = nn.Linear(_CORNERS * embed_dims, len(classes))
-        self.corner_branch = classification_branch(embed_dims, 2)
-        focal = {"type": "mmdet.FocalLoss", "use_sigmoid": True, "loss_weight": cls_weight}
-        self.loss_cls = MODELS.build(focal)
+        self.corner_branch = classification_branch(embed_dims, num_classes=2)
+        focal_loss = {"type": "mmdet.FocalLoss", "use_sigmoid": True, "loss_weight": cls_weight}
+        self.loss_cls = MODELS.build(focal_loss)
         self.cost_cls = TASK_UTILS.build({"type": "mmdet.FocalLossCost", "weight": cls_weight})
-        self.box_weight, self.giou_weight = box_weight, giou_weight
+        self.box_weight = box_weight
+        self.giou_weight = giou_weight
 
     def init_weights(self) -> None:
-        """Initialise the layers' matrices (Xavier), and let every class be unlikely."""
+        """Initialise matrices with Xavier's method and the class bias at a probability of 1 %."""
         super().init_weights()
-        for part in (self.layers, self.context, self.initial):
-            init_matrices(part)
+        for module in (self.layers, self.context, self.initial):
+            init_matrices(module)
         nn.init.constant_(self.cls_branch.bias, bias_init_with_prob(0.01))
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the transform that follow from those of the canvas."""
+        """Return the settings of `FormatPolylineTargets` that follow from the head's settings."""
         return dict(settings["canvas"] or {})
 
     def forward(self, bev_outputs: Tensors) -> list[KeyPointPredictions]:
-        """Predict the elements after every layer, from ``bev_feats`` (B, C', H, W)."""
+        """Predict the elements after every layer from ``bev_feats``. (B, C', H, W)"""
         context = self.context(bev_outputs["bev_feats"])
-        queries = self.elements.weight[:, None] + self.corners.weight  # (N, 2, 2 C)
-        queries = queries.flatten(0, 1).expand(len(context), -1, -1)
-        pos, states = queries.chunk(2, -1)
+        embeddings = self.elements.weight[:, None] + self.corners.weight  # (N, 2, 2 C)
+        embeddings = embeddings.flatten(0, 1).expand(len(context), -1, -1)  # (B, N * 2, 2 C)
+        pos, states = embeddings.chunk(2, dim=-1)
         start = self.initial(pos).float()
-        reference, outputs = start.sigmoid(), []
+        reference = start.sigmoid()
+        outputs = []
         for layer in self.layers:
-            states = layer(states, pos, reference, context)
+            states = layer(states, pos, reference=reference, context=context)
             outputs.append(self.predictions(states, start))
         return outputs
 
     def predictions(self, states: Tensor, start: Tensor) -> KeyPointPredictions:
-        """Return the scores and corners of key points (B, N * 2, C) that start somewhere."""
-        by_element = states.unflatten(1, (-1, _CORNERS))
-        corners = (self.corner_branch(states).float() + start).sigmoid()
-        corners = (corners * self.reference.size(corners)).unflatten(1, (-1, _CORNERS))
-        return KeyPointPredictions(self.cls_branch(by_element.flatten(2)).float(), corners)
+        """Predict class scores and corners from the states of the key points.
+
+        Args:
+            states: States of the key points. (B, N * 2, C)
+            start: Logits of the initial corners, to which offsets are added. (B, N * 2, 2)
+        """
+        element_states = states.unflatten(1, (-1, _CORNERS)).flatten(2)  # (B, N, 2 C)
+        corners_norm = (self.corner_branch(states).float() + start).sigmoid()
+        corners_px = corners_norm * self.reference.size(corners_norm)
+        return KeyPointPredictions(
+            scores=self.cls_branch(element_states).float(),
+            references=corners_px.unflatten(1, (-1, _CORNERS)),
+        )
 
     def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
-        """Run the head and return its losses, sums of all layers."""
+        """Compute ``loss_cls`` and ``loss_box``, each summed over the layers.
+
+        Args:
+            bev_outputs: Outputs of the BEV encoder: ``bev_feats``. (B, C', H, W)
+            batch_data_samples: Samples with the targets of `FormatPolylineTargets`.
+
+        Raises:
+            ValueError: If a sample has no targets, or targets of another canvas.
+            FloatingPointError: If a matching cost is not finite.
+        """
         outputs = self(bev_outputs)
-        truths = [targets_of(sample, self.reference.canvas) for sample in batch_data_samples]
+        truths = [get_targets(sample, self.reference.canvas) for sample in batch_data_samples]
         tokens = [str(sample.metainfo.get("token")) for sample in batch_data_samples]
+        cls_terms = []
+        box_terms = []
         with torch.autocast(bev_outputs["bev_feats"].device.type, enabled=False):
-            layers = [self.layer_losses(output, truths, tokens) for output in outputs]
-        cls, box = (torch.stack(terms).sum() for terms in zip(*layers, strict=True))
-        return {"loss_cls": cls, "loss_box": box}
+            for output in outputs:
+                loss_cls, loss_box = self.layer_losses(output, truths, tokens=tokens)
+                cls_terms.append(loss_cls)
+                box_terms.append(loss_box)
+        return {"loss_cls": torch.stack(cls_terms).sum(), "loss_box": torch.stack(box_terms).sum()}
 
     def layer_losses(
         self, output: KeyPointPredictions, truths: Sequence[InstanceData], tokens: Sequence[str]
     ) -> tuple[Tensor, Tensor]:
-        """Return the losses of classes and of corners of a layer."""
-        scores, boxes = output.scores.float(), output.references.float().flatten(2)
-        pairs = [self.match(*case) for case in zip(scores, boxes, truths, tokens, strict=True)]
+        """Compute the classification loss and the corner loss of one layer.
+
+        Args:
+            output: Predictions of the layer.
+            truths: Targets of each sample. (B,)
+            tokens: Token of each sample, for error messages. (B,)
+
+        Returns:
+            Weighted scalars, averaged over the matched elements of the batch.
+        """
+        scores = output.scores.float()
+        boxes = output.references.float().flatten(2)
         labels = torch.full_like(scores[..., 0], len(self.classes), dtype=torch.long)
-        off = []
-        for i, ((rows, cols), truth) in enumerate(zip(pairs, truths, strict=True)):
+        num_matches = 0
+        distances = []
+        for i, truth in enumerate(truths):
+            rows, cols = self.match(scores[i], boxes[i], truth=truth, token=tokens[i])
+            num_matches += len(rows)
             labels[i, rows] = truth.labels_3d[cols]
-            off.append(
-                F.smooth_l1_loss(boxes[i, rows], truth.keypoints[cols], beta=0.5, reduction="sum")
+            distance = F.smooth_l1_loss(
+                boxes[i, rows], truth.keypoints[cols], beta=0.5, reduction="sum"
             )
-        number = max(sum(len(rows) for rows, _ in pairs), 1)
-        cls = self.loss_cls(scores.flatten(0, 1), labels.flatten(), avg_factor=number)
-        return cls, self.box_weight * torch.stack(off).sum() / (2 * _CORNERS * number)
+            distances.append(distance)
+        number = max(num_matches, 1)
+        loss_cls = self.loss_cls(scores.flatten(0, 1), labels.flatten(), avg_factor=number)
+        loss_box = self.box_weight * torch.stack(distances).sum() / (2 * _CORNERS * number)
+        return loss_cls, loss_box
 
     @torch.no_grad()
     def match(
         self, scores: Tensor, boxes: Tensor, truth: InstanceData, token: str
     ) -> tuple[Tensor, Tensor]:
-        """Match a sample's boxes in pixels; FloatingPointError if a cost is not finite."""
-        costs = self.costs(scores, boxes, truth).cpu()
-        rows, cols = assigned(costs, ["class scores", "corners", "overlaps"], {"token": token})
+        """Match predicted elements of one sample to annotated ones.
+
+        Args:
+            scores: Class logits. (N, classes)
+            boxes: Corners x0, y0, x1, y1 in pixels of the canvas. (N, 4)
+            truth: Targets of the sample, K elements.
+            token: Token of the sample, for error messages.
+
+        Returns:
+            Indices of the predictions and of their annotated elements. (min(N, K),) each
+
+        Raises:
+            FloatingPointError: If a matching cost is not finite.
+        """
+        costs = self.costs(scores, boxes, truth=truth).cpu()
+        names = ["class scores", "corners", "overlaps"]
+        rows, cols = assigned(costs, names, img_meta={"token": token})
         return rows.to(boxes.device), cols.to(boxes.device)
 
     def costs(self, scores: Tensor, boxes: Tensor, truth: InstanceData) -> Tensor:
-        """Return the costs of classes, corners and overlaps. (3, N, K)"""
-        predicted, annotated = InstanceData(scores=scores), InstanceData(labels=truth.labels_3d)
-        apart = torch.cdist(boxes, truth.keypoints, p=1)
+        """Compute the matching costs of every prediction with every annotated element.
+
+        Args:
+            scores: Class logits. (N, classes)
+            boxes: Corners x0, y0, x1, y1 in pixels of the canvas. (N, 4)
+            truth: Targets of the sample, K elements.
+
+        Returns:
+            Weighted costs of classes, corner distances and overlaps. (3, N, K)
+        """
+        predicted = InstanceData(scores=scores)
+        annotated = InstanceData(labels=truth.labels_3d)
+        distance = torch.cdist(boxes, truth.keypoints, p=1)
         overlap = bbox_overlaps(boxes, truth.keypoints, mode="giou")
-        cls = self.cost_cls(predicted, annotated)
-        return torch.stack([cls, self.box_weight * apart, -self.giou_weight * overlap])
+        cls_cost = self.cost_cls(predicted, annotated)
+        return torch.stack([cls_cost, self.box_weight * distance, -self.giou_weight * overlap])
 
 
-def targets_of(sample: Det3DDataSample, canvas: Canvas) -> InstanceData:
-    """Return a sample's targets; ValueError if they are of another kind or of another canvas."""
+def get_targets(sample: Det3DDataSample, canvas: Canvas) -> InstanceData:
+    """Return the targets of `FormatPolylineTargets` of a sample.
+
+    Args:
+        sample: Training sample.
+        canvas: Canvas of the head.
+
+    Raises:
+        ValueError: If the sample has no such targets, or if their canvas differs.
+    """
     instances = sample.get("gt_instances_3d", InstanceData())
     if "keypoints" not in instances:
         raise ValueError(
             f"sample {sample.metainfo.get('token')!r} has no key points: add FormatPolylineTargets "
             "to the training pipeline."
         )
-    if tuple(instances.metainfo["canvas"]) != canvas.settings:
+    target_settings = tuple(instances.metainfo["canvas"])
+    if target_settings != canvas.settings:
         raise ValueError(
-            f"FormatPolylineTargets has the canvas {tuple(instances.metainfo['canvas'])} (pixel_m, "
+            f"FormatPolylineTargets has the canvas {target_settings} (pixel_m, "
             f"margin_m, ranges), the head {canvas.settings}: give both the same pixel_m and "
             "margin_m."
         )

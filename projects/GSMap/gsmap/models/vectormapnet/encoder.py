@@ -1,4 +1,4 @@
-"""VectorMapNet's BEV encoder: image features where planes of several heights are seen."""
+"""VectorMapNet's BEV encoder, which samples image features at horizontal planes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -18,15 +18,19 @@ from gsmap.structures.grid import BEVGrid
 
 @MODELS.register_module()
 class HeightPlanesEncoder(CameraEncoder):
-    """Mean features of all cameras at points of planes, side by side, and a neck of stride 4.
+    """BEV encoder that averages the image features of all cameras at points of horizontal planes.
+
+    The planes are concatenated along the channels and reduced by a neck of stride 4.
 
     Args:
-        grid: The map's extent.
-        heights_m: Heights Z of the planes above the ground.
-        bev_pixel_m: Distance of a plane's points; its outermost lie on the edges of the map.
-        embed_dims: Channels C of image and of BEV features.
-        num_levels: Levels of image features, each half as large as the one before.
-        neck_dims: Channels inside the neck.
+        grid: Extent of the map, in metres.
+        heights_m: Heights of the Z planes above the ground, in metres.
+        bev_pixel_m: Approximate distance of neighbouring points of a plane, in metres. The
+            outermost points lie on the edges of the map.
+        embed_dims: Channels C of the image features and of the BEV features.
+        num_levels: Number of levels of image features, each half as large as the previous one.
+        neck_dims: Hidden channels of the neck.
+        init_cfg: Initialisation config of mmengine.
     """
 
     calibration = ("img_from_ground",)
@@ -42,42 +46,64 @@ class HeightPlanesEncoder(CameraEncoder):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.grid, self.num_levels = grid.rasterized(bev_pixel_m), num_levels
+        self.grid = grid.rasterized(bev_pixel_m)
+        self.num_levels = num_levels
         norm = {"type": "GN", "num_groups": min(32, embed_dims)}
-        self.upsampling = nn.ModuleList(
-            nn.ModuleList(
-                ConvModule(embed_dims, embed_dims, 3, padding=1, bias=True, norm_cfg=norm)
-                for _ in range(level)
-            )
-            for level in range(1, num_levels)
-        )
-        self.reduction = nn.Conv2d(len(heights_m) * (embed_dims + 3), embed_dims, 3, padding=1)
-        stem, stages = resnet_stages(BasicBlock, embed_dims, [neck_dims])
-        last = nn.Conv2d(neck_dims, embed_dims, 1, bias=False)
-        self.neck = nn.Sequential(*stem, nn.MaxPool2d(3, 2, 1), *stages, last)
-        axes = zip((grid.y_range, grid.x_range), (self.grid.height, self.grid.width), strict=True)
-        y, x = (torch.linspace(*ends, number) for ends, number in axes)
-        z, y, x = torch.meshgrid(torch.tensor(heights_m), y, x, indexing="ij")
+        self.upsampling = nn.ModuleList()
+        for level in range(1, num_levels):
+            blocks = nn.ModuleList()
+            for _ in range(level):
+                block = ConvModule(embed_dims, embed_dims, 3, padding=1, bias=True, norm_cfg=norm)
+                blocks.append(block)
+            self.upsampling.append(blocks)
+        plane_channels = len(heights_m) * (embed_dims + 3)
+        self.reduction = nn.Conv2d(plane_channels, embed_dims, kernel_size=3, padding=1)
+        stem, stages = resnet_stages(BasicBlock, embed_dims, widths=[neck_dims])
+        pooling = nn.MaxPool2d(3, stride=2, padding=1)
+        projection = nn.Conv2d(neck_dims, embed_dims, kernel_size=1, bias=False)
+        self.neck = nn.Sequential(*stem, pooling, *stages, projection)
+        z = torch.tensor(heights_m)
+        y = torch.linspace(grid.y_range[0], grid.y_range[1], steps=self.grid.height)
+        x = torch.linspace(grid.x_range[0], grid.x_range[1], steps=self.grid.width)
+        z, y, x = torch.meshgrid(z, y, x, indexing="ij")
         self.planes: Tensor
         self.register_buffer("planes", torch.stack([x, y, z]), persistent=False)  # (3, Z, H, W)
 
     def levels(self, mlvl_feats: Sequence[Tensor]) -> list[Tensor]:
-        """Return the first levels."""
+        """Return the first ``num_levels`` levels of image features."""
         return list(mlvl_feats[: self.num_levels])
 
     def encode(
         self, feats: Sequence[Tensor], calibration: Mapping[str, Tensor], img_shape: tuple[int, int]
     ) -> dict[str, Any]:
-        """Encode feature maps, each (B, V, C, h, w), with ``img_from_ground`` (B, V, 4, 4)."""
-        seen = self.project(calibration["img_from_ground"], img_shape)
-        planes = self.sampled(self.joined(feats), seen)
-        return {"bev_feats": self.neck(self.flattened(planes))}
+        """Encode image features to BEV features.
 
-    def joined(self, feats: Sequence[Tensor]) -> Tensor:
-        """Return the sum of all levels at the size of the first. (B, V, C, h, w)
+        Args:
+            feats: Levels of image features, the finest first. (B, V, C, h, w) each
+            calibration: ``img_from_ground``, transforms from the ground frame in metres to pixels.
+                (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
 
-        Each level is enlarged to that of the next finer one, and so on. ValueError if there are
-        fewer levels than the encoder is built for.
+        Returns:
+            ``bev_feats``. (B, C, H / 4, W / 4)
+        """
+        projection = self.project(calibration["img_from_ground"], img_shape)
+        planes = self.sample_planes(self.merge_levels(feats), projection)
+        return {"bev_feats": self.neck(self.flatten_planes(planes))}
+
+    def merge_levels(self, feats: Sequence[Tensor]) -> Tensor:
+        """Sum all levels at the size of the first one.
+
+        Each level is enlarged step by step through the sizes of the finer levels.
+
+        Args:
+            feats: Levels of image features, the finest first. (B, V, C, h, w) each
+
+        Returns:
+            Sum of the levels. (B, V, C, h, w)
+
+        Raises:
+            ValueError: If the number of levels differs from ``num_levels``.
         """
         if len(feats) != self.num_levels:
             raise ValueError(
@@ -87,7 +113,7 @@ class HeightPlanesEncoder(CameraEncoder):
             )
         sizes = [level.shape[-2:] for level in feats]
         total = feats[0].flatten(0, 1)
-        for number, blocks in enumerate(cast(Any, self.upsampling), 1):
+        for number, blocks in enumerate(cast(Any, self.upsampling), start=1):
             image = feats[number].flatten(0, 1)
             for block, size in zip(blocks, reversed(sizes[:number]), strict=True):
                 image = enlarged(block(image), size)
@@ -95,23 +121,46 @@ class HeightPlanesEncoder(CameraEncoder):
         return total.unflatten(0, feats[0].shape[:2])
 
     def project(self, img_from_ground: Tensor, img_shape: tuple[int, int]) -> PillarProjection:
-        """Project every point of the planes, each a pillar of one point. Q = Z * H * W"""
-        points = F.pad(self.planes.flatten(1).T, (0, 1), value=1.0)
-        return project_pillars(points[:, None], img_from_ground, img_shape)
+        """Project the Q = Z * H * W points of the planes, each as a pillar of one point.
 
-    def sampled(self, feats: Tensor, seen: PillarProjection) -> Tensor:
-        """Return the mean over the cameras that see a point, 0 if none. (B, C, Z, H, W)"""
-        shape = self.planes.shape[1:]
+        Args:
+            img_from_ground: Transforms from the ground frame in metres to pixels. (B, V, 4, 4)
+            img_shape: Rows and columns of the padded images.
+        """
+        points = F.pad(self.planes.flatten(1).T, (0, 1), value=1.0)  # (Q, 4)
+        return project_pillars(points[:, None], img_from_ground, img_shape=img_shape)
+
+    def sample_planes(self, feats: Tensor, projection: PillarProjection) -> Tensor:
+        """Average the features of all cameras in which a point is visible.
+
+        Args:
+            feats: Image features. (B, V, C, h, w)
+            projection: Projection of the points of the planes, from `project`.
+
+        Returns:
+            Mean features, 0 where no camera covers the point. (B, C, Z, H, W)
+        """
+        num_planes, height, width = self.planes.shape[1:]
+        visible = projection.visible  # (B, V, Q)
+        uv = 2 * projection.uv[..., 0, :] - 1  # [-1, 1] over the image, (B, V, Q, 2)
+        uv = uv.where(visible[..., None], -2.0)
         total = feats.new_zeros(())
-        uv = (2 * seen.uv[..., 0, :] - 1).where(seen.visible[..., None], -2.0)  # (B, V, Q, 2)
         for view in range(feats.shape[1]):
-            grid = uv[:, view].unflatten(1, (-1, shape[-1])).to(feats.dtype)  # (B, Z * H, W, 2)
-            image = F.grid_sample(feats[:, view], grid, align_corners=False)
-            total = total + image * seen.visible[:, view].view(-1, 1, *grid.shape[1:3])
-        number = seen.visible.sum(1).clamp(min=1).view(-1, 1, *shape)
-        return total.unflatten(2, shape[:2]) / number
+            grid = uv[:, view].unflatten(1, (-1, width)).to(feats.dtype)  # (B, Z * H, W, 2)
+            sampled = F.grid_sample(feats[:, view], grid, align_corners=False)  # (B, C, Z * H, W)
+            mask = visible[:, view].view(-1, 1, num_planes * height, width)
+            total = total + sampled * mask
+        num_views = visible.sum(dim=1).clamp(min=1).view(-1, 1, num_planes, height, width)
+        return total.unflatten(2, (num_planes, height)) / num_views
 
-    def flattened(self, planes: Tensor) -> Tensor:
-        """Return one map of all planes, which know where they lie. -> (B, C, H, W)"""
-        places = self.planes.expand(len(planes), -1, -1, -1, -1).to(planes.dtype)
-        return self.reduction(torch.cat([planes, places], 1).flatten(1, 2))
+    def flatten_planes(self, planes: Tensor) -> Tensor:
+        """Merge the features and the coordinates of all planes into one map.
+
+        Args:
+            planes: Features at the points of the planes. (B, C, Z, H, W)
+
+        Returns:
+            BEV features before the neck. (B, C, H, W)
+        """
+        coordinates = self.planes.expand(len(planes), -1, -1, -1, -1).to(planes.dtype)
+        return self.reduction(torch.cat([planes, coordinates], dim=1).flatten(1, 2))

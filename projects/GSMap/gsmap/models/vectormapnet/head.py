@@ -1,4 +1,4 @@
-"""VectorMapNet's head: a detector of elements, and a generator of their polylines."""
+"""VectorMapNet's head: a detector of elements and a generator of their polylines."""
 
 import zlib
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from torch import Tensor
 from gsmap.models.base.coder import DetectionHead, Samples, Tensors
 from gsmap.models.base.parts import PARTS
 from gsmap.models.vectormapnet.canvas import Canvas
-from gsmap.models.vectormapnet.detector import KeyPointHead, targets_of
+from gsmap.models.vectormapnet.detector import KeyPointHead, get_targets
 from gsmap.models.vectormapnet.generator import Elements, PolylineGenerator
 from gsmap.structures.grid import BEVGrid
 from gsmap.structures.tensors import constant
@@ -20,18 +20,19 @@ from gsmap.structures.tensors import constant
 
 @MODELS.register_module()
 class VectorMapNetHead(DetectionHead):
-    """Detect elements with any head, and generate a polyline in each one's box.
+    """Head that detects elements with another head and generates a polyline in each box.
 
-    Lines take class and score of their element; one without two points is left out.
+    A line has the class and the score of its element. Lines of fewer than two points are dropped.
 
     Args:
-        grid: The map's extent.
+        grid: Extent of the map, in metres.
         classes: Names of the classes.
-        detector: The head of the elements: `KeyPointHead` by default, or any other. Its boxes are
-            those that it predicts (`KeyPointHead`), or those around its points.
+        detector: Settings of the head that detects the elements, by default `KeyPointHead`. With
+            any other head, the boxes are the bounding boxes of its points.
         generator: Settings of `PolylineGenerator`.
         canvas: Settings of `Canvas`.
         loss_weight: Weight of the generator's loss.
+        init_cfg: Initialisation config of mmengine.
 
     Raises:
         ValueError: If the detector is a `KeyPointHead` with another canvas.
@@ -55,78 +56,118 @@ class VectorMapNetHead(DetectionHead):
         init_cfg: dict | None = None,
     ) -> None:
         super().__init__(init_cfg)
-        self.grid, self.classes, self.loss_weight = grid, tuple(classes), loss_weight
+        self.grid = grid
+        self.classes = tuple(classes)
+        self.loss_weight = loss_weight
         self.canvas = Canvas(grid, **(canvas or {}))
-        first: PARTS = {"type": "KeyPointHead", "grid": grid, "classes": classes}
-        first |= detector or {}
-        if first["type"] == "KeyPointHead":
-            first = {"canvas": canvas, **first}
-        self.detector: DetectionHead = MODELS.build(first)
-        other = self.canvas
+        detector_settings: PARTS = {"type": "KeyPointHead", "grid": grid, "classes": classes}
+        detector_settings |= detector or {}
+        if detector_settings["type"] == "KeyPointHead":
+            detector_settings = {"canvas": canvas, **detector_settings}
+        self.detector: DetectionHead = MODELS.build(detector_settings)
+        detector_canvas = self.canvas
         if isinstance(self.detector, KeyPointHead):
-            other = self.detector.reference.canvas
-        if other != self.canvas:
+            detector_canvas = self.detector.reference.canvas
+        if detector_canvas != self.canvas:
             raise ValueError(
-                f"the detector's canvas {other.settings} is not the generator's "
+                f"the detector's canvas {detector_canvas.settings} is not the generator's "
                 f"{self.canvas.settings}: give canvas to VectorMapNetHead alone."
             )
-        second: PARTS = {"canvas": self.canvas, "num_classes": len(classes), **(generator or {})}
-        self.generator = PolylineGenerator(**second)
+        generator_settings: PARTS = {"canvas": self.canvas, "num_classes": len(classes)}
+        generator_settings |= generator or {}
+        self.generator = PolylineGenerator(**generator_settings)
 
     @classmethod
     def target_settings(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the transform that follow from those of the canvas."""
+        """Return the settings of `FormatPolylineTargets` that follow from the head's settings."""
         return dict(settings["canvas"] or {})
 
     def fit_state(self, state: dict[str, Tensor], prefix: str) -> None:
-        """Fit a checkpoint's state to the detector's, in place."""
+        """Fit the state of a checkpoint to the detector, in place."""
         self.detector.fit_state(state, f"{prefix}detector.")
 
     def forward(self, bev_outputs: Tensors) -> Sequence[object]:
-        """Return the detector's predictions."""
+        """Return the predictions of the detector."""
         return self.detector(bev_outputs)
 
     def loss(self, bev_outputs: Tensors, batch_data_samples: Samples) -> Tensors:
-        """Return the losses of both stages; annotated boxes condition the lines."""
+        """Compute the losses of the detector and ``loss_seq``, the loss of the generator.
+
+        The generator is trained on annotated boxes.
+
+        Args:
+            bev_outputs: Outputs of the BEV encoder: ``bev_feats``. (B, C', H, W)
+            batch_data_samples: Samples with the targets of `FormatPolylineTargets`.
+
+        Raises:
+            ValueError: If a sample has no targets, or targets of another canvas.
+        """
         losses = self.detector.loss(bev_outputs, batch_data_samples)
-        truths = [targets_of(sample, self.canvas) for sample in batch_data_samples]
-        own = [
-            self.generator.loss(
-                feats,
-                Elements(truth.labels_3d, truth.keypoint_tokens),
-                truth.tokens,
-                truth.token_weights,
+        truths = [get_targets(sample, self.canvas) for sample in batch_data_samples]
+        sequence_losses = []
+        for feats, truth in zip(bev_outputs["bev_feats"], truths, strict=True):
+            elements = Elements(truth.labels_3d, truth.keypoint_tokens)
+            sequence_loss = self.generator.loss(
+                feats, elements, tokens=truth.tokens, weights=truth.token_weights
             )
-            for feats, truth in zip(bev_outputs["bev_feats"], truths, strict=True)
-        ]
-        weight = torch.cat([truth.token_weights.flatten() for truth in truths]).sum()
-        seq = torch.stack(own).sum() / weight.clamp(min=1e-6)
-        return losses | {"loss_seq": self.loss_weight * seq}
+            sequence_losses.append(sequence_loss)
+        total_weight = torch.cat([truth.token_weights.flatten() for truth in truths]).sum()
+        loss_seq = torch.stack(sequence_losses).sum() / total_weight.clamp(min=1e-6)
+        return losses | {"loss_seq": self.loss_weight * loss_seq}
 
     def predict(self, bev_outputs: Tensors, batch_data_samples: Samples) -> list[InstanceData]:
-        """Return the lines of each sample, best first: ``pts`` (M, P, 2), ``num_pts`` (M,)."""
-        found = self.detector.predict(bev_outputs, batch_data_samples)
-        cases = zip(bev_outputs["bev_feats"], found, batch_data_samples, strict=True)
-        return [self.drawn(feats, each, sample.metainfo) for feats, each, sample in cases]
+        """Predict the lines of each sample, the highest score first.
 
-    def drawn(self, feats: Tensor, found: InstanceData, meta: Mapping[str, object]) -> InstanceData:
-        """Return the lines of a sample's elements, by draws that its token alone decides."""
+        Args:
+            bev_outputs: Outputs of the BEV encoder: ``bev_feats``. (B, C', H, W)
+            batch_data_samples: Samples of the batch.
+
+        Returns:
+            For each sample ``pts`` in metres (M, P, 2), ``num_pts`` (M,), ``labels_3d`` (M,) and
+            ``scores_3d`` (M,).
+        """
+        detections = self.detector.predict(bev_outputs, batch_data_samples)
+        results = []
+        for i, sample in enumerate(batch_data_samples):
+            lines = self.generate_lines(
+                bev_outputs["bev_feats"][i], detections[i], meta=sample.metainfo
+            )
+            results.append(lines)
+        return results
+
+    def generate_lines(
+        self, feats: Tensor, detections: InstanceData, meta: Mapping[str, object]
+    ) -> InstanceData:
+        """Generate the lines of one sample's elements, with its token as the random seed.
+
+        Args:
+            feats: BEV features of the sample. (C', H, W)
+            detections: Elements of the detector: ``pts``, ``labels_3d`` and ``scores_3d``.
+            meta: Metadata of the sample: ``token``.
+
+        Returns:
+            Lines of two or more points: ``pts`` in metres (M, P, 2), ``num_pts`` (M,),
+            ``labels_3d`` (M,) and ``scores_3d`` (M,).
+        """
         seed = zlib.crc32(str(meta.get("token")).encode())
-        elements = Elements(found.labels_3d, self.boxes(found))
+        elements = Elements(detections.labels_3d, self.boxes(detections))
         with torch.autocast(feats.device.type, enabled=False):
             draw = self.generator.seeded_draw(seed)
-            tokens = self.generator.generate(feats.float(), elements, draw)
+            tokens = self.generator.generate(feats.float(), elements, draw=draw)
         points, number = self.generator.lines(tokens)
         lines = InstanceData(
-            pts=points, num_pts=number, labels_3d=found.labels_3d, scores_3d=found.scores_3d
+            pts=points,
+            num_pts=number,
+            labels_3d=detections.labels_3d,
+            scores_3d=detections.scores_3d,
         )
         return lines[number > 1]
 
-    def boxes(self, found: InstanceData) -> Tensor:
-        """Return the boxes of elements in whole pixels of the canvas. (n, 4)"""
-        corners = self.canvas.norm_from_metres(found.pts[..., :2])
+    def boxes(self, detections: InstanceData) -> Tensor:
+        """Return the boxes of elements, x0, y0, x1, y1 in whole pixels of the canvas. (n, 4)"""
+        corners = self.canvas.norm_from_metres(detections.pts[..., :2])
         if not isinstance(self.detector, KeyPointHead):
-            corners = torch.stack([corners.amin(1), corners.amax(1)], 1)
+            corners = torch.stack([corners.amin(dim=1), corners.amax(dim=1)], dim=1)
         size = constant(corners, self.canvas.size)
         pixels = (corners * size).round().clamp(min=0).minimum(size)
         return pixels.long().flatten(1)

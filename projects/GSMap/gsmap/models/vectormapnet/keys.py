@@ -1,4 +1,4 @@
-"""The table between VectorMapNet's state keys and ours."""
+"""Mapping between the state keys of the released VectorMapNet and of this project."""
 
 import torch
 
@@ -17,7 +17,9 @@ VECTORMAPNET = KeyMap(
     "vectormapnet",
     (
         *rules_of("backbone.", "", "img_backbone. img_neck."),
-        *((f"backbone.upsample.fscale.{n + 1}.", f"bev_encoder.upsampling.{n}.") for n in range(3)),
+        ("backbone.upsample.fscale.1.", "bev_encoder.upsampling.0."),
+        ("backbone.upsample.fscale.2.", "bev_encoder.upsampling.1."),
+        ("backbone.upsample.fscale.3.", "bev_encoder.upsampling.2."),
         ("backbone.outconvs.", "bev_encoder.reduction."),
         ("neck.", "bev_encoder.neck."),
         *rules_of(
@@ -49,19 +51,19 @@ VECTORMAPNET = KeyMap(
         ),
     ),
     {
-        # settings: points of the planes, pixels of the canvas, and two of the noise in training
+        # settings: points of the planes, pixels of the canvas, and two settings of the noise
         "backbone.bev_planes": torch.stack((_PLANES[2], _PLANES[1], _PLANES[0]), -1),
         _ELEMENTS + "canvas_size": torch.tensor((200, 100)),
         _LINES + "canvas_size": torch.tensor((200, 100)),
         "head.augmentation.canvas_size": torch.tensor((200, 100)),
         "head.augmentation.shift_scale": None,
         "head.augmentation.scaling_size": None,
-        # trained without effect: a table that is never read, codes of the one level and of labels
+        # parameters without effect: an unused table, embeddings of the only level and of the labels
         "backbone.masked_embeds.weight": torch.zeros(()).expand(4, 128),
         **zeros(_ELEMENTS, {"transformer.level_embeds": (1, 256), "label_embed.weight": (3, 256)}),
     },
     markers=((_LINES, "map_head.generator."),),
-    idle=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",  # further names of the branch of index 0
+    idle=r"head\.det_net\.pre_branches\.(cls|reg)\.[1-9]",  # aliases of the branch of index 0
     sign=_LINES,
 )
 

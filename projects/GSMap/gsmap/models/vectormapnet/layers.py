@@ -1,46 +1,69 @@
-"""Layers of VectorMapNet's polyline generator, whose keys and values can be kept."""
+"""Layers of VectorMapNet's polyline generator, with cached keys and values."""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-Cache = tuple[Tensor, Tensor]  # keys and values, by head (n, heads, S, C / heads)
+Cache = tuple[Tensor, Tensor]  # keys and values, split by head (n, heads, S, C / heads) each
 
 
 class CachedAttention(nn.MultiheadAttention):
-    """Multi-head attention to keys and values that were computed before."""
+    """Multi-head attention to keys and values that are computed in advance.
+
+    Takes the arguments of `torch.nn.MultiheadAttention`.
+    """
 
     def keys_values(self, tokens: Tensor) -> Cache:
-        """Return keys and values of tokens. (n, S, C)"""
+        """Compute the keys and values of tokens. (n, S, C)"""
         C = self.embed_dim
-        both = F.linear(tokens, self.in_proj_weight[C:], self.in_proj_bias[C:]).chunk(2, -1)
-        keys, values = (self.by_head(part) for part in both)
-        return keys, values
+        projected = F.linear(tokens, self.in_proj_weight[C:], self.in_proj_bias[C:])
+        keys, values = projected.chunk(2, dim=-1)
+        return self.split_heads(keys), self.split_heads(values)
 
     def forward(self, query: Tensor, cache: Cache, mask: Tensor | None = None) -> Tensor:  # type: ignore[override]
-        """Attend to what is kept; the mask says which tokens a query sees. (n, T, C)"""
-        C = self.embed_dim
-        query = self.by_head(F.linear(query, self.in_proj_weight[:C], self.in_proj_bias[:C]))
-        dropout = self.dropout if self.training else 0.0
-        seen = F.scaled_dot_product_attention(query, *cache, mask, dropout)
-        return self.out_proj(seen.transpose(1, 2).flatten(2))
+        """Attend to cached keys and values.
 
-    def by_head(self, tokens: Tensor) -> Tensor:
+        Args:
+            query: Query tokens. (n, T, C)
+            cache: Keys and values of S tokens. (n, heads, S, C / heads) each
+            mask: True where a query attends to a key, None for all keys. (T, S)
+
+        Returns:
+            Attended values. (n, T, C)
+        """
+        C = self.embed_dim
+        queries = F.linear(query, self.in_proj_weight[:C], self.in_proj_bias[:C])
+        keys, values = cache
+        attended = F.scaled_dot_product_attention(
+            self.split_heads(queries),
+            keys,
+            values,
+            attn_mask=mask,
+            dropout_p=self.dropout if self.training else 0.0,
+        )
+        return self.out_proj(attended.transpose(1, 2).flatten(2))
+
+    def split_heads(self, tokens: Tensor) -> Tensor:
         """Split the channels among the heads. (n, S, C) -> (n, heads, S, C / heads)"""
         return tokens.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
 
 
 class GatedLayer(nn.Module):
-    """Self-attention, attention to the map, feed-forward network; pre-norm, behind learned gates.
+    """Decoder layer with learned gates: self-attention, attention to the map, feed-forward.
 
-    The gates start at 0, so that the layer does nothing at first.
+    Normalisation precedes each part. The gates start at 0, so a new layer is the identity.
+
+    Args:
+        embed_dims: Channels C of the tokens and of the map.
+        num_heads: Number of attention heads.
+        ffn_dims: Hidden channels of the feed-forward network.
+        dropout: Probability of setting a value to zero in training, in [0, 1].
     """
 
     def __init__(self, embed_dims: int, num_heads: int, ffn_dims: int, dropout: float) -> None:
         super().__init__()
-        self.self_attn, self.cross_attn = (
-            CachedAttention(embed_dims, num_heads, dropout) for _ in range(2)
-        )
+        self.self_attn = CachedAttention(embed_dims, num_heads, dropout=dropout)
+        self.cross_attn = CachedAttention(embed_dims, num_heads, dropout=dropout)
         self.ffn = nn.Sequential(
             nn.Linear(embed_dims, ffn_dims),
             nn.ReLU(),
@@ -52,36 +75,56 @@ class GatedLayer(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def keys_values(self, states: Tensor) -> Cache:
-        """Return what later tokens attend to. (n, T, C)"""
+        """Compute the keys and values of the self-attention. (n, T, C)"""
         return self.self_attn.keys_values(self.norms[0](states))
 
     def forward(
-        self, states: Tensor, own: Cache, memory: Cache, mask: Tensor | None = None
+        self, states: Tensor, cache: Cache, memory: Cache, mask: Tensor | None = None
     ) -> Tensor:
-        """Update tokens by those before them and by the map (1, heads, S, C'). (n, T, C)"""
-        shape = states.shape
-        shared = self.self_attn(self.norms[0](states), own, mask)
-        states = states + self.gates[0] * self.dropout(shared)
-        query = self.norms[1](states).flatten(0, 1)[None]  # all lines see one map
-        seen = self.cross_attn(query, memory).view(shape)
-        states = states + self.gates[1] * self.dropout(seen)
+        """Update the states of tokens.
+
+        Args:
+            states: States of the tokens of n lines. (n, T, C)
+            cache: Keys and values of the S tokens that self-attention covers.
+                (n, heads, S, C / heads) each
+            memory: Keys and values of the map's cells, shared by all lines.
+                (1, heads, cells, C / heads) each
+            mask: True where a token attends to another one, None for all tokens. (T, S)
+
+        Returns:
+            Updated states. (n, T, C)
+        """
+        attended = self.self_attn(self.norms[0](states), cache, mask=mask)
+        states = states + self.gates[0] * self.dropout(attended)
+        query = self.norms[1](states).flatten(0, 1)[None]  # (1, n * T, C)
+        attended = self.cross_attn(query, memory).view(states.shape)
+        states = states + self.gates[1] * self.dropout(attended)
         return states + self.gates[2] * self.dropout(self.ffn(self.norms[2](states)))
 
 
-def joined(before: Cache | None, new: Cache) -> Cache:
-    """Return keys and values of all tokens so far."""
-    if before is None:
+def append_cache(cache: Cache | None, new: Cache) -> Cache:
+    """Append keys and values of new tokens to a cache, None for an empty cache."""
+    if cache is None:
         return new
-    return torch.cat([before[0], new[0]], 2), torch.cat([before[1], new[1]], 2)
+    keys = torch.cat([cache[0], new[0]], dim=2)
+    values = torch.cat([cache[1], new[1]], dim=2)
+    return keys, values
 
 
-def most_likely(logits: Tensor, share: float) -> Tensor:
-    """Return logits without the tail of the law: -1e9 where the mass before exceeds a share.
+def keep_most_likely(logits: Tensor, share: float) -> Tensor:
+    """Mask the tail of a distribution for nucleus sampling (Holtzman et al., ICLR 2020).
 
-    The most likely token always stays: alone with a share of 0. (..., tokens)
+    Args:
+        logits: Logits of the tokens. (..., tokens)
+        share: Probability mass in [0, 1]. A token is masked if the more likely tokens have a larger
+            mass; the most likely token is never masked.
+
+    Returns:
+        Logits with -1e9 for masked tokens. (..., tokens)
     """
     ordered, index = logits.sort(dim=-1, descending=True)
-    law = ordered.softmax(-1)
-    cut = law.cumsum(-1) - law > share
-    cut[..., 0] = False
-    return logits.masked_fill(cut.gather(-1, index.argsort(-1)), -1e9)
+    law = ordered.softmax(dim=-1)
+    is_tail = law.cumsum(dim=-1) - law > share
+    is_tail[..., 0] = False
+    ranks = index.argsort(dim=-1)
+    return logits.masked_fill(is_tail.gather(-1, ranks), -1e9)

@@ -17,20 +17,20 @@ SHRUNK_MARGIN_M = 2.0
 @register_metric
 @dataclass(frozen=True)
 class VectorMapNetAP(ChamferConfig):
-    """AP_chamfer at 0.5, 1.0 and 1.5 m without the samples that lack either side."""
+    """AP_chamfer at 0.5, 1.0 and 1.5 m over the samples with predictions and ground truth."""
 
     name: ClassVar[str] = "vectormapnet"
     beside: ClassVar[tuple[str, ...]] = ("chamfer",)
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "VectorMapNetAP":
-        """Return the metric by the settings of a command or config.
+        """Create the metric from the settings of a command or config.
 
         Raises:
-            ValueError: If they are about heights or points as they are given.
+            ValueError: If the settings ask for heights or for lines that are not resampled.
         """
-        given = settings.resample_predictions, settings.resample_ground_truth
-        if settings.dim != 2 or not all(given):
+        resamples = settings.resample_predictions and settings.resample_ground_truth
+        if settings.dim != 2 or not resamples:
             raise ValueError(
                 f"{cls.name} is AP_chamfer of lines of 100 points in the plane: leave out "
                 "heights (dim 3) and points as they are given."
@@ -38,17 +38,17 @@ class VectorMapNetAP(ChamferConfig):
         return cls(settings.classes)
 
     def match(self, sample: Sample) -> FrameMatches:
-        """Match one sample; one that lacks a side is empty."""
+        """Match one sample; the matches are empty without predictions or without ground truth."""
         return super().match(sample).if_two_sided()
 
 
 @register_metric
 @dataclass(frozen=True)
 class ShrunkVectorMapNetAP(VectorMapNetAP):
-    """The metric in the units of its release, where a map is smaller as its canvas is larger.
+    """`VectorMapNetAP` in the units of the released code, which shrink the map by its margin.
 
     Args:
-        grid: Extent of the map, by which both sides are scaled.
+        grid: Extent of the map, in metres, by which predictions and ground truth are scaled.
     """
 
     name: ClassVar[str] = "vectormapnet_shrunk"
@@ -57,22 +57,26 @@ class ShrunkVectorMapNetAP(VectorMapNetAP):
 
     @classmethod
     def of(cls, settings: MetricSettings) -> "ShrunkVectorMapNetAP":
-        """Return the metric by the settings of a command or config."""
+        """Create the metric from the settings of a command or config.
+
+        Raises:
+            ValueError: If the settings ask for heights or for lines that are not resampled.
+        """
         plain = VectorMapNetAP.of(settings)
         return cls(plain.classes, grid=settings.canvas)
 
     def match(self, sample: Sample) -> FrameMatches:
-        """Match one sample in those units."""
-        found = _in_shrunk_units(sample.predictions, self.grid)
-        truth = _in_shrunk_units(sample.ground_truth, self.grid)
-        return super().match(Sample(sample.token, found, truth))
+        """Match one sample in the units of the released code."""
+        predictions = _shrink(sample.predictions, self.grid)
+        ground_truth = _shrink(sample.ground_truth, self.grid)
+        return super().match(Sample(sample.token, predictions, ground_truth=ground_truth))
 
 
-def _in_shrunk_units(elements: MapElements, grid: BEVGrid) -> MapElements:
-    """Return elements of a map in the units of VectorMapNet's release.
+def _shrink(elements: MapElements, grid: BEVGrid) -> MapElements:
+    """Scale the elements of a map to the units of the released code.
 
-    There coordinates are a share of the map and 2 m more, and come back as that share of the map
-    alone. It matters to distances that they are scaled so, not from which corner.
+    The release divides coordinates by the extent of the map plus 2 m and multiplies them by the
+    extent alone. The origin of the scaling has no effect on distances.
     """
     size = np.array(grid.extent_m)
     points = elements.with_coordinates(2).points * (size / (size + SHRUNK_MARGIN_M))

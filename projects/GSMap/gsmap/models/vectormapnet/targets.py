@@ -1,4 +1,4 @@
-"""VectorMapNet's targets: simplified lines as tokens, their boxes, and weights of the tokens."""
+"""VectorMapNet's targets: simplified lines as tokens, their boxes and token weights."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from mmdet3d.registry import TRANSFORMS
 from mmengine.structures import InstanceData
 from numpy.typing import NDArray
 
-from gsmap.models.vectormapnet.canvas import Canvas, tokens_of
+from gsmap.models.vectormapnet.canvas import Canvas, tokenize_points
 from gsmap.structures.elements import annotated
 from gsmap.structures.grid import BEVGrid, padded_size
 from gsmap.structures.polylines import padded
@@ -20,53 +20,66 @@ from gsmap.structures.polylines import padded
 Floats = NDArray[np.float64]
 
 
-def grown_box(line: Floats, smallest: float) -> Floats:
-    """Return a line's box (x0, y0, x1, y1), grown on all sides if one is short. (n, 2) -> (4,)
+def bounding_box(line: Floats, smallest: float) -> Floats:
+    """Compute the bounding box of a line, enlarged on all sides if its shorter side is too small.
 
     Args:
-        line: Vertices, [0, 1] over the canvas.
-        smallest: Length of the shorter side at least.
+        line: Vertices in [0, 1] over the canvas. (n, 2)
+        smallest: Smallest length of the shorter side, in [0, 1].
+
+    Returns:
+        Corners x0, y0, x1, y1. (4,)
     """
-    missing = smallest - np.ptp(line, 0).min()
     shape = shapely.LineString(line)
-    return np.array((shape.buffer(missing / 2, quad_segs=16) if missing > 0 else shape).bounds)
+    missing = smallest - np.ptp(line, axis=0).min()
+    if missing > 0:
+        shape = shape.buffer(missing / 2, quad_segs=16)
+    return np.array(shape.bounds)
 
 
 def even_weights(line: Floats) -> Floats:
-    """Return equal weights of the coordinates and the stop, of sum 1. (n, 2) -> (2 n + 1,)"""
+    """Return equal token weights of sum 1 for the coordinates and the stop token of a line.
+
+    (n, 2) -> (2 n + 1,)
+    """
     number = 2 * len(line) + 1
     return np.full(number, 1 / number)
 
 
 def edge_weights(line: Floats) -> Floats:
-    """Return weights by the mean length of a point's edges, of sum 1, and of the stop.
+    """Compute token weights in proportion to the mean length of a point's two edges.
+
+    The weights of the coordinates sum to 1; the stop token has the weight 1 / (2 n).
 
     (n, 2) -> (2 n + 1,)
     """
     edges = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    means = (np.append(edges[:1], edges) + np.append(edges, edges[-1:])) / 2
-    number = 2 * len(line)
+    edge_before = np.append(edges[:1], edges)
+    edge_after = np.append(edges, edges[-1:])
+    means = (edge_before + edge_after) / 2
     shares = means / max(means.sum(), np.finfo(float).eps) / 2
-    return np.append(np.repeat(shares, 2), 1 / number)
+    return np.append(np.repeat(shares, 2), 1 / (2 * len(line)))
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class FormatPolylineTargets(BaseTransform):
-    """Add VectorMapNet's targets to ``gt_instances_3d``, from ``map_instances``.
+    """Add VectorMapNet's targets to ``gt_instances_3d``, computed from ``map_instances``.
 
-    They are ``keypoints`` (K, 4), corners of boxes in canvas pixels, ``keypoint_tokens`` (K, 4),
-    ``tokens`` and ``token_weights`` (K, T), of shorter lines filled with 0. Behind
-    `FormatMapTargets` its targets stay; alone it also adds ``labels_3d`` (K,), the simplified lines
-    ``pts`` (K, P, 2) in metres, the last point repeated, and ``num_pts`` (K,).
+    The targets are ``keypoints`` (K, 4), box corners in pixels of the canvas, ``keypoint_tokens``
+    (K, 4), and ``tokens`` and ``token_weights`` (K, T), filled with 0 for shorter lines. Targets of
+    a preceding `FormatMapTargets` are not changed. Without it, the transform also adds
+    ``labels_3d`` (K,), the simplified lines ``pts`` (K, P, 2) in metres, filled with the last
+    point, and ``num_pts`` (K,).
 
     Args:
-        pixel_m: As in `Canvas`, that of the head.
-        margin_m: As in `Canvas`, that of the head.
-        tolerance_m: How far a simplified line may be from the annotated one.
-        smallest_box: Shorter side of a box at least, as a share of the canvas.
-        border_px: Least distance of corners from the border of the canvas, in pixels.
-        edge_classes: Class indices whose points weigh as long as their edges; others weigh alike.
+        pixel_m: Side of a pixel in metres, as in the `Canvas` of the head.
+        margin_m: Margin in metres, as in the `Canvas` of the head.
+        tolerance_m: Largest distance of a simplified line from the annotated one, in metres.
+        smallest_box: Smallest length of the shorter side of a box, as a share of the canvas.
+        border_px: Smallest distance of box corners from the border of the canvas, in pixels.
+        edge_classes: Class indices whose tokens are weighted by edge length. Other classes have
+            even weights.
 
     Raises:
         ValueError: If a setting is negative.
@@ -84,60 +97,73 @@ class FormatPolylineTargets(BaseTransform):
             raise ValueError(f"settings of FormatPolylineTargets must not be negative: {self}.")
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Add the targets; ValueError if the sample has no ground truth."""
+        """Add the targets to a sample.
+
+        Raises:
+            ValueError: If the sample has no ground truth.
+        """
         elements = annotated(results, self)
         grid = BEVGrid(results["x_range"], results["y_range"])
-        canvas = Canvas(grid, self.pixel_m, self.margin_m)
+        canvas = Canvas(grid, self.pixel_m, margin_m=self.margin_m)
         low, high = np.transpose([grid.x_range, grid.y_range])
-        lines_m = [self.simplified(e.points[:, :2]).clip(low, high) for e in elements]
-        lines = [canvas.norm_from_metres(line) for line in lines_m]
-        weights = [
-            edge_weights(line) if element.label in self.edge_classes else even_weights(line)
-            for element, line in zip(elements, lines, strict=True)
-        ]
-        boxes = np.array([grown_box(line, self.smallest_box) for line in lines]).reshape(-1, 2, 2)
+        labels = []
+        counts = []
+        lines_m = []
+        boxes = []
+        tokens = []
+        weights = []
+        for element in elements:
+            line_m = self.simplify(element.points[:, :2]).clip(low, high)
+            line = canvas.norm_from_metres(line_m)
+            weigh = edge_weights if element.label in self.edge_classes else even_weights
+            labels.append(element.label)
+            counts.append(len(line))
+            lines_m.append(line_m)
+            boxes.append(bounding_box(line, self.smallest_box))
+            tokens.append(tokenize_points(line, canvas.steps))
+            weights.append(weigh(line))
         border = self.border_px / np.array(canvas.size)
-        boxes = boxes.clip(border, 1 - border)
+        corners = np.array(boxes).reshape(-1, 2, 2).clip(border, 1 - border)
         instances = results.get("gt_instances_3d", InstanceData())
         if "pts" not in instances:
-            instances.labels_3d = torch.tensor([e.label for e in elements], dtype=torch.int64)
+            instances.labels_3d = torch.tensor(labels, dtype=torch.int64)
             instances.pts = torch.from_numpy(padded(lines_m)).float()
-            instances.num_pts = torch.tensor([len(line) for line in lines], dtype=torch.int64)
-        instances.keypoints = torch.from_numpy((boxes * canvas.size).reshape(-1, 4)).float()
-        instances.keypoint_tokens = torch.from_numpy(boxes * canvas.steps).long().flatten(1)
-        tokens = [tokens_of(line, canvas.steps) for line in lines]
-        instances.tokens = filled(tokens).long()
-        instances.token_weights = filled(weights).float()
+            instances.num_pts = torch.tensor(counts, dtype=torch.int64)
+        instances.keypoints = torch.from_numpy((corners * canvas.size).reshape(-1, 4)).float()
+        instances.keypoint_tokens = torch.from_numpy(corners * canvas.steps).long().flatten(1)
+        instances.tokens = stack_rows(tokens).long()
+        instances.token_weights = stack_rows(weights).float()
         instances.set_metainfo({"canvas": canvas.settings})
         results["gt_instances_3d"] = instances
         return results
 
-    def simplified(self, points: NDArray[Any]) -> Floats:
-        """Return a line without the vertices that it does not need. (n, 2)"""
+    def simplify(self, points: NDArray[Any]) -> Floats:
+        """Simplify a line within the tolerance (Douglas and Peucker). (n, 2) -> (m, 2)"""
         return shapely.get_coordinates(shapely.LineString(points).simplify(self.tolerance_m))
 
 
-def filled(rows: Sequence[NDArray[Any]]) -> torch.Tensor:
-    """Stack arrays (n,), the shorter ones filled with zeros. (K, longest)"""
-    return torch.from_numpy(padded([row[:, None] for row in rows], mode="constant")[..., 0])
+def stack_rows(rows: Sequence[NDArray[Any]]) -> torch.Tensor:
+    """Stack arrays of different lengths, filled with zeros. (n,) each -> (K, longest n)"""
+    columns = [row[:, None] for row in rows]
+    return torch.from_numpy(padded(columns, mode="constant")[..., 0])
 
 
 @TRANSFORMS.register_module()
 @dataclass(eq=False)
 class StretchToPadding(BaseTransform):
-    """Scale projections as if images were stretched over their padding, as released.
+    """Scale projections as if images were stretched over their padding, as in the released code.
 
     Args:
-        pad_size_divisor: What the sizes of padded images are multiples of.
+        pad_size_divisor: Divisor of the height and width of padded images.
     """
 
     pad_size_divisor: int = 32
 
     def transform(self, results: dict[str, Any]) -> dict[str, Any]:
-        """Scale ``lidar2img``, and ``img_aug_matrix`` with it, which leads back to the file."""
+        """Scale ``lidar2img``, and ``img_aug_matrix`` to preserve the mapping to the image file."""
         height, width = results["img_shape"]
-        padded = padded_size((height, width), self.pad_size_divisor)
-        stretch = np.diag([padded[1] / width, padded[0] / height, 1.0, 1.0])
+        padded_height, padded_width = padded_size((height, width), self.pad_size_divisor)
+        stretch = np.diag([padded_width / width, padded_height / height, 1.0, 1.0])
         for key in results.keys() & {"lidar2img", "img_aug_matrix"}:
             results[key] = [stretch @ matrix for matrix in results[key]]
         return results
